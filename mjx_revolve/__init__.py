@@ -1,0 +1,65 @@
+"""Massively parallel evolution of modular robots under water, in JAX and MuJoCo MJX.
+
+The names below are what users rely on; each is imported when it is first used, so that importing the
+package, or starting one of its command lines, loads neither JAX nor MuJoCo.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_WHERE = {
+    "InputError": "errors",
+    "load_config": "config",
+    "load_modules": "modules",
+    "MODULES": "modules",
+    "THESIS_MODULES": "modules",
+    "load_morphology": "morphology",
+    "save_morphology": "morphology",
+    "trim_neutral": "morphology",
+    "load_world": "world",
+    "make_world": "world",
+    "build_robot": "robot",
+    "export_mjcf": "robot",
+    "make_cpg": "controllers",
+    "make_sine": "controllers",
+    "bind_genes": "controllers",
+    "simulate": "rollout",
+    "make_fitness": "fitness",
+}
+
+__all__ = ["__version__", *sorted(_WHERE)]
+
+if TYPE_CHECKING:
+    from mjx_revolve.config import load_config as load_config
+    from mjx_revolve.controllers import bind_genes as bind_genes
+    from mjx_revolve.controllers import make_cpg as make_cpg
+    from mjx_revolve.controllers import make_sine as make_sine
+    from mjx_revolve.errors import InputError as InputError
+    from mjx_revolve.fitness import make_fitness as make_fitness
+    from mjx_revolve.modules import MODULES as MODULES
+    from mjx_revolve.modules import THESIS_MODULES as THESIS_MODULES
+    from mjx_revolve.modules import load_modules as load_modules
+    from mjx_revolve.morphology import load_morphology as load_morphology
+    from mjx_revolve.morphology import save_morphology as save_morphology
+    from mjx_revolve.morphology import trim_neutral as trim_neutral
+    from mjx_revolve.robot import build_robot as build_robot
+    from mjx_revolve.robot import export_mjcf as export_mjcf
+    from mjx_revolve.rollout import simulate as simulate
+    from mjx_revolve.world import load_world as load_world
+    from mjx_revolve.world import make_world as make_world
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_WHERE[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_WHERE})

@@ -1,0 +1,129 @@
+"""What reads a user's input: one kind of error, and YAML without its traps.
+
+Every function that reads user input raises `InputError` with one line that names the file, the
+place in it, what was expected and what was found. Command lines turn it into exit code 2.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Hashable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+# Revolve's deepest evolved robots stay below 60 levels of YAML; Python's own recursion limit is
+# 1000. A file nested deeper than this is a mistake or an attack.
+_MAX_DEPTH = 200
+# An alias bomb is small in the file and huge when walked; our files need no aliases at all.
+_MAX_NODES = 200_000
+
+
+class InputError(ValueError):
+    """A user's input is wrong; the message says where, what was expected and what was found."""
+
+
+class _Loader(yaml.SafeLoader):
+    """`yaml.SafeLoader` that reads `1e-3` as a number and refuses duplicate keys."""
+
+
+# YAML 1.1 wants a dot in floats and no sign before it; people write 1e-3 and -.5 and mean it.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(?:(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+|\.[0-9][0-9_]*)$"),
+    list("-+.0123456789"),
+)
+
+
+def _construct_mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Hashable, Any]:
+    mapping: dict[Hashable, Any] = {}
+    for key_node, value_node in node.value:
+        key = loader.construct_object(key_node, deep=True)
+        place = f"line {key_node.start_mark.line + 1}"
+        if not isinstance(key, Hashable):
+            raise InputError(f"{place}: expected a plain key; found {key!r}")
+        if key in mapping:
+            raise InputError(f"{place}: expected each key once; found {key!r} twice")
+        mapping[key] = loader.construct_object(value_node, deep=True)
+    return mapping
+
+
+_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
+
+
+def _check_size(data: Any) -> None:
+    stack, count = [(data, 0)], 0
+    while stack:
+        item, depth = stack.pop()
+        count += 1
+        if depth > _MAX_DEPTH:
+            raise InputError(f"expected at most {_MAX_DEPTH} levels of nesting; found more")
+        if count > _MAX_NODES:
+            raise InputError(f"expected at most {_MAX_NODES} values; found more (aliases?)")
+        if isinstance(item, dict):
+            stack.extend((value, depth + 1) for value in item.values())
+        elif isinstance(item, list):
+            stack.extend((value, depth + 1) for value in item)
+
+
+def load_yaml(path: str | Path) -> Any:
+    """Reads one YAML document.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The document as plain Python values (dict, list, str, int, float, bool, None).
+
+    Raises:
+        InputError: the file is missing, unreadable, no valid YAML, nested too deeply, or repeats a
+            key.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file; found none") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: expected a file; found a folder") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected UTF-8 text; found {error.reason}") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
+    try:
+        data = yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+        _check_size(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: expected at most {_MAX_DEPTH} levels; found more") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}: " if mark else ""
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InputError(f"{path}: {place}expected valid YAML; found: {problem}") from None
+    except ValueError as error:  # e.g. an impossible date
+        raise InputError(f"{path}: expected valid YAML values; found: {error}") from None
+    return data
+
+
+def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
+    """Runs a command line's `main`, turning `InputError` into one line and exit code 2.
+
+    Args:
+        main: takes the arguments (None: `sys.argv[1:]`) and returns the exit code.
+        argv: the arguments.
+
+    Returns:
+        The exit code.
+    """
+    try:
+        return main(argv)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # `| head` closed the pipe: not an error of ours
+        sys.stderr.close()
+        return 1
