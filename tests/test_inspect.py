@@ -1,0 +1,292 @@
+"""The command line that shows a morphology, and its picture."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from mjx_revolve import inspect
+from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.morphology import load_morphology
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def _leg() -> dict:
+    """Hinge, brick, hinge, brick, as in Revolve's spider."""
+    foot = {"id": "foot", "type": "FixedBrick"}
+    ankle = {"id": "ankle", "type": "ActiveHinge", "children": {1: foot}}
+    shin = {"id": "shin", "type": "FixedBrick", "orientation": -90, "children": {1: ankle}}
+    return {"id": "hip", "type": "ActiveHinge", "orientation": 90, "children": {1: shin}}
+
+
+def _rename(module: dict, suffix: int) -> dict:
+    children = {slot: _rename(child, suffix) for slot, child in module.get("children", {}).items()}
+    return module | {"id": f"{module['id']}{suffix}"} | ({"children": children} if children else {})
+
+
+@pytest.fixture
+def spider(tmp_path) -> Path:
+    """A file with the thesis's spider."""
+    legs = {slot: _rename(_leg(), slot) for slot in range(4)}
+    params = {"red": 0.04, "green": 0.26, "blue": 0.72}
+    body = {"id": "core", "type": "Core", "params": params, "children": legs}
+    path = tmp_path / "spider.yaml"
+    path.write_text(yaml.safe_dump({"id": "spider", "body": body}))
+    return path
+
+
+def run(*arguments: object) -> int:
+    """The command line in this process."""
+    return run_command(inspect.main, [str(argument) for argument in arguments])
+
+
+def _value(text: str, name: str) -> float:
+    """The number in the line of the output that starts with `name`."""
+    (line,) = (line for line in text.splitlines() if line.startswith(name))
+    return float(line.removeprefix(name).split()[0])
+
+
+def _is_png(path: Path) -> bool:
+    data = path.read_bytes()
+    return data.startswith(b"\x89PNG\r\n\x1a\n") and data.endswith(b"IEND\xaeB`\x82")
+
+
+def test_the_spider_weighs_what_the_thesis_says(spider, capsys):
+    assert run(spider) == 0
+    out = capsys.readouterr().out
+    assert _value(out, "modules") == 17
+    assert _value(out, "hinges") == 8
+    assert _value(out, "mass") == pytest.approx(0.2572)
+    assert _value(out, "volume (displaced)") == pytest.approx(241.516, abs=1e-3)
+    assert _value(out, "weight in air") == pytest.approx(2.5231, abs=1e-4)
+    assert _value(out, "buoyancy in water of 999.103 kg/m3") == pytest.approx(2.3671, abs=1e-4)
+    assert _value(out, "net weight in water") == pytest.approx(0.156, abs=1e-3)
+    assert _value(out, "relative density") == pytest.approx(1 / 0.93818, rel=1e-5)
+    assert "(sinks)" in out
+
+
+def test_the_table_is_aligned_with_units_in_its_header(spider):
+    lines = inspect.module_table(load_morphology(spider))
+    assert len(lines) == 2 + 17
+    assert lines[0].split() == [
+        "#", "name", "type", "parent", "slot", "turn", "x", "y", "z", "mass", "volume"
+    ]  # fmt: skip
+    assert lines[1].split() == ["[deg]", "[m]", "[m]", "[m]", "[kg]", "[cm3]"]
+    assert len({len(line) for line in lines}) == 1  # the last column is set to the right
+    # The foot along +x: x .17905, as in Revolve's SDF; brick 10.70 cm³, .0102 kg.
+    foot = next(line.split() for line in lines if " foot2 " in line)
+    assert foot[2:] == [
+        "FixedBrick", str(int(foot[0]) - 1), "1", "0", "0.17905", "0.00000", "0.00000",
+        "0.0102", "10.700",
+    ]  # fmt: skip
+    core = lines[2].split()
+    assert core == ["0", "core", "Core", "-", "-", "-", *["0.00000"] * 3, "0.0900", "50.540"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "buoyancy", "net", "verdict"),
+    [
+        (("--density", "1025"), 2.4285, 0.0946, "sinks"),
+        (("--density", "1200"), 2.8431, -0.3200, "floats"),
+        (("--gravity", "1.62"), 0.3909, 0.0258, "sinks"),
+    ],
+)
+def test_density_and_gravity_change_the_weights(spider, capsys, arguments, buoyancy, net, verdict):
+    assert run(spider, *arguments) == 0
+    out = capsys.readouterr().out
+    assert _value(out, f"buoyancy in water of {_density(arguments):g} kg/m3") == pytest.approx(
+        buoyancy, abs=1e-4
+    )
+    assert _value(out, "net weight in water") == pytest.approx(net, abs=1e-4)
+    assert f"({verdict})" in out
+
+
+def _density(arguments: tuple[str, str]) -> float:
+    return float(arguments[1]) if arguments[0] == "--density" else 999.1026
+
+
+def test_a_neutral_robot_is_called_neutral(spider):
+    body = load_morphology(spider)
+    assert any("(neutral)" in line for line in inspect.summary(body, body.mass / body.volume))
+
+
+def test_descriptors_are_listed(spider, capsys):
+    assert run(spider) == 0
+    out = capsys.readouterr().out
+    for key, value in load_morphology(spider).descriptors.items():
+        assert _value(out, f"  {key} ") == pytest.approx(float(value), rel=1e-5)
+
+
+def test_own_module_types_are_read(tmp_path, capsys):
+    (tmp_path / "mine.yaml").write_text(
+        "modules:\n  Fin:\n    mount: -x\n"
+        "    parts:\n      - {size: [.06, .04, .002], mass: .006, volume: 4.0e-6}\n"
+    )
+    (tmp_path / "robot.yaml").write_text(
+        "id: fish\nbody:\n  id: core\n  type: Core\n  children:\n    1: {id: fin, type: Fin}\n"
+    )
+    assert run(tmp_path / "robot.yaml", "--modules", tmp_path / "mine.yaml") == 0
+    assert _value(capsys.readouterr().out, "mass") == pytest.approx(0.096)
+    assert run(tmp_path / "robot.yaml") == 2
+    assert "Fin" in capsys.readouterr().err
+
+
+def test_overlap_is_refused_unless_allowed(tmp_path, capsys):
+    """Four bricks in a ring come back to where they began."""
+    brick: dict = {"id": "d", "type": "FixedBrick"}
+    for name in "cba":
+        brick = {"id": name, "type": "FixedBrick", "children": {2: brick}}
+    hub = {"id": "hub", "type": "FixedBrick", "children": {2: brick}}
+    path = tmp_path / "ring.yaml"
+    path.write_text(yaml.safe_dump({"id": "ring", "body": {
+        "id": "core", "type": "Core", "children": {1: hub}}}))  # fmt: skip
+    assert run(path) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert run(path, "--allow-overlap") == 0
+    assert "overlap at rest" in capsys.readouterr().out
+
+
+# --- the picture --------------------------------------------------------------------------------
+
+
+def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
+    from matplotlib.image import imread
+
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    picture = folder / "spider.png"
+    picture.write_text("old")
+    assert run(spider, "--picture", picture) == 0
+    assert _is_png(picture)
+    assert os.listdir(folder) == ["spider.png"]
+    pixels = imread(picture)[..., :3]
+    assert pixels.shape[0] > 700 and pixels.shape[1] > 1200
+    blue = (pixels[..., 2] > 0.3) & (pixels[..., 2] > 2 * pixels[..., 0])
+    white = (pixels > 0.99).all(axis=-1)
+    assert 0.01 < blue.mean() < 0.3  # core and bricks
+    assert 0.3 < white.mean() < 0.9
+
+
+def test_what_is_nearer_hides_what_is_farther():
+    from mjx_revolve.pictures import _depth_buffer
+
+    square = np.array([[(0, 0), (4, 0), (4, 4)], [(0, 0), (4, 4), (0, 4)]], float)
+    low = np.concatenate([square, np.zeros((2, 3, 1))], axis=2)
+    high = np.concatenate([0.5 * square + 1, np.ones((2, 3, 1))], axis=2)
+    for corners, near in ((np.concatenate([low, high]), 2), (np.concatenate([high, low]), 0)):
+        depth, index = _depth_buffer(corners, np.zeros(2), 0.1, (40, 40))
+        assert (depth[10:30, 10:30] == 1.0).all()
+        assert (depth == 1.0).sum() == 400 and (depth == 0.0).sum() == 1200
+        assert np.isin(index[10:30, 10:30], (near, near + 1)).all()
+    depth, _ = _depth_buffer(low[:, ::-1], np.zeros(2), 0.1, (40, 40))
+    assert not np.isfinite(depth).any()  # faces that look away are not drawn
+
+
+def test_drawing_leaves_matplotlib_alone():
+    code = (
+        "import sys, matplotlib; before = matplotlib.rcParams.copy(); "
+        "import mjx_revolve.pictures; "
+        "sys.exit('matplotlib.pyplot' in sys.modules or before != matplotlib.rcParams)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--density", "heavy"), "--density: expected a number > 0 [kg/m3]; found 'heavy'"),
+        (("--density", "0"), "--density: expected a number > 0 [kg/m3]; found 0.0"),
+        (("--density", "nan"), "--density: expected a number > 0 [kg/m3]; found nan"),
+        (("--gravity", "-9.81"), "--gravity: expected a number > 0 [m/s2]; found -9.81"),
+        (("--gravity", "inf"), "--gravity: expected a number > 0 [m/s2]; found inf"),
+        (("--picture", "{tmp}/none/a.png"),
+         "{tmp}/none/a.png: expected the folder {tmp}/none to exist; found none"),
+        (("--picture", "{tmp}/a.jpg"), "{tmp}/a.jpg: expected a name that ends in .png; found "
+         "'.jpg'"),
+        (("--picture", "{tmp}/folder.png"), "{tmp}/folder.png: expected a file; found a folder"),
+        (("--modules", "{tmp}/none.yaml"), "{tmp}/none.yaml: expected a file; found none"),
+        (("--colour", "red"), "unrecognized arguments: --colour red (see --help)"),
+        (("--density",), "argument --density: expected one argument (see --help)"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_one_line_and_code_2(spider, tmp_path, capsys, arguments, message):
+    (tmp_path / "folder.png").mkdir()
+    before = sorted(os.listdir(tmp_path))
+    assert run(spider, *(argument.format(tmp=tmp_path) for argument in arguments)) == 2
+    captured = capsys.readouterr()
+    assert captured.err == f"error: {message.format(tmp=tmp_path)}\n"
+    assert captured.out == ""
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "expected a file; found none"),
+        ("body: [", "expected valid YAML"),
+        ("id: x\n", "body"),
+        ("body: {id: c, type: Bric}\n", "'Bric'"),
+    ],
+)
+def test_bad_files_are_one_line_and_code_2(tmp_path, capsys, text, message):
+    path = tmp_path / "robot.yaml"
+    if text is not None:
+        path.write_text(text)
+    assert run(path) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"error: {path}: ")
+    assert message in captured.err and captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_without_a_file_the_command_says_so(capsys):
+    assert run() == 2
+    assert capsys.readouterr().err == (
+        "error: the following arguments are required: file (see --help)\n"
+    )
+
+
+def test_a_picture_that_cannot_be_written_leaves_nothing(spider, tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    from mjx_revolve import pictures
+
+    def full(self, file, **options):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", full)
+    monkeypatch.setattr(pictures, "_compose", lambda morphology: Figure())
+    picture = tmp_path / "spider.png"
+    with pytest.raises(InputError, match="expected a writable file; found No space left on device"):
+        pictures.draw_morphology(load_morphology(spider), picture)
+    assert os.listdir(tmp_path) == ["spider.yaml"]
+
+
+def test_the_module_runs_as_a_command(spider):
+    done = subprocess.run(
+        [sys.executable, "-m", "mjx_revolve.inspect", str(spider)],
+        capture_output=True, text=True, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "17" in done.stdout and done.stderr == ""
+
+
+@pytest.mark.parametrize("name", ["spider", "gecko", "snake", "babyA", "robot_5", "spider17"])
+def test_robots_in_the_wild_are_shown(name, capsys):
+    path = ROOT.parent / "shared" / "revolve_robots" / f"{name}.yaml"
+    if not path.exists():
+        pytest.skip("no collection of Revolve's robots beside the repository")
+    assert run(path) == 0
+    assert len(capsys.readouterr().out.splitlines()) > 20
