@@ -1,0 +1,171 @@
+"""Controllers: genes to parameters to joint targets. Zero genes keep every joint still.
+
+A controller is four plain functions over a population on the last axis. The genes are unbounded real
+numbers, squashed into physical ranges by tanh, so that any optimiser can move them freely.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.robot import Robot
+from mjx_revolve.spatial import sincos
+
+
+class Controller(NamedTuple):
+    """What turns genes into joint targets.
+
+    Attributes:
+        num_genes: length of an individual's genes.
+        gene_names: `[num_genes]` what each gene is, for tables and plots.
+        decode: (genes `[num_genes, lanes]`, order `[nu]`) → parameters; rows follow `order`.
+        init: parameters → controller state.
+        step: (parameters, state, time [s]) → (state, targets `[nu, lanes]` [rad]).
+    """
+
+    num_genes: int
+    gene_names: tuple[str, ...]
+    decode: Callable[[jax.Array, np.ndarray], Any]
+    init: Callable[[Any], Any]
+    step: Callable[[Any, Any, jax.Array], tuple[Any, jax.Array]]
+
+
+@dataclass(frozen=True)
+class BoundController:
+    """A controller with one individual's genes, as `simulate` takes it."""
+
+    controller: Controller
+    genes: Any
+
+
+def bind_genes(controller: Controller, genes: Any) -> BoundController:
+    """Joins a controller and one individual's genes.
+
+    Args:
+        controller: from `make_cpg` or `make_sine`.
+        genes: `[num_genes]`.
+
+    Returns:
+        What `simulate` takes as `ctrl`.
+    """
+    return BoundController(controller, genes)
+
+
+def _range(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """`[nu, 1]` middle and half width of each servo's target range [rad]."""
+    low, high = robot.mj_model.actuator_ctrlrange.reshape(-1, 2).T
+    return (low + high)[:, None] / 2, (high - low)[:, None] / 2
+
+
+def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -> Controller:
+    """Revolve's differential CPG: one oscillator pair per hinge, neighbours coupled.
+
+    ẋ_i = w_i y_i + Σ_j c_ij x_j,  ẏ_i = -w_i x_i,  c_ij = -c_ji for hinges that share a rigid link
+    (Lan et al. 2021, Learning locomotion skills in evolvable robots, Neurocomputing 452). The system matrix is antisymmetric, so Σ x² + y² is constant. Target of hinge i:
+    amplitude × half range × tanh(x_i), from the middle of its range. It starts at x = 0, y = 1: with all weights
+    zero nothing ever moves. Integrated by the classical Runge-Kutta method at the physics' step.
+
+    Genes: one w per hinge, then one c per pair of neighbours; w = 2π f_max tanh(gene),
+    c = π f_max tanh(gene).
+
+    Args:
+        robot: whose hinges are driven.
+        max_frequency: of an uncoupled oscillator [Hz].
+        amplitude: share of the hinges' range used [-].
+
+    Returns:
+        The controller.
+    """
+    n, dt = robot.num_hinges, robot.world.timestep
+    pairs = robot.morphology.hinge_neighbours()
+    middle, half = _range(robot)
+    names = [robot.mj_model.actuator(i).name for i in range(n)]
+    gene_names = tuple(
+        [f"w {name}" for name in names] + [f"c {names[i]}~{names[j]}" for i, j in pairs]
+    )
+    source = np.zeros((n, n), int)
+    sign = np.zeros((n, n, 1))
+    for k, (i, j) in enumerate(pairs):
+        source[i, j] = source[j, i] = n + k
+        sign[i, j], sign[j, i] = 1.0, -1.0
+
+    def decode(genes: jax.Array, order: np.ndarray) -> Any:
+        squashed = jnp.tanh(genes)
+        w = 2 * np.pi * max_frequency * squashed[:n][order]
+        c = np.pi * max_frequency * squashed[source] * sign
+        c = c[order][:, order]
+        reach = jnp.broadcast_to(jnp.asarray(amplitude * half, genes.dtype)[order], w.shape)
+        center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], w.shape)
+        return w, c, reach, center
+
+    def slope(w: jax.Array, c: jax.Array, x: jax.Array, y: jax.Array) -> tuple[Any, Any]:
+        coupled = w * y
+        for j in range(n):  # written out: no reductions inside the compiled loop
+            if np.any(sign[:, j]) or np.any(sign[j]):
+                coupled = coupled + c[:, j] * x[j : j + 1]
+        return coupled, -w * x
+
+    def init(parameters: Any) -> Any:
+        w = parameters[0]
+        return jnp.zeros_like(w), jnp.ones_like(w)
+
+    def step(parameters: Any, state: Any, time: jax.Array) -> tuple[Any, jax.Array]:
+        w, c, reach, center = parameters
+        x, y = state
+        a1, b1 = slope(w, c, x, y)
+        a2, b2 = slope(w, c, x + dt / 2 * a1, y + dt / 2 * b1)
+        a3, b3 = slope(w, c, x + dt / 2 * a2, y + dt / 2 * b2)
+        a4, b4 = slope(w, c, x + dt * a3, y + dt * b3)
+        x = x + dt / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        y = y + dt / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
+        return (x, y), center + reach * jnp.tanh(x)
+
+    return Controller(n + len(pairs), gene_names, decode, init, step)
+
+
+def make_sine(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -> Controller:
+    """One sine per hinge: amplitude, phase and offset each, and a frequency shared by all.
+
+    target_i = offset_i + a_i sin(2π f t + φ_i), with a = amplitude × half range × tanh(gene),
+    φ = π gene, offset = half of half range × tanh(gene), f = f_max / (1 + e^-gene). The amplitudes and
+    offsets fade in over the first half second, so that no joint jumps at the start.
+
+    Args:
+        robot: whose hinges are driven.
+        max_frequency: upper end of f [Hz].
+        amplitude: share of the hinges' range used [-].
+
+    Returns:
+        The controller; genes: amplitudes, phases, offsets (one per hinge each), frequency.
+    """
+    n = robot.num_hinges
+    middle, half = _range(robot)
+    names = [robot.mj_model.actuator(i).name for i in range(n)]
+    gene_names = tuple(
+        f"{what} {name}" for what in ("amplitude", "phase", "offset") for name in names
+    ) + ("frequency",)
+
+    def decode(genes: jax.Array, order: np.ndarray) -> Any:
+        a, phase, offset = (genes[k * n : (k + 1) * n][order] for k in range(3))
+        reach = jnp.asarray(half, genes.dtype)[order]
+        center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], a.shape)
+        rate = 2 * np.pi * max_frequency * jax.nn.sigmoid(genes[3 * n :])
+        return amplitude * reach * jnp.tanh(a), np.pi * phase, 0.5 * reach * jnp.tanh(
+            offset
+        ), rate, center
+
+    def step(parameters: Any, state: Any, time: jax.Array) -> tuple[Any, jax.Array]:
+        a, phase, offset, rate, center = parameters
+        fade = jnp.minimum(time / 0.5, 1.0)
+        return state, center + fade * (offset + a * sincos(rate * time + phase)[0])
+
+    return Controller(3 * n + 1, gene_names, decode, lambda parameters: (), step)
+
+
+CONTROLLERS = {"cpg": make_cpg, "sine": make_sine}

@@ -1,0 +1,317 @@
+"""Morphology and world to MuJoCo: one model, and per-part tables for the water.
+
+Modules that are welded together become one MuJoCo body, so a spider has 9 moving bodies, but every
+part keeps its own geom and its own row in the fluid table. The compiled model is the single source
+of masses, inertias, axes, limits and gains for every engine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_revolve.errors import InputError
+from mjx_revolve.hydrodynamics import (
+    ELLIPSOID_COEFFICIENTS,
+    FluidTable,
+    box_added_mass,
+    face_drag_coefficients,
+)
+from mjx_revolve.modules import Part
+from mjx_revolve.morphology import Morphology
+from mjx_revolve.terrain import sample_bed
+from mjx_revolve.world import World
+
+# Error at which the servo gives its full torque [rad]. A choice: hobby servos are stiff, and 0.1 rad
+# (6 degrees) with the speed limit's damping gives a lag of 19 ms.
+FULL_TORQUE_ERROR = 0.1
+
+# Colour of a module whose YAML gives none (Revolve's default grey).
+_GREY = (0.5, 0.5, 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A compiled robot in its world.
+
+    Attributes:
+        morphology: the tree of modules that it was built from.
+        world: the water around it.
+        mj_spec: the editable MuJoCo model.
+        mj_model: the compiled model. Its own fluid (`opt.density`, `opt.viscosity`) is off.
+        fluid: per-part tables.
+        contact_body: `[npoint]` body of each point that may touch the bed.
+        contact_position: `[npoint, 3]` the point, body frame [m].
+    """
+
+    morphology: Morphology
+    world: World
+    mj_spec: mujoco.MjSpec
+    mj_model: mujoco.MjModel
+    fluid: FluidTable
+    contact_body: np.ndarray
+    contact_position: np.ndarray
+
+    @cached_property
+    def mjx_model(self) -> Any:
+        """The model on JAX's default device (`mujoco.mjx.Model`); made at first use."""
+        from mujoco import mjx
+
+        return mjx.put_model(self.mj_model)
+
+    @property
+    def num_hinges(self) -> int:
+        """Number of actuated hinges, the length of `ctrl`."""
+        return self.mj_model.nu
+
+    @property
+    def qpos0(self) -> np.ndarray:
+        """`[nq]` the rest pose at the world's origin, joints at 0."""
+        return self.mj_model.qpos0.copy()
+
+    def start_qpos(self, depth: float = 1.0) -> np.ndarray:
+        """The rest pose at a depth.
+
+        Args:
+            depth: of the core's centre below the surface [m].
+
+        Returns:
+            `[nq]` qpos.
+        """
+        qpos = self.qpos0
+        qpos[2] = self.world.surface_height - depth
+        return qpos
+
+
+def build_robot(morphology: Morphology, world: World) -> Robot:
+    """Compiles a morphology in a world.
+
+    Args:
+        morphology: the robot's modules.
+        world: the water, and the bed if there is one.
+
+    Returns:
+        The robot.
+
+    Raises:
+        InputError: MuJoCo refuses the model (a massless moving part, say).
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = str(morphology.name)
+    spec.compiler.degree = False
+    spec.option.timestep = world.timestep
+    spec.option.gravity = [0.0, 0.0, -world.gravity]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    # MuJoCo's own fluid stays off in every engine: hydrodynamics owns the water.
+    spec.option.density = 0.0
+    spec.option.viscosity = 0.0
+    _add_bed(spec, world)
+    rows, points = _add_modules(spec, morphology, world)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"{morphology.path or morphology.name}: expected a body that MuJoCo can simulate; "
+            f"found: {reason}"
+        ) from None
+    body = {model.body(i).name: i for i in range(model.nbody)}
+    return Robot(
+        morphology=morphology,
+        world=world,
+        mj_spec=spec,
+        mj_model=model,
+        fluid=_fluid_table(rows, body),
+        contact_body=np.array([body[name] for name, _ in points], int),
+        contact_position=np.array([p for _, p in points], float).reshape(-1, 3),
+    )
+
+
+def export_mjcf(robot: Robot, path: str | Path) -> None:
+    """Writes the model as MJCF that stock MuJoCo opens.
+
+    Args:
+        robot: the robot.
+        path: the XML file to write.
+    """
+    Path(path).write_text(robot.mj_spec.to_xml(), encoding="utf-8")
+
+
+def _quat(rotation: np.ndarray) -> np.ndarray:
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation, np.float64).ravel())
+    return quat
+
+
+def _add_bed(spec: mujoco.MjSpec, world: World) -> None:
+    """The ground as a geom, to be seen; our own penalty law makes contact with it."""
+    bed = world.bed
+    if bed is None:
+        return
+    half = bed.extent / 2
+    common: dict[str, Any] = {"name": "bed", "contype": 0, "conaffinity": 0}
+    common["rgba"] = [0.76, 0.70, 0.50, 1.0]
+    if bed.kind == "flat":
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[half, half, 1.0],
+            pos=[0, 0, bed.height],
+            **common,
+        )
+        return
+    heights = sample_bed(bed)
+    span = bed.highest - bed.height
+    spec.add_hfield(
+        name="bed",
+        nrow=heights.shape[0],
+        ncol=heights.shape[1],
+        size=[half, half, span, 1.0],
+        userdata=((heights - bed.height) / span).ravel(),
+    )
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="bed", pos=[0, 0, bed.height], **common
+    )
+
+
+@dataclass
+class _Link:
+    """A MuJoCo body under construction and its pose at rest, world frame."""
+
+    body: Any
+    name: str
+    position: np.ndarray
+    rotation: np.ndarray
+
+
+def _add_modules(
+    spec: mujoco.MjSpec, morphology: Morphology, world: World
+) -> tuple[list[dict[str, Any]], list[tuple[str, np.ndarray]]]:
+    """Adds bodies, joints, servos and geoms; returns the fluid rows and the contact points."""
+    rows: list[dict[str, Any]] = []
+    points: list[tuple[str, np.ndarray]] = []
+    link_of: list[_Link] = []  # the link that carries a module's children
+    for index, module in enumerate(morphology.modules):
+        kind = module.kind
+        if module.parent < 0:
+            body = spec.worldbody.add_body(name=module.name)
+            body.add_freejoint(name="root")
+            link = _Link(body, module.name, np.zeros(3), np.eye(3))
+        else:
+            link = link_of[module.parent]
+        still = link
+        if kind.hinge is not None:
+            link = _add_hinge(spec, still, module)
+        for k, part in enumerate(kind.parts):
+            carrier = still if k == 0 else link
+            place = carrier.rotation.T @ (
+                module.position + module.rotation @ np.asarray(part.position) - carrier.position
+            )
+            turn = carrier.rotation.T @ module.rotation
+            _add_geoms(carrier, module, part, place, turn, world)
+            rows.append(
+                {"body": carrier.name, "module": index, "part": part, "at": place, "turn": turn}
+            )
+            if part.contact:
+                low, high = (np.asarray(x) for x in part.bounds)
+                for corner in np.ndindex(2, 2, 2):
+                    at = np.where(corner, high, low)
+                    points.append((carrier.name, place + turn @ at))
+        link_of.append(link)
+    return rows, points
+
+
+def _add_hinge(spec: mujoco.MjSpec, parent: _Link, module: Any) -> _Link:
+    """The body that a hinge moves: its frame is the module's, at the hinge's anchor."""
+    hinge = module.kind.hinge
+    anchor = module.position + module.rotation @ np.asarray(hinge.anchor)
+    body = parent.body.add_body(
+        name=module.name,
+        pos=parent.rotation.T @ (anchor - parent.position),
+        quat=_quat(parent.rotation.T @ module.rotation),
+    )
+    body.add_joint(
+        name=module.name,
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=list(hinge.axis),
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        range=list(hinge.range),
+        # A DC servo's torque falls linearly to zero at its no-load speed; as joint damping, that is
+        # the speed limit in every engine, and MuJoCo integrates it implicitly.
+        damping=hinge.effort / hinge.speed,
+    )
+    stiffness = hinge.effort / FULL_TORQUE_ERROR
+    spec.add_actuator(
+        name=module.name,
+        target=module.name,
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        gainprm=[stiffness] + [0.0] * 9,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        biasprm=[0.0, -stiffness, 0.0] + [0.0] * 7,
+        ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        ctrlrange=list(hinge.range),
+        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        forcerange=[-hinge.effort, hinge.effort],
+    )
+    return _Link(body, module.name, anchor, module.rotation)
+
+
+def _add_geoms(
+    link: _Link, module: Any, part: Part, place: np.ndarray, turn: np.ndarray, world: World
+) -> None:
+    """One geom for each box; the first carries the part's mass and MuJoCo's ellipsoid."""
+    rgb = module.rgb if module.rgb is not None else _GREY
+    for k, box in enumerate(part.boxes):
+        geom = link.body.add_geom(
+            name=f"{module.name}/{part.name}" + (f"/{k}" if k else ""),
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[edge / 2 for edge in box.size],
+            pos=place + turn @ np.asarray(box.position),
+            quat=_quat(turn),
+            mass=part.mass if k == 0 else 0.0,
+            rgba=[*rgb, 1.0],
+            contype=0,
+            conaffinity=0,
+        )
+        if world.drag == "ellipsoid" and k == 0:
+            geom.fluid_ellipsoid = 1
+            geom.fluid_coefs = list(ELLIPSOID_COEFFICIENTS)
+
+
+def _fluid_table(rows: list[dict[str, Any]], body: dict[str, int]) -> FluidTable:
+    """Stacks the rows of all parts."""
+    parts: list[Part] = [row["part"] for row in rows]
+    half = np.array([p.boxes[0].size for p in parts]) / 2
+    offset = np.array([p.boxes[0].position for p in parts])
+    turn = np.array([row["turn"] for row in rows])
+    added_mass, added_inertia = box_added_mass(half)
+    scale = np.array([p.added_mass_coefficient for p in parts])[:, None]
+    drag = [
+        face_drag_coefficients(np.array(p.boxes[0].size), p.face_areas, p.drag_coefficient)
+        for p in parts
+    ]
+    areas = np.array([p.face_areas for p in parts])
+    upward = areas.argmax(-1)
+    # The chord runs along the longer of the two edges that lie in the plate.
+    lying = np.where(np.arange(3) == upward[:, None], -np.inf, half)
+    return FluidTable(
+        body=np.array([body[row["body"]] for row in rows], int),
+        module=np.array([row["module"] for row in rows], int),
+        position=np.array([row["at"] for row in rows]) + np.einsum("pij,pj->pi", turn, offset),
+        rotation=turn,
+        half_size=half,
+        center_of_volume=np.array([p.center_of_volume for p in parts], float) - offset,
+        volume=np.array([p.volume + p.electronics_volume for p in parts]),
+        mass=np.array([p.mass for p in parts]),
+        drag_linear=np.array([d[0] for d in drag]),
+        drag_angular=np.array([d[1] for d in drag]),
+        added_mass=scale * added_mass,
+        added_inertia=scale * added_inertia,
+        plate_area=areas.max(-1),
+        plate_axes=np.stack([lying.argmax(-1), upward], -1),
+    )

@@ -1,0 +1,331 @@
+"""Rollouts: a scan of steps, from a start to a trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.controllers import BoundController, Controller
+from mjx_revolve.dynamics import Engine, make_population_engine
+from mjx_revolve.errors import InputError
+from mjx_revolve.hydrodynamics import Water, water_of
+from mjx_revolve.robot import Robot
+from mjx_revolve.xla import compiler_options, one_loop, share_once
+
+ENGINES = ("population", "mjx")
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["time", "qpos", "qvel", "xpos", "ctrl", "power"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class Trajectory:
+    """What a robot did, one row after each step.
+
+    Attributes:
+        time: `[T]` [s]; the first row is one timestep after the start.
+        qpos: `[T, nq]` root position, world frame [m], root quaternion (w, x, y, z), hinges [rad].
+        qvel: `[T, nv]` root velocity, world frame [m/s], root angular velocity, body frame [rad/s],
+            hinges [rad/s].
+        xpos: `[T, nbody, 3]` origins of MuJoCo's bodies (0 is the world, 1 the core), world frame [m].
+        ctrl: `[T, nu]` joint targets [rad].
+        power: `[T]` mechanical power at the servos, summed without sign [W].
+    """
+
+    time: jax.Array
+    qpos: jax.Array
+    qvel: jax.Array
+    xpos: jax.Array
+    ctrl: jax.Array
+    power: jax.Array
+
+
+@lru_cache(maxsize=32)
+def make_engine(robot: Robot, engine: str = "population", contact: bool = True) -> Engine:
+    """The simulator behind a rollout.
+
+    Args:
+        robot: from `build_robot`.
+        engine: "population" or "mjx".
+        contact: whether the robot can touch the bed.
+
+    Returns:
+        The engine.
+
+    Raises:
+        InputError: an unknown engine, or something that it cannot do.
+    """
+    if engine == "population":
+        return make_population_engine(robot, contact)
+    if engine == "mjx":
+        from mjx_revolve.mjx_step import make_mjx_engine
+
+        return make_mjx_engine(robot, contact)
+    raise InputError(f"engine: expected one of {', '.join(ENGINES)}; found {engine!r}")
+
+
+def roll_out(
+    engine: Engine,
+    drive: Callable[[Any, jax.Array, Any], tuple[Any, jax.Array]],
+    record: Callable[[Any, jax.Array, jax.Array], Any],
+    state: Any,
+    drive_state: Any,
+    inputs: Any,
+    water: Water,
+    *,
+    records: int,
+    every: int,
+    timestep: float,
+) -> tuple[Any, Any]:
+    """Steps a chunk of a population and records it now and then.
+
+    Args:
+        engine: what steps it.
+        drive: (controller state, time [s], inputs of this step) → (controller state, ctrl
+            `[nu, lanes]` in the engine's order).
+        record: (state, ctrl, energy since the last record `[lanes]` [J]) → what to keep.
+        state: from `engine.init`.
+        drive_state: initial controller state.
+        inputs: None, or arrays `[records * every, ...]`, one row for each step.
+        water: surface and current.
+        records: how many records.
+        every: steps between them.
+        timestep: [s].
+
+    Returns:
+        The last state, and the records, `[records, ...]` each.
+    """
+
+    def step(carry: Any, now: Any) -> tuple[Any, jax.Array]:
+        state, drive_state, energy, count = carry
+        # The step counter travels as an integer, so that time is exact however long the run.
+        drive_state, ctrl = drive(drive_state, count.astype(energy.dtype) * timestep, now)
+        state, power = engine.step(state, ctrl, water)
+        return (state, drive_state, energy + timestep * power, count + 1), ctrl
+
+    shared = share_once(step)
+
+    def block(carry: Any, rows: Any) -> tuple[Any, Any]:
+        state, drive_state, energy, count = carry
+        start = (state, drive_state, jnp.zeros_like(energy), count)
+        if every == 1:
+            row = None if rows is None else jax.tree.map(lambda x: x[0], rows)
+            carry, ctrl = shared(start, row)
+        else:
+            carry, ctrls = jax.lax.scan(shared, start, rows, length=every)
+            ctrl = jax.tree.map(lambda x: x[-1], ctrls)
+        return carry, record(carry[0], ctrl, carry[2])
+
+    energy = jnp.zeros_like(engine.root(state)[0])
+    carry = (state, drive_state, energy, jnp.zeros((), jnp.int32))
+    if inputs is not None:
+        inputs = jax.tree.map(lambda x: x.reshape(records, every, *x.shape[1:]), inputs)
+    carry, kept = jax.lax.scan(block, carry, inputs, length=records)
+    return carry[0], kept
+
+
+def body_positions(robot: Robot, qpos: jax.Array) -> jax.Array:
+    """Where every body is: MuJoCo's `xpos`, for many configurations at once.
+
+    Args:
+        robot: from `build_robot`.
+        qpos: `[n, nq]`.
+
+    Returns:
+        `[n, nbody, 3]` world frame [m].
+    """
+    m = robot.mj_model
+    place: list[Any] = [jnp.zeros((qpos.shape[0], 3), qpos.dtype)]
+    turn: list[Any] = [jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype), (qpos.shape[0], 3, 3))]
+    cast = partial(jnp.asarray, dtype=qpos.dtype)
+    for body in range(1, m.nbody):
+        joint = int(m.body_jntadr[body])
+        adr = int(m.jnt_qposadr[joint])
+        if body == 1:
+            quat = qpos[:, adr + 3 : adr + 7]
+            place.append(qpos[:, adr : adr + 3])
+            turn.append(_matrix(quat / jnp.linalg.norm(quat, axis=-1, keepdims=True)))
+            continue
+        parent = int(m.body_parentid[body])
+        half = qpos[:, adr : adr + 1] / 2
+        axis = cast(m.jnt_axis[joint])
+        hinge = _matrix(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
+        fixed = _matrix(cast(m.body_quat[body])[None])
+        place.append(place[parent] + turn[parent] @ cast(m.body_pos[body]))
+        turn.append(turn[parent] @ fixed @ hinge)
+    return jnp.stack(place, 1)
+
+
+def _matrix(quat: jax.Array) -> jax.Array:
+    """`[n, 4]` unit quaternions to `[n, 3, 3]`."""
+    w, x, y, z = jnp.moveaxis(quat, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+@lru_cache(maxsize=64)
+def _compiled(
+    robot: Robot, engine: str, steps: int, controller: Controller | None, still: bool
+) -> Any:
+    """The jitted rollout of one robot; cached, so that a second call compiles nothing.
+
+    `still` leaves the water's surface and current to the world, as constants that fold away.
+    """
+    simulator = make_engine(robot, engine)
+    dt = robot.world.timestep
+
+    def run(qpos: Any, qvel: Any, drive_input: Any, water: Water | None) -> Trajectory:
+        water = water_of(robot.world) if still else water
+        if controller is None:
+            rows = drive_input[:, simulator.order, None]
+            parameters, drive_state = None, ()
+            drive = lambda s, time, row: (s, row)  # noqa: E731
+        else:
+            rows = None
+            parameters = controller.decode(drive_input[:, None], simulator.order)
+            drive_state = controller.init(parameters)
+            drive = lambda s, time, row: controller.step(parameters, s, time)  # noqa: E731
+        keep = lambda state, ctrl, energy: (state, ctrl, energy)  # noqa: E731
+        _, (states, ctrl, energy) = roll_out(
+            simulator,
+            drive,
+            keep,
+            simulator.init(qpos[:, None], qvel[:, None]),
+            drive_state,
+            rows,
+            water,
+            records=steps,
+            every=1,
+            timestep=dt,
+        )
+        qs, vs = jax.vmap(simulator.observe)(states)
+        back = np.argsort(simulator.order)
+        return Trajectory(
+            time=dt * jnp.arange(1, steps + 1, dtype=qs.dtype),
+            qpos=qs[..., 0],
+            qvel=vs[..., 0],
+            xpos=body_positions(robot, qs[..., 0]),
+            ctrl=ctrl[..., 0][:, back],
+            power=energy[..., 0] / dt,
+        )
+
+    return jax.jit(run, compiler_options=compiler_options()), run
+
+
+def simulate(
+    robot: Robot,
+    ctrl: Any = None,
+    duration: float | None = None,
+    *,
+    qpos: Any = None,
+    qvel: Any = None,
+    key: jax.Array | None = None,
+    water: Water | None = None,
+    engine: str = "population",
+) -> Trajectory:
+    """Simulates one robot.
+
+    Args:
+        robot: from `build_robot`.
+        ctrl: joint targets [rad]: None (all 0), `[nu]` (held), `[T, nu]` (a row for each step), a
+            `BoundController` (see `controllers.bind_genes`), or a function of time [s] that
+            returns `[nu]` and that JAX can trace.
+        duration: [s]; by default as long as `ctrl` has rows, else 5.
+        qpos: `[nq]` start; by default the rest pose 1 m below the surface. Root position, world
+            frame [m], quaternion (w, x, y, z), hinges [rad].
+        qvel: `[nv]` start, by default at rest; root velocity, world frame [m/s], root angular
+            velocity, body frame [rad/s], hinges [rad/s].
+        key: if given, the default start pose is turned at random about the vertical.
+        water: surface and current, by default the world's.
+        engine: "population" or "mjx".
+
+    Returns:
+        The trajectory, one row after each step. Differentiable in qpos, qvel, ctrl and water.
+
+    Raises:
+        InputError: a shape or a number is wrong.
+    """
+    model, dt = robot.mj_model, robot.world.timestep
+    controller, rows = None, None
+    if isinstance(ctrl, BoundController):
+        controller, drive_input = ctrl.controller, _array("genes", ctrl.genes, (-1,))
+        if drive_input.shape[0] != controller.num_genes:
+            raise InputError(
+                f"genes: expected {controller.num_genes} numbers; found {drive_input.shape[0]}"
+            )
+    elif ctrl is not None and not callable(ctrl):
+        rows = _array("ctrl", ctrl, None)
+        if rows.ndim not in (1, 2) or rows.shape[-1] != model.nu:
+            raise InputError(
+                f"ctrl: expected [{model.nu}] or [T, {model.nu}]; found {list(rows.shape)}"
+            )
+    steps = _steps(rows, duration, dt)
+    if controller is None:
+        if ctrl is None:
+            rows = jnp.zeros(model.nu)
+        elif callable(ctrl):
+            rows = jax.vmap(lambda t: jnp.asarray(ctrl(t)))(dt * jnp.arange(steps))
+        if rows.shape[-1] != model.nu:
+            raise InputError(f"ctrl: expected {model.nu} targets; found {rows.shape[-1]}")
+        drive_input = jnp.broadcast_to(rows, (steps, model.nu))
+    if qpos is None:
+        qpos = robot.start_qpos()
+        if key is not None:
+            half = jax.random.uniform(key, (), minval=-np.pi, maxval=np.pi) / 2
+            turned = jnp.stack([jnp.cos(half), 0 * half, 0 * half, jnp.sin(half)])
+            qpos = jnp.asarray(qpos).at[3:7].set(turned)
+    qpos = _array("qpos", qpos, (model.nq,))
+    qvel = jnp.zeros(model.nv) if qvel is None else _array("qvel", qvel, (model.nv,))
+    if water is not None:
+        water = jax.tree.map(jnp.asarray, water)
+    jitted, plain = _compiled(robot, engine, steps, controller, water is None)
+    traced = any(
+        isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((qpos, qvel, drive_input, water))
+    )
+    return (plain if traced else jitted)(qpos, qvel, drive_input, water)
+
+
+def _steps(rows: Any, duration: float | None, dt: float) -> int:
+    if duration is not None and (
+        isinstance(duration, bool)
+        or not isinstance(duration, int | float | np.number)
+        or not np.isfinite(duration)
+        or duration <= 0
+    ):
+        raise InputError(f"duration: expected seconds > 0; found {duration!r}")
+    if rows is not None and rows.ndim == 2:
+        steps = rows.shape[0]
+        if duration is not None and abs(duration - steps * dt) > dt:
+            raise InputError(
+                f"duration: expected {steps * dt:g} s, as ctrl has {steps} rows of {dt:g} s; "
+                f"found {duration:g}"
+            )
+        return steps
+    return max(1, round((5.0 if duration is None else duration) / dt))
+
+
+def _array(place: str, value: Any, shape: tuple[int, ...] | None) -> jax.Array:
+    try:
+        array = jnp.asarray(value, dtype=jnp.result_type(float))
+    except (TypeError, ValueError):
+        raise InputError(f"{place}: expected numbers; found {value!r}") from None
+    if shape is not None and (
+        array.ndim != len(shape)
+        or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True))
+    ):
+        raise InputError(f"{place}: expected shape {list(shape)}; found {list(array.shape)}")
+    if not isinstance(array, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(array))):
+        raise InputError(f"{place}: expected finite numbers; found NaN or infinity")
+    return array

@@ -1,0 +1,220 @@
+"""Vectors and matrices as tuples of arrays, so that a whole population moves in each operation.
+
+A 3-vector is a tuple of three arrays, a 3×3 matrix a tuple of three rows, a symmetric one the tuple
+(xx, xy, xz, yy, yz, zz). Every component has the population on its last axis. XLA:CPU turns such
+code into straight vector loops, where arrays `[..., 3]` and `dot` would cost a kernel each.
+
+Constants are Python floats or NumPy arrays; products with 0 and 1 are folded away while tracing, so
+that an axis-aligned robot pays nothing for rotations that it does not have.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Scalar = Any  # float, NumPy array or jax.Array that broadcast against each other
+Vec = tuple[Scalar, Scalar, Scalar]
+Mat = tuple[Vec, Vec, Vec]
+Sym = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
+
+SYM = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_SYM_INDEX = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+
+
+def _constant(a: Scalar) -> bool:
+    return isinstance(a, int | float | np.ndarray | np.generic)
+
+
+def fold(a: np.ndarray) -> float | np.ndarray:
+    """A constant that is the same everywhere as one float, which products can fold away."""
+    a = np.asarray(a, np.float64)
+    return float(a.flat[0]) if a.size and np.all(a == a.flat[0]) else a
+
+
+def _as(a: Scalar, like: jax.Array) -> Scalar:
+    """Constants take the dtype of what they meet: NumPy's float64 must not widen float32."""
+    return np.asarray(a, like.dtype) if isinstance(a, np.ndarray | np.generic) else a
+
+
+def mul(a: Scalar, b: Scalar) -> Scalar:
+    """Product; folds constant 0, 1 and -1."""
+    if _constant(a) and _constant(b):
+        return a * b
+    if _constant(b):
+        a, b = b, a
+    if not _constant(a):
+        return a * b
+    if np.all(np.equal(a, 0)):
+        return 0.0
+    if np.all(np.equal(a, 1)):
+        return b
+    if np.all(np.equal(a, -1)):
+        return -b
+    return _as(a, b) * b
+
+
+def add(a: Scalar, b: Scalar) -> Scalar:
+    """Sum; folds constant 0."""
+    if _constant(a) and np.all(np.equal(a, 0)):
+        return b
+    if _constant(b) and np.all(np.equal(b, 0)):
+        return a
+    if _constant(a) and _constant(b):
+        return a + b
+    if _constant(a):
+        return _as(a, b) + b
+    if _constant(b):
+        return a + _as(b, a)
+    return a + b
+
+
+def neg(a: Scalar) -> Scalar:
+    """Negative."""
+    return mul(-1.0, a)
+
+
+def sub(a: Scalar, b: Scalar) -> Scalar:
+    """Difference; folds constant 0."""
+    if _constant(b):
+        return add(a, -b)
+    if _constant(a):
+        return add(a, -b)
+    return a - b
+
+
+def total(*terms: Scalar) -> Scalar:
+    """Sum of several terms, from the left."""
+    result: Scalar = 0.0
+    for term in terms:
+        result = add(result, term)
+    return result
+
+
+def dot(a: Vec, b: Vec) -> Scalar:
+    """a · b."""
+    return total(*[mul(x, y) for x, y in zip(a, b, strict=True)])
+
+
+def cross(a: Vec, b: Vec) -> Vec:
+    """a × b."""
+    return (
+        sub(mul(a[1], b[2]), mul(a[2], b[1])),
+        sub(mul(a[2], b[0]), mul(a[0], b[2])),
+        sub(mul(a[0], b[1]), mul(a[1], b[0])),
+    )
+
+
+def vadd(a: Any, b: Any) -> Any:
+    """a + b, component by component."""
+    return tuple(add(x, y) for x, y in zip(a, b, strict=True))
+
+
+def vsub(a: Any, b: Any) -> Any:
+    """a - b, component by component."""
+    return tuple(sub(x, y) for x, y in zip(a, b, strict=True))
+
+
+def vscale(s: Scalar, a: Any) -> Any:
+    """s a, component by component."""
+    return tuple(mul(s, x) for x in a)
+
+
+def matvec(r: Mat, x: Vec) -> Vec:
+    """R x: from the child's frame to the parent's."""
+    return tuple(dot(row, x) for row in r)
+
+
+def transpose(r: Mat) -> Mat:
+    """Rᵀ."""
+    return tuple(tuple(r[i][j] for i in range(3)) for j in range(3))
+
+
+def matTvec(r: Mat, x: Vec) -> Vec:  # noqa: N802  (T for transposed)
+    """Rᵀ x: from the parent's frame to the child's."""
+    return matvec(transpose(r), x)
+
+
+def matmul(a: Mat, b: Mat) -> Mat:
+    """A B."""
+    columns = transpose(b)
+    return tuple(tuple(dot(row, column) for column in columns) for row in a)
+
+
+def full(s: Sym) -> Mat:
+    """The nine entries of a symmetric matrix."""
+    return tuple(tuple(s[k] for k in row) for row in _SYM_INDEX)
+
+
+def symvec(s: Sym, x: Vec) -> Vec:
+    """S x for a symmetric S."""
+    return matvec(full(s), x)
+
+
+def skew(r: Vec) -> Mat:
+    """[r]ₓ, so that [r]ₓ x = r × x."""
+    return ((0.0, neg(r[2]), r[1]), (r[2], 0.0, neg(r[0])), (neg(r[1]), r[0], 0.0))
+
+
+def rotate(r: Mat, m: Mat) -> Mat:
+    """R M Rᵀ."""
+    return matmul(matmul(r, m), transpose(r))
+
+
+def rotate_sym(r: Mat, s: Sym) -> Sym:
+    """R S Rᵀ for a symmetric S."""
+    half = matmul(r, full(s))
+    return tuple(dot(half[i], r[j]) for i, j in SYM)
+
+
+def safe_norm(a: Vec) -> Scalar:
+    """|a|, with gradient 0 instead of NaN where a = 0."""
+    square = dot(a, a)
+    # The inner `where` keeps the square root's infinite slope out of the backward pass.
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
+def sincos(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Sine and cosine by one argument reduction and two short polynomials.
+
+    XLA:CPU does not vectorise its own sine inside a called loop. Coefficients: Cephes `sinf`, `cosf`
+    (Moshier 1992), good to 1 ulp of float32 for |angle| < 8192; float64 uses XLA's own functions.
+
+    Args:
+        angle: any shape [rad].
+
+    Returns:
+        (sin, cos), same shape.
+    """
+    if angle.dtype != jnp.float32:
+        return jnp.sin(angle), jnp.cos(angle)
+    f = np.float32
+    turns = jnp.round(angle * f(2 / np.pi))
+    # π/2 in two parts, so that the reduced angle keeps its digits (Cody & Waite).
+    r = (angle - turns * f(1.5707963705062866)) - turns * f(-4.371139000186241e-08)
+    z = r * r
+    s = ((f(-1.9515295891e-4) * z + f(8.3321608736e-3)) * z + f(-1.6666654611e-1)) * z * r + r
+    c = ((f(2.443315711809948e-5) * z + f(-1.388731625493765e-3)) * z + f(4.166664568298827e-2)) * (
+        z * z
+    ) + (f(1) - f(0.5) * z)
+    quadrant = turns.astype(jnp.int32)
+    odd = (quadrant & 1) != 0
+    sine = jnp.where(odd, c, s)
+    cosine = jnp.where(odd, s, c)
+    sine = jnp.where((quadrant & 2) != 0, -sine, sine)
+    cosine = jnp.where(((quadrant + 1) & 2) != 0, -cosine, cosine)
+    return sine, cosine
+
+
+def quat_to_rows(q: tuple[Scalar, Scalar, Scalar, Scalar]) -> Mat:
+    """Rotation matrix (world from body) of a unit quaternion (w, x, y, z)."""
+    a, b, c, d = q
+    return (
+        (a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)),
+        (2 * (b * c + a * d), a * a - b * b + c * c - d * d, 2 * (c * d - a * b)),
+        (2 * (b * d - a * c), 2 * (c * d + a * b), a * a - b * b - c * c + d * d),
+    )

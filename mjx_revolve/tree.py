@@ -1,0 +1,429 @@
+"""The compiled MuJoCo model as levels of bodies: the constants of the population step.
+
+Bodies at equal depth in the tree are stacked on the first axis, so one operation moves all of them.
+Each moving body's frame is turned so that its hinge is its z axis, which makes the joint's motion
+subspace constant (Featherstone 2008, Rigid Body Dynamics Algorithms, § 4.4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_revolve.errors import InputError
+from mjx_revolve.hydrodynamics import ellipsoid_constants
+from mjx_revolve.robot import Robot
+from mjx_revolve.spatial import SYM, Mat, Scalar, Sym, Vec, fold
+
+# Stiffness of a joint's end stop, as full effort per this overshoot [rad]. A choice: stiff enough to
+# keep within half a degree of the real range; the step treats it implicitly, so it is stable.
+LIMIT_OVERSHOOT = 0.008
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Constants of the parts of one level, each `[npart, nbody, 1]` or a float.
+
+    Attributes are those of `hydrodynamics.FluidTable`, in the level's body frames, times the water's
+    density where a force needs it.
+    """
+
+    position: Vec
+    rotation: Mat
+    half_size: Vec
+    center: Vec
+    center_position: Vec
+    volume: Scalar
+    drag_linear: Vec
+    drag_angular: Vec
+    limit_linear: Vec
+    limit_angular: Vec
+    added_linear: Sym
+    added_cross: Mat
+    added_angular: Sym
+    plate_area: Scalar
+    plate_forward: Vec
+    plate_upward: Vec
+    ellipsoid: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Points:
+    """Contact points of one level, each `[npoint, nbody, 1]` or a float."""
+
+    position: Vec
+    mass: Scalar
+
+
+@dataclass(frozen=True)
+class Level:
+    """Constants of the bodies at one depth of the tree, each `[nbody, 1]` or a float.
+
+    Attributes:
+        body: MuJoCo ids of the bodies.
+        frame: `[nbody, 3, 3]` MuJoCo's body frame from ours, whose z is the hinge.
+        parent: for each, where its parent stands in the level above.
+        rotation: parent from child at joint angle 0.
+        position: of the joint in the parent's frame [m].
+        mass: [kg].
+        moment: mass times centre of mass [kg·m].
+        inertia: about the body frame's origin [kg·m²].
+        armature: of the hinge [kg·m²].
+        damping: of the hinge, passive [N·m·s/rad].
+        gain: of the servo, per target angle [N·m/rad].
+        stiffness: of the servo, per joint angle [N·m/rad].
+        servo_damping: of the servo, per joint speed [N·m·s/rad].
+        effort: torque limits of the servo, low and high [N·m].
+        target: limits of the servo's target, low and high [rad].
+        range: limits of the joint, low and high [rad].
+        stop: stiffness of the end stops [N·m/rad].
+        box_rotation: body from inertial frame, for MuJoCo's inertia-box law.
+        box_position: centre of mass [m].
+        box_size: edges of the box of equal inertia [m].
+        parts: what the water acts on.
+        points: what may touch the bed.
+    """
+
+    body: tuple[int, ...]
+    frame: np.ndarray
+    parent: tuple[int, ...]
+    rotation: Mat
+    position: Vec
+    mass: Scalar
+    moment: Vec
+    inertia: Sym
+    armature: Scalar
+    damping: Scalar
+    gain: Scalar
+    stiffness: Scalar
+    servo_damping: Scalar
+    effort: tuple[Scalar, Scalar]
+    target: tuple[Scalar, Scalar]
+    range: tuple[Scalar, Scalar]
+    stop: Scalar
+    box_rotation: Mat
+    box_position: Vec
+    box_size: Vec
+    parts: Parts | None
+    points: Points | None
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """A robot for the population step.
+
+    Attributes:
+        levels: root first.
+        qpos_index: where the hinges, level by level, stand in MuJoCo's qpos.
+        qvel_index: the same in qvel.
+        ctrl_index: the same in ctrl; hinges without a servo have none and are refused.
+        robot: the source.
+    """
+
+    levels: tuple[Level, ...]
+    qpos_index: np.ndarray
+    qvel_index: np.ndarray
+    ctrl_index: np.ndarray
+    robot: Robot
+
+
+def _clean(x: np.ndarray) -> np.ndarray:
+    """Rounds 1e-17 to 0 and 0.9999999 to 1, so that products with them fold away."""
+    near = np.round(x)
+    return np.where(np.abs(x - near) < 1e-12, near, x)
+
+
+def _rotation(quat: np.ndarray) -> np.ndarray:
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.asarray(quat, np.float64))
+    return _clean(matrix.reshape(3, 3))
+
+
+def _z_frame(axis: np.ndarray) -> np.ndarray:
+    """A rotation whose third column is the axis; a permutation where the axis allows it."""
+    axis = axis / np.linalg.norm(axis)
+    k = int(np.argmax(np.abs(axis)))
+    if abs(abs(axis[k]) - 1) < 1e-12:
+        frame = np.eye(3)[:, [(k + 1) % 3, (k + 2) % 3, k]]
+        return frame * np.sign(axis[k]) if axis[k] > 0 else frame @ np.diag([1.0, -1.0, -1.0])
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    x = np.cross(helper, axis)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(axis, x), axis], 1)
+
+
+def _skew(r: np.ndarray) -> np.ndarray:
+    return np.array([[0, -r[2], r[1]], [r[2], 0, -r[0]], [-r[1], r[0], 0]])
+
+
+def _vec(rows: list[Any]) -> Vec:
+    """`[..., 3]` to three constants `[..., 1]`."""
+    a = _clean(np.asarray(rows, np.float64))
+    return tuple(fold(a[..., i, None]) for i in range(3))
+
+
+def _mat(rows: list[Any]) -> Mat:
+    a = _clean(np.asarray(rows, np.float64))
+    return tuple(tuple(fold(a[..., i, j, None]) for j in range(3)) for i in range(3))
+
+
+def _sym(rows: list[Any]) -> Sym:
+    a = np.asarray(rows, np.float64)
+    a = np.where(np.abs(a) < 1e-15, 0, a)
+    return tuple(fold(a[..., i, j, None]) for i, j in SYM)
+
+
+def _num(rows: list[Any]) -> Scalar:
+    return fold(np.asarray(rows, np.float64)[..., None])
+
+
+def make_tree(robot: Robot, contact: bool = True) -> Tree:
+    """Reads the constants of the population step from a compiled robot.
+
+    Args:
+        robot: from `build_robot`.
+        contact: whether the robot can touch the bed; without, its points are left out.
+
+    Returns:
+        The tree.
+
+    Raises:
+        InputError: the model holds a joint that the population step cannot do; it is named.
+    """
+    m = robot.mj_model
+    depth: dict[int, int] = {}
+    frames: dict[int, np.ndarray] = {}  # MuJoCo body frame from our body frame
+    servo = {int(m.actuator_trnid[k, 0]): k for k in range(m.nu)}
+    for body in range(1, m.nbody):
+        name, joint, parent = m.body(body).name, int(m.body_jntadr[body]), m.body_parentid[body]
+        kind = m.jnt_type[joint] if m.body_jntnum[body] == 1 else None
+        if body == 1 and kind == mujoco.mjtJoint.mjJNT_FREE:
+            depth[body], frames[body] = 0, np.eye(3)
+            continue
+        if body == 1 or kind != mujoco.mjtJoint.mjJNT_HINGE or np.any(m.jnt_pos[joint]):
+            raise InputError(
+                f"engine population: body {name!r}: expected one hinge at the body's origin below "
+                "one free root; use engine: mjx"
+            )
+        if joint not in servo:
+            raise InputError(f"engine population: joint {name!r}: expected a servo; found none")
+        depth[body], frames[body] = depth[parent] + 1, _z_frame(m.jnt_axis[joint])
+    bodies = [
+        [b for b in depth if depth[b] == d] for d in range(max(depth.values(), default=0) + 1)
+    ]
+    levels = []
+    for d, ids in enumerate(bodies):
+        above = bodies[d - 1] if d else []
+        levels.append(_level(robot, ids, above, frames, servo, contact))
+    joints = [int(m.body_jntadr[b]) for ids in bodies[1:] for b in ids]
+    return Tree(
+        levels=tuple(levels),
+        qpos_index=m.jnt_qposadr[joints].astype(int) if joints else np.zeros(0, int),
+        qvel_index=m.jnt_dofadr[joints].astype(int) if joints else np.zeros(0, int),
+        ctrl_index=np.array([servo[j] for j in joints], int),
+        robot=robot,
+    )
+
+
+def _level(
+    robot: Robot,
+    ids: list[int],
+    above: list[int],
+    frames: dict[int, np.ndarray],
+    servo: dict[int, int],
+    contact: bool,
+) -> Level:
+    m = robot.mj_model
+    rotation, position, moment, inertia, box_rotation, box_position, box_size = ([] for _ in "1234567")
+    for b in ids:
+        c = frames[b]
+        up = frames[int(m.body_parentid[b])] if above else np.eye(3)
+        rotation.append(up.T @ _rotation(m.body_quat[b]) @ c if above else np.eye(3))
+        position.append(up.T @ m.body_pos[b] if above else np.zeros(3))
+        com = c.T @ m.body_ipos[b]
+        axes = c.T @ _rotation(m.body_iquat[b])
+        mass = m.body_mass[b]
+        moment.append(mass * com)
+        inertia.append(
+            axes @ np.diag(m.body_inertia[b]) @ axes.T - mass * _skew(com) @ _skew(com)
+        )
+        i = m.body_inertia[b]
+        # MuJoCo: a uniform box of the same mass and principal inertia.
+        edges = np.maximum(np.array([i[1] + i[2] - i[0], i[0] + i[2] - i[1], i[0] + i[1] - i[2]]), 0)
+        box_size.append(np.sqrt(6 * edges / mass))
+        box_rotation.append(axes)
+        box_position.append(com)
+    if above:
+        joint = [int(m.body_jntadr[b]) for b in ids]
+        dof = [int(m.jnt_dofadr[j]) for j in joint]
+        act = [servo[j] for j in joint]
+        effort = m.actuator_forcerange[act]
+        free = ~m.actuator_forcelimited[act].astype(bool)
+        effort = np.where(free[:, None], [-np.inf, np.inf], effort)
+        target = np.where(
+            m.actuator_ctrllimited[act].astype(bool)[:, None],
+            m.actuator_ctrlrange[act],
+            [-np.inf, np.inf],
+        )
+        limited = m.jnt_limited[joint].astype(bool)[:, None]
+        limits = np.where(limited, m.jnt_range[joint], [-np.inf, np.inf])
+        strong = np.where(np.isfinite(effort[:, 1]), effort[:, 1], 1.0)
+        hinge = {
+            "armature": _num(m.dof_armature[dof]),
+            "damping": _num(m.dof_damping[dof]),
+            "gain": _num(m.actuator_gainprm[act, 0]),
+            "stiffness": _num(-m.actuator_biasprm[act, 1]),
+            "servo_damping": _num(-m.actuator_biasprm[act, 2]),
+            "effort": (_num(effort[:, 0]), _num(effort[:, 1])),
+            "target": (_num(target[:, 0]), _num(target[:, 1])),
+            "range": (_num(limits[:, 0]), _num(limits[:, 1])),
+            "stop": _num(strong / LIMIT_OVERSHOOT),
+        }
+    else:
+        pair = (0.0, 0.0)
+        zero = dict.fromkeys(
+            ("armature", "damping", "gain", "stiffness", "servo_damping", "stop"), 0.0
+        )
+        hinge = {**zero, "effort": pair, "target": pair, "range": pair}
+    where = {b: k for k, b in enumerate(above)}
+    return Level(
+        body=tuple(ids),
+        frame=np.array([frames[b] for b in ids]),
+        parent=tuple(where[int(m.body_parentid[b])] for b in ids) if above else (),
+        rotation=_mat(rotation),
+        position=_vec(position),
+        mass=_num(m.body_mass[ids]),
+        moment=_vec(moment),
+        inertia=_sym(inertia),
+        box_rotation=_mat(box_rotation),
+        box_position=_vec(box_position),
+        box_size=_vec(box_size),
+        parts=_parts(robot, ids, frames),
+        points=_points(robot, ids, frames) if contact else None,
+        **hinge,
+    )
+
+
+def _stack(rows: list[list[Any]], empty: Any) -> np.ndarray:
+    """`[nbody][k]` ragged to `[kmax, nbody, ...]`, padded with `empty`."""
+    most = max(len(row) for row in rows)
+    return np.array([[row[k] if k < len(row) else empty for row in rows] for k in range(most)])
+
+
+def _parts(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Parts | None:
+    table, world = robot.fluid, robot.world
+    rows = [list(np.flatnonzero(table.body == b)) for b in ids]
+    if not any(rows):
+        return None
+
+    def gather(value: Any, empty: Any) -> np.ndarray:
+        return _stack([[value(p, frames[b]) for p in row] for b, row in zip(ids, rows, strict=True)], empty)
+
+    def turn(p: int, c: np.ndarray) -> np.ndarray:
+        return _clean(c.T @ table.rotation[p])
+
+    def added(p: int, c: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        r, t = c.T @ table.position[p], turn(p, c)
+        linear = world.density * t @ np.diag(table.added_mass[p]) @ t.T
+        angular = world.density * t @ np.diag(table.added_inertia[p]) @ t.T
+        x = _skew(r)
+        return linear, x @ linear, angular - x @ linear @ x
+
+    def inertia(p: int) -> np.ndarray:
+        edges = 2 * table.half_size[p]
+        total = edges @ edges
+        return table.mass[p] / 12 * (total - edges**2)
+
+    carried = world.density if world.added_mass else 0.0
+    zero3, zero33, eye = np.zeros(3), np.zeros((3, 3)), np.eye(3)
+    h = world.timestep
+    coefficients = np.zeros(12)
+    geom_fluid = robot.mj_model.geom_fluid
+    main = _main_geoms(robot)
+    ellipsoid = None
+    if world.drag == "ellipsoid":
+        k = ellipsoid_constants(
+            gather(lambda p, c: table.half_size[p], np.ones(3)),
+            gather(lambda p, c: geom_fluid[main[p]], coefficients),
+        )
+        ellipsoid = {
+            name: tuple(fold(x[..., None]) for x in value)
+            if isinstance(value, tuple)
+            else fold(value[..., None])
+            for name, value in k.items()
+        }
+    return Parts(
+        position=_vec(gather(lambda p, c: c.T @ table.position[p], zero3)),
+        rotation=_mat(gather(turn, eye)),
+        half_size=_vec(gather(lambda p, c: table.half_size[p], np.ones(3))),
+        center=_vec(gather(lambda p, c: table.center_of_volume[p], zero3)),
+        center_position=_vec(
+            gather(
+                lambda p, c: c.T
+                @ (table.position[p] + table.rotation[p] @ table.center_of_volume[p]),
+                zero3,
+            )
+        ),
+        volume=_num(gather(lambda p, c: table.volume[p], 0.0)),
+        drag_linear=_vec(gather(lambda p, c: world.density * table.drag_linear[p], zero3)),
+        drag_angular=_vec(gather(lambda p, c: world.density * table.drag_angular[p], zero3)),
+        limit_linear=_vec(
+            gather(lambda p, c: (table.mass[p] + carried * table.added_mass[p]) / h, zero3)
+        ),
+        limit_angular=_vec(
+            gather(lambda p, c: (inertia(p) + carried * table.added_inertia[p]) / h, zero3)
+        ),
+        added_linear=_sym(gather(lambda p, c: added(p, c)[0], zero33)),
+        added_cross=_mat(gather(lambda p, c: added(p, c)[1], zero33)),
+        added_angular=_sym(gather(lambda p, c: added(p, c)[2], zero33)),
+        plate_area=_num(gather(lambda p, c: table.plate_area[p], 0.0)),
+        plate_forward=_vec(gather(lambda p, c: eye[table.plate_axes[p, 0]], eye[0])),
+        plate_upward=_vec(gather(lambda p, c: eye[table.plate_axes[p, 1]], eye[2])),
+        ellipsoid=ellipsoid,
+    )
+
+
+def _main_geoms(robot: Robot) -> np.ndarray:
+    """`[npart]` the geom of each part's main box: the ones that may carry MuJoCo's ellipsoid."""
+    model = robot.mj_model
+    names = [model.geom(g).name for g in range(model.ngeom)]
+    main = [
+        g
+        for g, name in enumerate(names)
+        if model.geom_bodyid[g] > 0 and not name.rsplit("/", 1)[-1].isdigit()
+    ]
+    # Geoms are grouped by body, table rows by module: match them by place.
+    order = []
+    for body, position in zip(robot.fluid.body, robot.fluid.position, strict=True):
+        here = [g for g in main if model.geom_bodyid[g] == body]
+        order.append(min(here, key=lambda g: np.abs(model.geom_pos[g] - position).sum()))
+    return np.array(order)
+
+
+def _points(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Points | None:
+    if robot.world.bed is None:
+        return None
+    rows = [list(np.flatnonzero(robot.contact_body == b)) for b in ids]
+    if not any(rows):
+        return None
+    mass = robot.mj_model.body_mass
+    return Points(
+        position=_vec(
+            _stack(
+                [
+                    [frames[b].T @ robot.contact_position[p] for p in row]
+                    for b, row in zip(ids, rows, strict=True)
+                ],
+                np.zeros(3),
+            )
+        ),
+        # A padded point has no mass, so its spring, damper and friction vanish.
+        mass=_num(
+            _stack(
+                [[mass[b] / len(row)] * len(row) for b, row in zip(ids, rows, strict=True)], 0.0
+            )
+        ),
+    )
