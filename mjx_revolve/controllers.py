@@ -1,7 +1,9 @@
 """Controllers: genes to parameters to joint targets. Zero genes keep every joint still.
 
 A controller is four plain functions over a population on the last axis. The genes are unbounded real
-numbers, squashed into physical ranges by tanh, so that any optimiser can move them freely.
+numbers, folded into physical ranges by sin(gene), so that any optimiser can move them freely. Folded, not
+squashed: with tanh, an optimum at the end of a range lies at infinity, and strategies that adapt their step
+size run after it until their numbers overflow.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.robot import Robot
-from mjx_revolve.spatial import sincos
+from mjx_revolve.spatial import safe_norm, sincos
 
 
 class Controller(NamedTuple):
@@ -71,8 +73,8 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
     amplitude × half range × tanh(x_i), from the middle of its range. It starts at x = 0, y = 1: with all weights
     zero nothing ever moves. Integrated by the classical Runge-Kutta method at the physics' step.
 
-    Genes: one w per hinge, then one c per pair of neighbours; w = 2π f_max tanh(gene),
-    c = π f_max tanh(gene).
+    Genes: one w per hinge, then one c per pair of neighbours; w = 2π f_max sin(gene),
+    c = π f_max sin(gene).
 
     Args:
         robot: whose hinges are driven.
@@ -96,9 +98,9 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
         sign[i, j], sign[j, i] = 1.0, -1.0
 
     def decode(genes: jax.Array, order: np.ndarray) -> Any:
-        squashed = jnp.tanh(genes)
-        w = 2 * np.pi * max_frequency * squashed[:n][order]
-        c = np.pi * max_frequency * squashed[source] * sign
+        folded = jnp.sin(genes)
+        w = 2 * np.pi * max_frequency * folded[:n][order]
+        c = np.pi * max_frequency * folded[source] * sign
         c = c[order][:, order]
         reach = jnp.broadcast_to(jnp.asarray(amplitude * half, genes.dtype)[order], w.shape)
         center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], w.shape)
@@ -132,9 +134,11 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
 def make_sine(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -> Controller:
     """One sine per hinge: amplitude, phase and offset each, and a frequency shared by all.
 
-    target_i = offset_i + a_i sin(2π f t + φ_i), with a = amplitude × half range × tanh(gene),
-    φ = π gene, offset = half of half range × tanh(gene), f = f_max / (1 + e^-gene). The amplitudes and
-    offsets fade in over the first half second, so that no joint jumps at the start.
+    target_i = offset_i + a_i sin(2π f t + φ_i). Amplitude and phase are evolved as a point in the plane,
+    (u, v): a = amplitude × half range × sin|(u, v)|, φ its angle; so there is no seam at φ = ±π
+    where optimisers get lost, and no amplitude without a sign. Offset = half of half range × sin(gene),
+    f = f_max (1 + sin(gene)) / 2. Amplitudes and offsets fade in over the first half second, so that no joint
+    jumps at the start.
 
     Args:
         robot: whose hinges are driven.
@@ -142,28 +146,31 @@ def make_sine(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) 
         amplitude: share of the hinges' range used [-].
 
     Returns:
-        The controller; genes: amplitudes, phases, offsets (one per hinge each), frequency.
+        The controller; genes: u, v and offset (one per hinge each), then the frequency.
     """
     n = robot.num_hinges
     middle, half = _range(robot)
     names = [robot.mj_model.actuator(i).name for i in range(n)]
     gene_names = tuple(
-        f"{what} {name}" for what in ("amplitude", "phase", "offset") for name in names
+        f"{what} {name}" for what in ("u", "v", "offset") for name in names
     ) + ("frequency",)
 
     def decode(genes: jax.Array, order: np.ndarray) -> Any:
-        a, phase, offset = (genes[k * n : (k + 1) * n][order] for k in range(3))
+        u, v, offset = (genes[k * n : (k + 1) * n][order] for k in range(3))
         reach = jnp.asarray(half, genes.dtype)[order]
-        center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], a.shape)
-        rate = 2 * np.pi * max_frequency * jax.nn.sigmoid(genes[3 * n :])
-        return amplitude * reach * jnp.tanh(a), np.pi * phase, 0.5 * reach * jnp.tanh(
-            offset
-        ), rate, center
+        center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], u.shape)
+        rate = 2 * np.pi * max_frequency * (1 + jnp.sin(genes[3 * n :])) / 2
+        size = safe_norm((u, v))
+        # sin(r) / r, and its limit where r = 0.
+        fold = jnp.where(size > 1e-6, jnp.sin(size) / jnp.maximum(size, 1e-6), 1.0)
+        scale = amplitude * reach * fold
+        return scale * u, scale * v, 0.5 * reach * jnp.sin(offset), rate, center
 
     def step(parameters: Any, state: Any, time: jax.Array) -> tuple[Any, jax.Array]:
-        a, phase, offset, rate, center = parameters
+        u, v, offset, rate, center = parameters
         fade = jnp.minimum(time / 0.5, 1.0)
-        return state, center + fade * (offset + a * sincos(rate * time + phase)[0])
+        sine, cosine = sincos(rate * time)
+        return state, center + fade * (offset + u * sine + v * cosine)
 
     return Controller(3 * n + 1, gene_names, decode, lambda parameters: (), step)
 

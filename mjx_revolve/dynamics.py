@@ -37,6 +37,7 @@ from mjx_revolve.spatial import (
     add,
     cross,
     dot,
+    fold,
     full,
     matmul,
     matTvec,
@@ -143,11 +144,11 @@ def _up(level: Level, above: int, x: Any) -> Any:
         return tuple(_up(level, above, y) for y in x)
     if level.parent == tuple(range(above)):
         return x
-    if not isinstance(x, jax.Array):
-        if not np.any(x):
-            return 0.0
-        x = jnp.asarray(x)
     n = len(level.parent)
+    if not isinstance(x, jax.Array):  # a constant stays one, so that it still folds away
+        rows = np.broadcast_to(x, (n, 1))
+        children = np.equal.outer(range(above), level.parent)
+        return fold(children @ rows)
     if x.shape[0] == 1 and n > 1:
         x = jnp.broadcast_to(x, (n, *x.shape[1:]))
     if above == 1:

@@ -25,19 +25,19 @@ class InputError(ValueError):
     """A user's input is wrong; the message says where, what was expected and what was found."""
 
 
-class _Loader(yaml.SafeLoader):
+class SafeLoader(yaml.SafeLoader):
     """`yaml.SafeLoader` that reads `1e-3` as a number and refuses duplicate keys."""
 
 
 # YAML 1.1 wants a dot in floats and no sign before it; people write 1e-3 and -.5 and mean it.
-_Loader.add_implicit_resolver(
+SafeLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(r"^[-+]?(?:(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+|\.[0-9][0-9_]*)$"),
     list("-+.0123456789"),
 )
 
 
-def _construct_mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Hashable, Any]:
+def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hashable, Any]:
     mapping: dict[Hashable, Any] = {}
     for key_node, value_node in node.value:
         key = loader.construct_object(key_node, deep=True)
@@ -50,7 +50,7 @@ def _construct_mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Hashable
     return mapping
 
 
-_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
+SafeLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
 
 
 def _check_size(data: Any) -> None:
@@ -93,7 +93,7 @@ def load_yaml(path: str | Path) -> Any:
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
     try:
-        data = yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+        data = yaml.load(text, Loader=SafeLoader)  # noqa: S506  (a SafeLoader)
         _check_size(data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -73,6 +73,7 @@ class FluidTable:
         center_of_volume: `[npart, 3]` centre of the displaced volume, part frame [m].
         volume: `[npart]` displaced volume: tabulated mesh volume plus electronics [m³].
         mass: `[npart]` [kg].
+        exposed: `[npart, 3]` share of each pair of faces that the water reaches [-].
         drag_linear: `[npart, 3]` ½ C_d A of each pair of faces [m²].
         drag_angular: `[npart, 3]` the same for rotation about each axis [m⁵].
         added_mass: `[npart, 3]` per unit density, part frame [m³].
@@ -89,6 +90,7 @@ class FluidTable:
     center_of_volume: np.ndarray
     volume: np.ndarray
     mass: np.ndarray
+    exposed: np.ndarray
     drag_linear: np.ndarray
     drag_angular: np.ndarray
     added_mass: np.ndarray
@@ -153,7 +155,10 @@ def box_added_mass(half_size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def face_drag_coefficients(
-    size: np.ndarray, face_areas: np.ndarray, drag_coefficient: float
+    size: np.ndarray,
+    face_areas: np.ndarray,
+    drag_coefficient: float,
+    exposed: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Quadratic drag of a box from its faces, per unit density.
 
@@ -165,16 +170,20 @@ def face_drag_coefficients(
         size: `[3]` edges of the box [m].
         face_areas: `[3]` area that faces each axis [m²].
         drag_coefficient: C_d of a face that meets the flow [-].
+        exposed: `[3]` share of each pair of faces that the water reaches [-]; by default all.
 
     Returns:
         `[3]` ½ C_d A [m²] and `[3]` the angular one [m⁵].
     """
     b = np.asarray(size, np.float64)
-    linear = 0.5 * drag_coefficient * np.asarray(face_areas, np.float64)
-    angular = [
-        drag_coefficient * b[i] * (b[(i + 1) % 3] ** 4 + b[(i + 2) % 3] ** 4) / 64
-        for i in range(3)
-    ]
+    e = np.ones(3) if exposed is None else np.asarray(exposed, np.float64)
+    linear = 0.5 * drag_coefficient * e * np.asarray(face_areas, np.float64)
+    angular = []
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        # The faces across k are strips along j, and the other way round.
+        strips = e[k] * b[j] ** 4 + e[j] * b[k] ** 4
+        angular.append(drag_coefficient * b[i] * strips / 64)
     return linear, np.array(angular)
 
 
@@ -289,7 +298,8 @@ def quadratic_drag(rate: Scalar, coefficient: Scalar, share: Scalar, limit: Scal
     Returns:
         Force [N] or torque [N·m].
     """
-    strength = jnp.minimum(mul(coefficient, jnp.abs(rate)) * share, limit)
+    # The share comes last: a part that is half out of the water carries less of it with it, too.
+    strength = jnp.minimum(mul(coefficient, jnp.abs(rate)), limit) * share
     return -strength * rate
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from mjx_revolve.descriptors import describe
-from mjx_revolve.errors import InputError, _Loader, load_yaml
+from mjx_revolve.errors import InputError, SafeLoader, load_yaml
 from mjx_revolve.module_types import ModuleType, check_number, show
 from mjx_revolve.modules import MODULES
 from mjx_revolve.placement import Module, attach, find_bounds, find_overlaps, frozen, same
@@ -470,7 +470,7 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
 class _Dumper(yaml.SafeDumper):
     """Puts text in quotes that our own reader would take for a number (`1e-3`)."""
 
-    yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+    yaml_implicit_resolvers = SafeLoader.yaml_implicit_resolvers
 
     def ignore_aliases(self, data: Any) -> bool:
         """Writes shared values out."""

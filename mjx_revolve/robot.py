@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.errors import InputError
+from mjx_revolve.exposure import exposed_shares
 from mjx_revolve.hydrodynamics import (
     ELLIPSOID_COEFFICIENTS,
     FluidTable,
@@ -126,7 +127,7 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
         world=world,
         mj_spec=spec,
         mj_model=model,
-        fluid=_fluid_table(rows, body),
+        fluid=_fluid_table(rows, body, np.array(exposed_shares(morphology))),
         contact_body=np.array([body[name] for name, _ in points], int),
         contact_position=np.array([p for _, p in points], float).reshape(-1, 3),
     )
@@ -283,8 +284,10 @@ def _add_geoms(
             geom.fluid_coefs = list(ELLIPSOID_COEFFICIENTS)
 
 
-def _fluid_table(rows: list[dict[str, Any]], body: dict[str, int]) -> FluidTable:
-    """Stacks the rows of all parts."""
+def _fluid_table(
+    rows: list[dict[str, Any]], body: dict[str, int], exposed: np.ndarray
+) -> FluidTable:
+    """Stacks the rows of all parts; drag and added mass act on exposed faces only."""
     parts: list[Part] = [row["part"] for row in rows]
     half = np.array([p.boxes[0].size for p in parts]) / 2
     offset = np.array([p.boxes[0].position for p in parts])
@@ -292,9 +295,11 @@ def _fluid_table(rows: list[dict[str, Any]], body: dict[str, int]) -> FluidTable
     added_mass, added_inertia = box_added_mass(half)
     scale = np.array([p.added_mass_coefficient for p in parts])[:, None]
     drag = [
-        face_drag_coefficients(np.array(p.boxes[0].size), p.face_areas, p.drag_coefficient)
-        for p in parts
+        face_drag_coefficients(np.array(p.boxes[0].size), p.face_areas, p.drag_coefficient, e)
+        for p, e in zip(parts, exposed, strict=True)
     ]
+    # Water that turns about an axis is pushed by the four faces beside it.
+    beside = (exposed[:, [1, 2, 0]] + exposed[:, [2, 0, 1]]) / 2
     areas = np.array([p.face_areas for p in parts])
     upward = areas.argmax(-1)
     # The chord runs along the longer of the two edges that lie in the plate.
@@ -310,8 +315,9 @@ def _fluid_table(rows: list[dict[str, Any]], body: dict[str, int]) -> FluidTable
         mass=np.array([p.mass for p in parts]),
         drag_linear=np.array([d[0] for d in drag]),
         drag_angular=np.array([d[1] for d in drag]),
-        added_mass=scale * added_mass,
-        added_inertia=scale * added_inertia,
+        exposed=exposed,
+        added_mass=scale * exposed * added_mass,
+        added_inertia=scale * beside * added_inertia,
         plate_area=areas.max(-1),
         plate_axes=np.stack([lying.argmax(-1), upward], -1),
     )

@@ -1,0 +1,327 @@
+"""Fitness: genes of a whole population to scores, as one pure JAX function.
+
+`make_fitness` builds the robot, the controller and the task of a configuration once; what it returns
+is a function of (population, key) that any optimiser can call, and that runs under jit, vmap and grad.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.config import Config, load_config, make_config
+from mjx_revolve.controllers import CONTROLLERS, Controller, bind_genes
+from mjx_revolve.dynamics import Engine
+from mjx_revolve.errors import InputError
+from mjx_revolve.hydrodynamics import Water
+from mjx_revolve.modules import MODULES, load_modules
+from mjx_revolve.morphology import load_morphology, trim_neutral
+from mjx_revolve.robot import Robot, build_robot
+from mjx_revolve.rollout import Trajectory, make_engine, roll_out, simulate
+from mjx_revolve.tasks import TASKS, Track, measure
+from mjx_revolve.terrain import bed_height
+from mjx_revolve.world import load_world
+from mjx_revolve.xla import compiler_options, one_loop, over_chunks
+
+# Score of a rollout that blew up. Finite, because optimisers' averages and sorts are not made for
+# infinities, and below anything that a task gives.
+WORST = -1e3
+
+# Nothing made of these modules swims or sinks this fast: servos, drag and weight allow a tenth of it. An
+# individual that gets further than this allows has blown up [m/s].
+_FASTEST = 3.0
+
+# The track is sampled at least this often [s].
+_INTERVAL = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Fitness:
+    """Scores of a population: `fitness(population, key)`.
+
+    Attributes:
+        config: what it was made from.
+        robot: the compiled robot.
+        controller: genes to joint targets.
+        engine: what steps the robot.
+    """
+
+    config: Config
+    robot: Robot
+    controller: Controller
+    engine: Engine
+
+    @property
+    def num_genes(self) -> int:
+        """Length of an individual's genes."""
+        return self.controller.num_genes
+
+    @property
+    def worst_score(self) -> float:
+        """The score of a rollout that blew up."""
+        return WORST
+
+    def __call__(self, population: Any, key: jax.Array) -> jax.Array:
+        """Scores a population.
+
+        Args:
+            population: `[P, num_genes]`.
+            key: draws the episodes' start poses and water, the same for every individual.
+
+        Returns:
+            `[P]` mean score over the episodes, higher is better; `WORST` where a rollout blew up.
+        """
+        return self.evaluate(population, key)[0]
+
+    def evaluate(
+        self, population: Any, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Scores a population and says how it moved.
+
+        Args:
+            population: `[P, num_genes]`.
+            key: as above.
+
+        Returns:
+            `[P]` scores and `[P]` measures (see `tasks.measure`), means over the episodes.
+
+        Raises:
+            InputError: the population has another shape, or there are no genes to evolve.
+        """
+        shape = jnp.shape(population)
+        if len(shape) != 2 or shape[1] != self.num_genes or shape[0] < 1:
+            raise InputError(
+                f"population: expected [P, {self.num_genes}]; found {list(shape)}"
+            )
+        traced = any(isinstance(x, jax.core.Tracer) for x in (population, key))
+        return (self._evaluate if traced else self._jitted)(jnp.asarray(population), key)
+
+    @cached_property
+    def _jitted(self) -> Any:
+        # Compiler options belong to the outermost jit, so under somebody else's we go without.
+        return jax.jit(self._evaluate, compiler_options=compiler_options())
+
+    def replay(self, genes: Any, key: jax.Array, trial: int = 0) -> Trajectory:
+        """One episode of one individual, in full.
+
+        Args:
+            genes: `[num_genes]`.
+            key: as in `evaluate`.
+            trial: which of the key's episodes.
+
+        Returns:
+            The trajectory.
+        """
+        qpos, water = self.starts(key)
+        return simulate(
+            self.robot,
+            bind_genes(self.controller, genes),
+            self._records * self._every * self.robot.world.timestep,
+            qpos=qpos[:, trial],
+            water=None if water is None else jax.tree.map(lambda x: x[trial], water),
+            engine=self.config.engine,
+        )
+
+    @property
+    def _every(self) -> int:
+        return max(1, int(_INTERVAL / self.robot.world.timestep + 1e-6))
+
+    @property
+    def _records(self) -> int:
+        interval = self._every * self.robot.world.timestep
+        return max(2, round(self.config.task.duration / interval))
+
+    def starts(self, key: jax.Array) -> tuple[jax.Array, Water | None]:
+        """Start poses and water of a key's episodes.
+
+        Args:
+            key: draws them.
+
+        Returns:
+            `[nq, trials]` qpos, and the water `[trials]` where it varies, else None.
+        """
+        task, world, trials = self.config.task, self.robot.world, self.config.task.trials
+        place_key, tilt_key, yaw_key, current_key = jax.random.split(key, 4)
+        place = task.start_position * jax.random.normal(place_key, (3, trials))
+        tilt = task.start_tilt * jax.random.normal(tilt_key, (2, trials))
+        yaw = task.start_yaw * jax.random.normal(yaw_key, (trials,))
+        if task.type == "crawl":
+            # The lowest corner of any module 5 mm above the bed, whatever the tilt.
+            height = bed_height(world.bed, place[0], place[1]) + self._reach + 0.005
+            place = place.at[2].set(height)
+        else:
+            place = place.at[2].add(world.surface_height - task.depth)
+        quat = _euler_quat(tilt[0], tilt[1], yaw)
+        rest = jnp.asarray(self.robot.qpos0, place.dtype)[7:, None]
+        rest = jnp.broadcast_to(rest, (rest.shape[0], trials))
+        qpos = jnp.concatenate([place, quat, rest])
+        if task.current_std == 0:
+            return qpos, None
+        extra = task.current_std * jax.random.normal(current_key, (2, trials))
+        x, y, z = world.current
+        full = jnp.full((trials,), 0.0, place.dtype)
+        return qpos, Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
+
+    @cached_property
+    def _reach(self) -> float:
+        """How far the rest pose reaches below the core's centre, in any attitude drawn [m]."""
+        points = []
+        for module in self.robot.morphology.modules:
+            for part in module.kind.parts:
+                low, high = part.bounds
+                for corner in np.ndindex(2, 2, 2):
+                    local = np.asarray(part.position) + np.where(corner, high, low)
+                    points.append(module.position + module.rotation @ local)
+        cloud = np.array(points)
+        tilt = min(3 * self.config.task.start_tilt, np.pi / 2)
+        radius = np.linalg.norm(cloud[:, :2], axis=1).max()
+        return float(-cloud[:, 2].min() * np.cos(tilt) + radius * np.sin(tilt))
+
+    def _evaluate(self, population: Any, key: jax.Array) -> Any:
+        task, world = self.config.task, self.robot.world
+        size, trials = population.shape[0], task.trials
+        qpos, water = self.starts(key)
+        qpos = qpos.astype(population.dtype)
+        # Lanes run over individuals and, within each, over its episodes.
+        lanes = lambda x: jnp.tile(x, (1,) * (x.ndim - 1) + (size,))  # noqa: E731
+        genes = jnp.repeat(population.T, trials, 1)
+        varied = None if water is None else jax.tree.map(lanes, water)
+        position, energy = over_chunks(self._episode)(genes, lanes(qpos), varied)
+        interval = self._every * world.timestep
+        first = min(round(task.settle / interval), position.shape[0] - 2)
+        kept = position[first:]
+        clearance = jnp.full_like(kept[:, 0], jnp.inf)
+        if world.bed is not None:
+            clearance = kept[:, 2] - bed_height(world.bed, kept[:, 0], kept[:, 1])
+        track = Track(
+            position=kept,
+            clearance=clearance,
+            energy=energy[first:],
+            interval=interval,
+            start_height=lanes(qpos)[2],
+            length=self.robot.morphology.length,
+            weight=self.robot.morphology.mass * max(world.gravity, 1e-9),
+            surface_height=world.surface_height,
+        )
+        measures = measure(track)
+        score = TASKS[task.type](track, task) - task.energy_weight * measures["energy_j"]
+        away = jnp.max(jnp.abs(position - lanes(qpos)[:3]), (0, 1))
+        # Written so that NaN counts as too far.
+        sane = jnp.isfinite(score) & (away < _reach(self.config, self.robot))
+        score = jnp.where(sane, score, WORST)
+        mean = lambda x: jnp.mean(x.reshape(size, trials), 1)  # noqa: E731
+        sane_all = jnp.all(sane.reshape(size, trials), 1)
+        return jnp.where(sane_all, mean(score), WORST), {k: mean(v) for k, v in measures.items()}
+
+    def _episode(self, genes: jax.Array, qpos: jax.Array, water: Water | None) -> Any:
+        """Track of one chunk: `[S, 3, lanes]` positions and `[S, lanes]` energies."""
+        world, controller = self.robot.world, self.controller
+        parameters = controller.decode(genes, self.engine.order)
+
+        def loop(qpos: Any, parameters: Any, water: Any) -> Any:
+            qvel = jnp.zeros((self.robot.mj_model.nv, qpos.shape[-1]), qpos.dtype)
+            still = Water(world.surface_height, tuple(world.current))
+            _, kept = roll_out(
+                self.engine,
+                lambda state, time, row: controller.step(parameters, state, time),
+                lambda state, ctrl, energy: (self.engine.root(state), energy),
+                self.engine.init(qpos, qvel),
+                controller.init(parameters),
+                None,
+                still if water is None else water,
+                records=self._records,
+                every=self._every,
+                timestep=world.timestep,
+            )
+            return kept
+
+        if self.config.engine == "population":
+            loop = one_loop(loop)
+        place, energy = loop(qpos, parameters, water)
+        return jnp.stack(place, 1), energy
+
+
+def _euler_quat(roll: Any, pitch: Any, yaw: Any) -> jax.Array:
+    """`[4, n]` quaternion (w, x, y, z) of roll, then pitch, then yaw [rad]."""
+    (cr, sr), (cp, sp), (cy, sy) = (
+        (jnp.cos(x / 2), jnp.sin(x / 2)) for x in (roll, pitch, yaw)
+    )
+    return jnp.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+def make_fitness(config: Config | str | Path | dict[str, Any], **overrides: Any) -> Fitness:
+    """Builds the fitness function of a configuration.
+
+    Args:
+        config: a `Config`, the path of a YAML file, or a mapping like one.
+        **overrides: settings that replace the configuration's, dotted names through `**`:
+            `make_fitness(path, engine="mjx", **{"task.duration": 5.0})`.
+
+    Returns:
+        The fitness function.
+
+    Raises:
+        InputError: the configuration, the morphology or the world is wrong; the message says where.
+    """
+    if isinstance(config, Config):
+        if overrides:
+            config = make_config(config.model_dump(), overrides=overrides, source=config.source)
+    elif isinstance(config, dict):
+        config = make_config(config, overrides=overrides)
+    else:
+        config = load_config(config, overrides=overrides)
+    modules = MODULES | load_modules(config.modules) if config.modules else MODULES
+    morphology = load_morphology(config.morphology, modules, config.allow_overlap)
+    try:
+        world = load_world(config.world_name, **config.world_overrides)
+    except InputError as error:
+        raise InputError(f"{config.source}: {error}") from None
+    if config.trim == "neutral":
+        morphology = trim_neutral(morphology, world.density)
+    if config.task.type == "crawl" and world.bed is None:
+        raise InputError(f"{config.source}: task.type: crawl expected a world with a bed; found none")
+    robot = build_robot(morphology, world)
+    make = CONTROLLERS[config.controller.type]
+    controller = make(robot, config.controller.max_frequency, config.controller.amplitude)
+    contact = _may_touch_bed(config, robot)
+    return Fitness(config, robot, controller, make_engine(robot, config.engine, contact))
+
+
+def _may_touch_bed(config: Config, robot: Robot) -> bool:
+    """Whether the bed is within reach of an episode; if not, the step needs no contact.
+
+    Reach is what a robot at `_FASTEST` covers, plus its fall where the water does not carry it. An
+    individual that outruns it counts as blown up, so nothing can pass through an absent bed unseen.
+    """
+    world, task = robot.world, config.task
+    if world.bed is None:
+        return False
+    reach = _reach(config, robot)
+    line = np.linspace(-reach, reach, 101)
+    x, y = np.meshgrid(line, line)
+    highest = float(np.max(bed_height(world.bed, jnp.asarray(x), jnp.asarray(y))))
+    return task.type == "crawl" or world.surface_height - task.depth - reach < highest
+
+
+def _reach(config: Config, robot: Robot) -> float:
+    """How far from its start an episode may lead [m]."""
+    world, task = robot.world, config.task
+    current = np.linalg.norm(world.current) + 4 * task.current_std
+    fall = 0.0
+    if world.buoyancy == "off" or world.density * robot.morphology.volume < robot.morphology.mass / 2:
+        fall = 0.5 * world.gravity * task.duration**2
+    start = 4 * task.start_position + robot.morphology.length
+    return float((_FASTEST + current) * task.duration + fall + start)
