@@ -1,7 +1,7 @@
 """Massively parallel evolution of modular robots under water, in JAX and MuJoCo MJX.
 
-The names below are what users rely on; each is imported when it is first used, so that importing the
-package, or starting one of its command lines, loads neither JAX nor MuJoCo.
+The names below are what users rely on; each is imported when it is first used, so that importing
+the package, or starting one of its command lines, loads neither JAX nor MuJoCo.
 """
 
 from __future__ import annotations

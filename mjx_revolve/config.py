@@ -65,6 +65,14 @@ class ControllerConfig(_Model):
     """The fastest oscillation [Hz]."""
     amplitude: float = Field(1.0, gt=0, le=1)
     """The largest joint target, as a fraction of the hinge's range [-]."""
+    harmonics: int = Field(1, ge=1, le=8)
+    """How many sines add up at each hinge; `type: sine` only [-]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> ControllerConfig:
+        if self.type != "sine" and self.harmonics != 1:
+            raise ValueError(f"harmonics: 1, as only type sine has more; found {self.harmonics}")
+        return self
 
 
 class TaskConfig(_Model):

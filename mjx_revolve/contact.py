@@ -1,7 +1,7 @@
 """Contact with the bed: a penalty law with Coulomb friction at the corners of the modules.
 
-Under water a robot weighs a sixteenth of its weight in air, so a soft ground is enough, and it costs a
-few operations where a contact solver would cost the whole speed of the population step.
+Under water a robot weighs a sixteenth of its weight in air, so a soft ground is enough, and it
+costs a few operations where a contact solver would cost the whole speed of the population step.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def bed_contact(
 ) -> Vec:
     """Force of the bed on points of the robot.
 
-    Normal: F_n = k d - c ḋ while the point is a depth d below the bed and the sum pushes outwards, with
-    k the bed's stiffness or 0.5 m/dt² where that is less, and c = 0.5 m/dt. Tangential: Coulomb,
-    F_t = -μ F_n v_t / max(|v_t|, 5 mm/s), at most 0.5 m/dt |v_t|.
+    Normal: F_n = k d - c ḋ while the point is a depth d below the bed and the sum pushes outwards,
+    with k the bed's stiffness or 0.5 m/dt² where that is less, and c = 0.5 m/dt. Tangential:
+    Coulomb, F_t = -μ F_n v_t / max(|v_t|, 5 mm/s), at most 0.5 m/dt |v_t|.
 
     Args:
         bed: the ground.

@@ -1,9 +1,9 @@
 """Controllers: genes to parameters to joint targets. Zero genes keep every joint still.
 
-A controller is four plain functions over a population on the last axis. The genes are unbounded real
-numbers, folded into physical ranges by sin(gene), so that any optimiser can move them freely. Folded, not
-squashed: with tanh, an optimum at the end of a range lies at infinity, and strategies that adapt their step
-size run after it until their numbers overflow.
+A controller is four plain functions over a population on the last axis. The genes are unbounded
+real numbers, folded into physical ranges by sin(gene), so that any optimiser can move them freely.
+Folded, not squashed: with tanh, an optimum at the end of a range lies at infinity, and strategies
+that adapt their step size run after it until their numbers overflow.
 """
 
 from __future__ import annotations
@@ -69,8 +69,9 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
     """Revolve's differential CPG: one oscillator pair per hinge, neighbours coupled.
 
     ẋ_i = w_i y_i + Σ_j c_ij x_j,  ẏ_i = -w_i x_i,  c_ij = -c_ji for hinges that share a rigid link
-    (Lan et al. 2021, Learning locomotion skills in evolvable robots, Neurocomputing 452). The system matrix is antisymmetric, so Σ x² + y² is constant. Target of hinge i:
-    amplitude × half range × tanh(x_i), from the middle of its range. It starts at x = 0, y = 1: with all weights
+    (Lan et al. 2021, Learning locomotion skills in evolvable robots, Neurocomputing 452). The
+    system matrix is antisymmetric, so Σ x² + y² is constant. Target of hinge i: amplitude × half
+    range × tanh(x_i), from the middle of its range. It starts at x = 0, y = 1: with all weights
     zero nothing ever moves. Integrated by the classical Runge-Kutta method at the physics' step.
 
     Genes: one w per hinge, then one c per pair of neighbours; w = 2π f_max sin(gene),
@@ -131,48 +132,67 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
     return Controller(n + len(pairs), gene_names, decode, init, step)
 
 
-def make_sine(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -> Controller:
+def make_sine(
+    robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0, harmonics: int = 1
+) -> Controller:
     """One sine per hinge: amplitude, phase and offset each, and a frequency shared by all.
 
-    target_i = offset_i + a_i sin(2π f t + φ_i). Amplitude and phase are evolved as a point in the plane,
-    (u, v): a = amplitude × half range × sin|(u, v)|, φ its angle; so there is no seam at φ = ±π
-    where optimisers get lost, and no amplitude without a sign. Offset = half of half range × sin(gene),
-    f = f_max (1 + sin(gene)) / 2. Amplitudes and offsets fade in over the first half second, so that no joint
-    jumps at the start.
+    target_i = offset_i + Σ_k a_ik sin(2π k f t + φ_ik), k = 1 … harmonics. One harmonic is the
+    plain sine; with more, a stroke and its return may differ in speed, which is what rowing needs.
+    Amplitude and phase are evolved as a point in the plane, (u, v): a = amplitude × half range ×
+    sin|(u, v)| / k, φ its angle; so there is no seam at φ = ±π where optimisers get lost, and no
+    amplitude without a sign. Offset = half of half range × sin(gene), f = f_max (1 + sin(gene)) /
+    2. The servo's range clips the sum. Amplitudes and offsets fade in over the first half second,
+    so that no joint jumps at the start.
 
     Args:
         robot: whose hinges are driven.
         max_frequency: upper end of f [Hz].
         amplitude: share of the hinges' range used [-].
+        harmonics: how many sines are added up [-].
 
     Returns:
-        The controller; genes: u, v and offset (one per hinge each), then the frequency.
+        The controller; genes: u and v of the first harmonic (one per hinge each), of the second and
+        so on, offsets, then the frequency.
     """
     n = robot.num_hinges
     middle, half = _range(robot)
     names = [robot.mj_model.actuator(i).name for i in range(n)]
-    gene_names = tuple(
-        f"{what} {name}" for what in ("u", "v", "offset") for name in names
-    ) + ("frequency",)
+    waves = [f"{x}{k + 1 if k else ''}" for k in range(harmonics) for x in "uv"]
+    gene_names = tuple(f"{what} {name}" for what in (*waves, "offset") for name in names)
+    gene_names += ("frequency",)
 
     def decode(genes: jax.Array, order: np.ndarray) -> Any:
-        u, v, offset = (genes[k * n : (k + 1) * n][order] for k in range(3))
-        reach = jnp.asarray(half, genes.dtype)[order]
-        center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], u.shape)
-        rate = 2 * np.pi * max_frequency * (1 + jnp.sin(genes[3 * n :])) / 2
-        size = safe_norm((u, v))
-        # sin(r) / r, and its limit where r = 0.
-        fold = jnp.where(size > 1e-6, jnp.sin(size) / jnp.maximum(size, 1e-6), 1.0)
-        scale = amplitude * reach * fold
-        return scale * u, scale * v, 0.5 * reach * jnp.sin(offset), rate, center
+        rows = [genes[k * n : (k + 1) * n][order] for k in range(2 * harmonics + 1)]
+        reach = amplitude * jnp.asarray(half, genes.dtype)[order]
+        center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], rows[0].shape)
+        rate = 2 * np.pi * max_frequency * (1 + jnp.sin(genes[-1:])) / 2
+        sizes = []
+        for k in range(harmonics):
+            u, v = rows[2 * k], rows[2 * k + 1]
+            size = safe_norm((u, v))
+            # sin(r) / r, and its limit where r = 0.
+            fold = jnp.where(size > 1e-6, jnp.sin(size) / jnp.maximum(size, 1e-6), 1.0)
+            scale = reach * fold / (k + 1)
+            sizes.append((scale * u, scale * v))
+        return tuple(sizes), 0.5 * reach * jnp.sin(rows[-1]), rate, center
 
     def step(parameters: Any, state: Any, time: jax.Array) -> tuple[Any, jax.Array]:
-        u, v, offset, rate, center = parameters
+        sizes, offset, rate, center = parameters
         fade = jnp.minimum(time / 0.5, 1.0)
-        sine, cosine = sincos(rate * time)
-        return state, center + fade * (offset + u * sine + v * cosine)
+        wave = offset
+        for k, (u, v) in enumerate(sizes):
+            sine, cosine = sincos((k + 1) * rate * time)
+            wave = wave + u * sine + v * cosine
+        return state, center + fade * wave
 
-    return Controller(3 * n + 1, gene_names, decode, lambda parameters: (), step)
+    return Controller(len(gene_names), gene_names, decode, lambda parameters: (), step)
 
 
-CONTROLLERS = {"cpg": make_cpg, "sine": make_sine}
+# By the name that a configuration gives; each takes (robot, settings).
+CONTROLLERS: dict[str, Callable[[Robot, Any], Controller]] = {
+    "cpg": lambda robot, settings: make_cpg(robot, settings.max_frequency, settings.amplitude),
+    "sine": lambda robot, settings: make_sine(
+        robot, settings.max_frequency, settings.amplitude, settings.harmonics
+    ),
+}

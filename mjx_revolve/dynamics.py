@@ -1,15 +1,16 @@
 """One step of a whole population: an articulated body in water, the population on the last axis.
 
-Featherstone's articulated-body algorithm (2008, Rigid Body Dynamics Algorithms, § 7.3) over levels of
-bodies, in components (`spatial`), with the water's forces (`hydrodynamics`) and the carried water's
-mass inside each body's 6×6 inertia. Integration is MuJoCo's semi-implicit Euler with implicit joint
-damping, so that trajectories can be compared step by step.
+Featherstone's articulated-body algorithm (2008, Rigid Body Dynamics Algorithms, § 7.3) over levels
+of bodies, in components (`spatial`), with the water's forces (`hydrodynamics`) and the carried
+water's mass inside each body's 6×6 inertia. Integration is MuJoCo's semi-implicit Euler with
+implicit joint damping, so that trajectories can be compared step by step.
 
 Spatial quantities are (angular, linear), in each body's own frame, about its own origin.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -86,8 +87,8 @@ class Engine(NamedTuple):
 
     Attributes:
         init: (qpos `[nq, lanes]`, qvel `[nv, lanes]`) → state.
-        step: (state, ctrl `[nu, lanes]` in `order`, water) → (state, power `[lanes]` that the servos
-            deliver or take up, summed without sign [W]).
+        step: (state, ctrl `[nu, lanes]` in `order`, water) → (state, power `[lanes]` that the
+            servos deliver or take up, summed without sign [W]).
         observe: state → (qpos `[nq, lanes]`, qvel `[nv, lanes]`).
         root: state → root position, world frame [m], three of `[lanes]`; cheaper than observe.
         order: `[nu]` actuator of each row of `step`'s ctrl.
@@ -107,9 +108,9 @@ class Motion(NamedTuple):
     velocity: Vec  # of the origin, body frame
     up: Vec  # world z in the body frame
     height: Scalar  # world z of the origin
-    x_axis: Vec | None  # world x and y in the body frame, where something needs them
-    y_axis: Vec | None
-    place: tuple[Scalar, Scalar] | None  # world x and y of the origin
+    x_axis: Any  # world x and y in the body frame, where something needs them
+    y_axis: Any
+    place: Any  # world x and y of the origin
 
 
 class SpatialInertia(NamedTuple):
@@ -170,21 +171,19 @@ def _sum_first(x: Scalar, n: int) -> Scalar:
 # ------------------------------------------------------------------ the water on a level
 
 
-def _drag(
-    world: World, parts: Parts, v: Vec, w: Vec, share: Scalar
-) -> tuple[Vec, Vec]:
+def _drag(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Vec, Vec]:
     """Force and torque of the world's drag law on each part, part frame, at the box's centre."""
     zero = (0.0, 0.0, 0.0)
     if world.drag == "faces":
-        force = [
+        push = [
             quadratic_drag(x, c, share, m)
             for x, c, m in zip(v, parts.drag_linear, parts.limit_linear, strict=True)
         ]
-        torque = [
+        twist = [
             quadratic_drag(x, c, share, m)
             for x, c, m in zip(w, parts.drag_angular, parts.limit_angular, strict=True)
         ]
-        return tuple(force), tuple(torque)
+        return tuple(push), tuple(twist)
     if world.drag == "lift_drag":
         force = lift_drag(
             v,
@@ -279,13 +278,12 @@ def _share_of_body(parts: Parts, share: Scalar, shape: tuple[int, ...]) -> Scala
     return _sum_first(mul(weight, share), shape[0])
 
 
-def _bed_on_level(
-    world: World, level: Level, motion: Motion, points: Points
-) -> tuple[Vec, Vec]:
+def _bed_on_level(world: World, level: Level, motion: Motion, points: Points) -> tuple[Vec, Vec]:
     """Torque and force of the bed on each body, body frame, about its origin."""
     n, lanes = len(level.body), jnp.shape(motion.height)[-1]
     k = max(x.shape[0] if isinstance(x, np.ndarray) else 1 for x in points.position)
     wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
+    assert world.bed is not None  # there are points only above a bed
     rows = (motion.x_axis, motion.y_axis, motion.up)
     ground, normal = bed_plane(world.bed, motion.place)
     normal = matTvec(rows, normal)
@@ -309,9 +307,7 @@ def _cross_force(spin: Vec, velocity: Vec, angular: Vec, linear: Vec) -> tuple[V
 
 def _apply_inertia(inertia: SpatialInertia, spin: Vec, velocity: Vec) -> tuple[Vec, Vec]:
     angular = vadd(symvec(inertia.angular, spin), matvec(inertia.cross, velocity))
-    linear = vadd(
-        matvec(transpose(inertia.cross), spin), symvec(inertia.linear, velocity)
-    )
+    linear = vadd(matvec(transpose(inertia.cross), spin), symvec(inertia.linear, velocity))
     return angular, linear
 
 
@@ -320,9 +316,9 @@ def outer_forces(
 ) -> tuple[Vec, Vec, SpatialInertia | None]:
     """What water and bed do to the bodies of a level, their weight apart.
 
-    The carried water enters as an inertia and as the force that its momentum needs when the body turns
-    (Kirchhoff; Fossen 2011, Handbook of Marine Craft Hydrodynamics, § 6.3): its momentum is A ν_r, and
-    in a uniform current u, d(v - u)/dt in the body's frame is dv/dt + ω × u.
+    The carried water enters as an inertia and as the force that its momentum needs when the body
+    turns (Kirchhoff; Fossen 2011, Handbook of Marine Craft Hydrodynamics, § 6.3): its momentum is A
+    ν_r, and in a uniform current u, d(v - u)/dt in the body's frame is dv/dt + ω × u.
 
     Args:
         world: which laws act.
@@ -341,9 +337,7 @@ def outer_forces(
         torque, force = vadd(torque, on_torque), vadd(force, on_force)
     if added is not None:
         relative = motion.velocity if drift is None else vsub(motion.velocity, drift)
-        swirl = _cross_force(
-            motion.spin, relative, *_apply_inertia(added, motion.spin, relative)
-        )
+        swirl = _cross_force(motion.spin, relative, *_apply_inertia(added, motion.spin, relative))
         torque, force = vsub(torque, swirl[0]), vsub(force, swirl[1])
         if drift is not None:
             turning = _apply_inertia(added, (0.0, 0.0, 0.0), cross(motion.spin, drift))
@@ -400,9 +394,7 @@ def _to_parent(
     shifted = tuple(vadd(a, b) for a, b in zip(across, matmul(r, full(linear)), strict=True))
     first = matmul(r, transpose(across))  # [r]ₓ crossᵀ
     second = matmul(shifted, r)
-    moved = tuple(
-        sub(add(angular[k], first[i][j]), second[i][j]) for k, (i, j) in enumerate(SYM)
-    )
+    moved = tuple(sub(add(angular[k], first[i][j]), second[i][j]) for k, (i, j) in enumerate(SYM))
     return SpatialInertia(moved, shifted, linear), (vadd(torque, cross(position, force)), force)
 
 
@@ -433,12 +425,55 @@ def _solve_root(inertia: SpatialInertia, bias: tuple[Vec, Vec]) -> tuple[Vec, Ve
     return tuple(rhs[3:]), tuple(rhs[:3])
 
 
-def _servo(level: Level, angle: Scalar, speed: Scalar, target: Scalar) -> Scalar:
-    """Torque of the position servos, within their targets' and their torque's limits [N·m]."""
+def servo(
+    level: Level, angle: Scalar, speed: Scalar, target: Scalar, dt: float
+) -> tuple[Scalar, Scalar]:
+    """Torque of the position servos, and what an implicit step adds to the joints' inertia.
+
+    MuJoCo's position actuator, clip(k_p (target - q), ± effort), on a motor whose driver limits its
+    current: full effort up to half its top speed, from there a line that the joint's friction d q̇
+    meets at the top speed,
+
+        τ ≤ d w + k (w - q̇),   k = 2 (effort - d w) / w,
+
+    and likewise backwards. Below half the top speed it is stock MuJoCo. The line acts on the speed
+    at the end of the step as soon as it may be met within the step: a light limb could otherwise
+    pass the top speed in one step from rest.
+
+    Args:
+        level: whose hinges.
+        angle: q `[nbody, lanes]` [rad].
+        speed: q̇ `[nbody, lanes]` [rad/s].
+        target: `[nbody, lanes]` [rad].
+        dt: for which the line is implicit [s]; 0 for none.
+
+    Returns:
+        Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
+    """
     target = jnp.clip(target, _cast(level.target[0], target), _cast(level.target[1], target))
     torque = sub(mul(level.gain, target), mul(level.stiffness, angle))
     torque = sub(torque, mul(level.servo_damping, speed))
-    return jnp.clip(torque, _cast(level.effort[0], torque), _cast(level.effort[1], torque))
+    low, high = (_cast(x, torque) for x in level.effort)
+    torque = jnp.clip(torque, low, high)
+    top = np.asarray(level.top_speed, np.float64)
+    limited = np.isfinite(top) & np.isfinite(level.effort[1])
+    if not np.any(limited):
+        return torque, jnp.zeros_like(torque)
+    w = np.where(limited, top, 1.0)
+    friction = np.asarray(level.damping) * w
+    effort = np.where(limited, level.effort[1], friction)
+    slope = np.where(limited, np.maximum(2 * (effort - friction) / w, 0), 0)
+    # No limb is lighter than the body that the hinge carries: where the line may be met.
+    reach = dt / (np.asarray(level.inertia[5]) + np.asarray(level.armature) + dt * level.damping)
+    forward = jnp.sign(torque)
+    rate = forward * speed
+    push = jnp.abs(torque)
+    ahead = rate + _cast(reach, torque) * (push - _cast(level.damping, torque) * rate)
+    f0, f1, f2 = (_cast(x, torque) for x in (friction, slope, w))
+    line = lambda x: f0 + f1 * (f2 - x)  # noqa: E731
+    met = (line(ahead) < push) & limited
+    torque = jnp.where(met, forward * jnp.minimum(push, line(rate)), torque)
+    return torque, jnp.where(met, dt * _cast(slope, torque), jnp.zeros_like(torque))
 
 
 def _cast(x: Scalar, like: jax.Array) -> Scalar:
@@ -448,8 +483,8 @@ def _cast(x: Scalar, like: jax.Array) -> Scalar:
 def end_stop(level: Level, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:
     """Torque of the joint's end stops, and what an implicit step adds to the joint's inertia.
 
-    A spring that acts on the angle at the end of the step, q + dt q̇: linearly implicit, so it is stable
-    at any stiffness (cf. MuJoCo's soft limit constraint, which it stands in for).
+    A spring that acts on the angle at the end of the step, q + dt q̇: linearly implicit, so it is
+    stable at any stiffness (cf. MuJoCo's soft limit constraint, which it stands in for).
     """
     low, high = (_cast(x, angle) for x in level.range)
     ahead = angle + dt * speed
@@ -471,8 +506,8 @@ def _acceleration(
         dt: for which joint damping and end stops are implicit [s]; 0 for none.
 
     Returns:
-        Root: linear, world frame [m/s²], angular, body frame [rad/s²]; hinges [rad/s²]; servo power,
-        summed over the hinges without sign [W], `[lanes]`.
+        Root: linear, world frame [m/s²], angular, body frame [rad/s²]; hinges [rad/s²]; servo
+        power, summed over the hinges without sign [W], `[lanes]`.
     """
     world = tree.robot.world
     row = lambda xs: tuple(x[None] for x in xs)  # noqa: E731
@@ -488,7 +523,9 @@ def _acceleration(
         y_axis=turn_root[1] if located else None,
         place=row(state.position[:2]) if located else None,
     )
-    motions, turns, coriolis, owns = [root], [None], [None], []
+    motions, owns = [root], []
+    turns: list[Any] = [None]  # the root has no joint
+    coriolis: list[Any] = [None]
     for level, angle, speed in zip(tree.levels[1:], state.angle, state.speed, strict=True):
         parent = Motion(*[_down(level, x) for x in motions[-1]])
         sine, cosine = sincos(angle)
@@ -541,14 +578,17 @@ def _acceleration(
     for d in range(len(tree.levels) - 1, 0, -1):
         level, angle, speed = tree.levels[d], state.angle[d - 1], state.speed[d - 1]
         inertia, bias = inertias[d], biases[d]
-        servo = _servo(level, angle, speed, targets[d - 1])
-        delivered = jnp.abs(servo * speed)
+        motor, motor_inertia = servo(level, angle, speed, targets[d - 1], dt)
+        delivered = jnp.abs(motor * speed)
         power = add(power, total(*[delivered[k] for k in range(delivered.shape[0])]))
         stop, stop_inertia = end_stop(level, angle, speed, dt)
-        torque = sub(add(servo, stop), mul(level.damping, speed))
+        torque = sub(add(motor, stop), mul(level.damping, speed))
         column_a = full(inertia.angular)[2]
         column_l = inertia.cross[2]
-        own = add(add(column_a[2], level.armature), add(mul(dt, level.damping), stop_inertia))
+        own = add(
+            add(column_a[2], level.armature),
+            add(mul(dt, level.damping), add(stop_inertia, motor_inertia)),
+        )
         inverse = 1 / own
         rest = sub(torque, bias[0][2])
         joint[d] = (column_a, column_l, inverse, rest)
@@ -590,9 +630,7 @@ def _acceleration(
         column_a, column_l, inverse, rest = joint[d]
         up_angular, up_linear = (_down(level, x) for x in accelerations[-1])
         a = vadd(matTvec(turn, up_angular), coriolis[d][0])
-        b = vadd(
-            matTvec(turn, vadd(up_linear, cross(up_angular, level.position))), coriolis[d][1]
-        )
+        b = vadd(matTvec(turn, vadd(up_linear, cross(up_angular, level.position))), coriolis[d][1])
         hinge = mul(inverse, sub(sub(rest, dot(column_a, a)), dot(column_l, b)))
         hinges.append(hinge)
         accelerations.append(((a[0], a[1], add(a[2], hinge)), b))
@@ -649,7 +687,7 @@ def make_population_engine(robot: Robot, contact: bool = True) -> Engine:
     model, dt = robot.mj_model, robot.world.timestep
     sizes = [len(level.body) for level in tree.levels[1:]]
     edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-    spans = list(zip(edges[:-1], edges[1:], strict=True))
+    spans = list(itertools.pairwise(edges))
 
     def init(qpos: jax.Array, qvel: jax.Array) -> State:
         angle, speed = qpos[tree.qpos_index], qvel[tree.qvel_index]
@@ -706,8 +744,8 @@ def acceleration(
         water: surface and current.
 
     Returns:
-        `[nv, lanes]` qacc: root linear, world frame [m/s²], root angular, body frame [rad/s²], hinges
-        [rad/s²].
+        `[nv, lanes]` qacc: root linear, world frame [m/s²], root angular, body frame [rad/s²],
+        hinges [rad/s²].
     """
     tree, engine = make_tree(robot), make_population_engine(robot)
     ctrl = ctrl[tree.ctrl_index]

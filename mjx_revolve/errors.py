@@ -32,7 +32,9 @@ class SafeLoader(yaml.SafeLoader):
 # YAML 1.1 wants a dot in floats and no sign before it; people write 1e-3 and -.5 and mean it.
 SafeLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+|\.[0-9][0-9_]*)$"),
+    re.compile(
+        r"^[-+]?(?:(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+|\.[0-9][0-9_]*)$"
+    ),
     list("-+.0123456789"),
 )
 
@@ -93,7 +95,7 @@ def load_yaml(path: str | Path) -> Any:
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
     try:
-        data = yaml.load(text, Loader=SafeLoader)  # noqa: S506  (a SafeLoader)
+        data = yaml.load(text, Loader=SafeLoader)
         _check_size(data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

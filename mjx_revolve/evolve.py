@@ -434,10 +434,11 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     arguments = _parser().parse_args(argv)
     try:
         runtime.prepare_process()
-        if make_fitness is None:
-            from mjx_revolve.fitness import make_fitness
+        make: Any = make_fitness
+        if make is None:
+            from mjx_revolve.fitness import make_fitness as make
         start = _begin if arguments.resume is None else _continue
-        run, config, fitness, checkpoint = start(arguments, make_fitness)
+        run, config, fitness, checkpoint = start(arguments, make)
     except KeyboardInterrupt:
         print("interrupted before the first generation", file=sys.stderr)
         return 130

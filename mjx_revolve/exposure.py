@@ -1,7 +1,7 @@
 """Which faces the water reaches: modules hide the faces by which they are joined.
 
-Without this, a chain of modules would meet the water head-on with the front of every module in it, and a
-limb would be no harder to move sideways than lengthwise; swimming lives on that difference.
+Without this, a chain of modules would meet the water head-on with the front of every module in it,
+and a limb would be no harder to move sideways than lengthwise; swimming lives on that difference.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import numpy as np
 
 from mjx_revolve.morphology import Morphology
 
-# A face is covered where a neighbour is found at one of these distances in front of it [m]: Revolve's joints
-# leave up to 2 mm, or sink a plate of 1 mm into the neighbour's face; limbs keep further apart.
+# A face is covered where a neighbour is found at one of these distances in front of it [m]:
+# Revolve's joints leave up to 2 mm, or sink a plate of 1 mm into the neighbour's face; limbs keep
+# further apart.
 _DISTANCES = (-2e-3, -1e-3, 0.0, 1e-3, 2e-3)
 # Points along each edge of a face; an exposed share is known to about one in this many.
 _POINTS = 24
@@ -22,8 +23,8 @@ _POINTS = 24
 def exposed_shares(morphology: Morphology) -> list[np.ndarray]:
     """The share of each part's faces that no other part covers, at rest.
 
-    A choice: the pose at rest stands for all poses; a bent hinge opens a little more. Opposite faces
-    are averaged, as drag and added mass are the same in both directions.
+    A choice: the pose at rest stands for all poses; a bent hinge opens a little more. Opposite
+    faces are averaged, as drag and added mass are the same in both directions.
 
     Args:
         morphology: the robot.
@@ -35,9 +36,7 @@ def exposed_shares(morphology: Morphology) -> list[np.ndarray]:
     parts: list[dict[str, Any]] = []
     for module in morphology.modules:
         for part in module.kind.parts:
-            boxes = [
-                (np.asarray(box.position), np.asarray(box.size) / 2) for box in part.boxes
-            ]
+            boxes = [(np.asarray(box.position), np.asarray(box.size) / 2) for box in part.boxes]
             parts.append(
                 {
                     "center": module.position + module.rotation @ np.asarray(part.position),
@@ -49,10 +48,10 @@ def exposed_shares(morphology: Morphology) -> list[np.ndarray]:
     centers = np.array([part["center"] for part in parts])
     radii = np.array([np.abs(part["bounds"]).sum(0).max() for part in parts])
     shares = []
-    for i, part in enumerate(parts):
-        apart = np.linalg.norm(centers - part["center"], axis=1)
+    for i, here in enumerate(parts):
+        apart = np.linalg.norm(centers - here["center"], axis=1)
         near = [parts[j] for j in np.flatnonzero(apart < 2 * (radii + radii[i])) if j != i]
-        shares.append(np.array([_exposed_share(part, near, axis) for axis in range(3)]))
+        shares.append(np.array([_exposed_share(here, near, axis) for axis in range(3)]))
     return shares
 
 

@@ -1,7 +1,8 @@
 """Fitness: genes of a whole population to scores, as one pure JAX function.
 
-`make_fitness` builds the robot, the controller and the task of a configuration once; what it returns
-is a function of (population, key) that any optimiser can call, and that runs under jit, vmap and grad.
+`make_fitness` builds the robot, the controller and the task of a configuration once; what it
+returns is a function of (population, key) that any optimiser can call, and that runs under jit,
+vmap and grad.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from mjx_revolve.xla import compiler_options, one_loop, over_chunks
 # infinities, and below anything that a task gives.
 WORST = -1e3
 
-# Nothing made of these modules swims or sinks this fast: servos, drag and weight allow a tenth of it. An
-# individual that gets further than this allows has blown up [m/s].
+# Nothing made of these modules swims or sinks this fast: servos, drag and weight allow a tenth of
+# it. An individual that gets further than this allows has blown up [m/s].
 _FASTEST = 3.0
 
 # The track is sampled at least this often [s].
@@ -79,9 +80,7 @@ class Fitness:
         """
         return self.evaluate(population, key)[0]
 
-    def evaluate(
-        self, population: Any, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def evaluate(self, population: Any, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Scores a population and says how it moved.
 
         Args:
@@ -96,9 +95,7 @@ class Fitness:
         """
         shape = jnp.shape(population)
         if len(shape) != 2 or shape[1] != self.num_genes or shape[0] < 1:
-            raise InputError(
-                f"population: expected [P, {self.num_genes}]; found {list(shape)}"
-            )
+            raise InputError(f"population: expected [P, {self.num_genes}]; found {list(shape)}")
         traced = any(isinstance(x, jax.core.Tracer) for x in (population, key))
         return (self._evaluate if traced else self._jitted)(jnp.asarray(population), key)
 
@@ -151,7 +148,7 @@ class Fitness:
         place = task.start_position * jax.random.normal(place_key, (3, trials))
         tilt = task.start_tilt * jax.random.normal(tilt_key, (2, trials))
         yaw = task.start_yaw * jax.random.normal(yaw_key, (trials,))
-        if task.type == "crawl":
+        if task.type == "crawl" and world.bed is not None:
             # The lowest corner of any module 5 mm above the bed, whatever the tilt.
             height = bed_height(world.bed, place[0], place[1]) + self._reach + 0.005
             place = place.at[2].set(height)
@@ -249,9 +246,7 @@ class Fitness:
 
 def _euler_quat(roll: Any, pitch: Any, yaw: Any) -> jax.Array:
     """`[4, n]` quaternion (w, x, y, z) of roll, then pitch, then yaw [rad]."""
-    (cr, sr), (cp, sp), (cy, sy) = (
-        (jnp.cos(x / 2), jnp.sin(x / 2)) for x in (roll, pitch, yaw)
-    )
+    (cr, sr), (cp, sp), (cy, sy) = ((jnp.cos(x / 2), jnp.sin(x / 2)) for x in (roll, pitch, yaw))
     return jnp.stack(
         [
             cr * cp * cy + sr * sp * sy,
@@ -292,10 +287,11 @@ def make_fitness(config: Config | str | Path | dict[str, Any], **overrides: Any)
     if config.trim == "neutral":
         morphology = trim_neutral(morphology, world.density)
     if config.task.type == "crawl" and world.bed is None:
-        raise InputError(f"{config.source}: task.type: crawl expected a world with a bed; found none")
+        raise InputError(
+            f"{config.source}: task.type: crawl expected a world with a bed; found none"
+        )
     robot = build_robot(morphology, world)
-    make = CONTROLLERS[config.controller.type]
-    controller = make(robot, config.controller.max_frequency, config.controller.amplitude)
+    controller = CONTROLLERS[config.controller.type](robot, config.controller)
     contact = _may_touch_bed(config, robot)
     return Fitness(config, robot, controller, make_engine(robot, config.engine, contact))
 
@@ -321,7 +317,10 @@ def _reach(config: Config, robot: Robot) -> float:
     world, task = robot.world, config.task
     current = np.linalg.norm(world.current) + 4 * task.current_std
     fall = 0.0
-    if world.buoyancy == "off" or world.density * robot.morphology.volume < robot.morphology.mass / 2:
+    if (
+        world.buoyancy == "off"
+        or world.density * robot.morphology.volume < robot.morphology.mass / 2
+    ):
         fall = 0.5 * world.gravity * task.duration**2
     start = 4 * task.start_position + robot.morphology.length
     return float((_FASTEST + current) * task.duration + fall + start)

@@ -2,11 +2,11 @@
 
 Every function works on many parts and many individuals at once: vectors are tuples of three arrays
 (see `spatial`), tables are constants that broadcast against them. All of it runs under `jax.jit`,
-`vmap` and `grad`. Frames: `v`, `w` and forces are in the part's own frame, at its box's centre; `up`
-is the world's vertical seen from there. `v` and `w` are relative to the water (Fossen's nu_r).
+`vmap` and `grad`. Frames: `v`, `w` and forces are in the part's own frame, at its box's centre;
+`up` is the world's vertical seen from there. `v` and `w` are relative to the water (Fossen's nu_r).
 
-A *part* is what moves and floats as one box: core, brick and sensor are one part each, an active hinge
-is two (the frame, fixed to the parent, and the servo holder, which moves).
+A *part* is what moves and floats as one box: core, brick and sensor are one part each, an active
+hinge is two (the frame, fixed to the parent, and the servo holder, which moves).
 """
 
 from __future__ import annotations
@@ -127,9 +127,7 @@ def lamb_coefficients(semi_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # A body of revolution about this axis carries no water round with it.
         round_ = np.abs(difference) < 1e-9 * square
         safe = np.where(round_, 1.0, below)
-        return np.where(
-            round_, 0.0, volume / 5 * difference**2 * (gamma - beta) / safe
-        )
+        return np.where(round_, 0.0, volume / 5 * difference**2 * (gamma - beta) / safe)
 
     added_inertia = [
         inertia(b, c, beta, gamma),
@@ -162,9 +160,10 @@ def face_drag_coefficients(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Quadratic drag of a box from its faces, per unit density.
 
-    Along axis i the pressure acts on the face A_i: F = ½ ρ C_d A_i |v| v. Turning about axis i, each
-    strip of the two pairs of faces beside it meets the water at ω r; integrating ½ ρ C_d (ω r)² r over
-    them gives T = ρ C_d b_i (b_j⁴ + b_k⁴) / 64 |ω| ω (the form of MuJoCo's inertia-box law).
+    Along axis i the pressure acts on the face A_i: F = ½ ρ C_d A_i |v| v. Turning about axis i,
+    each strip of the two pairs of faces beside it meets the water at ω r; integrating ½ ρ C_d (ω
+    r)² r over them gives T = ρ C_d b_i (b_j⁴ + b_k⁴) / 64 |ω| ω (the form of MuJoCo's inertia-box
+    law).
 
     Args:
         size: `[3]` edges of the box [m].
@@ -286,8 +285,9 @@ def quadratic_drag(rate: Scalar, coefficient: Scalar, share: Scalar, limit: Scal
 
     An explicit step is stable while c |x| dt is below the inertia that meets it. The coefficient is
     capped at `limit` = inertia of the part / dt: because the parts' inertias add up to no more than
-    the body's, the damping of one step is then at most the body's inertia, so it can stop a motion but
-    never reverse it. Below the cap (several m/s for the catalogue's modules) nothing is changed.
+    the body's, the damping of one step is then at most the body's inertia, so it can stop a motion
+    but never reverse it. Below the cap (several m/s for the catalogue's modules) nothing is
+    changed.
 
     Args:
         rate: velocity [m/s] or angular velocity [rad/s] relative to the water.
@@ -303,9 +303,7 @@ def quadratic_drag(rate: Scalar, coefficient: Scalar, share: Scalar, limit: Scal
     return -strength * rate
 
 
-def lift_drag(
-    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: float, p: LiftDrag
-) -> Vec:
+def lift_drag(v: Vec, forward: Vec, upward: Vec, area: Scalar, density: float, p: LiftDrag) -> Vec:
     """Gazebo's LiftDragPlugin for one plate, its 0/0 cases taken out.
 
     Source: Gazebo 9 `LiftDragPlugin.cc`, with v in the lift-drag plane taken as v - (v·n)n (the
@@ -381,8 +379,8 @@ def ellipsoid_constants(half_size: np.ndarray, coefficients: np.ndarray) -> dict
 
     Args:
         half_size: `[..., 3]` semi-axes [m].
-        coefficients: `[..., 12]` MuJoCo's `geom_fluid`: interaction, blunt, slender, angular, Kutta,
-            Magnus, virtual mass (3), virtual inertia (3).
+        coefficients: `[..., 12]` MuJoCo's `geom_fluid`: interaction, blunt, slender, angular,
+            Kutta, Magnus, virtual mass (3), virtual inertia (3).
 
     Returns:
         Constants for `ellipsoid`, each `[...]` or a tuple of three.
@@ -390,13 +388,19 @@ def ellipsoid_constants(half_size: np.ndarray, coefficients: np.ndarray) -> dict
     s = np.asarray(half_size, np.float64)
     g = np.asarray(coefficients, np.float64)
     interaction, blunt, slender, angular, kutta, magnus = (g[..., i] for i in range(6))
-    small, middle, large = np.moveaxis(np.sort(s, -1), -1, 0)
+    _, middle, large = np.moveaxis(np.sort(s, -1), -1, 0)
     volume = 4 / 3 * np.pi * s.prod(-1)
     areas = np.stack([s[..., 1] * s[..., 2], s[..., 2] * s[..., 0], s[..., 0] * s[..., 1]], -1) ** 2
     largest = areas.max(-1)
     inertia_max = 8 / 15 * np.pi * middle * large**4
-    own = 8 / 15 * np.pi * s * np.stack(
-        [np.maximum(s[..., (i + 1) % 3], s[..., (i + 2) % 3]) ** 4 for i in range(3)], -1
+    own = (
+        8
+        / 15
+        * np.pi
+        * s
+        * np.stack(
+            [np.maximum(s[..., (i + 1) % 3], s[..., (i + 2) % 3]) ** 4 for i in range(3)], -1
+        )
     )
     diameter = 2 / 3 * s.sum(-1)
     turning = angular[..., None] * own + slender[..., None] * (inertia_max[..., None] - own)
@@ -422,8 +426,9 @@ def ellipsoid(
 ) -> tuple[Vec, Vec]:
     """MuJoCo's ellipsoid law for one geom, in its own frame.
 
-    Source: MuJoCo documentation, Computation, "Ellipsoid model"; `mj_ellipsoidFluidModel`: blunt and
-    slender drag, angular drag, Kutta and Magnus lift, and the velocity terms of its virtual mass.
+    Source: MuJoCo documentation, Computation, "Ellipsoid model"; `mj_ellipsoidFluidModel`: blunt
+    and slender drag, angular drag, Kutta and Magnus lift, and the velocity terms of its virtual
+    mass.
 
     Args:
         v: velocity of the centre relative to the water [m/s].
@@ -447,9 +452,7 @@ def ellipsoid(
     # As MuJoCo has it: the denominator is the normal's length squared, which scales `normal` below.
     normal = tuple(mul(a, x) for a, x in zip(k["areas"], v, strict=True))
     cosine = jnp.where(moving, num / jnp.maximum(speed * den, tiny), 0.0)
-    lift = vscale(
-        mul(density * k["kutta"], cosine * projected), cross(cross(normal, v), v)
-    )
+    lift = vscale(mul(density * k["kutta"], cosine * projected), cross(cross(normal, v), v))
     spin = vscale(density * k["magnus"], cross(w, v))
     drag = add(
         viscosity * k["viscous"],
@@ -457,9 +460,7 @@ def ellipsoid(
     )
     moment = [mul(density * t, x) for t, x in zip(k["turning"], w, strict=True)]
     turning = add(viscosity * k["viscous_turning"], safe_norm(tuple(moment)))
-    force = tuple(
-        total(a, b, neg(mul(drag, x))) for a, b, x in zip(lift, spin, v, strict=True)
-    )
+    force = tuple(total(a, b, neg(mul(drag, x))) for a, b, x in zip(lift, spin, v, strict=True))
     torque = tuple(neg(mul(turning, x)) for x in w)
     if carried:
         momentum = tuple(mul(density * m, x) for m, x in zip(k["mass"], v, strict=True))

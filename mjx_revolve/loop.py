@@ -361,8 +361,6 @@ def search_from_arrays(
         )
     paths, structure = jax.tree_util.tree_flatten_with_path(template.state)
     leaves = [arrays["state" + jax.tree_util.keystr(path)] for path, _ in paths]
-    return Search(
-        state=jax.tree_util.tree_unflatten(structure, leaves),
-        **{name: arrays[name].item() for name in _COUNTERS},
-        **{name: arrays[name] for name in _ARRAYS},
-    )
+    fields: dict[str, Any] = {name: arrays[name].item() for name in _COUNTERS}
+    fields |= {name: arrays[name] for name in _ARRAYS}
+    return Search(state=jax.tree_util.tree_unflatten(structure, leaves), **fields)

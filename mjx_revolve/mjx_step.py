@@ -1,8 +1,8 @@
 """MJX's step behind the same call as the population step: the reference, and the fallback.
 
-MJX computes kinematics, the joint-space inertia, bias forces and actuation of each individual; the
-water's forces and the carried water's inertia come from the same functions as in the population step
-and enter through the bodies' Jacobians. So the two engines share the water and nothing else.
+MJX computes kinematics, the joint-space inertia and bias forces of each individual; the water's
+forces, the carried water's inertia and the servos come from the same functions as in the population
+step and enter through the bodies' Jacobians. So the two engines share the laws, not the mechanics.
 """
 
 from __future__ import annotations
@@ -13,22 +13,26 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
-from mujoco.mjx._src import forward, support
 
 from mjx_revolve.dynamics import (
     Engine,
     Motion,
+    SpatialInertia,
     end_stop,
     is_drifting,
     outer_forces,
+    servo,
     turn_quat,
     water_drift,
 )
 from mjx_revolve.hydrodynamics import Water
-from mjx_revolve.robot import Robot
+from mjx_revolve.robot import Robot, import_mjx
 from mjx_revolve.spatial import full
 from mjx_revolve.tree import make_tree
+
+mjx = import_mjx()
+# Not exported, but the only way to the stages of a step and to a body's Jacobian.
+from mujoco.mjx._src import forward, support  # noqa: E402
 
 
 def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
@@ -52,11 +56,10 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
     off = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     model = model.replace(opt=model.opt.replace(disableflags=int(model.opt.disableflags) | off))
 
-    def forward_parts(qpos: Any, qvel: Any, ctrl: Any) -> Any:
-        data = mjx.make_data(model).replace(qpos=qpos, qvel=qvel, ctrl=ctrl)
+    def forward_parts(qpos: Any, qvel: Any) -> Any:
+        data = mjx.make_data(model).replace(qpos=qpos, qvel=qvel)
         data = forward.fwd_position(model, data)
-        data = forward.fwd_velocity(model, data)
-        return forward.fwd_actuation(model, data)
+        return forward.fwd_velocity(model, data)
 
     def jacobians(data: Any, level: Any) -> tuple[Any, Any]:
         """`[nbody, 6, nv]` of the level's bodies, in their own frames, and `[nbody, 3, 3]` axes."""
@@ -83,14 +86,12 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         return [jnp.einsum("bij,j->bi", jacobians(data, x)[0], qvel) for x in tree.levels]
 
     def one(qpos: Any, qvel: Any, ctrl: Any, water: Water) -> tuple[Any, Any, Any]:
-        data = forward_parts(qpos, qvel, ctrl)
+        data = forward_parts(qpos, qvel)
         mass = support.full_m(model, data)
-        force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+        force = data.qfrc_passive - data.qfrc_bias
         zero = jnp.zeros((), qpos.dtype)
         # Spatial acceleration of each body when no joint accelerates: d/dt of J at constant q̇.
-        _, still = jax.jvp(
-            lambda t: velocities(moved(qpos, qvel, t), qvel), (zero,), (zero + 1,)
-        )
+        _, still = jax.jvp(lambda t: velocities(moved(qpos, qvel, t), qvel), (zero,), (zero + 1,))
         for level, drift_rate in zip(tree.levels, still, strict=True):
             jacobian, axes = jacobians(data, level)
             rate = jnp.einsum("bij,j->bi", jacobian, qvel)
@@ -108,38 +109,28 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
             drift = water_drift(motion, water) if is_drifting(water) else None
             torque, push, added = outer_forces(world, level, motion, drift, water)
             n = len(level.body)
-            stack = lambda xs: jnp.stack(  # noqa: E731
-                [jnp.broadcast_to(jnp.asarray(x, qpos.dtype), (n, 1))[:, 0] for x in xs], -1
-            )
-            wrench = jnp.concatenate([stack(torque), stack(push)], -1)
+            wrench = jnp.concatenate([_stack(torque, n), _stack(push, n)], -1)
             if added is not None:
-                block = lambda mat: jnp.stack([stack(row) for row in mat], -2)  # noqa: E731
-                cross = block(added.cross)
-                spatial = jnp.concatenate(
-                    [
-                        jnp.concatenate([block(full(added.angular)), cross], -1),
-                        jnp.concatenate([jnp.swapaxes(cross, 1, 2), block(full(added.linear))], -1),
-                    ],
-                    -2,
-                )
+                spatial = _dense(added, n)
                 wrench = wrench - jnp.einsum("bij,bj->bi", spatial, drift_rate)
                 mass = mass + jnp.einsum("bik,bij,bjl->kl", jacobian, spatial, jacobian)
             force = force + jnp.einsum("bij,bi->j", jacobian, wrench)
         diagonal = jnp.asarray(m.dof_damping * dt, qpos.dtype)
-        start = 0
+        power, start = zero, 0
         for level in tree.levels[1:]:
             stop = start + len(level.body)
             q, v = tree.qpos_index[start:stop], tree.qvel_index[start:stop]
-            torque, inertia = end_stop(level, qpos[q][:, None], qvel[v][:, None], dt)
-            force = force.at[v].add(torque[:, 0])
-            diagonal = diagonal.at[v].add(inertia[:, 0])
+            angle, speed = qpos[q][:, None], qvel[v][:, None]
+            motor, motor_inertia = servo(
+                level, angle, speed, ctrl[tree.ctrl_index[start:stop]][:, None], dt
+            )
+            torque, inertia = end_stop(level, angle, speed, dt)
+            force = force.at[v].add((torque + motor)[:, 0])
+            diagonal = diagonal.at[v].add((inertia + motor_inertia)[:, 0])
+            power = power + jnp.sum(jnp.abs(motor * speed))
             start = stop
-        acceleration = jax.scipy.linalg.solve(
-            mass + jnp.diag(diagonal), force, assume_a="pos"
-        )
+        acceleration = jax.scipy.linalg.solve(mass + jnp.diag(diagonal), force, assume_a="pos")
         new = qvel + dt * acceleration
-        speeds = qvel[np.asarray(m.jnt_dofadr[m.actuator_trnid[:, 0]], int)] if m.nu else zero[None]
-        power = jnp.sum(jnp.abs(data.actuator_force * speeds)) if m.nu else zero
         return moved(qpos, new, jnp.asarray(dt, qpos.dtype)), new, power
 
     def step(state: Any, ctrl: jax.Array, water: Water) -> tuple[Any, jax.Array]:
@@ -167,3 +158,21 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         return qpos.at[3:7].divide(length), qvel
 
     return Engine(init, step, lambda s: s, lambda s: tuple(s[0][:3]), np.arange(m.nu))
+
+
+def _stack(components: Any, n: int) -> jax.Array:
+    """Components of `[nbody, 1]` each to `[nbody, number]`."""
+    dtype = jnp.result_type(float)
+    wide = [jnp.broadcast_to(jnp.asarray(x, dtype), (n, 1))[:, 0] for x in components]
+    return jnp.stack(wide, -1)
+
+
+def _dense(inertia: SpatialInertia, n: int) -> jax.Array:
+    """A spatial inertia as `[nbody, 6, 6]`."""
+    angular, cross, linear = (
+        jnp.stack([_stack(row, n) for row in block], -2)
+        for block in (full(inertia.angular), inertia.cross, full(inertia.linear))
+    )
+    top = jnp.concatenate([angular, cross], -1)
+    bottom = jnp.concatenate([jnp.swapaxes(cross, 1, 2), linear], -1)
+    return jnp.concatenate([top, bottom], -2)

@@ -7,6 +7,8 @@ of masses, inertias, axes, limits and gains for every engine.
 
 from __future__ import annotations
 
+import contextlib
+import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,9 +30,11 @@ from mjx_revolve.morphology import Morphology
 from mjx_revolve.terrain import sample_bed
 from mjx_revolve.world import World
 
-# Error at which the servo gives its full torque [rad]. A choice: hobby servos are stiff, and 0.1 rad
-# (6 degrees) with the speed limit's damping gives a lag of 19 ms.
-FULL_TORQUE_ERROR = 0.1
+# Error at which the servo gives its full torque [rad]. A choice: hobby servos are stiff.
+FULL_TORQUE_ERROR = 0.05
+# Share of the servo's effort that its gears' viscous friction takes at the speed limit [-]. A
+# choice; it is also what damps the servo, which has no velocity gain of its own.
+FRICTION = 1 / 5
 
 # Colour of a module whose YAML gives none (Revolve's default grey).
 _GREY = (0.5, 0.5, 0.5)
@@ -61,9 +65,7 @@ class Robot:
     @cached_property
     def mjx_model(self) -> Any:
         """The model on JAX's default device (`mujoco.mjx.Model`); made at first use."""
-        from mujoco import mjx
-
-        return mjx.put_model(self.mj_model)
+        return import_mjx().put_model(self.mj_model)
 
     @property
     def num_hinges(self) -> int:
@@ -89,6 +91,17 @@ class Robot:
         return qpos
 
 
+def import_mjx() -> Any:
+    """MJX, imported late because it is slow, and without the lines that it prints about Warp.
+
+    Returns:
+        The module `mujoco.mjx`.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
+
+
 def build_robot(morphology: Morphology, world: World) -> Robot:
     """Compiles a morphology in a world.
 
@@ -105,6 +118,7 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
     spec = mujoco.MjSpec()
     spec.modelname = str(morphology.name)
     spec.compiler.degree = False
+    spec.nuser_jnt = 1
     spec.option.timestep = world.timestep
     spec.option.gravity = [0.0, 0.0, -world.gravity]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -241,9 +255,9 @@ def _add_hinge(spec: mujoco.MjSpec, parent: _Link, module: Any) -> _Link:
         axis=list(hinge.axis),
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         range=list(hinge.range),
-        # A DC servo's torque falls linearly to zero at its no-load speed; as joint damping, that is
-        # the speed limit in every engine, and MuJoCo integrates it implicitly.
-        damping=hinge.effort / hinge.speed,
+        damping=FRICTION * hinge.effort / hinge.speed,
+        # MuJoCo has no speed limit; `dynamics.servo` reads it from here.
+        userdata=[hinge.speed],
     )
     stiffness = hinge.effort / FULL_TORQUE_ERROR
     spec.add_actuator(

@@ -16,7 +16,7 @@ from mjx_revolve.dynamics import Engine, make_population_engine
 from mjx_revolve.errors import InputError
 from mjx_revolve.hydrodynamics import Water, water_of
 from mjx_revolve.robot import Robot
-from mjx_revolve.xla import compiler_options, one_loop, share_once
+from mjx_revolve.xla import compiler_options, share_once
 
 ENGINES = ("population", "mjx")
 
@@ -35,8 +35,8 @@ class Trajectory:
         qpos: `[T, nq]` root position, world frame [m], root quaternion (w, x, y, z), hinges [rad].
         qvel: `[T, nv]` root velocity, world frame [m/s], root angular velocity, body frame [rad/s],
             hinges [rad/s].
-        xpos: `[T, nbody, 3]` origins of MuJoCo's bodies (0 is the world, 1 the core), world frame [m].
-        ctrl: `[T, nu]` joint targets [rad].
+        xpos: `[T, nbody, 3]` origins of MuJoCo's bodies (0 is the world, 1 the core), world frame
+        [m]. ctrl: `[T, nu]` joint targets [rad].
         power: `[T]` mechanical power at the servos, summed without sign [W].
     """
 
@@ -187,7 +187,7 @@ def _compiled(
     dt = robot.world.timestep
 
     def run(qpos: Any, qvel: Any, drive_input: Any, water: Water | None) -> Trajectory:
-        water = water_of(robot.world) if still else water
+        flow = water_of(robot.world) if still or water is None else water
         if controller is None:
             rows = drive_input[:, simulator.order, None]
             parameters, drive_state = None, ()
@@ -205,7 +205,7 @@ def _compiled(
             simulator.init(qpos[:, None], qvel[:, None]),
             drive_state,
             rows,
-            water,
+            flow,
             records=steps,
             every=1,
             timestep=dt,
@@ -258,7 +258,8 @@ def simulate(
         InputError: a shape or a number is wrong.
     """
     model, dt = robot.mj_model, robot.world.timestep
-    controller, rows = None, None
+    controller: Controller | None = None
+    rows: Any = None
     if isinstance(ctrl, BoundController):
         controller, drive_input = ctrl.controller, _array("genes", ctrl.genes, (-1,))
         if drive_input.shape[0] != controller.num_genes:

@@ -219,7 +219,8 @@ class Run:
         buffer = io.BytesIO()
         text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         # Names go into the zip as they are; "meta" cannot collide with an "array:" one.
-        np.savez(buffer, meta=text, **{f"array:{name}": value for name, value in arrays.items()})
+        named: dict[str, Any] = {f"array:{name}": value for name, value in arrays.items()}
+        np.savez(buffer, meta=text, **named)
         write_atomic(path, buffer.getvalue())
         for old in self.checkpoints()[keep:]:
             old.unlink(missing_ok=True)

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 Scalar = Any  # float, NumPy array or jax.Array that broadcast against each other
-Vec = tuple[Scalar, Scalar, Scalar]
-Mat = tuple[Vec, Vec, Vec]
-Sym = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
+Vec = tuple[Scalar, ...]  # 3
+Mat = tuple[Vec, ...]  # 3 rows
+Sym = tuple[Scalar, ...]  # 6: xx, xy, xz, yy, yz, zz
 
 SYM = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _SYM_INDEX = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
@@ -95,12 +95,12 @@ def total(*terms: Scalar) -> Scalar:
 
 
 def dot(a: Vec, b: Vec) -> Scalar:
-    """a · b."""
+    """A · b."""
     return total(*[mul(x, y) for x, y in zip(a, b, strict=True)])
 
 
 def cross(a: Vec, b: Vec) -> Vec:
-    """a × b."""
+    """A × b."""
     return (
         sub(mul(a[1], b[2]), mul(a[2], b[1])),
         sub(mul(a[2], b[0]), mul(a[0], b[2])),
@@ -109,17 +109,17 @@ def cross(a: Vec, b: Vec) -> Vec:
 
 
 def vadd(a: Any, b: Any) -> Any:
-    """a + b, component by component."""
+    """A + b, component by component."""
     return tuple(add(x, y) for x, y in zip(a, b, strict=True))
 
 
 def vsub(a: Any, b: Any) -> Any:
-    """a - b, component by component."""
+    """A - b, component by component."""
     return tuple(sub(x, y) for x, y in zip(a, b, strict=True))
 
 
 def vscale(s: Scalar, a: Any) -> Any:
-    """s a, component by component."""
+    """S a, component by component."""
     return tuple(mul(s, x) for x in a)
 
 
@@ -181,8 +181,9 @@ def safe_norm(a: Vec) -> Scalar:
 def sincos(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine by one argument reduction and two short polynomials.
 
-    XLA:CPU does not vectorise its own sine inside a called loop. Coefficients: Cephes `sinf`, `cosf`
-    (Moshier 1992), good to 1 ulp of float32 for |angle| < 8192; float64 uses XLA's own functions.
+    XLA:CPU does not vectorise its own sine inside a called loop. Coefficients: Cephes `sinf`,
+    `cosf` (Moshier 1992), good to 1 ulp of float32 for |angle| < 8192; float64 uses XLA's own
+    functions.
 
     Args:
         angle: any shape [rad].

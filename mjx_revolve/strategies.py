@@ -104,7 +104,7 @@ class Strategy:
     std_init: float
     population_based: bool
 
-    def init(self, key: jax.Array, mean: np.ndarray | None = None) -> dict[str, Any]:
+    def init(self, key: jax.Array, mean: Any = None) -> dict[str, Any]:
         """Starts a search.
 
         Args:
@@ -218,7 +218,7 @@ def _constructor_settings(
     evosax's defaults assume a step size of 1; ours follow `std_init`, so that every strategy moves
     at all within the some ten generations that a robot can afford.
     """
-    takes = inspect.signature(STRATEGIES[name].__init__).parameters
+    takes = inspect.signature(STRATEGIES[name]).parameters
     keywords: dict[str, Any] = {}
     used: dict[str, float] = {}
     if "std_schedule" in takes:

@@ -38,7 +38,7 @@ class Track:
     start_height: jax.Array
     length: float
     weight: float
-    surface_height: jax.Array
+    surface_height: jax.Array | float
 
     @property
     def duration(self) -> float:
@@ -76,7 +76,9 @@ def speed(track: Track, settings: Any) -> jax.Array:
 def reach_target(track: Track, settings: Any) -> jax.Array:
     """How much nearer to the target the robot ends than it began [body lengths]."""
     target = np.asarray(settings.target, float)
-    away = [safe_norm(tuple(row[i] - target[i] for i in range(3))) for row in track.position[[0, -1]]]
+    away = [
+        safe_norm(tuple(row[i] - target[i] for i in range(3))) for row in track.position[[0, -1]]
+    ]
     return (away[0] - away[1]) / track.length
 
 

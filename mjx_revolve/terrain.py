@@ -93,8 +93,8 @@ def bed_height(bed: Bed, x: Any, y: Any) -> Any:
 def bed_slope(bed: Bed, x: Any, y: Any) -> tuple[Any, Any]:
     """Slope of the bed by central differences over 2 cm.
 
-    Differences, because they are cheap, need no second formula, and average over about the size of a
-    module's edge.
+    Differences, because they are cheap, need no second formula, and average over about the size of
+    a module's edge.
 
     Args:
         bed: the bed.

@@ -18,8 +18,8 @@ from mjx_revolve.hydrodynamics import ellipsoid_constants
 from mjx_revolve.robot import Robot
 from mjx_revolve.spatial import SYM, Mat, Scalar, Sym, Vec, fold
 
-# Stiffness of a joint's end stop, as full effort per this overshoot [rad]. A choice: stiff enough to
-# keep within half a degree of the real range; the step treats it implicitly, so it is stable.
+# Stiffness of a joint's end stop, as full effort per this overshoot [rad]. A choice: stiff enough
+# to keep within half a degree of the real range; the step treats it implicitly, so it is stable.
 LIMIT_OVERSHOOT = 0.008
 
 
@@ -27,8 +27,8 @@ LIMIT_OVERSHOOT = 0.008
 class Parts:
     """Constants of the parts of one level, each `[npart, nbody, 1]` or a float.
 
-    Attributes are those of `hydrodynamics.FluidTable`, in the level's body frames, times the water's
-    density where a force needs it.
+    Attributes are those of `hydrodynamics.FluidTable`, in the level's body frames, times the
+    water's density where a force needs it.
     """
 
     position: Vec
@@ -47,7 +47,7 @@ class Parts:
     plate_area: Scalar
     plate_forward: Vec
     plate_upward: Vec
-    ellipsoid: dict[str, Any] | None
+    ellipsoid: Any
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class Level:
         target: limits of the servo's target, low and high [rad].
         range: limits of the joint, low and high [rad].
         stop: stiffness of the end stops [N·m/rad].
+        top_speed: of the servo [rad/s]; infinite where the model states none.
         box_rotation: body from inertial frame, for MuJoCo's inertia-box law.
         box_position: centre of mass [m].
         box_size: edges of the box of equal inertia [m].
@@ -104,6 +105,7 @@ class Level:
     target: tuple[Scalar, Scalar]
     range: tuple[Scalar, Scalar]
     stop: Scalar
+    top_speed: Scalar
     box_rotation: Mat
     box_position: Vec
     box_size: Vec
@@ -159,24 +161,24 @@ def _skew(r: np.ndarray) -> np.ndarray:
     return np.array([[0, -r[2], r[1]], [r[2], 0, -r[0]], [-r[1], r[0], 0]])
 
 
-def _vec(rows: list[Any]) -> Vec:
+def _vec(rows: Any) -> Vec:
     """`[..., 3]` to three constants `[..., 1]`."""
     a = _clean(np.asarray(rows, np.float64))
     return tuple(fold(a[..., i, None]) for i in range(3))
 
 
-def _mat(rows: list[Any]) -> Mat:
+def _mat(rows: Any) -> Mat:
     a = _clean(np.asarray(rows, np.float64))
     return tuple(tuple(fold(a[..., i, j, None]) for j in range(3)) for i in range(3))
 
 
-def _sym(rows: list[Any]) -> Sym:
+def _sym(rows: Any) -> Sym:
     a = np.asarray(rows, np.float64)
     a = np.where(np.abs(a) < 1e-15, 0, a)
     return tuple(fold(a[..., i, j, None]) for i, j in SYM)
 
 
-def _num(rows: list[Any]) -> Scalar:
+def _num(rows: Any) -> Scalar:
     return fold(np.asarray(rows, np.float64)[..., None])
 
 
@@ -237,7 +239,9 @@ def _level(
     contact: bool,
 ) -> Level:
     m = robot.mj_model
-    rotation, position, moment, inertia, box_rotation, box_position, box_size = ([] for _ in "1234567")
+    rotation, position, moment, inertia, box_rotation, box_position, box_size = (
+        [] for _ in "1234567"
+    )
     for b in ids:
         c = frames[b]
         up = frames[int(m.body_parentid[b])] if above else np.eye(3)
@@ -247,12 +251,12 @@ def _level(
         axes = c.T @ _rotation(m.body_iquat[b])
         mass = m.body_mass[b]
         moment.append(mass * com)
-        inertia.append(
-            axes @ np.diag(m.body_inertia[b]) @ axes.T - mass * _skew(com) @ _skew(com)
-        )
+        inertia.append(axes @ np.diag(m.body_inertia[b]) @ axes.T - mass * _skew(com) @ _skew(com))
         i = m.body_inertia[b]
         # MuJoCo: a uniform box of the same mass and principal inertia.
-        edges = np.maximum(np.array([i[1] + i[2] - i[0], i[0] + i[2] - i[1], i[0] + i[1] - i[2]]), 0)
+        edges = np.maximum(
+            np.array([i[1] + i[2] - i[0], i[0] + i[2] - i[1], i[0] + i[1] - i[2]]), 0
+        )
         box_size.append(np.sqrt(6 * edges / mass))
         box_rotation.append(axes)
         box_position.append(com)
@@ -281,11 +285,12 @@ def _level(
             "target": (_num(target[:, 0]), _num(target[:, 1])),
             "range": (_num(limits[:, 0]), _num(limits[:, 1])),
             "stop": _num(strong / LIMIT_OVERSHOOT),
+            "top_speed": _num(m.jnt_user[joint, 0] if m.nuser_jnt else np.full(len(joint), np.inf)),
         }
     else:
         pair = (0.0, 0.0)
         zero = dict.fromkeys(
-            ("armature", "damping", "gain", "stiffness", "servo_damping", "stop"), 0.0
+            ("armature", "damping", "gain", "stiffness", "servo_damping", "stop", "top_speed"), 0.0
         )
         hinge = {**zero, "effort": pair, "target": pair, "range": pair}
     where = {b: k for k, b in enumerate(above)}
@@ -320,7 +325,9 @@ def _parts(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Parts
         return None
 
     def gather(value: Any, empty: Any) -> np.ndarray:
-        return _stack([[value(p, frames[b]) for p in row] for b, row in zip(ids, rows, strict=True)], empty)
+        return _stack(
+            [[value(p, frames[b]) for p in row] for b, row in zip(ids, rows, strict=True)], empty
+        )
 
     def turn(p: int, c: np.ndarray) -> np.ndarray:
         return _clean(c.T @ table.rotation[p])
@@ -362,8 +369,9 @@ def _parts(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Parts
         center=_vec(gather(lambda p, c: table.center_of_volume[p], zero3)),
         center_position=_vec(
             gather(
-                lambda p, c: c.T
-                @ (table.position[p] + table.rotation[p] @ table.center_of_volume[p]),
+                lambda p, c: (
+                    c.T @ (table.position[p] + table.rotation[p] @ table.center_of_volume[p])
+                ),
                 zero3,
             )
         ),
@@ -422,8 +430,6 @@ def _points(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Poin
         ),
         # A padded point has no mass, so its spring, damper and friction vanish.
         mass=_num(
-            _stack(
-                [[mass[b] / len(row)] * len(row) for b, row in zip(ids, rows, strict=True)], 0.0
-            )
+            _stack([[mass[b] / len(row)] * len(row) for b, row in zip(ids, rows, strict=True)], 0.0)
         ),
     )

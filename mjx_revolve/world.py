@@ -133,7 +133,7 @@ def _read_vector(place: str, value: Any) -> tuple[float, ...]:
         raise InputError(f"{place}: expected 3 numbers; found {value!r}")
     for axis, v in zip("xyz", vector, strict=True):
         if hasattr(v, "item"):
-            v = v.item()  # noqa: PLW2901  (numpy scalars are numbers too)
+            v = v.item()
         _check_number(f"{place}.{axis}", v)
     return tuple(float(v) for v in vector)
 

@@ -3,10 +3,12 @@
 Two things stand in the way, and two internal annotations of XLA remove them (jaxlib is pinned for
 their sake; tests/test_xla.py notices if they lose their effect; results do not depend on them):
 
-1. XLA:CPU recomputes a shared value inside every fusion that uses it, and a tree recursion is nothing
+1. XLA:CPU recomputes a shared value inside every fusion that uses it, and a tree recursion is
+nothing
    but shared values: the work multiplies with depth. `optimization_barrier` does not help, as the
    CPU compiler drops it before fusion. A call that is never inlined does: `share_once`.
-2. Each kernel that the loop runs costs about 300 ns to dispatch, more than the arithmetic on a chunk of
+2. Each kernel that the loop runs costs about 300 ns to dispatch, more than the arithmetic on a
+chunk of
    64 individuals. A call marked `xla_cpu_small_call` is compiled into one function: `one_loop`.
    Inside it there is no scatter and no reduction: the population step writes sums out.
 
@@ -69,7 +71,8 @@ def share_once(fun: Callable[..., Any]) -> Callable[..., Any]:
         fun: a function of pytrees of arrays.
 
     Returns:
-        The same function, its multiply-used floating-point values behind calls that are not inlined.
+        The same function, its multiply-used floating-point values behind calls that are not
+        inlined.
     """
 
     def shared(*args: Any) -> Any:
