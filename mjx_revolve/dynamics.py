@@ -425,18 +425,23 @@ def _solve_root(inertia: SpatialInertia, bias: tuple[Vec, Vec]) -> tuple[Vec, Ve
     return tuple(rhs[3:]), tuple(rhs[:3])
 
 
+# Share of its top speed up to which a servo gives its full effort [-]. A choice, between the
+# straight line of a bare motor (0) and Revolve's box of effort and speed (1).
+_KNEE = 0.75
+
+
 def servo(
     level: Level, angle: Scalar, speed: Scalar, target: Scalar, dt: float
 ) -> tuple[Scalar, Scalar]:
     """Torque of the position servos, and what an implicit step adds to the joints' inertia.
 
     MuJoCo's position actuator, clip(k_p (target - q), ± effort), on a motor whose driver limits its
-    current: full effort up to half its top speed, from there a line that the joint's friction d q̇
-    meets at the top speed,
+    current: full effort up to three quarters of its top speed w, from there a line that the
+    joint's friction d q̇ meets at the top speed,
 
-        τ ≤ d w + k (w - q̇),   k = 2 (effort - d w) / w,
+        τ ≤ d w + k (w - q̇),   k = (effort - d w) / (w / 4),
 
-    and likewise backwards. Below half the top speed it is stock MuJoCo. The line acts on the speed
+    and likewise backwards. Below the knee it is stock MuJoCo. The line acts on the speed
     at the end of the step as soon as it may be met within the step: a light limb could otherwise
     pass the top speed in one step from rest.
 
@@ -462,7 +467,7 @@ def servo(
     w = np.where(limited, top, 1.0)
     friction = np.asarray(level.damping) * w
     effort = np.where(limited, level.effort[1], friction)
-    slope = np.where(limited, np.maximum(2 * (effort - friction) / w, 0), 0)
+    slope = np.where(limited, np.maximum((effort - friction) / ((1 - _KNEE) * w), 0), 0)
     # No limb is lighter than the body that the hinge carries: where the line may be met.
     reach = dt / (np.asarray(level.inertia[5]) + np.asarray(level.armature) + dt * level.damping)
     forward = jnp.sign(torque)

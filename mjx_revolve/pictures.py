@@ -2,14 +2,14 @@
 
 The parts' meshes are drawn by a small depth buffer of our own, in parallel projection: matplotlib
 sorts whole polygons by their mean depth, which puts parts that touch in the wrong order. Nothing
-here needs a display or a graphics driver.
+here needs a display or a graphics driver. `swim_picture` draws with the same functions.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,19 +44,49 @@ _TURN = math.cos(math.radians(30.0))
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """What is drawn: `m` triangles in the world frame."""
+class Scene:
+    """What is drawn: `m` triangles in the world frame.
 
-    corners: np.ndarray  # [m, 3, 3] m
-    color: np.ndarray  # [m, 3] red, green, blue from 0 to 1
-    part: np.ndarray  # [m] number of the part that the triangle belongs to
+    Attributes:
+        corners: `[m, 3, 3]` [m].
+        color: `[m, 3]` red, green, blue from 0 to 1.
+        part: `[m]` number of the piece that the triangle belongs to.
+    """
+
+    corners: np.ndarray
+    color: np.ndarray
+    part: np.ndarray
 
 
-def _scene(morphology: Morphology) -> _Scene:
-    """All parts of the morphology at rest."""
+@dataclass(frozen=True)
+class Piece:
+    """One part of a module, or the rod that shows a hinge's axis.
+
+    Attributes:
+        module: number of the module in its morphology.
+        part: the part of the module that carries it.
+        corners: `[m, 3, 3]` triangles, module frame at hinge angle 0 [m].
+        color: `[3]` red, green, blue from 0 to 1.
+    """
+
+    module: int
+    part: int
+    corners: np.ndarray
+    color: np.ndarray
+
+
+def make_pieces(morphology: Morphology) -> list[Piece]:
+    """All parts of a morphology in their file's colours, and a rod for each hinge's axis.
+
+    Args:
+        morphology: the robot's modules.
+
+    Returns:
+        The pieces, in the order of the modules and their parts.
+    """
     meshes: dict[Hashable, list[np.ndarray]] = {}
-    corners, color, part_id, count = [], [], [], 0
-    for module in morphology.modules:
+    pieces = []
+    for number, module in enumerate(morphology.modules):
         kind = module.kind
         drawn = tuple((part.name, part.boxes, part.volume, part.position) for part in kind.parts)
         key = (kind.name, kind.hinge, drawn)
@@ -64,21 +94,52 @@ def _scene(morphology: Morphology) -> _Scene:
             meshes[key] = [
                 part_mesh(kind, part).triangles + np.asarray(part.position) for part in kind.parts
             ]
-        position, rotation = np.asarray(module.position), np.asarray(module.rotation)
         rgb = np.clip(np.asarray(_GREY if module.rgb is None else module.rgb, float), 0.0, 1.0)
         for k, triangles in enumerate(meshes[key]):
-            corners.append(triangles @ rotation.T + position)
             shade = rgb * (_MOVING if kind.hinge is not None and k > 0 else 1.0)
-            color.append(np.broadcast_to(shade, (len(triangles), 3)))
-            part_id.append(np.full(len(triangles), count))
-            count += 1
+            pieces.append(Piece(number, k, triangles, shade))
         if kind.hinge is not None:
             rod = _rod(kind.hinge.axis) + np.asarray(kind.hinge.anchor)
-            corners.append(rod @ rotation.T + position)
-            color.append(np.broadcast_to(_AXIS, (len(rod), 3)))
-            part_id.append(np.full(len(rod), count))
-            count += 1
-    return _Scene(np.concatenate(corners), np.concatenate(color), np.concatenate(part_id))
+            pieces.append(Piece(number, 0, rod, np.array(_AXIS)))
+    return pieces
+
+
+def place_pieces(
+    pieces: Sequence[Piece], place: Callable[[Piece], tuple[np.ndarray, np.ndarray]]
+) -> Scene:
+    """Puts pieces together.
+
+    Args:
+        pieces: from `make_pieces`.
+        place: position `[3]` [m] and rotation `[3, 3]` of a piece's module frame in the world.
+
+    Returns:
+        The scene.
+    """
+    corners, color, part = [], [], []
+    for number, piece in enumerate(pieces):
+        position, rotation = place(piece)
+        corners.append(piece.corners @ rotation.T + position)
+        color.append(np.broadcast_to(piece.color, (len(piece.corners), 3)))
+        part.append(np.full(len(piece.corners), number))
+    return Scene(np.concatenate(corners), np.concatenate(color), np.concatenate(part))
+
+
+def rest_scene(morphology: Morphology) -> Scene:
+    """All parts of the morphology at rest.
+
+    Args:
+        morphology: the robot's modules.
+
+    Returns:
+        The scene, the core's frame at the world's origin.
+    """
+
+    def place(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+        module = morphology.modules[piece.module]
+        return np.asarray(module.position), np.asarray(module.rotation)
+
+    return place_pieces(make_pieces(morphology), place)
 
 
 def _rod(axis: Sequence[float]) -> np.ndarray:
@@ -95,12 +156,15 @@ def _rod(axis: Sequence[float]) -> np.ndarray:
     return np.array(walls + [(low[0], low[k + 1], low[k]) for k in range(1, 5)])
 
 
-def _view(azimuth: float, elevation: float) -> np.ndarray:
-    """Rotation `[3, 3]` from the world to a view: right, up, towards the viewer.
+def make_view(azimuth: float, elevation: float) -> np.ndarray:
+    """Rotation from the world to a view.
 
     Args:
         azimuth: where the viewer stands, about z from x [deg].
         elevation: how high [deg].
+
+    Returns:
+        `[3, 3]`; its rows are right, up and towards the viewer.
     """
     a, e = math.radians(azimuth), math.radians(elevation)
     right = np.array([-math.sin(a), math.cos(a), 0.0])
@@ -178,10 +242,24 @@ def _lines(depth: np.ndarray, part: np.ndarray, normal: np.ndarray) -> np.ndarra
     return line
 
 
-def _draw(
-    scene: _Scene, view: np.ndarray, low: np.ndarray, high: np.ndarray, pixel: float
+def draw_scene(
+    scene: Scene,
+    view: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    pixel: float,
+    tint: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Picture of the scene in a view.
+    """Picture of a scene in a view.
+
+    Args:
+        scene: what to draw.
+        view: from `make_view`.
+        low: `[2]` lower left corner of the picture, right and up in the view [m].
+        high: `[2]` its upper right corner at least [m].
+        pixel: size of a pixel [m].
+        tint: changes the finished colours: `[..., 3]` colours and `[..., 3]` places in the view
+            (right, up, towards the viewer [m]; towards is -inf where nothing is) to `[..., 3]`.
 
     Returns:
         red, green, blue, alpha `[rows, columns, 4]`, row 0 the lowest, and what it covers: left,
@@ -204,6 +282,10 @@ def _draw(
     color = 0.06 + 0.94 * scene.color[index]
     color = np.clip(color * light[..., None], 0.0, 1.0)
     color[_lines(depth, part, normal)] *= 0.4
+    if tint is not None:
+        right = low[0] + fine * (np.arange(columns * _FINE) + 0.5)
+        up = low[1] + fine * (np.arange(rows * _FINE) + 0.5)
+        color = tint(color, np.stack([*np.meshgrid(right, up), depth], axis=-1))
     image = np.concatenate([color * covered[..., None], covered[..., None]], axis=-1)
     image = image.reshape(rows, _FINE, columns, _FINE, 4).mean(axis=(1, 3))
     image[..., :3] /= np.maximum(image[..., 3:], 1e-6)
@@ -225,7 +307,7 @@ def _number(value: float) -> str:
     return f"{value + 0.0:.4g}".replace("-", "\u2212")
 
 
-def _shadow(axes: Axes, scene: _Scene, view: np.ndarray, ground: float) -> None:
+def _shadow(axes: Axes, scene: Scene, view: np.ndarray, ground: float) -> None:
     """Draws the soft shadow that light from straight above throws on the floor z = `ground`."""
     points = scene.corners[..., :2].reshape(-1, 2)
     blur = 0.01
@@ -249,7 +331,7 @@ def _shadow(axes: Axes, scene: _Scene, view: np.ndarray, ground: float) -> None:
 
 
 def _floor(
-    axes: Axes, scene: _Scene, view: np.ndarray, low: np.ndarray, high: np.ndarray
+    axes: Axes, scene: Scene, view: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
     """Draws a floor grid and three scaled axes below and beside the bounds `low` to `high` [m].
 
@@ -310,11 +392,11 @@ def _floor(
     return np.array(corners) @ view[:2].T
 
 
-def _show(axes: Axes, scene: _Scene, view: np.ndarray, pixel: float) -> None:
+def _show(axes: Axes, scene: Scene, view: np.ndarray, pixel: float) -> None:
     """Draws the scene into axes whose units are metres of the view."""
     points = scene.corners.reshape(-1, 3) @ view[:2].T
     margin = 4 * pixel
-    image, extent = _draw(scene, view, points.min(0) - margin, points.max(0) + margin, pixel)
+    image, extent = draw_scene(scene, view, points.min(0) - margin, points.max(0) + margin, pixel)
     limits = axes.axis()
     axes.imshow(image, extent=extent, origin="lower", interpolation="bilinear", zorder=3)
     axes.axis(limits)
@@ -322,7 +404,7 @@ def _show(axes: Axes, scene: _Scene, view: np.ndarray, pixel: float) -> None:
 
 def _compose(morphology: Morphology) -> Figure:
     """The whole picture."""
-    scene = _scene(morphology)
+    scene = rest_scene(morphology)
     low, high = scene.corners.min((0, 1)), scene.corners.max((0, 1))
     width, height = _INCHES
     figure = Figure(figsize=_INCHES, dpi=_DPI, facecolor="white")
@@ -332,7 +414,7 @@ def _compose(morphology: Morphology) -> Figure:
     room = np.array([8.3, height - 0.75])
     axes = figure.add_axes((0.1 / width, 0.1 / height, room[0] / width, room[1] / height))
     axes.set_axis_off()
-    view = _view(-58.0, 30.0)
+    view = make_view(-58.0, 30.0)
     corners = _floor(axes, scene, view, low, high)
     center = (corners.min(0) + corners.max(0)) / 2
     unit = float((np.ptp(corners, axis=0) / room).max()) * 1.01  # metres per inch
@@ -346,7 +428,7 @@ def _compose(morphology: Morphology) -> Figure:
     along = 0 if size[0] >= 0.8 * size[1] else 1  # the side view looks across the longer way
     panels = (
         (0, 1, "from above", np.eye(3)),
-        (along, 2, "from the side", _view(-90.0 if along == 0 else 0.0, 0.0)),
+        (along, 2, "from the side", make_view(-90.0 if along == 0 else 0.0, 0.0)),
     )
     room = np.array([3.4, height - 2.7])
     wide, tall = (np.array([size[panel[k]] + 2 * pad for panel in panels]) for k in (0, 1))
@@ -385,6 +467,49 @@ def _compose(morphology: Morphology) -> Figure:
     return figure
 
 
+def check_picture_path(path: str | Path) -> Path:
+    """Whether a picture may be written somewhere.
+
+    Args:
+        path: of the PNG.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: `path` does not end in `.png`, is a folder, or lies in none.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: expected a name that ends in .png; found '{path.suffix}'")
+    if path.is_dir():
+        raise InputError(f"{path}: expected a file; found a folder")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: expected the folder {path.parent} to exist; found none")
+    return path
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Writes a figure as a PNG that appears whole or not at all.
+
+    Args:
+        figure: the figure.
+        path: the file, see `check_picture_path`.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with draft.open("wb") as file:
+            figure.savefig(file, format="png", dpi=figure.dpi)
+        os.replace(draft, path)
+    except OSError as error:
+        raise InputError(f"{path}: expected a writable file; found {error.strerror}") from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
 def draw_morphology(morphology: Morphology, path: str | Path) -> None:
     """Draws a morphology at rest: three-quarter, top and side view, axes in metres.
 
@@ -399,20 +524,5 @@ def draw_morphology(morphology: Morphology, path: str | Path) -> None:
         InputError: `path` does not end in `.png`, its folder does not exist, or it cannot be
             written.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: expected a name that ends in .png; found '{path.suffix}'")
-    if path.is_dir():
-        raise InputError(f"{path}: expected a file; found a folder")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: expected the folder {path.parent} to exist; found none")
-    figure = _compose(morphology)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with draft.open("wb") as file:
-            figure.savefig(file, format="png", dpi=_DPI)
-        os.replace(draft, path)
-    except OSError as error:
-        raise InputError(f"{path}: expected a writable file; found {error.strerror}") from None
-    finally:
-        draft.unlink(missing_ok=True)
+    path = check_picture_path(path)
+    write_figure(_compose(morphology), path)
