@@ -398,6 +398,10 @@ def _finish(run: Run, config: Config, fitness: Any, search: Search) -> None:
         height = float(getattr(getattr(robot, "world", None), "surface_height", 0.0))
         figure = plots.plot_trajectory(trajectory, height, title)
         run.write("trajectory.png", plots.figure_png(figure))
+        if robot is not None:
+            from mjx_revolve.swim_picture import plot_swim
+
+            run.write("swim.png", plots.figure_png(plot_swim(robot, trajectory)))
     run.update_info(finished=_now(), generations=search.generation, champion=facts)
     print(f"champion: {result} ({champion.origin})")
     if champion.measures:

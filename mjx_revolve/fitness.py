@@ -8,7 +8,7 @@ vmap and grad.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -221,7 +221,7 @@ class Fitness:
         world, controller = self.robot.world, self.controller
         parameters = controller.decode(genes, self.engine.order)
 
-        def loop(qpos: Any, parameters: Any, water: Any) -> Any:
+        def loop(qpos: Any, parameters: Any, water: Any, derived: bool = False) -> Any:
             qvel = jnp.zeros((self.robot.mj_model.nv, qpos.shape[-1]), qpos.dtype)
             still = Water(world.surface_height, tuple(world.current))
             _, kept = roll_out(
@@ -235,12 +235,15 @@ class Fitness:
                 records=self._records,
                 every=self._every,
                 timestep=world.timestep,
+                derived=derived,
             )
             return kept
 
         if self.config.engine == "population":
-            loop = one_loop(loop)
-        place, energy = loop(qpos, parameters, water)
+            episode = one_loop(loop, partial(loop, derived=True))
+        else:
+            episode = loop
+        place, energy = episode(qpos, parameters, water)
         return jnp.stack(place, 1), energy
 
 

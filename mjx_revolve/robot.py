@@ -128,6 +128,7 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
     _add_bed(spec, world)
     rows, points = _add_modules(spec, morphology, world)
     try:
+        _limit_stiffness(spec, spec.compile())
         model = spec.compile()
     except ValueError as error:
         reason = str(error).splitlines()[0]
@@ -274,6 +275,27 @@ def _add_hinge(spec: mujoco.MjSpec, parent: _Link, module: Any) -> _Link:
         forcerange=[-hinge.effort, hinge.effort],
     )
     return _Link(body, module.name, anchor, module.rotation)
+
+
+def _limit_stiffness(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Softens servos that are too stiff for the limb that they move and the time step.
+
+    MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d implicitly;
+    it is well damped while k dt² is at most 1.5 (I + d dt). Only hinges that carry next to nothing
+    are touched.
+    """
+    dt = model.opt.timestep
+    for actuator in spec.actuators:
+        joint = model.joint(actuator.target).id
+        body, axis = model.jnt_bodyid[joint], model.jnt_axis[joint]
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body_iquat[body])
+        along = turn.reshape(3, 3).T @ axis
+        arm = np.cross(axis, model.body_ipos[body])
+        inertia = model.body_inertia[body] @ along**2 + model.body_mass[body] * (arm @ arm)
+        most = 1.5 * (inertia / dt**2 + model.dof_damping[model.jnt_dofadr[joint]] / dt)
+        stiffness = min(actuator.gainprm[0], most)
+        actuator.gainprm[0], actuator.biasprm[1] = stiffness, -stiffness
 
 
 def _add_geoms(

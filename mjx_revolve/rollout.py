@@ -84,6 +84,7 @@ def roll_out(
     records: int,
     every: int,
     timestep: float,
+    derived: bool = False,
 ) -> tuple[Any, Any]:
     """Steps a chunk of a population and records it now and then.
 
@@ -99,6 +100,8 @@ def roll_out(
         records: how many records.
         every: steps between them.
         timestep: [s].
+        derived: whether it is to be differentiated: then each step is computed again on the way
+            back, so that memory grows with the state and not with the step's working.
 
     Returns:
         The last state, and the records, `[records, ...]` each.
@@ -112,6 +115,8 @@ def roll_out(
         return (state, drive_state, energy + timestep * power, count + 1), ctrl
 
     shared = share_once(step)
+    if derived:
+        shared = jax.checkpoint(shared, prevent_cse=False)
 
     def block(carry: Any, rows: Any) -> tuple[Any, Any]:
         state, drive_state, energy, count = carry
@@ -186,7 +191,9 @@ def _compiled(
     simulator = make_engine(robot, engine)
     dt = robot.world.timestep
 
-    def run(qpos: Any, qvel: Any, drive_input: Any, water: Water | None) -> Trajectory:
+    def run(
+        qpos: Any, qvel: Any, drive_input: Any, water: Water | None, derived: bool = False
+    ) -> Trajectory:
         flow = water_of(robot.world) if still or water is None else water
         if controller is None:
             rows = drive_input[:, simulator.order, None]
@@ -209,6 +216,7 @@ def _compiled(
             records=steps,
             every=1,
             timestep=dt,
+            derived=derived,
         )
         qs, vs = jax.vmap(simulator.observe)(states)
         back = np.argsort(simulator.order)
@@ -221,7 +229,7 @@ def _compiled(
             power=energy[..., 0] / dt,
         )
 
-    return jax.jit(run, compiler_options=compiler_options()), run
+    return jax.jit(run, compiler_options=compiler_options()), partial(run, derived=True)
 
 
 def simulate(

@@ -77,7 +77,8 @@ def reach_target(track: Track, settings: Any) -> jax.Array:
     """How much nearer to the target the robot ends than it began [body lengths]."""
     target = np.asarray(settings.target, float)
     away = [
-        safe_norm(tuple(row[i] - target[i] for i in range(3))) for row in track.position[[0, -1]]
+        safe_norm(tuple(row[i] - target[i] for i in range(3)))
+        for row in (track.position[0], track.position[-1])
     ]
     return (away[0] - away[1]) / track.length
 

@@ -20,6 +20,8 @@ from mjx_revolve.spatial import sincos
 LAKE_EXTENT = 998.0
 LAKE_LOWEST = -112.8
 LAKE_HIGHEST = 36.7
+# Height of the dunes as a share of the lake's: 0.8 m in the thesis's lake. A choice.
+_DUNES = 0.8 / (LAKE_HIGHEST - LAKE_LOWEST)
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,8 @@ def bed_height(bed: Bed, x: Any, y: Any) -> Any:
 
     The lake is a basin that is flat out to 30 % of its half width, climbs along a smooth-step slope
     and ends in a shore at 98 %; the waterline lies two thirds up. It is a little longer in x
-    than in y, and carries dunes of 0.8 m that vanish at the bottom and on the shore, so that the
-    stated extremes are exact.
+    than in y, and carries low dunes (0.8 m in the thesis's lake) that vanish at the bottom and on
+    the shore, so that the stated extremes are exact.
 
     Args:
         bed: the bed.
@@ -85,9 +87,11 @@ def bed_height(bed: Bed, x: Any, y: Any) -> Any:
     # 1e-12 keeps the square root differentiable at the centre.
     radius = jnp.sqrt((x / (1.05 * half)) ** 2 + (y / half) ** 2 + 1e-12)
     rise = jnp.clip((radius - 0.3) / (0.98 - 0.3), 0.0, 1.0)
-    dunes = 0.8 * sincos(x * (2 * np.pi / 61))[0] * sincos(y * (2 * np.pi / 43))[0]
+    dunes = _DUNES * sincos(x * (2 * np.pi / 61))[0] * sincos(y * (2 * np.pi / 43))[0]
+    # Squared, like the smooth step's start: dunes that rose faster would dig below the bottom.
+    where = 16 * (rise * (1 - rise)) ** 2
     smooth = rise * rise * (3 - 2 * rise)
-    return bed.height + (bed.highest - bed.height) * smooth + dunes * 4 * rise * (1 - rise)
+    return bed.height + (bed.highest - bed.height) * (smooth + dunes * where)
 
 
 def bed_slope(bed: Bed, x: Any, y: Any) -> tuple[Any, Any]:

@@ -22,6 +22,27 @@ DRAG = ("faces", "lift_drag", "inertia_box", "ellipsoid", "off")
 _FOLDER = Path(__file__).parent / "worlds"
 
 
+def _or(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names))
+
+
+def _check_number(
+    place: str, value: Any, low: float | None = None, high: float | None = None
+) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{place}: expected a number; found {value!r}")
+    try:
+        finite = math.isfinite(value)
+    except OverflowError:  # an integer of more than 308 digits
+        finite, value = False, "a huge integer"
+    if not finite:
+        raise InputError(f"{place}: expected a finite number; found {value!r}")
+    if low is not None and value < low:
+        raise InputError(f"{place}: expected at least {low:g}; found {value!r}")
+    if high is not None and value > high:
+        raise InputError(f"{place}: expected at most {high:g}; found {value!r}")
+
+
 @dataclass(frozen=True)
 class LiftDrag:
     """Parameters of Gazebo's LiftDrag plugin for one plate (world option `drag: lift_drag`).
@@ -33,7 +54,9 @@ class LiftDrag:
         alpha_stall: stall angle [rad].
         cla_stall: lift slope after the stall [1/rad].
         cda_stall: drag slope after the stall [1/rad].
-        cma: moment slope before the stall [1/rad] is not modelled, as in the thesis.
+
+    The plugin's moment slope (`cma`) and centre of pressure (`cp`, here the box's centre) are not
+    modelled.
     """
 
     a0: float = 0.0
@@ -42,6 +65,10 @@ class LiftDrag:
     alpha_stall: float = math.pi / 2
     cla_stall: float = 0.0
     cda_stall: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            _check_number(f"lift_drag.{field.name}", getattr(self, field.name))
 
 
 @dataclass(frozen=True)
@@ -96,23 +123,6 @@ class World:
             raise InputError(f"name: expected a text; found {self.name!r}")
 
 
-def _or(names: Sequence[str]) -> str:
-    return ", ".join(map(repr, names))
-
-
-def _check_number(
-    place: str, value: Any, low: float | None = None, high: float | None = None
-) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{place}: expected a number; found {value!r}")
-    if not math.isfinite(value):
-        raise InputError(f"{place}: expected a finite number; found {value!r}")
-    if low is not None and value < low:
-        raise InputError(f"{place}: expected at least {low:g}; found {value!r}")
-    if high is not None and value > high:
-        raise InputError(f"{place}: expected at most {high:g}; found {value!r}")
-
-
 def _read_gravity(value: Any) -> Any:
     """Accepts MuJoCo's and Gazebo's vector (0, 0, -g) beside the plain number g."""
     if isinstance(value, str) or not isinstance(value, Sequence):
@@ -146,19 +156,22 @@ def _read_part(place: str, value: Any, kind: type) -> Any:
     known = [field.name for field in dataclasses.fields(kind)]
     for name in value:
         if name not in known:
-            raise InputError(f"{place}.{name}: expected one of {', '.join(known)}")
+            raise InputError(f"{place}: expected one of {', '.join(known)}; found {name!r}")
     return kind(**value)
 
 
 def _read_bed(value: Any) -> Bed | None:
     if value is None or value == "off" or value is False:
         return None
-    if isinstance(value, str):
+    if hasattr(value, "item") and not getattr(value, "shape", ()):
+        value = value.item()
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        _check_number("bed", value)
+        return Bed(kind="flat", height=float(value))
+    if not isinstance(value, Bed | Mapping):
         raise InputError(
             f"bed: expected 'off', a height in metres or a mapping with kind; found {value!r}"
         )
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return Bed(kind="flat", height=float(value))
     return _read_part("bed", value, Bed)
 
 
@@ -205,7 +218,8 @@ def load_world(name: str | Path, **overrides: Any) -> World:
 
     Args:
         name: "empty_underwater", "lake", or the path of a YAML file with fields of `World`.
-        **overrides: fields that replace those of the file.
+        **overrides: fields that replace those of the file; a mapping (`bed`, `lift_drag`) replaces
+            what it names, a bed of another `kind` the whole bed.
 
     Returns:
         The world.
@@ -215,6 +229,8 @@ def load_world(name: str | Path, **overrides: Any) -> World:
             the file and the field.
     """
     names = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
+    if not isinstance(name, str | Path):
+        raise InputError(f"world: expected a name or a path; found {name!r}")
     path = _FOLDER / f"{name}.yaml" if str(name) in names else Path(name)
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         raise InputError(
@@ -223,13 +239,22 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     data = load_yaml(path)
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected a mapping of world fields; found {data!r}")
-    fields = {"name": path.stem} | data
+    for key in data:
+        if not isinstance(key, str):
+            raise InputError(f"{path}: expected names of world fields; found {key!r}")
+    fields: dict[str, Any] = {"name": path.stem} | data
     try:
         world = make_world(**fields)
-    except (InputError, TypeError) as error:
+    except InputError as error:
         raise InputError(f"{path}: {error}") from None
     if not overrides:
         return world
+    for key, value in overrides.items():
+        # A mapping changes what it names and keeps the rest: a bed's friction, not its whole shape.
+        below = fields.get(key)
+        if isinstance(below, Mapping) and isinstance(value, Mapping):
+            alike = value.get("kind", below.get("kind")) == below.get("kind")
+            overrides[key] = {**below, **value} if alike else value
     try:
         return make_world(**fields | overrides)
     except InputError as error:

@@ -137,16 +137,19 @@ def _evaluate(jaxpr: Any, consts: list[Any], args: list[Any]) -> list[Any]:
     return [read(v) for v in jaxpr.outvars]
 
 
-def one_loop(fun: Callable[..., Any]) -> Callable[..., Any]:
+def one_loop(fun: Callable[..., Any], derived: Callable[..., Any]) -> Callable[..., Any]:
     """Makes XLA:CPU compile `fun`, a scan of element-wise steps, as one function.
 
     Args:
         fun: a function of pytrees of arrays.
+        derived: the same function as it is to be differentiated: XLA takes minutes over the
+            derivative of one long function, and seconds over many short ones.
 
     Returns:
         The same function.
     """
 
+    @jax.custom_jvp
     def called(*args: Any) -> Any:
         if not on_cpu():
             return fun(*args)
@@ -154,6 +157,10 @@ def one_loop(fun: Callable[..., Any]) -> Callable[..., Any]:
             lambda x: set_xla_metadata(x, inlineable="false", xla_cpu_small_call="true"),
             jax.jit(fun)(*args),
         )
+
+    @called.defjvp
+    def _derive(primals: Any, tangents: Any) -> Any:
+        return jax.jvp(derived, primals, tangents)
 
     return called
 

@@ -1,0 +1,39 @@
+"""Fixtures that several files share; whatever compiles is made once for the whole session."""
+
+from __future__ import annotations
+
+import pytest
+
+from laboratory import WATER, arm_robot, body, elbow_robot, world
+from mjx_revolve.robot import build_robot
+from mjx_revolve.world import load_world
+
+
+@pytest.fixture(scope="session")
+def spider():
+    """The spider in deep still water, everything on."""
+    return build_robot(body("spider"), load_world("lake"))
+
+
+@pytest.fixture(scope="session")
+def core():
+    """The core alone in deep still water, everything on."""
+    return build_robot(body("core"), load_world("lake"))
+
+
+@pytest.fixture(scope="session")
+def arm():
+    """A small crooked body with nothing around it."""
+    return arm_robot(world())
+
+
+@pytest.fixture(scope="session")
+def wet_arm():
+    """The same in water, 1 m or more from any surface it can reach."""
+    return arm_robot(world(**WATER))
+
+
+@pytest.fixture(scope="session")
+def elbow():
+    """The smallest body with two hinges, in water."""
+    return elbow_robot(world(**WATER))

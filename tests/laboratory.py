@@ -1,0 +1,232 @@
+"""Small robots and a tank to try them in: what several files of tests share.
+
+Everything here runs the package's own step, in float64, so that tolerances can say what a law's
+discretisation errs by and not what float32 rounds to.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.dynamics import acceleration
+from mjx_revolve.hydrodynamics import water_of
+from mjx_revolve.module_types import Box, ModuleType, Part
+from mjx_revolve.morphology import Module, Morphology, load_morphology
+from mjx_revolve.robot import Robot, build_robot
+from mjx_revolve.rollout import make_engine, roll_out
+from mjx_revolve.world import World, load_world
+from mjx_revolve.xla import on_cpu, share_once
+
+ROOT = Path(__file__).resolve().parents[1]
+OURS = sorted((ROOT / "morphologies").glob("*.yaml"))
+WILD = sorted((ROOT.parent / "shared" / "revolve_robots").glob("*.yaml"))
+
+# What real water does, for `world`.
+WATER = {"gravity": 9.81, "buoyancy": "partial", "drag": "faces", "added_mass": True}
+# Nothing but inertia: what a test does not name is off.
+EMPTY = {"gravity": 0.0, "buoyancy": "off", "drag": "off", "added_mass": False, "bed": None}
+
+
+def world(**fields) -> World:
+    """A world in which only what is named acts."""
+    return load_world("empty_underwater", **EMPTY | fields)
+
+
+def body(name: str) -> Morphology:
+    """One of the shipped robots."""
+    return load_morphology(ROOT / "morphologies" / f"{name}.yaml")
+
+
+def box_robot(size, mass: float, tank: World, volume: float | None = None, **part) -> Robot:
+    """A single box; without `volume`, it displaces what its box holds."""
+    volume = float(np.prod(size)) if volume is None else volume
+    only = Part("box", (Box(tuple(size)),), mass=mass, volume=volume, **part)
+    module = Module(
+        name="box",
+        type="Core",
+        parent=-1,
+        slot=-1,
+        orientation=0.0,
+        rgb=None,
+        position=np.zeros(3),
+        rotation=np.eye(3),
+        kind=ModuleType("Core", (only,)),
+    )
+    return build_robot(Morphology("box", (module,)), tank)
+
+
+def at_rest(robot: Robot, lanes: int = 1, height: float = 0.0):
+    """`[nq, lanes]` rest pose at a height of the core, and `[nv, lanes]` zeros."""
+    model = robot.mj_model
+    qpos = np.repeat(model.qpos0[:, None], lanes, 1)
+    qpos[2] = height
+    return qpos, np.zeros((model.nv, lanes))
+
+
+def random_states(robot: Robot, lanes: int, seed: int = 0, speed: float = 1.0, depth: float = 5.0):
+    """`[nq, lanes]` and `[nv, lanes]`: any attitude, joints within 80 % of their limits."""
+    draw = np.random.default_rng(seed)
+    model = robot.mj_model
+    qpos, qvel = at_rest(robot, lanes)
+    qpos[:3] = draw.normal(size=(3, lanes))
+    qpos[2] -= depth
+    qpos[3:7] = draw.normal(size=(4, lanes))
+    qpos[3:7] /= np.linalg.norm(qpos[3:7], axis=0)
+    low, high = model.jnt_range[1:].T
+    qpos[7:] = draw.uniform(0.8 * low[:, None], 0.8 * high[:, None], (model.nu, lanes))
+    qvel[:] = speed * draw.normal(size=qvel.shape)
+    return qpos, qvel
+
+
+# A test runs a program once: LLVM's optimisations cost more than they save.
+_CHEAP = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICK = _CHEAP if on_cpu() else None
+
+
+@lru_cache(maxsize=64)
+def _accelerator(robot: Robot, still: bool):
+    def run(qpos, qvel, ctrl, water):
+        return acceleration(robot, qpos, qvel, ctrl, water_of(robot.world) if still else water)
+
+    return jax.jit(share_once(run), compiler_options=QUICK)
+
+
+def accelerate(robot: Robot, qpos, qvel, ctrl=None, water=None, x64: bool = True) -> np.ndarray:
+    """`dynamics.acceleration` of lanes of states, as NumPy: `[nv, lanes]`."""
+    with jax.enable_x64(x64):
+        kind = jnp.float64 if x64 else jnp.float32
+        ctrl = np.zeros((robot.num_hinges, np.shape(qpos)[-1])) if ctrl is None else ctrl
+        arrays = [jnp.asarray(x, kind) for x in (qpos, qvel, ctrl)]
+        return np.asarray(_accelerator(robot, water is None)(*arrays, water))
+
+
+@lru_cache(maxsize=64)
+def _marcher(robot: Robot, records: int, every: int, engine: str, still: bool):
+    simulator = make_engine(robot, engine)
+
+    def run(qpos, qvel, targets, water):
+        _, kept = roll_out(
+            simulator,
+            lambda state, time, row: (state, targets),
+            lambda state, ctrl, energy: (*simulator.observe(state), energy),
+            simulator.init(qpos, qvel),
+            (),
+            None,
+            water_of(robot.world) if still else water,
+            records=records,
+            every=every,
+            timestep=robot.world.timestep,
+        )
+        return kept
+
+    return jax.jit(run, compiler_options=QUICK)
+
+
+def march(
+    robot: Robot,
+    duration: float,
+    qpos,
+    qvel,
+    ctrl=None,
+    *,
+    water=None,
+    every: int = 1,
+    engine: str = "population",
+    x64: bool = True,
+):
+    """Steps lanes of one robot with held joint targets.
+
+    Args:
+        robot: from `build_robot`.
+        duration: [s].
+        qpos: `[nq, lanes]`.
+        qvel: `[nv, lanes]`.
+        ctrl: `[nu, lanes]`, by default 0.
+        water: surface and current, by default the world's.
+        every: steps between the rows of the result.
+        engine: "population" or "mjx".
+        x64: in float64.
+
+    Returns:
+        `[T]` time, `[T, nq, lanes]`, `[T, nv, lanes]` and `[T, lanes]` servo work since the row
+        before, the start not among them.
+    """
+    dt = robot.world.timestep
+    records = round(duration / dt / every)
+    with jax.enable_x64(x64):
+        kind = jnp.float64 if x64 else jnp.float32
+        lanes = np.shape(qpos)[-1]
+        ctrl = np.zeros((robot.mj_model.nu, lanes)) if ctrl is None else ctrl
+        order = make_engine(robot, engine).order
+        arrays = [jnp.asarray(x, kind) for x in (qpos, qvel, np.asarray(ctrl)[order])]
+        run = _marcher(robot, records, every, engine, water is None)
+        kept = [np.asarray(x, np.float64) for x in run(*arrays, water)]
+    return (dt * every * np.arange(1, records + 1), *kept)
+
+
+# Two small bodies without symmetry. The arm has two crooked limbs of different length: five moving
+# bodies, four hinges about two axes. The elbow is one limb of two hinges.
+_ARM = """
+id: arm
+body:
+  id: core
+  type: Core
+  children:
+    1:
+      id: shoulder
+      type: ActiveHinge
+      orientation: 90
+      children:
+        1:
+          id: upper
+          type: FixedBrick
+          orientation: -90
+          children:
+            1: {id: wrist, type: ActiveHinge, children: {1: {id: hand, type: FixedBrick}}}
+    2:
+      id: tail
+      type: ActiveHinge
+      children:
+        1: {id: tip, type: ActiveHinge, orientation: 90}
+"""
+_ELBOW = """
+id: elbow
+body:
+  id: core
+  type: Core
+  children:
+    1:
+      id: shoulder
+      type: ActiveHinge
+      orientation: 90
+      children:
+        1:
+          id: upper
+          type: FixedBrick
+          children:
+            2: {id: wrist, type: ActiveHinge, orientation: 180, children: {1: {type: FixedBrick}}}
+"""
+
+
+def read(text: str) -> Morphology:
+    """A morphology from the text of its YAML."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.yaml"
+        path.write_text(text)
+        return load_morphology(path)
+
+
+def arm_robot(tank: World) -> Robot:
+    """The arm in a world."""
+    return build_robot(read(_ARM), tank)
+
+
+def elbow_robot(tank: World) -> Robot:
+    """The elbow in a world."""
+    return build_robot(read(_ELBOW), tank)

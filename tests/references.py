@@ -1,0 +1,128 @@
+"""Independent references in float64 NumPy: what the package computes, by another road."""
+
+from __future__ import annotations
+
+import itertools
+
+import mujoco
+import numpy as np
+
+# A cube cut into six tetrahedra around one diagonal (Kuhn): corners as indices into (0, 1)³.
+_KUHN = [
+    [np.zeros(3), *np.cumsum(np.eye(3)[list(order)], axis=0)]
+    for order in itertools.permutations(range(3))
+]
+
+
+def _tetrahedron_below(corners, height):
+    """Volume and volume times centroid of the part of a tetrahedron where height < 0, exactly."""
+
+    def whole(points):
+        points = np.asarray(points)
+        volume = abs(np.linalg.det(points[1:] - points[0])) / 6
+        return volume, volume * points.mean(0)
+
+    def cut(i, j):
+        share = height[i] / (height[i] - height[j])
+        return corners[i] + share * (corners[j] - corners[i])
+
+    order = np.argsort(height)
+    below = int(np.sum(height < 0))
+    if below == 0:
+        return 0.0, np.zeros(3)
+    if below == 4:
+        return whole(corners)
+    if below == 1:
+        a = order[0]
+        return whole([corners[a], *(cut(a, b) for b in order[1:])])
+    if below == 3:
+        top = order[3]
+        all_of_it = whole(corners)
+        dry = whole([corners[top], *(cut(top, b) for b in order[:3])])
+        return all_of_it[0] - dry[0], all_of_it[1] - dry[1]
+    # Two corners below: a wedge with triangular ends, of three tetrahedra.
+    a, b, c, d = order
+    p, q = [corners[a], cut(a, c), cut(a, d)], [corners[b], cut(b, c), cut(b, d)]
+    pieces = [whole([*p, q[2]]), whole([p[0], p[1], q[1], q[2]]), whole([p[0], q[0], q[1], q[2]])]
+    return sum(v for v, _ in pieces), sum(m for _, m in pieces)
+
+
+def clip_box(up, depth, half):
+    """Submerged share of a box and its moment, by cutting it into tetrahedra.
+
+    Args:
+        up: `[3]` unit vertical, box frame.
+        depth: of the box's centre below the surface.
+        half: `[3]` half edges.
+
+    Returns:
+        share of the volume under water, and share times centre of the piece, box frame.
+    """
+    up, half = np.asarray(up, float), np.asarray(half, float)
+    volume, moment = 0.0, np.zeros(3)
+    for tetrahedron in _KUHN:
+        corners = (2 * np.array(tetrahedron) - 1) * half
+        v, m = _tetrahedron_below(corners, corners @ up - depth)
+        volume, moment = volume + v, moment + m
+    return volume / (8 * half.prod()), moment / (8 * half.prod())
+
+
+class Lagrangian:
+    """Equations of motion from the kinetic energy alone: body and carried water, no recursion.
+
+    T(q, v) = ½ v · B(q) v with B = M + Σ_parts ρ (J_vᵀ A J_v + J_ωᵀ A' J_ω); M and the Jacobians J are
+    MuJoCo's, A and A' each part's added mass and inertia. Derivatives are central differences.
+    """
+
+    def __init__(self, robot, density):
+        self.robot, self.density = robot, density
+        self.model, self.data = robot.mj_model, mujoco.MjData(robot.mj_model)
+
+    def inertia(self, qpos):
+        """B at a configuration, wholly under water."""
+        model, data, fluid = self.model, self.data, self.robot.fluid
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_crb(model, data)
+        total = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, total)
+        for p, body in enumerate(fluid.body):
+            turn = data.xmat[body].reshape(3, 3)
+            place = data.xpos[body] + turn @ fluid.position[p]
+            axes = turn @ fluid.rotation[p]
+            linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+            mujoco.mj_jac(model, data, linear, angular, place, body)
+            for jacobian, table in (
+                (axes.T @ linear, fluid.added_mass[p]),
+                (axes.T @ angular, fluid.added_inertia[p]),
+            ):
+                total += self.density * jacobian.T @ np.diag(table) @ jacobian
+        return total
+
+    def moved(self, qpos, direction, step):
+        """A configuration moved along a velocity for `step` seconds."""
+        qpos = qpos.copy()
+        mujoco.mj_integratePos(self.model, qpos, direction, step)
+        return qpos
+
+    def energy(self, qpos, qvel):
+        """½ v · B v."""
+        return qvel @ self.inertia(qpos) @ qvel / 2
+
+    def force(self, qpos, qvel, qacc, step=1e-5):
+        """`[nv]` generalised force that this motion needs (Hamel's form of Lagrange's equations).
+
+        d/dt ∂T/∂v - ∂T/∂π, and ω × ∂T/∂ω more for the root's turning, whose velocity is its own
+        frame's and not a coordinate's rate.
+        """
+
+        def rate(direction):
+            ahead, behind = (self.inertia(self.moved(qpos, direction, s)) for s in (step, -step))
+            return (ahead - behind) / (2 * step)
+
+        momentum = self.inertia(qpos) @ qvel
+        result = self.inertia(qpos) @ qacc + rate(qvel) @ qvel
+        result -= [qvel @ rate(e) @ qvel / 2 for e in np.eye(len(qvel))]
+        result[3:6] += np.cross(qvel[3:6], momentum[3:6])
+        return result

@@ -1,0 +1,82 @@
+"""The command line with the real robot: what a new user types, and what comes out."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+# What the clock writes; everything else is reproducible.
+CLOCK = {"seconds", "evaluations_per_second"}
+
+
+def evolve(*arguments, check=True):
+    run = subprocess.run(
+        [sys.executable, "-m", "mjx_revolve.evolve", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    if check:
+        assert run.returncode == 0, run.stderr
+    return run
+
+
+def metrics(folder):
+    with open(folder / "metrics.csv", newline="") as file:
+        return [{k: v for k, v in row.items() if k not in CLOCK} for row in csv.DictReader(file)]
+
+
+def champion(folder):
+    genes = next((folder / "champion").glob("*genes*"))
+    if genes.suffix == ".npz":
+        return np.load(genes)["genes"]
+    return np.array(yaml.safe_load(genes.read_text())["genes"])
+
+
+@pytest.mark.slow
+def test_a_stopped_run_resumed_equals_one_never_stopped(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    evolve("configs/smoke.yaml", "--out", whole, "--set", "evolution.generations=4")
+    evolve("configs/smoke.yaml", "--out", parts, "--set", "evolution.generations=2")
+    evolve("--resume", parts, "--set", "evolution.generations=4")
+    assert metrics(parts) == metrics(whole)
+    assert len(metrics(whole)) == 4
+    np.testing.assert_array_equal(champion(parts), champion(whole))
+    for name in ("config.yaml", "run.json", "fitness.png", "trajectory.png", "swim.png"):
+        assert (whole / name).stat().st_size > 0
+    for name in ("morphology.yaml", "robot.xml"):
+        assert (whole / "champion" / name).stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_another_seed_is_another_run(tmp_path):
+    for seed in (0, 1):
+        evolve("configs/smoke.yaml", "--out", tmp_path / str(seed), "--seed", seed)
+    assert metrics(tmp_path / "0") != metrics(tmp_path / "1")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["configs/lake_swim.yaml", "--set", "world=laek"], "expected one of empty_underwater"),
+        (["configs/lake_swim.yaml", "--set", "world.drag=facs"], "drag: expected one of 'faces'"),
+        (["configs/lake_swim.yaml", "--set", "morphology=README.md"], "README.md"),
+        (["configs/lake_swim.yaml", "--set", "task.duration=-1"], "expected a number > 0"),
+        (["configs/none.yaml"], "expected a file; found none"),
+        (["configs/smoke.yaml", "--set", "task.type=crawl", "--set", "world.bed=off"], "a bed"),
+    ],
+)
+def test_wrong_input_is_one_line_and_code_2(arguments, message):
+    run = evolve(*arguments, check=False)
+    assert run.returncode == 2
+    assert run.stderr.count("\n") == 1
+    assert run.stderr.startswith("error: ") and message in run.stderr
+    assert "Traceback" not in run.stderr
