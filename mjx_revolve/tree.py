@@ -223,9 +223,9 @@ def make_tree(robot: Robot, contact: bool = True) -> Tree:
     joints = [int(m.body_jntadr[b]) for ids in bodies[1:] for b in ids]
     return Tree(
         levels=tuple(levels),
-        qpos_index=m.jnt_qposadr[joints].astype(int) if joints else np.zeros(0, int),
-        qvel_index=m.jnt_dofadr[joints].astype(int) if joints else np.zeros(0, int),
-        ctrl_index=np.array([servo[j] for j in joints], int),
+        qpos_index=m.jnt_qposadr[joints].astype(np.int32) if joints else np.zeros(0, np.int32),
+        qvel_index=m.jnt_dofadr[joints].astype(np.int32) if joints else np.zeros(0, np.int32),
+        ctrl_index=np.array([servo[j] for j in joints], np.int32),
         robot=robot,
     )
 

@@ -23,6 +23,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 
@@ -108,7 +109,8 @@ def _evaluate(jaxpr: Any, consts: list[Any], args: list[Any]) -> list[Any]:
     cost: dict[Any, int] = {}
 
     def read(v: Any) -> Any:
-        return v.val if isinstance(v, core.Literal) else env[v]
+        # A literal's dtype is in its aval: a bare Python number would take the mode's, 32 or 64 bits.
+        return np.asarray(v.val, v.aval.dtype) if isinstance(v, core.Literal) else env[v]
 
     for eqn in jaxpr.eqns:
         inputs = [read(v) for v in eqn.invars]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import pytest
 
 from laboratory import WATER, arm_robot, body, elbow_robot, world
@@ -37,3 +38,10 @@ def wet_arm():
 def elbow():
     """The smallest body with two hinges, in water."""
     return elbow_robot(world(**WATER))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fresh_traces():
+    """Forgets traces after each file: JAX would reuse one made in float64 where float32 is meant."""
+    yield
+    jax.clear_caches()

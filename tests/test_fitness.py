@@ -68,8 +68,8 @@ def test_one_score_each_and_the_same_again(fitness, population, scores):
 
 
 def test_an_individual_does_not_feel_the_population_around_it(fitness, population, scores):
-    """70 individuals of 2 episodes are 3 chunks of 64 lanes, 5 are one: the same program,
-    padded.""" few = np.asarray(fitness(population[:40], KEY))
+    """70 individuals of 2 episodes are 3 chunks of 64 lanes, 40 are two, the last one padded."""
+    few = np.asarray(fitness(population[:40], KEY))
     np.testing.assert_array_equal(few, scores[:40])
 
 

@@ -1,0 +1,283 @@
+"""What `experiments.bench` measures: one engine in one process.
+
+``python -m experiments.bench_cases '{"case": ...}'`` builds and compiles one case, prints a line
+of JSON when it is ready, and measures once for every line that it reads. `experiments.bench` starts
+one such process for each case, so that no engine shares memory, threads or settings with another.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+# Physics by the changes to the default world. In "ellipsoid" the robot is weightless and under
+# water, as a body of the water's density is, so that MuJoCo C has the same water. Joint limits are
+# MuJoCo's own constraints in C and MJX, springs in ours.
+PHYSICS: dict[str, dict[str, Any]] = {
+    "default": {"name": "lake"},
+    "mask": {"name": "lake", "buoyancy": "mask"},
+    "no_drag": {"name": "lake", "drag": "off"},
+    "no_added_mass": {"name": "lake", "added_mass": False},
+    "ellipsoid": {
+        "name": "empty_underwater", "gravity": 0.0, "buoyancy": "off", "drag": "ellipsoid",
+        "added_mass": False,
+    },
+    "inertia_box": {
+        "name": "empty_underwater", "gravity": 0.0, "buoyancy": "off", "drag": "inertia_box",
+        "added_mass": False,
+    },
+    "none": {
+        "name": "empty_underwater", "gravity": 0.0, "buoyancy": "off", "drag": "off",
+        "added_mass": False,
+    },
+}  # fmt: skip
+# Steps in one call of an engine that is given plain controls.
+STEPS = 200
+DEPTH = 2.0  # of the start [m]
+
+# A prepared case: a function that steps the population, and how many steps of one robot it makes.
+Case = tuple[Callable[[], Any], int]
+
+
+def _fitness(job: dict[str, Any]) -> Any:
+    from mjx_revolve import load_config, make_fitness
+
+    swims = job["task"] != "crawl"
+    config = load_config(
+        job["config"],
+        overrides={
+            "morphology": job["robot"],
+            "world": PHYSICS[job["physics"]],
+            "task.type": job["task"],
+            # Without gravity there is nothing to trim, and a crawler had better sink.
+            "trim": "neutral" if swims and PHYSICS[job["physics"]]["name"] == "lake" else "none",
+            "evolution.population_size": job["population"],
+            "evolution.generations": 10**6,
+        },
+    )
+    return make_fitness(config)
+
+
+def _episode_steps(fitness: Any) -> int:
+    task = fitness.config.task
+    return task.trials * round(task.duration / fitness.robot.world.timestep)
+
+
+def make_evaluation(job: dict[str, Any]) -> Case:
+    """Whole episodes of a random population, as an optimiser calls for them."""
+    import jax
+
+    fitness = _fitness(job)
+    genes = jax.random.normal(jax.random.key(0), (job["population"], fitness.num_genes))
+    key = jax.random.key(1)
+    run = lambda: jax.block_until_ready(fitness.evaluate(genes, key))  # noqa: E731
+    return run, job["population"] * _episode_steps(fitness)
+
+
+def make_generation(job: dict[str, Any]) -> Case:
+    """A whole generation of the evolution loop: ask, evaluate, tell, and what it keeps."""
+    from mjx_revolve.loop import evolve
+
+    fitness = _fitness(job)
+    generations = evolve(fitness.config.evolution, fitness)
+    return lambda: next(generations), job["population"] * _episode_steps(fitness)
+
+
+def make_bare(job: dict[str, Any]) -> Case:
+    """The population step alone: no controller, no record of the way, no score."""
+    import jax
+    import jax.numpy as jnp
+
+    from mjx_revolve.hydrodynamics import water_of
+    from mjx_revolve.rollout import roll_out
+    from mjx_revolve.xla import compiler_options, one_loop, over_chunks
+
+    fitness = _fitness(job)
+    robot, engine = fitness.robot, fitness.engine
+    world, count = robot.world, job["population"]
+    steps = _episode_steps(fitness) // fitness.config.task.trials
+
+    def chunk(qpos: Any, ctrl: Any) -> Any:
+        qvel = jnp.zeros((robot.mj_model.nv, qpos.shape[-1]), qpos.dtype)
+        state, _ = roll_out(
+            engine,
+            lambda state, time, row: (state, ctrl),
+            lambda state, ctrl, energy: (),
+            engine.init(qpos, qvel),
+            (),
+            None,
+            water_of(world),
+            records=steps // 20,
+            every=20,
+            timestep=world.timestep,
+        )
+        return jnp.stack(state.position)
+
+    run = jax.jit(over_chunks(one_loop(chunk, chunk)), compiler_options=compiler_options())
+    qpos = jnp.tile(jnp.asarray(robot.start_qpos(DEPTH), jnp.float32)[:, None], (1, count))
+    low, high = robot.mj_model.actuator_ctrlrange[engine.order].T[:, :, None]
+    share = jax.random.uniform(jax.random.key(0), (robot.num_hinges, count))
+    ctrl = jnp.asarray(low + (high - low) * share, jnp.float32)
+    return lambda: jax.block_until_ready(run(qpos, ctrl)), count * steps
+
+
+def _c_model(job: dict[str, Any]) -> Any:
+    """The compiled model; the water of "ellipsoid" and "inertia_box" is MuJoCo's own."""
+    from mjx_revolve import build_robot, load_morphology, load_world
+
+    fields = dict(PHYSICS[job["physics"]])
+    world = load_world(fields.pop("name"), **fields)
+    model = build_robot(load_morphology(job["robot"]), world).mj_model
+    if world.drag in ("ellipsoid", "inertia_box"):
+        model.opt.density, model.opt.viscosity = world.density, world.viscosity
+    model.qpos0[2] = -DEPTH
+    return model
+
+
+def _controls(model: Any, count: int) -> tuple[Any, Any]:
+    """Sines of 1 Hz: `[count, STEPS, nu]` targets [rad], and their phases `[count, nu]` [rad]."""
+    import numpy as np
+
+    phase = 2 * np.pi * np.random.default_rng(0).random((count, model.nu))
+    time = model.opt.timestep * np.arange(STEPS)
+    reach = 0.5 * model.actuator_ctrlrange[:, 1]
+    return reach * np.sin(2 * np.pi * time[None, :, None] + phase[:, None]), phase
+
+
+def make_mjx(job: dict[str, Any]) -> Case:
+    """`jax.jit(jax.vmap(mjx.step))` on the same model, in a scan, nothing of ours added.
+
+    In a scan because that is faster than calling the jitted step from Python.
+    """
+    import jax
+    import jax.numpy as jnp
+    import mujoco
+    from mujoco import mjx
+
+    model = _c_model(job)
+    if not job["limits"]:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    count, dt = job["population"], model.opt.timestep
+    phase = jnp.asarray(_controls(model, count)[1], jnp.float32)
+    reach = jnp.asarray(0.5 * model.actuator_ctrlrange[:, 1], jnp.float32)
+    mjx_model = mjx.put_model(model)
+    data = jax.vmap(lambda _: mjx.make_data(mjx_model))(jnp.arange(count))
+    data = data.replace(qpos=jnp.tile(jnp.asarray(model.qpos0, jnp.float32), (count, 1)))
+
+    @jax.jit
+    def run(data: Any) -> Any:
+        def step(data: Any, k: Any) -> tuple[Any, None]:
+            data = data.replace(ctrl=reach * jnp.sin(2 * jnp.pi * dt * k + phase))
+            return jax.vmap(mjx.step, in_axes=(None, 0))(mjx_model, data), None
+
+        return jax.lax.scan(step, data, jnp.arange(STEPS))[0].qpos
+
+    return lambda: jax.block_until_ready(run(data)), count * STEPS
+
+
+def make_rollout(job: dict[str, Any]) -> Case:
+    """MuJoCo C's `mujoco.rollout`, with as many threads as asked for."""
+    import mujoco
+    import numpy as np
+    from mujoco import rollout
+
+    model = _c_model(job)
+    count, threads = job["population"], job["threads"]
+    data = [mujoco.MjData(model) for _ in range(threads)]
+    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.zeros(mujoco.mj_stateSize(model, full))
+    mujoco.mj_getState(model, data[0], state, full)
+    states, controls = np.tile(state, (count, 1)), _controls(model, count)[0]
+    pool = rollout.Rollout(nthread=threads)
+    return lambda: pool.rollout(model, data, states, controls), count * STEPS
+
+
+def make_batch(job: dict[str, Any]) -> Case:
+    """MuJoCo C's `mujoco.batch.Batch`, with as many threads as asked for."""
+    import mujoco
+    from mujoco.batch import Batch
+
+    model = _c_model(job)
+    batch = Batch(model, job["population"], job["threads"])
+    controls = _controls(model, job["population"])[0]
+
+    def run() -> None:
+        batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        batch.rollout(STEPS, controls)
+
+    return run, job["population"] * STEPS
+
+
+MAKERS: dict[str, Callable[[dict[str, Any]], Case]] = {
+    "evaluation": make_evaluation,
+    "generation": make_generation,
+    "bare": make_bare,
+    "mjx": make_mjx,
+    "rollout": make_rollout,
+    "batch": make_batch,
+}
+
+
+def measure(run: Callable[[], Any], steps: int, seconds: float) -> dict[str, float]:
+    """Calls a case for a while.
+
+    Args:
+        run: the case.
+        steps: how many steps of one robot a call makes.
+        seconds: how long to go on, at least.
+
+    Returns:
+        Steps per second, and how many cores were busy in the mean.
+    """
+    began, busy, calls = time.perf_counter(), time.process_time(), 0
+    while (spent := time.perf_counter() - began) < seconds or not calls:
+        run()
+        calls += 1
+    spent = time.perf_counter() - began
+    return {
+        "steps_per_second": calls * steps / spent,
+        "cores": (time.process_time() - busy) / spent,
+    }
+
+
+def main() -> int:
+    """Serves one case until standard input ends."""
+    job = json.loads(sys.argv[1])
+    # Libraries print while they are imported; the answers go where nobody else writes.
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+
+    def answer(values: dict[str, Any]) -> None:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # Linux: KiB
+        print(json.dumps(values | {"peak_bytes": peak}), file=answers, flush=True)
+
+    if job.get("core") is not None:
+        os.sched_setaffinity(0, {job["core"]})
+    from mjx_revolve.errors import InputError
+    from mjx_revolve.runtime import prepare_process
+
+    began = time.perf_counter()
+    prepare_process()
+    try:
+        run, steps = MAKERS[job["case"]](job)
+    except InputError as error:
+        answer({"error": str(error)})
+        return 2
+    built = time.perf_counter()
+    run()
+    first = time.perf_counter()
+    run()
+    second = time.perf_counter() - first
+    answer({"built_s": built - began, "compile_s": max(0.0, first - built - second)})
+    for line in sys.stdin:
+        answer(measure(run, steps, float(line)))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

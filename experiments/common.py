@@ -1,0 +1,98 @@
+"""What the experiments' command lines share: options, the output folder, tables."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from mjx_revolve.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose complaints are one line and exit code 2, like all of ours."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raises `InputError` instead of printing the usage."""
+        raise InputError(f"{self.prog}: {message}")
+
+
+def make_parser(name: str, description: str) -> Parser:
+    """A parser with the option that all experiments share.
+
+    Args:
+        name: of the experiment's module.
+        description: what it does, in a sentence.
+
+    Returns:
+        The parser, with `--out`.
+    """
+    parser = Parser(
+        prog=f"python -m experiments.{name}", description=description, allow_abbrev=False
+    )
+    parser.add_argument("--out", metavar="DIR", help=f"folder to write into (default: runs/{name})")
+    return parser
+
+
+def count(text: str) -> int:
+    """Reads a whole number above 0, for `add_argument(type=count)`."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0; found {text!r}")
+    return value
+
+
+def make_folder(out: str | None, name: str) -> Path:
+    """Makes the folder that an experiment writes into.
+
+    Args:
+        out: what the user chose, or None.
+        name: of the experiment's module.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    folder = Path(out) if out is not None else ROOT / "runs" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"--out: expected a folder to write into; found {error.strerror}: {out}"
+        ) from None
+    return folder
+
+
+def shown(path: Path) -> str:
+    """A path as a user would type it."""
+    path = path.resolve()
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def align(rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Rows of text as an aligned table.
+
+    Args:
+        rows: of equal length; the first holds the headings, the second their units.
+        left: how many columns, from the first, are aligned to the left.
+
+    Returns:
+        The table, lines joined.
+    """
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if k < left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
