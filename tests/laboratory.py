@@ -87,8 +87,6 @@ def random_states(robot: Robot, lanes: int, seed: int = 0, speed: float = 1.0, d
 # A test runs a program once: LLVM's optimisations cost more than they save.
 _CHEAP = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 QUICK = _CHEAP if on_cpu() else None
-# Backward passes share most of their values, and fusion would write each of them out many times.
-UNFUSED = {**_CHEAP, "xla_disable_hlo_passes": "fusion"} if on_cpu() else None
 
 
 @lru_cache(maxsize=64)

