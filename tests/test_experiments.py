@@ -1,0 +1,252 @@
+"""The experiments: their closed forms, what they read from the thesis's data, their options."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import bench, falling_spider, optimisers
+from experiments.falling_spider import (
+    GAZEBO_GRAVITY,
+    RUNS,
+    TICK,
+    acceleration,
+    closed_form,
+    fall,
+    fit,
+    load_thesis,
+    mean_acceleration,
+    read_run,
+    read_tables,
+    row_ticks,
+)
+from mjx_revolve.errors import InputError, run_command
+
+ROOT = Path(__file__).resolve().parent.parent
+THESIS = ROOT.parent / "shared" / "thesis"
+SHARE = 0.93818  # ρ V / m of the spider
+
+
+@pytest.fixture(scope="module")
+def readings():
+    data = load_thesis(THESIS)
+    if data is None:
+        pytest.skip("the thesis's data are not beside the repository")
+    return {
+        kind: read_run(heights, closed_form(kind, GAZEBO_GRAVITY, SHARE))
+        for kind, heights in data.items()
+    }
+
+
+# ------------------------------------------------------------------ falling spider
+
+
+def test_the_closed_forms_height_and_time_are_inverse():
+    form = closed_form("water", 9.81, SHARE)
+    assert form.wet == pytest.approx(0.60648, abs=1e-4)
+    time = np.linspace(0.3, 14, 50)
+    np.testing.assert_allclose(form.time(form.height(time)), time, rtol=1e-12)
+    # Dry, then wet, without a jump in height or speed.
+    entry = form.entry_speed / 9.81
+    assert form.height(np.array([0.0, entry])) == pytest.approx([0.25, 0.0], abs=1e-12)
+    speeds = np.diff(form.height(entry + 1e-6 * np.arange(-1, 2)))
+    assert speeds[0] == pytest.approx(speeds[1], rel=1e-5)
+
+
+@pytest.mark.parametrize(("run", "expected"), [("air", 9.81), ("mask", 0.60648)])
+def test_the_spider_falls_as_fast_as_it_must(run, expected):
+    assert acceleration(fall(RUNS[run][0], 1.5)) == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_parabola_gives_its_own_acceleration_back():
+    time = 0.2 * np.arange(30)
+    found, square, rms = fit(time, 0.4 - 1.3 * time - 0.5 * 0.7 * time**2)
+    assert found == pytest.approx(0.7)
+    assert square == pytest.approx(1.3**2 + 2 * 0.7 * 0.4)
+    assert rms < 1e-12
+    heights = -0.5 * 0.7 * time**2
+    assert mean_acceleration(heights, len(heights) - 2) == pytest.approx(0.7)
+
+
+def test_ticks_are_found_in_uneven_rows():
+    form = closed_form("water", 9.8, SHARE)
+    ticks = np.random.default_rng(0).choice([99, 100, 101, 102], 60)
+    time = 0.8 + TICK * np.concatenate([[0], np.cumsum(ticks)])
+    found, misfit = row_ticks(form.height(time), form)
+    np.testing.assert_array_equal(found, ticks)
+    assert misfit < 1e-8
+    reading = read_run(form.height(time), form)
+    assert reading.timed == pytest.approx(form.wet, rel=1e-9)
+    assert reading.drop == pytest.approx(0.25, rel=1e-9)
+    np.testing.assert_allclose(reading.time, time, atol=1e-9)
+
+
+def test_the_thesis_data_read_with_its_errata(readings):
+    air, water = readings["air"], readings["water"]
+    assert air.printed == pytest.approx(9.28, abs=0.005)
+    assert air.mended == pytest.approx(9.82, abs=0.005)
+    assert water.printed == pytest.approx(0.608, abs=0.0005)
+    assert water.mended == pytest.approx(0.617, abs=0.0005)
+    assert water.fitted == pytest.approx(0.618, abs=0.0005)
+
+
+def test_on_the_simulators_clock_the_data_are_the_closed_form(readings):
+    air, water = readings["air"], readings["water"]
+    assert air.misfit < 0.02
+    assert air.timed == pytest.approx(9.8, abs=0.002)
+    assert water.timed == pytest.approx(GAZEBO_GRAVITY * (1 - SHARE), abs=2e-4)
+    assert water.drop == pytest.approx(0.25, abs=5e-4)
+    assert abs(water.drop_short - 0.25) > 10 * abs(water.drop - 0.25)
+
+
+def test_heights_that_are_none_are_refused(tmp_path):
+    assert load_thesis(tmp_path) is None
+    (tmp_path / "air_heights.txt").write_text("0.1\nx\n")
+    (tmp_path / "water_heights.txt").write_text("0.1\n")
+    message = r"air_heights\.txt: expected one number in each row; found"
+    with pytest.raises(InputError, match=message):
+        load_thesis(tmp_path)
+    (tmp_path / "air_heights.txt").write_text("0.1\n0.2\n")
+    with pytest.raises(InputError, match=r"air_heights\.txt: expected at least 19 rows; found"):
+        load_thesis(tmp_path)
+
+
+@pytest.mark.slow
+def test_falling_spider_writes_its_table_and_its_plot(tmp_path, capsys):
+    assert falling_spider.main(["--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    for line in ("no buoyancy (air)", "thesis's buoyancy, no drag", "default water"):
+        assert line in printed
+    assert (tmp_path / "falls.png").read_bytes().startswith(b"\x89PNG")
+    rows = (tmp_path / "falls.csv").read_text().splitlines()
+    assert rows[0] == "time_s,air_m,mask_m,partial_m,default_m"
+    # Drag ends the fall in the default water at the speed of the closed form.
+    last, before = (float(row.split(",")[-1]) for row in (rows[-1], rows[-201]))
+    assert before - last == pytest.approx(read_tables().terminal, rel=1e-3)
+
+
+# ------------------------------------------------------------------ options
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "message"),
+    [
+        (falling_spider.main, ["--speed"], "unrecognized arguments: --speed"),
+        (falling_spider.main, ["--data", "nowhere"], "--data: expected air_heights.txt and"),
+        (falling_spider.main, ["--out", "/dev/null/x"], "--out: expected a folder to write into"),
+        (bench.main, ["--population", "0"], "expected a whole number above 0; found '0'"),
+        (bench.main, ["--rounds", "two"], "expected a whole number above 0; found 'two'"),
+        (bench.main, ["--robot", "nowhere.yaml"], "nowhere.yaml: expected a file; found none"),
+        (
+            bench.main,
+            ["--robot", str(ROOT / "morphologies" / "core.yaml")],
+            "--robot: expected a robot with hinges; found none",
+        ),
+        (bench.main, ["spider"], "unrecognized arguments: spider"),
+        (optimisers.main, ["--evaluations", "-3"], "expected a whole number above 0; found '-3'"),
+        (optimisers.main, ["--out"], "argument --out: expected one argument"),
+    ],
+)
+def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
+    assert run_command(main, arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert message in captured.err
+
+
+# ------------------------------------------------------------------ benchmark
+
+
+def _result(case, physics, rates, limits=True):
+    row = bench.Row(f"{case} {physics}", case, physics, limits=limits)
+    return bench.Result(row, rates=rates, cores=[1.0] * len(rates), peak=2.0**20)
+
+
+def test_ratios_are_to_the_better_of_cs_engines_and_to_plain_mjx():
+    ours = _result("evaluation", "default", [30.0, 20.0, 10.0])
+    free = _result("evaluation", "none", [40.0])
+    results = [
+        ours,
+        free,
+        _result("mjx", "none", [2.0]),
+        _result("mjx", "none", [5.0], limits=False),
+        _result("rollout", "ellipsoid", [1.0, 3.0, 100.0]),
+        _result("batch", "ellipsoid", [4.0]),
+        _result("rollout", "none", [8.0]),
+        _result("batch", "none", [7.0]),
+    ]
+    base = bench.baselines(results)
+    assert base == {"ellipsoid": 4.0, "none": 8.0, "mjx": 2.0}
+    assert ours.rate == 20.0
+    assert bench.ratios(ours, base) == (5.0, 10.0)
+    assert bench.ratios(free, base) == (5.0, 20.0)
+    lines = bench.table(results).splitlines()
+    assert len(lines) == 2 + len(results)
+    assert "5.00" in lines[2]
+
+
+def test_every_row_of_the_benchmark_can_be_made():
+    from experiments.bench_cases import MAKERS, PHYSICS
+
+    for row in (*bench.ROWS, *bench.PARTS):
+        assert row.case in MAKERS
+        assert row.physics in PHYSICS
+    quick = {row.case for row in bench.ROWS if row.quick}
+    assert {"evaluation", "mjx", "rollout", "batch"} <= quick
+
+
+@pytest.mark.slow
+def test_a_quick_benchmark_runs_and_keeps_its_numbers(tmp_path, capsys):
+    assert bench.main(["--quick", "--population", "64", "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "to C's" in printed
+    text = (tmp_path / "bench.json").read_text()
+    assert str(ROOT) not in text
+    report = json.loads(text)
+    assert report["settings"]["population"] == 64
+    assert report["machine"]["cores"] >= 1
+    rows = {row["name"]: row for row in report["rows"]}
+    ours = rows["ours, evaluation, default water"]
+    assert len(ours["steps_per_second"]) == 3
+    assert ours["to_plain_mjx"] >= 1
+    assert report["large_population"]["peak_bytes"] < 4 * 2**30
+
+
+def test_a_case_that_fails_says_why():
+    with pytest.raises(RuntimeError, match="nonsense: KeyError"):
+        bench.start(bench.Row("no such case", "nonsense", "default"), {})
+
+
+# ------------------------------------------------------------------ optimisers
+
+
+def test_the_counter_keeps_the_best():
+    counter = optimisers.Counter(lambda population: population[:, 0], np.zeros(2))
+    counter(np.array([[1.0, 2.0], [3.0, 4.0]]))
+    counter(np.array([[2.0, 0.0]]))
+    np.testing.assert_array_equal(counter.best, [3.0, 4.0])
+    assert (counter.best_score, counter.evaluations) == (3.0, 3)
+
+
+@pytest.mark.parametrize("name", optimisers.OPTIMISERS)
+def test_each_library_maximises(name):
+    def score(population):
+        assert population.shape == (20, 5)
+        return -np.sum((population - 0.3) ** 2, axis=1)
+
+    counter = optimisers.Counter(score, np.zeros(5))
+    optimisers.OPTIMISERS[name](counter, 5, 20, 40)
+    assert counter.evaluations == 20 * 40
+    assert counter.best_score > -0.02
+
+
+@pytest.mark.slow
+def test_the_three_optimisers_share_one_fitness():
+    outcomes, still = optimisers.optimise(300)
+    assert still == pytest.approx(0.0, abs=0.02)
+    assert len({outcome.evaluations for outcome in outcomes}) == 1
+    assert all(outcome.score > still for outcome in outcomes)
+    assert all(np.isfinite(outcome.fresh) for outcome in outcomes)
