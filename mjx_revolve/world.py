@@ -13,7 +13,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from mjx_revolve.currents import (
+    CurrentField,
+    Gust,
+    Shear,
+    Wave,
+    check_number,
+    check_wave,
+    find_field,
+    listed,
+    load_current_field,
+    read_vector,
+)
 from mjx_revolve.errors import InputError, load_yaml
+from mjx_revolve.plates import LiftDrag
 from mjx_revolve.terrain import Bed
 
 BUOYANCY = ("partial", "mask", "off")
@@ -22,53 +37,21 @@ DRAG = ("faces", "lift_drag", "inertia_box", "ellipsoid", "off")
 _FOLDER = Path(__file__).parent / "worlds"
 
 
-def _or(names: Sequence[str]) -> str:
-    return ", ".join(map(repr, names))
-
-
-def _check_number(
-    place: str, value: Any, low: float | None = None, high: float | None = None
-) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{place}: expected a number; found {value!r}")
-    try:
-        finite = math.isfinite(value)
-    except OverflowError:  # an integer of more than 308 digits
-        finite, value = False, "a huge integer"
-    if not finite:
-        raise InputError(f"{place}: expected a finite number; found {value!r}")
-    if low is not None and value < low:
-        raise InputError(f"{place}: expected at least {low:g}; found {value!r}")
-    if high is not None and value > high:
-        raise InputError(f"{place}: expected at most {high:g}; found {value!r}")
-
-
 @dataclass(frozen=True)
-class LiftDrag:
-    """Parameters of Gazebo's LiftDrag plugin for one plate (world option `drag: lift_drag`).
+class SurfaceTension:
+    """Surface tension along the waterline; see `buoyancy.surface_tension`.
 
     Attributes:
-        a0: angle of attack at zero lift [rad].
-        cla: lift slope before the stall [1/rad].
-        cda: drag slope before the stall [1/rad].
-        alpha_stall: stall angle [rad].
-        cla_stall: lift slope after the stall [1/rad].
-        cda_stall: drag slope after the stall [1/rad].
-
-    The plugin's moment slope (`cma`) and centre of pressure (`cp`, here the box's centre) are not
-    modelled.
+        gamma: γ [N/m]; .0728 is that of clean water at 20 °C.
+        contact_angle: between water and module, through the water [rad]; below π/2 it wets.
     """
 
-    a0: float = 0.0
-    cla: float = 1.0
-    cda: float = 0.01
-    alpha_stall: float = math.pi / 2
-    cla_stall: float = 0.0
-    cda_stall: float = 1.0
+    gamma: float = 0.0728
+    contact_angle: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            _check_number(f"lift_drag.{field.name}", getattr(self, field.name))
+        check_number("surface_tension.gamma", self.gamma, low=1e-6)
+        check_number("surface_tension.contact_angle", self.contact_angle, low=0.0, high=math.pi)
 
 
 @dataclass(frozen=True)
@@ -88,7 +71,15 @@ class World:
         drag: "faces" (quadratic, on the modules' true faces, and angular), "lift_drag" (Gazebo's
             plugin on each module as a plate), "inertia_box" or "ellipsoid" (MuJoCo's laws), "off".
         added_mass: whether the water that a module carries along is part of its inertia.
-        lift_drag: parameters of `drag: lift_drag`.
+        lift_drag: parameters of `drag: lift_drag`; fins have their own.
+        shear: a current that fades with depth, or None. All moving water adds up: current, shear,
+            field, gust and waves.
+        current_field: velocities on a grid (in YAML the path of an NPZ or CSV file), or None.
+        gust: a current that wanders around the mean, or None.
+        waves: regular waves on the surface, added up; each may not break by itself.
+        water_depth: of the level bed that the waves feel, below the still surface [m]; None for
+            deep water, where a wave is shorter than twice the depth.
+        surface_tension: along the waterline, or None.
         timestep: of the simulation [s].
     """
 
@@ -102,23 +93,38 @@ class World:
     buoyancy: str = "partial"
     drag: str = "faces"
     added_mass: bool = True
-    lift_drag: LiftDrag = LiftDrag()
+    lift_drag: LiftDrag = dataclasses.field(default_factory=LiftDrag)
+    shear: Shear | None = None
+    current_field: CurrentField | None = None
+    gust: Gust | None = None
+    waves: tuple[Wave, ...] = ()
+    water_depth: float | None = None
+    surface_tension: SurfaceTension | None = None
     timestep: float = 0.005
 
     def __post_init__(self) -> None:
-        _check_number("density", self.density, low=0.0)
-        _check_number("viscosity", self.viscosity, low=0.0)
-        _check_number("gravity", self.gravity, low=0.0)
-        _check_number("surface_height", self.surface_height)
-        _check_number("timestep", self.timestep, low=1e-5, high=0.1)
+        check_number("density", self.density, low=0.0)
+        check_number("viscosity", self.viscosity, low=0.0)
+        check_number("gravity", self.gravity, low=0.0)
+        check_number("surface_height", self.surface_height)
+        check_number("timestep", self.timestep, low=1e-5, high=0.1)
         for axis, value in zip("xyz", self.current, strict=True):
-            _check_number(f"current.{axis}", value)
+            check_number(f"current.{axis}", value)
         if self.buoyancy not in BUOYANCY:
-            raise InputError(f"buoyancy: expected one of {_or(BUOYANCY)}; found {self.buoyancy!r}")
+            raise InputError(
+                f"buoyancy: expected one of {listed(BUOYANCY)}; found {self.buoyancy!r}"
+            )
         if self.drag not in DRAG:
-            raise InputError(f"drag: expected one of {_or(DRAG)}; found {self.drag!r}")
+            raise InputError(f"drag: expected one of {listed(DRAG)}; found {self.drag!r}")
         if not isinstance(self.added_mass, bool):
             raise InputError(f"added_mass: expected true or false; found {self.added_mass!r}")
+        if self.water_depth is not None:
+            check_number("water_depth", self.water_depth, low=1e-2)
+        for i, wave in enumerate(self.waves):
+            try:
+                check_wave(wave, self.gravity, self.water_depth)
+            except InputError as error:
+                raise InputError(_numbered(error, i)) from None
         if not isinstance(self.name, str) or not self.name:
             raise InputError(f"name: expected a text; found {self.name!r}")
 
@@ -134,20 +140,6 @@ def _read_gravity(value: Any) -> Any:
     return -float(value[2])
 
 
-def _read_vector(place: str, value: Any) -> tuple[float, ...]:
-    try:
-        vector = tuple(value) if not isinstance(value, str) else None
-    except TypeError:
-        vector = None
-    if vector is None or len(vector) != 3:
-        raise InputError(f"{place}: expected 3 numbers; found {value!r}")
-    for axis, v in zip("xyz", vector, strict=True):
-        if hasattr(v, "item"):
-            v = v.item()
-        _check_number(f"{place}.{axis}", v)
-    return tuple(float(v) for v in vector)
-
-
 def _read_part(place: str, value: Any, kind: type) -> Any:
     if isinstance(value, kind):
         return value
@@ -157,7 +149,49 @@ def _read_part(place: str, value: Any, kind: type) -> Any:
     for name in value:
         if name not in known:
             raise InputError(f"{place}: expected one of {', '.join(known)}; found {name!r}")
-    return kind(**value)
+    for field in dataclasses.fields(kind):
+        required = field.default is dataclasses.MISSING
+        if required and field.name not in value:
+            raise InputError(f"{place}: expected {field.name}; found none")
+    return kind(**{k: v.item() if isinstance(v, np.generic) else v for k, v in value.items()})
+
+
+def _numbered(error: InputError, i: int) -> str:
+    return str(error).replace("waves", f"waves.{i}", 1)
+
+
+def _is_off(value: Any) -> bool:
+    """Whether a value says that there is none: YAML 1.1 reads a bare `off` as False."""
+    return value is None or value is False or (isinstance(value, str) and value == "off")
+
+
+def _read_waves(value: Any) -> tuple[Wave, ...]:
+    if _is_off(value):
+        return ()
+    if isinstance(value, Wave | Mapping):
+        value = [value]
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise InputError(f"waves: expected a list of mappings; found {value!r}")
+    waves = []
+    for i, item in enumerate(value):
+        try:
+            waves.append(_read_part("waves", item, Wave))
+        except InputError as error:
+            raise InputError(_numbered(error, i)) from None
+    return tuple(waves)
+
+
+def _read_field(value: Any, folder: Path) -> CurrentField | None:
+    if _is_off(value):
+        return None
+    if isinstance(value, CurrentField):
+        return value
+    if not isinstance(value, str | Path) or not str(value):
+        raise InputError(f"current_field: expected the path of a file; found {value!r}")
+    try:
+        return load_current_field(find_field(value, folder))
+    except InputError as error:
+        raise InputError(f"current_field: {error}") from None
 
 
 def _read_bed(value: Any) -> Bed | None:
@@ -166,7 +200,7 @@ def _read_bed(value: Any) -> Bed | None:
     if hasattr(value, "item") and not getattr(value, "shape", ()):
         value = value.item()
     if isinstance(value, int | float) and not isinstance(value, bool):
-        _check_number("bed", value)
+        check_number("bed", value)
         return Bed(kind="flat", height=float(value))
     if not isinstance(value, Bed | Mapping):
         raise InputError(
@@ -180,7 +214,9 @@ def make_world(**fields: Any) -> World:
 
     Args:
         **fields: the fields of `World`; `gravity` also as (0, 0, -g); `bed` also as a height [m],
-            "off" or a mapping; `current` any sequence of 3.
+            "off" or a mapping; `current` any sequence of 3; `shear`, `gust` and `surface_tension`
+            also as mappings, `waves` as a list of mappings or one, each also "off";
+            `current_field` as a path, which, if relative, lies inside the current folder.
 
     Returns:
         The world.
@@ -193,7 +229,7 @@ def make_world(**fields: Any) -> World:
         if name not in known:
             raise InputError(f"{name}: expected one of {', '.join(known)}; found {name!r}")
     values = dict(fields)
-    for name in ("density", "viscosity", "surface_height", "timestep", "gravity"):
+    for name in ("density", "viscosity", "surface_height", "timestep", "gravity", "water_depth"):
         if hasattr(values.get(name), "item") and not hasattr(values[name], "__len__"):
             values[name] = values[name].item()
     if "gravity" in values:
@@ -201,7 +237,7 @@ def make_world(**fields: Any) -> World:
             values["gravity"] = values["gravity"].tolist()
         values["gravity"] = _read_gravity(values["gravity"])
     if "current" in values:
-        values["current"] = _read_vector("current", values["current"])
+        values["current"] = read_vector("current", values["current"])
     if "bed" in values:
         values["bed"] = _read_bed(values["bed"])
     # YAML 1.1 reads a bare `off` as False.
@@ -210,6 +246,19 @@ def make_world(**fields: Any) -> World:
             values[name] = "off"
     if "lift_drag" in values:
         values["lift_drag"] = _read_part("lift_drag", values["lift_drag"], LiftDrag)
+    for name, kind in (("shear", Shear), ("gust", Gust), ("surface_tension", SurfaceTension)):
+        if name not in values:
+            continue
+        if _is_off(values[name]):
+            values[name] = None
+        elif name == "surface_tension" and values[name] is True:
+            values[name] = SurfaceTension()
+        else:
+            values[name] = _read_part(name, values[name], kind)
+    if "waves" in values:
+        values["waves"] = _read_waves(values["waves"])
+    if "current_field" in values:
+        values["current_field"] = _read_field(values["current_field"], Path())
     return World(**values)
 
 
@@ -218,8 +267,9 @@ def load_world(name: str | Path, **overrides: Any) -> World:
 
     Args:
         name: "empty_underwater", "lake", or the path of a YAML file with fields of `World`.
-        **overrides: fields that replace those of the file; a mapping (`bed`, `lift_drag`) replaces
-            what it names, a bed of another `kind` the whole bed.
+        **overrides: fields that replace those of the file; a mapping (`bed`, `lift_drag`, `shear`,
+            `gust`, `surface_tension`) replaces what it names, a bed of another `kind` the whole
+            bed; see `make_world`.
 
     Returns:
         The world.
@@ -228,13 +278,13 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         InputError: no such world, an unknown field, or a value out of range; the message names
             the file and the field.
     """
-    names = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
+    shipped = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
     if not isinstance(name, str | Path):
         raise InputError(f"world: expected a name or a path; found {name!r}")
-    path = _FOLDER / f"{name}.yaml" if str(name) in names else Path(name)
+    path = _FOLDER / f"{name}.yaml" if str(name) in shipped else Path(name)
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         raise InputError(
-            f"world: expected one of {', '.join(names)} or a YAML file; found {str(name)!r}"
+            f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
         )
     data = load_yaml(path)
     if not isinstance(data, dict):
@@ -244,6 +294,9 @@ def load_world(name: str | Path, **overrides: Any) -> World:
             raise InputError(f"{path}: expected names of world fields; found {key!r}")
     fields: dict[str, Any] = {"name": path.stem} | data
     try:
+        if "current_field" in fields:
+            # A world file names its field's file from where it stands itself.
+            fields["current_field"] = _read_field(fields["current_field"], path.parent)
         world = make_world(**fields)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
