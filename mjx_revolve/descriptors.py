@@ -27,8 +27,9 @@ def describe(modules: Sequence[Module]) -> dict[str, float]:
         modules: a robot's modules at rest, the core first, parents before their children.
 
     Returns:
-        - num_modules, num_bricks, num_hinges, num_sensors: counts (bricks: all that is rigid,
-          neither sensor nor core);
+        - num_modules, num_bricks, num_hinges, num_sensors, num_thrusters, num_fins: counts (bricks:
+          all that is rigid and is neither core, sensor, thruster nor fin; fins: modules with a part
+          whose drag is that of a plate with lift);
         - mass [kg], volume [m³], box_volume [m³]: as the properties of a `Morphology`;
         - extent_x, extent_y, extent_z, length [m]: bounding box at rest and its longest edge;
         - num_limbs: modules without children, core and sensors not counted;
@@ -55,6 +56,9 @@ def describe(modules: Sequence[Module]) -> dict[str, float]:
     size = len(body)
     hinges = [i for i, module in enumerate(modules) if module.kind.hinge is not None]
     sensors = len(modules) - size
+    thrusters = [module.kind.is_thruster for module in modules]
+    fins = [module.kind.is_fin for module in modules]
+    bricks = [i for i in rigid if i > 0 and not thrusters[i] and not fins[i]]
     tips = sum(children[i] == 0 for i in limb)
     full = sum(0 < len(modules[i].kind.slots) == children[i] for i in rigid)
     free = sum(len(modules[i].kind.slots) - children[i] for i in body)
@@ -65,9 +69,11 @@ def describe(modules: Sequence[Module]) -> dict[str, float]:
     box_volume = sum(module.kind.box_volume for module in modules)
     return {
         "num_modules": float(len(modules)),
-        "num_bricks": float(len(rigid) - 1),
+        "num_bricks": float(len(bricks)),
         "num_hinges": float(len(hinges)),
         "num_sensors": float(sensors),
+        "num_thrusters": float(sum(thrusters)),
+        "num_fins": float(sum(fins)),
         "mass": sum(module.kind.mass for module in modules),
         "volume": sum(module.kind.volume for module in modules),
         "box_volume": box_volume,

@@ -11,6 +11,8 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import NoReturn
 
+import numpy as np
+
 from mjx_revolve.errors import InputError, run_command
 from mjx_revolve.module_types import check_number
 from mjx_revolve.modules import MODULES, load_modules
@@ -61,6 +63,38 @@ def module_table(morphology: Morphology) -> list[str]:
     return _align(rows, left=(1, 2))
 
 
+def thruster_table(morphology: Morphology) -> list[str]:
+    """The thrusters of a morphology at rest as lines of an aligned table; none: no lines.
+
+    Where each pushes, which way (core frame), its thrust at both ends of its command's range, its
+    lag and its torque ratio.
+    """
+    rows = [
+        ["#", "thruster", "x", "y", "z", "axis x", "y", "z", "astern", "ahead", "lag", "torque"],
+        ["", "", "[m]", "[m]", "[m]", "[-]", "[-]", "[-]", "[N]", "[N]", "[s]", "[m]"],
+    ]
+    for index, k in morphology.thrusters:
+        module = morphology.modules[index]
+        part = module.kind.parts[k]
+        thruster = part.thruster
+        assert thruster is not None
+        local = np.add(part.position, thruster.position)
+        low, high = thruster.range
+        rows.append(
+            [
+                str(index),
+                module.name,
+                *(f"{x:.5f}" for x in _rounded(module.position + module.rotation @ local)),
+                *(f"{x:.3g}" for x in _rounded(module.rotation @ thruster.axis)),
+                f"{thruster.thrust_at(low):.4g}",
+                f"{thruster.thrust_at(high):.4g}",
+                f"{thruster.time_constant:g}",
+                f"{thruster.torque_ratio:g}",
+            ]
+        )
+    return _align(rows, left=(1,)) if len(rows) > 2 else []
+
+
 def _rounded(values: Iterable[float]) -> list[float]:
     """Values to five places, without the minus of a rounded zero."""
     return [round(float(value), 5) + 0.0 for value in values]
@@ -86,10 +120,14 @@ def summary(
     rows = [
         ("modules", f"{morphology.num_modules}", ""),
         ("hinges", f"{morphology.num_hinges}", ""),
+        ("thrusters", f"{morphology.num_thrusters}", ""),
+        ("fins", f"{morphology.num_fins}", ""),
         ("mass", f"{mass:.6g}", "kg"),
         ("volume (displaced)", f"{1e6 * volume:.6g}", "cm3"),
         ("volume of the boxes", f"{1e6 * morphology.box_volume:.6g}", "cm3"),
         ("extent at rest", extent, "m"),
+        ("centre of mass at rest", _place(morphology.center_of_mass), "m"),
+        ("centre of volume at rest", _place(morphology.center_of_volume), "m"),
         ("weight in air", f"{weight:.4f}", "N"),
         (f"buoyancy in water of {density:g} kg/m3", f"{buoyancy:.4f}", "N"),
         ("net weight in water", f"{net:.4f}", f"N ({verdict})"),
@@ -107,6 +145,10 @@ def summary(
         ]
     )
     return lines
+
+
+def _place(values: Iterable[float]) -> str:
+    return " ".join(f"{value:.5f}" for value in _rounded(values))
 
 
 def _columns(rows: Sequence[tuple[str, str, str]]) -> list[str]:
@@ -173,8 +215,10 @@ def main(argv: list[str] | None = None) -> int:
         draw_morphology(morphology, arguments.picture)
     print(f"{arguments.file}: {morphology.name}")
     print()
-    print("\n".join(module_table(morphology)))
-    print()
+    for table in (module_table(morphology), thruster_table(morphology)):
+        if table:
+            print("\n".join(table))
+            print()
     print("\n".join(summary(morphology, density, gravity)))
     if arguments.picture is not None:
         print(f"\npicture: {arguments.picture}")

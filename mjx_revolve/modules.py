@@ -3,8 +3,9 @@
 Users add their own types in YAML with `load_modules` and merge them:
 `MODULES | load_modules("my_modules.yaml")`.
 
-Frames follow Revolve: core and brick look along +y, hinge and touch sensor along +x. Slots are
-0 back (-y, where a brick is attached), 1 front (+y), 2 (+x) and 3 (-x); a hinge has slot 1 only.
+Frames follow Revolve: core and brick look along +y, all others along +x. Slots are
+0 back (-y, where a brick is attached), 1 front (+y), 2 (+x) and 3 (-x); a hinge has slot 1 only;
+sensor, thrusters and fin have none.
 
 Sources: boxes, masses, attachment faces, offsets and the servo's limits are those of Revolve
 (github.com/ci-group/revolve, `pyrevolve/revolve_bot/revolve_module.py` and the SDF it writes);
@@ -24,17 +25,30 @@ import numpy as np
 
 from mjx_revolve.boxes import union_measure
 from mjx_revolve.errors import InputError, load_yaml
-from mjx_revolve.module_types import Box, Hinge, ModuleType, Mount, Part, Slot, Vector, show
+from mjx_revolve.module_types import (
+    Box,
+    Hinge,
+    ModuleType,
+    Mount,
+    Part,
+    Slot,
+    Thruster,
+    Vector,
+    show,
+)
+from mjx_revolve.plates import LiftDrag
 
 __all__ = [
     "MODULES",
     "THESIS_MODULES",
     "Box",
     "Hinge",
+    "LiftDrag",
     "ModuleType",
     "Mount",
     "Part",
     "Slot",
+    "Thruster",
     "load_modules",
 ]
 
@@ -114,8 +128,82 @@ _TOUCH_SENSOR = ModuleType(
     sensor=True,
 )
 
-MODULES: dict[str, ModuleType] = _with_aliases(_CORE, _BRICK, _HINGE, _TOUCH_SENSOR)
-"""The catalogue by name and alias: the values of Revolve's code."""
+# Thrusters and fin are ours: Revolve has neither. What has no source below is a choice.
+
+# A ducted propeller of the hobby class, 30 mm across: half a newton, for which an ideal propeller
+# needs .3 W, and .1 s to answer. Mesh volume: a duct with a wall of 2 mm (7.0 cm³) and a motor of
+# 12 × 35 mm (4.0 cm³); half of the room that they leave is taken to go along. Reaction torque:
+# K_Q / K_T of about 1/7 at standstill (Carlton, Marine Propellers and Propulsion, chapter 6) times
+# a propeller of 24.5 mm.
+_DUCT, _DUCT_LENGTH = 0.030, 0.040
+_PROPELLER = Thruster(axis=(1.0, 0.0, 0.0), gain=0.5, time_constant=0.1, torque_ratio=0.0035)
+_THRUSTER = ModuleType(
+    name="Thruster",
+    parts=(
+        Part(
+            "duct",
+            (Box((_DUCT_LENGTH, _DUCT, _DUCT)),),
+            mass=0.025,
+            volume=1.1e-5,
+            entrained_water=0.5,
+            thruster=_PROPELLER,
+        ),
+    ),
+    mount=Mount((-_DUCT_LENGTH / 2, 0.0, 0.0), (1.0, 0.0, 0.0)),
+)
+# The same, held at its side: it pushes across the way in which it is mounted, along its own z,
+# which is up where its parent is level, or level where it is turned by ±90°.
+_LIFT_THRUSTER = ModuleType(
+    name="LiftThruster",
+    parts=(
+        replace(
+            _THRUSTER.parts[0],
+            boxes=(Box((_DUCT, _DUCT, _DUCT_LENGTH)),),
+            thruster=replace(_PROPELLER, axis=(0.0, 0.0, 1.0)),
+        ),
+    ),
+    mount=Mount((-_DUCT / 2, 0.0, 0.0), (1.0, 0.0, 0.0)),
+)
+
+# A stiff plate of ABS (1050 kg/m³), 60 × 50 × 2 mm with corners rounded to 10 mm, whose leading
+# edge is where it is mounted, as a tail's. Its box's face stands for its area, 3 % too much.
+# Lift before the stall: 2π A / (2 + √(A² + 4)) per rad (Helmbold 1942) for the aspect ratio
+# A = 50/60, which makes 1.26. Such plates stall late, at 30° to 40° (Torres and Mueller, AIAA
+# Journal 42, 2004): 30°; from there the lift falls to none at 90°. Drag: what a force normal to the
+# plate has, lift × tan α, whose mean before the stall is that of .465 |α|; then up to the 1.17 of a
+# square plate across the flow (Hoerner, Fluid-Dynamic Drag, 1965, chapter 3). That friction is left
+# out, and that the centre of pressure stays in the middle, are choices: a tail works at large
+# angles.
+_FIN_STALL = math.pi / 6
+_FIN_LIFT = 2 * math.pi * (50 / 60) / (2 + math.hypot(50 / 60, 2))
+_FIN_DRAG = 0.465
+_TO_ACROSS = math.pi / 2 - _FIN_STALL  # from the stall to a plate across the flow [rad]
+_FIN = ModuleType(
+    name="Fin",
+    parts=(
+        Part(
+            "plate",
+            (Box((0.060, 0.050, 0.002)),),
+            mass=0.0061,
+            volume=5.828e-6,
+            lift_drag=LiftDrag(
+                cla=_FIN_LIFT,
+                cda=_FIN_DRAG,
+                alpha_stall=_FIN_STALL,
+                cla_stall=-_FIN_LIFT * _FIN_STALL / _TO_ACROSS,
+                cda_stall=(1.17 - _FIN_DRAG * _FIN_STALL) / _TO_ACROSS,
+                forward=(-1.0, 0.0, 0.0),
+                upward=(0.0, 0.0, 1.0),
+            ),
+        ),
+    ),
+    mount=Mount((-0.030, 0.0, 0.0), (1.0, 0.0, 0.0)),
+)
+
+MODULES: dict[str, ModuleType] = _with_aliases(
+    _CORE, _BRICK, _HINGE, _TOUCH_SENSOR, _THRUSTER, _LIFT_THRUSTER, _FIN
+)
+"""The catalogue by name and alias: the values of Revolve's code, and our thrusters and fin."""
 
 # The thesis's Table 1 prints the two hinge masses the other way round. It also gives the touch
 # sensor the brick's box; that is not taken over, since it says nowhere how such a box is attached.
@@ -137,7 +225,7 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
     A file looks like this (SI units; three numbers are x, y, z in the module's or part's frame)::
 
         modules:
-          Fin:
+          Flipper:
             mount: -x                # or {position: [...], outward: [1, 0, 0]}; null: a core
             hinge:                   # leave out for a rigid module
               axis: [0, 1, 0]
@@ -158,13 +246,42 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
                 volume: 4.0e-6                    # default: that of the boxes, solid
                 electronics_volume: 0.0           # default
                 center_of_volume: [0, 0, 0]       # default
+                ballast_mass: 0.0                 # default; a point mass
+                ballast_volume: 0.0               # default; a point volume
+                ballast_position: [0, 0, 0]       # default; of both
+                entrained_water: 0.0              # default; share of the free volume, 0 to 1
+                buoyancy: partial                 # or mask, off; default: the world's
+                drag: lift_drag                   # or faces, ellipsoid, off; default: the world's,
+                                                  # of a fin lift_drag
+                added_mass: true                  # default: the world's
                 drag_coefficient: 1.05            # default
                 added_mass_coefficient: 1.0       # default
                 contact: true                     # default
             slots:                   # default: none
               1: +x                  # or {position: [...], direction: [...], up: [0, 0, 1]}
             sensor: false            # default
-            aliases: [Flipper]       # default: those of the catalogue's type of that name, if any
+            aliases: [Paddle]        # default: those of the catalogue's type of that name, if any
+          PectoralFin:
+            mount: -x
+            parts:
+              - size: [0.06, 0.04, 0.002]
+                mass: 0.005
+                lift_drag:           # makes it a fin; fields of `LiftDrag`
+                  {cla: 2.0, cda: 0.3, alpha_stall: 0.5, forward: [0, 1, 0], upward: [0, 0, 1]}
+          Jet:
+            mount: -x
+            parts:
+              - size: [0.03, 0.02, 0.02]
+                mass: 0.012
+                volume: 4.0e-6
+                thruster:            # makes it a thruster; fields of `Thruster`
+                  axis: [1, 0, 0]                 # default
+                  curve: dead_band                # or basic, interpolated
+                  gain: 0.3                       # N at command 1
+                  dead_band: [-0.05, 0.05]
+                  range: [-1, 1]                  # default
+                  time_constant: 0.05             # s; default 0
+                  torque_ratio: 0.002             # m; default 0
 
     `-x`, `+y` and so on name a level face of a main box: of the first part for `mount`, and for
     `slots` of the last part with a hinge, of the first without. Unknown keys are refused.
@@ -275,6 +392,13 @@ def _read_part(item: Any, index: int, place: str) -> Part:
     half = np.array([box.size for box in boxes]) / 2
     values = {"name": f"part{index}", "volume": union_measure(center - half, center + half)}
     values |= {key: item[key] for key in (*plain, "mass") if key in item}
+    for key, kind in (("lift_drag", LiftDrag), ("thruster", Thruster)):
+        if values.get(key) is not None:
+            known = [f.name for f in fields(kind)]
+            given = _check_keys(values[key], f"{place}.{key}", (), known)
+            values[key] = _make(kind, place, **given)
+    # YAML 1.1 reads a bare `off` as False.
+    values |= {key: "off" for key in ("buoyancy", "drag") if values.get(key) is False}
     return _make(Part, place, boxes=tuple(boxes), **values)
 
 

@@ -8,7 +8,7 @@ origin, unturned. All positions are in that frame, at rest (hinges at 0), in met
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,8 +19,9 @@ import yaml
 
 from mjx_revolve.descriptors import describe
 from mjx_revolve.errors import InputError, SafeLoader, load_yaml
-from mjx_revolve.module_types import ModuleType, check_number, show
+from mjx_revolve.module_types import ModuleType, Part, Vector, check_number, show
 from mjx_revolve.modules import MODULES
+from mjx_revolve.overrides import apply_overrides, check_overrides, read_number
 from mjx_revolve.placement import Module, attach, find_bounds, find_overlaps, frozen, same
 
 __all__ = ["Module", "Morphology", "load_morphology", "save_morphology", "trim_neutral"]
@@ -33,9 +34,6 @@ _RESERVED = ("world", "root")
 
 _MODULE_KEYS = ("id", "type", "slot", "orientation", "params", "children")
 _COLORS = ("red", "green", "blue")
-_OVERRIDES = {"mass": "kg", "volume": "m3", "electronics_volume": "m3", "ballast": "kg"}
-
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
 # ------------------------------------------------------------------------- values
@@ -83,8 +81,32 @@ class Morphology:
 
     @property
     def volume(self) -> float:
-        """Displaced volume, electronics included [m³]."""
+        """Displaced volume, electronics and ballast included [m³]."""
         return sum(module.kind.volume for module in self.modules)
+
+    @property
+    def center_of_mass(self) -> np.ndarray:
+        """`[3]` centre of mass at rest, core frame [m]."""
+        return self._center(lambda part: (part.total_mass, part.center_of_mass))
+
+    @property
+    def center_of_volume(self) -> np.ndarray:
+        """`[3]` centre of the displaced volume at rest, core frame [m].
+
+        Where it lies above the centre of mass, the robot rights itself under water.
+        """
+        return self._center(lambda part: (part.total_volume, part.displaced_center))
+
+    def _center(self, look: Callable[[Part], tuple[float, Vector]]) -> np.ndarray:
+        """Weighted mean of a point of each part; `look` gives weight and point, part frame."""
+        center, whole = np.zeros(3), 0.0
+        for module in self.modules:
+            for part in module.kind.parts:
+                weight, point = look(part)
+                place = module.rotation @ np.add(part.position, point)
+                center += weight * (module.position + place)
+                whole += weight
+        return center / whole if whole > 0.0 else center
 
     @property
     def box_volume(self) -> float:
@@ -100,6 +122,26 @@ class Morphology:
     def num_hinges(self) -> int:
         """Number of hinges."""
         return len(self.hinges)
+
+    @property
+    def thrusters(self) -> tuple[tuple[int, int], ...]:
+        """Module and part of each thruster, in order: the order of `ctrl` after the hinges'."""
+        return tuple(
+            (i, k)
+            for i, module in enumerate(self.modules)
+            for k, part in enumerate(module.kind.parts)
+            if part.thruster is not None
+        )
+
+    @property
+    def num_thrusters(self) -> int:
+        """Number of thrusters."""
+        return len(self.thrusters)
+
+    @property
+    def num_fins(self) -> int:
+        """Number of modules with a fin."""
+        return sum(module.kind.is_fin for module in self.modules)
 
     def hinge_neighbours(self) -> tuple[tuple[int, int], ...]:
         """Pairs of hinges that share a rigid body.
@@ -165,13 +207,25 @@ def load_morphology(
     it is. Where an id repeats, or is one that MuJoCo needs, the later modules get the suffix _2,
     _3 and so on. Anything else unexpected is refused.
 
-    `params` may hold `red`, `green`, `blue` (0 to 1, all or none) and these overrides, all >= 0:
+    `params` may hold `red`, `green`, `blue` (0 to 1, all or none) and these overrides; numbers are
+    >= 0:
 
     - `mass` [kg] and `volume` [m³] of the whole module, shared among its parts in proportion to the
       catalogue's values (a choice);
     - `electronics_volume` [m³] of the whole module, all of it in the part with the largest volume,
-      which in a hinge is the servo (a choice);
-    - `ballast` [kg] added to the first part.
+      which in a hinge is the servo (a choice); `center_of_volume` of that part (three numbers, part
+      frame [m]);
+    - `ballast` [kg] added to the first part: to its mass, or, with `ballast_position` (three
+      numbers, part frame [m]) or `ballast_volume` [m³], as a point there that takes the place of
+      the part's own;
+    - `drag_coefficient`, `added_mass_coefficient`, `entrained_water` (share of the box's free
+      volume, 0 to 1) of every part [-];
+    - `buoyancy`, `drag` (a law's name or `off`) and `added_mass` (true or false): the module's own
+      choice where the world's does not suit it;
+    - `lift_drag`: a mapping with fields of `LiftDrag`, such as `{cla: 2.0}`; it changes a fin and
+      makes a fin of any other module;
+    - `thruster`: a mapping with fields of `Thruster`, such as `{torque_ratio: -0.0035}` for a
+      left-handed propeller; `thrust` [N] at its highest command, which scales its curve.
 
     Args:
         path: the file.
@@ -258,7 +312,7 @@ def _read_module(
         )
     rgb, params = _read_params(item.get("params"), f"{place}.params")
     try:
-        changed = _apply_overrides(kind, params)
+        changed = apply_overrides(kind, params)
     except InputError as error:
         raise InputError(f"{place}.params: {error}") from None
     return Module(
@@ -340,18 +394,10 @@ def _read_id(value: Any, place: str) -> str:
         raise InputError(f"{place}: expected a name or a number; found {show(value)}") from None
 
 
-def _number(value: Any) -> Any:
-    """Text such as `0.707;` as a number; everything else as it is."""
-    if isinstance(value, str):
-        text = value.strip().rstrip(";,").rstrip()
-        return float(text) if _NUMBER.fullmatch(text) else value
-    return value
-
-
 def _read_orientation(value: Any, place: str) -> float:
     if value is None:  # Revolve itself writes `orientation: null`
         return 0.0
-    angle = _number(value)
+    angle = read_number(value)
     known = (0, 90, 180, 270, -90, -180, -270)
     if isinstance(angle, bool) or not isinstance(angle, int | float) or angle not in known:
         raise InputError(f"{place}: expected 0, 90, 180, 270 or -90 [deg]; found {show(value)}")
@@ -367,9 +413,7 @@ def _read_params(
     if not isinstance(params, dict):
         raise InputError(f"{place}: expected a mapping; found {show(params)}")
     rest = {key: value for key, value in params.items() if key not in _COLORS}
-    for key, unit in _OVERRIDES.items():
-        if key in rest:
-            rest[key] = check_number(_number(rest[key]), f"{place}.{key}", unit)
+    rest = check_overrides(rest, place)
     given = [key for key in _COLORS if key in params]
     if not given:
         return None, rest
@@ -377,7 +421,7 @@ def _read_params(
         raise InputError(
             f"{place}: expected red, green and blue, or none; found {', '.join(given)} only"
         )
-    levels = [_number(params[key]) for key in _COLORS]
+    levels = [read_number(params[key]) for key in _COLORS]
     for key, level in zip(_COLORS, levels, strict=True):
         number = isinstance(level, int | float) and not isinstance(level, bool)
         if not number or not 0.0 <= level <= 1.0:
@@ -402,36 +446,7 @@ def _with_unique_names(modules: list[Module]) -> tuple[Module, ...]:
     return tuple(replace(m, name=name) for m, name in zip(modules, names, strict=True))
 
 
-# ------------------------------------------------------------------------- overrides
-
-
-def _share(values: list[float], total: float) -> list[float]:
-    """Splits a total in proportion to `values`; all to the first where they are all 0."""
-    whole = sum(values)
-    if whole == 0.0:
-        return [total] + [0.0] * (len(values) - 1)
-    return [total * value / whole for value in values]
-
-
-def _apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
-    """The type with a module's own mass, volume, electronics and ballast."""
-    if not any(key in params for key in _OVERRIDES):
-        return kind
-    parts = list(kind.parts)
-    for key in ("mass", "volume"):
-        if key in params:
-            values = _share([getattr(part, key) for part in parts], params[key])
-            changes: list[dict[str, Any]] = [{key: value} for value in values]
-            parts = [replace(p, **change) for p, change in zip(parts, changes, strict=True)]
-    if "electronics_volume" in params:
-        largest = max(range(len(parts)), key=lambda i: parts[i].volume)
-        parts = [
-            replace(part, electronics_volume=params["electronics_volume"] if i == largest else 0.0)
-            for i, part in enumerate(parts)
-        ]
-    if "ballast" in params:
-        parts[0] = replace(parts[0], mass=parts[0].mass + params["ballast"])
-    return replace(kind, parts=tuple(parts))
+# ------------------------------------------------------------------------- trimming
 
 
 def trim_neutral(morphology: Morphology, density: float) -> Morphology:
@@ -460,7 +475,7 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
             f"{-total * density:.4g} kg would do)"
         )
     added = {"electronics_volume": max(total, 0.0)}
-    core = replace(core, kind=_apply_overrides(core.kind, added), params={**core.params, **added})
+    core = replace(core, kind=apply_overrides(core.kind, added), params={**core.params, **added})
     return replace(morphology, modules=(core, *morphology.modules[1:]))
 
 

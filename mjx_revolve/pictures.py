@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ _FINE = 2
 _MOVING = 0.72
 _AXIS = (1.0, 0.47, 0.1)  # hinge axes are drawn as thin rods of this colour
 _ROD = (0.0011, 0.025)  # their radius and half length [m]
+_THRUST = (0.13, 0.66, 0.30)  # thrusts are drawn as arrows of this colour, along a command ahead
+_ARROW = (0.0011, 0.034, 0.0036, 0.010)  # shaft's radius and length, head's radius and length [m]
 _GREY = (0.62, 0.64, 0.68)  # modules without a colour of their own
 _INK = "#3a4250"
 _FAINT = "#c9ced6"
@@ -60,7 +63,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Piece:
-    """One part of a module, or the rod that shows a hinge's axis.
+    """One part of a module, the rod that shows a hinge's axis, or the arrow of a thrust.
 
     Attributes:
         module: number of the module in its morphology.
@@ -76,7 +79,7 @@ class Piece:
 
 
 def make_pieces(morphology: Morphology) -> list[Piece]:
-    """All parts of a morphology in their file's colours, and a rod for each hinge's axis.
+    """All parts of a morphology in their file's colours, hinges' axes and thrusts.
 
     Args:
         morphology: the robot's modules.
@@ -88,7 +91,10 @@ def make_pieces(morphology: Morphology) -> list[Piece]:
     pieces = []
     for number, module in enumerate(morphology.modules):
         kind = module.kind
-        drawn = tuple((part.name, part.boxes, part.volume, part.position) for part in kind.parts)
+        drawn = tuple(
+            (part.name, part.boxes, part.volume, part.position, part.thruster)
+            for part in kind.parts
+        )
         key = (kind.name, kind.hinge, drawn)
         if key not in meshes:
             meshes[key] = [
@@ -99,8 +105,17 @@ def make_pieces(morphology: Morphology) -> list[Piece]:
             shade = rgb * (_MOVING if kind.hinge is not None and k > 0 else 1.0)
             pieces.append(Piece(number, k, triangles, shade))
         if kind.hinge is not None:
-            rod = _rod(kind.hinge.axis) + np.asarray(kind.hinge.anchor)
+            radius, half = _ROD
+            profile = [(-half, 0.0), (-half, radius), (half, radius), (half, 0.0)]
+            rod = _spindle(kind.hinge.axis, profile) + np.asarray(kind.hinge.anchor)
             pieces.append(Piece(number, 0, rod, np.array(_AXIS)))
+        for k, part in enumerate(kind.parts):
+            if part.thruster is not None:
+                radius, shaft, wide, head = _ARROW
+                profile = [(0.0, 0.0), (0.0, radius), (shaft, radius), (shaft, wide)]
+                arrow = _spindle(part.thruster.axis, [*profile, (shaft + head, 0.0)])
+                arrow = arrow + np.asarray(part.position) + np.asarray(part.thruster.position)
+                pieces.append(Piece(number, k, arrow, np.array(_THRUST)))
     return pieces
 
 
@@ -142,18 +157,22 @@ def rest_scene(morphology: Morphology) -> Scene:
     return place_pieces(make_pieces(morphology), place)
 
 
-def _rod(axis: Sequence[float]) -> np.ndarray:
-    """Thin six-sided rod `[m, 3, 3]` along a direction through the origin [m]."""
+def _spindle(axis: Sequence[float], profile: Sequence[tuple[float, float]]) -> np.ndarray:
+    """Six-sided solid of revolution `[m, 3, 3]` about a direction through the origin [m].
+
+    Args:
+        axis: the direction.
+        profile: places along it and radii [m], from a point on the axis to another.
+    """
     along = np.asarray(axis, float) / np.linalg.norm(axis)
     side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
     side /= np.linalg.norm(side)
     angle = np.arange(7)[:, None] * math.pi / 3
-    ring = _ROD[0] * (np.cos(angle) * side + np.sin(angle) * np.cross(along, side))
-    low, high = ring - _ROD[1] * along, ring + _ROD[1] * along
-    walls = [(low[k], low[k + 1], high[k]) for k in range(6)]
-    walls += [(low[k + 1], high[k + 1], high[k]) for k in range(6)]
-    walls += [(high[0], high[k], high[k + 1]) for k in range(1, 5)]
-    return np.array(walls + [(low[0], low[k + 1], low[k]) for k in range(1, 5)])
+    ring = np.cos(angle) * side + np.sin(angle) * np.cross(along, side)
+    rings = [place * along + radius * ring for place, radius in profile]
+    walls = [(low[k], low[k + 1], high[k]) for low, high in pairwise(rings) for k in range(6)]
+    walls += [(low[k + 1], high[k + 1], high[k]) for low, high in pairwise(rings) for k in range(6)]
+    return np.array(walls)
 
 
 def make_view(azimuth: float, elevation: float) -> np.ndarray:
@@ -454,9 +473,17 @@ def _compose(morphology: Morphology) -> Figure:
             axis.set_major_locator(MaxNLocator(nbins=count, steps=[1, 2, 5, 10]))
         _show(axes, scene, view, unit / _DPI)
 
-    words = (
-        f"modules {morphology.num_modules}, hinges {morphology.num_hinges}, "
-        f"{morphology.mass:.4g} kg, {1e6 * morphology.volume:.4g} cm³"
+    counts = [
+        f"{name} {count}"
+        for name, count in (("thrusters", morphology.num_thrusters), ("fins", morphology.num_fins))
+        if count
+    ]
+    words = ", ".join(
+        [
+            f"modules {morphology.num_modules}, hinges {morphology.num_hinges}",
+            *counts,
+            f"{morphology.mass:.4g} kg, {1e6 * morphology.volume:.4g} cm³",
+        ]
     )
     figure.text(
         0.3 / width, 1 - 0.38 / height, morphology.name, fontsize=15, color=_INK, va="center"
@@ -514,7 +541,8 @@ def draw_morphology(morphology: Morphology, path: str | Path) -> None:
     """Draws a morphology at rest: three-quarter, top and side view, axes in metres.
 
     Modules have the colours of their file; the part of a hinge that moves is drawn darker than its
-    frame. The file appears whole or not at all.
+    frame. An orange rod is a hinge's axis, a green arrow the thrust of a command ahead. The file
+    appears whole or not at all.
 
     Args:
         morphology: what to draw.

@@ -1,9 +1,10 @@
 """The project's own meshes of the modules: what a picture shows, with the tabulated volume.
 
 They look like RoboGen's printed parts (hollow boxes with windows, a U bracket, a servo with its
-plate, a slab with two pads) but are drawn from the catalogue alone: the outer dimensions are those
-of a part's boxes, and one free dimension (a wall, a window, the height of the pads) is solved so
-that the mesh encloses the part's tabulated volume. A user's module type is drawn the same way.
+plate, a slab with two pads; the propeller in its duct and the rounded fin are our own) but are
+drawn from the catalogue alone: the outer dimensions are those of a part's boxes, and one free
+dimension (a wall, a window, the height of the pads) is solved so that the mesh encloses the part's
+tabulated volume. A user's module type is drawn the same way.
 
 A surface is put together from flat faces and from bands between two closed loops of points. A loop
 is four quadrants, counter-clockwise about the direction in which its face looks; the quadrants let
@@ -308,12 +309,79 @@ def _sensor(kind: ModuleType, part: Part) -> _Triangles | None:
     return _solve(build, 1e-6 * half_y, 2.0 * half_y, part.volume)
 
 
+def _duct(kind: ModuleType, part: Part) -> _Triangles | None:
+    """Tube along the thrust, and in it a motor with three blades at the end that pushes ahead."""
+    if part.thruster is None:
+        return None
+    axis = int(np.abs(part.thruster.axis).argmax())
+    ahead = 1.0 if part.thruster.axis[axis] > 0.0 else -1.0
+    half = 0.5 * np.asarray(part.boxes[0].size)
+    length, radius = half[axis], min(half[(axis + 1) % 3], half[(axis + 2) % 3])
+
+    def circle(size: float, height: float) -> _Loop:
+        return _place(_rounded(size, size, size), axis, height)
+
+    hub, nose, most = 0.4 * radius, 0.12 * radius, 0.9 * length
+    ends = [(nose, -most), (hub, -0.7 * most), (hub, 0.7 * most), (nose, most)]
+    motor = [circle(size, height) for size, height in ends]
+    look = np.eye(3)[axis]
+    inside = _face(motor[0], -look) + _chain(*motor) + _face(motor[-1], look)
+
+    # Blades are pitched by 35 degrees and end short of motor and tube: nothing counts twice.
+    wide, c, s = 0.55 * radius, np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
+    pitch = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    root = 1.01 * hub
+
+    def blade(tip: float, turn: float) -> _Triangles:
+        """Thin plate from the motor to the tip."""
+        cos, sin = np.cos(turn), np.sin(turn)
+        about = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        at = np.array([0.5 * (tip + root), 0.0, 0.0])
+        height = np.array([0.0, 0.0, ahead * 0.5 * most])
+        # Built about z, then z becomes the axis: a turn that keeps the order of the axes.
+        order = [(k - axis - 1) % 3 for k in range(3)]
+        plate = _box((tip - root, wide, 0.05 * radius))
+        return [((one @ pitch.T + at) @ about.T + height)[:, order] for one in plate]
+
+    def build(wall: float) -> _Triangles:
+        inner = radius - wall
+        rims = [
+            circle(size, height)
+            for size, height in (
+                (inner, -length), (radius, -length), (radius, length), (inner, length)
+            )
+        ]  # fmt: skip
+        triangles = _chain(*rims, rims[0]) + inside
+        for k in range(3):
+            tip = np.sqrt((0.97 * inner) ** 2 - (0.5 * wide * c) ** 2)
+            triangles += blade(tip, k * 2.0 * np.pi / 3.0)
+        return triangles
+
+    return _solve(build, 1e-3 * radius, 0.5 * radius, part.volume)
+
+
+def _plate(kind: ModuleType, part: Part) -> _Triangles | None:
+    """Flat plate with rounded corners."""
+    half = 0.5 * np.asarray(part.boxes[0].size)
+    axis = int(half.argmin())
+    u, v, look = half[(axis + 1) % 3], half[(axis + 2) % 3], np.eye(3)[axis]
+
+    def build(radius: float) -> _Triangles:
+        low, high = (_place(_rounded(u, v, radius), axis, sign * half[axis]) for sign in (-1, 1))
+        return _face(low, -look) + _chain(low, high) + _face(high, look)
+
+    return _solve(build, 1e-6 * min(u, v), min(u, v), part.volume)
+
+
 _SHAPES = {
     ("Core", "core"): _core,
     ("FixedBrick", "brick"): _brick,
     ("ActiveHinge", "frame"): _frame,
     ("ActiveHinge", "servo"): _servo,
     ("TouchSensor", "sensor"): _sensor,
+    ("Thruster", "duct"): _duct,
+    ("LiftThruster", "duct"): _duct,
+    ("Fin", "plate"): _plate,
 }
 
 

@@ -124,18 +124,49 @@ def test_descriptors_are_listed(spider, capsys):
         assert _value(out, f"  {key} ") == pytest.approx(float(value), rel=1e-5)
 
 
+def test_thrusters_are_listed_with_what_they_do(capsys):
+    assert run(ROOT / "morphologies" / "auv.yaml") == 0
+    out = capsys.readouterr().out
+    assert (_value(out, "thrusters"), _value(out, "fins"), _value(out, "hinges")) == (4, 0, 0)
+    assert "(neutral)" in out
+    lines = inspect.thruster_table(load_morphology(ROOT / "morphologies" / "auv.yaml"))
+    assert len(lines) == 2 + 4 and all(line in out for line in lines)
+    assert [line.split()[1:] for line in lines[2:]] == [
+        ["bow", "0.00000", "0.05950", "0.00000", "0", "0", "1", "-0.5", "0.5", "0.1", "0.0035"],
+        ["stern", "0.00000", "-0.05950", "0.00000", "0", "0", "1", "-0.5", "0.5", "0.1", "-0.0035"],
+        ["starboard", "0.05950", "0.00000", "0.00000", "0", "1", "0", "-0.5", "0.5", "0.1",
+         "0.0035"],
+        ["port", "-0.05950", "0.00000", "0.00000", "0", "1", "0", "-0.5", "0.5", "0.1", "-0.0035"],
+    ]  # fmt: skip
+
+
+def test_centres_of_mass_and_volume_are_shown(spider, capsys):
+    assert run(spider) == 0
+    out = capsys.readouterr().out
+    assert "centre of mass at rest" in out and inspect.thruster_table(load_morphology(spider)) == []
+    assert run(ROOT / "morphologies" / "fish.yaml") == 0
+    out = capsys.readouterr().out
+    (mass,), (volume,) = (
+        [line.split()[-4:-1] for line in out.splitlines() if line.startswith(f"centre of {what}")]
+        for what in ("mass", "volume")
+    )
+    assert mass[:2] == volume[:2]  # level at rest
+    assert float(volume[2]) > float(mass[2]) + 0.004  # and upright
+    assert (_value(out, "thrusters"), _value(out, "fins"), _value(out, "hinges")) == (0, 3, 3)
+
+
 def test_own_module_types_are_read(tmp_path, capsys):
     (tmp_path / "mine.yaml").write_text(
-        "modules:\n  Fin:\n    mount: -x\n"
+        "modules:\n  Flipper:\n    mount: -x\n"
         "    parts:\n      - {size: [.06, .04, .002], mass: .006, volume: 4.0e-6}\n"
     )
     (tmp_path / "robot.yaml").write_text(
-        "id: fish\nbody:\n  id: core\n  type: Core\n  children:\n    1: {id: fin, type: Fin}\n"
+        "id: fish\nbody:\n  id: core\n  type: Core\n  children:\n    1: {id: fin, type: Flipper}\n"
     )
     assert run(tmp_path / "robot.yaml", "--modules", tmp_path / "mine.yaml") == 0
     assert _value(capsys.readouterr().out, "mass") == pytest.approx(0.096)
     assert run(tmp_path / "robot.yaml") == 2
-    assert "Fin" in capsys.readouterr().err
+    assert "Flipper" in capsys.readouterr().err
 
 
 def test_overlap_is_refused_unless_allowed(tmp_path, capsys):
@@ -173,6 +204,44 @@ def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
     white = (pixels > 0.99).all(axis=-1)
     assert 0.01 < blue.mean() < 0.3  # core and bricks
     assert 0.3 < white.mean() < 0.9
+
+
+def test_thrusts_are_drawn_as_green_arrows(tmp_path):
+    from matplotlib.image import imread
+
+    share = {}
+    for name in ("auv", "fish"):
+        assert run(ROOT / "morphologies" / f"{name}.yaml", "--picture", tmp_path / "a.png") == 0
+        red, green, blue = np.moveaxis(imread(tmp_path / "a.png")[..., :3], -1, 0)
+        share[name] = ((green > 1.6 * red) & (green > 1.6 * blue) & (green > 0.3)).mean()
+    assert share["auv"] > 1e-3
+    assert share["fish"] == 0.0
+
+
+@pytest.mark.parametrize("name", ["Thruster", "LiftThruster", "Fin"])
+def test_thrusters_and_fins_have_shapes_of_their_volume_within_their_box(name):
+    from mjx_revolve.modules import MODULES
+    from mjx_revolve.shapes import part_mesh
+
+    kind = MODULES[name]
+    (part,) = kind.parts
+    mesh = part_mesh(kind, part)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(part.volume, rel=1e-9)
+    assert mesh.bounds == pytest.approx(np.array(part.bounds), abs=1e-9)
+
+
+def test_an_arrow_is_closed_and_points_along_its_axis():
+    import trimesh
+
+    from mjx_revolve.pictures import _spindle
+
+    corners = _spindle((0, 0, 2), [(0.0, 0.0), (0.0, 1.0), (3.0, 1.0), (3.0, 2.0), (5.0, 0.0)])
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    mesh.merge_vertices()
+    hexagon = 1.5 * np.sqrt(3)
+    assert mesh.volume == pytest.approx(hexagon * 3 + 4 * hexagon * 2 / 3)
+    assert mesh.bounds[:, 2] == pytest.approx([0.0, 5.0])
 
 
 def test_what_is_nearer_hides_what_is_farther():

@@ -17,10 +17,12 @@ from mjx_revolve.modules import (
     THESIS_MODULES,
     Box,
     Hinge,
+    LiftDrag,
     ModuleType,
     Mount,
     Part,
     Slot,
+    Thruster,
     load_modules,
 )
 from mjx_revolve.morphology import load_morphology
@@ -74,6 +76,74 @@ def test_slots_look_away_from_the_module(name, free):
     assert len(kind.slots) == free
     for slot in kind.slots.values():
         assert np.dot(slot.position, slot.direction) > 0
+
+
+@pytest.mark.parametrize("name, axis", [("Thruster", 0), ("LiftThruster", 2)])
+def test_thrusters_push_half_a_newton_through_their_length(name, axis):
+    kind = MODULES[name]
+    (duct,) = kind.parts
+    thruster = duct.thruster
+    assert kind.is_thruster and not kind.is_fin and not kind.slots
+    assert thruster.axis == tuple(np.eye(3)[axis])
+    assert duct.boxes[0].size[axis] == max(duct.boxes[0].size)
+    assert (thruster.thrust_at(-2.0), thruster.thrust_at(0.5)) == (-0.5, 0.125)
+    # It is attached by the face of its box that looks along -x.
+    assert kind.mount.position == (-duct.boxes[0].size[0] / 2, 0.0, 0.0)
+    # The pieces that the comment counts: a duct with a wall of 2 mm and a motor.
+    ring = math.pi * (0.015**2 - 0.013**2) * 0.040
+    assert duct.volume == pytest.approx(ring + math.pi * 0.006**2 * 0.035, rel=0.01)
+
+
+def test_the_fin_is_a_plate_of_abs_with_lift():
+    (plate,) = MODULES["Fin"].parts
+    length, width, thickness = plate.boxes[0].size
+    corners = (4 - math.pi) * 0.01**2
+    assert plate.volume == pytest.approx((length * width - corners) * thickness, rel=1e-3)
+    assert plate.mass / plate.volume == pytest.approx(1050, rel=0.005)
+    p, aspect = plate.lift_drag, width / length
+    assert p.cla == pytest.approx(2 * math.pi * aspect / (2 + math.sqrt(aspect**2 + 4)))
+    stall, across = p.alpha_stall, math.pi / 2 - p.alpha_stall
+    assert p.cla * stall + p.cla_stall * across == pytest.approx(0.0)
+    assert p.cda * stall + p.cda_stall * across == pytest.approx(1.17)
+    # Before the stall the mean drag is that of a force normal to the plate.
+    angle = (np.arange(1000) + 0.5) / 1000 * stall
+    assert (p.cda * angle).mean() == pytest.approx((p.cla * angle * np.tan(angle)).mean(), rel=0.01)
+
+
+# ------------------------------------------------------------------- masses, volumes, centres
+
+
+def test_ballast_moves_the_centres_of_mass_and_volume():
+    part = Part(
+        "p",
+        (Box((0.1, 0.1, 0.1)),),
+        mass=0.3,
+        volume=2e-4,
+        electronics_volume=1e-4,
+        center_of_volume=(0.0, 0.01, 0.02),
+        ballast_mass=0.1,
+        ballast_volume=1e-4,
+        ballast_position=(0.04, 0.0, -0.04),
+    )
+    assert part.total_mass == pytest.approx(0.4)
+    assert part.total_volume == pytest.approx(4e-4)
+    assert part.free_volume == pytest.approx(6e-4)
+    assert part.center_of_mass == pytest.approx((0.01, 0.0, -0.01))
+    assert part.displaced_center == pytest.approx((0.01, 0.0075, 0.005))
+    bare = replace(part, ballast_mass=0.0, ballast_volume=0.0)
+    assert bare.center_of_mass == (0.0, 0.0, 0.0)
+    assert bare.displaced_center == part.center_of_volume
+    kind = ModuleType("M", (part,))
+    assert (kind.mass, kind.volume) == pytest.approx((0.4, 4e-4))
+
+
+def test_what_weighs_or_displaces_nothing_has_its_centres_in_the_middle():
+    part = Part("p", (Box((1, 1, 1)),), mass=0.0, volume=0.0)
+    assert part.center_of_mass == part.displaced_center == (0.0, 0.0, 0.0)
+
+
+def test_a_part_fuller_than_its_box_has_no_room_for_water():
+    assert MODULES["TouchSensor"].parts[0].free_volume == 0.0
 
 
 # ------------------------------------------------------------------------- box geometry
@@ -156,6 +226,7 @@ def test_edge_against_edge_needs_the_cross_products():
 
 PART = Part("p", (Box((1, 1, 1)),), 1.0, 1.0)
 HINGE = Hinge((0, 1, 0), (0, 0, 0), (-1, 1), 1.0, 1.0)
+LINE = Thruster(curve="interpolated", commands=(-1, 0, 1), thrusts=(-1, 0, 2))
 MOUNT = Mount((-0.5, 0, 0), (1, 0, 0))
 
 
@@ -178,6 +249,79 @@ MOUNT = Mount((-0.5, 0, 0), (1, 0, 0))
         (
             lambda: replace(PART, boxes=(Box((1, 1, 1), (1, 0, 0)),)),
             "part 'p': boxes.0.position: expected [0, 0, 0]",
+        ),
+        (
+            lambda: replace(PART, buoyancy="some"),
+            "part 'p': buoyancy: expected one of partial, mask, off; found 'some'",
+        ),
+        (
+            lambda: replace(PART, drag="inertia_box"),
+            "part 'p': drag: expected one of faces, lift_drag, ellipsoid, off (a law of whole "
+            "bodies: the world's); found 'inertia_box'",
+        ),
+        (lambda: replace(PART, drag=["off"]), "part 'p': drag: expected one of faces, lift_drag"),
+        (
+            lambda: replace(PART, added_mass=1),
+            "part 'p': added_mass: expected true or false; found",
+        ),
+        (
+            lambda: replace(PART, entrained_water=1.5),
+            "part 'p': entrained_water: expected a share from 0 to 1 [-]; found 1.5",
+        ),
+        (lambda: replace(PART, entrained_water=-0.1), "entrained_water: expected a number >= 0"),
+        (lambda: replace(PART, ballast_mass=-1), "ballast_mass: expected a number >= 0 [kg]"),
+        (lambda: replace(PART, ballast_volume=-1), "ballast_volume: expected a number >= 0 [m3]"),
+        (lambda: replace(PART, ballast_position=1), "ballast_position: expected three numbers [m]"),
+        (lambda: replace(PART, lift_drag={}), "part 'p': lift_drag: expected a LiftDrag; found {}"),
+        (lambda: replace(PART, thruster=True), "part 'p': thruster: expected a Thruster; found Tr"),
+        (
+            lambda: Thruster(curve="linear"),
+            "thruster: curve: expected one of basic, dead_band, interpolated; found 'linear'",
+        ),
+        (lambda: Thruster(axis=(0, 0, 0)), "thruster: axis: expected a direction, not zero"),
+        (lambda: Thruster(position=(0, 0)), "thruster: position: expected three numbers [m]"),
+        (lambda: Thruster(gain=-1), "thruster: gain: expected a number >= 0 [N]; found -1"),
+        (lambda: Thruster(gain=math.nan), "thruster: gain: expected a number >= 0 [N]; found nan"),
+        (lambda: Thruster(time_constant=-1), "thruster: time_constant: expected a number >= 0 [s]"),
+        (lambda: Thruster(torque_ratio="a"), "thruster: torque_ratio: expected a number [m]"),
+        (lambda: Thruster(range=(-1, 0, 1)), "thruster: range: expected 2 numbers [-]"),
+        (
+            lambda: Thruster(range=(0.1, 1)),
+            "thruster: range: expected [lowest, highest] around the command 0 [-]; found [0.1, 1.0",
+        ),
+        (lambda: Thruster(range=(0, 0)), "thruster: range: expected [lowest, highest] around the"),
+        (
+            lambda: Thruster(gain_backward=1),
+            "thruster: gain_backward: expected none with curve basic; found 1.0",
+        ),
+        (
+            lambda: Thruster(dead_band=(-1, 1)),
+            "thruster: dead_band: expected none with curve basic",
+        ),
+        (lambda: Thruster(commands=(0, 1)), "thruster: commands: expected none with curve basic"),
+        (lambda: Thruster(thrusts=(0, 1)), "thruster: thrusts: expected none with curve basic; f"),
+        (lambda: replace(LINE, gain=2), "gain: expected none with curve interpolated; found 2.0"),
+        (
+            lambda: Thruster(curve="dead_band", dead_band=(0.1, 0.2)),
+            "thruster: dead_band: expected [at most 0, at least 0] [-]; found [0.1, 0.2]",
+        ),
+        (
+            lambda: Thruster(curve="dead_band", gain_backward=-1),
+            "thruster: gain_backward: expected a number >= 0 [N]; found -1",
+        ),
+        (
+            lambda: Thruster(curve="interpolated"),
+            "thruster: commands and thrusts: expected two or more, as many of both; found 0 and 0",
+        ),
+        (lambda: replace(LINE, thrusts=(0, 1)), "as many of both; found 3 and 2"),
+        (
+            lambda: replace(LINE, commands=(-1, 1, 1)),
+            "thruster: commands: expected numbers that rise from each to the next [-]; found",
+        ),
+        (lambda: replace(LINE, commands="abc"), "commands: expected a list of numbers [-]; found"),
+        (
+            lambda: replace(LINE, commands=(0, 1, "a")),
+            "commands.2: expected a number [-]; found 'a",
         ),
         (lambda: replace(HINGE, axis=(0, 0, 0)), "hinge: axis: expected a direction, not zero"),
         (lambda: replace(HINGE, range=(0.5, 1)), "hinge: range: expected [lowest, highest] around"),
@@ -280,9 +424,28 @@ def test_own_types_are_read(tmp_path):
 
 def test_the_example_in_the_docstring_works(tmp_path):
     lines = load_modules.__doc__.split("::\n\n")[1].split("\n\n    `-x`")[0]
-    fin = load_modules(write(tmp_path, lines))["Flipper"]
-    assert fin.name == "Fin"
-    assert [part.mass for part in fin.parts] == [0.002, 0.006]
+    kinds = load_modules(write(tmp_path, lines))
+    flipper = kinds["Paddle"]
+    assert flipper.name == "Flipper"
+    assert [part.mass for part in flipper.parts] == [0.002, 0.006]
+    assert (flipper.parts[1].buoyancy, flipper.parts[1].drag) == ("partial", "lift_drag")
+    # What it calls a default is one.
+    defaults = Part("blade", flipper.parts[1].boxes, 0.006, 4e-6, position=(0.04, 0, 0))
+    assert replace(flipper.parts[1], buoyancy=None, drag=None, added_mass=None) == defaults
+    (fin,), (jet,) = kinds["PectoralFin"].parts, kinds["Jet"].parts
+    assert fin.lift_drag == LiftDrag(
+        cla=2.0, cda=0.3, alpha_stall=0.5, forward=(0, 1, 0), upward=(0, 0, 1)
+    )
+    assert jet.thruster == Thruster(
+        curve="dead_band", gain=0.3, dead_band=(-0.05, 0.05), time_constant=0.05, torque_ratio=2e-3
+    )
+
+
+def test_switches_may_be_off_without_quotes(tmp_path):
+    text = "{size: [1, 1, 1], mass: 1, buoyancy: off, drag: off, added_mass: off}"
+    kinds = load_modules(write(tmp_path, f"modules: {{M: {{mount: null, parts: [{text}]}}}}"))
+    (part,) = kinds["M"].parts
+    assert (part.buoyancy, part.drag, part.added_mass) == ("off", "off", False)
 
 
 def test_own_types_make_a_robot(tmp_path):
@@ -311,7 +474,7 @@ body:
     morphology.save(tmp_path / "again.yaml")
     again = load_morphology(tmp_path / "again.yaml", modules=mine)
     assert again.modules == morphology.modules
-    with pytest.raises(InputError, match=r"expected one of ActiveHinge, FixedBrick, .*'Ring'"):
+    with pytest.raises(InputError, match=r"expected one of ActiveHinge, Fin, FixedBr.*'Ring'"):
         load_morphology(tmp_path / "again.yaml")
 
 
@@ -381,6 +544,39 @@ def _drop(*keys):
         (
             _changed(_set("Fin", "parts", 1, "boxes", 0, "size", [1, -1, 1])),
             "modules.Fin.parts.1.boxes.0: box: size.1: expected a number > 0 [m]; found -1",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "lift_drag", {"clap": 1})),
+            "modules.Fin.parts.1.lift_drag: expected only a0, cla, cda",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "lift_drag", {"cla": "steep"})),
+            "modules.Fin.parts.1: lift_drag.cla: expected a number; found 'steep'",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "lift_drag", {"cla": 10**400})),
+            "modules.Fin.parts.1: lift_drag.cla: expected a finite number; found 'a huge integer'",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "lift_drag", True)),
+            "lift_drag: expected a mapping with",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "thruster", {"power": 1})),
+            "modules.Fin.parts.1.thruster: expected only axis, position, curve, gain",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "thruster", {"range": [1, 2]})),
+            "modules.Fin.parts.1: thruster: range: expected [lowest, highest] around",
+        ),
+        (_changed(_set("Fin", "parts", 1, "thruster", [1])), "thruster: expected a mapping with"),
+        (
+            _changed(_set("Fin", "parts", 1, "drag", "inertia_box")),
+            "modules.Fin.parts.1: part 'blade': drag: expected one of faces, lift_drag, ellipsoid",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "ballast_position", [0, 0])),
+            "modules.Fin.parts.1: part 'blade': ballast_position: expected three numbers [m]",
         ),
         (_changed(_set("Fin", "mount", "-z")), "Fin.mount: expected -x, +x, -y, +y or a mapping"),
         (_changed(_set("Fin", "mount", 3)), "Fin.mount: expected a mapping with position, outward"),

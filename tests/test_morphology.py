@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 import yaml
 
 from mjx_revolve.errors import InputError
-from mjx_revolve.modules import MODULES, THESIS_MODULES
+from mjx_revolve.modules import MODULES, THESIS_MODULES, LiftDrag
 from mjx_revolve.morphology import (
     MAX_MODULES,
     Morphology,
@@ -170,7 +171,15 @@ def test_our_robots_load_and_have_colours_and_names(path):
 
 
 def test_our_robots_are_what_they_promise():
-    assert {p.stem for p in OURS} >= {"spider", "gecko", "snake", "centipede", "core"}
+    assert {p.stem for p in OURS} >= {
+        "spider",
+        "gecko",
+        "snake",
+        "centipede",
+        "core",
+        "auv",
+        "fish",
+    }
     assert (ours("core").num_modules, ours("core").num_hinges) == (1, 0)
     centipede, snake = ours("centipede"), ours("snake")
     assert centipede.num_modules == 30 and centipede.num_hinges >= 16
@@ -311,6 +320,174 @@ body:
     assert MODULES["Core"].mass == 0.09
 
 
+def test_ballast_without_a_place_is_spread_and_with_one_is_a_point(tmp_path):
+    text = "body: {type: Core, params: {mass: 0.1, volume: 1e-4, ballast: 0.1%s}}"
+    (spread,) = read(tmp_path, text % "").modules[0].kind.parts
+    assert (spread.mass, spread.ballast_mass) == (0.2, 0.0)
+    (placed,) = read(tmp_path, text % ", ballast_position: [0, 0, -0.02]").modules[0].kind.parts
+    assert (placed.mass, placed.ballast_mass, placed.ballast_volume) == (0.1, 0.1, 0.0)
+    robot = read(tmp_path, text % ", ballast_position: [0, '.01;', -0.02], ballast_volume: 1e-4")
+    (part,) = robot.modules[0].kind.parts
+    assert part.ballast_position == (0.0, 0.01, -0.02)
+    assert robot.mass == part.total_mass == pytest.approx(0.2)
+    assert robot.volume == part.total_volume == pytest.approx(2e-4)
+    assert robot.center_of_mass == pytest.approx([0.0, 0.005, -0.01])
+    assert robot.center_of_volume == pytest.approx([0.0, 0.005, -0.01])
+
+
+def test_own_ballast_stays_where_only_its_place_is_given(tmp_path):
+    core = MODULES["Core"]
+    heavy = replace(core, parts=(replace(core.parts[0], ballast_mass=0.5),))
+    text = "body: {type: Core, params: {ballast_position: [0, 0, 0.01]}}"
+    robot = read(tmp_path, text, modules=MODULES | {"Core": heavy})
+    assert robot.center_of_mass == pytest.approx([0, 0, 0.01 * 0.5 / 0.59])
+
+
+def test_centres_are_those_of_all_parts_at_rest(tmp_path):
+    text = """
+body:
+  type: Core
+  params: {electronics_volume: 2e-5, center_of_volume: [0.01, 0, 0.002]}
+  children:
+    2:
+      type: ActiveHinge
+      orientation: 90
+      params: {ballast: 0.01, ballast_position: [0, 0.01, 0.002], center_of_volume: [0, 0, 0.001]}
+"""
+    robot = read(tmp_path, text)
+    # Along +x, turned by 90 degrees: the hinge's y is up and its z is -y.
+    x, servo = 0.0555, 0.0555 + 0.015525
+    mass = [
+        (0.09, [0, 0, 0]),
+        (0.0017, [x, 0, 0]),
+        (0.01, [x, -0.002, 0.01]),
+        (0.009, [servo, 0, 0]),
+    ]
+    volume = [
+        (7.054e-5, [0.01, 0, 0.002]),
+        (3.032e-6, [x, 0, 0]),
+        (1.014e-5, [servo, -0.001, 0]),
+    ]
+    for found, rows in ((robot.center_of_mass, mass), (robot.center_of_volume, volume)):
+        weight = np.array([w for w, _ in rows])
+        assert found == pytest.approx(weight @ np.array([at for _, at in rows]) / weight.sum())
+    assert robot.mass == pytest.approx(sum(w for w, _ in mass))
+    assert robot.volume == pytest.approx(sum(w for w, _ in volume))
+
+
+def test_laws_and_coefficients_of_a_module(tmp_path):
+    text = """
+body:
+  type: Core
+  params: {buoyancy: mask, drag: off, added_mass: off, entrained_water: "0.5;"}
+  children:
+    1:
+      type: ActiveHinge
+      params: {drag: ellipsoid, drag_coefficient: 2, added_mass_coefficient: 3}
+    2: {type: FixedBrick, params: {lift_drag: {cla: 2.0}}}
+    3: {type: Fin, params: {lift_drag: {cla: 2.0}, drag: faces}}
+"""
+    robot = read(tmp_path, text)
+    core, hinge, brick, fin = (module.kind.parts for module in robot.modules)
+    (core,), (brick,), (fin,) = core, brick, fin
+    assert (core.buoyancy, core.drag, core.added_mass) == ("mask", "off", False)
+    assert core.entrained_water == 0.5
+    for part in hinge:
+        assert (part.drag, part.drag_coefficient, part.added_mass_coefficient) == (
+            "ellipsoid",
+            2,
+            3,
+        )
+    assert brick.lift_drag == LiftDrag(cla=2.0)
+    assert fin.lift_drag == replace(MODULES["Fin"].parts[0].lift_drag, cla=2.0)
+    assert fin.drag == "faces"
+    assert robot.num_fins == 2 and robot.descriptors["num_bricks"] == 0
+    check_round_trip(robot, tmp_path)
+
+
+def test_numbers_of_a_thruster(tmp_path):
+    text = """
+body:
+  type: Core
+  children:
+    1:
+      type: Thruster
+      id: jet
+      params: {thrust: 0.8, thruster: {axis: [0, 0, 2], range: [-1, 0.5]}}
+    2: {type: LiftThruster, id: lift, params: {thruster: {torque_ratio: -0.002, time_constant: 0}}}
+    3:
+      type: Thruster
+      id: line
+      params:
+        thrust: 3
+        thruster:
+          {curve: interpolated, gain: 1, commands: [-1, 0, 1], thrusts: [-0.5, 0, 1]}
+"""
+    robot = read(tmp_path, text)
+    assert robot.thrusters == ((1, 0), (2, 0), (3, 0))
+    assert (robot.num_thrusters, robot.num_hinges) == (3, 0)
+    jet, lift, line = (robot.modules[i].kind.parts[k].thruster for i, k in robot.thrusters)
+    assert jet.axis == (0.0, 0.0, 1.0) and jet.thrust_at(1.0) == pytest.approx(0.8)
+    assert jet.gain == pytest.approx(3.2)  # full ahead is command .5
+    assert (lift.torque_ratio, lift.time_constant, lift.gain) == (-0.002, 0.0, 0.5)
+    assert line.thrusts == pytest.approx((-1.5, 0.0, 3.0))
+    check_round_trip(robot, tmp_path)
+
+
+def test_a_dead_band_is_scaled_on_both_sides(tmp_path):
+    thruster = "{curve: dead_band, gain: 2, gain_backward: 1, dead_band: [-0.5, 0.5]}"
+    text = "body: {type: Core, children: {1: {type: Thruster, params: {thrust: 4, thruster: %s}}}}"
+    (part,) = read(tmp_path, text % thruster).modules[1].kind.parts
+    assert (part.thruster.gain, part.thruster.gain_backward) == (8.0, 4.0)
+    assert [part.thruster.thrust_at(x) for x in (-1, 0.7, 1)] == [-2.0, 0.0, 4.0]
+
+
+# ------------------------------------------------------------------------- the AUV and the fish
+
+
+def test_the_auv_pushes_up_and_ahead_without_torque():
+    robot = ours("auv")
+    force, torque = np.zeros((4, 3)), np.zeros((4, 3))
+    for i, (index, k) in enumerate(robot.thrusters):
+        module = robot.modules[index]
+        thruster = module.kind.parts[k].thruster
+        force[i] = module.rotation @ np.array(thruster.axis) * thruster.thrust_at(1.0)
+        torque[i] = np.cross(module.position, force[i]) - thruster.torque_ratio * force[i]
+    up, ahead = slice(0, 2), slice(2, 4)
+    assert force[up].sum(0) == pytest.approx([0, 0, 1]) and torque[up].sum(0) == pytest.approx(0)
+    assert force[ahead].sum(0) == pytest.approx([0, 1, 0])
+    assert torque[ahead].sum(0) == pytest.approx(0)
+    # Against each other: pitch about x with bow and stern, yaw about z with the sides.
+    assert (torque[0] - torque[1])[0] == pytest.approx(0.0595)
+    assert (torque[2] - torque[3])[2] == pytest.approx(0.0595)
+
+
+def test_the_fish_has_a_tail_that_beats_sideways():
+    robot = ours("fish")
+    tail = robot.modules[robot.num_modules - 3]
+    plate = tail.kind.parts[0].lift_drag
+    assert tail.rotation @ np.array(plate.forward) == pytest.approx([0, 1, 0])
+    assert np.abs(tail.rotation @ np.array(plate.upward)) == pytest.approx([1, 0, 0])
+    for i in robot.hinges:
+        hinge = robot.modules[i]
+        assert np.abs(hinge.rotation @ hinge.kind.hinge.axis) == pytest.approx([0, 0, 1])
+    for name in ("right_fin", "left_fin"):
+        (fin,) = [m for m in robot.modules if m.name == name]
+        plate = fin.kind.parts[0].lift_drag
+        assert fin.rotation @ np.array(plate.forward) == pytest.approx([0, 1, 0])
+        assert fin.rotation @ np.array(plate.upward) == pytest.approx([0, 0, 1])
+    assert robot.hinge_neighbours() == ((0, 1), (1, 2))
+
+
+@pytest.mark.parametrize("name", ["auv", "fish"])
+def test_swimmers_with_ballast_are_neutral_level_and_upright(name):
+    robot = ours(name)
+    assert robot.volume * WATER == pytest.approx(robot.mass, rel=1e-9)
+    apart = robot.center_of_volume - robot.center_of_mass
+    assert apart[:2] == pytest.approx([0, 0], abs=1e-7)
+    assert apart[2] > 0.004
+
+
 def test_trim_neutral(tmp_path):
     robot = ours("spider")
     trimmed = trim_neutral(robot, WATER)
@@ -382,9 +559,13 @@ def random_tree(rng: random.Random, size: int) -> dict:
         if rng.random() < 0.5:
             params |= {c: round(rng.random(), rng.randrange(1, 17)) for c in ("red", "green")}
             params["blue"] = 1
-        for key in ("mass", "volume", "electronics_volume", "ballast"):
+        for key in ("mass", "volume", "electronics_volume", "ballast", "entrained_water"):
             if rng.random() < 0.2:
                 params[key] = rng.uniform(1e-9, 0.1)
+        if rng.random() < 0.2:
+            params["ballast_position"] = [rng.uniform(-0.1, 0.1), 0, 1]
+        if rng.random() < 0.2:
+            params |= {"drag": rng.choice(["faces", False]), "added_mass": rng.random() < 0.5}
         return item | ({"params": params} if params else {})
 
     root = module("Core") | {"orientation": 0}
@@ -393,7 +574,7 @@ def random_tree(rng: random.Random, size: int) -> dict:
         if not free:
             break
         parent, slot = free.pop(rng.randrange(len(free)))
-        kind = rng.choice(["FixedBrick", "ActiveHinge", "TouchSensor"])
+        kind = rng.choice(["FixedBrick", "ActiveHinge", "TouchSensor", "Thruster", "Fin"])
         child = module(kind)
         key = str(slot) if rng.random() < 0.5 else slot
         parent.setdefault("children", {})[key] = child
@@ -552,6 +733,14 @@ def test_sensors_are_not_part_of_the_body(tmp_path):
     assert more["num_limbs"] == 1 and more["chain_length"] == 2
 
 
+def test_thrusters_and_fins_are_counted():
+    auv, fish = ours("auv").descriptors, ours("fish").descriptors
+    expected = {"num_thrusters": 4, "num_fins": 0, "num_bricks": 0, "num_limbs": 4, "symmetry": 1}
+    assert {key: auv[key] for key in expected} == expected
+    expected = {"num_thrusters": 0, "num_fins": 3, "num_bricks": 2, "num_limbs": 3, "symmetry": 1}
+    assert {key: fish[key] for key in expected} == expected
+
+
 def test_symmetry_needs_a_mirror_image(tmp_path):
     text = "body: {type: Core, children: {2: {type: FixedBrick}%s}}"
     assert read(tmp_path, text % "").descriptors["symmetry"] == 0
@@ -562,6 +751,7 @@ def test_symmetry_needs_a_mirror_image(tmp_path):
 # ------------------------------------------------------------------------- wrong files
 
 HINGE_ON = "body: {type: Core, children: {1: {type: ActiveHinge, %s}}}"
+JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
 
 
 @pytest.mark.parametrize(
@@ -585,13 +775,13 @@ HINGE_ON = "body: {type: Core, children: {1: {type: ActiveHinge, %s}}}"
         ),
         (
             "body: {type: Core, children: {1: {type: Core}}}",
-            "body.children.1.type: expected one of ActiveHinge, FixedBrick, FixedBrickSensor, "
-            "TouchSensor (a core is always the root); found 'Core'",
+            "body.children.1.type: expected one of ActiveHinge, Fin, FixedBrick, FixedBrickSensor, "
+            "LiftThruster, Thruster, TouchSensor (a core is always the root); found 'Core'",
         ),
         (
             "body: {type: Core, children: {0: {type: Bric}}}",
-            "body.children.0.type: expected one of ActiveHinge, FixedBrick, FixedBrickSensor, "
-            "TouchSensor; found 'Bric'",
+            "body.children.0.type: expected one of ActiveHinge, Fin, FixedBrick, FixedBrickSensor, "
+            "LiftThruster, Thruster, TouchSensor; found 'Bric'",
         ),
         ("body: {type: Core, orientaton: 0}", "body: expected only id, type, slot, orientation, p"),
         ("body: {type: Core, orientation: 90}", "body.orientation: expected 0 (the core is attac"),
@@ -652,6 +842,74 @@ HINGE_ON = "body: {type: Core, children: {1: {type: ActiveHinge, %s}}}"
         (HINGE_ON % "params: {volume: 1e999}", "params.volume: expected a number >= 0 [m3]"),
         (HINGE_ON % "params: {ballast: yes}", "ballast: expected a number >= 0 [kg]; found True"),
         (HINGE_ON % "params: {electronics_volume: -1}", "electronics_volume: expected a number >="),
+        (
+            HINGE_ON % "params: {ballast_position: [0, 1]}",
+            "body.children.1.params.ballast_position: expected three numbers [m]; found [0, 1]",
+        ),
+        (
+            HINGE_ON % "params: {ballast_position: 1}",
+            "ballast_position: expected three numbers [m]",
+        ),
+        (
+            HINGE_ON % "params: {ballast_position: [0, 0, x]}",
+            "position.2: expected a number [m]; f",
+        ),
+        (HINGE_ON % "params: {center_of_volume: [0]}", "center_of_volume: expected three numbers"),
+        (HINGE_ON % "params: {ballast_volume: -1}", "ballast_volume: expected a number >= 0 [m3]"),
+        (
+            HINGE_ON % "params: {entrained_water: 2}",
+            "body.children.1.params: part 'frame': entrained_water: expected a share from 0 to 1",
+        ),
+        (HINGE_ON % "params: {entrained_water: x}", "params.entrained_water: expected a number >="),
+        (HINGE_ON % "params: {drag_coefficient: -1}", "params.drag_coefficient: expected a number"),
+        (HINGE_ON % "params: {added_mass_coefficient: }", "added_mass_coefficient: expected a num"),
+        (
+            HINGE_ON % "params: {buoyancy: on}",
+            "children.1.params: part 'frame': buoyancy: expected one of partial, mask, off; foun",
+        ),
+        (HINGE_ON % "params: {drag: 3}", "drag: expected one of faces, lift_drag, ellipsoid, off;"),
+        (
+            HINGE_ON % "params: {drag: inertia_box}",
+            "ellipsoid, off (a law of whole bodies: the world's); found 'inertia_box'",
+        ),
+        (HINGE_ON % "params: {added_mass: 2}", "added_mass: expected true or false; found 2"),
+        (
+            HINGE_ON % "params: {thrust: 1}",
+            "body.children.1.params: thrust: expected a module with a thruster; found type Ac",
+        ),
+        (
+            HINGE_ON % "params: {thruster: {gain: 1}}",
+            "params: thruster: expected a module with a thruster; found type Ac",
+        ),
+        (
+            HINGE_ON % "params: {thruster: {power: 1}}",
+            "body.children.1.params.thruster: expected only axis, position, curve, gain",
+        ),
+        (
+            HINGE_ON % "params: {thruster: 1}",
+            "params.thruster: expected a mapping with any",
+        ),
+        (
+            HINGE_ON % "params: {lift_drag: {}}",
+            "params.lift_drag: expected a mapping with any",
+        ),
+        (
+            HINGE_ON % "params: {lift_drag: {Cla: 1}}",
+            "params.lift_drag: expected only a0, cla, cda",
+        ),
+        (
+            HINGE_ON % "params: {lift_drag: {cla: x}}",
+            "body.children.1.params: lift_drag.cla: expected a number; found 'x'",
+        ),
+        (JET_ON % "thrust: -1", "params.thrust: expected a number >= 0 [N]; found -1"),
+        (
+            JET_ON % "thruster: {gain: x}",
+            "body.children.1.params: thruster: gain: expected a number >= 0 [N]; found 'x'",
+        ),
+        (
+            JET_ON % "thrust: 1, thruster: {range: [-1, 0]}",
+            "thrust: expected a thruster that pushes at its highest command 0; found 0 N there",
+        ),
         (HINGE_ON % "params: {mass: 0}", "children.1.params: module 'ActiveHinge': parts: expec"),
         (
             "body: {type: Core, params: {mass: 0}}",
