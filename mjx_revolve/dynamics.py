@@ -11,29 +11,34 @@ Spatial quantities are (angular, linear), in each body's own frame, about its ow
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.contact import bed_contact, bed_plane
-from mjx_revolve.hydrodynamics import (
-    Water,
-    buoyancy,
-    ellipsoid,
-    inertia_box,
-    lift_drag,
-    quadratic_drag,
-    submersion,
+from mjx_revolve.bodies import (
+    Block,
+    Motion,
+    SpatialInertia,
+    add_block,
+    add_inertia,
+    apply_block,
+    apply_inertia,
+    block_of,
+    cross_force,
+    gyroscope,
+    scale_inertia,
 )
-from mjx_revolve.robot import Robot
+from mjx_revolve.contact import bed_on_level
+from mjx_revolve.hydrodynamics import Outer, water_on_level
+from mjx_revolve.robot import Robot, check_timestep
+from mjx_revolve.servos import end_stop, servo
 from mjx_revolve.spatial import (
     SYM,
     Mat,
     Scalar,
-    Sym,
     Vec,
     add,
     cross,
@@ -51,14 +56,15 @@ from mjx_revolve.spatial import (
     sincos,
     skew,
     sub,
-    symvec,
     total,
     transpose,
     vadd,
     vscale,
     vsub,
 )
-from mjx_revolve.tree import Level, Parts, Points, Tree, make_tree
+from mjx_revolve.thrusters import clamp_command, ideal_power, lag_command, thrust
+from mjx_revolve.tree import Level, Propeller, Tree, make_tree
+from mjx_revolve.water import Water, needs_place
 from mjx_revolve.world import World
 
 
@@ -72,6 +78,9 @@ class State(NamedTuple):
         spin: angular velocity of the root, body frame [rad/s], three of `[lanes]`.
         angle: of the hinges, one `[nbody, lanes]` for each level below the root [rad].
         speed: of the hinges, likewise [rad/s].
+        pace: accelerations of the step before, (linear, angular, hinges); the root's as rates of
+            its body-frame velocities; empty where nothing needs them.
+        command: of the thrusters, behind their lag, one `[lanes]` each [-].
     """
 
     position: Vec
@@ -80,6 +89,24 @@ class State(NamedTuple):
     spin: Vec
     angle: tuple[jax.Array, ...]
     speed: tuple[jax.Array, ...]
+    pace: Any = ()
+    command: tuple[jax.Array, ...] = ()
+
+
+class Sense(NamedTuple):
+    """What a controller may know of a robot's state, `[lanes]` each.
+
+    Attributes:
+        height: z of the core's centre above the still surface, negative under water [m].
+        climb: its vertical velocity [m/s].
+        up: the world's vertical, core frame, three of `[lanes]` [-].
+        spin: angular velocity, core frame, three of `[lanes]` [rad/s].
+    """
+
+    height: jax.Array
+    climb: jax.Array
+    up: Vec
+    spin: Vec
 
 
 class Engine(NamedTuple):
@@ -91,6 +118,8 @@ class Engine(NamedTuple):
             servos deliver or take up, summed without sign [W]).
         observe: state → (qpos `[nq, lanes]`, qvel `[nv, lanes]`).
         root: state → root position, world frame [m], three of `[lanes]`; cheaper than observe.
+        sense: state → what a controller may know of it.
+        command: state → the thrusters' commands behind their lag, `[nthruster, lanes]` [-].
         order: `[nu]` actuator of each row of `step`'s ctrl.
     """
 
@@ -98,27 +127,9 @@ class Engine(NamedTuple):
     step: Callable[[Any, jax.Array, Water], tuple[Any, jax.Array]]
     observe: Callable[[Any], tuple[jax.Array, jax.Array]]
     root: Callable[[Any], Vec]
+    sense: Callable[[Any], Sense]
+    command: Callable[[Any], jax.Array]
     order: np.ndarray
-
-
-class Motion(NamedTuple):
-    """Where the bodies of a level are and how they move."""
-
-    spin: Vec  # body frame
-    velocity: Vec  # of the origin, body frame
-    up: Vec  # world z in the body frame
-    height: Scalar  # world z of the origin
-    x_axis: Any  # world x and y in the body frame, where something needs them
-    y_axis: Any
-    place: Any  # world x and y of the origin
-
-
-class SpatialInertia(NamedTuple):
-    """A 6×6 spatial inertia [[angular, cross], [crossᵀ, linear]]."""
-
-    angular: Sym
-    cross: Mat
-    linear: Sym
 
 
 # ------------------------------------------------------------------ between the levels
@@ -161,492 +172,409 @@ def _up(level: Level, above: int, x: Any) -> Any:
     return jnp.concatenate(sums)
 
 
-def _sum_first(x: Scalar, n: int) -> Scalar:
-    """Sum over the first axis, written out: XLA cannot reduce inside a called loop."""
-    if not hasattr(x, "shape") or x.ndim < 3:
-        return mul(float(n), x)
-    return total(*[x[k] for k in range(x.shape[0])]) if x.shape[0] > 1 else mul(float(n), x[0])
-
-
-# ------------------------------------------------------------------ the water on a level
-
-
-def _drag(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Vec, Vec]:
-    """Force and torque of the world's drag law on each part, part frame, at the box's centre."""
-    zero = (0.0, 0.0, 0.0)
-    if world.drag == "faces":
-        push = [
-            quadratic_drag(x, c, share, m)
-            for x, c, m in zip(v, parts.drag_linear, parts.limit_linear, strict=True)
-        ]
-        twist = [
-            quadratic_drag(x, c, share, m)
-            for x, c, m in zip(w, parts.drag_angular, parts.limit_angular, strict=True)
-        ]
-        return tuple(push), tuple(twist)
-    if world.drag == "lift_drag":
-        force = lift_drag(
-            v,
-            parts.plate_forward,
-            parts.plate_upward,
-            parts.plate_area,
-            world.density,
-            world.lift_drag,
-        )
-        return vscale(share, force), zero
-    if world.drag == "ellipsoid":
-        force, torque = ellipsoid(
-            v, w, parts.ellipsoid, world.density, world.viscosity, not world.added_mass
-        )
-        return vscale(share, force), vscale(share, torque)
-    return zero, zero
-
-
-def _water_on_level(
-    world: World, level: Level, motion: Motion, drift: Vec | None, water: Water
-) -> tuple[Vec, Vec, SpatialInertia | None]:
-    """Sum of the water's forces on each body of a level, and the inertia of the carried water.
-
-    Returns:
-        Torque [N·m] and force [N] about the body's origin, body frame, and the added inertia.
-    """
-    parts = level.parts
-    zero = (0.0, 0.0, 0.0)
-    if parts is None or (world.buoyancy == "off" and world.drag == "off" and not world.added_mass):
-        return zero, zero, None
-    n = len(level.body)
-    k = max(
-        x.shape[0] if isinstance(x, np.ndarray) else 1
-        for x in (parts.volume, *parts.position, *parts.half_size, parts.plate_area)
-    )
-    shape = (k, n, 1)
-    lanes = jnp.shape(motion.height)[-1]
-    wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
-    relative = motion.velocity if drift is None else vsub(motion.velocity, drift)
-    at_part = vadd(relative, cross(motion.spin, parts.position))
-    v = matTvec(parts.rotation, at_part)
-    w = matTvec(parts.rotation, motion.spin)
-    up = tuple(wide(x) for x in matTvec(parts.rotation, motion.up))
-    depth = wide(
-        sub(water.surface_height, add(motion.height, dot(motion.up, parts.center_position)))
-    )
-    # Without buoyancy the water still drags what is below its surface.
-    mode = "mask" if world.buoyancy == "off" else world.buoyancy
-    share, moment = submersion(up, depth, parts.half_size, mode)
-    force, torque = _drag(world, parts, v, w, share)
-    if world.buoyancy != "off":
-        lift, righting = buoyancy(
-            up, share, moment, parts.volume, parts.center, world.density * world.gravity
-        )
-        force, torque = vadd(force, lift), vadd(torque, righting)
-    force = matvec(parts.rotation, force)
-    torque = vadd(matvec(parts.rotation, torque), cross(parts.position, force))
-    force = tuple(_sum_first(wide(x) if _is_array(x) else x, k) for x in force)
-    torque = tuple(_sum_first(wide(x) if _is_array(x) else x, k) for x in torque)
-    if world.drag == "inertia_box":
-        of_body = _share_of_body(parts, share, shape)
-        at_com = vadd(relative, cross(motion.spin, level.box_position))
-        f, t = inertia_box(
-            matTvec(level.box_rotation, at_com),
-            matTvec(level.box_rotation, motion.spin),
-            level.box_size,
-            world.density,
-            world.viscosity,
-        )
-        f = vscale(of_body, matvec(level.box_rotation, f))
-        t = vadd(vscale(of_body, matvec(level.box_rotation, t)), cross(level.box_position, f))
-        force, torque = vadd(force, f), vadd(torque, t)
-    if not world.added_mass:
-        return torque, force, None
-    weigh = lambda x: _sum_first(mul(x, share), k) if np.any(x) else 0.0  # noqa: E731
-    added = SpatialInertia(
-        tuple(weigh(x) for x in parts.added_angular),
-        tuple(tuple(weigh(x) for x in row) for row in parts.added_cross),
-        tuple(weigh(x) for x in parts.added_linear),
-    )
-    return torque, force, added
-
-
-def _is_array(x: Scalar) -> bool:
-    return hasattr(x, "shape")
-
-
-def _share_of_body(parts: Parts, share: Scalar, shape: tuple[int, ...]) -> Scalar:
-    """Submerged share of a whole body, its parts weighted by volume."""
-    volume = np.broadcast_to(parts.volume, shape)
-    weight = volume / np.maximum(volume.sum(0), 1e-30)
-    return _sum_first(mul(weight, share), shape[0])
-
-
-def _bed_on_level(world: World, level: Level, motion: Motion, points: Points) -> tuple[Vec, Vec]:
-    """Torque and force of the bed on each body, body frame, about its origin."""
-    n, lanes = len(level.body), jnp.shape(motion.height)[-1]
-    k = max(x.shape[0] if isinstance(x, np.ndarray) else 1 for x in points.position)
-    wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
-    assert world.bed is not None  # there are points only above a bed
-    rows = (motion.x_axis, motion.y_axis, motion.up)
-    ground, normal = bed_plane(world.bed, motion.place)
-    normal = matTvec(rows, normal)
-    # Depth of the body's origin below the tangent plane, then of each point.
-    origin = mul(sub(ground, motion.height), dot(normal, motion.up))
-    depth = wide(sub(origin, dot(normal, points.position)))
-    velocity = vadd(motion.velocity, cross(motion.spin, points.position))
-    normal, velocity = tuple(wide(x) for x in normal), tuple(wide(x) for x in velocity)
-    force = bed_contact(world.bed, depth, normal, velocity, points.mass, world.timestep)
-    torque = cross(points.position, force)
-    return tuple(_sum_first(x, k) for x in torque), tuple(_sum_first(x, k) for x in force)
-
-
 # ------------------------------------------------------------------ articulated bodies
 
 
-def _cross_force(spin: Vec, velocity: Vec, angular: Vec, linear: Vec) -> tuple[Vec, Vec]:
-    """The force cross product (Featherstone's v ×*): rate of change of a momentum seen turning."""
-    return vadd(cross(spin, angular), cross(velocity, linear)), cross(spin, linear)
-
-
-def _apply_inertia(inertia: SpatialInertia, spin: Vec, velocity: Vec) -> tuple[Vec, Vec]:
-    angular = vadd(symvec(inertia.angular, spin), matvec(inertia.cross, velocity))
-    linear = vadd(matvec(transpose(inertia.cross), spin), symvec(inertia.linear, velocity))
-    return angular, linear
-
-
 def outer_forces(
-    world: World, level: Level, motion: Motion, drift: Vec | None, water: Water
-) -> tuple[Vec, Vec, SpatialInertia | None]:
-    """What water and bed do to the bodies of a level, their weight apart.
-
-    The carried water enters as an inertia and as the force that its momentum needs when the body
-    turns (Kirchhoff; Fossen 2011, Handbook of Marine Craft Hydrodynamics, § 6.3): its momentum is A
-    ν_r, and in a uniform current u, d(v - u)/dt in the body's frame is dv/dt + ω × u.
+    level: Level,
+    motion: Motion,
+    swirling: tuple[Vec, Vec],
+    gravity: Vec,
+    water: Water,
+    thrusts: Sequence[Scalar],
+    world: World,
+) -> Outer:
+    """What water, thrusters and bed do to the bodies of a level, their weight apart.
 
     Args:
-        world: which laws act.
         level: the bodies.
-        motion: where they are and how they move.
-        drift: velocity of the water, body frame [m/s], or None in still water.
-        water: surface and current.
+        motion: where they are and how they move, relative to the uniform current.
+        swirling: as in `hydrodynamics.water_on_level`.
+        gravity: as there.
+        water: surface, current, time.
+        thrusts: of the robot's thrusters, `[lanes]` each [N].
+        world: which laws act.
 
     Returns:
-        Torque [N·m] and force [N] about each body's origin, body frame, and the carried water's
-        inertia, or None where there is none.
+        Forces, torques and inertias.
     """
-    torque, force, added = _water_on_level(world, level, motion, drift, water)
-    if level.points is not None:
-        on_torque, on_force = _bed_on_level(world, level, motion, level.points)
-        torque, force = vadd(torque, on_torque), vadd(force, on_force)
-    if added is not None:
-        relative = motion.velocity if drift is None else vsub(motion.velocity, drift)
-        swirl = _cross_force(motion.spin, relative, *_apply_inertia(added, motion.spin, relative))
-        torque, force = vsub(torque, swirl[0]), vsub(force, swirl[1])
-        if drift is not None:
-            turning = _apply_inertia(added, (0.0, 0.0, 0.0), cross(motion.spin, drift))
-            torque, force = vsub(torque, turning[0]), vsub(force, turning[1])
-    return torque, force, added
+    outer = water_on_level(world, level, motion, swirling, gravity, water, thrusts)
+    if level.points is None:
+        return outer
+    torque, force, damping = bed_on_level(world, level, motion, level.points, water)
+    if outer.damping is not None:
+        damping = add_inertia(damping, outer.damping)
+    return outer._replace(
+        torque=vadd(outer.torque, torque), force=vadd(outer.force, force), damping=damping
+    )
 
 
 def _own(
-    world: World, level: Level, motion: Motion, drift: Vec | None, water: Water
-) -> tuple[SpatialInertia, tuple[Vec, Vec]]:
-    """Each body's inertia with its carried water, and the bias force that needs no acceleration."""
+    tree: Tree,
+    level: Level,
+    motion: Motion,
+    swirling: tuple[Vec, Vec],
+    water: Water,
+    thrusts: Sequence[Scalar],
+    gravity: Vec,
+    dt: float,
+) -> tuple[Block, tuple[Vec, Vec]]:
+    """Each body's inertia with its carried water, and the bias force that needs no acceleration.
+
+    Where water is carried, the whole momentum h turns by K(h) ν in the middle of the step (see
+    `_acceleration`), which makes the inertia's matrix unsymmetric.
+    """
     h = level.moment
-    inertia = SpatialInertia(
+    rigid = SpatialInertia(
         level.inertia, skew(h), (level.mass, 0.0, 0.0, level.mass, 0.0, level.mass)
     )
-    momentum = _apply_inertia(inertia, motion.spin, motion.velocity)
-    bias = _cross_force(motion.spin, motion.velocity, *momentum)
-    torque, force, added = outer_forces(world, level, motion, drift, water)
-    weight = vscale(-world.gravity, motion.up)
-    force = vadd(force, vscale(level.mass, weight))
-    torque = vadd(torque, cross(h, weight))
-    if added is not None:
-        inertia = SpatialInertia(
-            vadd(inertia.angular, added.angular),
-            tuple(vadd(a, b) for a, b in zip(inertia.cross, added.cross, strict=True)),
-            vadd(inertia.linear, added.linear),
+    momentum = apply_inertia(rigid, *swirling)
+    outer = outer_forces(level, motion, swirling, gravity, water, thrusts, tree.robot.world)
+    weight = tuple(neg(g) for g in gravity)
+    force = vadd(outer.force, vscale(level.mass, weight))
+    torque = vadd(outer.torque, cross(h, weight))
+    inertia = rigid
+    if outer.carried is not None:
+        inertia = add_inertia(inertia, outer.carried)
+    if outer.damping is not None and dt:
+        inertia = add_inertia(inertia, scale_inertia(dt, outer.damping))
+    block = block_of(inertia)
+    if outer.momentum is not None:
+        momentum = tuple(vadd(a, b) for a, b in zip(momentum, outer.momentum, strict=True))
+    if tree.carries and dt:
+        block = add_block(block, 0.5 * dt, gyroscope(*momentum))
+    bias = cross_force(motion.spin, motion.velocity, *momentum)
+    return block, (vsub(bias[0], torque), vsub(bias[1], force))
+
+
+def _to_parent(
+    turn: Mat, position: Vec, block: Block, bias: tuple[Vec, Vec], symmetric: bool
+) -> tuple[Block, tuple[Vec, Vec]]:
+    """An articulated inertia and its bias force, seen from the parent's frame and origin."""
+    across = rotate(turn, block.across)
+    if symmetric:
+        angular, linear = (full(rotate_sym(turn, _upper(x))) for x in (block.angular, block.linear))
+        back = transpose(across)
+    else:
+        angular, linear, back = (
+            rotate(turn, x) for x in (block.angular, block.linear, block.back)
         )
-    return inertia, (vsub(bias[0], torque), vsub(bias[1], force))
+    torque, force = (matvec(turn, x) for x in bias)
+    r = skew(position)
+    shifted = _plus(across, matmul(r, linear))
+    below = transpose(shifted) if symmetric else _minus(back, matmul(linear, r))
+    first, second = matmul(r, back), matmul(shifted, r)
+    entry = lambda i, j: sub(add(angular[i][j], first[i][j]), second[i][j])  # noqa: E731
+    moved = _square(entry, symmetric)
+    return Block(moved, shifted, below, linear), (vadd(torque, cross(position, force)), force)
 
 
-def water_drift(motion: Motion, water: Water) -> Vec:
-    """The current seen from each body's frame [m/s]."""
-    axes = (motion.x_axis, motion.y_axis, motion.up)
+def _upper(m: Mat) -> Vec:
+    return tuple(m[i][j] for i, j in SYM)
+
+
+def _square(entry: Callable[[int, int], Scalar], symmetric: bool) -> Mat:
+    """A 3×3 matrix from its entries; a symmetric one from its upper half alone."""
+    if symmetric:
+        return full(tuple(entry(i, j) for i, j in SYM))
+    return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))
+
+
+def _plus(a: Mat, b: Mat) -> Mat:
+    return tuple(vadd(x, y) for x, y in zip(a, b, strict=True))
+
+
+def _minus(a: Mat, b: Mat) -> Mat:
+    return tuple(vsub(x, y) for x, y in zip(a, b, strict=True))
+
+
+class _Joint(NamedTuple):
+    """What the tips-to-root sweep leaves for the way back."""
+
+    row_a: Vec
+    row_l: Vec
+    inverse: Scalar
+    rest: Scalar
+
+
+def _lift_off(
+    block: Block,
+    bias: tuple[Vec, Vec],
+    inertia: Scalar,
+    torque: Scalar,
+    coriolis: tuple[Vec, Vec],
+    symmetric: bool,
+) -> tuple[Block, tuple[Vec, Vec], _Joint]:
+    """Articulated inertia and bias of a hinge's body, the hinge (its z axis) set free.
+
+    Args:
+        block: of the body and all that it carries.
+        bias: likewise.
+        inertia: that the hinge adds about its axis: armature and implicit terms [kg·m²].
+        torque: at the hinge [N·m].
+        coriolis: velocity times joint velocity.
+        symmetric: whether `block` is.
+
+    Returns:
+        What the parent feels, and what the way back needs.
+    """
+    column_a = tuple(block.angular[i][2] for i in range(3))
+    column_l = tuple(block.back[i][2] for i in range(3))
+    row_a, row_l = block.angular[2], block.across[2]
+    inverse = 1 / add(block.angular[2][2], inertia)
+    rest = sub(torque, bias[0][2])
+    scaled_a, scaled_l = vscale(inverse, row_a), vscale(inverse, row_l)
+    less = lambda m, column, row: lambda i, j: sub(m[i][j], mul(column[i], row[j]))  # noqa: E731
+    across = _square(less(block.across, column_a, scaled_l), False)
+    if symmetric:
+        back = transpose(across)
+    else:
+        back = _square(less(block.back, column_l, scaled_a), False)
+    left = Block(
+        _square(less(block.angular, column_a, scaled_a), symmetric),
+        across,
+        back,
+        _square(less(block.linear, column_l, scaled_l), symmetric),
+    )
+    carried = apply_block(left, *coriolis)
+    pushed = mul(inverse, rest)
+    bias = (
+        vadd(vadd(bias[0], carried[0]), vscale(pushed, column_a)),
+        vadd(vadd(bias[1], carried[1]), vscale(pushed, column_l)),
+    )
+    return left, bias, _Joint(row_a, row_l, inverse, rest)
+
+
+def _solve_root(block: Block, bias: tuple[Vec, Vec], symmetric: bool) -> tuple[Vec, Vec]:
+    """Acceleration of the free root: block a = -bias, by elimination, linear rows first.
+
+    Without pivoting, which the positive symmetric part makes safe (Golub & Van Loan 2013, § 4.3).
+    """
+    a = [[*block.linear[i], *block.back[i]] for i in range(3)]
+    a += [[*block.across[i], *block.angular[i]] for i in range(3)]
+    rhs = [neg(x) for x in (*bias[1], *bias[0])]
+    inverse = []
+    for i in range(6):
+        inverse.append(1 / a[i][i])
+        for j in range(i + 1, 6):
+            factor = mul(a[i][j] if symmetric else a[j][i], inverse[i])
+            for k in range(j if symmetric else i + 1, 6):
+                a[j][k] = sub(a[j][k], mul(factor, a[i][k]))
+            rhs[j] = sub(rhs[j], mul(factor, rhs[i]))
+    for i in reversed(range(6)):
+        known = total(*[mul(a[i][j], rhs[j]) for j in range(i + 1, 6)])
+        rhs[i] = mul(sub(rhs[i], known), inverse[i])
+    return tuple(rhs[3:]), tuple(rhs[:3])
+
+
+def _turn(level: Level, angle: Scalar) -> Mat:
+    """Rotation of each body's frame, parent from child."""
+    sine, cosine = sincos(angle)
+    r = level.rotation
     return tuple(
-        total(*[mul(c, axis[i]) for c, axis in zip(water.current, axes, strict=True)])
+        (
+            add(mul(r[i][0], cosine), mul(r[i][1], sine)),
+            sub(mul(r[i][1], cosine), mul(r[i][0], sine)),
+            r[i][2],
+        )
         for i in range(3)
     )
 
 
-def is_drifting(water: Water) -> bool:
-    """Whether there may be a current: a traced one counts, a plain 0 does not."""
-    return any(not isinstance(c, int | float) or c != 0 for c in water.current)
+def _velocities(
+    tree: Tree, turns: Sequence[Mat], spin: Vec, velocity: Vec, speed: tuple[Scalar, ...]
+) -> list[tuple[Vec, Vec]]:
+    """Angular and linear velocity of each level's bodies, body frame, at its origin."""
+    rates = [(spin, velocity)]
+    for level, turn, rate in zip(tree.levels[1:], turns[1:], speed, strict=True):
+        above_spin, above_velocity = (_down(level, x) for x in rates[-1])
+        spin = matTvec(turn, above_spin)
+        spin = (spin[0], spin[1], add(spin[2], rate))
+        velocity = matTvec(turn, vadd(above_velocity, cross(above_spin, level.position)))
+        rates.append((spin, velocity))
+    return rates
 
 
-def _to_parent(
-    turn: Mat, position: Vec, inertia: SpatialInertia, bias: tuple[Vec, Vec]
-) -> tuple[SpatialInertia, tuple[Vec, Vec]]:
-    """An articulated inertia and its bias force, seen from the parent's frame and origin."""
-    angular = rotate_sym(turn, inertia.angular)
-    across = rotate(turn, inertia.cross)
-    linear = rotate_sym(turn, inertia.linear)
-    torque, force = (matvec(turn, x) for x in bias)
-    r = skew(position)
-    shifted = tuple(vadd(a, b) for a, b in zip(across, matmul(r, full(linear)), strict=True))
-    first = matmul(r, transpose(across))  # [r]ₓ crossᵀ
-    second = matmul(shifted, r)
-    moved = tuple(sub(add(angular[k], first[i][j]), second[i][j]) for k, (i, j) in enumerate(SYM))
-    return SpatialInertia(moved, shifted, linear), (vadd(torque, cross(position, force)), force)
-
-
-def _solve_root(inertia: SpatialInertia, bias: tuple[Vec, Vec]) -> tuple[Vec, Vec]:
-    """Acceleration of the free root: inertia a = -bias, by LDLᵀ, linear block first."""
-    angular, across, linear = full(inertia.angular), inertia.cross, full(inertia.linear)
-    a = [[0.0] * 6 for _ in range(6)]
-    for i in range(3):
-        for j in range(3):
-            a[i][j], a[i + 3][j + 3] = linear[i][j], angular[i][j]
-            a[i + 3][j] = across[i][j]
-    rhs = [neg(x) for x in (*bias[1], *bias[0])]
-    lower = [[0.0] * 6 for _ in range(6)]
-    diagonal: list[Scalar] = [0.0] * 6
-    inverse: list[Scalar] = [0.0] * 6
-    for j in range(6):
-        scaled = [mul(lower[j][k], diagonal[k]) for k in range(j)]
-        diagonal[j] = sub(a[j][j], total(*[mul(lower[j][k], scaled[k]) for k in range(j)]))
-        inverse[j] = 1 / diagonal[j]
-        for i in range(j + 1, 6):
-            rest = total(*[mul(lower[i][k], scaled[k]) for k in range(j)])
-            lower[i][j] = mul(sub(a[i][j], rest), inverse[j])
-    for i in range(6):
-        rhs[i] = sub(rhs[i], total(*[mul(lower[i][k], rhs[k]) for k in range(i)]))
-    rhs = [mul(x, y) for x, y in zip(rhs, inverse, strict=True)]
-    for i in reversed(range(6)):
-        rhs[i] = sub(rhs[i], total(*[mul(lower[k][i], rhs[k]) for k in range(i + 1, 6)]))
-    return tuple(rhs[3:]), tuple(rhs[:3])
-
-
-# Share of its top speed up to which a servo gives its full effort [-]. A choice, between the
-# straight line of a bare motor (0) and Revolve's box of effort and speed (1).
-_KNEE = 0.75
-
-
-def servo(
-    level: Level, angle: Scalar, speed: Scalar, target: Scalar, dt: float
-) -> tuple[Scalar, Scalar]:
-    """Torque of the position servos, and what an implicit step adds to the joints' inertia.
-
-    MuJoCo's position actuator, clip(k_p (target - q), ± effort), on a motor whose driver limits its
-    current: full effort up to three quarters of its top speed w, from there a line that the
-    joint's friction d q̇ meets at the top speed,
-
-        τ ≤ d w + k (w - q̇),   k = (effort - d w) / (w / 4),
-
-    and likewise backwards. Below the knee it is stock MuJoCo. The line acts on the speed
-    at the end of the step as soon as it may be met within the step: a light limb could otherwise
-    pass the top speed in one step from rest.
-
-    Args:
-        level: whose hinges.
-        angle: q `[nbody, lanes]` [rad].
-        speed: q̇ `[nbody, lanes]` [rad/s].
-        target: `[nbody, lanes]` [rad].
-        dt: for which the line is implicit [s]; 0 for none.
-
-    Returns:
-        Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
-    """
-    target = jnp.clip(target, _cast(level.target[0], target), _cast(level.target[1], target))
-    torque = sub(mul(level.gain, target), mul(level.stiffness, angle))
-    torque = sub(torque, mul(level.servo_damping, speed))
-    low, high = (_cast(x, torque) for x in level.effort)
-    torque = jnp.clip(torque, low, high)
-    top = np.asarray(level.top_speed, np.float64)
-    limited = np.isfinite(top) & np.isfinite(level.effort[1])
-    if not np.any(limited):
-        return torque, jnp.zeros_like(torque)
-    w = np.where(limited, top, 1.0)
-    friction = np.asarray(level.damping) * w
-    effort = np.where(limited, level.effort[1], friction)
-    slope = np.where(limited, np.maximum((effort - friction) / ((1 - _KNEE) * w), 0), 0)
-    # No limb is lighter than the body that the hinge carries: where the line may be met.
-    reach = dt / (np.asarray(level.inertia[5]) + np.asarray(level.armature) + dt * level.damping)
-    forward = jnp.sign(torque)
-    rate = forward * speed
-    push = jnp.abs(torque)
-    ahead = rate + _cast(reach, torque) * (push - _cast(level.damping, torque) * rate)
-    f0, f1, f2 = (_cast(x, torque) for x in (friction, slope, w))
-    line = lambda x: f0 + f1 * (f2 - x)  # noqa: E731
-    met = (line(ahead) < push) & limited
-    torque = jnp.where(met, forward * jnp.minimum(push, line(rate)), torque)
-    return torque, jnp.where(met, dt * _cast(slope, torque), jnp.zeros_like(torque))
-
-
-def _cast(x: Scalar, like: jax.Array) -> Scalar:
-    return np.asarray(x, like.dtype)
-
-
-def end_stop(level: Level, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:
-    """Torque of the joint's end stops, and what an implicit step adds to the joint's inertia.
-
-    A spring that acts on the angle at the end of the step, q + dt q̇: linearly implicit, so it is
-    stable at any stiffness (cf. MuJoCo's soft limit constraint, which it stands in for).
-    """
-    low, high = (_cast(x, angle) for x in level.range)
-    ahead = angle + dt * speed
-    over = jnp.maximum(ahead - high, 0) - jnp.maximum(low - ahead, 0)
-    stop = _cast(level.stop, angle)
-    return -stop * over, jnp.where(over != 0, dt * dt * stop, jnp.zeros_like(angle))
+def _motions(
+    tree: Tree, turns: Sequence[Mat], state: State, rates: Sequence[Any], located: bool
+) -> list[Motion]:
+    """Where the bodies of each level are and how they move."""
+    row = lambda xs: tuple(x[None] for x in xs)  # noqa: E731
+    root = Motion(
+        *rates[0],
+        up=turns[0][2],
+        height=state.position[2][None],
+        x_axis=turns[0][0] if located else None,
+        y_axis=turns[0][1] if located else None,
+        place=row(state.position[:2]) if located else None,
+    )
+    motions = [root]
+    for level, turn, rate in zip(tree.levels[1:], turns[1:], rates[1:], strict=True):
+        parent = motions[-1]
+        up, height = _down(level, parent.up), _down(level, parent.height)
+        x_axis, y_axis, place = None, None, None
+        if located:
+            x_axis, y_axis, place = (
+                _down(level, x) for x in (parent.x_axis, parent.y_axis, parent.place)
+            )
+            place = (
+                add(place[0], dot(x_axis, level.position)),
+                add(place[1], dot(y_axis, level.position)),
+            )
+            x_axis, y_axis = matTvec(turn, x_axis), matTvec(turn, y_axis)
+        height = add(height, dot(up, level.position))
+        motions.append(Motion(*rate, matTvec(turn, up), height, x_axis, y_axis, place))
+    return motions
 
 
 def _acceleration(
-    tree: Tree, state: State, targets: tuple[Scalar, ...], water: Water, dt: float
+    tree: Tree,
+    state: State,
+    targets: tuple[Scalar, ...],
+    water: Water,
+    thrusts: Sequence[Scalar],
+    dt: float,
 ) -> tuple[Vec, Vec, tuple[Scalar, ...], Scalar]:
     """Accelerations, by the articulated-body algorithm.
 
+    Where water is carried, the momentum h of each body with its water turns as K(h) ν, and the step
+    takes ν in its middle: M ν' + K(h) (ν + dt/2 ν') = f. K is antisymmetric, so that turning does
+    no work, at any step and for any share of carried water; with ν at the step's beginning it
+    would feed a light body that carries many times its mass until it blows up. h itself is
+    extrapolated to the middle from the step before, for second order.
+
     Args:
         tree: the robot.
-        state: the population.
+        state: the population, its velocities relative to the uniform current.
         targets: of the servos, one `[nbody, lanes]` for each level below the root [rad].
         water: surface and current.
-        dt: for which joint damping and end stops are implicit [s]; 0 for none.
+        thrusts: of the thrusters, one `[lanes]` each [N].
+        dt: for which turning, damping, drag and end stops are implicit [s]; 0 for none.
 
     Returns:
-        Root: linear, world frame [m/s²], angular, body frame [rad/s²]; hinges [rad/s²]; servo
-        power, summed over the hinges without sign [W], `[lanes]`.
+        Root: linear and angular, body frame, as rates of the body-frame components [m/s², rad/s²];
+        hinges [rad/s²]; servo power, summed over the hinges without sign [W], `[lanes]`.
     """
     world = tree.robot.world
+    symmetric = not (tree.carries and dt)
     row = lambda xs: tuple(x[None] for x in xs)  # noqa: E731
     turn_root = tuple(row(r) for r in quat_to_rows(state.quat))
-    drifting = is_drifting(water)
-    located = drifting or any(level.points is not None for level in tree.levels)
-    root = Motion(
-        spin=row(state.spin),
-        velocity=matTvec(turn_root, row(state.velocity)),
-        up=turn_root[2],
-        height=state.position[2][None],
-        x_axis=turn_root[0] if located else None,
-        y_axis=turn_root[1] if located else None,
-        place=row(state.position[:2]) if located else None,
+    turns: list[Any] = [turn_root]
+    turns += [
+        _turn(level, angle) for level, angle in zip(tree.levels[1:], state.angle, strict=True)
+    ]
+    pulled = any(not isinstance(x, int | float) or x != 0 for x in water.acceleration)
+    located = (
+        pulled or needs_place(world) or any(level.points is not None for level in tree.levels)
     )
-    motions, owns = [root], []
-    turns: list[Any] = [None]  # the root has no joint
-    coriolis: list[Any] = [None]
-    for level, angle, speed in zip(tree.levels[1:], state.angle, state.speed, strict=True):
-        parent = Motion(*[_down(level, x) for x in motions[-1]])
-        sine, cosine = sincos(angle)
-        r = level.rotation
-        turn = tuple(
-            (
-                add(mul(r[i][0], cosine), mul(r[i][1], sine)),
-                sub(mul(r[i][1], cosine), mul(r[i][0], sine)),
-                r[i][2],
-            )
-            for i in range(3)
+    velocity, spin = matTvec(turn_root, row(state.velocity)), row(state.spin)
+    rates = _velocities(tree, turns, spin, velocity, state.speed)
+    motions = _motions(tree, turns, state, rates, located)
+    swirling, speeds = rates, state.speed
+    if state.pace and dt:
+        half = lambda v, a: add(v, mul(0.5 * dt, a))  # noqa: E731
+        linear, angular, hinges = state.pace
+        speeds = tuple(half(v, a) for v, a in zip(state.speed, hinges, strict=True))
+        swirling = _velocities(
+            tree,
+            turns,
+            tuple(half(v, a) for v, a in zip(spin, row(angular), strict=True)),
+            tuple(half(v, a) for v, a in zip(velocity, row(linear), strict=True)),
+            speeds,
         )
-        spin = matTvec(turn, parent.spin)
-        spin = (spin[0], spin[1], add(spin[2], speed))
-        velocity = matTvec(turn, vadd(parent.velocity, cross(parent.spin, level.position)))
-        place = None
-        if located:
-            place = (
-                add(parent.place[0], dot(parent.x_axis, level.position)),
-                add(parent.place[1], dot(parent.y_axis, level.position)),
-            )
-        motions.append(
-            Motion(
-                spin=spin,
-                velocity=velocity,
-                up=matTvec(turn, parent.up),
-                height=add(parent.height, dot(parent.up, level.position)),
-                x_axis=matTvec(turn, parent.x_axis) if located else None,
-                y_axis=matTvec(turn, parent.y_axis) if located else None,
-                place=place,
-            )
-        )
-        turns.append(turn)
-        # Velocity times joint velocity (Featherstone's c_J): ν × (z q̇).
+    # Velocity times joint velocity (Featherstone's c_J): ν × (z q̇).
+    coriolis: list[Any] = [None]  # the root has no joint
+    for (spin, velocity), speed in zip(swirling[1:], speeds, strict=True):
         coriolis.append(
             (
                 (mul(spin[1], speed), neg(mul(spin[0], speed)), 0.0),
                 (mul(velocity[1], speed), neg(mul(velocity[0], speed)), 0.0),
             )
         )
-    for level, motion in zip(tree.levels, motions, strict=True):
-        drift = water_drift(motion, water) if drifting else None
-        owns.append(_own(world, level, motion, drift, water))
+    owns = []
+    for level, motion, rate in zip(tree.levels, motions, swirling, strict=True):
+        # In a frame that goes with a gusty current, its acceleration is felt as weight is.
+        gravity = vscale(world.gravity, motion.up)
+        if pulled:
+            axes = (motion.x_axis, motion.y_axis, motion.up)
+            for push, axis in zip(water.acceleration, axes, strict=True):
+                gravity = vadd(gravity, vscale(push, axis))
+        owns.append(_own(tree, level, motion, rate, water, thrusts, gravity, dt))
 
     # Tips to root: articulated inertias.
-    inertias = [inertia for inertia, _ in owns]
+    blocks = [block for block, _ in owns]
     biases = [bias for _, bias in owns]
     power: Scalar = 0.0
     joint: list[Any] = [None] * len(tree.levels)
     for d in range(len(tree.levels) - 1, 0, -1):
         level, angle, speed = tree.levels[d], state.angle[d - 1], state.speed[d - 1]
-        inertia, bias = inertias[d], biases[d]
-        motor, motor_inertia = servo(level, angle, speed, targets[d - 1], dt)
+        stop, stop_inertia = end_stop(level, angle, speed, dt)
+        load = sub(stop, mul(level.damping, speed))
+        inertia = add(level.armature, add(mul(dt, level.damping), stop_inertia))
+        motor, motor_inertia = servo(
+            level,
+            angle,
+            speed,
+            targets[d - 1],
+            dt,
+            add(blocks[d].angular[2][2], inertia),
+            sub(load, biases[d][0][2]),
+        )
         delivered = jnp.abs(motor * speed)
         power = add(power, total(*[delivered[k] for k in range(delivered.shape[0])]))
-        stop, stop_inertia = end_stop(level, angle, speed, dt)
-        torque = sub(add(motor, stop), mul(level.damping, speed))
-        column_a = full(inertia.angular)[2]
-        column_l = inertia.cross[2]
-        own = add(
-            add(column_a[2], level.armature),
-            add(mul(dt, level.damping), add(stop_inertia, motor_inertia)),
-        )
-        inverse = 1 / own
-        rest = sub(torque, bias[0][2])
-        joint[d] = (column_a, column_l, inverse, rest)
-        scaled_a, scaled_l = vscale(inverse, column_a), vscale(inverse, column_l)
-        left = SpatialInertia(
-            tuple(
-                sub(inertia.angular[k], mul(column_a[i], scaled_a[j]))
-                for k, (i, j) in enumerate(SYM)
-            ),
-            tuple(
-                tuple(sub(inertia.cross[i][j], mul(column_a[i], scaled_l[j])) for j in range(3))
-                for i in range(3)
-            ),
-            tuple(
-                sub(inertia.linear[k], mul(column_l[i], scaled_l[j]))
-                for k, (i, j) in enumerate(SYM)
-            ),
-        )
-        carried = _apply_inertia(left, *coriolis[d])
-        bias = (
-            vadd(vadd(bias[0], carried[0]), vscale(rest, scaled_a)),
-            vadd(vadd(bias[1], carried[1]), vscale(rest, scaled_l)),
+        left, bias, joint[d] = _lift_off(
+            blocks[d],
+            biases[d],
+            add(inertia, motor_inertia),
+            add(motor, load),
+            coriolis[d],
+            symmetric,
         )
         above = len(tree.levels[d - 1].body)
-        moved, bias = _to_parent(turns[d], level.position, left, bias)
-        moved, bias = _up(level, above, tuple(moved)), _up(level, above, bias)
-        inertias[d - 1] = SpatialInertia(
-            vadd(inertias[d - 1].angular, moved[0]),
-            tuple(vadd(a, b) for a, b in zip(inertias[d - 1].cross, moved[1], strict=True)),
-            vadd(inertias[d - 1].linear, moved[2]),
-        )
+        moved, bias = _to_parent(turns[d], level.position, left, bias, symmetric)
+        blocks[d - 1] = _join(blocks[d - 1], _up_block(level, above, moved, symmetric), symmetric)
+        bias = _up(level, above, bias)
         biases[d - 1] = tuple(vadd(a, b) for a, b in zip(biases[d - 1], bias, strict=True))
 
     # Root to tips: accelerations.
-    angular, linear = _solve_root(inertias[0], biases[0])
+    angular, linear = _solve_root(blocks[0], biases[0], symmetric)
     accelerations, hinges = [(angular, linear)], []
     for d in range(1, len(tree.levels)):
         level, turn = tree.levels[d], turns[d]
-        column_a, column_l, inverse, rest = joint[d]
+        row_a, row_l, inverse, rest = joint[d]
         up_angular, up_linear = (_down(level, x) for x in accelerations[-1])
         a = vadd(matTvec(turn, up_angular), coriolis[d][0])
         b = vadd(matTvec(turn, vadd(up_linear, cross(up_angular, level.position))), coriolis[d][1])
-        hinge = mul(inverse, sub(sub(rest, dot(column_a, a)), dot(column_l, b)))
+        hinge = mul(inverse, sub(sub(rest, dot(row_a, a)), dot(row_l, b)))
         hinges.append(hinge)
         accelerations.append(((a[0], a[1], add(a[2], hinge)), b))
-    world_linear = matvec(turn_root, vadd(linear, cross(root.spin, root.velocity)))
     lane = lambda x: jnp.broadcast_to(x, (1, state.position[0].shape[0]))[0]  # noqa: E731
     return (
-        tuple(lane(x) for x in world_linear),
+        tuple(lane(x) for x in linear),
         tuple(lane(x) for x in angular),
         tuple(hinges),
-        power if _is_array(power) else jnp.zeros_like(state.position[0]),
+        power if hasattr(power, "shape") else jnp.zeros_like(state.position[0]),
     )
+
+
+def _up_block(level: Level, above: int, block: Block, symmetric: bool) -> Block:
+    if not symmetric:
+        return Block(*_up(level, above, tuple(block)))
+    angular, linear = (full(_up(level, above, _upper(x))) for x in (block.angular, block.linear))
+    across = _up(level, above, block.across)
+    return Block(angular, across, transpose(across), linear)
+
+
+def _join(a: Block, b: Block, symmetric: bool) -> Block:
+    """The sum of two, of symmetric ones from their upper halves alone."""
+    if not symmetric:
+        return add_block(a, 1.0, b)
+    angular, linear = (
+        full(vadd(_upper(x), _upper(y)))
+        for x, y in ((a.angular, b.angular), (a.linear, b.linear))
+    )
+    across = _plus(a.across, b.across)
+    return Block(angular, across, transpose(across), linear)
 
 
 def turn_quat(quat: tuple[Scalar, ...], spin: Vec, dt: float) -> tuple[Scalar, ...]:
@@ -689,22 +617,29 @@ def make_population_engine(robot: Robot, contact: bool = True) -> Engine:
         InputError: the model holds something that the population step cannot do.
     """
     tree = make_tree(robot, contact)
-    model, dt = robot.mj_model, robot.world.timestep
+    model, world, dt = robot.mj_model, robot.world, robot.world.timestep
+    check_timestep(robot)
     sizes = [len(level.body) for level in tree.levels[1:]]
     edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
     spans = list(itertools.pairwise(edges))
+    propellers = sorted((p for level in tree.levels for p in level.propellers), key=_index)
 
     def init(qpos: jax.Array, qvel: jax.Array) -> State:
         angle, speed = qpos[tree.qpos_index], qvel[tree.qvel_index]
         # MuJoCo accepts quaternions of any length and normalises them before use.
         length = jnp.sqrt(jnp.sum(qpos[3:7] ** 2, 0))
+        velocity, spin = tuple(qvel[:3]), tuple(qvel[3:6])
+        speeds = tuple(speed[a:b] for a, b in spans)
+        pace = jax.tree.map(jnp.zeros_like, (velocity, spin, speeds)) if tree.carries else ()
         return State(
             position=tuple(qpos[:3]),
             quat=tuple(qpos[3:7] / length),
-            velocity=tuple(qvel[:3]),
-            spin=tuple(qvel[3:6]),
+            velocity=velocity,
+            spin=spin,
             angle=tuple(angle[a:b] for a, b in spans),
-            speed=tuple(speed[a:b] for a, b in spans),
+            speed=speeds,
+            pace=pace,
+            command=tuple(jnp.zeros_like(qpos[0]) for _ in propellers),
         )
 
     def observe(state: State) -> tuple[jax.Array, jax.Array]:
@@ -718,22 +653,90 @@ def make_population_engine(robot: Robot, contact: bool = True) -> Engine:
 
     def step(state: State, ctrl: jax.Array, water: Water) -> tuple[State, jax.Array]:
         targets = tuple(ctrl[a:b] for a, b in spans)
-        linear, angular, hinges, power = _acceleration(tree, state, targets, water, dt)
-        velocity = tuple(v + dt * a for v, a in zip(state.velocity, linear, strict=True))
+        command, thrusts, pumped = run_thrusters(
+            propellers, state.command, tuple(ctrl[edges[-1] :]), world, dt
+        )
+        # The whole step is seen from the uniform current: there, no current is left.
+        relative = state._replace(velocity=vsub(state.velocity, water.current))
+        linear, angular, hinges, power = _acceleration(tree, relative, targets, water, thrusts, dt)
         spin = tuple(w + dt * a for w, a in zip(state.spin, angular, strict=True))
         speed = tuple(w + dt * a for w, a in zip(state.speed, hinges, strict=True))
+        turn, quat = quat_to_rows(state.quat), turn_quat(state.quat, spin, dt)
+        seen = matTvec(turn, relative.velocity)
+        if tree.carries:
+            # Momentum is kept in the body's frame, so velocity turns with it.
+            ahead = tuple(v + dt * a for v, a in zip(seen, linear, strict=True))
+            velocity = vadd(matvec(quat_to_rows(quat), ahead), water.current)
+        else:
+            # As MuJoCo: the body-frame rate and the frame's turning make the world's acceleration.
+            push = matvec(turn, vadd(linear, cross(state.spin, seen)))
+            velocity = vadd(state.velocity, vscale(dt, push))
+        if any(not isinstance(x, int | float) or x != 0 for x in water.acceleration):
+            velocity = vadd(velocity, vscale(dt, water.acceleration))
         new = State(
             position=tuple(x + dt * v for x, v in zip(state.position, velocity, strict=True)),
-            quat=turn_quat(state.quat, spin, dt),
+            quat=quat,
             velocity=velocity,
             spin=spin,
             angle=tuple(q + dt * w for q, w in zip(state.angle, speed, strict=True)),
             speed=speed,
+            pace=(linear, angular, hinges) if tree.carries else (),
+            command=command,
         )
-        return new, power
+        return new, add(power, pumped)
+
+    def sense(state: State) -> Sense:
+        return Sense(
+            state.position[2] - world.surface_height,
+            state.velocity[2],
+            quat_to_rows(state.quat)[2],
+            state.spin,
+        )
+
+    def command(state: State) -> jax.Array:
+        return jnp.stack(state.command) if propellers else jnp.zeros((0, *state.spin[0].shape))
 
     assert model.nq == 7 + len(tree.qpos_index)
-    return Engine(init, step, observe, lambda state: state.position, tree.ctrl_index)
+    return Engine(
+        init, step, observe, lambda state: state.position, sense, command, tree.ctrl_index
+    )
+
+
+def _index(propeller: Propeller) -> int:
+    return propeller.index
+
+
+def run_thrusters(
+    propellers: Sequence[Propeller],
+    lagged: tuple[Scalar, ...],
+    ctrl: tuple[Scalar, ...],
+    world: World,
+    dt: float,
+) -> tuple[tuple[Scalar, ...], list[Scalar], Scalar]:
+    """The thrusters' part of a step.
+
+    As in MuJoCo's filtered actuators, a command passes its lag at the end of the step, and thrust
+    follows the command that had passed at its beginning; without a lag it follows at once.
+
+    Args:
+        propellers: the robot's thrusters.
+        lagged: their commands behind the lag, `[lanes]` each [-].
+        ctrl: what is asked for, likewise.
+        world: whose water they push.
+        dt: of the step [s].
+
+    Returns:
+        The lagged commands after the step, the thrusts, `[lanes]` each [N], and the power that
+        an ideal propeller needs for them, summed [W] (`thrusters.ideal_power`).
+    """
+    after, thrusts, power = [], [], 0.0
+    for propeller, before, asked in zip(propellers, lagged, ctrl, strict=True):
+        thruster = propeller.thruster
+        asked = clamp_command(thruster, asked)
+        after.append(lag_command(thruster, before, asked, dt))
+        thrusts.append(thrust(thruster, before if thruster.time_constant > 0 else asked))
+        power = add(power, ideal_power(thrusts[-1], propeller.disc, world.density))
+    return tuple(after), thrusts, power
 
 
 def acceleration(
@@ -754,10 +757,17 @@ def acceleration(
     """
     tree, engine = make_tree(robot), make_population_engine(robot)
     ctrl = ctrl[tree.ctrl_index]
-    edges = np.cumsum([len(level.body) for level in tree.levels[1:]])[:-1]
-    targets = tuple(jnp.split(ctrl, edges)) if len(tree.levels) > 1 else ()
-    linear, angular, hinges, _ = _acceleration(tree, engine.init(qpos, qvel), targets, water, 0.0)
-    root = jnp.stack([*linear, *angular])
+    edges = np.cumsum([len(level.body) for level in tree.levels[1:]])
+    targets = tuple(jnp.split(ctrl[: len(tree.qpos_index)], edges[:-1])) if len(edges) else ()
+    propellers = sorted((p for level in tree.levels for p in level.propellers), key=_index)
+    thrusts = [thrust(p.thruster, clamp_command(p.thruster, x)) for p, x in zip(propellers, ctrl[len(tree.qpos_index) :], strict=True)]
+    state = engine.init(qpos, qvel)._replace(pace=())
+    relative = state._replace(velocity=vsub(state.velocity, water.current))
+    linear, angular, hinges, _ = _acceleration(tree, relative, targets, water, thrusts, 0.0)
+    turn = quat_to_rows(state.quat)
+    seen = matTvec(turn, relative.velocity)
+    linear = matvec(turn, vadd(linear, cross(state.spin, seen)))
+    root = jnp.stack([*vadd(linear, water.acceleration), *angular])
     if not hinges:
         return root
     return jnp.concatenate([root, jnp.concatenate(hinges)[np.argsort(tree.qvel_index)]])

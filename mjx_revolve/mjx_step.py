@@ -14,21 +14,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_revolve.dynamics import (
-    Engine,
-    Motion,
-    SpatialInertia,
-    end_stop,
-    is_drifting,
-    outer_forces,
-    servo,
-    turn_quat,
-    water_drift,
-)
-from mjx_revolve.hydrodynamics import Water
-from mjx_revolve.robot import Robot, import_mjx
-from mjx_revolve.spatial import full
+from mjx_revolve.bodies import Motion, SpatialInertia, apply_inertia, cross_force, gyroscope
+from mjx_revolve.dynamics import Engine, Sense, outer_forces, run_thrusters, turn_quat
+from mjx_revolve.robot import Robot, check_timestep, import_mjx
+from mjx_revolve.servos import end_stop, servo
+from mjx_revolve.spatial import full, quat_to_rows, skew, vadd
 from mjx_revolve.tree import make_tree
+from mjx_revolve.water import Water
 
 mjx = import_mjx()
 # Not exported, but the only way to the stages of a step and to a body's Jacobian.
@@ -51,6 +43,10 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
     tree = make_tree(robot, contact)
     m, world = robot.mj_model, robot.world
     dt = world.timestep
+    check_timestep(robot)
+    propellers = sorted(
+        (p for level in tree.levels for p in level.propellers), key=lambda p: p.index
+    )
     model = robot.mjx_model
     # End stops and the bed are our own penalty laws, the same as in the population step.
     off = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -85,16 +81,32 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         data = mjx.com_pos(model, data)
         return [jnp.einsum("bij,j->bi", jacobians(data, x)[0], qvel) for x in tree.levels]
 
-    def one(qpos: Any, qvel: Any, ctrl: Any, water: Water) -> tuple[Any, Any, Any]:
-        data = forward_parts(qpos, qvel)
-        mass = support.full_m(model, data)
-        force = data.qfrc_passive - data.qfrc_bias
+    def one(qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, water: Water) -> Any:
         zero = jnp.zeros((), qpos.dtype)
+        current, acceleration = (
+            jnp.stack([zero + x for x in xs]) for xs in (water.current, water.acceleration)
+        )
+        qvel = qvel.at[:3].add(-current)  # as seen from the current
+        # Momenta that turn are taken half a step ahead (see `dynamics._acceleration`).
+        ahead = qvel
+        if pace is not None:
+            turn = _rows(qpos)
+            ahead = qvel + 0.5 * dt * pace.at[:3].set(turn @ pace[:3])
+        # With carried water the bodies' own momenta turn with it, below; else MuJoCo's terms hold.
+        data = forward_parts(qpos, jnp.zeros_like(qvel) if tree.carries else qvel)
+        mass = support.full_m(model, data)
+        friction = jnp.asarray(m.dof_damping, qpos.dtype)
+        force = data.qfrc_passive - data.qfrc_bias - friction * (qvel if tree.carries else 0.0)
+        # The current's acceleration is felt as weight is.
+        force = force - mass[:, :3] @ acceleration
         # Spatial acceleration of each body when no joint accelerates: d/dt of J at constant q̇.
-        _, still = jax.jvp(lambda t: velocities(moved(qpos, qvel, t), qvel), (zero,), (zero + 1,))
+        _, still = jax.jvp(
+            lambda t: velocities(moved(qpos, ahead, t), ahead), (zero,), (zero + 1,)
+        )
         for level, drift_rate in zip(tree.levels, still, strict=True):
             jacobian, axes = jacobians(data, level)
             rate = jnp.einsum("bij,j->bi", jacobian, qvel)
+            rate_ahead = jnp.einsum("bij,j->bi", jacobian, ahead)
             column = lambda x: tuple(x[:, i, None] for i in range(3))  # noqa: E731
             place = data.xpos[jnp.asarray(level.body)]
             motion = Motion(
@@ -106,58 +118,139 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
                 y_axis=column(axes[:, 1]),
                 place=(place[:, 0, None], place[:, 1, None]),
             )
-            drift = water_drift(motion, water) if is_drifting(water) else None
-            torque, push, added = outer_forces(world, level, motion, drift, water)
+            swirling = (column(rate_ahead[:, :3]), column(rate_ahead[:, 3:]))
+            upwards = acceleration + jnp.array([0.0, 0.0, world.gravity], qpos.dtype)
+            gravity = column(jnp.einsum("bji,j->bi", axes, upwards))
+            outer = outer_forces(level, motion, swirling, gravity, water, thrusts, world)
             n = len(level.body)
-            wrench = jnp.concatenate([_stack(torque, n), _stack(push, n)], -1)
-            if added is not None:
-                spatial = _dense(added, n)
+            wrench = jnp.concatenate([_stack(outer.torque, n), _stack(outer.force, n)], -1)
+            matrices = []
+            if outer.carried is not None:
+                matrices.append(_dense(outer.carried, n))
+            if outer.damping is not None:
+                matrices.append(dt * _dense(outer.damping, n))
+            if tree.carries:
+                h = level.moment
+                rigid = SpatialInertia(
+                    level.inertia, skew(h), (level.mass, 0.0, 0.0, level.mass, 0.0, level.mass)
+                )
+                momentum = apply_inertia(rigid, *swirling)
+                if outer.momentum is not None:
+                    momentum = tuple(
+                        vadd(a, b) for a, b in zip(momentum, outer.momentum, strict=True)
+                    )
+                turning = cross_force(motion.spin, motion.velocity, *momentum)
+                wrench = wrench - jnp.concatenate([_stack(x, n) for x in turning], -1)
+                # The mass matrix holds the rigid inertia; only its J̇ q̇ is missing.
+                wrench = wrench - jnp.einsum("bij,bj->bi", _dense(rigid, n), drift_rate)
+                gyro = gyroscope(*momentum)
+                rows = [
+                    jnp.concatenate([_matrix(a, n), _matrix(b, n)], -1)
+                    for a, b in ((gyro.angular, gyro.across), (gyro.back, gyro.linear))
+                ]
+                matrices.append(0.5 * dt * jnp.concatenate(rows, -2))
+            for spatial in matrices:
                 wrench = wrench - jnp.einsum("bij,bj->bi", spatial, drift_rate)
                 mass = mass + jnp.einsum("bik,bij,bjl->kl", jacobian, spatial, jacobian)
             force = force + jnp.einsum("bij,bi->j", jacobian, wrench)
-        diagonal = jnp.asarray(m.dof_damping * dt, qpos.dtype)
-        power, start = zero, 0
-        for level in tree.levels[1:]:
-            stop = start + len(level.body)
+        mass = mass + jnp.diag(jnp.asarray(m.dof_damping * dt, qpos.dtype))
+        power, stop = zero, len(tree.qpos_index)
+        # Tips to root, as in the articulated-body algorithm: a servo must know what it moves.
+        for level in reversed(tree.levels[1:]):
+            start = stop - len(level.body)
             q, v = tree.qpos_index[start:stop], tree.qvel_index[start:stop]
             angle, speed = qpos[q][:, None], qvel[v][:, None]
-            motor, motor_inertia = servo(
-                level, angle, speed, ctrl[tree.ctrl_index[start:stop]][:, None], dt
-            )
             torque, inertia = end_stop(level, angle, speed, dt)
-            force = force.at[v].add((torque + motor)[:, 0])
-            diagonal = diagonal.at[v].add((inertia + motor_inertia)[:, 0])
+            force = force.at[v].add(torque[:, 0])
+            mass = mass.at[v, v].add(inertia[:, 0])
+            moved_inertia, load = [], []
+            for j in v:
+                below = [k for k in np.arange(m.nv) if k != j and _descends(m, k, j)]
+                column, load_j, own = mass[j, :][np.array(below, int)], force[j], mass[j, j]
+                if below:
+                    inner = mass[np.ix_(below, below)]
+                    back = jnp.linalg.solve(inner.T, column)
+                    own = own - back @ mass[np.array(below), j]
+                    load_j = load_j - back @ force[np.array(below)]
+                moved_inertia.append(own)
+                load.append(load_j)
+            asked = ctrl[tree.ctrl_index[start:stop]][:, None]
+            motor, motor_inertia = servo(
+                level,
+                angle,
+                speed,
+                asked,
+                dt,
+                jnp.stack(moved_inertia)[:, None],
+                jnp.stack(load)[:, None],
+            )
+            force = force.at[v].add(motor[:, 0])
+            mass = mass.at[v, v].add(motor_inertia[:, 0])
             power = power + jnp.sum(jnp.abs(motor * speed))
-            start = stop
-        acceleration = jax.scipy.linalg.solve(mass + jnp.diag(diagonal), force, assume_a="pos")
-        new = qvel + dt * acceleration
-        return moved(qpos, new, jnp.asarray(dt, qpos.dtype)), new, power
+            stop = start
+        kind = "gen" if tree.carries else "pos"
+        rates = jax.scipy.linalg.solve(mass, force, assume_a=kind)
+        new = qvel + dt * rates
+        turn = _rows(qpos)
+        seen = turn.T @ qvel[:3]
+        pace = rates.at[:3].set(
+            turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3])
+        )
+        if tree.carries:
+            quat = turn_quat(tuple(qpos[3:7]), tuple(new[3:6]), dt)
+            turned = jnp.stack([jnp.stack(r) for r in quat_to_rows(quat)])
+            new = new.at[:3].set(turned @ (seen + dt * pace[:3]))
+        new = new.at[:3].add(current + dt * acceleration)
+        return moved(qpos, new, jnp.asarray(dt, qpos.dtype)), new, pace, power
 
     def step(state: Any, ctrl: jax.Array, water: Water) -> tuple[Any, jax.Array]:
-        qpos, qvel = state
+        qpos, qvel, pace, command = state
         lanes = qpos.shape[-1]
         # Plain numbers stay constants, so that still water costs nothing; arrays are mapped.
         plain = lambda x: isinstance(x, int | float)  # noqa: E731
         fixed = jax.tree.map(lambda x: x if plain(x) else None, water)
         given = jax.tree.map(lambda x: None if plain(x) else x, water)
+        asked = tuple(ctrl[k] for k in tree.ctrl_index[len(tree.qpos_index) :])
+        command, thrusts, pumped = run_thrusters(propellers, command, asked, world, dt)
 
-        def single(qpos: Any, qvel: Any, ctrl: Any, given: Any) -> Any:
+        def single(
+            qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, given: Any
+        ) -> Any:
             merged = jax.tree.map(
                 lambda a, b: b if a is None else a, fixed, given, is_leaf=lambda x: x is None
             )
-            return one(qpos, qvel, ctrl, merged)
+            return one(qpos, qvel, pace, ctrl, thrusts, merged)
 
         given = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes,)), given)
-        new_qpos, new_qvel, power = jax.vmap(single, in_axes=-1, out_axes=-1)(
-            qpos, qvel, ctrl, given
+        qpos, qvel, pace, power = jax.vmap(single, in_axes=-1, out_axes=-1)(
+            qpos, qvel, pace, ctrl, [jnp.broadcast_to(x, (lanes,)) for x in thrusts], given
         )
-        return (new_qpos, new_qvel), power
+        pace = pace if tree.carries else None
+        return (qpos, qvel, pace, command), power + pumped
 
     def init(qpos: jax.Array, qvel: jax.Array) -> Any:
         length = jnp.sqrt(jnp.sum(qpos[3:7] ** 2, 0))
-        return qpos.at[3:7].divide(length), qvel
+        command = tuple(jnp.zeros_like(qpos[0]) for _ in propellers)
+        pace = jnp.zeros_like(qvel) if tree.carries else None
+        return qpos.at[3:7].divide(length), qvel, pace, command
 
-    return Engine(init, step, lambda s: s, lambda s: tuple(s[0][:3]), np.arange(m.nu))
+    def sense(state: Any) -> Sense:
+        qpos, qvel, *_ = state
+        up = quat_to_rows(tuple(qpos[3:7]))[2]
+        return Sense(qpos[2] - world.surface_height, qvel[2], up, tuple(qvel[3:6]))
+
+    def command(state: Any) -> jax.Array:
+        return jnp.stack(state[3]) if propellers else jnp.zeros((0, *state[0].shape[1:]))
+
+    return Engine(
+        init,
+        step,
+        lambda state: state[:2],
+        lambda state: tuple(state[0][:3]),
+        sense,
+        command,
+        np.arange(m.nu),
+    )
 
 
 def _stack(components: Any, n: int) -> jax.Array:
@@ -165,6 +258,24 @@ def _stack(components: Any, n: int) -> jax.Array:
     dtype = jnp.result_type(float)
     wide = [jnp.broadcast_to(jnp.asarray(x, dtype), (n, 1))[:, 0] for x in components]
     return jnp.stack(wide, -1)
+
+
+def _descends(model: Any, dof: int, ancestor: int) -> bool:
+    """Whether a degree of freedom hangs below another."""
+    while dof >= 0:
+        dof = model.dof_parentid[dof]
+        if dof == ancestor:
+            return True
+    return False
+
+
+def _rows(qpos: jax.Array) -> jax.Array:
+    """`[3, 3]` world from root."""
+    return jnp.stack([jnp.stack(row) for row in quat_to_rows(tuple(qpos[3:7]))])
+
+
+def _matrix(m: Any, n: int) -> jax.Array:
+    return jnp.stack([_stack(row, n) for row in m], -2)
 
 
 def _dense(inertia: SpatialInertia, n: int) -> jax.Array:

@@ -19,15 +19,12 @@ import numpy as np
 
 from mjx_revolve.errors import InputError
 from mjx_revolve.exposure import exposed_shares
-from mjx_revolve.hydrodynamics import (
-    ELLIPSOID_COEFFICIENTS,
-    FluidTable,
-    box_added_mass,
-    face_drag_coefficients,
-)
-from mjx_revolve.modules import Part
+from mjx_revolve.drag import ELLIPSOID_COEFFICIENTS
+from mjx_revolve.fluid_table import FluidTable, drag_law, make_fluid_table
+from mjx_revolve.module_types import Part
 from mjx_revolve.morphology import Morphology
 from mjx_revolve.terrain import sample_bed
+from mjx_revolve.thrusters import thrust as thruster_curve
 from mjx_revolve.world import World
 
 # Error at which the servo gives its full torque [rad]. A choice: hobby servos are stiff.
@@ -52,6 +49,10 @@ class Robot:
         fluid: per-part tables.
         contact_body: `[npoint]` body of each point that may touch the bed.
         contact_position: `[npoint, 3]` the point, body frame [m].
+        servos: actuators of the model that turn hinges, in the order of the modules.
+        thrusters: actuators of the model that are thrusters, in the order of the modules.
+        thruster_row: row of the fluid table of each thruster's part.
+        thruster_part: each thruster's part.
     """
 
     morphology: Morphology
@@ -61,6 +62,10 @@ class Robot:
     fluid: FluidTable
     contact_body: np.ndarray
     contact_position: np.ndarray
+    servos: tuple[int, ...]
+    thrusters: tuple[int, ...]
+    thruster_row: tuple[int, ...]
+    thruster_part: tuple[Part, ...]
 
     @cached_property
     def mjx_model(self) -> Any:
@@ -69,8 +74,13 @@ class Robot:
 
     @property
     def num_hinges(self) -> int:
-        """Number of actuated hinges, the length of `ctrl`."""
-        return self.mj_model.nu
+        """Number of actuated hinges."""
+        return len(self.servos)
+
+    @property
+    def num_thrusters(self) -> int:
+        """Number of thrusters; with the hinges, the length of `ctrl`."""
+        return len(self.thrusters)
 
     @property
     def qpos0(self) -> np.ndarray:
@@ -137,14 +147,29 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
             f"found: {reason}"
         ) from None
     body = {model.body(i).name: i for i in range(model.nbody)}
+    parts = [row["part"] for row in rows]
+    pushing = tuple(k for k, part in enumerate(parts) if part.thruster is not None)
+    on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     return Robot(
         morphology=morphology,
         world=world,
         mj_spec=spec,
         mj_model=model,
-        fluid=_fluid_table(rows, body, np.array(exposed_shares(morphology))),
+        fluid=make_fluid_table(
+            parts,
+            [body[row["body"]] for row in rows],
+            [row["module"] for row in rows],
+            [row["at"] for row in rows],
+            [row["turn"] for row in rows],
+            np.array(exposed_shares(morphology)),
+            world,
+        ),
         contact_body=np.array([body[name] for name, _ in points], int),
         contact_position=np.array([p for _, p in points], float).reshape(-1, 3),
+        servos=tuple(map(int, np.flatnonzero(on_joint))),
+        thrusters=tuple(map(int, np.flatnonzero(~on_joint))),
+        thruster_row=pushing,
+        thruster_part=tuple(parts[k] for k in pushing),
     )
 
 
@@ -229,6 +254,8 @@ def _add_modules(
             )
             turn = carrier.rotation.T @ module.rotation
             _add_geoms(carrier, module, part, place, turn, world)
+            if part.thruster is not None:
+                _add_thruster(spec, carrier, f"{module.name}/{part.name}", part, place, turn)
             rows.append(
                 {"body": carrier.name, "module": index, "part": part, "at": place, "turn": turn}
             )
@@ -277,6 +304,36 @@ def _add_hinge(spec: mujoco.MjSpec, parent: _Link, module: Any) -> _Link:
     return _Link(body, module.name, anchor, module.rotation)
 
 
+def _add_thruster(
+    spec: mujoco.MjSpec, link: _Link, name: str, part: Part, place: np.ndarray, turn: np.ndarray
+) -> None:
+    """A thruster as stock MuJoCo can have it: a filtered force at a site, linear in the command.
+
+    Our engines take lag and limits from here and thrust from the thruster's own curve, which
+    MuJoCo cannot hold; its gain is the curve's slope between the ends of the command's range.
+    """
+    thruster = part.thruster
+    assert thruster is not None
+    axis = turn @ np.asarray(thruster.axis)
+    link.body.add_site(name=name, pos=place + turn @ np.asarray(thruster.position))
+    low, high = thruster.range
+    ends = thruster_curve(thruster, np.array([low, high]))
+    lag = thruster.time_constant > 0
+    spec.add_actuator(
+        name=name.split("/")[0],
+        target=name,
+        trntype=mujoco.mjtTrn.mjTRN_SITE,
+        gear=[*axis, *(-thruster.torque_ratio * axis)],
+        dyntype=mujoco.mjtDyn.mjDYN_FILTEREXACT if lag else mujoco.mjtDyn.mjDYN_NONE,
+        dynprm=[thruster.time_constant] + [0.0] * 9,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        gainprm=[float((ends[1] - ends[0]) / (high - low))] + [0.0] * 9,
+        biastype=mujoco.mjtBias.mjBIAS_NONE,
+        ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        ctrlrange=[low, high],
+    )
+
+
 def _limit_stiffness(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Softens servos that are too stiff for the limb that they move and the time step.
 
@@ -286,6 +343,8 @@ def _limit_stiffness(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """
     dt = model.opt.timestep
     for actuator in spec.actuators:
+        if actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
+            continue
         joint = model.joint(actuator.target).id
         body, axis = model.jnt_bodyid[joint], model.jnt_axis[joint]
         turn = np.zeros(9)
@@ -315,45 +374,52 @@ def _add_geoms(
             contype=0,
             conaffinity=0,
         )
-        if world.drag == "ellipsoid" and k == 0:
+        if k == 0 and drag_law(part, world) == "ellipsoid":
             geom.fluid_ellipsoid = 1
             geom.fluid_coefs = list(ELLIPSOID_COEFFICIENTS)
+    if part.ballast_mass > 0:
+        # A point mass; MuJoCo wants some size, and a millimetre turns nothing.
+        link.body.add_geom(
+            name=f"{module.name}/{part.name}/ballast",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[1e-3, 0, 0],
+            pos=place + turn @ np.asarray(part.ballast_position),
+            mass=part.ballast_mass,
+            rgba=[*rgb, 0.0],
+            contype=0,
+            conaffinity=0,
+        )
 
 
-def _fluid_table(
-    rows: list[dict[str, Any]], body: dict[str, int], exposed: np.ndarray
-) -> FluidTable:
-    """Stacks the rows of all parts; drag and added mass act on exposed faces only."""
-    parts: list[Part] = [row["part"] for row in rows]
-    half = np.array([p.boxes[0].size for p in parts]) / 2
-    offset = np.array([p.boxes[0].position for p in parts])
-    turn = np.array([row["turn"] for row in rows])
-    added_mass, added_inertia = box_added_mass(half)
-    scale = np.array([p.added_mass_coefficient for p in parts])[:, None]
-    drag = [
-        face_drag_coefficients(np.array(p.boxes[0].size), p.face_areas, p.drag_coefficient, e)
-        for p, e in zip(parts, exposed, strict=True)
-    ]
-    # Water that turns about an axis is pushed by the four faces beside it.
-    beside = (exposed[:, [1, 2, 0]] + exposed[:, [2, 0, 1]]) / 2
-    areas = np.array([p.face_areas for p in parts])
-    upward = areas.argmax(-1)
-    # The chord runs along the longer of the two edges that lie in the plate.
-    lying = np.where(np.arange(3) == upward[:, None], -np.inf, half)
-    return FluidTable(
-        body=np.array([body[row["body"]] for row in rows], int),
-        module=np.array([row["module"] for row in rows], int),
-        position=np.array([row["at"] for row in rows]) + np.einsum("pij,pj->pi", turn, offset),
-        rotation=turn,
-        half_size=half,
-        center_of_volume=np.array([p.center_of_volume for p in parts], float) - offset,
-        volume=np.array([p.volume + p.electronics_volume for p in parts]),
-        mass=np.array([p.mass for p in parts]),
-        drag_linear=np.array([d[0] for d in drag]),
-        drag_angular=np.array([d[1] for d in drag]),
-        exposed=exposed,
-        added_mass=scale * exposed * added_mass,
-        added_inertia=scale * beside * added_inertia,
-        plate_area=areas.max(-1),
-        plate_axes=np.stack([lying.argmax(-1), upward], -1),
-    )
+# The speed at which a law that a step takes explicitly must still be stable [m/s]; servos, weight
+# and currents lead to a few tenths.
+_BRISK = 1.0
+
+
+def check_timestep(robot: Robot) -> None:
+    """Refuses a time step that MuJoCo's explicit fluid laws cannot bear.
+
+    The default drag, contact and end stops are implicit and bear any step. MuJoCo's own laws stay
+    explicit, as MuJoCo's Euler step has them: the step must stay below m / (c v), with c the drag
+    of the largest face of a body of mass m (its carried water included), at v = 1 m/s.
+
+    Args:
+        robot: from `build_robot`.
+
+    Raises:
+        InputError: the step is too long; the message names the body and the largest stable step.
+    """
+    table, world, model = robot.fluid, robot.world, robot.mj_model
+    explicit = np.array([law in ("ellipsoid", "inertia_box") for law in table.drag])
+    for body in np.unique(table.body[explicit]):
+        rows = explicit & (table.body == body)
+        mass = model.body_mass[body] + world.density * table.carried_mass[rows].min(-1).sum()
+        # Twice ½ C_d A v, the slope of the force, with the two laws' C_d of 1.
+        slope = 2 * world.density * (table.drag_linear[rows] / 1.05).max(-1).sum() * _BRISK
+        longest = 2 * mass / slope
+        if world.timestep > longest:
+            raise InputError(
+                f"timestep: expected at most {longest:.2g} s, as drag: {world.drag} is explicit "
+                f"and body {model.body(body).name!r} of {mass:.3g} kg is light; found "
+                f"{world.timestep:g} s (drag: faces bears any step)"
+            )

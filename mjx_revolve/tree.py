@@ -7,6 +7,7 @@ subspace constant (Featherstone 2008, Rigid Body Dynamics Algorithms, § 4.4).
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,9 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.errors import InputError
-from mjx_revolve.hydrodynamics import ellipsoid_constants
+from mjx_revolve.drag import ellipsoid_constants
+from mjx_revolve.lift_drag import LiftDrag
+from mjx_revolve.module_types import Thruster
 from mjx_revolve.robot import Robot
 from mjx_revolve.spatial import SYM, Mat, Scalar, Sym, Vec, fold
 
@@ -25,29 +28,63 @@ LIMIT_OVERSHOOT = 0.008
 
 @dataclass(frozen=True)
 class Parts:
-    """Constants of the parts of one level, each `[npart, nbody, 1]` or a float.
+    """Constants of those parts of one level that obey the same laws, `[npart, nbody, 1]` or a float.
 
-    Attributes are those of `hydrodynamics.FluidTable`, in the level's body frames, times the
-    water's density where a force needs it.
+    Attributes are those of `fluid_table.FluidTable`, in the level's body frames, times the water's
+    density where a force needs it. Bodies with fewer parts are padded with parts that do nothing.
+
+    Attributes:
+        rows: `[npart][nbody]` rows of the fluid table, -1 for padding.
+        buoyancy: their buoyancy law.
+        drag: their drag law.
     """
 
+    rows: tuple[tuple[int, ...], ...]
+    buoyancy: str
+    drag: str
     position: Vec
     rotation: Mat
     half_size: Vec
     center: Vec
     center_position: Vec
     volume: Scalar
+    exposed: Vec
     drag_linear: Vec
     drag_angular: Vec
-    limit_linear: Vec
-    limit_angular: Vec
-    added_linear: Sym
-    added_cross: Mat
-    added_angular: Sym
+    carried_linear: Sym
+    carried_cross: Mat
+    carried_angular: Sym
+    plate: LiftDrag | None
     plate_area: Scalar
     plate_forward: Vec
     plate_upward: Vec
+    plate_center: Vec
     ellipsoid: Any
+
+
+@dataclass(frozen=True)
+class Propeller:
+    """Constants of one thruster.
+
+    Attributes:
+        index: which of the robot's thrusters it is.
+        body: where its body stands in the level.
+        group: which of the level's `parts` holds the part that carries it.
+        slot: where in that group.
+        axis: of its thrust, unit vector in the level's body frame.
+        position: where it pushes, body frame [m].
+        disc: area of the propeller's disc [m²].
+        thruster: curve, lag and limits.
+    """
+
+    index: int
+    body: int
+    group: int
+    slot: int
+    axis: Vec
+    position: Vec
+    disc: float
+    thruster: Thruster
 
 
 @dataclass(frozen=True)
@@ -84,7 +121,8 @@ class Level:
         box_rotation: body from inertial frame, for MuJoCo's inertia-box law.
         box_position: centre of mass [m].
         box_size: edges of the box of equal inertia [m].
-        parts: what the water acts on.
+        parts: what the water acts on, in groups that obey the same laws.
+        propellers: what drives it beside its hinges.
         points: what may touch the bed.
     """
 
@@ -109,7 +147,8 @@ class Level:
     box_rotation: Mat
     box_position: Vec
     box_size: Vec
-    parts: Parts | None
+    parts: tuple[Parts, ...]
+    propellers: tuple[Propeller, ...]
     points: Points | None
 
 
@@ -121,7 +160,8 @@ class Tree:
         levels: root first.
         qpos_index: where the hinges, level by level, stand in MuJoCo's qpos.
         qvel_index: the same in qvel.
-        ctrl_index: the same in ctrl; hinges without a servo have none and are refused.
+        ctrl_index: the same in ctrl, then the thrusters; hinges without a servo are refused.
+        carries: whether water is carried along by any part.
         robot: the source.
     """
 
@@ -129,6 +169,7 @@ class Tree:
     qpos_index: np.ndarray
     qvel_index: np.ndarray
     ctrl_index: np.ndarray
+    carries: bool
     robot: Robot
 
 
@@ -198,7 +239,7 @@ def make_tree(robot: Robot, contact: bool = True) -> Tree:
     m = robot.mj_model
     depth: dict[int, int] = {}
     frames: dict[int, np.ndarray] = {}  # MuJoCo body frame from our body frame
-    servo = {int(m.actuator_trnid[k, 0]): k for k in range(m.nu)}
+    servo = {int(m.actuator_trnid[k, 0]): k for k in robot.servos}
     for body in range(1, m.nbody):
         name, joint, parent = m.body(body).name, int(m.body_jntadr[body]), m.body_parentid[body]
         kind = m.jnt_type[joint] if m.body_jntnum[body] == 1 else None
@@ -225,7 +266,8 @@ def make_tree(robot: Robot, contact: bool = True) -> Tree:
         levels=tuple(levels),
         qpos_index=m.jnt_qposadr[joints].astype(np.int32) if joints else np.zeros(0, np.int32),
         qvel_index=m.jnt_dofadr[joints].astype(np.int32) if joints else np.zeros(0, np.int32),
-        ctrl_index=np.array([servo[j] for j in joints], np.int32),
+        ctrl_index=np.array([*(servo[j] for j in joints), *robot.thrusters], np.int32),
+        carries=bool(np.any(robot.fluid.carried_mass) or np.any(robot.fluid.carried_inertia)),
         robot=robot,
     )
 
@@ -294,6 +336,7 @@ def _level(
         )
         hinge = {**zero, "effort": pair, "target": pair, "range": pair}
     where = {b: k for k, b in enumerate(above)}
+    parts = _parts(robot, ids, frames)
     return Level(
         body=tuple(ids),
         frame=np.array([frames[b] for b in ids]),
@@ -306,7 +349,8 @@ def _level(
         box_rotation=_mat(box_rotation),
         box_position=_vec(box_position),
         box_size=_vec(box_size),
-        parts=_parts(robot, ids, frames),
+        parts=parts,
+        propellers=_propellers(robot, ids, frames, parts),
         points=_points(robot, ids, frames) if contact else None,
         **hinge,
     )
@@ -318,11 +362,30 @@ def _stack(rows: list[list[Any]], empty: Any) -> np.ndarray:
     return np.array([[row[k] if k < len(row) else empty for row in rows] for k in range(most)])
 
 
-def _parts(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Parts | None:
+def _parts(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> tuple[Parts, ...]:
+    table = robot.fluid
+    here = [p for p in range(len(table.body)) if table.body[p] in ids]
+    laws = sorted({(table.buoyancy[p], table.drag[p]) for p in here})
+    groups = []
+    for buoyancy, drag in laws:
+        alike = [p for p in here if (table.buoyancy[p], table.drag[p]) == (buoyancy, drag)]
+        rows = [[p for p in alike if table.body[p] == b] for b in ids]
+        # Nothing acts on a group that neither floats nor drags nor carries nor pushes.
+        active = np.any(table.carried_mass[alike]) or set(alike) & set(robot.thruster_row)
+        if (buoyancy, drag) != ("off", "off") or active:
+            groups.append(_group(robot, ids, frames, rows, buoyancy, drag))
+    return tuple(groups)
+
+
+def _group(
+    robot: Robot,
+    ids: list[int],
+    frames: dict[int, np.ndarray],
+    rows: list[list[int]],
+    buoyancy: str,
+    drag: str,
+) -> Parts:
     table, world = robot.fluid, robot.world
-    rows = [list(np.flatnonzero(table.body == b)) for b in ids]
-    if not any(rows):
-        return None
 
     def gather(value: Any, empty: Any) -> np.ndarray:
         return _stack(
@@ -332,29 +395,25 @@ def _parts(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Parts
     def turn(p: int, c: np.ndarray) -> np.ndarray:
         return _clean(c.T @ table.rotation[p])
 
-    def added(p: int, c: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def carried(p: int, c: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         r, t = c.T @ table.position[p], turn(p, c)
-        linear = world.density * t @ np.diag(table.added_mass[p]) @ t.T
-        angular = world.density * t @ np.diag(table.added_inertia[p]) @ t.T
+        linear = world.density * t @ np.diag(table.carried_mass[p]) @ t.T
+        angular = world.density * t @ np.diag(table.carried_inertia[p]) @ t.T
         x = _skew(r)
         return linear, x @ linear, angular - x @ linear @ x
 
-    def inertia(p: int) -> np.ndarray:
-        edges = 2 * table.half_size[p]
-        total = edges @ edges
-        return table.mass[p] / 12 * (total - edges**2)
+    def centre(p: int, c: np.ndarray) -> np.ndarray:
+        return c.T @ (table.position[p] + table.rotation[p] @ table.center_of_volume[p])
 
-    carried = world.density if world.added_mass else 0.0
     zero3, zero33, eye = np.zeros(3), np.zeros((3, 3)), np.eye(3)
-    h = world.timestep
-    coefficients = np.zeros(12)
-    geom_fluid = robot.mj_model.geom_fluid
-    main = _main_geoms(robot)
-    ellipsoid = None
-    if world.drag == "ellipsoid":
+    plate, ellipsoid = None, None
+    if drag == "lift_drag":
+        plate = _plate(gather, table.plate, world.density)
+    if drag == "ellipsoid":
+        geom_fluid, main = robot.mj_model.geom_fluid, _main_geoms(robot)
         k = ellipsoid_constants(
             gather(lambda p, c: table.half_size[p], np.ones(3)),
-            gather(lambda p, c: geom_fluid[main[p]], coefficients),
+            gather(lambda p, c: geom_fluid[main[p]], np.zeros(12)),
         )
         ellipsoid = {
             name: tuple(fold(x[..., None]) for x in value)
@@ -363,35 +422,80 @@ def _parts(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Parts
             for name, value in k.items()
         }
     return Parts(
+        rows=tuple(map(tuple, gather(lambda p, c: p, -1))),
+        buoyancy=buoyancy,
+        drag=drag,
         position=_vec(gather(lambda p, c: c.T @ table.position[p], zero3)),
         rotation=_mat(gather(turn, eye)),
         half_size=_vec(gather(lambda p, c: table.half_size[p], np.ones(3))),
         center=_vec(gather(lambda p, c: table.center_of_volume[p], zero3)),
-        center_position=_vec(
-            gather(
-                lambda p, c: (
-                    c.T @ (table.position[p] + table.rotation[p] @ table.center_of_volume[p])
-                ),
-                zero3,
-            )
-        ),
+        center_position=_vec(gather(centre, zero3)),
         volume=_num(gather(lambda p, c: table.volume[p], 0.0)),
+        exposed=_vec(gather(lambda p, c: table.exposed[p], zero3)),
         drag_linear=_vec(gather(lambda p, c: world.density * table.drag_linear[p], zero3)),
         drag_angular=_vec(gather(lambda p, c: world.density * table.drag_angular[p], zero3)),
-        limit_linear=_vec(
-            gather(lambda p, c: (table.mass[p] + carried * table.added_mass[p]) / h, zero3)
-        ),
-        limit_angular=_vec(
-            gather(lambda p, c: (inertia(p) + carried * table.added_inertia[p]) / h, zero3)
-        ),
-        added_linear=_sym(gather(lambda p, c: added(p, c)[0], zero33)),
-        added_cross=_mat(gather(lambda p, c: added(p, c)[1], zero33)),
-        added_angular=_sym(gather(lambda p, c: added(p, c)[2], zero33)),
+        carried_linear=_sym(gather(lambda p, c: carried(p, c)[0], zero33)),
+        carried_cross=_mat(gather(lambda p, c: carried(p, c)[1], zero33)),
+        carried_angular=_sym(gather(lambda p, c: carried(p, c)[2], zero33)),
+        plate=plate,
         plate_area=_num(gather(lambda p, c: table.plate_area[p], 0.0)),
-        plate_forward=_vec(gather(lambda p, c: eye[table.plate_axes[p, 0]], eye[0])),
-        plate_upward=_vec(gather(lambda p, c: eye[table.plate_axes[p, 1]], eye[2])),
+        plate_forward=_vec(gather(lambda p, c: table.plate_forward[p], eye[0])),
+        plate_upward=_vec(gather(lambda p, c: table.plate_upward[p], eye[2])),
+        plate_center=_vec(gather(lambda p, c: table.plate_center[p], zero3)),
         ellipsoid=ellipsoid,
     )
+
+
+def _plate(gather: Any, plates: tuple[LiftDrag, ...], density: float) -> LiftDrag:
+    """One `LiftDrag` whose numbers are arrays, each part's own."""
+    usual = LiftDrag(density=density)
+    plates = tuple(dataclasses.replace(p, density=p.density or density) for p in plates)
+    numbers = {}
+    for field in dataclasses.fields(LiftDrag):
+        value = getattr(usual, field.name)
+        if isinstance(value, int | float):
+            stacked = gather(lambda p, c, name=field.name: float(getattr(plates[p], name)), value)
+            numbers[field.name] = _num(stacked)
+    plate = object.__new__(LiftDrag)  # not through its checks, which are for a user's numbers
+    for field in dataclasses.fields(LiftDrag):
+        object.__setattr__(plate, field.name, numbers.get(field.name, getattr(usual, field.name)))
+    return plate
+
+
+def _propellers(
+    robot: Robot, ids: list[int], frames: dict[int, np.ndarray], parts: tuple[Parts, ...]
+) -> tuple[Propeller, ...]:
+    table, found = robot.fluid, []
+    for index, row in enumerate(robot.thruster_row):
+        body = int(table.body[row])
+        if body not in ids:
+            continue
+        j = ids.index(body)
+        group, slot = next(
+            (g, k)
+            for g, group in enumerate(parts)
+            for k, rows in enumerate(group.rows)
+            if rows[j] == row
+        )
+        thruster = robot.thruster_part[index].thruster
+        assert thruster is not None
+        turn = _clean(frames[body].T @ table.rotation[row])
+        axis = turn @ np.asarray(thruster.axis)
+        at = frames[body].T @ table.position[row] + turn @ np.asarray(thruster.position)
+        across = np.prod(2 * table.half_size[row]) / (2 * table.half_size[row])
+        found.append(
+            Propeller(
+                index=index,
+                body=j,
+                group=group,
+                slot=slot,
+                axis=tuple(float(x) for x in _clean(axis)),
+                position=tuple(float(x) for x in _clean(at)),
+                disc=float(np.pi / 4 * np.abs(np.asarray(thruster.axis)) @ across),
+                thruster=thruster,
+            )
+        )
+    return tuple(found)
 
 
 def _main_geoms(robot: Robot) -> np.ndarray:

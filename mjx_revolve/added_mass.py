@@ -1,0 +1,82 @@
+"""Water that a body carries along: added mass of its envelope, and water inside it.
+
+Added mass comes from the outer shape (the envelope), not from the volume of the mesh. Entrained
+water fills part of the envelope and moves with it like cargo.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import elliprd
+
+
+def lamb_coefficients(semi_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Added mass and added inertia of an ellipsoid in unbounded water, per unit density.
+
+    Lamb, Hydrodynamics (1932), §§ 114-115; the integrals are Carlson's R_D (Carlson 1979).
+
+    Args:
+        semi_axes: `[..., 3]` semi-axes a, b, c [m].
+
+    Returns:
+        `[..., 3]` added mass along each axis [m³] and `[..., 3]` added inertia about each [m⁵].
+    """
+    a, b, c = (np.asarray(semi_axes, np.float64)[..., i] for i in range(3))
+    abc = a * b * c
+    volume = 4 / 3 * np.pi * abc
+    alpha = 2 / 3 * abc * elliprd(b * b, c * c, a * a)
+    beta = 2 / 3 * abc * elliprd(c * c, a * a, b * b)
+    gamma = 2 / 3 * abc * elliprd(a * a, b * b, c * c)
+    mass = [volume * x / (2 - x) for x in (alpha, beta, gamma)]
+
+    def inertia(b: np.ndarray, c: np.ndarray, beta: np.ndarray, gamma: np.ndarray) -> np.ndarray:
+        difference, square = b * b - c * c, b * b + c * c
+        below = 2 * difference + square * (beta - gamma)
+        # A body of revolution about this axis carries no water round with it.
+        round_ = np.abs(difference) < 1e-9 * square
+        safe = np.where(round_, 1.0, below)
+        return np.where(round_, 0.0, volume / 5 * difference**2 * (gamma - beta) / safe)
+
+    added_inertia = [
+        inertia(b, c, beta, gamma),
+        inertia(c, a, gamma, alpha),
+        inertia(a, b, alpha, beta),
+    ]
+    return np.stack(mass, -1), np.stack(added_inertia, -1)
+
+
+def box_added_mass(half_size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Added mass of a box: that of the ellipsoid of equal volume and equal proportions.
+
+    A choice: for a cube it gives 0.50 of the displaced water where experiment gives 0.64 to 0.68
+    (DNV-RP-H103, table A-2); the inscribed ellipsoid would give 0.26.
+
+    Args:
+        half_size: `[..., 3]` half edges [m].
+
+    Returns:
+        As `lamb_coefficients`.
+    """
+    return lamb_coefficients((6 / np.pi) ** (1 / 3) * np.asarray(half_size, np.float64))
+
+
+def entrained_water(
+    half_size: np.ndarray, free_volume: np.ndarray, fraction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Water that fills a share of a part's envelope, per unit density.
+
+    It is spread evenly over the box, so it resists every motion alike; under water its weight and
+    its buoyancy cancel. A choice: what is flooded drains at once above the surface.
+
+    Args:
+        half_size: `[..., 3]` half edges of the box [m].
+        free_volume: `[...]` volume of the box that the part's material leaves free [m³].
+        fraction: `[...]` share of it that is flooded [-].
+
+    Returns:
+        `[..., 3]` mass [m³] and inertia [m⁵] along and about each axis.
+    """
+    volume = np.asarray(fraction, np.float64) * np.maximum(free_volume, 0)
+    square = (2 * np.asarray(half_size, np.float64)) ** 2
+    inertia = volume[..., None] / 12 * (square.sum(-1, keepdims=True) - square)
+    return np.repeat(volume[..., None], 3, -1), inertia

@@ -1,0 +1,103 @@
+"""Servos and end stops of the hinges: torques, and what an implicit step adds to the inertia."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.spatial import Scalar, mul, sub
+from mjx_revolve.tree import Level
+
+# Share of its top speed up to which a servo gives its full effort [-]. A choice, between the
+# straight line of a bare motor (0) and Revolve's box of effort and speed (1).
+_KNEE = 0.75
+# Ratio of the end stops' damper to their spring [s]. A choice: a leg arrives over-damped.
+STOP_TIME = 0.005
+
+
+def servo(
+    level: Level,
+    angle: Scalar,
+    speed: Scalar,
+    target: Scalar,
+    dt: float,
+    inertia: Scalar,
+    load: Scalar,
+) -> tuple[Scalar, Scalar]:
+    """Torque of the position servos, and what an implicit step adds to the joints' inertia.
+
+    MuJoCo's position actuator, clip(k_p (target - q), ± effort), on a motor whose driver limits its
+    current: full effort up to three quarters of its top speed w, from there a line that the
+    joint's friction d q̇ meets at the top speed,
+
+        τ ≤ d w + k (w - q̇),   k = (effort - d w) / (w / 4),
+
+    and likewise backwards. Below the knee it is stock MuJoCo. The line is taken at the speed at the
+    end of the step, where that speed would pass the knee: a light limb goes from rest to its top
+    speed within one step.
+
+    Args:
+        level: whose hinges.
+        angle: q `[nbody, lanes]` [rad].
+        speed: q̇ `[nbody, lanes]` [rad/s].
+        target: `[nbody, lanes]` [rad].
+        dt: for which the line is implicit [s]; 0 for none.
+        inertia: that the hinge moves, its parent held still, with all that is implicit [kg·m²].
+        load: torque of all but the motor [N·m].
+
+    Returns:
+        Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
+    """
+    target = jnp.clip(target, _cast(level.target[0], target), _cast(level.target[1], target))
+    torque = sub(mul(level.gain, target), mul(level.stiffness, angle))
+    torque = sub(torque, mul(level.servo_damping, speed))
+    low, high = (_cast(x, torque) for x in level.effort)
+    torque = jnp.clip(torque, low, high)
+    top = np.asarray(level.top_speed, np.float64)
+    limited = np.isfinite(top) & np.isfinite(level.effort[1])
+    if not np.any(limited):
+        return torque, jnp.zeros_like(torque)
+    w = np.where(limited, top, 1.0)
+    friction = np.asarray(level.damping) * w
+    effort = np.where(limited, level.effort[1], friction)
+    slope = np.where(limited, np.maximum((effort - friction) / ((1 - _KNEE) * w), 0), 0)
+    forward = jnp.sign(torque)
+    rate, push = forward * speed, jnp.abs(torque)
+    f0, f1, f2 = (_cast(x, torque) for x in (friction, slope, w))
+    line = lambda x: f0 + f1 * (f2 - x)  # noqa: E731
+    ahead = rate + dt * (push + forward * load) / inertia
+    met = (line(ahead) < push) & limited
+    torque = jnp.where(met, forward * line(rate), torque)
+    return torque, jnp.where(met, dt * _cast(slope, torque), jnp.zeros_like(torque))
+
+
+def _cast(x: Scalar, like: jax.Array) -> Scalar:
+    return np.asarray(x, like.dtype)
+
+
+def end_stop(level: Level, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:
+    """Torque of the joint's end stops, and what an implicit step adds to the joint's inertia.
+
+    A spring with a damper, both of which act on angle and speed at the end of the step: linearly
+    implicit, so stable at any stiffness (cf. MuJoCo's soft limit constraint, which it stands in
+    for). The damper lets go within `STOP_TIME`: hinges arrive and stay, they do not bounce.
+
+    Args:
+        level: whose hinges.
+        angle: q `[nbody, lanes]` [rad].
+        speed: q̇ `[nbody, lanes]` [rad/s].
+        dt: for which it is implicit [s]; 0 for none.
+
+    Returns:
+        Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
+    """
+    low, high = (_cast(x, angle) for x in level.range)
+    ahead = angle + dt * speed
+    over = jnp.maximum(ahead - high, 0) - jnp.maximum(low - ahead, 0)
+    stop = _cast(level.stop, angle)
+    # The damper never holds a hinge that swings back.
+    outward = jnp.where(over * speed > 0, speed, 0)
+    torque = -stop * (over + STOP_TIME * outward)
+    stiff = jnp.where(over * speed > 0, dt + STOP_TIME, dt)
+    return torque, jnp.where(over != 0, dt * stop * stiff, jnp.zeros_like(angle))
