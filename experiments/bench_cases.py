@@ -93,8 +93,8 @@ def make_bare(job: dict[str, Any]) -> Case:
     import jax
     import jax.numpy as jnp
 
-    from mjx_revolve.hydrodynamics import water_of
-    from mjx_revolve.rollout import roll_out
+    from mjx_revolve.rollout import flow_at, roll_out
+    from mjx_revolve.water import water_of
     from mjx_revolve.xla import compiler_options, one_loop, over_chunks
 
     fitness = _fitness(job)
@@ -106,12 +106,12 @@ def make_bare(job: dict[str, Any]) -> Case:
         qvel = jnp.zeros((robot.mj_model.nv, qpos.shape[-1]), qpos.dtype)
         state, _ = roll_out(
             engine,
-            lambda state, time, row: (state, ctrl),
+            lambda state, time, row, sense: (state, ctrl),
+            flow_at(robot, water_of(world)),
             lambda state, ctrl, energy: (),
             engine.init(qpos, qvel),
             (),
             None,
-            water_of(world),
             records=steps // 20,
             every=20,
             timestep=world.timestep,

@@ -60,13 +60,17 @@ class _Model(BaseModel):
 class ControllerConfig(_Model):
     """What turns genes into joint targets."""
 
-    type: Literal["cpg", "sine"] = "cpg"
+    type: Literal["cpg", "sine", "feedback"] = "cpg"
     max_frequency: float = Field(2.0, gt=0, le=20)
     """The fastest oscillation [Hz]."""
     amplitude: float = Field(1.0, gt=0, le=1)
     """The largest joint target, as a fraction of the hinge's range [-]."""
     harmonics: int = Field(1, ge=1, le=8)
     """How many sines add up at each hinge; `type: sine` only [-]."""
+    gain: float = Field(2.0, gt=0)
+    """Largest answer to an error of normal size, as a share of the range; `type: feedback` [-]."""
+    depth: float | None = Field(None, ge=0)
+    """Depth that `type: feedback` holds; that of the task's start where none is given [m]."""
 
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
@@ -382,6 +386,7 @@ def _resolve(data: dict[str, Any], key: str, folder: Path, origin: str) -> None:
     if key == "world" and isinstance(value, dict):
         if isinstance(value.get("name"), str) and is_path(value["name"]):
             _resolve(value, "name", folder, origin + "world.")
+        _resolve(value, "current_field", folder, origin + "world.")
         return
     if not isinstance(value, str) or not value or (key == "world" and not is_path(value)):
         return

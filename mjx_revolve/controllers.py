@@ -1,4 +1,4 @@
-"""Controllers: genes to parameters to joint targets. Zero genes keep every joint still.
+"""Controllers: genes to parameters to commands. Zero genes keep every joint and thruster still.
 
 A controller is four plain functions over a population on the last axis. The genes are unbounded
 real numbers, folded into physical ranges by sin(gene), so that any optimiser can move them freely.
@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.dynamics import Sense
 from mjx_revolve.robot import Robot
 from mjx_revolve.spatial import safe_norm, sincos
 
@@ -28,14 +29,15 @@ class Controller(NamedTuple):
         gene_names: `[num_genes]` what each gene is, for tables and plots.
         decode: (genes `[num_genes, lanes]`, order `[nu]`) → parameters; rows follow `order`.
         init: parameters → controller state.
-        step: (parameters, state, time [s]) → (state, targets `[nu, lanes]` [rad]).
+        step: (parameters, state, time [s], sense) → (state, `[nu, lanes]` joint targets [rad] and
+            commands of thrusters [-]); `sense` is a `dynamics.Sense`, what the robot may feel.
     """
 
     num_genes: int
     gene_names: tuple[str, ...]
     decode: Callable[[jax.Array, np.ndarray], Any]
     init: Callable[[Any], Any]
-    step: Callable[[Any, Any, jax.Array], tuple[Any, jax.Array]]
+    step: Callable[[Any, Any, jax.Array, Sense], tuple[Any, jax.Array]]
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def bind_genes(controller: Controller, genes: Any) -> BoundController:
 
 
 def _range(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """`[nu, 1]` middle and half width of each servo's target range [rad]."""
+    """`[nu, 1]` middle and half width of each actuator's range ([rad], or [-] of thrusters)."""
     low, high = robot.mj_model.actuator_ctrlrange.reshape(-1, 2).T
     return (low + high)[:, None] / 2, (high - low)[:, None] / 2
 
@@ -73,9 +75,10 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
     system matrix is antisymmetric, so Σ x² + y² is constant. Target of hinge i: amplitude × half
     range × tanh(x_i), from the middle of its range. It starts at x = 0, y = 1: with all weights
     zero nothing ever moves. Integrated by the classical Runge-Kutta method at the physics' step.
+    Thrusters have no neighbours: each runs at a constant command, half range × sin(gene).
 
-    Genes: one w per hinge, then one c per pair of neighbours; w = 2π f_max sin(gene),
-    c = π f_max sin(gene).
+    Genes: one w per hinge, then one c per pair of neighbours, then one command per thruster;
+    w = 2π f_max sin(gene), c = π f_max sin(gene).
 
     Args:
         robot: whose hinges are driven.
@@ -85,27 +88,39 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
     Returns:
         The controller.
     """
-    n, dt = robot.num_hinges, robot.world.timestep
+    n, thrusters, dt = robot.num_hinges, robot.num_thrusters, robot.world.timestep
     pairs = robot.morphology.hinge_neighbours()
     middle, half = _range(robot)
-    names = [robot.mj_model.actuator(i).name for i in range(n)]
+    hinges, pushers = list(robot.servos), list(robot.thrusters)
+    names = [robot.mj_model.actuator(i).name for i in hinges]
     gene_names = tuple(
-        [f"w {name}" for name in names] + [f"c {names[i]}~{names[j]}" for i, j in pairs]
+        [f"w {name}" for name in names]
+        + [f"c {names[i]}~{names[j]}" for i, j in pairs]
+        + [f"thrust {robot.mj_model.actuator(i).name}" for i in pushers]
     )
-    source = np.zeros((n, n), int)
+    # 32 bits and, below, the genes' dtype: JAX keeps one typed copy of a NumPy array that it meets
+    # in a trace, of whichever mode, 32 or 64 bits, it met it in first.
+    source = np.zeros((n, n), np.int32)
     sign = np.zeros((n, n, 1))
     for k, (i, j) in enumerate(pairs):
         source[i, j] = source[j, i] = n + k
         sign[i, j], sign[j, i] = 1.0, -1.0
 
     def decode(genes: jax.Array, order: np.ndarray) -> Any:
+        # The engine wants its hinges first: where each stands among the hinges.
+        turn = np.array([hinges.index(i) for i in order[:n]], int)
+        blow = np.array([pushers.index(i) for i in order[n:]], int)
         folded = jnp.sin(genes)
-        w = 2 * np.pi * max_frequency * folded[:n][order]
-        c = np.pi * max_frequency * folded[source] * sign
-        c = c[order][:, order]
-        reach = jnp.broadcast_to(jnp.asarray(amplitude * half, genes.dtype)[order], w.shape)
-        center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], w.shape)
-        return w, c, reach, center
+        w = 2 * np.pi * max_frequency * folded[:n][turn]
+        c = np.pi * max_frequency * folded[source] * np.asarray(sign, genes.dtype)
+        c = c[turn][:, turn]
+        wide = lambda x, rows: jnp.broadcast_to(  # noqa: E731
+            jnp.asarray(x, genes.dtype)[rows], (len(rows), *genes.shape[1:])
+        )
+        reach, center = wide(amplitude * half, order[:n]), wide(middle, order[:n])
+        constant = folded[len(folded) - thrusters :][blow]
+        constant = wide(middle, order[n:]) + wide(half, order[n:]) * constant
+        return w, c, reach, center, constant
 
     def slope(w: jax.Array, c: jax.Array, x: jax.Array, y: jax.Array) -> tuple[Any, Any]:
         coupled = w * y
@@ -118,8 +133,8 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
         w = parameters[0]
         return jnp.zeros_like(w), jnp.ones_like(w)
 
-    def step(parameters: Any, state: Any, time: jax.Array) -> tuple[Any, jax.Array]:
-        w, c, reach, center = parameters
+    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+        w, c, reach, center, constant = parameters
         x, y = state
         a1, b1 = slope(w, c, x, y)
         a2, b2 = slope(w, c, x + dt / 2 * a1, y + dt / 2 * b1)
@@ -127,15 +142,16 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
         a4, b4 = slope(w, c, x + dt * a3, y + dt * b3)
         x = x + dt / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
         y = y + dt / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
-        return (x, y), center + reach * jnp.tanh(x)
+        targets = center + reach * jnp.tanh(x)
+        return (x, y), jnp.concatenate([targets, constant]) if thrusters else targets
 
-    return Controller(n + len(pairs), gene_names, decode, init, step)
+    return Controller(len(gene_names), gene_names, decode, init, step)
 
 
 def make_sine(
     robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0, harmonics: int = 1
 ) -> Controller:
-    """One sine per hinge: amplitude, phase and offset each, and a frequency shared by all.
+    """One sine per hinge or thruster: amplitude, phase and offset, and a frequency shared by all.
 
     target_i = offset_i + Σ_k a_ik sin(2π k f t + φ_ik), k = 1 … harmonics. One harmonic is the
     plain sine; with more, a stroke and its return may differ in speed, which is what rowing needs.
@@ -155,7 +171,7 @@ def make_sine(
         The controller; genes: u and v of the first harmonic (one per hinge each), of the second and
         so on, offsets, then the frequency.
     """
-    n = robot.num_hinges
+    n = robot.mj_model.nu
     middle, half = _range(robot)
     names = [robot.mj_model.actuator(i).name for i in range(n)]
     waves = [f"{x}{k + 1 if k else ''}" for k in range(harmonics) for x in "uv"]
@@ -177,7 +193,7 @@ def make_sine(
             sizes.append((scale * u, scale * v))
         return tuple(sizes), 0.5 * reach * jnp.sin(rows[-1]), rate, center
 
-    def step(parameters: Any, state: Any, time: jax.Array) -> tuple[Any, jax.Array]:
+    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
         sizes, offset, rate, center = parameters
         fade = jnp.minimum(time / 0.5, 1.0)
         wave = offset
@@ -189,10 +205,66 @@ def make_sine(
     return Controller(len(gene_names), gene_names, decode, lambda parameters: (), step)
 
 
+# What `make_feedback` multiplies by its genes: names, and the size that counts as 1. Choices: an
+# error of 0.2 m or of 0.2 rad, and the speeds at which it matters.
+_FEEDBACK = (
+    ("depth error", 0.2),
+    ("climb", 0.1),
+    ("roll", 0.2),
+    ("pitch", 0.2),
+    ("spin x", 0.5),
+    ("spin y", 0.5),
+    ("spin z", 0.5),
+)
+
+
+def make_feedback(robot: Robot, depth: float = 1.0, gain: float = 2.0) -> Controller:
+    """Commands that answer to depth and attitude, linearly: what an AUV needs to hold its depth.
+
+    command_i = middle + half range × clip(sin(b_i) + gain Σ_k sin(W_ik) feature_k, -1, 1), with
+    features depth error (core above `depth` counts positive) [0.2 m], climb [0.1 m/s], roll and
+    pitch (the vertical's y and x in the core's frame) [0.2], and spin about the core's three axes
+    [0.5 rad/s], each divided by the size in brackets. Zero genes: nothing moves.
+
+    Args:
+        robot: whose hinges and thrusters are driven.
+        depth: to hold, of the core's centre below the still surface [m].
+        gain: share of the range that a feature of size 1 may command at most [-].
+
+    Returns:
+        The controller; genes: a bias per actuator, then the gains, actuator by actuator.
+    """
+    n, count = robot.mj_model.nu, len(_FEEDBACK)
+    middle, half = _range(robot)
+    names = [robot.mj_model.actuator(i).name for i in range(n)]
+    gene_names = tuple(
+        [f"bias {name}" for name in names]
+        + [f"{feature} {name}" for name in names for feature, _ in _FEEDBACK]
+    )
+
+    def decode(genes: jax.Array, order: np.ndarray) -> Any:
+        folded = jnp.sin(genes)
+        bias = folded[:n][order]
+        weights = gain * folded[n:].reshape(n, count, *genes.shape[1:])[order]
+        wide = lambda x: jnp.broadcast_to(jnp.asarray(x, genes.dtype)[order], bias.shape)  # noqa: E731
+        return bias, tuple(weights[:, k] for k in range(count)), wide(middle), wide(half)
+
+    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+        bias, weights, center, reach = parameters
+        found = (sense.height + depth, sense.climb, sense.up[1], sense.up[0], *sense.spin)
+        command = bias
+        for weight, feature, (_, size) in zip(weights, found, _FEEDBACK, strict=True):
+            command = command + weight * (feature / size)
+        return state, center + reach * jnp.clip(command, -1, 1)
+
+    return Controller(len(gene_names), gene_names, decode, lambda parameters: (), step)
+
+
 # By the name that a configuration gives; each takes (robot, settings).
 CONTROLLERS: dict[str, Callable[[Robot, Any], Controller]] = {
     "cpg": lambda robot, settings: make_cpg(robot, settings.max_frequency, settings.amplitude),
     "sine": lambda robot, settings: make_sine(
         robot, settings.max_frequency, settings.amplitude, settings.harmonics
     ),
+    "feedback": lambda robot, settings: make_feedback(robot, settings.depth, settings.gain),
 }

@@ -20,13 +20,20 @@ from mjx_revolve.config import Config, load_config, make_config
 from mjx_revolve.controllers import CONTROLLERS, Controller, bind_genes
 from mjx_revolve.dynamics import Engine
 from mjx_revolve.errors import InputError
-from mjx_revolve.hydrodynamics import Water
 from mjx_revolve.modules import MODULES, load_modules
 from mjx_revolve.morphology import load_morphology, trim_neutral
 from mjx_revolve.robot import Robot, build_robot
-from mjx_revolve.rollout import Trajectory, make_engine, roll_out, simulate
+from mjx_revolve.rollout import (
+    Trajectory,
+    flow_at,
+    gusty_water,
+    make_engine,
+    roll_out,
+    simulate,
+)
 from mjx_revolve.tasks import TASKS, Track, measure
 from mjx_revolve.terrain import bed_height
+from mjx_revolve.water import Water, gust_path, water_of
 from mjx_revolve.world import load_world
 from mjx_revolve.xla import compiler_options, one_loop, over_chunks
 
@@ -37,6 +44,9 @@ WORST = -1e3
 # Nothing made of these modules swims or sinks this fast: servos, drag and weight allow a tenth of
 # it. An individual that gets further than this allows has blown up [m/s].
 _FASTEST = 3.0
+
+# How long a sea is before it begins again, as episodes see it [s].
+_SEA = 1000.0
 
 # The track is sampled at least this often [s].
 _INTERVAL = 0.1
@@ -116,12 +126,17 @@ class Fitness:
             The trajectory.
         """
         qpos, water = self.starts(key)
+        gusts = self.gusts(key)
+        if water is not None:
+            water = jax.tree.map(lambda x: x[trial], water)
+        if gusts is not None:
+            water = gusty_water(self.robot.world, gusts[..., trial], water)
         return simulate(
             self.robot,
             bind_genes(self.controller, genes),
             self._records * self._every * self.robot.world.timestep,
             qpos=qpos[:, trial],
-            water=None if water is None else jax.tree.map(lambda x: x[trial], water),
+            water=water,
             engine=self.config.engine,
         )
 
@@ -158,12 +173,33 @@ class Fitness:
         rest = jnp.asarray(self.robot.qpos0, place.dtype)[7:, None]
         rest = jnp.broadcast_to(rest, (rest.shape[0], trials))
         qpos = jnp.concatenate([place, quat, rest])
-        if task.current_std == 0:
+        if task.current_std == 0 and not world.waves:
             return qpos, None
         extra = task.current_std * jax.random.normal(current_key, (2, trials))
         x, y, z = world.current
         full = jnp.full((trials,), 0.0, place.dtype)
-        return qpos, Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
+        water = Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
+        if world.waves:
+            # Episodes begin at any moment of the sea.
+            time_key = jax.random.fold_in(key, 2)
+            water = water._replace(time=jax.random.uniform(time_key, (trials,), maxval=_SEA))
+        return qpos, jax.tree.map(lambda x: jnp.broadcast_to(x, (trials,)), water)
+
+    def gusts(self, key: jax.Array) -> jax.Array | None:
+        """Gusts of a key's episodes.
+
+        Args:
+            key: draws them.
+
+        Returns:
+            `[steps + 1, 3, trials]` velocity around the episode's current [m/s], or None where the
+            world has no gusts.
+        """
+        world, steps = self.robot.world, self._records * self._every
+        if world.gust is None:
+            return None
+        gust_key = jax.random.fold_in(key, 1)
+        return gust_path(world.gust, gust_key, steps, world.timestep, self.config.task.trials)
 
     @cached_property
     def _reach(self) -> float:
@@ -188,8 +224,12 @@ class Fitness:
         # Lanes run over individuals and, within each, over its episodes.
         lanes = lambda x: jnp.tile(x, (1,) * (x.ndim - 1) + (size,))  # noqa: E731
         genes = jnp.repeat(population.T, trials, 1)
-        varied = None if water is None else jax.tree.map(lanes, water)
-        position, energy = over_chunks(self._episode)(genes, lanes(qpos), varied)
+        water = None if water is None else jax.tree.map(lanes, water)
+        # Gusts are long: each chunk of lanes picks those of its episodes.
+        gusts = self.gusts(key)
+        trial = None if gusts is None else lanes(jnp.arange(trials))
+        episode = partial(self._episode, gusts=gusts)
+        position, energy = over_chunks(episode)(genes, lanes(qpos), water, trial)
         interval = self._every * world.timestep
         first = min(round(task.settle / interval), position.shape[0] - 2)
         kept = position[first:]
@@ -216,22 +256,30 @@ class Fitness:
         sane_all = jnp.all(sane.reshape(size, trials), 1)
         return jnp.where(sane_all, mean(score), WORST), {k: mean(v) for k, v in measures.items()}
 
-    def _episode(self, genes: jax.Array, qpos: jax.Array, water: Water | None) -> Any:
+    def _episode(
+        self, genes: jax.Array, qpos: jax.Array, water: Water | None, trial: Any, gusts: Any
+    ) -> Any:
         """Track of one chunk: `[S, 3, lanes]` positions and `[S, lanes]` energies."""
         world, controller = self.robot.world, self.controller
         parameters = controller.decode(genes, self.engine.order)
+        rows = None
+        if gusts is not None:
+            rows = gusty_water(world, gusts[..., trial], water)
+            rows = jax.tree.map(
+                lambda x: jnp.broadcast_to(x, (gusts.shape[0] - 1, qpos.shape[-1])), rows
+            )
 
-        def loop(qpos: Any, parameters: Any, water: Any, derived: bool = False) -> Any:
+        def loop(qpos: Any, parameters: Any, water: Any, rows: Any, derived: bool = False) -> Any:
             qvel = jnp.zeros((self.robot.mj_model.nv, qpos.shape[-1]), qpos.dtype)
-            still = Water(world.surface_height, tuple(world.current))
+            still = water_of(world) if water is None else water
             _, kept = roll_out(
                 self.engine,
-                lambda state, time, row: controller.step(parameters, state, time),
+                lambda state, time, row, sense: controller.step(parameters, state, time, sense),
+                lambda time, row: flow_at(self.robot, still if row is None else row)(time, None),
                 lambda state, ctrl, energy: (self.engine.root(state), energy),
                 self.engine.init(qpos, qvel),
                 controller.init(parameters),
-                None,
-                still if water is None else water,
+                rows,
                 records=self._records,
                 every=self._every,
                 timestep=world.timestep,
@@ -243,7 +291,7 @@ class Fitness:
             episode = one_loop(loop, partial(loop, derived=True))
         else:
             episode = loop
-        place, energy = episode(qpos, parameters, water)
+        place, energy = episode(qpos, parameters, water, rows)
         return jnp.stack(place, 1), energy
 
 
@@ -294,7 +342,10 @@ def make_fitness(config: Config | str | Path | dict[str, Any], **overrides: Any)
             f"{config.source}: task.type: crawl expected a world with a bed; found none"
         )
     robot = build_robot(morphology, world)
-    controller = CONTROLLERS[config.controller.type](robot, config.controller)
+    settings = config.controller
+    if settings.depth is None:
+        settings = settings.model_copy(update={"depth": config.task.depth})
+    controller = CONTROLLERS[settings.type](robot, settings)
     contact = _may_touch_bed(config, robot)
     return Fitness(config, robot, controller, make_engine(robot, config.engine, contact))
 

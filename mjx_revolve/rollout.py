@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.controllers import BoundController, Controller
-from mjx_revolve.dynamics import Engine, make_population_engine
+from mjx_revolve.dynamics import Engine, Sense, make_population_engine
 from mjx_revolve.errors import InputError
-from mjx_revolve.hydrodynamics import Water, water_of
 from mjx_revolve.robot import Robot
+from mjx_revolve.water import Water, gust_path, water_of
+from mjx_revolve.world import World
 from mjx_revolve.xla import compiler_options, share_once
 
 ENGINES = ("population", "mjx")
@@ -23,7 +24,7 @@ ENGINES = ("population", "mjx")
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["time", "qpos", "qvel", "xpos", "ctrl", "power"],
+    data_fields=["time", "qpos", "qvel", "xpos", "ctrl", "power", "command"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -36,8 +37,11 @@ class Trajectory:
         qvel: `[T, nv]` root velocity, world frame [m/s], root angular velocity, body frame [rad/s],
             hinges [rad/s].
         xpos: `[T, nbody, 3]` origins of MuJoCo's bodies (0 is the world, 1 the core), world frame
-        [m]. ctrl: `[T, nu]` joint targets [rad].
-        power: `[T]` mechanical power at the servos, summed without sign [W].
+            [m].
+        ctrl: `[T, nu]` joint targets [rad] and commands of the thrusters [-], MuJoCo's order.
+        power: `[T]` mechanical power at the servos, summed without sign, and what ideal propellers
+            need for the thrust [W].
+        command: `[T, nthruster]` commands of the thrusters behind their lag [-].
     """
 
     time: jax.Array
@@ -46,6 +50,7 @@ class Trajectory:
     xpos: jax.Array
     ctrl: jax.Array
     power: jax.Array
+    command: jax.Array | None = None
 
 
 @lru_cache(maxsize=32)
@@ -74,12 +79,12 @@ def make_engine(robot: Robot, engine: str = "population", contact: bool = True) 
 
 def roll_out(
     engine: Engine,
-    drive: Callable[[Any, jax.Array, Any], tuple[Any, jax.Array]],
+    drive: Callable[[Any, jax.Array, Any, Sense], tuple[Any, jax.Array]],
+    flow: Callable[[jax.Array, Any], Water],
     record: Callable[[Any, jax.Array, jax.Array], Any],
     state: Any,
     drive_state: Any,
     inputs: Any,
-    water: Water,
     *,
     records: int,
     every: int,
@@ -90,13 +95,13 @@ def roll_out(
 
     Args:
         engine: what steps it.
-        drive: (controller state, time [s], inputs of this step) → (controller state, ctrl
-            `[nu, lanes]` in the engine's order).
+        drive: (controller state, time [s], inputs of this step, what the robot senses) →
+            (controller state, ctrl `[nu, lanes]` in the engine's order).
+        flow: (time [s], inputs of this step) → the water.
         record: (state, ctrl, energy since the last record `[lanes]` [J]) → what to keep.
         state: from `engine.init`.
         drive_state: initial controller state.
         inputs: None, or arrays `[records * every, ...]`, one row for each step.
-        water: surface and current.
         records: how many records.
         every: steps between them.
         timestep: [s].
@@ -110,8 +115,9 @@ def roll_out(
     def step(carry: Any, now: Any) -> tuple[Any, jax.Array]:
         state, drive_state, energy, count = carry
         # The step counter travels as an integer, so that time is exact however long the run.
-        drive_state, ctrl = drive(drive_state, count.astype(energy.dtype) * timestep, now)
-        state, power = engine.step(state, ctrl, water)
+        time = count.astype(energy.dtype) * timestep
+        drive_state, ctrl = drive(drive_state, time, now, engine.sense(state))
+        state, power = engine.step(state, ctrl, flow(time, now))
         return (state, drive_state, energy + timestep * power, count + 1), ctrl
 
     shared = share_once(step)
@@ -180,6 +186,21 @@ def _matrix(quat: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
+def flow_at(robot: Robot, water: Water) -> Callable[[jax.Array, Any], Water]:
+    """The water at each moment of a rollout whose surface and current do not change.
+
+    Args:
+        robot: in whose world.
+        water: at the start; where there are waves, its time is when the rollout begins.
+
+    Returns:
+        What `roll_out` takes as `flow`.
+    """
+    if not robot.world.waves:
+        return lambda time, row: water
+    return lambda time, row: water._replace(time=water.time + time)
+
+
 @lru_cache(maxsize=64)
 def _compiled(
     robot: Robot, engine: str, steps: int, controller: Controller | None, still: bool
@@ -194,25 +215,31 @@ def _compiled(
     def run(
         qpos: Any, qvel: Any, drive_input: Any, water: Water | None, derived: bool = False
     ) -> Trajectory:
-        flow = water_of(robot.world) if still or water is None else water
+        parameters, drive_state, targets = None, (), None
         if controller is None:
-            rows = drive_input[:, simulator.order, None]
-            parameters, drive_state = None, ()
-            drive = lambda s, time, row: (s, row)  # noqa: E731
+            targets = drive_input[:, simulator.order, None]
+            drive = lambda s, time, row, sense: (s, row[0])  # noqa: E731
         else:
-            rows = None
             parameters = controller.decode(drive_input[:, None], simulator.order)
             drive_state = controller.init(parameters)
-            drive = lambda s, time, row: controller.step(parameters, s, time)  # noqa: E731
+            drive = lambda s, time, row, sense: controller.step(  # noqa: E731
+                parameters, s, time, sense
+            )
+        moving = None if still else water
+        if moving is None:
+            flow = flow_at(robot, water_of(robot.world))
+        else:
+            moving = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[:, None], moving)
+            flow = lambda time, row: flow_at(robot, row[1])(time, None)  # noqa: E731
         keep = lambda state, ctrl, energy: (state, ctrl, energy)  # noqa: E731
         _, (states, ctrl, energy) = roll_out(
             simulator,
             drive,
+            flow,
             keep,
             simulator.init(qpos[:, None], qvel[:, None]),
             drive_state,
-            rows,
-            flow,
+            (targets, moving),
             records=steps,
             every=1,
             timestep=dt,
@@ -227,9 +254,27 @@ def _compiled(
             xpos=body_positions(robot, qs[..., 0]),
             ctrl=ctrl[..., 0][:, back],
             power=energy[..., 0] / dt,
+            command=jax.vmap(simulator.command)(states)[..., 0],
         )
 
     return jax.jit(run, compiler_options=compiler_options()), partial(run, derived=True)
+
+
+def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Water:
+    """The water along a path of gusts.
+
+    Args:
+        world: whose gusts they are.
+        path: `[steps + 1, 3, ...]` from `water.gust_path` [m/s], around the world's current.
+        water: what else differs from the world; its current is that around which the gusts blow.
+
+    Returns:
+        Water whose current and acceleration are `[steps, ...]`.
+    """
+    base = water_of(world) if water is None else water
+    current = tuple(c + path[:-1, i] for i, c in enumerate(base.current))
+    change = jnp.diff(path, axis=0) / world.timestep
+    return base._replace(current=current, acceleration=tuple(change[:, i] for i in range(3)))
 
 
 def simulate(
@@ -249,14 +294,16 @@ def simulate(
         robot: from `build_robot`.
         ctrl: joint targets [rad]: None (all 0), `[nu]` (held), `[T, nu]` (a row for each step), a
             `BoundController` (see `controllers.bind_genes`), or a function of time [s] that
-            returns `[nu]` and that JAX can trace.
+            returns `[nu]` and that JAX can trace. Thrusters take commands within their range.
         duration: [s]; by default as long as `ctrl` has rows, else 5.
         qpos: `[nq]` start; by default the rest pose 1 m below the surface. Root position, world
             frame [m], quaternion (w, x, y, z), hinges [rad].
         qvel: `[nv]` start, by default at rest; root velocity, world frame [m/s], root angular
             velocity, body frame [rad/s], hinges [rad/s].
-        key: if given, the default start pose is turned at random about the vertical.
-        water: surface and current, by default the world's.
+        key: if given, the default start pose is turned at random about the vertical; it also draws
+            the world's gusts (`jax.random.key(0)` by default).
+        water: surface and current, by default the world's; each a number or `[T]`, a row for each
+            step. It replaces the world's gusts.
         engine: "population" or "mjx".
 
     Returns:
@@ -297,8 +344,17 @@ def simulate(
             qpos = jnp.asarray(qpos).at[3:7].set(turned)
     qpos = _array("qpos", qpos, (model.nq,))
     qvel = jnp.zeros(model.nv) if qvel is None else _array("qvel", qvel, (model.nv,))
+    if water is None and robot.world.gust is not None:
+        gust_key = jax.random.fold_in(jax.random.key(0) if key is None else key, 1)
+        path = gust_path(robot.world.gust, gust_key, steps, dt, 1)[..., 0]
+        water = gusty_water(robot.world, path)
     if water is not None:
-        water = jax.tree.map(jnp.asarray, water)
+        water = jax.tree.map(lambda x: _array("water", x, None), water)
+        for leaf in jax.tree.leaves(water):
+            if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
+                raise InputError(
+                    f"water: expected numbers or [{steps}]; found {list(leaf.shape)}"
+                )
     jitted, plain = _compiled(robot, engine, steps, controller, water is None)
     traced = any(
         isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((qpos, qvel, drive_input, water))

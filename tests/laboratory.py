@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.dynamics import acceleration
-from mjx_revolve.hydrodynamics import water_of
 from mjx_revolve.module_types import Box, ModuleType, Part
 from mjx_revolve.morphology import Module, Morphology, load_morphology
 from mjx_revolve.robot import Robot, build_robot
-from mjx_revolve.rollout import make_engine, roll_out
+from mjx_revolve.rollout import flow_at, make_engine, roll_out
+from mjx_revolve.water import water_of
 from mjx_revolve.world import World, load_world
 from mjx_revolve.xla import on_cpu, share_once
 
@@ -113,12 +113,12 @@ def _marcher(robot: Robot, records: int, every: int, engine: str, still: bool):
     def run(qpos, qvel, targets, water):
         _, kept = roll_out(
             simulator,
-            lambda state, time, row: (state, targets),
+            lambda state, time, row, sense: (state, targets),
+            flow_at(robot, water_of(robot.world) if still else water),
             lambda state, ctrl, energy: (*simulator.observe(state), energy),
             simulator.init(qpos, qvel),
             (),
             None,
-            water_of(robot.world) if still else water,
             records=records,
             every=every,
             timestep=robot.world.timestep,

@@ -65,12 +65,14 @@ def test_force_on_a_point():
     force = np.stack(
         bed_contact(
             FLAT, jnp.asarray(depth), tuple(normal), tuple(map(jnp.asarray, velocity)), 0.01, 0.005
-        )
+        )[0]
     )
     outward = (force * normal).sum(0)
     sliding = force - outward * normal
     slip = velocity - (velocity * normal).sum(0) * normal
-    assert not force[:, depth <= 0].any()
+    # The spring is that of the end of the step: what arrives within it is met.
+    ahead = depth - 0.005 * (velocity * normal).sum(0)
+    assert not force[:, ahead <= 0].any()
     # float32 leaves a millionth of the largest force.
     assert outward.min() > -1e-6 * np.abs(force).max()
     assert np.all(np.linalg.norm(sliding, axis=0) < FLAT.friction * outward + 1e-5)
@@ -82,13 +84,13 @@ def test_force_is_continuous_where_a_point_touches_down():
     depth = jnp.linspace(-1e-5, 1e-5, 2001)
     for speed in (0.0, -0.5):
         velocity = (0.3, 0.0, jnp.full_like(depth, speed))
-        force = np.stack(bed_contact(FLAT, depth, (0.0, 0.0, 1.0), velocity, 0.01, 0.005))
+        force = np.stack(bed_contact(FLAT, depth, (0.0, 0.0, 1.0), velocity, 0.01, 0.005)[0])
         assert np.abs(np.diff(force, axis=1)).max() < 1e-3
 
 
 def test_gradient_is_finite_at_rest_and_at_touch_down():
     def pull(depth, speed):
-        return sum(bed_contact(FLAT, depth, (0.0, 0.0, 1.0), (speed, 0.0, -speed), 0.01, 0.005))
+        return sum(bed_contact(FLAT, depth, (0.0, 0.0, 1.0), (speed, 0.0, -speed), 0.01, 0.005)[0])
 
     for depth in (-1e-3, 0.0, 1e-3):
         for speed in (0.0, 0.1):
@@ -164,20 +166,17 @@ def test_a_core_creeps_slowly_on_a_slope_below_the_friction_angle(lake_core):
     assert crept < 0.03
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the explicit cap m / 2dt on each point's friction makes light bodies creep faster",
-)
 def test_creep_stays_below_the_stated_speed(lake_core):
-    """Where tan(slope) is half of μ, the docstring's 5 mm/s law would creep at 3 mm/s."""
+    """Where tan(slope) is half of μ, the docstring's 1 mm/s law creeps at .6 mm/s."""
     _, q, _ = lake_core
-    assert np.linalg.norm(q[-1, :2, 1] - q[-51, :2, 1]) / 5.0 < 0.006
+    assert np.linalg.norm(q[-1, :2, 1] - q[-51, :2, 1]) / 5.0 < 0.0012
 
 
 def test_sliding_friction_is_coulombs():
     """A core on dry ground at 1 m/s loses μ g until it is slow."""
     robot = sink(FLAT, surface_height=-50.0, drag="off", added_mass=False)
-    qpos, qvel = at_rest(robot, 1, FLAT.height + 0.0225 - 9e-4)
+    sunk = 0.09 * G / 4 / FLAT.stiffness  # four corners carry its weight
+    qpos, qvel = at_rest(robot, 1, FLAT.height + 0.0225 - sunk)
     qvel[0] = 1.0
     time, _, v, _ = march(robot, 0.11, qpos, qvel)
     assert v[-1, 0, 0] == pytest.approx(1.0 - 0.6 * G * time[-1], abs=0.05)

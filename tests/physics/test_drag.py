@@ -45,7 +45,9 @@ def test_falling_box_approaches_its_terminal_velocity(size, mass, volume, added_
     robot = box_robot(size, mass, tank, volume)
     qpos, qvel = at_rest(robot, 3, -20.0)
     qpos[3:7] = SIDES
-    time, _, qvel, _ = march(robot, 3.0, qpos, qvel)
+    # Sharp end down is an unstable equilibrium with carried water (Munk's moment): after 2.5 s the
+    # rounding of the start pose would have grown to a tumble.
+    time, _, qvel, _ = march(robot, 2.0 if added_mass else 3.0, qpos, qvel)
     down = np.array([2, 1, 0])  # the edge that is upright
     area = np.prod(size) / np.array(size)[down]
     net = (mass - RHO * volume) * G
@@ -53,7 +55,7 @@ def test_falling_box_approaches_its_terminal_velocity(size, mass, volume, added_
     carried = RHO * robot.fluid.added_mass[0][down] if added_mass else 0.0
     expected = terminal * np.tanh(time[:, None] * net / ((mass + carried) * terminal))
     assert -qvel[:, 2] == pytest.approx(expected, abs=0.01 * terminal.max())
-    assert -qvel[-1, 2] == pytest.approx(terminal, rel=1e-3 if added_mass else 1e-6)
+    assert -qvel[-1, 2] == pytest.approx(terminal, rel=3e-3 if added_mass else 1e-6)
 
 
 @pytest.mark.parametrize("added_mass", [False, True])
@@ -108,7 +110,7 @@ def power(force, torque, v, w):
 def test_no_law_adds_energy():
     v, w = random_flow(2000)
     half = np.array([0.05, 0.02, 0.01])
-    drag = [quadratic_drag(x, 0.7, 1.0, 3.0) for x in (*v, *w)]
+    drag = [quadratic_drag(x, 0.7, 1.0)[0] for x in (*v, *w)]
     assert np.all(power(drag[:3], drag[3:], v, w) <= 0)
     force, torque = inertia_box(v, w, tuple(2 * half), RHO, 1e-3)
     assert np.all(power(force, torque, v, w) < 0)
@@ -181,10 +183,6 @@ def test_a_jointed_body_slows_down_from_more_than_it_can_reach():
     assert np.linalg.norm(after[-1, :3], axis=0).max() < 0.3
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the carried water's Coriolis terms are explicit: they pump energy into a light plate",
-)
 def test_a_light_plate_that_carries_twenty_times_its_mass():
     robot = box_robot((0.2, 0.1, 0.01), 0.05, world(drag="faces", added_mass=True))
     qpos, qvel = random_states(robot, 32)
