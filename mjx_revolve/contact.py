@@ -67,8 +67,8 @@ def bed_contact(
 
     Normal, with d the depth and ḋ the speed inwards: F_n = k max(0, d + dt ḋ) + c ḋ while the sum
     pushes outwards: a spring at the end of the step, k the bed's stiffness, c critical damping of
-    the point's mass. Tangential: Coulomb, F_t = -μ F_n v_t / √(v_t² + v_c²) with v_c = 1 mm/s, so that
-    on a slope the point creeps at v_c tan(slope) / μ and slides where that passes μ.
+    the point's mass. Tangential: Coulomb, F_t = -μ F_n v_t / √(v_t² + v_c²) with v_c = 1 mm/s, so
+    that on a slope the point creeps at v_c tan(slope) / μ and slides where that passes μ.
 
     Both are linear in the velocity at the end of the step, with the damping that is returned: a
     body of any mass can rest on a bed of any stiffness.
@@ -159,9 +159,7 @@ def _damping(position: Vec, normal: Vec, along: Scalar, alike: Scalar, gather) -
     linear = tuple(add(mul(b, u), mul(a, o)) for u, o in zip(unit, outer, strict=True))
     # Σ [r] (b 1 + a n nᵀ) and -Σ [r] (b 1 + a n nᵀ) [r].
     nn = full(outer)
-    across = tuple(
-        vadd(p, q) for p, q in zip(skew(br), matmul(skew(ar), nn), strict=True)
-    )
+    across = tuple(vadd(p, q) for p, q in zip(skew(br), matmul(skew(ar), nn), strict=True))
     trace = total(brr[0], brr[3], brr[5])
     angular = tuple(
         add(sub(mul(u, trace), s), t)

@@ -114,9 +114,11 @@ def make_cpg(robot: Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -
         w = 2 * np.pi * max_frequency * folded[:n][turn]
         c = np.pi * max_frequency * folded[source] * np.asarray(sign, genes.dtype)
         c = c[turn][:, turn]
-        wide = lambda x, rows: jnp.broadcast_to(  # noqa: E731
-            jnp.asarray(x, genes.dtype)[rows], (len(rows), *genes.shape[1:])
-        )
+
+        def wide(x: Any, rows: np.ndarray) -> jax.Array:
+            shape = (len(rows), *genes.shape[1:])
+            return jnp.broadcast_to(jnp.asarray(x, genes.dtype)[rows], shape)
+
         reach, center = wide(amplitude * half, order[:n]), wide(middle, order[:n])
         constant = folded[len(folded) - thrusters :][blow]
         constant = wide(middle, order[n:]) + wide(half, order[n:]) * constant

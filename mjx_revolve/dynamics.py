@@ -256,9 +256,7 @@ def _to_parent(
         angular, linear = (full(rotate_sym(turn, _upper(x))) for x in (block.angular, block.linear))
         back = transpose(across)
     else:
-        angular, linear, back = (
-            rotate(turn, x) for x in (block.angular, block.linear, block.back)
-        )
+        angular, linear, back = (rotate(turn, x) for x in (block.angular, block.linear, block.back))
     torque, force = (matvec(turn, x) for x in bias)
     r = skew(position)
     shifted = _plus(across, matmul(r, linear))
@@ -326,10 +324,8 @@ def _lift_off(
     scaled_a, scaled_l = vscale(inverse, row_a), vscale(inverse, row_l)
     less = lambda m, column, row: lambda i, j: sub(m[i][j], mul(column[i], row[j]))  # noqa: E731
     across = _square(less(block.across, column_a, scaled_l), False)
-    if symmetric:
-        back = transpose(across)
-    else:
-        back = _square(less(block.back, column_l, scaled_a), False)
+    other = less(block.back, column_l, scaled_a)
+    back = transpose(across) if symmetric else _square(other, False)
     left = Block(
         _square(less(block.angular, column_a, scaled_a), symmetric),
         across,
@@ -400,8 +396,10 @@ def _motions(
 ) -> list[Motion]:
     """Where the bodies of each level are and how they move."""
     row = lambda xs: tuple(x[None] for x in xs)  # noqa: E731
+    spin, velocity = rates[0]
     root = Motion(
-        *rates[0],
+        spin=spin,
+        velocity=velocity,
         up=turns[0][2],
         height=state.position[2][None],
         x_axis=turns[0][0] if located else None,
@@ -409,7 +407,7 @@ def _motions(
         place=row(state.position[:2]) if located else None,
     )
     motions = [root]
-    for level, turn, rate in zip(tree.levels[1:], turns[1:], rates[1:], strict=True):
+    for level, turn, (spin, velocity) in zip(tree.levels[1:], turns[1:], rates[1:], strict=True):
         parent = motions[-1]
         up, height = _down(level, parent.up), _down(level, parent.height)
         x_axis, y_axis, place = None, None, None
@@ -423,7 +421,7 @@ def _motions(
             )
             x_axis, y_axis = matTvec(turn, x_axis), matTvec(turn, y_axis)
         height = add(height, dot(up, level.position))
-        motions.append(Motion(*rate, matTvec(turn, up), height, x_axis, y_axis, place))
+        motions.append(Motion(spin, velocity, matTvec(turn, up), height, x_axis, y_axis, place))
     return motions
 
 
@@ -464,9 +462,7 @@ def _acceleration(
         _turn(level, angle) for level, angle in zip(tree.levels[1:], state.angle, strict=True)
     ]
     pulled = any(not isinstance(x, int | float) or x != 0 for x in water.acceleration)
-    located = (
-        pulled or needs_place(world) or any(level.points is not None for level in tree.levels)
-    )
+    located = pulled or needs_place(world) or any(level.points is not None for level in tree.levels)
     velocity, spin = matTvec(turn_root, row(state.velocity)), row(state.spin)
     rates = _velocities(tree, turns, spin, velocity, state.speed)
     motions = _motions(tree, turns, state, rates, located)
@@ -570,8 +566,7 @@ def _join(a: Block, b: Block, symmetric: bool) -> Block:
     if not symmetric:
         return add_block(a, 1.0, b)
     angular, linear = (
-        full(vadd(_upper(x), _upper(y)))
-        for x, y in ((a.angular, b.angular), (a.linear, b.linear))
+        full(vadd(_upper(x), _upper(y))) for x, y in ((a.angular, b.angular), (a.linear, b.linear))
     )
     across = _plus(a.across, b.across)
     return Block(angular, across, transpose(across), linear)
@@ -760,7 +755,10 @@ def acceleration(
     edges = np.cumsum([len(level.body) for level in tree.levels[1:]])
     targets = tuple(jnp.split(ctrl[: len(tree.qpos_index)], edges[:-1])) if len(edges) else ()
     propellers = sorted((p for level in tree.levels for p in level.propellers), key=_index)
-    thrusts = [thrust(p.thruster, clamp_command(p.thruster, x)) for p, x in zip(propellers, ctrl[len(tree.qpos_index) :], strict=True)]
+    thrusts = [
+        thrust(p.thruster, clamp_command(p.thruster, x))
+        for p, x in zip(propellers, ctrl[len(tree.qpos_index) :], strict=True)
+    ]
     state = engine.init(qpos, qvel)._replace(pace=())
     relative = state._replace(velocity=vsub(state.velocity, water.current))
     linear, angular, hinges, _ = _acceleration(tree, relative, targets, water, thrusts, 0.0)

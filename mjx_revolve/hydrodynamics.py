@@ -149,12 +149,8 @@ def _drag(
 ) -> tuple[Vec, Vec, tuple[Vec, Vec] | None]:
     """Force, torque and damping of the drag law on each part, part frame, at the box's centre."""
     if parts.drag == "faces":
-        push = [
-            quadratic_drag(x, c, share) for x, c in zip(v, parts.drag_linear, strict=True)
-        ]
-        twist = [
-            quadratic_drag(x, c, share) for x, c in zip(w, parts.drag_angular, strict=True)
-        ]
+        push = [quadratic_drag(x, c, share) for x, c in zip(v, parts.drag_linear, strict=True)]
+        twist = [quadratic_drag(x, c, share) for x, c in zip(w, parts.drag_angular, strict=True)]
         damping = (tuple(d for _, d in push), tuple(d for _, d in twist))
         return tuple(f for f, _ in push), tuple(t for t, _ in twist), damping
     if parts.drag == "lift_drag":
@@ -298,9 +294,7 @@ def _inertia_box(
     return vadd(torque, cross(level.box_position, force)), force
 
 
-def _thrust(
-    level: Level, shares: Sequence[Scalar], thrusts: Sequence[Scalar]
-) -> tuple[Vec, Vec]:
+def _thrust(level: Level, shares: Sequence[Scalar], thrusts: Sequence[Scalar]) -> tuple[Vec, Vec]:
     """Torque and force of the thrusters on each body."""
     n = len(level.body)
     torques: list[list[Any]] = [[0.0] * n for _ in range(3)]

@@ -100,9 +100,7 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         # The current's acceleration is felt as weight is.
         force = force - mass[:, :3] @ acceleration
         # Spatial acceleration of each body when no joint accelerates: d/dt of J at constant q̇.
-        _, still = jax.jvp(
-            lambda t: velocities(moved(qpos, ahead, t), ahead), (zero,), (zero + 1,)
-        )
+        _, still = jax.jvp(lambda t: velocities(moved(qpos, ahead, t), ahead), (zero,), (zero + 1,))
         for level, drift_rate in zip(tree.levels, still, strict=True):
             jacobian, axes = jacobians(data, level)
             rate = jnp.einsum("bij,j->bi", jacobian, qvel)
@@ -193,9 +191,7 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         new = qvel + dt * rates
         turn = _rows(qpos)
         seen = turn.T @ qvel[:3]
-        pace = rates.at[:3].set(
-            turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3])
-        )
+        pace = rates.at[:3].set(turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3]))
         if tree.carries:
             quat = turn_quat(tuple(qpos[3:7]), tuple(new[3:6]), dt)
             turned = jnp.stack([jnp.stack(r) for r in quat_to_rows(quat)])
@@ -213,9 +209,7 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         asked = tuple(ctrl[k] for k in tree.ctrl_index[len(tree.qpos_index) :])
         command, thrusts, pumped = run_thrusters(propellers, command, asked, world, dt)
 
-        def single(
-            qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, given: Any
-        ) -> Any:
+        def single(qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, given: Any) -> Any:
             merged = jax.tree.map(
                 lambda a, b: b if a is None else a, fixed, given, is_leaf=lambda x: x is None
             )

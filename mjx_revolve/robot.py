@@ -17,9 +17,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjx_revolve.drag import ELLIPSOID_COEFFICIENTS
 from mjx_revolve.errors import InputError
 from mjx_revolve.exposure import exposed_shares
-from mjx_revolve.drag import ELLIPSOID_COEFFICIENTS
 from mjx_revolve.fluid_table import FluidTable, drag_law, make_fluid_table
 from mjx_revolve.module_types import Part
 from mjx_revolve.morphology import Morphology

@@ -352,9 +352,7 @@ def simulate(
         water = jax.tree.map(lambda x: _array("water", x, None), water)
         for leaf in jax.tree.leaves(water):
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
-                raise InputError(
-                    f"water: expected numbers or [{steps}]; found {list(leaf.shape)}"
-                )
+                raise InputError(f"water: expected numbers or [{steps}]; found {list(leaf.shape)}")
     jitted, plain = _compiled(robot, engine, steps, controller, water is None)
     traced = any(
         isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((qpos, qvel, drive_input, water))

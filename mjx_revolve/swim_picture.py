@@ -292,7 +292,7 @@ def _draw_ground(
     region: _Region,
     ground: tuple[float, np.ndarray],
     scenes: Sequence[Scene],
-    fades: Sequence[float],
+    fades: np.ndarray,
     sand: bool,
 ) -> None:
     """Lays the ground over the water: sand or open water, a grid and the robot's shadows."""
@@ -462,8 +462,8 @@ def _scale_bars(axes: Axes, panel: _Panel, swim: _Swim, places: _Places) -> None
 
     In a parallel projection they may lie anywhere: where the lower left corner is free.
     """
-    metres = _round_values(0.0, swim.length, 4)
-    metres = float(metres[metres <= 1.001 * swim.length][-1])
+    rounds = _round_values(0.0, swim.length, 4)
+    metres = float(rounds[rounds <= 1.001 * swim.length][-1])
     sizes = ((metres, f"{metres:g} m"), (swim.length, f"1 body length ({swim.length:.2g} m)"))
     unit = np.subtract(*panel.pixels([[*swim.along, 0.0], [0.0, 0.0, 0.0]]))  # pixels per metre
     angle = math.degrees(math.atan2(unit[1], unit[0]))
@@ -560,7 +560,7 @@ def _draw_way(
     if surface is None:
         marks = [foot, (*foot[:2], top)]
     else:
-        marks = [region.point(*start, world.surface_height)]
+        marks = [region.point(start[0], start[1], world.surface_height)]
     panel = _fit(view, np.concatenate([points, marks]), size, (84, 46, 34, 40))
 
     image = _open_water(size)
@@ -624,7 +624,7 @@ def _draw_stroke(figure: Figure, swim: _Swim, view: np.ndarray, period: float | 
         image = _open_water(size)
         surface = None
         if world.surface_height < float(scene.corners[..., 2].max()) + 0.3 * swim.length:
-            here = _Region(swim.along, *np.zeros((2, 2)), swim.length)
+            here = _Region(swim.along, np.zeros(2), np.zeros(2), swim.length)
             here = replace(here, low=here.split(at[:2]), high=here.split(at[:2]))
             surface = (world.surface_height, here)
             xy = _on_plane(view, panel.grid(), world.surface_height, np.zeros(2))
@@ -682,7 +682,7 @@ def plot_swim(robot: Robot, trajectory: Trajectory) -> Figure:
         raise InputError(
             f"trajectory.qpos: expected {list(expected)} [T, nq]; found {list(qpos.shape)}"
         )
-    finite = np.isfinite(qpos).all(axis=1)
+    finite = np.asarray(np.isfinite(qpos).all(axis=1))
     count = len(finite) if finite.all() else int(finite.argmin())
     if count == 0:
         raise InputError("trajectory.qpos: expected finite numbers in its first row; found none")

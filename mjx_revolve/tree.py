@@ -14,8 +14,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_revolve.errors import InputError
 from mjx_revolve.drag import ellipsoid_constants
+from mjx_revolve.errors import InputError
 from mjx_revolve.lift_drag import LiftDrag
 from mjx_revolve.module_types import Thruster
 from mjx_revolve.robot import Robot
@@ -28,7 +28,7 @@ LIMIT_OVERSHOOT = 0.008
 
 @dataclass(frozen=True)
 class Parts:
-    """Constants of those parts of one level that obey the same laws, `[npart, nbody, 1]` or a float.
+    """Constants of those parts of a level that obey the same laws, `[npart, nbody, 1]` or a float.
 
     Attributes are those of `fluid_table.FluidTable`, in the level's body frames, times the water's
     density where a force needs it. Bodies with fewer parts are padded with parts that do nothing.

@@ -4,13 +4,11 @@ Two things stand in the way, and two internal annotations of XLA remove them (ja
 their sake; tests/test_xla.py notices if they lose their effect; results do not depend on them):
 
 1. XLA:CPU recomputes a shared value inside every fusion that uses it, and a tree recursion is
-nothing
-   but shared values: the work multiplies with depth. `optimization_barrier` does not help, as the
-   CPU compiler drops it before fusion. A call that is never inlined does: `share_once`.
+   nothing but shared values: the work multiplies with depth. `optimization_barrier` does not help,
+   as the CPU compiler drops it before fusion. A call that is never inlined does: `share_once`.
 2. Each kernel that the loop runs costs about 300 ns to dispatch, more than the arithmetic on a
-chunk of
-   64 individuals. A call marked `xla_cpu_small_call` is compiled into one function: `one_loop`.
-   Inside it there is no scatter and no reduction: the population step writes sums out.
+   chunk of 64 individuals. A call marked `xla_cpu_small_call` is compiled into one function:
+   `one_loop`. Inside it there is no scatter and no reduction: the population step writes sums out.
 
 Both are plain identities to JAX: jit, vmap and grad go through them. On other back ends they are
 left out.
@@ -109,8 +107,11 @@ def _evaluate(jaxpr: Any, consts: list[Any], args: list[Any]) -> list[Any]:
     cost: dict[Any, int] = {}
 
     def read(v: Any) -> Any:
-        # A literal's dtype is in its aval: a bare Python number would take the mode's, 32 or 64 bits.
-        return np.asarray(v.val, v.aval.dtype) if isinstance(v, core.Literal) else env[v]
+        if not isinstance(v, core.Literal):
+            return env[v]
+        # Its dtype is in its aval: a bare Python number would take the mode's, 32 or 64 bits.
+        aval: Any = v.aval
+        return np.asarray(v.val, aval.dtype)
 
     for eqn in jaxpr.eqns:
         inputs = [read(v) for v in eqn.invars]
