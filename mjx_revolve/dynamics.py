@@ -743,7 +743,8 @@ def acceleration(
         robot: from `build_robot`.
         qpos: `[nq, lanes]`.
         qvel: `[nv, lanes]`.
-        ctrl: `[nu, lanes]` servo targets, in MuJoCo's order [rad].
+        ctrl: `[nu, lanes]` servo targets [rad] and thrusters' commands [-], in MuJoCo's order; a
+            thruster with a lag is still.
         water: surface and current.
 
     Returns:
@@ -755,11 +756,10 @@ def acceleration(
     edges = np.cumsum([len(level.body) for level in tree.levels[1:]])
     targets = tuple(jnp.split(ctrl[: len(tree.qpos_index)], edges[:-1])) if len(edges) else ()
     propellers = sorted((p for level in tree.levels for p in level.propellers), key=_index)
-    thrusts = [
-        thrust(p.thruster, clamp_command(p.thruster, x))
-        for p, x in zip(propellers, ctrl[len(tree.qpos_index) :], strict=True)
-    ]
     state = engine.init(qpos, qvel)._replace(pace=())
+    asked = tuple(ctrl[len(tree.qpos_index) :])
+    # As in mj_forward, a thruster behind a lag has not heard of its command yet.
+    _, thrusts, _ = run_thrusters(propellers, state.command, asked, robot.world, 0.0)
     relative = state._replace(velocity=vsub(state.velocity, water.current))
     linear, angular, hinges, _ = _acceleration(tree, relative, targets, water, thrusts, 0.0)
     turn = quat_to_rows(state.quat)

@@ -154,7 +154,7 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         mass = mass + jnp.diag(jnp.asarray(m.dof_damping * dt, qpos.dtype))
         power, stop = zero, len(tree.qpos_index)
         # Tips to root, as in the articulated-body algorithm: a servo must know what it moves.
-        for level in reversed(tree.levels[1:]):
+        for level, drift_rate in zip(reversed(tree.levels[1:]), reversed(still[1:]), strict=True):
             start = stop - len(level.body)
             q, v = tree.qpos_index[start:stop], tree.qvel_index[start:stop]
             angle, speed = qpos[q][:, None], qvel[v][:, None]
@@ -162,16 +162,17 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
             force = force.at[v].add(torque[:, 0])
             mass = mass.at[v, v].add(inertia[:, 0])
             moved_inertia, load = [], []
-            for j in v:
-                below = [k for k in np.arange(m.nv) if k != j and _descends(m, k, j)]
-                column, load_j, own = mass[j, :][np.array(below, int)], force[j], mass[j, j]
-                if below:
+            for j, jacobian, drifting in zip(v, jacobians(data, level)[0], drift_rate, strict=True):
+                below = np.array([k for k in range(m.nv) if k != j and _descends(m, k, j)], int)
+                row, load_j = mass[j], force[j]
+                if len(below):
                     inner = mass[np.ix_(below, below)]
-                    back = jnp.linalg.solve(inner.T, column)
-                    own = own - back @ mass[np.array(below), j]
-                    load_j = load_j - back @ force[np.array(below)]
-                moved_inertia.append(own)
-                load.append(load_j)
+                    back = jnp.linalg.solve(inner.T, row[below])
+                    row, load_j = row - back @ mass[below], load_j - back @ force[below]
+                moved_inertia.append(row[j])
+                # There the hinge's body is held without acceleration, J̇ q̇ included.
+                held = jnp.linalg.solve(jacobian[:, :6], drifting)
+                load.append(load_j + row[:6] @ held)
             asked = ctrl[tree.ctrl_index[start:stop]][:, None]
             motor, motor_inertia = servo(
                 level,

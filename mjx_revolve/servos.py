@@ -66,7 +66,9 @@ def servo(
     rate, push = forward * speed, jnp.abs(torque)
     f0, f1, f2 = (_cast(x, torque) for x in (friction, slope, w))
     line = lambda x: f0 + f1 * (f2 - x)  # noqa: E731
-    ahead = rate + dt * (push + forward * load) / inertia
+    # The motor turns its base, too, the other way.
+    base = _cast(dt / np.asarray(level.base_inertia), torque)
+    ahead = rate + dt * (push + forward * load) / inertia + base * push
     met = (line(ahead) < push) & limited
     torque = jnp.where(met, forward * line(rate), torque)
     return torque, jnp.where(met, dt * _cast(slope, torque), jnp.zeros_like(torque))

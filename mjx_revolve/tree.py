@@ -118,6 +118,8 @@ class Level:
         range: limits of the joint, low and high [rad].
         stop: stiffness of the end stops [N·m/rad].
         top_speed: of the servo [rad/s]; infinite where the model states none.
+        base_inertia: of all that is on the parent's side of the hinge, about its axis, at rest
+            [kg·m²].
         box_rotation: body from inertial frame, for MuJoCo's inertia-box law.
         box_position: centre of mass [m].
         box_size: edges of the box of equal inertia [m].
@@ -144,6 +146,7 @@ class Level:
     range: tuple[Scalar, Scalar]
     stop: Scalar
     top_speed: Scalar
+    base_inertia: Scalar
     box_rotation: Mat
     box_position: Vec
     box_size: Vec
@@ -328,12 +331,17 @@ def _level(
             "range": (_num(limits[:, 0]), _num(limits[:, 1])),
             "stop": _num(strong / LIMIT_OVERSHOOT),
             "top_speed": _num(m.jnt_user[joint, 0] if m.nuser_jnt else np.full(len(joint), np.inf)),
+            "base_inertia": _num([_base_inertia(robot, b) for b in ids]),
         }
     else:
         pair = (0.0, 0.0)
         zero = dict.fromkeys(
-            ("armature", "damping", "gain", "stiffness", "servo_damping", "stop", "top_speed"), 0.0
-        )
+            (
+                "armature", "damping", "gain", "stiffness", "servo_damping", "stop", "top_speed",
+                "base_inertia",
+            ),
+            0.0,
+        )  # fmt: skip
         hinge = {**zero, "effort": pair, "target": pair, "range": pair}
     where = {b: k for k, b in enumerate(above)}
     parts = _parts(robot, ids, frames)
@@ -354,6 +362,34 @@ def _level(
         points=_points(robot, ids, frames) if contact else None,
         **hinge,
     )
+
+
+def _base_inertia(robot: Robot, body: int) -> float:
+    """Inertia about a hinge's axis of all bodies that it does not move, and their water, at rest."""
+    m, table = robot.mj_model, robot.fluid
+    data = mujoco.MjData(m)
+    mujoco.mj_kinematics(m, data)
+    axis, anchor = data.xaxis[m.body_jntadr[body]], data.xpos[body]
+    moved = {body}
+    for b in range(body + 1, m.nbody):
+        if int(m.body_parentid[b]) in moved:
+            moved.add(b)
+
+    def about(center: np.ndarray, mass: np.ndarray, inertia: np.ndarray, turn: np.ndarray) -> float:
+        swing = turn.T @ np.cross(axis, center - anchor)
+        return float(swing @ (mass * swing) + (turn.T @ axis) ** 2 @ inertia)
+
+    total = 0.0
+    for b in set(range(1, m.nbody)) - moved:
+        turn = data.ximat[b].reshape(3, 3)
+        total += about(data.xipos[b], np.full(3, m.body_mass[b]), m.body_inertia[b], turn)
+    for p in np.flatnonzero(~np.isin(table.body, list(moved))):
+        b = table.body[p]
+        frame = data.xmat[b].reshape(3, 3)
+        water = robot.world.density * table.carried_mass[p], table.carried_inertia[p]
+        center, turn = data.xpos[b] + frame @ table.position[p], frame @ table.rotation[p]
+        total += about(center, water[0], robot.world.density * water[1], turn)
+    return total
 
 
 def _stack(rows: list[list[Any]], empty: Any) -> np.ndarray:

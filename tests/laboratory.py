@@ -79,7 +79,7 @@ def random_states(robot: Robot, lanes: int, seed: int = 0, speed: float = 1.0, d
     qpos[3:7] = draw.normal(size=(4, lanes))
     qpos[3:7] /= np.linalg.norm(qpos[3:7], axis=0)
     low, high = model.jnt_range[1:].T
-    qpos[7:] = draw.uniform(0.8 * low[:, None], 0.8 * high[:, None], (model.nu, lanes))
+    qpos[7:] = draw.uniform(0.8 * low[:, None], 0.8 * high[:, None], (len(low), lanes))
     qvel[:] = speed * draw.normal(size=qvel.shape)
     return qpos, qvel
 
@@ -101,7 +101,7 @@ def accelerate(robot: Robot, qpos, qvel, ctrl=None, water=None, x64: bool = True
     """`dynamics.acceleration` of lanes of states, as NumPy: `[nv, lanes]`."""
     with jax.enable_x64(x64):
         kind = jnp.float64 if x64 else jnp.float32
-        ctrl = np.zeros((robot.num_hinges, np.shape(qpos)[-1])) if ctrl is None else ctrl
+        ctrl = np.zeros((robot.mj_model.nu, np.shape(qpos)[-1])) if ctrl is None else ctrl
         arrays = [jnp.asarray(x, kind) for x in (qpos, qvel, ctrl)]
         return np.asarray(_accelerator(robot, water is None)(*arrays, water))
 

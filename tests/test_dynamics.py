@@ -37,7 +37,7 @@ CURRENT = (0.2, -0.1, 0.05)
 def drawn(robot, lanes, seed=0, speed=1.0):
     """Random states far below the surface, and targets that saturate some servos."""
     qpos, qvel = random_states(robot, lanes, seed=seed, speed=speed, depth=50.0)
-    ctrl = np.random.default_rng(seed + 1).uniform(-1, 1, (robot.num_hinges, lanes))
+    ctrl = np.random.default_rng(seed + 1).uniform(-1, 1, (robot.mj_model.nu, lanes))
     return qpos, qvel, ctrl
 
 
@@ -279,7 +279,7 @@ def test_the_water_may_differ_between_lanes():
 
 
 def test_momentum_of_a_jointed_body_in_a_vacuum(arm):
-    """Linear and angular momentum do not change, whatever the servos do; by differences over 20 µs."""
+    """Linear and angular momentum do not change, whatever the servos do: differences over 20 µs."""
     qpos, qvel, ctrl = drawn(arm, 32, speed=0.5)
     qpos[:3] = 0.0
     qacc = accelerate(arm, qpos, qvel, ctrl)
@@ -324,10 +324,13 @@ def test_a_mirrored_spider_swims_a_mirrored_way():
     assert back[:, 7:] == pytest.approx((there[:, 7:] * sign.T)[:, other], abs=1e-6)
 
 
-def check_order(make):
-    """The end of half a second at 4, 2 and 1 ms: the error halves with the step."""
+def check_order(make, steps):
+    """The end of half a second: what changes when the step halves, halves too, or better.
+
+    Carried water and drag are second order; servos, end stops and friction are first.
+    """
     ends = []
-    for dt in (0.004, 0.002, 0.001):
+    for dt in steps:
         robot = make(world(**WATER, timestep=dt))
         qpos, qvel = at_rest(robot, 2, -0.5)
         qpos[2, 1] = 0.0
@@ -335,16 +338,17 @@ def check_order(make):
         ctrl = np.full((robot.num_hinges, 2), 0.3)
         ends.append(march(robot, 0.5, qpos, qvel, ctrl, every=round(0.1 / dt))[1][-1])
     ratio = np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(ends[2] - ends[1])
-    assert ratio == pytest.approx(2.0, abs=0.3)
+    assert ratio > 1.7
 
 
-def test_first_order_convergence_in_the_time_step():
-    check_order(lambda tank: build_robot(body("core"), tank))
+def test_convergence_in_the_time_step():
+    check_order(lambda tank: build_robot(body("core"), tank), (0.004, 0.002, 0.001))
 
 
 @pytest.mark.slow
-def test_first_order_convergence_of_a_jointed_body():
-    check_order(elbow_robot)
+def test_convergence_of_a_jointed_body():
+    """From 1 ms on: when a servo's torque leaves its limit is known to a step."""
+    check_order(elbow_robot, (0.001, 0.0005, 0.00025))
 
 
 # ------------------------------------------------------------------------- what it refuses
