@@ -51,7 +51,7 @@ from mjx_revolve.spatial import (
     vsub,
 )
 from mjx_revolve.tree import Level, Parts
-from mjx_revolve.water import Water, flow, is_uniform, surface, water_of
+from mjx_revolve.water import Water, flow, is_uniform, surface, water_of, wave_convection
 from mjx_revolve.world import World
 
 __all__ = [
@@ -140,7 +140,10 @@ def _stream(world: World, water: Water, motion: Motion, position: Vec) -> _Strea
     if is_uniform(world):
         return _Stream(None, None)
     rest = water._replace(current=_ZERO, acceleration=_ZERO)
-    velocity, acceleration = flow(world, rest, *_world_place(motion, position))
+    place = _world_place(motion, position)
+    velocity, acceleration = flow(world, rest, *place)
+    if world.waves:
+        acceleration = vadd(acceleration, wave_convection(world, rest, *place))
     return _Stream(_to_body(motion, _some(velocity)), _to_body(motion, _some(acceleration)))
 
 

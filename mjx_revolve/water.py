@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.currents import CurrentField, Gust, Shear, Wave
-from mjx_revolve.spatial import Scalar, Vec, add, mul, sincos, sub, vadd, vscale
+from mjx_revolve.spatial import Scalar, Vec, add, mul, sincos, sub, symvec, vadd, vscale
 from mjx_revolve.world import World
 
 
@@ -107,9 +107,9 @@ def surface(world: World, water: Water, x: Scalar, y: Scalar) -> tuple[Scalar, A
 def flow(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar) -> tuple[Vec, Vec]:
     """Velocity and acceleration of the water at places: all that moves it, added up.
 
-    Acceleration is that of the uniform current, and of the waves as `wave_flow` has it. What a
-    steady shear or field does to water that passes through it, and the waves' own u·∇u, are of
-    second order in velocities that are small, and left out.
+    Acceleration is that of the uniform current, and of the waves as `wave_flow` has it: ∂u/∂t. The
+    step adds the waves' own u·∇u (`wave_convection`); what a steady shear or field does to water
+    that passes through it is of second order in velocities that are small, and left out.
 
     Args:
         world: what moves its water.
@@ -257,23 +257,58 @@ def wave_flow(
     Returns:
         Velocity [m/s] and acceleration [m/s²], world frame.
     """
-    h, (c, s) = world.water_depth, _towards(wave)
-    k = wave.wavenumber(world.gravity, h)
-    omega = wave.frequency(world.gravity, h)
+    (c, s), omega = _towards(wave), wave.frequency(world.gravity, world.water_depth)
     sine, cosine = _phase(world, wave, water, x, y)
-    below = jnp.minimum(sub(z, water.surface_height), 0)
-    if h is None:
-        along = upright = jnp.exp(k * below)
-    else:
-        # cosh(k(z + h)) / sinh(kh) and sinh likewise, without large numbers.
-        below = jnp.maximum(below, -h)
-        whole = -1 / math.expm1(-2 * k * h)
-        fade, mirrored = jnp.exp(k * below), jnp.exp(-k * (below + 2 * h))
-        along, upright = whole * (fade + mirrored), whole * (fade - mirrored)
+    along, upright = _fading(world, wave, water, z)
     speed = wave.amplitude * omega
     u, w = speed * along * cosine, speed * upright * sine
     du, dw = speed * omega * along * sine, -speed * omega * upright * cosine
     return (mul(c, u), mul(s, u), w), (mul(c, du), mul(s, du), dw)
+
+
+def _fading(world: World, wave: Wave, water: Water, z: Scalar) -> tuple[Scalar, Scalar]:
+    """How orbital velocity along the wave and upright has faded at a height [-]."""
+    h = world.water_depth
+    k = wave.wavenumber(world.gravity, h)
+    below = jnp.minimum(sub(z, water.surface_height), 0)
+    if h is None:
+        fade = jnp.exp(k * below)
+        return fade, fade
+    # cosh(k(z + h)) / sinh(kh) and sinh likewise, without large numbers.
+    below = jnp.maximum(below, -h)
+    whole = -1 / math.expm1(-2 * k * h)
+    fade, mirrored = jnp.exp(k * below), jnp.exp(-k * (below + 2 * h))
+    return whole * (fade + mirrored), whole * (fade - mirrored)
+
+
+def wave_convection(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar) -> Vec:
+    """u·∇u of the waves' orbital velocity: what water accelerates by because it moves on.
+
+    Of second order in the waves' steepness, like the drift that it keeps away: without it a neutral
+    body would sink while it goes round.
+
+    Args:
+        world: with its waves.
+        water: still surface and time.
+        x: world x [m], any shape.
+        y: world y [m], same shape.
+        z: world z [m], same shape.
+
+    Returns:
+        Acceleration [m/s²], world frame.
+    """
+    velocity: Vec = (0.0, 0.0, 0.0)
+    slopes: list[Scalar] = [0.0] * 6  # ∇u is symmetric, as u has a potential: xx xy xz yy yz zz
+    for wave in _running(world):
+        velocity = vadd(velocity, wave_flow(world, wave, water, x, y, z)[0])
+        (c, s), omega = _towards(wave), wave.frequency(world.gravity, world.water_depth)
+        sine, cosine = _phase(world, wave, water, x, y)
+        along, upright = _fading(world, wave, water, z)
+        rate = wave.wavenumber(world.gravity, world.water_depth) * wave.amplitude * omega
+        level, tilt = rate * along * sine, rate * upright * cosine
+        terms = (-c * c * level, -c * s * level, c * tilt, -s * s * level, s * tilt, level)
+        slopes = [add(a, b) for a, b in zip(slopes, terms, strict=True)]
+    return symvec(tuple(slopes), velocity)
 
 
 def gust_path(gust: Gust, key: jax.Array, steps: int, dt: float, trials: int) -> jax.Array:
