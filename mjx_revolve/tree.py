@@ -365,7 +365,7 @@ def _level(
 
 
 def _base_inertia(robot: Robot, body: int) -> float:
-    """Inertia about a hinge's axis of all bodies that it does not move, and their water, at rest."""
+    """Inertia about a hinge's axis of all bodies that it does not move, and their water [kg·m²]."""
     m, table = robot.mj_model, robot.fluid
     data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)
