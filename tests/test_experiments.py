@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import bench, falling_spider, optimisers
+from experiments import bench, falling_spider, optimisers, validation, validation_cases
 from experiments.falling_spider import (
     GAZEBO_GRAVITY,
     RUNS,
@@ -21,6 +21,8 @@ from experiments.falling_spider import (
     read_tables,
     row_ticks,
 )
+from laboratory import QUICK
+from mjx_revolve import rollout
 from mjx_revolve.errors import InputError, run_command
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -54,8 +56,11 @@ def test_the_closed_forms_height_and_time_are_inverse():
     assert speeds[0] == pytest.approx(speeds[1], rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("run", "expected"), [("air", 9.81), ("mask", 0.60648)])
-def test_the_spider_falls_as_fast_as_it_must(run, expected):
+def test_the_spider_falls_as_fast_as_it_must(monkeypatch, run, expected):
+    # The compiler's optimisations cost more than they save here.
+    monkeypatch.setattr(rollout, "compiler_options", lambda: QUICK)
     assert acceleration(fall(RUNS[run][0], 1.5)) == pytest.approx(expected, abs=1e-4)
 
 
@@ -146,6 +151,7 @@ def test_falling_spider_writes_its_table_and_its_plot(tmp_path, capsys):
         (bench.main, ["spider"], "unrecognized arguments: spider"),
         (optimisers.main, ["--evaluations", "-3"], "expected a whole number above 0; found '-3'"),
         (optimisers.main, ["--out"], "argument --out: expected one argument"),
+        (validation.main, ["--out", "/dev/null/x"], "--out: expected a folder to write into"),
     ],
 )
 def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
@@ -250,3 +256,29 @@ def test_the_three_optimisers_share_one_fitness():
     assert len({outcome.evaluations for outcome in outcomes}) == 1
     assert all(outcome.score > still for outcome in outcomes)
     assert all(np.isfinite(outcome.fresh) for outcome in outcomes)
+
+
+# ---------------------------------------------------------------------- validation
+
+
+@pytest.mark.slow
+def test_the_quick_validation_passes_and_keeps_its_table(tmp_path, capsys):
+    assert validation.main(["--quick", "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "all within their tolerances" in printed
+    lines = (tmp_path / "out" / "validation.csv").read_text(encoding="utf-8").splitlines()
+    assert len(lines) > len(validation_cases.QUICK_CASES)
+    assert (tmp_path / "out" / "validation.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_case_outside_its_tolerance_fails_the_validation(tmp_path, monkeypatch, capsys):
+    row = validation_cases.Row("height", 1.0, 1.2, 0.1, "m")
+    case = lambda: validation_cases.Result([row], [])  # noqa: E731
+    monkeypatch.setattr(validation_cases, "CASES", {"too far": case})
+    assert validation.main(["--out", str(tmp_path / "out")]) == 1
+    assert "1 outside their tolerances" in capsys.readouterr().out
+    assert "FAILS" in (tmp_path / "out" / "validation.csv").read_text(encoding="utf-8")
+
+
+def test_every_quick_case_is_a_case():
+    assert set(validation_cases.QUICK_CASES) < set(validation_cases.CASES)

@@ -1,0 +1,600 @@
+"""What `experiments.validation` checks: laws of the water against closed forms, through the engine.
+
+A case is a function that returns rows, and curves for the plots. Everything runs in float64, so
+that an error is the law's or the time step's and not rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from experiments.common import ROOT
+from mjx_revolve.buoyancy import submersion
+from mjx_revolve.drag import ELLIPSOID_COEFFICIENTS, ellipsoid, ellipsoid_constants, inertia_box
+from mjx_revolve.dynamics import acceleration
+from mjx_revolve.lift_drag import LiftDrag, lift_drag
+from mjx_revolve.module_types import Box, ModuleType, Part, Thruster
+from mjx_revolve.morphology import Module, Morphology, load_morphology
+from mjx_revolve.robot import Robot, build_robot
+from mjx_revolve.rollout import flow_at, make_engine, roll_out, simulate
+from mjx_revolve.water import gust_path, water_of
+from mjx_revolve.world import World, load_world
+from mjx_revolve.xla import on_cpu
+
+RHO, G = 999.1026, 9.81
+# Nothing but inertia: what a case does not name is off.
+EMPTY = {"gravity": 0.0, "buoyancy": "off", "drag": "off", "added_mass": False, "bed": None}
+# A program runs once here: LLVM's optimisations cost more than they save.
+QUICK = {"xla_backend_optimization_level": 0} if on_cpu() else None
+
+# A champion of configs/lake_swim.yaml, seed 0, rounded: a spider that swims.
+SWIMMER = (
+    0.14, 1.48, 0.26, 2.48, -1.6, 0.09, 1.6, 2.47, -1.7, -1.22, -1.65, -0.71, -0.54, 2.73, 0.24,
+    1.56, 2.98, 4.73, 0.55, -3.75, 2.09, 2.15, 0.63, -0.22, 3.42, -1.49, 1.45, -3.6, -0.67, 0.03,
+    3.63, -1.37, -0.99, 0.3, -1.28, 0.56, 2.03, -2.27, -0.4, -0.66, 1.85, -0.05, 1.19, 2.57, -0.38,
+    0.22, 1.28, 2.34, 2.35, 1.05, -1.34, -0.96, 0.32, 2.04, -0.2, -0.5, 0.54,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison.
+
+    Attributes:
+        what: the quantity.
+        expected: by the closed form.
+        found: by the engine.
+        tolerance: how far apart they may be.
+        unit: of all three.
+    """
+
+    what: str
+    expected: float
+    found: float
+    tolerance: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether it holds; NaN does not."""
+        return bool(abs(self.found - self.expected) <= self.tolerance)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One panel of the plots.
+
+    Attributes:
+        title: of the panel.
+        x_label: with its unit.
+        y_label: with its unit.
+        lines: (label, x, y, whether it is the closed form).
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: list[tuple[str, np.ndarray, np.ndarray, bool]]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a case found."""
+
+    rows: list[Row]
+    curves: list[Curve] = field(default_factory=list)
+
+
+# ------------------------------------------------------------------------- the bench
+
+
+def tank(**fields: Any) -> World:
+    """A world in which only what is named acts."""
+    return load_world("empty_underwater", **EMPTY | fields)
+
+
+def box(size: Any, mass: float, world: World, volume: float | None = None, **part: Any) -> Robot:
+    """A single box; without `volume`, it displaces what its box holds."""
+    volume = float(np.prod(size)) if volume is None else volume
+    only = Part("box", (Box(tuple(size)),), mass=mass, volume=volume, **part)
+    kind = ModuleType("Core", (only,))
+    module = Module("box", "Core", -1, -1, 0.0, None, np.zeros(3), np.eye(3), kind=kind)
+    return build_robot(Morphology("box", (module,)), world)
+
+
+def start(robot: Robot, lanes: int = 1, height: float = -5.0) -> tuple[np.ndarray, np.ndarray]:
+    """`[nq, lanes]` rest pose at a height, and `[nv, lanes]` zeros."""
+    qpos = np.repeat(robot.mj_model.qpos0[:, None], lanes, 1)
+    qpos[2] = height
+    return qpos, np.zeros((robot.mj_model.nv, lanes))
+
+
+def march(
+    robot: Robot, duration: float, qpos: Any, qvel: Any, ctrl: Any = None, every: int = 1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Steps lanes of a robot: `[T]` time, `[T, nq, lanes]` and `[T, nv, lanes]`."""
+    engine, dt = make_engine(robot), robot.world.timestep
+    records = round(duration / dt / every)
+
+    def run(qpos: Any, qvel: Any, ctrl: Any) -> Any:
+        return roll_out(
+            engine,
+            lambda state, time, row, sense: (state, ctrl),
+            flow_at(robot, water_of(robot.world)),
+            lambda state, ctrl, energy: engine.observe(state),
+            engine.init(qpos, qvel),
+            (),
+            None,
+            records=records,
+            every=every,
+            timestep=dt,
+        )[1]
+
+    with jax.enable_x64(True):
+        ctrl = np.zeros((robot.mj_model.nu, qpos.shape[1])) if ctrl is None else ctrl
+        arrays = [jnp.asarray(x, jnp.float64) for x in (qpos, qvel, np.asarray(ctrl)[engine.order])]
+        qs, vs = jax.jit(run, compiler_options=QUICK)(*arrays)
+        return dt * every * np.arange(1, records + 1), np.asarray(qs), np.asarray(vs)
+
+
+def accelerate(robot: Robot, qpos: Any, qvel: Any) -> np.ndarray:
+    """`[nv, lanes]` acceleration."""
+    with jax.enable_x64(True):
+        ctrl = jnp.zeros((robot.mj_model.nu, qpos.shape[1]))
+        found = acceleration(
+            robot, jnp.asarray(qpos), jnp.asarray(qvel), ctrl, water_of(robot.world)
+        )
+        return np.asarray(found)
+
+
+def frequency(time: np.ndarray, x: np.ndarray) -> float:
+    """Angular frequency by the crossings of the mean [rad/s]."""
+    x = x - (x.max() + x.min()) / 2
+    k = np.flatnonzero(np.diff(np.sign(x)))
+    crossings = time[k] - x[k] * (time[k + 1] - time[k]) / (x[k + 1] - x[k])
+    return float(np.pi / np.mean(np.diff(crossings)))
+
+
+def carried(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Added mass [kg] and added inertia [kg·m²] of a single box."""
+    return RHO * robot.fluid.carried_mass[0], RHO * robot.fluid.carried_inertia[0]
+
+
+# ------------------------------------------------------------------------- buoyancy
+
+
+def thesis() -> Result:
+    """The thesis's spider, dry and under water with drag off."""
+    rows = []
+    body = load_morphology(ROOT / "morphologies" / "spider.yaml")
+    for what, buoyancy, expected in (("dry", "off", 9.81), ("under water", "mask", 0.60648)):
+        robot = build_robot(body, tank(gravity=G, buoyancy=buoyancy))
+        time, q, _ = march(robot, 2.0, *start(robot, 1, -50.0), every=400)
+        # Semi-implicit Euler covers a t (t + dt) / 2. Its legs swing a little on their servos.
+        found = 2 * (-50.0 - q[-1, 2, 0]) / (time[-1] * (time[-1] + robot.world.timestep))
+        rows.append(Row(f"spider falls, {what}", expected, found, 1e-3, "m/s²"))
+    return Result(rows)
+
+
+def clipping() -> Result:
+    """A tilted box cut by the surface, against the hull of the cut polyhedron."""
+    draw, rows = np.random.default_rng(0), []
+    half = np.array([0.3, 0.2, 0.05])
+    errors, moments = [], []
+    corners = half * np.array(list(np.ndindex(2, 2, 2))) * 2 - half
+    edges = [(i, j) for i in range(8) for j in range(i) if bin(i ^ j).count("1") == 1]
+    for _ in range(60):
+        up = draw.normal(size=3)
+        up /= np.linalg.norm(up)
+        depth = draw.uniform(-0.7, 0.7) * np.abs(up) @ half
+        below = depth - corners @ up
+        points = [corners[below > 0]]
+        for i, j in edges:
+            if below[i] * below[j] < 0:
+                t = below[i] / (below[i] - below[j])
+                points.append((corners[i] + t * (corners[j] - corners[i]))[None])
+        cloud = np.concatenate(points)
+        hull, middle = ConvexHull(cloud), cloud.mean(0)
+        volume, first = 0.0, np.zeros(3)
+        for simplex in hull.simplices:
+            a, b, c = cloud[simplex]
+            part = abs(np.dot(a - middle, np.cross(b - middle, c - middle))) / 6
+            volume, first = volume + part, first + part * (a + b + c + middle) / 4
+        with jax.enable_x64(True):
+            share, moment = submersion(
+                tuple(jnp.asarray(up)), jnp.asarray(depth), tuple(half), "partial"
+            )
+        whole = 8 * np.prod(half)
+        errors.append(abs(float(share) - volume / whole))
+        moments.append(np.abs(np.array(moment) - first / whole).max())
+    rows.append(Row("share of a tilted box, worst of 60", 0.0, max(errors), 1e-12, "-"))
+    rows.append(Row("its first moment, worst of 60", 0.0, max(moments), 1e-12, "m"))
+    return Result(rows)
+
+
+def floating() -> Result:
+    """A box of 0.6 of the water's density: draft, bobbing, and the shift by added mass."""
+    size, ratio = np.array([0.2, 0.16, 0.1]), 0.6
+    mass, rows, lines = ratio * RHO * np.prod(size), [], []
+    area, draft = size[0] * size[1], ratio * size[2]
+    for added in (False, True):
+        robot = box(
+            size, mass, tank(gravity=G, buoyancy="partial", added_mass=added, timestep=0.001)
+        )
+        qpos, qvel = start(robot, 1, size[2] / 2 - draft + 0.005)
+        time, q, _ = march(robot, 4.0, qpos, qvel)
+        inertia = mass + ratio * carried(robot)[0][2]
+        label = "with added mass" if added else "without added mass"
+        expected = np.sqrt(RHO * G * area / inertia)
+        found = frequency(time, q[:, 2, 0])
+        rows.append(Row(f"bobbing, {label}", expected, found, 0.01 * expected, "rad/s"))
+        lines.append((label, time, 1e3 * (q[:, 2, 0] - size[2] / 2 + draft), False))
+    robot = box(size, mass, tank(gravity=G, buoyancy="partial", drag="faces", added_mass=True))
+    qpos, qvel = start(robot, 1, size[2] / 2 - draft + 0.03)
+    _, q, _ = march(robot, 40.0, qpos, qvel, every=5)
+    # Quadratic drag never quite ends the bobbing: the mean over the last 10 s.
+    found = size[2] / 2 - q[-q.shape[0] // 4 :, 2, 0].mean()
+    rows.insert(0, Row("mean draft, 30 to 40 s with drag", draft, found, 2e-4, "m"))
+    return Result(rows, [Curve("A box bobs at its draft", "time [s]", "height [mm]", lines)])
+
+
+def righting() -> Result:
+    """A submerged neutral box with its ballast low swings like a pendulum."""
+    size, arm = np.array([0.2, 0.16, 0.1]), 0.01
+    volume = float(np.prod(size))
+    rows = []
+    for added in (False, True):
+        world = tank(gravity=G, buoyancy="partial", added_mass=added, timestep=0.001)
+        robot = box(size, RHO * volume, world, center_of_volume=(0, 0, arm))
+        qpos, qvel = start(robot)
+        qpos[3:7, 0] = [np.cos(0.01), np.sin(0.01), 0, 0]
+        time, q, _ = march(robot, 4.0, qpos, qvel)
+        inertia = robot.mj_model.body_inertia[1].copy()
+        # MuJoCo keeps principal inertias in an order of its own; about x it is this one.
+        about = RHO * volume / 12 * (size[1] ** 2 + size[2] ** 2)
+        assert np.any(np.isclose(inertia, about))
+        expected = np.sqrt(RHO * G * volume * arm / (about + carried(robot)[1][0]))
+        found = frequency(time, 2 * np.arcsin(q[:, 4, 0]))
+        label = "with" if added else "without"
+        rows.append(
+            Row(f"righting, {label} added inertia", expected, found, 0.01 * expected, "rad/s")
+        )
+    return Result(rows)
+
+
+# ------------------------------------------------------------------------- drag and added mass
+
+
+def falling() -> Result:
+    """A core sinks by v = v_t tanh(t / τ), with and without added mass."""
+    size, mass, volume = np.array([0.089, 0.089, 0.045]), 0.09, 5.054e-5
+    net, rows, lines = (mass - RHO * volume) * G, [], []
+    terminal = np.sqrt(2 * net / (RHO * 1.05 * size[0] * size[1]))
+    for added in (False, True):
+        world = tank(gravity=G, buoyancy="partial", drag="faces", added_mass=added, timestep=0.001)
+        robot = box(size, mass, world, volume)
+        time, _, v = march(robot, 2.0, *start(robot, 1, -20.0), every=10)
+        tau = (mass + carried(robot)[0][2]) * terminal / net
+        expected = terminal * np.tanh(time / tau)
+        label = "with added mass" if added else "without added mass"
+        worst = np.abs(-v[:, 2, 0] - expected).max()
+        rows.append(Row(f"approach to v_t, {label}", 0.0, worst, 0.005 * terminal, "m/s"))
+        rows.append(Row(f"speed at 2 s, {label}", expected[-1], -v[-1, 2, 0], 1e-3, "m/s"))
+        lines += [(label, time, -v[:, 2, 0], False), ("tanh", time, expected, True)]
+    return Result(rows, [Curve("A core sinks", "time [s]", "speed [m/s]", lines)])
+
+
+def drifting() -> Result:
+    """A neutral box in a current: u - u / (1 + u c t / m)."""
+    size, current = np.array([0.1, 0.08, 0.06]), 0.3
+    volume = float(np.prod(size))
+    world = tank(drag="faces", added_mass=True, current=(current, 0, 0))
+    robot = box(size, RHO * volume, world)
+    time, _, v = march(robot, 8.0, *start(robot), every=10)
+    inertia = RHO * volume + carried(robot)[0][0]
+    c = 0.5 * RHO * 1.05 * size[1] * size[2]
+    expected = current - current / (1 + current * c * time / inertia)
+    worst = np.abs(v[:, 0, 0] - expected).max()
+    lines = [("box", time, v[:, 0, 0], False), ("closed form", time, expected, True)]
+    return Result(
+        [Row("drift to a current, over 8 s", 0.0, worst, 1e-6, "m/s")],
+        [Curve("A box drifts with the current", "time [s]", "speed [m/s]", lines)],
+    )
+
+
+def munk() -> Result:
+    """The moment on a body at an angle to its way: (A_x - A_z) u w about y."""
+    size, mass = np.array([0.2, 0.1, 0.03]), 0.5
+    robot = box(size, mass, tank(added_mass=True))
+    qpos, qvel = start(robot)
+    qvel[:3, 0] = [0.5, 0.0, 0.2]
+    added, spin = carried(robot)
+    inertia = mass / 12 * (size[0] ** 2 + size[2] ** 2) + spin[1]
+    expected = (added[2] - added[0]) * 0.5 * 0.2 / inertia
+    found = accelerate(robot, qpos, qvel)[4, 0]
+    return Result([Row("Munk's moment over inertia", expected, found, 1e-9, "rad/s²")])
+
+
+def conserving() -> Result:
+    """Drag-free tumbling of plates that carry 3 and 30 times their mass, 2 s at 5 ms."""
+    rows, lines = [], []
+    draw = np.random.default_rng(1)
+    for mass in (0.5, 0.05):
+        robot = box((0.2, 0.1, 0.01), mass, tank(added_mass=True))
+        qpos, qvel = start(robot, 8)
+        qvel[:] = draw.normal(size=qvel.shape)
+        added, spin = carried(robot)
+        own = mass / 12 * np.array([0.1**2 + 0.01**2, 0.2**2 + 0.01**2, 0.2**2 + 0.1**2])
+
+        def energy(
+            q: np.ndarray, v: np.ndarray, a: Any = added, i: Any = own + spin, m: float = mass
+        ) -> Any:
+            turn = np.zeros(9)
+            mujoco.mju_quat2Mat(turn, q[3:7] / np.linalg.norm(q[3:7]))
+            seen = turn.reshape(3, 3).T @ v[:3]
+            return 0.5 * ((m + a) @ seen**2 + i @ v[3:] ** 2)
+
+        time, q, v = march(robot, 2.0, qpos, qvel, every=10)
+        first = np.array([energy(qpos[:, k], qvel[:, k]) for k in range(8)])
+        later = np.array(
+            [[energy(a[:, k], b[:, k]) for k in range(8)] for a, b in zip(q, v, strict=True)]
+        )
+        worst = np.abs(later / first - 1).max()
+        times = added[2] / mass
+        rows.append(Row(f"energy, {times:.0f} times its mass carried", 0.0, worst, 1e-9, "-"))
+        lines.append((f"{times:.0f} times its mass", time, (later / first - 1)[:, 0], False))
+    return Result(rows, [Curve("Energy of drag-free plates", "time [s]", "relative change", lines)])
+
+
+def moving_frame() -> Result:
+    """The arm-less spider in still water, and in a current with the current's speed added."""
+    body = load_morphology(ROOT / "morphologies" / "spider.yaml")
+    current = np.array([0.3, -0.2, 0.0])
+    ends = []
+    for flow in (np.zeros(3), current):
+        robot = build_robot(body, load_world("lake", bed=None, current=tuple(flow)))
+        qpos, qvel = start(robot, 1, -0.1)
+        qvel[:3, 0] = flow
+        ctrl = np.full((8, 1), 0.4)
+        time, q, _ = march(robot, 1.0, qpos, qvel, ctrl, every=20)
+        ends.append(q[-1, :, 0] - np.concatenate([time[-1] * flow, np.zeros(len(qpos) - 3)]))
+    worst = np.abs(ends[1] - ends[0]).max()
+    return Result([Row("Galilean invariance, spider over 1 s", 0.0, worst, 1e-9, "m, rad")])
+
+
+def mujoco_laws() -> Result:
+    """MuJoCo C's `qfrc_passive` of one box in a wind, for both of its models."""
+    rows, draw = [], np.random.default_rng(6)
+    size = np.array([0.1, 0.06, 0.03])
+    for law in ("inertia_box", "ellipsoid"):
+        shape = 'fluidshape="ellipsoid"' if law == "ellipsoid" else ""
+        model = mujoco.MjModel.from_xml_string(
+            f"""<mujoco><option density="{RHO}" viscosity="0.3" wind=".3 -.2 .1" gravity="0 0 0"/>
+            <worldbody><body><freejoint/><geom type="box" size=".05 .03 .015" mass=".3" {shape}/>
+            </body></worldbody></mujoco>"""
+        )
+        data, worst = mujoco.MjData(model), 0.0
+        for _ in range(20):
+            data.qpos[3:7], data.qvel[:] = draw.normal(size=4), draw.normal(size=6)
+            mujoco.mj_forward(model, data)
+            turn = data.xmat[1].reshape(3, 3)
+            wanted = np.array([*(turn.T @ data.qfrc_passive[:3]), *data.qfrc_passive[3:]])
+            with jax.enable_x64(True):
+                v = tuple(jnp.asarray(turn.T @ (data.qvel[:3] - model.opt.wind)))
+                w = tuple(jnp.asarray(data.qvel[3:]))
+                if law == "inertia_box":
+                    found = inertia_box(v, w, tuple(size), RHO, 0.3)
+                else:
+                    k = ellipsoid_constants(size / 2, model.geom_fluid[0])
+                    found = ellipsoid(v, w, k, RHO, 0.3, True)
+            error = np.abs(np.concatenate([np.stack(x) for x in found]) - wanted)
+            worst = max(worst, error.max() / np.abs(wanted).max())
+        rows.append(Row(f"MuJoCo's {law}, worst of 20", 0.0, worst, 1e-10, "-"))
+    assert len(ELLIPSOID_COEFFICIENTS) == 5
+    return Result(rows)
+
+
+def plate() -> Result:
+    """Lift and drag coefficients of the catalogue's fin through and past its stall."""
+    p = LiftDrag(cla=1.257, cda=0.465, alpha_stall=np.pi / 6, cla_stall=-0.6285, cda_stall=0.9)
+    angles = np.radians([-80, -30, -10, 10, 30, 60, 80])
+
+    def coefficients(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        v = (jnp.cos(alpha), 0 * alpha, -jnp.sin(alpha))
+        force = lift_drag(v, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0, 2.0, p)
+        along = sum(f * x for f, x in zip(force, v, strict=True))
+        lift = force[2] * jnp.cos(alpha) + force[0] * jnp.sin(alpha)
+        return np.asarray(lift), -np.asarray(along)
+
+    def by_hand(alpha: float) -> tuple[float, float]:
+        size, past = abs(alpha), max(0.0, abs(alpha) - p.alpha_stall)
+        lift = p.cla * min(size, p.alpha_stall) + p.cla_stall * past
+        return np.sign(alpha) * max(lift, 0.0), p.cda * min(
+            size, p.alpha_stall
+        ) + p.cda_stall * past
+
+    with jax.enable_x64(True):
+        found = coefficients(jnp.asarray(angles))
+        fine = np.linspace(-np.pi / 2 + 0.01, np.pi / 2 - 0.01, 181)
+        lift, drag = coefficients(jnp.asarray(fine))
+    wanted = np.array([by_hand(a) for a in angles]).T
+    rows = [
+        Row(f"c_{name} of a fin at 7 angles, worst", 0.0, np.abs(f - w).max(), 1e-12, "-")
+        for name, f, w in zip("ld", found, wanted, strict=True)
+    ]
+    degrees = np.degrees(fine)
+    lines = [("lift", degrees, lift, False), ("drag", degrees, drag, False)]
+    return Result(
+        rows, [Curve("A fin stalls at 30°", "angle of attack [deg]", "coefficient [-]", lines)]
+    )
+
+
+# ------------------------------------------------------------------------- what moves by itself
+
+
+def thrusting() -> Result:
+    """A box with a thruster: √(2 T / ρ C_d A) in the end, and 1 - 1/e of its command after τ."""
+    size = np.array([0.2, 0.1, 0.1])
+    volume = float(np.prod(size))
+    pusher = Thruster(gain=1.5, time_constant=0.2)
+    robot = box(size, RHO * volume, tank(drag="faces", added_mass=True), thruster=pusher)
+    qpos, qvel = start(robot)
+    qvel[0] = 0.3
+    time, _, v = march(robot, 60.0, qpos, qvel, np.ones((1, 1)), every=40)
+    expected = np.sqrt(2 * 1.5 / (RHO * 1.05 * size[1] * size[2]))
+    with jax.enable_x64(True):
+        track = simulate(robot, np.ones((40, 1)))
+    lag = 1 - np.exp(-1.0)
+    lines = [
+        ("box", time, v[:, 0, 0], False),
+        ("steady speed", time, np.full_like(time, expected), True),
+    ]
+    return Result(
+        [
+            Row("thruster, steady speed", expected, v[-1, 0, 0], 1e-3 * expected, "m/s"),
+            Row("its command after one time constant", lag, float(track.command[39, 0]), 1e-9, "-"),
+        ],
+        [Curve("A thruster pushes a box", "time [s]", "speed [m/s]", lines)],
+    )
+
+
+def gusts() -> Result:
+    """Mean, standard deviation and memory of a gusty current, at two time steps."""
+    world = tank(gust={"std": 0.1, "time": 2.0})
+    assert world.gust is not None
+    rows, trials = [], 2000
+    for dt in (0.005, 1.0):
+        steps = round(4.0 / dt)
+        path = np.asarray(gust_path(world.gust, jax.random.key(0), steps, dt, trials))[:, 0]
+        last = path[-1]
+        # Three standard errors of each estimate.
+        rows.append(
+            Row(f"gust, mean at dt {dt:g} s", 0.0, last.mean(), 3 * 0.1 / trials**0.5, "m/s")
+        )
+        rows.append(
+            Row(f"gust, std at dt {dt:g} s", 0.1, last.std(), 3 * 0.1 / (2 * trials) ** 0.5, "m/s")
+        )
+        memory = np.corrcoef(path[-1 - round(2.0 / dt)], last)[0, 1]
+        rows.append(
+            Row(
+                f"gust, correlation over T at dt {dt:g} s", np.exp(-1), memory, 3 / trials**0.5, "-"
+            )
+        )
+    return Result(rows)
+
+
+def orbiting() -> Result:
+    """A small neutral body under a deep-water wave goes round with the water, a e^(kz)."""
+    amplitude, length, depth = 0.05, 4.0, 0.5
+    world = tank(
+        gravity=G, buoyancy="partial", drag="faces", added_mass=True,
+        waves=[{"amplitude": amplitude, "wavelength": length}],
+    )  # fmt: skip
+    side = 0.04
+    robot = box((side,) * 3, RHO * side**3, world)
+    k = 2 * np.pi / length
+    omega = np.sqrt(G * k)
+    qpos, qvel = start(robot, 1, -depth)
+    qvel[0] = amplitude * omega * np.exp(-k * depth)
+    period = 2 * np.pi / omega
+    time, q, _ = march(robot, 3 * period, qpos, qvel)
+    expected = amplitude * np.exp(-k * depth)
+    # Stokes's drift carries it along; a parabola takes up what is left of it in z.
+    phase, ones = omega * time, np.ones_like(time)
+    basis = np.stack([np.cos(phase), np.sin(phase), ones, time, time**2], -1)
+    fit = np.linalg.lstsq(basis, q[:, 2, 0], rcond=None)[0]
+    found = np.hypot(fit[0], fit[1])
+    lines = [("body", 1e3 * q[:, 0, 0], 1e3 * (q[:, 2, 0] + depth), False)]
+    return Result(
+        [Row("orbit under a wave", expected, found, 0.05 * expected, "m")],
+        [Curve("Three periods under a wave (with Stokes's drift)", "x [mm]", "z [mm]", lines)],
+    )
+
+
+# ------------------------------------------------------------------------- the bed
+
+
+def sliding() -> Result:
+    """A core on dry flat ground: what it sinks in, and μ g."""
+    bed = {"kind": "flat", "height": -2.0}
+    robot = box((0.089, 0.089, 0.045), 0.09, tank(gravity=G, bed=bed, timestep=0.001))
+    assert robot.world.bed is not None
+    sunk = 0.09 * G / 4 / robot.world.bed.stiffness
+    qpos, qvel = start(robot, 2, -2.0 + 0.0225 - sunk)
+    qvel[0, 1] = 1.0
+    time, q, v = march(robot, 0.1, qpos, qvel)
+    found = (1.0 - v[-1, 0, 1]) / time[-1]
+    return Result(
+        [
+            Row("depth of rest on the bed", sunk, -2.0 + 0.0225 - q[-1, 2, 0], 1e-6, "m"),
+            Row("sliding deceleration μ g", 0.6 * G, found, 0.02 * 0.6 * G, "m/s²"),
+        ]
+    )
+
+
+# ------------------------------------------------------------------------- the step
+
+
+def gradients() -> Result:
+    """The derivative of a rollout through the surface, against central differences."""
+    robot = box(
+        (0.1, 0.08, 0.06), 0.4, tank(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
+    )
+    with jax.enable_x64(True):
+        qpos = jnp.asarray(robot.start_qpos(-0.05))
+        qvel = jnp.zeros(6).at[3].set(0.5)
+
+        def end(height: Any) -> Any:
+            return simulate(robot, duration=0.4, qpos=qpos.at[2].set(height), qvel=qvel).qpos[-1, 2]
+
+        found = float(jax.grad(end)(0.05))
+        wanted = float(end(0.05 + 1e-6) - end(0.05 - 1e-6)) / 2e-6
+    return Result(
+        [Row("slope of a fall into the water", wanted, found, 1e-5 * abs(wanted) + 1e-8, "-")]
+    )
+
+
+def converging() -> Result:
+    """Where a swimming spider is after 10 s, at the step of configs/lake_swim.yaml and at half."""
+    from mjx_revolve import make_fitness
+
+    ends, path = {}, ROOT / "configs" / "lake_swim.yaml"
+    with jax.enable_x64(True):
+        for step in (0.005, 0.0025):
+            fitness = make_fitness(path, **{"world.timestep": step})
+            track = fitness.replay(np.array(SWIMMER), jax.random.key(5))
+            ends[step] = np.asarray(track.qpos)[-1, :3]
+    distance = np.linalg.norm(ends[0.0025] - [0, 0, -2])
+    moved = np.linalg.norm(ends[0.005] - ends[0.0025]) / distance
+    return Result([Row("halved step moves a swimmer's end by", 0.0, moved, 0.01, "of its way")])
+
+
+CASES: dict[str, Callable[[], Result]] = {
+    "thesis": thesis,
+    "clipping": clipping,
+    "floating": floating,
+    "righting": righting,
+    "falling": falling,
+    "drifting": drifting,
+    "Munk": munk,
+    "plate": plate,
+    "MuJoCo": mujoco_laws,
+    "conservation": conserving,
+    "moving frame": moving_frame,
+    "thruster": thrusting,
+    "gusts": gusts,
+    "waves": orbiting,
+    "bed": sliding,
+    "gradient": gradients,
+    "time step": converging,
+}
+# What takes under half a minute together.
+QUICK_CASES = ("thesis", "clipping", "Munk", "plate", "MuJoCo", "drifting", "gusts", "bed")
