@@ -30,14 +30,6 @@ if TYPE_CHECKING:
 
 # What may change when a run is resumed; everything else would make it another run.
 _FREE = ("generations", "checkpoint_every", "keep_checkpoints")
-# Units of the tasks' scores.
-_UNITS = {
-    "directed_swim": "body lengths/s",
-    "speed": "body lengths/s",
-    "crawl": "body lengths/s",
-    "reach_target": "body lengths",
-    "hold_depth": "body lengths",
-}
 # What the bits of a run depend on, besides its configuration.
 _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
 
@@ -383,11 +375,12 @@ def _finish(run: Run, config: Config, fitness: Any, search: Search) -> None:
     """Chooses the champion, draws the pictures, and says what came out."""
     from mjx_revolve import plots
     from mjx_revolve.loop import REPORT_EPISODES, choose_champion
+    from mjx_revolve.tasks import UNITS
 
     champion = choose_champion(config.evolution, fitness, search)
     facts = _champion_facts(config, champion)
     run.save_champion(champion.genes, final=True, **facts)
-    unit = _UNITS[config.task.type]
+    unit = UNITS[config.task.type]
     result = f"{champion.score:.3g} ± {champion.std:.2g} {unit} over {REPORT_EPISODES} fresh starts"
     title = f"{run.folder.name}: {result}"
     figure = plots.plot_fitness(run.load_metrics(), title, f"fitness ({unit})")

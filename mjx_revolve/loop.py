@@ -291,8 +291,20 @@ def choose_champion(config: EvolutionConfig, fitness: Fitness, search: Search) -
         std=float(scores[:, 0].std()),
         origin=origins[winner],
         measures={name: float(values[:, 0].mean()) for name, values in measures.items()},
-        key=jax.random.fold_in(key, 0),
+        key=replay_key(config.seed),
     )
+
+
+def replay_key(seed: int) -> jax.Array:
+    """The first of the fresh starts on which a run's champion is judged.
+
+    Args:
+        seed: of the run.
+
+    Returns:
+        A key for `Fitness.replay`.
+    """
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), _REPORT_STREAM), 0)
 
 
 def _fresh(

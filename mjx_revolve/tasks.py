@@ -15,6 +15,15 @@ import numpy as np
 
 from mjx_revolve.spatial import safe_norm
 
+# Units of the tasks' scores.
+UNITS = {
+    "directed_swim": "body lengths/s",
+    "speed": "body lengths/s",
+    "crawl": "body lengths/s",
+    "reach_target": "body lengths",
+    "hold_depth": "body lengths",
+}
+
 
 @dataclass(frozen=True)
 class Track:

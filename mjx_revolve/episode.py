@@ -1,0 +1,141 @@
+"""An episode to look at: a run's champion, or a morphology that is dropped into the water.
+
+Replays, reports and exports all start here, so that each shows the same swim: the first of the
+fresh starts on which the champion was judged.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from mjx_revolve.config import Config, load_config
+from mjx_revolve.errors import InputError, load_yaml
+from mjx_revolve.fitness import Fitness, make_fitness
+from mjx_revolve.loop import replay_key
+from mjx_revolve.morphology import load_morphology, trim_neutral
+from mjx_revolve.robot import Robot, build_robot
+from mjx_revolve.rollout import Trajectory, simulate
+from mjx_revolve.runs import load_genes
+from mjx_revolve.tasks import UNITS
+from mjx_revolve.world import load_world
+
+# How long a morphology without a task is shown [s].
+_SECONDS = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One life of one robot, with all that is known about it.
+
+    Attributes:
+        title: a few words to head a picture.
+        robot: the compiled robot; its world is `robot.world`.
+        trajectory: what it did.
+        score: the champion's mean score over fresh starts, or None.
+        score_unit: of the score, e.g. "body lengths/s"; "" without one.
+        genes: `[G]` or None without a controller.
+        fitness: what the genes were evolved for, or None.
+        folder: the run folder, or None.
+    """
+
+    title: str
+    robot: Robot
+    trajectory: Trajectory
+    score: float | None = None
+    score_unit: str = ""
+    genes: np.ndarray | None = None
+    fitness: Fitness | None = None
+    folder: Path | None = None
+
+
+def load_episode(
+    path: str | Path,
+    world: str = "lake",
+    duration: float | None = None,
+    seed: int | None = None,
+) -> Episode:
+    """Reads a champion, or a morphology, and lets it live.
+
+    Args:
+        path: a run folder, its `champion` folder, a `genes.yaml`, or a morphology. A morphology is
+            trimmed neutral where it can be, starts 1 m below the surface, and holds its hinges at
+            0.
+        world: of a morphology; a champion swims in the world that it evolved in.
+        duration: [s]; by default the task's, or 10.
+        seed: draws another start than the first on which the champion was judged.
+
+    Returns:
+        The episode.
+
+    Raises:
+        InputError: there is no champion, or a file holds something else.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _champion(_genes_file(path), duration, seed)
+    data = load_yaml(path)
+    if isinstance(data, dict) and "genes" in data:
+        return _champion(path, duration, seed)
+    if not (isinstance(data, dict) and "body" in data):
+        raise InputError(
+            f"{path}: expected a run folder, a champion's genes.yaml or a morphology; found a file "
+            "with neither genes nor body"
+        )
+    water = load_world(world)
+    morphology = load_morphology(path)
+    with suppress(InputError):  # what floats, floats
+        morphology = trim_neutral(morphology, water.density)
+    robot = build_robot(morphology, water)
+    key = None if seed is None else jax.random.key(seed)
+    trajectory = simulate(robot, None, duration or _SECONDS, key=key)
+    return Episode(morphology.name, robot, trajectory)
+
+
+def _genes_file(folder: Path) -> Path:
+    """Where a run folder, or its champion folder, keeps the champion."""
+    for place in (folder / "genes.yaml", folder / "champion" / "genes.yaml"):
+        if place.is_file():
+            return place
+    if (folder / "config.yaml").is_file():
+        raise InputError(
+            f"{folder / 'champion' / 'genes.yaml'}: expected a champion; found none: this run was "
+            "stopped before its first checkpoint, or the file is lost"
+        )
+    raise InputError(f"{folder}: expected a run folder; found no config.yaml in it")
+
+
+def _champion(path: Path, duration: float | None, seed: int | None) -> Episode:
+    genes = load_genes(path)
+    data = load_yaml(path)
+    named = data.get("config", "../config.yaml")
+    if not isinstance(named, str):
+        raise InputError(f"{path}: config: expected a path; found {named!r}")
+    source = path.parent / named
+    if not source.is_file():
+        raise InputError(f"{path}: config: expected the run's config.yaml; found no {source}")
+    overrides = {} if duration is None else {"task.duration": float(duration)}
+    config: Config = load_config(source, overrides=overrides)
+    fitness = make_fitness(config)
+    if len(genes) != fitness.num_genes:
+        raise InputError(
+            f"{path}: genes: expected {fitness.num_genes}, as {source.name} has it; found "
+            f"{len(genes)}"
+        )
+    key = replay_key(config.evolution.seed) if seed is None else jax.random.key(seed)
+    score = data.get("score")
+    folder = source.parent.absolute()
+    return Episode(
+        title=f"{fitness.robot.morphology.name}: {config.task.type.replace('_', ' ')}",
+        robot=fitness.robot,
+        trajectory=fitness.replay(genes, key),
+        score=float(score) if isinstance(score, int | float) else None,
+        score_unit=UNITS[config.task.type],
+        genes=genes,
+        fitness=fitness,
+        folder=folder,
+    )
