@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV   := .venv
 RUN    := $(VENV)/bin/python
+# Tests that share compiled programs sit in one file, so each file stays with one worker.
+TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 READY  := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
@@ -24,10 +26,10 @@ evolve: $(READY)  ## evolve a swimmer in the lake (into runs/)
 	$(RUN) -m mjx_revolve.evolve configs/lake_swim.yaml
 
 test: $(READY)  ## all tests
-	$(RUN) -m pytest
+	$(TEST)
 
 test-quick: $(READY)  ## the quick tests, under two minutes
-	$(RUN) -m pytest -m "not slow"
+	$(TEST) -m "not slow"
 
 check: $(READY)  ## lint, format and types
 	$(RUN) -m ruff check .

@@ -42,6 +42,6 @@ def elbow():
 
 @pytest.fixture(scope="module", autouse=True)
 def fresh_traces():
-    """Forgets traces after each file: JAX would reuse one made in float64 where float32 is meant."""
+    """Forgets traces after each file, and with them the memory that they hold."""
     yield
     jax.clear_caches()

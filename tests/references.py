@@ -70,8 +70,8 @@ def clip_box(up, depth, half):
 class Lagrangian:
     """Equations of motion from the kinetic energy alone: body and carried water, no recursion.
 
-    T(q, v) = ½ v · B(q) v with B = M + Σ_parts ρ (J_vᵀ A J_v + J_ωᵀ A' J_ω); M and the Jacobians J are
-    MuJoCo's, A and A' each part's added mass and inertia. Derivatives are central differences.
+    T(q, v) = ½ v · B(q) v with B = M + Σ_parts ρ (J_vᵀ A J_v + J_ωᵀ A' J_ω); M and the Jacobians J
+    are MuJoCo's, A and A' each part's added mass and inertia. Derivatives are central differences.
     """
 
     def __init__(self, robot, density):

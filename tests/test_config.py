@@ -90,7 +90,10 @@ def test_it_is_frozen(folder):
         ("trim=no", "--set trim: expected one of neutral, none; found False"),
         ("engine=gpu", "--set engine: expected one of population, mjx; found 'gpu'"),
         ("allow_overlap=1", "--set allow_overlap: expected true or false; found 1"),
-        ("controller.type=splines", "controller.type: expected one of cpg, sine; found 'splines'"),
+        (
+            "controller.type=splines",
+            "controller.type: expected one of cpg, sine, feedback; found 'splines'",
+        ),
         ("controller.max_frequency=21", "expected a number > 0 and <= 20; found 21"),
         ("controller.amplitude=0", "expected a number > 0 and <= 1; found 0"),
         ("world=3", "--set world: expected a world's name or path, or a mapping of name and "

@@ -13,9 +13,12 @@ import pytest
 from laboratory import WATER, at_rest, body, elbow_robot, march, random_states, read, world
 from mjx_revolve.config import ControllerConfig
 from mjx_revolve.controllers import CONTROLLERS, bind_genes, make_cpg, make_sine
+from mjx_revolve.dynamics import Sense
 from mjx_revolve.robot import build_robot
 
 EFFORT, SPEED = 0.17658, 5.235988
+# What those that do not listen are told of their robot.
+STILL = Sense(0.0, 0.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
 
 
 @lru_cache
@@ -29,7 +32,7 @@ def play(controller, genes, steps, dt=0.005, order=None):
         parameters = controller.decode(jnp.asarray(genes, jnp.float64), order)
 
         def step(state, k):
-            state, target = controller.step(parameters, state, k * dt)
+            state, target = controller.step(parameters, state, k * dt, STILL)
             return state, (target, state)
 
         run = jax.jit(lambda: jax.lax.scan(step, controller.init(parameters), jnp.arange(steps)))
@@ -78,8 +81,8 @@ def test_every_gene_has_a_name_of_its_own(kind):
 
 def test_the_names_that_a_configuration_gives():
     robot = robot_of("spider")
-    assert set(CONTROLLERS) == {"cpg", "sine"}
-    for kind, genes in (("cpg", 18), ("sine", 25)):
+    assert set(CONTROLLERS) == {"cpg", "sine", "feedback"}
+    for kind, genes in (("cpg", 18), ("sine", 25), ("feedback", 8 * (1 + 7))):
         assert CONTROLLERS[kind](robot, ControllerConfig(type=kind)).num_genes == genes
     assert CONTROLLERS["sine"](robot, ControllerConfig(type="sine", harmonics=2)).num_genes == 41
 
@@ -120,7 +123,7 @@ def test_targets_stay_within_the_range(kind, amplitude):
 
 
 def test_cpg_keeps_its_norm():
-    """The system matrix is antisymmetric: Σ x² + y² is constant, in 20 s to what Runge-Kutta errs by."""
+    """The system matrix is antisymmetric: Σ x² + y² is constant to what Runge-Kutta errs by."""
     controller = make_cpg(robot_of("spider"))
     _, (x, y) = play(controller, drawn(controller, 16), 4000, order=np.arange(8))
     norm = (x**2 + y**2).sum(1)
@@ -190,7 +193,7 @@ def test_gradients_are_finite_at_zero_genes(kind):
         parameters = controller.decode(genes, np.arange(2))
         state = controller.init(parameters)
         for k in range(3):
-            state, target = controller.step(parameters, state, jnp.asarray(0.3 * k))
+            state, target = controller.step(parameters, state, jnp.asarray(0.3 * k), STILL)
         return jnp.sum(target)
 
     slope = jax.jit(jax.grad(last))(jnp.zeros((controller.num_genes, 1)))
@@ -219,7 +222,7 @@ def test_servos_keep_the_speed_limit(elbow):
 
 
 def test_servos_keep_the_speed_limit_in_a_vacuum():
-    """Without water limbs are so light that recoil throws them past it for a step, by less than a fifth."""
+    """Limbs without water are so light that recoil throws them past it, by less than a fifth."""
     robot = read(
         "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: {type: FixedBrick}}}}}"
     )
@@ -229,7 +232,7 @@ def test_servos_keep_the_speed_limit_in_a_vacuum():
 
 
 def test_servos_keep_their_effort():
-    """Torque by Newton's law, on a limb so heavy that it gains no speed; 0.05 rad off is full effort."""
+    """Torque by Newton's law, on a limb too heavy to gain speed; 0.05 rad off is full effort."""
     robot = build_robot(
         read("""
 body:

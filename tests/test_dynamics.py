@@ -207,6 +207,7 @@ def test_the_two_engines_agree(case):
     check_engines(elbow_robot(world(**WATER | FULL[case])))
 
 
+@pytest.mark.slow
 def test_joints_stop_at_their_limits():
     """Neither target nor swing takes a hinge past its end by more than a fraction of a degree."""
     robot = elbow_robot(world())
@@ -236,6 +237,7 @@ def test_power_is_what_the_servos_deliver():
 # ------------------------------------------------------------------------- lanes
 
 
+@pytest.mark.slow
 def test_lanes_do_not_know_of_each_other(elbow):
     """A lane's bits depend neither on where it stands nor on a neighbour that blew up."""
     qpos, qvel, ctrl = drawn(elbow, 8)
@@ -341,6 +343,7 @@ def check_order(make, steps):
     assert ratio > 1.7
 
 
+@pytest.mark.slow
 def test_convergence_in_the_time_step():
     check_order(lambda tank: build_robot(body("core"), tank), (0.004, 0.002, 0.001))
 

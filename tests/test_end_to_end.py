@@ -41,10 +41,17 @@ def champion(folder):
     return np.array(yaml.safe_load(genes.read_text())["genes"])
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of a run of four generations, from seed 0."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    evolve("configs/smoke.yaml", "--out", folder, "--set", "evolution.generations=4")
+    return folder
+
+
 @pytest.mark.slow
-def test_a_stopped_run_resumed_equals_one_never_stopped(tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    evolve("configs/smoke.yaml", "--out", whole, "--set", "evolution.generations=4")
+def test_a_stopped_run_resumed_equals_one_never_stopped(whole, tmp_path):
+    parts = tmp_path / "parts"
     evolve("configs/smoke.yaml", "--out", parts, "--set", "evolution.generations=2")
     evolve("--resume", parts, "--set", "evolution.generations=4")
     assert metrics(parts) == metrics(whole)
@@ -57,21 +64,39 @@ def test_a_stopped_run_resumed_equals_one_never_stopped(tmp_path):
 
 
 @pytest.mark.slow
-def test_another_seed_is_another_run(tmp_path):
-    for seed in (0, 1):
-        evolve("configs/smoke.yaml", "--out", tmp_path / str(seed), "--seed", seed)
-    assert metrics(tmp_path / "0") != metrics(tmp_path / "1")
+def test_another_seed_is_another_run(whole, tmp_path):
+    other = tmp_path / "other"
+    generations = "evolution.generations=1"
+    evolve("configs/smoke.yaml", "--out", other, "--seed", 1, "--set", generations)
+    assert len(metrics(other)) == 1
+    assert metrics(other) != metrics(whole)[:1]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["configs/lake_swim.yaml", "--set", "world=laek"], "expected one of empty_underwater"),
-        (["configs/lake_swim.yaml", "--set", "world.drag=facs"], "drag: expected one of 'faces'"),
-        (["configs/lake_swim.yaml", "--set", "morphology=README.md"], "README.md"),
-        (["configs/lake_swim.yaml", "--set", "task.duration=-1"], "expected a number > 0"),
+        pytest.param(
+            ["configs/lake_swim.yaml", "--set", "world.drag=facs"],
+            "drag: expected one of 'faces'",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            ["configs/lake_swim.yaml", "--set", "morphology=README.md"],
+            "README.md",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            ["configs/lake_swim.yaml", "--set", "task.duration=-1"],
+            "expected a number > 0",
+            marks=pytest.mark.slow,
+        ),
         (["configs/none.yaml"], "expected a file; found none"),
-        (["configs/smoke.yaml", "--set", "task.type=crawl", "--set", "world.bed=off"], "a bed"),
+        pytest.param(
+            ["configs/smoke.yaml", "--set", "task.type=crawl", "--set", "world.bed=off"],
+            "a bed",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_wrong_input_is_one_line_and_code_2(arguments, message):

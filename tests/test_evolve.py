@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from laboratory import XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve import loop, runs
 from mjx_revolve.config import EvolutionConfig
@@ -659,13 +660,13 @@ sys.exit(run_command(lambda argv: evolve.main(argv, make_fitness), sys.argv[1:])
 
 
 def start(folder, *argv):
-    """The command in a process of its own; the generations of its output so far."""
+    """The command in a process of its own, compiled like this one's: bits are compared."""
     script = folder / "script.py"
     script.write_text(SCRIPT)
     path = f"{ROOT}{os.pathsep}{ROOT / 'tests'}"
     return subprocess.Popen(
         [sys.executable, str(script), *argv], cwd=folder, text=True,
-        env=os.environ | {"PYTHONPATH": path, "JAX_COMPILATION_CACHE_DIR": ""},
+        env=os.environ | XLA_FLAGS | {"PYTHONPATH": path, "JAX_COMPILATION_CACHE_DIR": ""},
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
 

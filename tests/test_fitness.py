@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from laboratory import QUICK
 from mjx_revolve import InputError, make_fitness
+from mjx_revolve import fitness as fitness_module
 from mjx_revolve.fitness import WORST
 from mjx_revolve.tasks import TASKS, Track, measure
 
@@ -31,6 +33,14 @@ body:
         1: {id: blade, type: FixedBrick, orientation: -90}
 """
 TASK = {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 2}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compiles():
+    """Leaves out the compiler's optimisations; test_end_to_end.py runs with them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitness_module, "compiler_options", lambda: QUICK)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +77,7 @@ def test_one_score_each_and_the_same_again(fitness, population, scores):
     assert not np.array_equal(scores, fitness(population, jax.random.key(8)))
 
 
+@pytest.mark.slow
 def test_an_individual_does_not_feel_the_population_around_it(fitness, population, scores):
     """70 individuals of 2 episodes are 3 chunks of 64 lanes, 40 are two, the last one padded."""
     few = np.asarray(fitness(population[:40], KEY))
@@ -96,11 +107,13 @@ def test_the_trimmed_spider_stays_where_it_is_without_genes():
     assert float(measures["depth_error_m"][0]) < 1e-3
 
 
+@pytest.mark.slow
 def test_under_jit_and_vmap(fitness, population, scores):
-    jitted = jax.jit(fitness)(population[:40], KEY)
+    jitted = jax.jit(fitness, compiler_options=QUICK)(population[:40], KEY)
     # Another compilation: equal to rounding, which a second of stroking may amplify a little.
     np.testing.assert_allclose(jitted, scores[:40], atol=2e-4)
-    both = jax.vmap(lambda genes: fitness(genes, KEY))(population[:40].reshape(2, 20, -1))
+    mapped = jax.vmap(lambda genes: fitness(genes, KEY))
+    both = jax.jit(mapped, compiler_options=QUICK)(population[:40].reshape(2, 20, -1))
     np.testing.assert_allclose(both.reshape(-1), scores[:40], atol=2e-4)
 
 
@@ -108,7 +121,7 @@ def test_under_jit_and_vmap(fitness, population, scores):
 def test_gradient_points_uphill(settings):
     short = make_fitness(settings, **{"task.duration": 0.6, "task.trials": 1})
     genes = 0.3 * jnp.ones((1, short.num_genes))
-    slope = jax.jit(jax.grad(lambda g: short(g, KEY)[0]))(genes)
+    slope = jax.jit(jax.grad(lambda g: short(g, KEY)[0]), compiler_options=QUICK)(genes)
     assert np.all(np.isfinite(slope)) and np.any(np.asarray(slope) != 0)
     step = 0.02 * slope / jnp.linalg.norm(slope)
     up, down = float(short(genes + step, KEY)[0]), float(short(genes - step, KEY)[0])

@@ -1,4 +1,4 @@
-"""The compiled robot: Revolve's geometry, masses and limits, tables that add up, MJCF that reloads."""
+"""The compiled robot: Revolve's geometry, masses, limits; tables that add up; MJCF that reloads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mjx_revolve.terrain import Bed, bed_height
 from mjx_revolve.world import load_world
 
 EFFORT, SPEED = 0.17658, 5.235988
-# Along one leg of the spider from the core's centre [m]: Revolve's own SDF (shared facts, section 1).
+# Along one leg of the spider from the core's centre [m], from Revolve's own SDF.
 LEG = {
     "frame": 0.0555,
     "first axis": 0.06015,

@@ -24,6 +24,7 @@ def rolled(x, body):
     return jax.lax.scan(lambda s, _: (body(s), None), x, None, length=5)[0]
 
 
+@pytest.mark.slow
 def test_they_change_nothing():
     plain = rolled(LANES, step)
     tricked = jax.jit(one_loop(lambda x: rolled(x, share_once(step)), lambda x: rolled(x, step)))

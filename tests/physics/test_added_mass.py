@@ -67,7 +67,8 @@ def test_ellipsoid_as_mujoco_has_it(semi):
     """MuJoCo's virtual mass and inertia of `fluidshape="ellipsoid"`, from its own quadrature."""
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco><worldbody><body><freejoint/><geom type="ellipsoid" mass="1"
-        size="{semi[0]} {semi[1]} {semi[2]}" fluidshape="ellipsoid"/></body></worldbody></mujoco>""")
+        size="{semi[0]} {semi[1]} {semi[2]}" fluidshape="ellipsoid"/></body></worldbody></mujoco>
+    """)
     mass, inertia = lamb_coefficients(np.array(semi))
     assert mass == pytest.approx(model.geom_fluid[0, 6:9], rel=1e-3)
     assert inertia == pytest.approx(model.geom_fluid[0, 9:12], rel=5e-3, abs=1e-3 * inertia.max())
@@ -135,7 +136,7 @@ def impulses(robot, qpos, qvel):
 
 
 def test_kirchhoff_impulse_and_energy_are_conserved():
-    """Without drag, dP/dt = 0, dL/dt = 0 and dT/dt = 0 in every state, by differences over 20 µs."""
+    """Without drag, dP/dt = 0, dL/dt = 0 and dT/dt = 0 in every state, over 20 µs."""
     robot = deep_box()
     qpos, qvel = random_states(robot, 20, speed=2.0)
     qacc = accelerate(robot, qpos, qvel)
@@ -184,7 +185,7 @@ def test_a_light_plate_keeps_its_energy(mass):
 
 
 def check_lagrange(robot, lanes, seed=0):
-    """The step's accelerations against Lagrange's equations with carried water, all 6 + n of them."""
+    """The step's accelerations against Lagrange's equations with carried water, all 6 + n."""
     qpos, qvel = random_states(robot, lanes, seed=seed, speed=1.5)
     servo = qpos[7:] + 0.02  # each servo pulls with a known part of its effort
     qacc = accelerate(robot, qpos, qvel, servo)
@@ -210,7 +211,7 @@ def test_shipped_bodies_obey_lagrange(name):
 
 
 def test_galilean_invariance_in_a_uniform_current():
-    """A current is a moving frame: same accelerations as in still water at velocities less by it."""
+    """A current is a moving frame: accelerations as in still water at velocities less by it."""
     robot = arm_robot(world(added_mass=True, drag="faces", gravity=9.81, buoyancy="partial"))
     current = np.array([0.3, -0.2, 0.1])
     # Some are half out of the water; in one instant, a surface that moves looks like one at rest.

@@ -148,6 +148,7 @@ def lake_core():
     return robot, *march(robot, 12.0, qpos, qvel, every=20)[1:3]
 
 
+@pytest.mark.slow
 def test_a_core_lands_in_the_lake_and_does_not_fall_through(lake_core):
     robot, q, v = lake_core
     clear = np.array([lowest(robot, q[:, :, lane]) for lane in range(3)])

@@ -1,4 +1,4 @@
-"""Drag and lift: falls and coasts in closed form, MuJoCo's own laws, Gazebo's plate, no free energy."""
+"""Drag: falls and coasts in closed form, MuJoCo's own laws, Gazebo's plate, no free energy."""
 
 from __future__ import annotations
 
@@ -126,9 +126,10 @@ def test_no_law_adds_energy():
         assert np.all(power(lift, zero, v, w) < 1e-6 * scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drag", ["faces", "lift_drag"])
 def test_drag_takes_energy_from_a_jointed_body(drag, arm):
-    """The power of the drag alone, qvel · M (a_with - a_without), in random states, some half out."""
+    """The power of the drag alone, qvel · M (a_with - a_without), in random states."""
     wet = arm_robot(world(drag=drag))
     qpos, qvel = random_states(wet, 64, speed=2.0, depth=0.0)
     change = accelerate(wet, qpos, qvel) - accelerate(arm, qpos, qvel)
@@ -149,7 +150,7 @@ def test_drag_takes_energy_from_a_jointed_body(drag, arm):
 
 
 def test_absurd_speeds_slow_down():
-    """100 m/s and 100 rad/s at 5 ms: uncapped, explicit drag would throw the box back 40 times as fast."""
+    """100 m/s and 100 rad/s at 5 ms: explicit drag would throw the box back 40 times as fast."""
     robot = box_robot(*BRICK[:2], world(drag="faces"))
     qpos, qvel = random_states(robot, 64, speed=100.0)
     _, _, after, _ = march(robot, 1.0, qpos, qvel)
@@ -160,7 +161,7 @@ def test_absurd_speeds_slow_down():
 
 @pytest.mark.parametrize("share", [1.0, 0.1])
 def test_absurd_speeds_with_added_mass(share):
-    """Along the axes, where no Munk moment turns the box; half-dry it carries less water with it."""
+    """Along the axes, where no Munk moment turns the box; half-dry it carries less."""
     size = BRICK[0]
     robot = box_robot(*BRICK[:2], world(buoyancy="partial", drag="faces", added_mass=True))
     qpos, qvel = at_rest(robot, 2, size[2] * (0.5 - share) - 1e-9)
@@ -172,6 +173,7 @@ def test_absurd_speeds_with_added_mass(share):
     assert np.all(speed[-1] < 0.1 / share)
 
 
+@pytest.mark.slow
 def test_a_jointed_body_slows_down_from_more_than_it_can_reach():
     """3 m/s and 10 rad/s, several times what servos and weight allow, with added mass at 5 ms."""
     robot = arm_robot(world(drag="faces", added_mass=True))

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laboratory import accelerate, at_rest, box_robot, march, world
 
+from laboratory import accelerate, at_rest, box_robot, march, world
 from mjx_revolve.errors import InputError
 from mjx_revolve.lift_drag import LiftDrag, lift_drag, lift_drag_damping, lift_drag_wrench
 
