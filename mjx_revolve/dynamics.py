@@ -18,13 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.articulated import lift_off, plus, solve_root, to_parent, upper
 from mjx_revolve.bodies import (
     Block,
     Motion,
     SpatialInertia,
     add_block,
     add_inertia,
-    apply_block,
     apply_inertia,
     block_of,
     cross_force,
@@ -36,7 +36,6 @@ from mjx_revolve.hydrodynamics import Outer, water_on_level
 from mjx_revolve.robot import Robot, check_timestep
 from mjx_revolve.servos import end_stop, servo
 from mjx_revolve.spatial import (
-    SYM,
     Mat,
     Scalar,
     Vec,
@@ -45,14 +44,11 @@ from mjx_revolve.spatial import (
     dot,
     fold,
     full,
-    matmul,
     matTvec,
     matvec,
     mul,
     neg,
     quat_to_rows,
-    rotate,
-    rotate_sym,
     sincos,
     skew,
     sub,
@@ -209,8 +205,9 @@ def outer_forces(
     )
 
 
-def _own(
-    tree: Tree,
+def own_inertia(
+    world: World,
+    carries: bool,
     level: Level,
     motion: Motion,
     swirling: tuple[Vec, Vec],
@@ -229,7 +226,7 @@ def _own(
         level.inertia, skew(h), (level.mass, 0.0, 0.0, level.mass, 0.0, level.mass)
     )
     momentum = apply_inertia(rigid, *swirling)
-    outer = outer_forces(level, motion, swirling, gravity, water, thrusts, tree.robot.world)
+    outer = outer_forces(level, motion, swirling, gravity, water, thrusts, world)
     weight = tuple(neg(g) for g in gravity)
     force = vadd(outer.force, vscale(level.mass, weight))
     torque = vadd(outer.torque, cross(h, weight))
@@ -241,129 +238,13 @@ def _own(
     block = block_of(inertia)
     if outer.momentum is not None:
         momentum = tuple(vadd(a, b) for a, b in zip(momentum, outer.momentum, strict=True))
-    if tree.carries and dt:
+    if carries and dt:
         block = add_block(block, 0.5 * dt, gyroscope(*momentum))
     bias = cross_force(motion.spin, motion.velocity, *momentum)
     return block, (vsub(bias[0], torque), vsub(bias[1], force))
 
 
-def _to_parent(
-    turn: Mat, position: Vec, block: Block, bias: tuple[Vec, Vec], symmetric: bool
-) -> tuple[Block, tuple[Vec, Vec]]:
-    """An articulated inertia and its bias force, seen from the parent's frame and origin."""
-    across = rotate(turn, block.across)
-    if symmetric:
-        angular, linear = (full(rotate_sym(turn, _upper(x))) for x in (block.angular, block.linear))
-        back = transpose(across)
-    else:
-        angular, linear, back = (rotate(turn, x) for x in (block.angular, block.linear, block.back))
-    torque, force = (matvec(turn, x) for x in bias)
-    r = skew(position)
-    shifted = _plus(across, matmul(r, linear))
-    below = transpose(shifted) if symmetric else _minus(back, matmul(linear, r))
-    first, second = matmul(r, back), matmul(shifted, r)
-    entry = lambda i, j: sub(add(angular[i][j], first[i][j]), second[i][j])  # noqa: E731
-    moved = _square(entry, symmetric)
-    return Block(moved, shifted, below, linear), (vadd(torque, cross(position, force)), force)
-
-
-def _upper(m: Mat) -> Vec:
-    return tuple(m[i][j] for i, j in SYM)
-
-
-def _square(entry: Callable[[int, int], Scalar], symmetric: bool) -> Mat:
-    """A 3×3 matrix from its entries; a symmetric one from its upper half alone."""
-    if symmetric:
-        return full(tuple(entry(i, j) for i, j in SYM))
-    return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))
-
-
-def _plus(a: Mat, b: Mat) -> Mat:
-    return tuple(vadd(x, y) for x, y in zip(a, b, strict=True))
-
-
-def _minus(a: Mat, b: Mat) -> Mat:
-    return tuple(vsub(x, y) for x, y in zip(a, b, strict=True))
-
-
-class _Joint(NamedTuple):
-    """What the tips-to-root sweep leaves for the way back."""
-
-    row_a: Vec
-    row_l: Vec
-    inverse: Scalar
-    rest: Scalar
-
-
-def _lift_off(
-    block: Block,
-    bias: tuple[Vec, Vec],
-    inertia: Scalar,
-    torque: Scalar,
-    coriolis: tuple[Vec, Vec],
-    symmetric: bool,
-) -> tuple[Block, tuple[Vec, Vec], _Joint]:
-    """Articulated inertia and bias of a hinge's body, the hinge (its z axis) set free.
-
-    Args:
-        block: of the body and all that it carries.
-        bias: likewise.
-        inertia: that the hinge adds about its axis: armature and implicit terms [kg·m²].
-        torque: at the hinge [N·m].
-        coriolis: velocity times joint velocity.
-        symmetric: whether `block` is.
-
-    Returns:
-        What the parent feels, and what the way back needs.
-    """
-    column_a = tuple(block.angular[i][2] for i in range(3))
-    column_l = tuple(block.back[i][2] for i in range(3))
-    row_a, row_l = block.angular[2], block.across[2]
-    inverse = 1 / add(block.angular[2][2], inertia)
-    rest = sub(torque, bias[0][2])
-    scaled_a, scaled_l = vscale(inverse, row_a), vscale(inverse, row_l)
-    less = lambda m, column, row: lambda i, j: sub(m[i][j], mul(column[i], row[j]))  # noqa: E731
-    across = _square(less(block.across, column_a, scaled_l), False)
-    other = less(block.back, column_l, scaled_a)
-    back = transpose(across) if symmetric else _square(other, False)
-    left = Block(
-        _square(less(block.angular, column_a, scaled_a), symmetric),
-        across,
-        back,
-        _square(less(block.linear, column_l, scaled_l), symmetric),
-    )
-    carried = apply_block(left, *coriolis)
-    pushed = mul(inverse, rest)
-    bias = (
-        vadd(vadd(bias[0], carried[0]), vscale(pushed, column_a)),
-        vadd(vadd(bias[1], carried[1]), vscale(pushed, column_l)),
-    )
-    return left, bias, _Joint(row_a, row_l, inverse, rest)
-
-
-def _solve_root(block: Block, bias: tuple[Vec, Vec], symmetric: bool) -> tuple[Vec, Vec]:
-    """Acceleration of the free root: block a = -bias, by elimination, linear rows first.
-
-    Without pivoting, which the positive symmetric part makes safe (Golub & Van Loan 2013, § 4.3).
-    """
-    a = [[*block.linear[i], *block.back[i]] for i in range(3)]
-    a += [[*block.across[i], *block.angular[i]] for i in range(3)]
-    rhs = [neg(x) for x in (*bias[1], *bias[0])]
-    inverse = []
-    for i in range(6):
-        inverse.append(1 / a[i][i])
-        for j in range(i + 1, 6):
-            factor = mul(a[i][j] if symmetric else a[j][i], inverse[i])
-            for k in range(j if symmetric else i + 1, 6):
-                a[j][k] = sub(a[j][k], mul(factor, a[i][k]))
-            rhs[j] = sub(rhs[j], mul(factor, rhs[i]))
-    for i in reversed(range(6)):
-        known = total(*[mul(a[i][j], rhs[j]) for j in range(i + 1, 6)])
-        rhs[i] = mul(sub(rhs[i], known), inverse[i])
-    return tuple(rhs[3:]), tuple(rhs[:3])
-
-
-def _turn(level: Level, angle: Scalar) -> Mat:
+def turn_hinges(level: Level, angle: Scalar) -> Mat:
     """Rotation of each body's frame, parent from child."""
     sine, cosine = sincos(angle)
     r = level.rotation
@@ -459,9 +340,9 @@ def _acceleration(
     turn_root = tuple(row(r) for r in quat_to_rows(state.quat))
     turns: list[Any] = [turn_root]
     turns += [
-        _turn(level, angle) for level, angle in zip(tree.levels[1:], state.angle, strict=True)
+        turn_hinges(level, angle) for level, angle in zip(tree.levels[1:], state.angle, strict=True)
     ]
-    pulled = any(not isinstance(x, int | float) or x != 0 for x in water.acceleration)
+    pulled = is_pulled(water)
     located = pulled or needs_place(world) or any(level.points is not None for level in tree.levels)
     velocity, spin = matTvec(turn_root, row(state.velocity)), row(state.spin)
     rates = _velocities(tree, turns, spin, velocity, state.speed)
@@ -489,13 +370,10 @@ def _acceleration(
         )
     owns = []
     for level, motion, rate in zip(tree.levels, motions, swirling, strict=True):
-        # In a frame that goes with a gusty current, its acceleration is felt as weight is.
-        gravity = vscale(world.gravity, motion.up)
-        if pulled:
-            axes = (motion.x_axis, motion.y_axis, motion.up)
-            for push, axis in zip(water.acceleration, axes, strict=True):
-                gravity = vadd(gravity, vscale(push, axis))
-        owns.append(_own(tree, level, motion, rate, water, thrusts, gravity, dt))
+        gravity = felt_gravity(world, water, motion)
+        owns.append(
+            own_inertia(world, tree.carries, level, motion, rate, water, thrusts, gravity, dt)
+        )
 
     # Tips to root: articulated inertias.
     blocks = [block for block, _ in owns]
@@ -518,7 +396,7 @@ def _acceleration(
         )
         delivered = jnp.abs(motor * speed)
         power = add(power, total(*[delivered[k] for k in range(delivered.shape[0])]))
-        left, bias, joint[d] = _lift_off(
+        left, bias, joint[d] = lift_off(
             blocks[d],
             biases[d],
             add(inertia, motor_inertia),
@@ -527,13 +405,13 @@ def _acceleration(
             symmetric,
         )
         above = len(tree.levels[d - 1].body)
-        moved, bias = _to_parent(turns[d], level.position, left, bias, symmetric)
+        moved, bias = to_parent(turns[d], level.position, left, bias, symmetric)
         blocks[d - 1] = _join(blocks[d - 1], _up_block(level, above, moved, symmetric), symmetric)
         bias = _up(level, above, bias)
         biases[d - 1] = tuple(vadd(a, b) for a, b in zip(biases[d - 1], bias, strict=True))
 
     # Root to tips: accelerations.
-    angular, linear = _solve_root(blocks[0], biases[0], symmetric)
+    angular, linear = solve_root(blocks[0], biases[0], symmetric)
     accelerations, hinges = [(angular, linear)], []
     for d in range(1, len(tree.levels)):
         level, turn = tree.levels[d], turns[d]
@@ -556,7 +434,7 @@ def _acceleration(
 def _up_block(level: Level, above: int, block: Block, symmetric: bool) -> Block:
     if not symmetric:
         return Block(*_up(level, above, tuple(block)))
-    angular, linear = (full(_up(level, above, _upper(x))) for x in (block.angular, block.linear))
+    angular, linear = (full(_up(level, above, upper(x))) for x in (block.angular, block.linear))
     across = _up(level, above, block.across)
     return Block(angular, across, transpose(across), linear)
 
@@ -566,9 +444,9 @@ def _join(a: Block, b: Block, symmetric: bool) -> Block:
     if not symmetric:
         return add_block(a, 1.0, b)
     angular, linear = (
-        full(vadd(_upper(x), _upper(y))) for x, y in ((a.angular, b.angular), (a.linear, b.linear))
+        full(vadd(upper(x), upper(y))) for x, y in ((a.angular, b.angular), (a.linear, b.linear))
     )
-    across = _plus(a.across, b.across)
+    across = plus(a.across, b.across)
     return Block(angular, across, transpose(across), linear)
 
 
@@ -593,6 +471,66 @@ def turn_quat(quat: tuple[Scalar, ...], spin: Vec, dt: float) -> tuple[Scalar, .
     )
     scale = 1 / jnp.sqrt(total(*[x * x for x in turned]))
     return tuple(x * scale for x in turned)
+
+
+def advance(state: State, water: Water, pace: Any, dt: float, carries: bool) -> State:
+    """The state after a step: semi-implicit Euler, velocities before positions.
+
+    Args:
+        state: before it.
+        water: its uniform current, in which the step is seen.
+        pace: accelerations, (linear, angular, hinges); the root's as rates of its body-frame
+            velocities [m/s², rad/s²].
+        dt: [s].
+        carries: whether water is carried along.
+
+    Returns:
+        The state; thrusters' commands as they were.
+    """
+    linear, angular, hinges = pace
+    spin = tuple(w + dt * a for w, a in zip(state.spin, angular, strict=True))
+    speed = tuple(w + dt * a for w, a in zip(state.speed, hinges, strict=True))
+    turn, quat = quat_to_rows(state.quat), turn_quat(state.quat, spin, dt)
+    relative = vsub(state.velocity, water.current)
+    seen = matTvec(turn, relative)
+    if carries:
+        # Momentum is kept in the body's frame, so velocity turns with it.
+        ahead = tuple(v + dt * a for v, a in zip(seen, linear, strict=True))
+        velocity = vadd(matvec(quat_to_rows(quat), ahead), water.current)
+    else:
+        # As MuJoCo: the body-frame rate and the frame's turning make the world's acceleration.
+        push = matvec(turn, vadd(linear, cross(state.spin, seen)))
+        velocity = vadd(state.velocity, vscale(dt, push))
+    if is_pulled(water):
+        velocity = vadd(velocity, vscale(dt, water.acceleration))
+    return State(
+        position=tuple(x + dt * v for x, v in zip(state.position, velocity, strict=True)),
+        quat=quat,
+        velocity=velocity,
+        spin=spin,
+        angle=tuple(q + dt * w for q, w in zip(state.angle, speed, strict=True)),
+        speed=speed,
+        pace=pace if carries else (),
+        command=state.command,
+    )
+
+
+def is_pulled(water: Water) -> bool:
+    """Whether the uniform current has an acceleration; a traced one counts."""
+    return any(not isinstance(x, int | float) or x != 0 for x in water.acceleration)
+
+
+def felt_gravity(world: World, water: Water, motion: Motion) -> Vec:
+    """Gravity upwards in the bodies' frames, with the acceleration of a gusty current [m/s²].
+
+    In a frame that goes with the current, its acceleration is felt as weight is.
+    """
+    gravity = vscale(world.gravity, motion.up)
+    if is_pulled(water):
+        axes = (motion.x_axis, motion.y_axis, motion.up)
+        for push, axis in zip(water.acceleration, axes, strict=True):
+            gravity = vadd(gravity, vscale(push, axis))
+    return gravity
 
 
 # ------------------------------------------------------------------ the engine
@@ -654,31 +592,8 @@ def make_population_engine(robot: Robot, contact: bool = True) -> Engine:
         # The whole step is seen from the uniform current: there, no current is left.
         relative = state._replace(velocity=vsub(state.velocity, water.current))
         linear, angular, hinges, power = _acceleration(tree, relative, targets, water, thrusts, dt)
-        spin = tuple(w + dt * a for w, a in zip(state.spin, angular, strict=True))
-        speed = tuple(w + dt * a for w, a in zip(state.speed, hinges, strict=True))
-        turn, quat = quat_to_rows(state.quat), turn_quat(state.quat, spin, dt)
-        seen = matTvec(turn, relative.velocity)
-        if tree.carries:
-            # Momentum is kept in the body's frame, so velocity turns with it.
-            ahead = tuple(v + dt * a for v, a in zip(seen, linear, strict=True))
-            velocity = vadd(matvec(quat_to_rows(quat), ahead), water.current)
-        else:
-            # As MuJoCo: the body-frame rate and the frame's turning make the world's acceleration.
-            push = matvec(turn, vadd(linear, cross(state.spin, seen)))
-            velocity = vadd(state.velocity, vscale(dt, push))
-        if any(not isinstance(x, int | float) or x != 0 for x in water.acceleration):
-            velocity = vadd(velocity, vscale(dt, water.acceleration))
-        new = State(
-            position=tuple(x + dt * v for x, v in zip(state.position, velocity, strict=True)),
-            quat=quat,
-            velocity=velocity,
-            spin=spin,
-            angle=tuple(q + dt * w for q, w in zip(state.angle, speed, strict=True)),
-            speed=speed,
-            pace=(linear, angular, hinges) if tree.carries else (),
-            command=command,
-        )
-        return new, add(power, pumped)
+        new = advance(state, water, (linear, angular, hinges), dt, tree.carries)
+        return new._replace(command=command), add(power, pumped)
 
     def sense(state: State) -> Sense:
         return Sense(

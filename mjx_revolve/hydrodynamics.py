@@ -109,6 +109,11 @@ def _is_array(x: Scalar) -> bool:
     return hasattr(x, "shape")
 
 
+def _present(x: Scalar) -> bool:
+    """Whether it is more than a plain zero; what is traced counts as something."""
+    return isinstance(x, jax.Array) or bool(np.any(x))
+
+
 def _some(vector: Any) -> Any:
     """A vector, or None where it is plainly zero: a traced zero counts as something."""
     if vector is None or all(isinstance(x, int | float) and x == 0 for x in vector):
@@ -241,8 +246,8 @@ def _water_on_parts(
             tuple(gather(x) for x in one.linear),
         )
     carried = None
-    if any(np.any(x) for x in (*parts.carried_linear, *parts.carried_angular)):
-        weigh = lambda x: sum_parts(mul(x, share), k) if np.any(x) else 0.0  # noqa: E731
+    if any(_present(x) for x in (*parts.carried_linear, *parts.carried_angular)):
+        weigh = lambda x: sum_parts(mul(x, share), k) if _present(x) else 0.0  # noqa: E731
         carried = SpatialInertia(
             tuple(weigh(x) for x in parts.carried_angular),
             tuple(tuple(weigh(x) for x in row) for row in parts.carried_cross),
@@ -266,16 +271,14 @@ def _plus(a: SpatialInertia | None, b: SpatialInertia | None) -> SpatialInertia 
 def _share_of_body(level: Level, shares: Sequence[Scalar]) -> Scalar:
     """Submerged share of each body, its parts weighted by volume."""
     n = len(level.body)
-    volumes = [
-        np.broadcast_to(np.asarray(parts.volume), (len(parts.rows), n, 1)) for parts in level.parts
-    ]
-    whole = np.maximum(sum(v.sum(0) for v in volumes), 1e-30)
-    return total(
-        *[
-            sum_parts(mul(volume / whole, share), len(volume))
-            for volume, share in zip(volumes, shares, strict=True)
-        ]
-    )
+    wet, whole = 0.0, 1e-30
+    for parts, share in zip(level.parts, shares, strict=True):
+        k, volume = len(parts.rows), parts.volume
+        if not isinstance(volume, jax.Array):
+            volume = np.broadcast_to(np.asarray(volume), (k, n, 1))
+        wet = add(wet, sum_parts(mul(volume, share), k))
+        whole = add(whole, sum(volume[i] for i in range(k)))
+    return mul(1 / whole, wet)
 
 
 def _inertia_box(

@@ -9,9 +9,6 @@ import numpy as np
 from mjx_revolve.spatial import Scalar, mul, sub
 from mjx_revolve.tree import Level
 
-# Share of its top speed up to which a servo gives its full effort [-]. A choice, between the
-# straight line of a bare motor (0) and Revolve's box of effort and speed (1).
-_KNEE = 0.75
 # Ratio of the end stops' damper to their spring [s]. A choice: a leg arrives over-damped.
 STOP_TIME = 0.005
 # A hinge counts as near its top speed where twice the gain in speed that is foreseen for the step
@@ -60,31 +57,24 @@ def servo(
     torque = sub(torque, mul(level.servo_damping, speed))
     low, high = (_cast(x, torque) for x in level.effort)
     torque = jnp.clip(torque, low, high)
-    top = np.asarray(level.top_speed, np.float64)
-    limited = np.isfinite(top) & np.isfinite(level.effort[1])
-    if not np.any(limited):
+    if level.motor is None:
         return torque, jnp.zeros_like(torque)
-    w = np.where(limited, top, 1.0)
-    friction = np.asarray(level.damping) * w
-    effort = np.where(limited, level.effort[1], friction)
-    slope = np.where(limited, np.maximum((effort - friction) / ((1 - _KNEE) * w), 0), 0)
+    friction, slope, top = (_cast(x, torque) for x in level.motor)
     forward = jnp.sign(torque)
     rate, push = forward * speed, jnp.abs(torque)
-    f0, f1, f2 = (_cast(x, torque) for x in (friction, slope, w))
-    line = lambda x: f0 + f1 * (f2 - x)  # noqa: E731
+    line = lambda x: friction + slope * (top - x)  # noqa: E731
     # The motor turns its base, too, the other way.
-    base = _cast(dt / np.asarray(level.base_inertia), torque)
-    gain = dt * (push + jnp.maximum(forward * load, 0)) / inertia + base * push
-    ahead = rate + _MARGIN * gain
-    beyond = (line(rate) < push) & limited
-    near = (line(ahead) < push) & limited & ~beyond
-    chord = jnp.maximum(push - f0, 0) / jnp.where(near, f2 - rate, 1)
+    per_base = dt / _cast(level.base_inertia, torque)
+    gain = dt * (push + jnp.maximum(forward * load, 0)) / inertia + per_base * push
+    beyond = line(rate) < push
+    near = (line(rate + _MARGIN * gain) < push) & ~beyond
+    chord = jnp.maximum(push - friction, 0) / jnp.where(near, top - rate, 1)
     torque = jnp.where(beyond, forward * line(rate), torque)
-    return torque, dt * jnp.where(beyond, f1, jnp.where(near, chord, 0))
+    return torque, dt * jnp.where(beyond, slope, jnp.where(near, chord, 0))
 
 
 def _cast(x: Scalar, like: jax.Array) -> Scalar:
-    return np.asarray(x, like.dtype)
+    return x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)
 
 
 def end_stop(level: Level, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:

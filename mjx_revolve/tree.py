@@ -24,6 +24,9 @@ from mjx_revolve.spatial import SYM, Mat, Scalar, Sym, Vec, fold
 # Stiffness of a joint's end stop, as full effort per this overshoot [rad]. A choice: stiff enough
 # to keep within half a degree of the real range; the step treats it implicitly, so it is stable.
 LIMIT_OVERSHOOT = 0.008
+# Share of its top speed up to which a servo gives its full effort [-]. A choice, between the
+# straight line of a bare motor (0) and Revolve's box of effort and speed (1).
+KNEE = 0.75
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,8 @@ class Level:
         range: limits of the joint, low and high [rad].
         stop: stiffness of the end stops [N·m/rad].
         top_speed: of the servo [rad/s]; infinite where the model states none.
+        motor: the line between speed and torque near the top speed, or None where no servo has
+            one: torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s].
         base_inertia: of all that is on the parent's side of the hinge, about its axis, at rest
             [kg·m²].
         box_rotation: body from inertial frame, for MuJoCo's inertia-box law.
@@ -146,6 +151,7 @@ class Level:
     range: tuple[Scalar, Scalar]
     stop: Scalar
     top_speed: Scalar
+    motor: Any
     base_inertia: Scalar
     box_rotation: Mat
     box_position: Vec
@@ -240,23 +246,8 @@ def make_tree(robot: Robot, contact: bool = True) -> Tree:
         InputError: the model holds a joint that the population step cannot do; it is named.
     """
     m = robot.mj_model
-    depth: dict[int, int] = {}
-    frames: dict[int, np.ndarray] = {}  # MuJoCo body frame from our body frame
+    depth, frames = _depths_and_frames(robot)
     servo = {int(m.actuator_trnid[k, 0]): k for k in robot.servos}
-    for body in range(1, m.nbody):
-        name, joint, parent = m.body(body).name, int(m.body_jntadr[body]), m.body_parentid[body]
-        kind = m.jnt_type[joint] if m.body_jntnum[body] == 1 else None
-        if body == 1 and kind == mujoco.mjtJoint.mjJNT_FREE:
-            depth[body], frames[body] = 0, np.eye(3)
-            continue
-        if body == 1 or kind != mujoco.mjtJoint.mjJNT_HINGE or np.any(m.jnt_pos[joint]):
-            raise InputError(
-                f"engine population: body {name!r}: expected one hinge at the body's origin below "
-                "one free root; use engine: mjx"
-            )
-        if joint not in servo:
-            raise InputError(f"engine population: joint {name!r}: expected a servo; found none")
-        depth[body], frames[body] = depth[parent] + 1, _z_frame(m.jnt_axis[joint])
     bodies = [
         [b for b in depth if depth[b] == d] for d in range(max(depth.values(), default=0) + 1)
     ]
@@ -275,6 +266,33 @@ def make_tree(robot: Robot, contact: bool = True) -> Tree:
     )
 
 
+def _depths_and_frames(robot: Robot) -> tuple[dict[int, int], dict[int, np.ndarray]]:
+    """Depth in the tree, and MuJoCo's body frame from ours, of each body.
+
+    Raises:
+        InputError: the model holds a joint that the population step cannot do; it is named.
+    """
+    m = robot.mj_model
+    depth: dict[int, int] = {}
+    frames: dict[int, np.ndarray] = {}
+    driven = {int(m.actuator_trnid[k, 0]) for k in robot.servos}
+    for body in range(1, m.nbody):
+        name, joint, parent = m.body(body).name, int(m.body_jntadr[body]), m.body_parentid[body]
+        kind = m.jnt_type[joint] if m.body_jntnum[body] == 1 else None
+        if body == 1 and kind == mujoco.mjtJoint.mjJNT_FREE:
+            depth[body], frames[body] = 0, np.eye(3)
+            continue
+        if body == 1 or kind != mujoco.mjtJoint.mjJNT_HINGE or np.any(m.jnt_pos[joint]):
+            raise InputError(
+                f"engine population: body {name!r}: expected one hinge at the body's origin below "
+                "one free root; use engine: mjx"
+            )
+        if joint not in driven:
+            raise InputError(f"engine population: joint {name!r}: expected a servo; found none")
+        depth[body], frames[body] = depth[parent] + 1, _z_frame(m.jnt_axis[joint])
+    return depth, frames
+
+
 def _level(
     robot: Robot,
     ids: list[int],
@@ -282,7 +300,13 @@ def _level(
     frames: dict[int, np.ndarray],
     servo: dict[int, int],
     contact: bool,
+    assigned: list[list[int]] | None = None,
 ) -> Level:
+    """The constants of some bodies whose parents are all `above`.
+
+    `assigned` says which rows of the fluid table each of them holds; by default all of its own. A
+    body that is listed more than once has its mass and its hinge in each place.
+    """
     m = robot.mj_model
     rotation, position, moment, inertia, box_rotation, box_position, box_size = (
         [] for _ in "1234567"
@@ -320,6 +344,7 @@ def _level(
         limited = m.jnt_limited[joint].astype(bool)[:, None]
         limits = np.where(limited, m.jnt_range[joint], [-np.inf, np.inf])
         strong = np.where(np.isfinite(effort[:, 1]), effort[:, 1], 1.0)
+        top = m.jnt_user[joint, 0] if m.nuser_jnt else np.full(len(joint), np.inf)
         hinge = {
             "armature": _num(m.dof_armature[dof]),
             "damping": _num(m.dof_damping[dof]),
@@ -330,8 +355,9 @@ def _level(
             "target": (_num(target[:, 0]), _num(target[:, 1])),
             "range": (_num(limits[:, 0]), _num(limits[:, 1])),
             "stop": _num(strong / LIMIT_OVERSHOOT),
-            "top_speed": _num(m.jnt_user[joint, 0] if m.nuser_jnt else np.full(len(joint), np.inf)),
-            "base_inertia": _num([_base_inertia(robot, b) for b in ids]),
+            "top_speed": _num(top),
+            "motor": _motor_line(top, effort[:, 1], m.dof_damping[dof]),
+            "base_inertia": _num(_base_inertias(robot)[ids]),
         }
     else:
         pair = (0.0, 0.0)
@@ -342,9 +368,11 @@ def _level(
             ),
             0.0,
         )  # fmt: skip
-        hinge = {**zero, "effort": pair, "target": pair, "range": pair}
+        hinge = {**zero, "motor": None, "effort": pair, "target": pair, "range": pair}
     where = {b: k for k, b in enumerate(above)}
-    parts = _parts(robot, ids, frames)
+    if assigned is None:
+        assigned = [list(np.flatnonzero(np.equal(robot.fluid.body, b))) for b in ids]
+    parts = _parts(robot, ids, frames, assigned)
     return Level(
         body=tuple(ids),
         frame=np.array([frames[b] for b in ids]),
@@ -364,32 +392,46 @@ def _level(
     )
 
 
-def _base_inertia(robot: Robot, body: int) -> float:
-    """Inertia about a hinge's axis of all bodies that it does not move, and their water [kg·m²]."""
-    m, table = robot.mj_model, robot.fluid
+def _base_inertias(robot: Robot) -> np.ndarray:
+    """For each body, the inertia about its hinge's axis of all that the hinge does not move.
+
+    Bodies and the water that they carry, at rest; `[nbody]` [kg·m²].
+    """
+    m, table, density = robot.mj_model, robot.fluid, robot.world.density
     data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)
-    axis, anchor = data.xaxis[m.body_jntadr[body]], data.xpos[body]
-    moved = {body}
-    for b in range(body + 1, m.nbody):
-        if int(m.body_parentid[b]) in moved:
-            moved.add(b)
+    turns = data.xmat.reshape(-1, 3, 3)
+    # Bodies and parts alike: whose, centre, axes, mass and inertia along the axes.
+    body = np.concatenate([np.arange(1, m.nbody), table.body])
+    at = np.einsum("pij,pj->pi", turns[table.body], table.position)
+    center = np.concatenate([data.xipos[1:], data.xpos[table.body] + at])
+    axes = np.concatenate([data.ximat[1:].reshape(-1, 3, 3), turns[table.body] @ table.rotation])
+    mass = np.concatenate([np.repeat(m.body_mass[1:, None], 3, 1), density * table.carried_mass])
+    inertia = np.concatenate([m.body_inertia[1:], density * table.carried_inertia])
+    found = np.full(m.nbody, np.inf)
+    for b in range(2, m.nbody):
+        moved = np.zeros(m.nbody, bool)
+        moved[b] = True
+        for c in range(b + 1, m.nbody):
+            moved[c] = moved[m.body_parentid[c]]
+        axis, anchor = data.xaxis[m.body_jntadr[b]], data.xpos[b]
+        swing = np.einsum("pji,pj->pi", axes, np.cross(axis, center - anchor))
+        turn = np.einsum("pji,j->pi", axes, axis)
+        about = np.sum(mass * swing**2 + inertia * turn**2, 1)
+        found[b] = about[~moved[body]].sum()
+    return found
 
-    def about(center: np.ndarray, mass: np.ndarray, inertia: np.ndarray, turn: np.ndarray) -> float:
-        swing = turn.T @ np.cross(axis, center - anchor)
-        return float(swing @ (mass * swing) + (turn.T @ axis) ** 2 @ inertia)
 
-    total = 0.0
-    for b in set(range(1, m.nbody)) - moved:
-        turn = data.ximat[b].reshape(3, 3)
-        total += about(data.xipos[b], np.full(3, m.body_mass[b]), m.body_inertia[b], turn)
-    for p in np.flatnonzero(~np.isin(table.body, list(moved))):
-        b = table.body[p]
-        frame = data.xmat[b].reshape(3, 3)
-        water = robot.world.density * table.carried_mass[p], table.carried_inertia[p]
-        center, turn = data.xpos[b] + frame @ table.position[p], frame @ table.rotation[p]
-        total += about(center, water[0], robot.world.density * water[1], turn)
-    return total
+def _motor_line(top: np.ndarray, effort: np.ndarray, damping: np.ndarray) -> Any:
+    """Torque at the top speed, slope and top speed of each servo; see `servos.servo`."""
+    limited = np.isfinite(top) & np.isfinite(effort)
+    if not np.any(limited):
+        return None
+    speed = np.where(limited, top, 1.0)
+    # Where there is no limit, the line lies far above any torque.
+    friction = np.where(limited, damping * speed, 1e30)
+    slope = np.where(limited, np.maximum((effort - friction) / ((1 - KNEE) * speed), 0), 0.0)
+    return _num(friction), _num(slope), _num(speed)
 
 
 def _stack(rows: list[list[Any]], empty: Any) -> np.ndarray:
@@ -398,14 +440,16 @@ def _stack(rows: list[list[Any]], empty: Any) -> np.ndarray:
     return np.array([[row[k] if k < len(row) else empty for row in rows] for k in range(most)])
 
 
-def _parts(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> tuple[Parts, ...]:
+def _parts(
+    robot: Robot, ids: list[int], frames: dict[int, np.ndarray], assigned: list[list[int]]
+) -> tuple[Parts, ...]:
     table = robot.fluid
-    here = [p for p in range(len(table.body)) if table.body[p] in ids]
+    here = [p for row in assigned for p in row]
     laws = sorted({(table.buoyancy[p], table.drag[p]) for p in here})
     groups = []
     for buoyancy, drag in laws:
         alike = [p for p in here if (table.buoyancy[p], table.drag[p]) == (buoyancy, drag)]
-        rows = [[p for p in alike if table.body[p] == b] for b in ids]
+        rows = [[p for p in row if p in alike] for row in assigned]
         # Nothing acts on a group that neither floats nor drags nor carries nor pushes.
         active = np.any(table.carried_mass[alike]) or set(alike) & set(robot.thruster_row)
         if (buoyancy, drag) != ("off", "off") or active:
