@@ -107,7 +107,7 @@ def make_bare(job: dict[str, Any]) -> Case:
         state, _ = roll_out(
             engine,
             lambda state, time, row, sense: (state, ctrl),
-            flow_at(robot, water_of(world)),
+            flow_at(robot.world, water_of(world)),
             lambda state, ctrl, energy: (),
             engine.init(qpos, qvel),
             (),

@@ -128,7 +128,7 @@ def march(
         return roll_out(
             engine,
             lambda state, time, row, sense: (state, ctrl),
-            flow_at(robot, water_of(robot.world)),
+            flow_at(robot.world, water_of(robot.world)),
             lambda state, ctrl, energy: engine.observe(state),
             engine.init(qpos, qvel),
             (),

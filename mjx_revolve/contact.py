@@ -6,6 +6,7 @@ costs a few operations where a contact solver would cost the whole speed of the 
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -84,9 +85,12 @@ def bed_contact(
     Returns:
         Force on each point, same frame [N], and its damping along the normal and across it [N·s/m].
     """
-    real = np.asarray(np.greater(point_mass, 0), np.float64)
-    stiffness = mul(bed.stiffness, real)
-    damper = np.asarray(2 * _DAMPING_RATIO * np.sqrt(bed.stiffness * np.asarray(point_mass)))
+    if isinstance(point_mass, jax.Array):  # bodies differ from lane to lane
+        stiffness = jnp.where(point_mass > 0, bed.stiffness, 0)
+        damper = 2 * _DAMPING_RATIO * jnp.sqrt(bed.stiffness * point_mass)
+    else:
+        stiffness = mul(bed.stiffness, np.asarray(np.greater(point_mass, 0), np.float64))
+        damper = np.asarray(2 * _DAMPING_RATIO * np.sqrt(bed.stiffness * np.asarray(point_mass)))
     outward = dot(velocity, normal)
     ahead = jnp.maximum(depth - timestep * outward, 0)
     damping = mul(damper, jnp.minimum(ahead / _FADE, 1))
@@ -116,7 +120,7 @@ def bed_on_level(
         Torque [N·m] and force [N] about each body's origin, body frame, and their damping.
     """
     n, lanes = len(level.body), jnp.shape(motion.height)[-1]
-    k = max(x.shape[0] if isinstance(x, np.ndarray) else 1 for x in points.position)
+    k = max(np.shape(x)[0] if np.ndim(x) == 3 else 1 for x in points.position)
     wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
     assert world.bed is not None  # there are points only above a bed
     rows = (motion.x_axis, motion.y_axis, motion.up)

@@ -184,27 +184,51 @@ def make_sine(
         rows = [genes[k * n : (k + 1) * n][order] for k in range(2 * harmonics + 1)]
         reach = amplitude * jnp.asarray(half, genes.dtype)[order]
         center = jnp.broadcast_to(jnp.asarray(middle, genes.dtype)[order], rows[0].shape)
-        rate = 2 * np.pi * max_frequency * (1 + jnp.sin(genes[-1:])) / 2
-        sizes = []
-        for k in range(harmonics):
-            u, v = rows[2 * k], rows[2 * k + 1]
-            size = safe_norm((u, v))
-            # sin(r) / r, and its limit where r = 0.
-            fold = jnp.where(size > 1e-6, jnp.sin(size) / jnp.maximum(size, 1e-6), 1.0)
-            scale = reach * fold / (k + 1)
-            sizes.append((scale * u, scale * v))
-        return tuple(sizes), 0.5 * reach * jnp.sin(rows[-1]), rate, center
+        return decode_sine(rows, genes[-1:], reach, center, max_frequency)
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
-        sizes, offset, rate, center = parameters
-        fade = jnp.minimum(time / 0.5, 1.0)
-        wave = offset
-        for k, (u, v) in enumerate(sizes):
-            sine, cosine = sincos((k + 1) * rate * time)
-            wave = wave + u * sine + v * cosine
-        return state, center + fade * wave
+    return Controller(len(gene_names), gene_names, decode, lambda parameters: (), step_sine)
 
-    return Controller(len(gene_names), gene_names, decode, lambda parameters: (), step)
+
+def decode_sine(
+    rows: list[jax.Array],
+    frequency: jax.Array,
+    reach: jax.Array,
+    center: jax.Array,
+    max_frequency: float,
+) -> Any:
+    """Parameters of the sines, as `make_sine` describes them.
+
+    Args:
+        rows: genes u, v of each harmonic, then offsets, `[nu, lanes]` each.
+        frequency: its gene, `[1, lanes]`.
+        reach: largest amplitude, `[nu, lanes]` or `[nu, 1]` [rad].
+        center: `[nu, lanes]` [rad].
+        max_frequency: upper end of the frequency [Hz].
+
+    Returns:
+        What `step_sine` takes.
+    """
+    rate = 2 * np.pi * max_frequency * (1 + jnp.sin(frequency)) / 2
+    sizes = []
+    for k in range(len(rows) // 2):
+        u, v = rows[2 * k], rows[2 * k + 1]
+        size = safe_norm((u, v))
+        # sin(r) / r, and its limit where r = 0.
+        fold = jnp.where(size > 1e-6, jnp.sin(size) / jnp.maximum(size, 1e-6), 1.0)
+        scale = reach * fold / (k + 1)
+        sizes.append((scale * u, scale * v))
+    return tuple(sizes), 0.5 * reach * jnp.sin(rows[-1]), rate, center
+
+
+def step_sine(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+    """The step of a `Controller` made of sines."""
+    sizes, offset, rate, center = parameters
+    fade = jnp.minimum(time / 0.5, 1.0)
+    wave = offset
+    for k, (u, v) in enumerate(sizes):
+        sine, cosine = sincos((k + 1) * rate * time)
+        wave = wave + u * sine + v * cosine
+    return state, center + fade * wave
 
 
 # What `make_feedback` multiplies by its genes: names, and the size that counts as 1. Choices: an

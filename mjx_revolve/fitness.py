@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.config import Config, load_config, make_config
+from mjx_revolve.config import Config, TaskConfig, load_config, make_config
 from mjx_revolve.controllers import CONTROLLERS, Controller, bind_genes
 from mjx_revolve.dynamics import Engine
 from mjx_revolve.errors import InputError
@@ -34,7 +34,7 @@ from mjx_revolve.rollout import (
 from mjx_revolve.tasks import TASKS, Track, measure
 from mjx_revolve.terrain import bed_height
 from mjx_revolve.water import Water, gust_path, water_of
-from mjx_revolve.world import load_world
+from mjx_revolve.world import World, load_world
 from mjx_revolve.xla import compiler_options, one_loop, over_chunks
 
 # Score of a rollout that blew up. Finite, because optimisers' averages and sorts are not made for
@@ -158,32 +158,10 @@ class Fitness:
         Returns:
             `[nq, trials]` qpos, and the water `[trials]` where it varies, else None.
         """
-        task, world, trials = self.config.task, self.robot.world, self.config.task.trials
-        place_key, tilt_key, yaw_key, current_key = jax.random.split(key, 4)
-        place = task.start_position * jax.random.normal(place_key, (3, trials))
-        tilt = task.start_tilt * jax.random.normal(tilt_key, (2, trials))
-        yaw = task.start_yaw * jax.random.normal(yaw_key, (trials,))
-        if task.type == "crawl" and world.bed is not None:
-            # The lowest corner of any module 5 mm above the bed, whatever the tilt.
-            height = bed_height(world.bed, place[0], place[1]) + self._reach + 0.005
-            place = place.at[2].set(height)
-        else:
-            place = place.at[2].add(world.surface_height - task.depth)
-        quat = _euler_quat(tilt[0], tilt[1], yaw)
+        place, quat, water = draw_starts(self.config.task, self.robot.world, key, self._reach)
         rest = jnp.asarray(self.robot.qpos0, place.dtype)[7:, None]
-        rest = jnp.broadcast_to(rest, (rest.shape[0], trials))
-        qpos = jnp.concatenate([place, quat, rest])
-        if task.current_std == 0 and not world.waves:
-            return qpos, None
-        extra = task.current_std * jax.random.normal(current_key, (2, trials))
-        x, y, z = world.current
-        full = jnp.full((trials,), 0.0, place.dtype)
-        water = Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
-        if world.waves:
-            # Episodes begin at any moment of the sea.
-            time_key = jax.random.fold_in(key, 2)
-            water = water._replace(time=jax.random.uniform(time_key, (trials,), maxval=_SEA))
-        return qpos, jax.tree.map(lambda x: jnp.broadcast_to(x, (trials,)), water)
+        rest = jnp.broadcast_to(rest, (rest.shape[0], place.shape[1]))
+        return jnp.concatenate([place, quat, rest]), water
 
     def gusts(self, key: jax.Array) -> jax.Array | None:
         """Gusts of a key's episodes.
@@ -195,26 +173,12 @@ class Fitness:
             `[steps + 1, 3, trials]` velocity around the episode's current [m/s], or None where the
             world has no gusts.
         """
-        world, steps = self.robot.world, self._records * self._every
-        if world.gust is None:
-            return None
-        gust_key = jax.random.fold_in(key, 1)
-        return gust_path(world.gust, gust_key, steps, world.timestep, self.config.task.trials)
+        steps = self._records * self._every
+        return draw_gusts(self.config.task, self.robot.world, key, steps)
 
     @cached_property
     def _reach(self) -> float:
-        """How far the rest pose reaches below the core's centre, in any attitude drawn [m]."""
-        points = []
-        for module in self.robot.morphology.modules:
-            for part in module.kind.parts:
-                low, high = part.bounds
-                for corner in np.ndindex(2, 2, 2):
-                    local = np.asarray(part.position) + np.where(corner, high, low)
-                    points.append(module.position + module.rotation @ local)
-        cloud = np.array(points)
-        tilt = min(3 * self.config.task.start_tilt, np.pi / 2)
-        radius = np.linalg.norm(cloud[:, :2], axis=1).max()
-        return float(-cloud[:, 2].min() * np.cos(tilt) + radius * np.sin(tilt))
+        return reach_below(self.robot, self.config.task)
 
     def _evaluate(self, population: Any, key: jax.Array) -> Any:
         task, world = self.config.task, self.robot.world
@@ -230,31 +194,17 @@ class Fitness:
         trial = None if gusts is None else lanes(jnp.arange(trials))
         episode = partial(self._episode, gusts=gusts)
         position, energy = over_chunks(episode)(genes, lanes(qpos), water, trial)
-        interval = self._every * world.timestep
-        first = min(round(task.settle / interval), position.shape[0] - 2)
-        kept = position[first:]
-        clearance = jnp.full_like(kept[:, 0], jnp.inf)
-        if world.bed is not None:
-            clearance = kept[:, 2] - bed_height(world.bed, kept[:, 0], kept[:, 1])
-        track = Track(
-            position=kept,
-            clearance=clearance,
-            energy=energy[first:],
-            interval=interval,
-            start_height=lanes(qpos)[2],
-            length=self.robot.morphology.length,
-            weight=self.robot.morphology.mass * max(world.gravity, 1e-9),
-            surface_height=world.surface_height,
+        return score_tracks(
+            self.config,
+            world,
+            position,
+            energy,
+            lanes(qpos)[:3],
+            self.robot.morphology.length,
+            self.robot.morphology.mass * max(world.gravity, 1e-9),
+            _reach(self.config, self.robot),
+            self._every * world.timestep,
         )
-        measures = measure(track)
-        score = TASKS[task.type](track, task) - task.energy_weight * measures["energy_j"]
-        away = jnp.max(jnp.abs(position - lanes(qpos)[:3]), (0, 1))
-        # Written so that NaN counts as too far.
-        sane = jnp.isfinite(score) & (away < _reach(self.config, self.robot))
-        score = jnp.where(sane, score, WORST)
-        mean = lambda x: jnp.mean(x.reshape(size, trials), 1)  # noqa: E731
-        sane_all = jnp.all(sane.reshape(size, trials), 1)
-        return jnp.where(sane_all, mean(score), WORST), {k: mean(v) for k, v in measures.items()}
 
     def _episode(
         self, genes: jax.Array, qpos: jax.Array, water: Water | None, trial: Any, gusts: Any
@@ -275,7 +225,7 @@ class Fitness:
             _, kept = roll_out(
                 self.engine,
                 lambda state, time, row, sense: controller.step(parameters, state, time, sense),
-                lambda time, row: flow_at(self.robot, still if row is None else row)(time, None),
+                lambda time, row: flow_at(world, still if row is None else row)(time, None),
                 lambda state, ctrl, energy: (self.engine.root(state), energy),
                 self.engine.init(qpos, qvel),
                 controller.init(parameters),
@@ -293,6 +243,124 @@ class Fitness:
             episode = loop
         place, energy = episode(qpos, parameters, water, rows)
         return jnp.stack(place, 1), energy
+
+
+def draw_starts(
+    task: TaskConfig, world: World, key: jax.Array, reach: Any
+) -> tuple[jax.Array, jax.Array, Water | None]:
+    """Start poses of the core, and water, of a key's episodes.
+
+    Args:
+        task: how starts vary.
+        world: the world.
+        key: draws them.
+        reach: how far robots reach below their core (`reach_below`) [m]; a crawler starts above
+            the bed by that.
+
+    Returns:
+        `[3, trials]` place [m], `[4, trials]` quaternion, and the water `[trials]` where it varies,
+        else None.
+    """
+    trials = task.trials
+    place_key, tilt_key, yaw_key, current_key = jax.random.split(key, 4)
+    place = task.start_position * jax.random.normal(place_key, (3, trials))
+    tilt = task.start_tilt * jax.random.normal(tilt_key, (2, trials))
+    yaw = task.start_yaw * jax.random.normal(yaw_key, (trials,))
+    if task.type == "crawl" and world.bed is not None:
+        # The lowest corner of any module 5 mm above the bed, whatever the tilt.
+        height = bed_height(world.bed, place[0], place[1]) + reach + 0.005
+        place = place.at[2].set(height)
+    else:
+        place = place.at[2].add(world.surface_height - task.depth)
+    quat = _euler_quat(tilt[0], tilt[1], yaw)
+    if task.current_std == 0 and not world.waves:
+        return place, quat, None
+    extra = task.current_std * jax.random.normal(current_key, (2, trials))
+    x, y, z = world.current
+    full = jnp.full((trials,), 0.0, place.dtype)
+    water = Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
+    if world.waves:
+        # Episodes begin at any moment of the sea.
+        time_key = jax.random.fold_in(key, 2)
+        water = water._replace(time=jax.random.uniform(time_key, (trials,), maxval=_SEA))
+    return place, quat, jax.tree.map(lambda x: jnp.broadcast_to(x, (trials,)), water)
+
+
+def draw_gusts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> jax.Array | None:
+    """Gusts of a key's episodes: `[steps + 1, 3, trials]` [m/s], or None without gusts."""
+    if world.gust is None:
+        return None
+    gust_key = jax.random.fold_in(key, 1)
+    return gust_path(world.gust, gust_key, steps, world.timestep, task.trials)
+
+
+def reach_below(robot: Robot, task: TaskConfig) -> float:
+    """How far the rest pose reaches below the core's centre, in any attitude drawn [m]."""
+    points = []
+    for module in robot.morphology.modules:
+        for part in module.kind.parts:
+            low, high = part.bounds
+            for corner in np.ndindex(2, 2, 2):
+                local = np.asarray(part.position) + np.where(corner, high, low)
+                points.append(module.position + module.rotation @ local)
+    cloud = np.array(points)
+    tilt = min(3 * task.start_tilt, np.pi / 2)
+    radius = np.linalg.norm(cloud[:, :2], axis=1).max()
+    return float(-cloud[:, 2].min() * np.cos(tilt) + radius * np.sin(tilt))
+
+
+def score_tracks(
+    config: Config,
+    world: World,
+    position: jax.Array,
+    energy: jax.Array,
+    start: jax.Array,
+    length: Any,
+    weight: Any,
+    farthest: float,
+    interval: float,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Scores and measures of individuals from the tracks of all their episodes.
+
+    Args:
+        config: task and trials; lanes run over individuals and, within each, over its episodes.
+        world: the world.
+        position: `[S, 3, lanes]` of the core [m].
+        energy: `[S, lanes]` since the row before [J].
+        start: `[3, lanes]` [m].
+        length: body length, a number or `[lanes]` [m].
+        weight: in air, likewise [N].
+        farthest: whoever gets further than this has blown up [m].
+        interval: between rows [s].
+
+    Returns:
+        `[P]` scores, and `[P]` measures.
+    """
+    task = config.task
+    first = min(round(task.settle / interval), position.shape[0] - 2)
+    kept = position[first:]
+    clearance = jnp.full_like(kept[:, 0], jnp.inf)
+    if world.bed is not None:
+        clearance = kept[:, 2] - bed_height(world.bed, kept[:, 0], kept[:, 1])
+    track = Track(
+        position=kept,
+        clearance=clearance,
+        energy=energy[first:],
+        interval=interval,
+        start_height=start[2],
+        length=length,
+        weight=weight,
+        surface_height=world.surface_height,
+    )
+    measures = measure(track)
+    score = TASKS[task.type](track, task) - task.energy_weight * measures["energy_j"]
+    away = jnp.max(jnp.abs(position - start), (0, 1))
+    # Written so that NaN counts as too far.
+    sane = jnp.isfinite(score) & (away < farthest)
+    score = jnp.where(sane, score, WORST)
+    mean = lambda x: jnp.mean(x.reshape(-1, task.trials), 1)  # noqa: E731
+    sane_all = jnp.all(sane.reshape(-1, task.trials), 1)
+    return jnp.where(sane_all, mean(score), WORST), {k: mean(v) for k, v in measures.items()}
 
 
 def _euler_quat(roll: Any, pitch: Any, yaw: Any) -> jax.Array:
@@ -346,11 +414,11 @@ def make_fitness(config: Config | str | Path | dict[str, Any], **overrides: Any)
     if settings.depth is None:
         settings = settings.model_copy(update={"depth": config.task.depth})
     controller = CONTROLLERS[settings.type](robot, settings)
-    contact = _may_touch_bed(config, robot)
+    contact = may_touch_bed(config, robot)
     return Fitness(config, robot, controller, make_engine(robot, config.engine, contact))
 
 
-def _may_touch_bed(config: Config, robot: Robot) -> bool:
+def may_touch_bed(config: Config, robot: Robot) -> bool:
     """Whether the bed is within reach of an episode; if not, the step needs no contact.
 
     Reach is what a robot at `_FASTEST` covers, plus its fall where the water does not carry it. An
@@ -367,14 +435,28 @@ def _may_touch_bed(config: Config, robot: Robot) -> bool:
 
 
 def _reach(config: Config, robot: Robot) -> float:
-    """How far from its start an episode may lead [m]."""
-    world, task = robot.world, config.task
-    current = np.linalg.norm(world.current) + 4 * task.current_std
-    fall = 0.0
-    if (
+    """How far from its start an episode of one robot may lead [m]."""
+    world = robot.world
+    sinks = (
         world.buoyancy == "off"
         or world.density * robot.morphology.volume < robot.morphology.mass / 2
-    ):
-        fall = 0.5 * world.gravity * task.duration**2
-    start = 4 * task.start_position + robot.morphology.length
-    return float((_FASTEST + current) * task.duration + fall + start)
+    )
+    return farthest(config, world, robot.morphology.length, sinks)
+
+
+def farthest(config: Config, world: World, length: float, sinks: bool) -> float:
+    """How far from its start an episode may lead [m].
+
+    Args:
+        config: its task.
+        world: the world.
+        length: of the robot [m].
+        sinks: whether the water carries less than half of its weight.
+
+    Returns:
+        The distance; who gets further has blown up.
+    """
+    task = config.task
+    current = np.linalg.norm(world.current) + 4 * task.current_std
+    fall = 0.5 * world.gravity * task.duration**2 if sinks else 0.0
+    return float((_FASTEST + current) * task.duration + fall + 4 * task.start_position + length)

@@ -186,17 +186,17 @@ def _matrix(quat: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
-def flow_at(robot: Robot, water: Water) -> Callable[[jax.Array, Any], Water]:
+def flow_at(world: World, water: Water) -> Callable[[jax.Array, Any], Water]:
     """The water at each moment of a rollout whose surface and current do not change.
 
     Args:
-        robot: in whose world.
+        world: the world.
         water: at the start; where there are waves, its time is when the rollout begins.
 
     Returns:
         What `roll_out` takes as `flow`.
     """
-    if not robot.world.waves:
+    if not world.waves:
         return lambda time, row: water
     return lambda time, row: water._replace(time=water.time + time)
 
@@ -227,10 +227,10 @@ def _compiled(
             )
         moving = None if still else water
         if moving is None:
-            flow = flow_at(robot, water_of(robot.world))
+            flow = flow_at(robot.world, water_of(robot.world))
         else:
             moving = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[:, None], moving)
-            flow = lambda time, row: flow_at(robot, row[1])(time, None)  # noqa: E731
+            flow = lambda time, row: flow_at(robot.world, row[1])(time, None)  # noqa: E731
         keep = lambda state, ctrl, energy: (state, ctrl, energy)  # noqa: E731
         _, (states, ctrl, energy) = roll_out(
             simulator,

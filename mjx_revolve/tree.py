@@ -246,7 +246,7 @@ def make_tree(robot: Robot, contact: bool = True) -> Tree:
         InputError: the model holds a joint that the population step cannot do; it is named.
     """
     m = robot.mj_model
-    depth, frames = _depths_and_frames(robot)
+    depth, frames = depths_and_frames(robot)
     servo = {int(m.actuator_trnid[k, 0]): k for k in robot.servos}
     bodies = [
         [b for b in depth if depth[b] == d] for d in range(max(depth.values(), default=0) + 1)
@@ -254,7 +254,7 @@ def make_tree(robot: Robot, contact: bool = True) -> Tree:
     levels = []
     for d, ids in enumerate(bodies):
         above = bodies[d - 1] if d else []
-        levels.append(_level(robot, ids, above, frames, servo, contact))
+        levels.append(make_level(robot, ids, above, frames, servo, contact))
     joints = [int(m.body_jntadr[b]) for ids in bodies[1:] for b in ids]
     return Tree(
         levels=tuple(levels),
@@ -266,7 +266,7 @@ def make_tree(robot: Robot, contact: bool = True) -> Tree:
     )
 
 
-def _depths_and_frames(robot: Robot) -> tuple[dict[int, int], dict[int, np.ndarray]]:
+def depths_and_frames(robot: Robot) -> tuple[dict[int, int], dict[int, np.ndarray]]:
     """Depth in the tree, and MuJoCo's body frame from ours, of each body.
 
     Raises:
@@ -293,7 +293,7 @@ def _depths_and_frames(robot: Robot) -> tuple[dict[int, int], dict[int, np.ndarr
     return depth, frames
 
 
-def _level(
+def make_level(
     robot: Robot,
     ids: list[int],
     above: list[int],
@@ -372,7 +372,7 @@ def _level(
     where = {b: k for k, b in enumerate(above)}
     if assigned is None:
         assigned = [list(np.flatnonzero(np.equal(robot.fluid.body, b))) for b in ids]
-    parts = _parts(robot, ids, frames, assigned)
+    parts = make_parts(robot, ids, frames, assigned)
     return Level(
         body=tuple(ids),
         frame=np.array([frames[b] for b in ids]),
@@ -387,7 +387,7 @@ def _level(
         box_size=_vec(box_size),
         parts=parts,
         propellers=_propellers(robot, ids, frames, parts),
-        points=_points(robot, ids, frames) if contact else None,
+        points=make_points(robot, ids, frames) if contact else None,
         **hinge,
     )
 
@@ -440,9 +440,10 @@ def _stack(rows: list[list[Any]], empty: Any) -> np.ndarray:
     return np.array([[row[k] if k < len(row) else empty for row in rows] for k in range(most)])
 
 
-def _parts(
+def make_parts(
     robot: Robot, ids: list[int], frames: dict[int, np.ndarray], assigned: list[list[int]]
 ) -> tuple[Parts, ...]:
+    """The groups of parts of some bodies; `assigned` as in `make_level`."""
     table = robot.fluid
     here = [p for row in assigned for p in row]
     laws = sorted({(table.buoyancy[p], table.drag[p]) for p in here})
@@ -595,7 +596,8 @@ def _main_geoms(robot: Robot) -> np.ndarray:
     return np.array(order)
 
 
-def _points(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Points | None:
+def make_points(robot: Robot, ids: list[int], frames: dict[int, np.ndarray]) -> Points | None:
+    """What may touch the bed, or None."""
     if robot.world.bed is None:
         return None
     rows = [list(np.flatnonzero(robot.contact_body == b)) for b in ids]

@@ -63,11 +63,12 @@ def _never_inlined(x: jax.Array) -> jax.Array:
     return set_xla_metadata(jax.jit(lambda y: y)(x), inlineable="false")
 
 
-def share_once(fun: Callable[..., Any]) -> Callable[..., Any]:
+def share_once(fun: Callable[..., Any], worth: float = _WORTH) -> Callable[..., Any]:
     """Makes XLA compute each value that `fun` uses more than once exactly once.
 
     Args:
         fun: a function of pytrees of arrays.
+        worth: least cost of a value that is worth storing, in plain operations.
 
     Returns:
         The same function, its multiply-used floating-point values behind calls that are not
@@ -86,13 +87,13 @@ def share_once(fun: Callable[..., Any]) -> Callable[..., Any]:
             return out
 
         closed = jax.make_jaxpr(flat)(*leaves)
-        out = _evaluate(closed.jaxpr, closed.consts, leaves)
+        out = _evaluate(closed.jaxpr, closed.consts, leaves, worth)
         return jax.tree.unflatten(out_tree[0], out)
 
     return shared
 
 
-def _evaluate(jaxpr: Any, consts: list[Any], args: list[Any]) -> list[Any]:
+def _evaluate(jaxpr: Any, consts: list[Any], args: list[Any], worth: float) -> list[Any]:
     """Runs a jaxpr again with a barrier behind each value that several equations read."""
     uses: dict[Any, int] = {}
     for eqn in jaxpr.eqns:
@@ -118,7 +119,7 @@ def _evaluate(jaxpr: Any, consts: list[Any], args: list[Any]) -> list[Any]:
         inner = eqn.params.get("jaxpr") if eqn.primitive.name in ("jit", "pjit") else None
         if inner is not None:
             # jnp.clip, jnp.where and their like are small jitted functions.
-            out = _evaluate(inner.jaxpr, inner.consts, inputs)
+            out = _evaluate(inner.jaxpr, inner.consts, inputs, worth)
         else:
             out = eqn.primitive.bind(*inputs, **eqn.params)
             out = out if eqn.primitive.multiple_results else [out]
@@ -127,16 +128,16 @@ def _evaluate(jaxpr: Any, consts: list[Any], args: list[Any]) -> list[Any]:
             cost.get(v, 0) for v in eqn.invars if not isinstance(v, core.Literal)
         )
         for v, x in zip(eqn.outvars, out, strict=True):
-            worth = (
+            stored = (
                 uses.get(v, 0) > 1
-                and spent >= _WORTH
+                and spent >= worth
                 and name not in _VIEWS
                 and jnp.issubdtype(v.aval.dtype, jnp.floating)
                 and v.aval.ndim > 0
                 and inner is None
             )
-            env[v] = _never_inlined(x) if worth else x
-            cost[v] = 0 if worth or inner is not None else spent
+            env[v] = _never_inlined(x) if stored else x
+            cost[v] = 0 if stored or inner is not None else spent
     return [read(v) for v in jaxpr.outvars]
 
 

@@ -138,7 +138,7 @@ def _marcher(robot: Robot, records: int, every: int, engine: str, still: bool):
         _, kept = roll_out(
             simulator,
             lambda state, time, row, sense: (state, targets),
-            flow_at(robot, water_of(robot.world) if still else water),
+            flow_at(robot.world, water_of(robot.world) if still else water),
             lambda state, ctrl, energy: (*simulator.observe(state), energy),
             simulator.init(qpos, qvel),
             (),

@@ -1,0 +1,305 @@
+"""Fitness of a population in which every individual has its own body.
+
+`make_mixed_fitness` fixes the world, the task, the controller's kind and the largest body once;
+then any bodies within that size run through one compiled program, generation after generation.
+Where all individuals happen to have one body, the faster program for that body is used instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjx_revolve.config import Config, load_config, make_config
+from mjx_revolve.controllers import CONTROLLERS, decode_sine, step_sine
+from mjx_revolve.errors import InputError
+from mjx_revolve.fitness import (
+    WORST,
+    Fitness,
+    draw_gusts,
+    draw_starts,
+    farthest,
+    may_touch_bed,
+    score_tracks,
+)
+from mjx_revolve.menagerie import Bodies, Shape, fit_shape, joint_of, pack_bodies
+from mjx_revolve.mixed_step import LANES, make_mixed_engine, to_rows
+from mjx_revolve.morphology import Morphology, trim_neutral
+from mjx_revolve.robot import Robot, build_robot, check_timestep
+from mjx_revolve.rollout import flow_at, gusty_water, make_engine, roll_out
+from mjx_revolve.water import water_of
+from mjx_revolve.world import World, load_world
+from mjx_revolve.xla import compiler_options, on_cpu, one_loop, over_chunks
+
+_INTERVAL = 0.1  # the track is sampled at least this often [s], as in `fitness`
+
+
+@dataclass(frozen=True, eq=False)
+class MixedFitness:
+    """Scores of different bodies: `fitness(robots, population, key)`.
+
+    Attributes:
+        config: task, world and controller; its morphology is not used.
+        world: the world.
+        shape: what the bodies must fit.
+        contact: whether they can touch the bed.
+    """
+
+    config: Config
+    world: World
+    shape: Shape
+    contact: bool
+    _single: dict[int, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def num_genes(self) -> int:
+        """Length of an individual's genes: those of the largest body; others leave some unused."""
+        return (2 * self.config.controller.harmonics + 1) * self.shape.hinges + 1
+
+    @property
+    def worst_score(self) -> float:
+        """The score of a rollout that blew up."""
+        return WORST
+
+    def build(self, morphology: Morphology) -> Robot:
+        """Compiles a body for this world, trimmed as the configuration says."""
+        if self.config.trim == "neutral":
+            morphology = trim_neutral(morphology, self.world.density)
+        return build_robot(morphology, self.world)
+
+    def pad_genes(self, genes: Any, robot: Robot) -> jax.Array:
+        """The genes of one body's own controller as this fitness takes them.
+
+        Args:
+            genes: `[..., (2 harmonics + 1) n + 1]`, n the robot's hinges, as `make_sine` has them.
+            robot: whose they are.
+
+        Returns:
+            `[..., num_genes]`: for each kind of gene, one for every hinge that a body may have.
+        """
+        genes = jnp.asarray(genes)
+        n, kinds = robot.num_hinges, 2 * self.config.controller.harmonics + 1
+        if genes.shape[-1] != kinds * n + 1:
+            raise InputError(f"genes: expected [..., {kinds * n + 1}]; found {list(genes.shape)}")
+        wide = genes[..., :-1].reshape(*genes.shape[:-1], kinds, n)
+        room = [(0, 0)] * (wide.ndim - 1) + [(0, self.shape.hinges - n)]
+        flat = jnp.pad(wide, room).reshape(*genes.shape[:-1], -1)
+        return jnp.concatenate([flat, genes[..., -1:]], -1)
+
+    def own_genes(self, genes: Any, robot: Robot) -> jax.Array:
+        """The way back: those of `[..., num_genes]` that a body's own controller takes."""
+        genes = jnp.asarray(genes)
+        kinds = 2 * self.config.controller.harmonics + 1
+        wide = genes[..., :-1].reshape(*genes.shape[:-1], kinds, self.shape.hinges)
+        flat = wide[..., : robot.num_hinges].reshape(*genes.shape[:-1], -1)
+        return jnp.concatenate([flat, genes[..., -1:]], -1)
+
+    def __call__(self, robots: Sequence[Robot] | Bodies, population: Any, key: jax.Array) -> Any:
+        """Scores a population; arguments as in `evaluate`."""
+        return self.evaluate(robots, population, key)[0]
+
+    def evaluate(
+        self, robots: Sequence[Robot] | Bodies, population: Any, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Scores a population and says how it moved.
+
+        Args:
+            robots: a body for each individual, from `build`; one object may stand there many
+                times. Or their tables, from `pack`.
+            population: `[P, num_genes]`.
+            key: draws the episodes' starts and water, the same for every individual.
+
+        Returns:
+            `[P]` scores and `[P]` measures, as `Fitness.evaluate` has them.
+
+        Raises:
+            InputError: the numbers of bodies and of individuals differ, or a body does not fit.
+        """
+        population = jnp.asarray(population)
+        if population.ndim != 2 or population.shape[1] != self.num_genes:
+            raise InputError(
+                f"population: expected [P, {self.num_genes}]; found {list(population.shape)}"
+            )
+        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((population, key)))
+        run = self._evaluate if traced else self._jitted
+        if isinstance(robots, Bodies):
+            return run(robots, population, key)
+        if len(robots) != len(population):
+            raise InputError(f"robots: expected {len(population)}, one each; found {len(robots)}")
+        if all(robot is robots[0] for robot in robots):
+            single = self._alone(robots[0])
+            return single.evaluate(self.own_genes(population, robots[0]), key)
+        return run(self.pack(robots), population, key)
+
+    def pack(self, robots: Sequence[Robot]) -> Bodies:
+        """Tables of the bodies, for many evaluations of the same ones."""
+        return pack_bodies(robots, self.shape)
+
+    def _alone(self, robot: Robot) -> Fitness:
+        """The fitness of one body, its compiled program kept."""
+        if id(robot) not in self._single:
+            controller = CONTROLLERS[self.config.controller.type](robot, self.config.controller)
+            engine = make_engine(robot, self.config.engine, self.contact)
+            # The robot goes along, so that its id is not given to another.
+            self._single[id(robot)] = Fitness(self.config, robot, controller, engine)
+        return self._single[id(robot)]
+
+    @cached_property
+    def _jitted(self) -> Any:
+        return jax.jit(self._evaluate, compiler_options=compiler_options())
+
+    @property
+    def _every(self) -> int:
+        return max(1, int(_INTERVAL / self.world.timestep + 1e-6))
+
+    @property
+    def _records(self) -> int:
+        return max(2, round(self.config.task.duration / (self._every * self.world.timestep)))
+
+    def _evaluate(self, bodies: Bodies, population: Any, key: jax.Array) -> Any:
+        task, world = self.config.task, self.world
+        size, trials = population.shape[0], task.trials
+        place, quat, water = draw_starts(task, world, key, 0.0)
+        lanes = lambda x: jnp.tile(x, (1,) * (x.ndim - 1) + (size,))  # noqa: E731
+        wide = lambda x: jnp.repeat(jnp.asarray(x), trials, -1)  # noqa: E731
+        bodies = jax.tree.map(wide, bodies)
+        root = lanes(jnp.concatenate([place, quat])).astype(population.dtype)
+        if task.type == "crawl":
+            root = root.at[2].add(bodies.below)
+        water = None if water is None else jax.tree.map(lanes, water)
+        gusts = draw_gusts(task, world, key, self._records * self._every)
+        trial = None if gusts is None else lanes(jnp.arange(trials))
+        chunk = LANES if on_cpu() else None
+        episode = over_chunks(partial(self._episode, gusts=gusts), chunk)
+        position, energy = episode(bodies, wide(population.T), root, water, trial)
+        return score_tracks(
+            self.config,
+            world,
+            position,
+            energy,
+            root[:3],
+            bodies.length,
+            jnp.maximum(bodies.weight, 1e-9),
+            farthest(self.config, world, self._longest, sinks=True),
+            self._every * world.timestep,
+        )
+
+    @property
+    def _longest(self) -> float:
+        # Longer than any body of so many rows: what has blown up is far beyond it.
+        return 0.2 * self.shape.rows
+
+    def _episode(
+        self, bodies: Bodies, genes: Any, root: Any, water: Any, trial: Any, gusts: Any
+    ) -> Any:
+        """Track of one chunk: `[S, 3, lanes]` positions and `[S, lanes]` energies."""
+        world, shape, settings = self.world, self.shape, self.config.controller
+        count = root.shape[-1]
+        kinds = genes[:-1].reshape(-1, shape.hinges, count)
+        low, high = joint_of(shape, bodies.tables).target
+        half = jnp.broadcast_to(jnp.asarray((high - low) / 2, genes.dtype), (shape.rows, count))
+        center = jnp.broadcast_to(jnp.asarray((high + low) / 2, genes.dtype), half.shape)
+        moves = bodies.hinge < shape.hinges
+        parameters = decode_sine(
+            [to_rows(bodies, row) for row in kinds],
+            genes[-1:],
+            jnp.where(moves, settings.amplitude * half, 0),
+            jnp.where(moves, center, 0),
+            settings.max_frequency,
+        )
+        rest = jnp.zeros((shape.hinges, count), root.dtype)
+        qpos = jnp.concatenate([root, rest])
+        qvel = jnp.zeros((6 + shape.hinges, count), root.dtype)
+        start = make_mixed_engine(world, shape, bodies).init(qpos, qvel)
+        rows = None
+        if gusts is not None:
+            rows = gusty_water(world, gusts[..., trial], water)
+            steps = gusts.shape[0] - 1
+            rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps, count)), rows)
+
+        def loop(
+            bodies: Any, start: Any, parameters: Any, water: Any, rows: Any, derived: bool = False
+        ) -> Any:
+            engine = make_mixed_engine(world, shape, bodies)
+            still = water_of(world) if water is None else water
+            _, kept = roll_out(
+                engine,
+                lambda state, time, row, sense: step_sine(parameters, state, time, sense),
+                lambda time, row: flow_at(world, still if row is None else row)(time, None),
+                lambda state, ctrl, energy: (engine.root(state), energy),
+                start,
+                (),
+                rows,
+                records=self._records,
+                every=self._every,
+                timestep=world.timestep,
+                derived=derived,
+            )
+            return kept
+
+        episode = one_loop(loop, partial(loop, derived=True))
+        place, energy = episode(bodies, start, parameters, water, rows)
+        return jnp.stack(place, 1), energy
+
+
+def make_mixed_fitness(
+    config: Config | str | Path | dict[str, Any],
+    examples: Sequence[Morphology],
+    hinges: int = 0,
+    rows: int = 0,
+    **overrides: Any,
+) -> MixedFitness:
+    """Builds the fitness function of a configuration for bodies of many kinds.
+
+    Args:
+        config: as `make_fitness` takes it; its morphology is not used.
+        examples: bodies of the kinds that will come: what is the same in all of them counts as
+            constant, and the largest of them sets the size.
+        hinges: most hinges that a body may have, if more than the examples'.
+        rows: most rows of tables that a body may need (see `menagerie`), likewise.
+        **overrides: as in `make_fitness`.
+
+    Returns:
+        The fitness function.
+
+    Raises:
+        InputError: the configuration or the world is wrong, or asks for what only bodies of one
+            kind may have; the message says where.
+    """
+    if isinstance(config, Config):
+        if overrides:
+            config = make_config(config.model_dump(), overrides=overrides, source=config.source)
+    elif isinstance(config, dict):
+        config = make_config(config, overrides=overrides)
+    else:
+        config = load_config(config, overrides=overrides)
+    where = config.source
+    if config.engine != "population":
+        raise InputError(
+            f"{where}: engine: expected population, as bodies differ; found {config.engine}"
+        )
+    if config.controller.type != "sine":
+        raise InputError(
+            f"{where}: controller.type: expected sine, as bodies differ; found "
+            f"{config.controller.type}"
+        )
+    try:
+        world = load_world(config.world_name, **config.world_overrides)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    if config.task.type == "crawl" and world.bed is None:
+        raise InputError(f"{where}: task.type: crawl expected a world with a bed; found none")
+    draft = MixedFitness(config, world, Shape(0, 1, 1, 1, 0, (), False), False)
+    robots = [draft.build(morphology) for morphology in examples]
+    for robot in robots:
+        check_timestep(robot)
+    if not robots:
+        raise InputError("examples: expected at least one morphology; found none")
+    contact = any(may_touch_bed(config, robot) for robot in robots)
+    return MixedFitness(config, world, fit_shape(robots, contact, hinges, rows), contact)

@@ -1,0 +1,420 @@
+"""One step of a population in which every individual may have another body.
+
+The same physics as `dynamics`, from tables of numbers that differ from lane to lane
+(`menagerie.Bodies`). All that a body does by itself, water included, is computed for all rows at
+once; the three sweeps along the tree are loops over the rows with a short stack, so the program,
+and the time to compile it, do not grow with the trees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.articulated import lift_off, solve_root, to_parent, upper
+from mjx_revolve.bodies import Block, Motion
+from mjx_revolve.dynamics import (
+    Engine,
+    Sense,
+    State,
+    advance,
+    felt_gravity,
+    is_pulled,
+    own_inertia,
+    turn_hinges,
+)
+from mjx_revolve.menagerie import Bodies, Shape, joint_of, level_of
+from mjx_revolve.servos import end_stop, servo
+from mjx_revolve.spatial import (
+    Scalar,
+    Vec,
+    add,
+    cross,
+    dot,
+    full,
+    matTvec,
+    mul,
+    neg,
+    quat_to_rows,
+    sub,
+    transpose,
+    vadd,
+    vsub,
+)
+from mjx_revolve.water import Water, needs_place
+from mjx_revolve.world import World
+from mjx_revolve.xla import share_once
+
+# Least cost at which a value is stored rather than computed twice [-]; see `xla`. Less than for
+# bodies of one kind: the loops over rows hold few values at a time (measured: 15 % faster).
+_WORTH = 1
+# Individuals stepped together; see `xla.LANES` (measured: 15 % faster than 64).
+LANES = 128
+
+# ------------------------------------------------------------------ the stack
+
+
+def _pick(stack: list[Any], slot: Scalar) -> Any:
+    """What stands in a slot, lane by lane; anything where there is no such slot."""
+    found = stack[0]
+    for k in range(1, len(stack)):
+        found = jax.tree.map(lambda a, b, k=k: jnp.where(slot == k, b, a), found, stack[k])
+    return found
+
+
+def _put(stack: list[Any], slot: Scalar, value: Any) -> list[Any]:
+    """The stack with a value in a slot; unchanged where there is no such slot."""
+    return [
+        jax.tree.map(lambda a, b, k=k: jnp.where(slot == k, b, a), old, value)
+        for k, old in enumerate(stack)
+    ]
+
+
+def _give(stack: list[Any], own: Scalar, to: Scalar, value: Any) -> list[Any]:
+    """Adds a row's value to its parent's slot.
+
+    A row that stands in its parent's own slot leads to the largest subtree and comes first on the
+    way up: it replaces what stands there, the sums that it has itself taken in.
+    """
+    before = _pick(stack[:-1], to) if len(stack) > 1 else value
+    summed = jax.tree.map(lambda new, old: new + jnp.where(to == own, 0, old), value, before)
+    return _put(stack, to, summed)
+
+
+def _sweep(
+    body: Callable[[Any, Any], tuple[Any, Any]],
+    carry: Any,
+    rows: Any,
+    kept: Any,
+    reverse: bool = False,
+) -> tuple[Any, Any]:
+    """A loop over rows: upwards over all of them, downwards over all but the root.
+
+    Args:
+        body: (carry, row) → (carry, what to keep of the row).
+        carry: before the first row.
+        rows: leaves `[rows, ...]`, or plain numbers that all rows share.
+        kept: what is kept of the root on the way down, leaves `[...]`.
+        reverse: upwards, from the last row to the root.
+
+    Returns:
+        The carry behind the last row, and what was kept, leaves `[rows, ...]`.
+    """
+    leaves, tree = jax.tree.flatten(rows)
+    moving = [x for x in leaves if isinstance(x, jax.Array)]
+
+    def visit(carry: Any, xs: Any) -> tuple[Any, Any]:
+        rest = iter(xs)
+        row = [next(rest) if isinstance(x, jax.Array) else x for x in leaves]
+        return body(carry, jax.tree.unflatten(tree, row))
+
+    shared = share_once(visit, _WORTH)
+    if reverse:
+        return jax.lax.scan(shared, carry, moving, reverse=True)
+    carry, new = jax.lax.scan(shared, carry, [x[1:] for x in moving])
+    return carry, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), kept, new)
+
+
+# ------------------------------------------------------------------ the sweeps
+
+
+def _wide(value: Any, lanes: int, dtype: Any) -> Any:
+    """Every number of one row as an array `[lanes]`."""
+
+    def widen(x: Any) -> jax.Array:
+        x = jnp.asarray(x, dtype)
+        return jnp.broadcast_to(x[0] if x.ndim == 2 else x, (lanes,))
+
+    return jax.tree.map(widen, value)
+
+
+def _flatten(block: Block, bias: tuple[Vec, Vec], symmetric: bool) -> tuple[Any, ...]:
+    """A block and its bias as the numbers that are their own."""
+    if symmetric:
+        return upper(block.angular), block.across, upper(block.linear), bias
+    return tuple(block), bias
+
+
+def _unflatten(value: tuple[Any, ...], symmetric: bool) -> tuple[Block, tuple[Vec, Vec]]:
+    if symmetric:
+        angular, across, linear, bias = value
+        return Block(full(angular), across, transpose(across), full(linear)), bias
+    block, bias = value
+    return Block(*block), bias
+
+
+def _coriolis(rate: tuple[Vec, Vec], speed: Scalar) -> tuple[Vec, Vec]:
+    """Velocity times joint velocity (Featherstone's c_J): ν × (z q̇)."""
+    spin, velocity = rate
+    return (
+        (mul(spin[1], speed), neg(mul(spin[0], speed)), 0.0),
+        (mul(velocity[1], speed), neg(mul(velocity[0], speed)), 0.0),
+    )
+
+
+def _child_rate(turn: Any, position: Vec, rate: tuple[Vec, Vec], speed: Scalar) -> Any:
+    """Angular and linear velocity of a child from those of its parent."""
+    spin, velocity = rate
+    below = matTvec(turn, spin)
+    return (below[0], below[1], add(below[2], speed)), matTvec(
+        turn, vadd(velocity, cross(spin, position))
+    )
+
+
+def _strip(x: Any) -> Any:
+    """`[1, lanes]` to `[lanes]`; numbers stay."""
+    return jax.tree.map(lambda y: y[0] if isinstance(y, jax.Array) else y, x)
+
+
+def _lift(x: Any) -> Any:
+    """`[lanes]` to `[1, lanes]`."""
+    return jax.tree.map(lambda y: y[None] if isinstance(y, jax.Array) else y, x)
+
+
+def _acceleration(
+    world: World,
+    shape: Shape,
+    bodies: Bodies,
+    state: State,
+    targets: jax.Array,
+    water: Water,
+    dt: float,
+) -> tuple[Vec, Vec, jax.Array, jax.Array]:
+    """Accelerations, as `dynamics` has them; hinges `[rows, lanes]`."""
+    symmetric = not (shape.carries and dt)
+    dtype, lanes = state.position[0].dtype, state.position[0].shape[0]
+    located = is_pulled(water) or needs_place(world) or shape.points > 0
+    angle, speed = state.angle[0], state.speed[0]
+    midway = speed
+    turn_root = quat_to_rows(state.quat)
+    rate = (state.spin, matTvec(turn_root, state.velocity))
+    root: dict[str, Any] = {"rate": rate, "up": turn_root[2], "height": state.position[2]}
+    if state.pace and dt:
+        half = lambda v, a: add(v, mul(0.5 * dt, a))  # noqa: E731
+        linear, angular, hinges = state.pace
+        root["middle"] = (tuple(map(half, rate[0], angular)), tuple(map(half, rate[1], linear)))
+        midway = half(speed, hinges[0])
+    if located:
+        root["axes"] = (turn_root[0], turn_root[1])
+        root["place"] = tuple(state.position[:2])
+    joint_tables = {k: x for k, x in bodies.tables.items() if k.startswith("joint.")}
+
+    def down(stack: list[Any], row: Any) -> tuple[list[Any], Any]:
+        source, own, table, angle, speed, midway = row
+        joint = joint_of(shape, table)
+        turn, position = turn_hinges(joint, angle), joint.position
+        parent = _pick(stack, source)
+        value: dict[str, Any] = {
+            "rate": _child_rate(turn, position, parent["rate"], speed),
+            "up": matTvec(turn, parent["up"]),
+            "height": add(parent["height"], dot(parent["up"], position)),
+        }
+        if "middle" in root:
+            value["middle"] = _child_rate(turn, position, parent["middle"], midway)
+        if located:
+            value["axes"] = tuple(matTvec(turn, axis) for axis in parent["axes"])
+            value["place"] = tuple(
+                add(x, dot(axis, position))
+                for x, axis in zip(parent["place"], parent["axes"], strict=True)
+            )
+        value, turn = _wide((value, turn), lanes, dtype)
+        return _put(stack, own, value), (value, turn)
+
+    one, zero = jnp.ones(lanes, dtype), jnp.zeros(lanes, dtype)
+    upright = tuple(tuple(one if i == j else zero for j in range(3)) for i in range(3))
+    slots = (bodies.source, bodies.slot)
+    _, (motions, turns) = _sweep(
+        down,
+        [root] * shape.slots,
+        (*slots, joint_tables, angle, speed, midway),
+        (root, upright),
+    )
+
+    def up(carry: Any, row: Any) -> tuple[Any, Any]:
+        stack, power = carry
+        source, own_slot, inner, table, motion, turn, angle, speed, midway, target = row
+        level = level_of(shape, table)
+        seen = _lift(motion)
+        moving = Motion(
+            *seen["rate"], seen["up"], seen["height"],
+            *seen.get("axes", (None, None)), seen.get("place"),
+        )  # fmt: skip
+        gravity = felt_gravity(world, water, moving)
+        swirling = seen.get("middle", seen["rate"])
+        own = own_inertia(world, shape.carries, level, moving, swirling, water, (), gravity, dt)
+        # A slot that nobody has filled for this row holds what another row has left.
+        summed = jax.tree.map(
+            lambda a, b: a + jnp.where(inner, b, 0),
+            _wide(_flatten(*own, symmetric), lanes, dtype),
+            _pick(stack, own_slot),
+        )
+        block, bias = _unflatten(summed, symmetric)
+        joint = joint_of(shape, table)
+        stop, stop_inertia = end_stop(joint, angle, speed, dt)
+        load = sub(stop, mul(joint.damping, speed))
+        inertia = add(joint.armature, add(mul(dt, joint.damping), stop_inertia))
+        motor, motor_inertia = servo(
+            joint, angle, speed, target, dt,
+            add(block.angular[2][2], inertia), sub(load, bias[0][2]),
+        )  # fmt: skip
+        coriolis = _coriolis(motion.get("middle", motion["rate"]), midway)
+        left, bias, hinge = lift_off(
+            block, bias, add(inertia, motor_inertia), add(motor, load), coriolis, symmetric
+        )
+        moved, bias = to_parent(turn, joint.position, left, bias, symmetric)
+        value = _wide(_flatten(moved, bias, symmetric), lanes, dtype)
+        stack = _give(stack, own_slot, source, value)
+        hinge = _wide(tuple(hinge), lanes, dtype)
+        return (stack, add(power, jnp.abs(motor * speed))), hinge
+
+    empty = _wide(_flatten(*_no_block(), symmetric), lanes, dtype)
+    (stack, power), hinges = _sweep(
+        up,
+        ([empty] * shape.slots, zero),
+        (*slots, bodies.inner, bodies.tables, motions, turns, angle, speed, midway, targets),
+        None,
+        reverse=True,
+    )
+    angular, linear = solve_root(*_unflatten(stack[0], symmetric), symmetric)
+
+    def out(stack: list[Any], row: Any) -> tuple[list[Any], Any]:
+        source, own, table, turn, rate, midway, hinge = row
+        row_a, row_l, inverse, rest = hinge
+        position, coriolis = joint_of(shape, table).position, _coriolis(rate, midway)
+        above_a, above_l = _pick(stack, source)
+        a = vadd(matTvec(turn, above_a), coriolis[0])
+        b = vadd(matTvec(turn, vadd(above_l, cross(above_a, position))), coriolis[1])
+        acceleration = mul(inverse, sub(sub(rest, dot(row_a, a)), dot(row_l, b)))
+        value = _wide(((a[0], a[1], add(a[2], acceleration)), b), lanes, dtype)
+        return _put(stack, own, value), acceleration
+
+    rate = motions.get("middle", motions["rate"])
+    _, found = _sweep(
+        out,
+        [(angular, linear)] * shape.slots,
+        (*slots, joint_tables, turns, rate, midway, hinges),
+        zero,
+    )
+    return linear, angular, found, power
+
+
+def _no_block() -> tuple[Block, tuple[Vec, Vec]]:
+    none = ((0.0,) * 3,) * 3
+    return Block(none, none, none, none), ((0.0,) * 3, (0.0,) * 3)
+
+
+# ------------------------------------------------------------------ the engine
+
+
+def make_mixed_engine(world: World, shape: Shape, bodies: Bodies) -> Engine:
+    """The population step of different bodies.
+
+    Args:
+        world: around all of them.
+        shape: of the tables.
+        bodies: of the individuals that are stepped together; arrays of JAX, traced or not.
+
+    Returns:
+        The engine. Its qpos is `[7 + hinges, lanes]`, each robot's own first and zeros behind them;
+        its ctrl is `[rows, lanes]`, row by row (`bodies.hinge`).
+    """
+    dt = world.timestep
+
+    def init(qpos: jax.Array, qvel: jax.Array) -> State:
+        length = jnp.sqrt(jnp.sum(qpos[3:7] ** 2, 0))
+        angle, speed = to_rows(bodies, qpos[7:]), to_rows(bodies, qvel[6:])
+        velocity, spin = tuple(qvel[:3]), tuple(qvel[3:6])
+        pace = (velocity, spin, (speed,)) if shape.carries else ()
+        return State(
+            position=tuple(qpos[:3]),
+            quat=tuple(qpos[3:7] / length),
+            velocity=velocity,
+            spin=spin,
+            angle=(angle,),
+            speed=(speed,),
+            pace=jax.tree.map(jnp.zeros_like, pace),
+        )
+
+    def observe(state: State) -> tuple[jax.Array, jax.Array]:
+        return (
+            jnp.concatenate(
+                [jnp.stack([*state.position, *state.quat]), to_hinges(bodies, state.angle[0])]
+            ),
+            jnp.concatenate(
+                [jnp.stack([*state.velocity, *state.spin]), to_hinges(bodies, state.speed[0])]
+            ),
+        )
+
+    def step(state: State, ctrl: jax.Array, water: Water) -> tuple[State, jax.Array]:
+        relative = state._replace(velocity=vsub(state.velocity, water.current))
+        linear, angular, hinges, power = _acceleration(
+            world, shape, bodies, relative, ctrl, water, dt
+        )
+        return advance(state, water, (linear, angular, (hinges,)), dt, shape.carries), power
+
+    def sense(state: State) -> Sense:
+        return Sense(
+            state.position[2] - world.surface_height,
+            state.velocity[2],
+            quat_to_rows(state.quat)[2],
+            state.spin,
+        )
+
+    def command(state: State) -> jax.Array:
+        return jnp.zeros((0, *state.spin[0].shape), state.spin[0].dtype)
+
+    order = np.arange(shape.rows)
+    return Engine(init, step, observe, lambda state: state.position, sense, command, order)
+
+
+def to_rows(bodies: Bodies, hinges: jax.Array) -> jax.Array:
+    """`[hinges, lanes]` in each robot's order to `[rows, lanes]`; 0 where there is no hinge."""
+    padded = jnp.concatenate([hinges, jnp.zeros_like(hinges[:1])])
+    return jnp.take_along_axis(padded, jnp.asarray(bodies.hinge), 0)
+
+
+def to_hinges(bodies: Bodies, rows: jax.Array) -> jax.Array:
+    """The way back: `[rows, lanes]` to `[hinges, lanes]`."""
+    padded = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
+    return jnp.take_along_axis(padded, jnp.asarray(bodies.row), 0)
+
+
+def acceleration(
+    world: World,
+    shape: Shape,
+    bodies: Bodies,
+    qpos: jax.Array,
+    qvel: jax.Array,
+    ctrl: jax.Array,
+    water: Water,
+) -> jax.Array:
+    """Acceleration in MuJoCo's coordinates, as `dynamics.acceleration`, each robot's first.
+
+    Args:
+        world: around all of them.
+        shape: of the tables.
+        bodies: the individuals.
+        qpos: `[7 + hinges, lanes]`.
+        qvel: `[6 + hinges, lanes]`.
+        ctrl: `[hinges, lanes]` joint targets [rad].
+        water: surface and current.
+
+    Returns:
+        `[6 + hinges, lanes]`.
+    """
+    engine = make_mixed_engine(world, shape, bodies)
+    state = engine.init(qpos, qvel)._replace(pace=())
+    relative = state._replace(velocity=vsub(state.velocity, water.current))
+    linear, angular, hinges, _ = _acceleration(
+        world, shape, bodies, relative, to_rows(bodies, ctrl), water, 0.0
+    )
+    turn = quat_to_rows(state.quat)
+    seen = matTvec(turn, relative.velocity)
+    pushed = vadd(linear, cross(state.spin, seen))
+    linear = tuple(dot(row, pushed) for row in turn)
+    root = jnp.stack([*vadd(linear, water.acceleration), *angular])
+    return jnp.concatenate([root, to_hinges(bodies, hinges)])
