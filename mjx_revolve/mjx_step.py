@@ -3,6 +3,7 @@
 MJX computes kinematics, the joint-space inertia and bias forces of each individual; the water's
 forces, the carried water's inertia and the servos come from the same functions as in the population
 step and enter through the bodies' Jacobians. So the two engines share the laws, not the mechanics.
+The bed is the population step's penalty law or, where the world says so, MJX's contact solver.
 """
 
 from __future__ import annotations
@@ -24,7 +25,12 @@ from mjx_revolve.water import Water
 
 mjx = import_mjx()
 # Not exported, but the only way to the stages of a step and to a body's Jacobian.
-from mujoco.mjx._src import forward, support  # noqa: E402
+from mujoco.mjx._src import forward, solver, support  # noqa: E402
+
+_OFF = mujoco.mjtDisableBit
+# Newton's steps of the contact solver and of its line search. MJX takes all steps of the search for
+# every lane; MuJoCo's 50 change nothing. A choice.
+_STEPS, _SEARCH = 20, 8
 
 
 def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
@@ -40,24 +46,31 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
     Raises:
         InputError: the model holds a joint that the water's tables cannot follow.
     """
-    tree = make_tree(robot, contact)
     m, world = robot.mj_model, robot.world
+    solves = contact and world.bed is not None and world.bed.contact == "mjx"
+    tree = make_tree(robot, contact and not solves)
     dt = world.timestep
-    check_timestep(robot)
+    check_timestep(robot, "mjx")
     propellers = sorted(
         (p for level in tree.levels for p in level.propellers), key=lambda p: p.index
     )
-    model = robot.mjx_model
-    # End stops and the bed are our own penalty laws, the same as in the population step.
-    off = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model = model.replace(opt=model.opt.replace(disableflags=int(model.opt.disableflags) | off))
+    models: dict[Any, Any] = {}
 
-    def forward_parts(qpos: Any, qvel: Any) -> Any:
-        data = mjx.make_data(model).replace(qpos=qpos, qvel=qvel)
-        data = forward.fwd_position(model, data)
+    def model_of(dtype: Any) -> Any:
+        # One for each precision: a model keeps the digits of the mode that it was made in.
+        if dtype not in models:
+            with jax.ensure_compile_time_eval():
+                model = mjx.put_model(m)
+            models[dtype] = model.replace(opt=_options(model.opt, solves))
+        return models[dtype]
+
+    def forward_parts(model: Any, qpos: Any, qvel: Any, seen: Any) -> Any:
+        """All that follows from place and velocity; contacts see the velocity over the ground."""
+        data = mjx.make_data(model).replace(qpos=qpos, qvel=seen)
+        data = forward.fwd_position(model, data).replace(qvel=qvel)
         return forward.fwd_velocity(model, data)
 
-    def jacobians(data: Any, level: Any) -> tuple[Any, Any]:
+    def jacobians(model: Any, data: Any, level: Any) -> tuple[Any, Any]:
         """`[nbody, 6, nv]` of the level's bodies, in their own frames, and `[nbody, 3, 3]` axes."""
         rows, axes = [], []
         for body, frame in zip(level.body, level.frame, strict=True):
@@ -76,16 +89,17 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
             [qpos[:3] + time * qvel[:3], jnp.stack(quat), qpos[7:] + time * qvel[6:]]
         )
 
-    def velocities(qpos: Any, qvel: Any) -> list[Any]:
+    def velocities(model: Any, qpos: Any, qvel: Any) -> list[Any]:
         data = mjx.kinematics(model, mjx.make_data(model).replace(qpos=qpos))
         data = mjx.com_pos(model, data)
-        return [jnp.einsum("bij,j->bi", jacobians(data, x)[0], qvel) for x in tree.levels]
+        return [jnp.einsum("bij,j->bi", jacobians(model, data, x)[0], qvel) for x in tree.levels]
 
     def one(qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, water: Water) -> Any:
-        zero = jnp.zeros((), qpos.dtype)
+        model, zero = model_of(qpos.dtype), jnp.zeros((), qpos.dtype)
         current, acceleration = (
             jnp.stack([zero + x for x in xs]) for xs in (water.current, water.acceleration)
         )
+        seen = qvel
         qvel = qvel.at[:3].add(-current)  # as seen from the current
         # Momenta that turn are taken half a step ahead (see `dynamics._acceleration`).
         ahead = qvel
@@ -93,16 +107,18 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
             turn = _rows(qpos)
             ahead = qvel + 0.5 * dt * pace.at[:3].set(turn @ pace[:3])
         # With carried water the bodies' own momenta turn with it, below; else MuJoCo's terms hold.
-        data = forward_parts(qpos, jnp.zeros_like(qvel) if tree.carries else qvel)
+        moving = jnp.zeros_like(qvel) if tree.carries else qvel
+        data = forward_parts(model, qpos, moving, seen)
         mass = support.full_m(model, data)
         friction = jnp.asarray(m.dof_damping, qpos.dtype)
         force = data.qfrc_passive - data.qfrc_bias - friction * (qvel if tree.carries else 0.0)
         # The current's acceleration is felt as weight is.
         force = force - mass[:, :3] @ acceleration
         # Spatial acceleration of each body when no joint accelerates: d/dt of J at constant q̇.
-        _, still = jax.jvp(lambda t: velocities(moved(qpos, ahead, t), ahead), (zero,), (zero + 1,))
+        drift = lambda t: velocities(model, moved(qpos, ahead, t), ahead)  # noqa: E731
+        _, still = jax.jvp(drift, (zero,), (zero + 1,))
         for level, drift_rate in zip(tree.levels, still, strict=True):
-            jacobian, axes = jacobians(data, level)
+            jacobian, axes = jacobians(model, data, level)
             rate = jnp.einsum("bij,j->bi", jacobian, qvel)
             rate_ahead = jnp.einsum("bij,j->bi", jacobian, ahead)
             column = lambda x: tuple(x[:, i, None] for i in range(3))  # noqa: E731
@@ -162,8 +178,10 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
             force = force.at[v].add(torque[:, 0])
             mass = mass.at[v, v].add(inertia[:, 0])
             moved_inertia, load = [], []
-            for j, jacobian, drifting in zip(v, jacobians(data, level)[0], drift_rate, strict=True):
-                below = np.array([k for k in range(m.nv) if k != j and _descends(m, k, j)], int)
+            jacobian_of, _ = jacobians(model, data, level)
+            for j, jacobian, drifting in zip(v, jacobian_of, drift_rate, strict=True):
+                # 32 bits: JAX keeps one typed copy of an array that it meets, in either mode.
+                below = np.array([k for k in range(m.nv) if _descends(m, k, j)], np.int32)
                 row, load_j = mass[j], force[j]
                 if len(below):
                     inner = mass[np.ix_(below, below)]
@@ -189,14 +207,18 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
             stop = start
         kind = "gen" if tree.carries else "pos"
         rates = jax.scipy.linalg.solve(mass, force, assume_a=kind)
+        if solves:
+            smooth = rates.at[:3].add(acceleration)
+            push = _contact_force(model, data, mass, smooth)
+            rates = rates + jax.scipy.linalg.solve(mass, push, assume_a=kind)
         new = qvel + dt * rates
         turn = _rows(qpos)
-        seen = turn.T @ qvel[:3]
+        before = turn.T @ qvel[:3]
         pace = rates.at[:3].set(turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3]))
         if tree.carries:
             quat = turn_quat(tuple(qpos[3:7]), tuple(new[3:6]), dt)
             turned = jnp.stack([jnp.stack(r) for r in quat_to_rows(quat)])
-            new = new.at[:3].set(turned @ (seen + dt * pace[:3]))
+            new = new.at[:3].set(turned @ (before + dt * pace[:3]))
         new = new.at[:3].add(current + dt * acceleration)
         return moved(qpos, new, jnp.asarray(dt, qpos.dtype)), new, pace, power
 
@@ -246,6 +268,53 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         command,
         np.arange(m.nu),
     )
+
+
+def _options(options: Any, solves: bool) -> Any:
+    """MJX's options without what is ours: the end stops, and the bed unless MJX solves it."""
+    flags = int(options.disableflags)
+    if not solves:
+        flags |= _OFF.mjDSBL_CONSTRAINT | _OFF.mjDSBL_CONTACT
+        return options.replace(disableflags=flags)
+    # Each step starts the solver afresh, so that a state is all that a step depends on.
+    flags |= _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_WARMSTART
+    return options.replace(
+        disableflags=flags,
+        iterations=_STEPS,
+        ls_iterations=_SEARCH,
+        # The mass matrix is put in whole, below.
+        jacobian=mujoco.mjtJacobian.mjJAC_DENSE,
+    )
+
+
+def _contact_force(model: Any, data: Any, mass: jax.Array, smooth: jax.Array) -> jax.Array:
+    """Generalised force of the bed on the robot, by MJX's constraint solver.
+
+    MuJoCo's contact model (Todorov 2014, Convex and analytically-invertible dynamics with contacts
+    and constraints): among accelerations a, the least of ½ (a - a₀)ᵀ M (a - a₀) plus the contacts'
+    soft constraints on J a. Here a₀ is the acceleration that our scheme gives without contact, and
+    M the symmetric part of the matrix that it solves with: inertia, carried water, and the implicit
+    drag, friction and servos of the step. So a contact pushes against what the water adds, and what
+    it asks of the velocity holds at the end of the step.
+
+    Approximated: what turns momenta is antisymmetric and of the order of dt, no minimum can hold
+    it, and the solver does not see it; the step that takes the force in does, so momentum is kept
+    and it is the contact that gives way. How soft a contact is (`invweight`) comes from the dry
+    masses. A servo foresees its speed without the contact.
+
+    Args:
+        model: MJX's.
+        data: with contacts and constraints from the velocity over the ground.
+        mass: `[nv, nv]` of the step, not symmetric.
+        smooth: `[nv]` acceleration without contact, over the ground.
+
+    Returns:
+        `[nv]` force [N, N·m].
+    """
+    inertia = 0.5 * (mass + mass.T)
+    data = data.tree_replace({"_impl.M": inertia})
+    data = data.replace(qacc_smooth=smooth, qfrc_smooth=inertia @ smooth)
+    return solver.solve(model, data).qfrc_constraint
 
 
 def _stack(components: Any, n: int) -> jax.Array:

@@ -33,6 +33,14 @@ FULL_TORQUE_ERROR = 0.05
 # choice; it is also what damps the servo, which has no velocity gain of its own.
 FRICTION = 1 / 5
 
+# Cells of a bed that MuJoCo's solver meets [m], and the most points along its side. A choice: in
+# the lake, chords of 1 m miss the dunes by 4 mm at most; a finer grid would fill megabytes.
+_GRID, _MOST_POINTS = 1.0, 1001
+# Contacts that MJX's solver has room for, if the robot does not lie on more. A choice.
+_LEAST_CONTACTS = 32
+# Corners within this of the outermost lie flush with it [m].
+_FLUSH = 1e-3
+
 # Colour of a module whose YAML gives none (Revolve's default grey).
 _GREY = (0.5, 0.5, 0.5)
 
@@ -135,7 +143,7 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
     # MuJoCo's own fluid stays off in every engine: hydrodynamics owns the water.
     spec.option.density = 0.0
     spec.option.viscosity = 0.0
-    _add_bed(spec, world)
+    _add_bed(spec, morphology, world)
     rows, points = _add_modules(spec, morphology, world)
     try:
         _limit_stiffness(spec, spec.compile())
@@ -189,14 +197,27 @@ def _quat(rotation: np.ndarray) -> np.ndarray:
     return quat
 
 
-def _add_bed(spec: mujoco.MjSpec, world: World) -> None:
-    """The ground as a geom, to be seen; our own penalty law makes contact with it."""
+def _add_bed(spec: mujoco.MjSpec, morphology: Morphology, world: World) -> None:
+    """The ground as a geom: to be seen, and with `contact: mjx` to be met by MuJoCo's solver."""
     bed = world.bed
     if bed is None:
         return
-    half = bed.extent / 2
+    half, points = bed.extent / 2, 201
     common: dict[str, Any] = {"name": "bed", "contype": 0, "conaffinity": 0}
     common["rgba"] = [0.76, 0.70, 0.50, 1.0]
+    if bed.contact == "mjx":
+        # Modules (contype 1) meet the bed (conaffinity 1), not each other. Its priority makes the
+        # bed's friction count, not the larger of the two.
+        common |= {"conaffinity": 1, "priority": 1, "friction": [bed.friction, 0.0, 0.0]}
+        # MuJoCo's least friction is 1e-5; MJX divides by it.
+        rough = bed.friction > 1e-5
+        common["condim"] = 3 if rough else 1
+        if rough:  # a round cone: the default pyramid loses 30 % of the friction across its edges
+            spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        # MJX's cost grows with the square of it; the deepest contacts are those that are kept.
+        most = max(_LEAST_CONTACTS, _flush_corners(morphology))
+        spec.add_numeric(name="max_contact_points", data=[most], size=1)
+        points = int(np.clip(bed.extent / _GRID + 1, points, _MOST_POINTS))
     if bed.kind == "flat":
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -205,7 +226,7 @@ def _add_bed(spec: mujoco.MjSpec, world: World) -> None:
             **common,
         )
         return
-    heights = sample_bed(bed)
+    heights = sample_bed(bed, points)
     span = bed.highest - bed.height
     spec.add_hfield(
         name="bed",
@@ -217,6 +238,22 @@ def _add_bed(spec: mujoco.MjSpec, world: World) -> None:
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="bed", pos=[0, 0, bed.height], **common
     )
+
+
+def _flush_corners(morphology: Morphology) -> int:
+    """Most corners that touch a plane on which the robot lies, as it is at rest."""
+    corners = []
+    for module in morphology.modules:
+        for part in (part for part in module.kind.parts if part.contact):
+            for box in part.boxes:
+                signs = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+                place = np.asarray(part.position) + box.position + signs * box.size
+                corners.append(module.position + place @ module.rotation.T)
+    if not corners:
+        return 0
+    place = np.concatenate(corners)
+    high, low = place > place.max(0) - _FLUSH, place < place.min(0) + _FLUSH
+    return int(max(high.sum(0).max(), low.sum(0).max()))
 
 
 @dataclass
@@ -371,7 +408,7 @@ def _add_geoms(
             quat=_quat(turn),
             mass=part.mass if k == 0 else 0.0,
             rgba=[*rgb, 1.0],
-            contype=0,
+            contype=int(part.contact and world.bed is not None and world.bed.contact == "mjx"),
             conaffinity=0,
         )
         if k == 0 and drag_law(part, world) == "ellipsoid":
@@ -396,19 +433,28 @@ def _add_geoms(
 _BRISK = 1.0
 
 
-def check_timestep(robot: Robot) -> None:
-    """Refuses a time step that MuJoCo's explicit fluid laws cannot bear.
+def check_timestep(robot: Robot, engine: str = "population") -> None:
+    """Refuses a world that an engine cannot step.
 
-    The default drag, contact and end stops are implicit and bear any step. MuJoCo's own laws stay
-    explicit, as MuJoCo's Euler step has them: the step must stay below m / (c v), with c the drag
-    of the largest face of a body of mass m (its carried water included), at v = 1 m/s.
+    MuJoCo's contact solver is in no engine but MJX's. And MuJoCo's explicit fluid laws cannot bear
+    every step: the default drag, contact and end stops are implicit and can. MuJoCo's own laws
+    stay explicit, as MuJoCo's Euler step has them: the step must stay below m / (c v), with c the
+    drag of the largest face of a body of mass m (its carried water included), at v = 1 m/s.
 
     Args:
         robot: from `build_robot`.
+        engine: "population" or "mjx".
 
     Raises:
-        InputError: the step is too long; the message names the body and the largest stable step.
+        InputError: the bed's contact is not the engine's; or the step is too long, and the message
+            names the body and the largest stable step.
     """
+    bed = robot.world.bed
+    if bed is not None and bed.contact == "mjx" and engine != "mjx":
+        raise InputError(
+            f"bed.contact: expected 'penalty' with engine: {engine}; found 'mjx' (choose engine: "
+            "mjx, or contact: penalty)"
+        )
     table, world, model = robot.fluid, robot.world, robot.mj_model
     explicit = np.array([law in ("ellipsoid", "inertia_box") for law in table.drag])
     for body in np.unique(table.body[explicit]):

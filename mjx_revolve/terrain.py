@@ -23,6 +23,8 @@ LAKE_HIGHEST = 36.7
 # Height of the dunes as a share of the lake's: 0.8 m in the thesis's lake. A choice.
 _DUNES = 0.8 / (LAKE_HIGHEST - LAKE_LOWEST)
 
+CONTACTS = ("penalty", "mjx")
+
 
 @dataclass(frozen=True)
 class Bed:
@@ -34,8 +36,11 @@ class Bed:
         highest: height of the lake's shore [m]; unused by "flat".
         extent: side of the square that is drawn and that "lake" is shaped in [m].
         stiffness: largest stiffness of one contact point [N/m]; the step uses less where the
-            body is too light for it to be stable (see `contact.contact_points`).
+            body is too light for it to be stable (see `contact`).
         friction: Coulomb coefficient [-].
+        contact: what keeps robots out of it: "penalty" (see `contact.bed_contact`), or "mjx", the
+            modules' boxes by MuJoCo's constraint solver (see `mjx_step`), which needs `engine: mjx`
+            and ignores `stiffness`.
     """
 
     kind: str = "flat"
@@ -44,10 +49,13 @@ class Bed:
     extent: float = 2000.0
     stiffness: float = 3000.0
     friction: float = 0.6
+    contact: str = "penalty"
 
     def __post_init__(self) -> None:
         if self.kind not in ("flat", "lake"):
             raise InputError(f"bed.kind: expected 'flat' or 'lake'; found {self.kind!r}")
+        if self.contact not in CONTACTS:
+            raise InputError(f"bed.contact: expected 'penalty' or 'mjx'; found {self.contact!r}")
         for name in ("height", "highest", "extent", "stiffness", "friction"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | float):
