@@ -19,9 +19,10 @@ from mjx_revolve.fitness import Fitness, make_fitness
 from mjx_revolve.loop import replay_key
 from mjx_revolve.morphology import load_morphology, trim_neutral
 from mjx_revolve.robot import Robot, build_robot
-from mjx_revolve.rollout import Trajectory, simulate
+from mjx_revolve.rollout import Trajectory, gusty_water, simulate
 from mjx_revolve.runs import load_genes
 from mjx_revolve.tasks import UNITS
+from mjx_revolve.water import Water, gust_path
 from mjx_revolve.world import load_world
 
 # How long a morphology without a task is shown [s].
@@ -38,6 +39,7 @@ class Episode:
         trajectory: what it did.
         score: the champion's mean score over fresh starts, or None.
         score_unit: of the score, e.g. "body lengths/s"; "" without one.
+        water: surface and current along the way, where they are not just the world's.
         genes: `[G]` or None without a controller.
         fitness: what the genes were evolved for, or None.
         folder: the run folder, or None.
@@ -48,6 +50,7 @@ class Episode:
     trajectory: Trajectory
     score: float | None = None
     score_unit: str = ""
+    water: Water | None = None
     genes: np.ndarray | None = None
     fitness: Fitness | None = None
     folder: Path | None = None
@@ -92,8 +95,13 @@ def load_episode(
         morphology = trim_neutral(morphology, water.density)
     robot = build_robot(morphology, water)
     key = None if seed is None else jax.random.key(seed)
-    trajectory = simulate(robot, None, duration or _SECONDS, key=key)
-    return Episode(morphology.name, robot, trajectory)
+    seconds, gusty = duration or _SECONDS, None
+    if water.gust is not None:
+        gust_key = jax.random.fold_in(jax.random.key(seed or 0), 1)
+        steps = max(1, round(seconds / water.timestep))
+        gusty = gusty_water(water, gust_path(water.gust, gust_key, steps, water.timestep, 1)[..., 0])
+    trajectory = simulate(robot, None, seconds, key=key, water=gusty)
+    return Episode(morphology.name, robot, trajectory, water=gusty)
 
 
 def _genes_file(folder: Path) -> Path:
@@ -133,6 +141,7 @@ def _champion(path: Path, duration: float | None, seed: int | None) -> Episode:
         title=f"{fitness.robot.morphology.name}: {config.task.type.replace('_', ' ')}",
         robot=fitness.robot,
         trajectory=fitness.replay(genes, key),
+        water=fitness.water(key),
         score=float(score) if isinstance(score, int | float) else None,
         score_unit=UNITS[config.task.type],
         genes=genes,

@@ -125,20 +125,24 @@ class Fitness:
         Returns:
             The trajectory.
         """
-        qpos, water = self.starts(key)
+        return simulate(
+            self.robot,
+            bind_genes(self.controller, genes),
+            self._records * self._every * self.robot.world.timestep,
+            qpos=self.starts(key)[0][:, trial],
+            water=self.water(key, trial),
+            engine=self.config.engine,
+        )
+
+    def water(self, key: jax.Array, trial: int = 0) -> Water | None:
+        """The water of one of a key's episodes, as `simulate` takes it; None: just the world's."""
+        _, water = self.starts(key)
         gusts = self.gusts(key)
         if water is not None:
             water = jax.tree.map(lambda x: x[trial], water)
         if gusts is not None:
             water = gusty_water(self.robot.world, gusts[..., trial], water)
-        return simulate(
-            self.robot,
-            bind_genes(self.controller, genes),
-            self._records * self._every * self.robot.world.timestep,
-            qpos=qpos[:, trial],
-            water=water,
-            engine=self.config.engine,
-        )
+        return water
 
     @property
     def _every(self) -> int:

@@ -13,6 +13,7 @@ moved there. Nothing here knows what the numbers mean.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import io
@@ -70,7 +71,8 @@ def write_atomic(path: Path, content: bytes | Callable[[Path], None]) -> None:
     except OSError as error:
         raise _with_path(error, path) from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:
