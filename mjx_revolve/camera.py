@@ -1,0 +1,185 @@
+"""Where the camera stands while it follows a robot: numbers in, numbers out.
+
+The whole way is known before the first picture is drawn, so the camera can glide along it without
+lagging behind: it looks at the robot's place averaged over strokes, from one side, and far enough
+off that the robot stays in frame whatever it does in between. It never passes through the surface
+or the bed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+# The camera's path is smoothed over this long, less where the robot would leave the frame [s].
+_CALM = (1.0, 0.6, 0.35, 0.2, 0.1, 0.05)
+# How far the robot may get from where the camera looks, in its own radii.
+_STRAY = 0.6
+# Share of the frame's smaller half that robot and its to and fro fill at most.
+_FILL = 0.66
+# The camera's height above the robot's horizon where the bed is near, and elsewhere, where more is
+# to be seen above than below [rad].
+_HIGH, _LEVEL = math.radians(17.0), math.radians(5.0)
+# How far the robot moves towards the viewer, not straight across [rad].
+_TOWARDS = math.radians(24.0)
+# The bed is near within so many distances of the camera from the robot.
+_NEAR = 4.0
+# How far above the robot's middle the camera looks, in shares of what it sees upright.
+_HEADROOM = 0.07
+# The steepest that a camera in the air looks down, and one in the water may have to [rad].
+_STEEP = math.radians(42.0)
+# Between camera and surface or bed, in shares of the distance to the robot.
+_AIR = 0.16
+# A robot whose middle is less deep than this for most of the time is filmed from the air [radii].
+_AFLOAT = 0.8
+
+
+@dataclass(frozen=True)
+class Shots:
+    """A camera along a film.
+
+    Attributes:
+        position: `[F, 3]` world frame [m].
+        target: `[F, 3]` what it looks at, world frame [m].
+        above: whether it stands in the air.
+        distance: usual distance from the robot [m].
+        fovy: angle of view, upright [rad].
+    """
+
+    position: np.ndarray
+    target: np.ndarray
+    above: bool
+    distance: float
+    fovy: float
+
+    def axes(self, frame: int) -> np.ndarray:
+        """`[3, 3]` of a frame; its rows point right, up and along the view, world frame."""
+        along = self.target[frame] - self.position[frame]
+        along = along / np.linalg.norm(along)
+        right = np.cross(along, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(right, along), along])
+
+    def project(self, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points appear.
+
+        Args:
+            frame: number of the frame.
+            points: `[n, 3]` world frame [m].
+
+        Returns:
+            `[n, 2]` right and up of the frame's middle, 1 at its upper edge, and `[n]` distance
+            along the view [m]. What lies behind the camera has a distance below 0.
+        """
+        seen = (points - self.position[frame]) @ self.axes(frame).T
+        depth = seen[:, 2]
+        safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
+        return seen[:, :2] / (safe[:, None] * math.tan(self.fovy / 2)), depth
+
+
+def plan_shots(
+    time: np.ndarray,
+    center: np.ndarray,
+    radius: np.ndarray,
+    *,
+    aspect: float,
+    fovy: float,
+    surface: float,
+    waves: float = 0.0,
+    bed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    along: tuple[float, float] = (1.0, 0.0),
+) -> Shots:
+    """Plans a camera that follows a robot.
+
+    Args:
+        time: `[F]` of the frames, equally spaced [s].
+        center: `[F, 3]` middle of the robot, world frame [m].
+        radius: `[F]` of a ball around it that holds the robot [m].
+        aspect: width of the frame over its height.
+        fovy: angle of view, upright [rad].
+        surface: z of the still surface [m].
+        waves: the most that waves rise above it [m].
+        bed: height of the bed at x and y `[n]` [m], or None.
+        along: direction from which a robot that goes nowhere is not seen: its own long axis.
+
+    Returns:
+        The camera; the ball is inside every frame.
+    """
+    largest = float(radius.max())
+    step = float(time[1] - time[0]) if len(time) > 1 else 1.0
+    target = center
+    for calm in _CALM:
+        target = _smooth(center, calm / step)
+        if np.linalg.norm(target - center, axis=1).max() <= _STRAY * largest:
+            break
+    else:
+        target = center
+    stray = float(np.linalg.norm(target - center, axis=1).max())
+    half = math.atan(min(1.0, aspect) * math.tan(fovy / 2))
+    distance = (largest + stray) / (_FILL * math.sin(half))
+
+    ahead = _heading(center, largest, along)
+    side = np.array([ahead[1], -ahead[0]])
+    stand = math.cos(_TOWARDS) * side + math.sin(_TOWARDS) * ahead
+    depth = surface - center[:, 2]
+    above = bool(np.median(depth) < _AFLOAT * largest)
+    margin = _AIR * distance
+    elevation = _HIGH
+    if not above and not _is_near(bed, center, _NEAR * distance):
+        elevation = _LEVEL
+    low, high = np.full(len(time), -np.inf), np.full(len(time), np.inf)
+    if above:
+        low[:] = surface + waves + margin
+    else:
+        high[:] = surface - waves - 0.5 * margin
+    reach = np.full(len(time), distance)
+    foot = target[:, :2] + distance * math.cos(elevation) * stand
+    if bed is not None:
+        # Also halfway, or a dune could stand between camera and robot.
+        for share in (1.0, 0.5):
+            at = target[:, :2] + share * (foot - target[:, :2])
+            rise = np.asarray(bed(at[:, 0], at[:, 1]), float) + 0.6 * margin - target[:, 2]
+            low = np.maximum(low, target[:, 2] + rise / share)
+    # In a gap too narrow for both, rather through the surface than through the bed.
+    height = np.maximum(np.minimum(target[:, 2] + distance * math.sin(elevation), high), low)
+    height = _smooth(height[:, None], _CALM[2] / step)[:, 0]
+    height = np.maximum(np.minimum(height, high), low)
+    rise = height - target[:, 2]
+    reach = np.maximum(reach, np.abs(rise) / math.sin(_STEEP))
+    level = np.sqrt(np.maximum(reach**2 - rise**2, 0.0))
+    position = np.concatenate([target[:, :2] + level[:, None] * stand, height[:, None]], axis=1)
+    target = target + np.array([0.0, 0.0, _HEADROOM * 2 * distance * math.tan(fovy / 2)])
+    return Shots(position, target, above, distance, fovy)
+
+
+def _is_near(bed: Any, center: np.ndarray, reach: float) -> bool:
+    """Whether the bed is that close below for half of the time."""
+    if bed is None:
+        return False
+    below = center[:, 2] - np.asarray(bed(center[:, 0], center[:, 1]), float)
+    return bool(np.median(below) < reach)
+
+
+def _smooth(path: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian mean over rows that leaves straight lines as they are, ends included."""
+    count = len(path)
+    reach = min(int(4 * sigma) + 1, count - 1)
+    if reach < 1:
+        return np.array(path)
+    before = 2 * path[0] - path[reach:0:-1]
+    after = 2 * path[-1] - path[-2 : -reach - 2 : -1]
+    padded = np.concatenate([before, path, after])
+    return gaussian_filter1d(padded, sigma, axis=0, mode="nearest")[reach : reach + count]
+
+
+def _heading(center: np.ndarray, radius: float, along: tuple[float, float]) -> np.ndarray:
+    """Unit vector `[2]` of the way as a whole; of the robot, where there is none."""
+    net = center[-1, :2] - center[0, :2]
+    if float(np.linalg.norm(net)) <= 0.1 * radius:
+        net = np.asarray(along, float)
+    return net / np.linalg.norm(net)

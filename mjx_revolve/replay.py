@@ -1,0 +1,366 @@
+"""Command line and function: a film of a champion, or of a morphology in the water.
+
+``python -m mjx_revolve.replay runs/mine`` writes `swim.mp4`, `swim.gif` and `swim.html` into the
+run folder. Films are drawn by MuJoCo, with a screen or without; see `docs/replay.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from mjx_revolve.errors import InputError, run_command
+
+if TYPE_CHECKING:
+    from mjx_revolve.episode import Episode
+    from mjx_revolve.film import Film
+
+_KINDS = (".mp4", ".gif", ".html")
+_SMALLEST, _LARGEST = (64, 64), (3840, 2160)  # pixels
+_MOST_FPS = 120
+
+
+def write_film(
+    film: Film,
+    opengl: str,
+    mp4: Path | None = None,
+    gif: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Draws a film once and writes it as MP4, as GIF, or as both.
+
+    Files appear whole or not at all.
+
+    Args:
+        film: from `film.make_film`.
+        opengl: from `opengl.find_opengl`.
+        mp4: where to write the MP4 (H.264), or None.
+        gif: where to write the GIF, or None.
+        progress: told after each frame how many are drawn, and of how many.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    from mjx_revolve.film import draw_frames
+    from mjx_revolve.runs import write_atomic
+    from mjx_revolve.video import GifMaker, Mp4Writer
+
+    count = len(film.time)
+    small = None if gif is None else GifMaker(film.size, film.fps, count)
+
+    def draw(take: Callable[[Any], None]) -> None:
+        for number, frame in enumerate(draw_frames(film, opengl), 1):
+            take(frame)
+            if small is not None:
+                small.add(frame)
+            if progress is not None:
+                progress(number, count)
+
+    def encode(path: Path) -> None:
+        with Mp4Writer(path, film.size, film.fps, film.episode.title) as writer:
+            draw(writer.add)
+
+    if mp4 is not None:
+        write_atomic(mp4, encode)
+    elif small is not None:
+        draw(lambda frame: None)
+    if gif is not None and small is not None:
+        write_atomic(gif, small.make())
+
+
+# --- the command line ----------------------------------------------------------------------------
+
+
+class _Parser(argparse.ArgumentParser):
+    """Argument parser whose complaints are one line, like those about files."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message} (see --help)")
+
+
+def _parser() -> _Parser:
+    parser = _Parser(
+        prog="python -m mjx_revolve.replay",
+        description="Film a champion, or a morphology in the water: swim.mp4, swim.gif, swim.html.",
+    )
+    parser.add_argument("path", help="run folder, champion's genes.yaml, or morphology YAML")
+    parser.add_argument(
+        "--out",
+        metavar="DIR_OR_FILE",
+        help="a folder for all three, or one file that ends in .mp4, .gif or .html (default: the "
+        "run folder, or files of the morphology's name in the current folder)",
+    )
+    parser.add_argument("--duration", metavar="S", help="[s] (default: the task's, or 10)")
+    parser.add_argument("--seed", metavar="N", help="draws another start")
+    parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
+    parser.add_argument(
+        "--size", default="640x480", help="of the film [pixels], both even (default: %(default)s)"
+    )
+    parser.add_argument("--fps", default="30", help="frames per second (default: %(default)s)")
+    parser.add_argument(
+        "--html", action="store_true", help="only the page for a browser; needs no OpenGL"
+    )
+    parser.add_argument("--view", action="store_true", help="look at it in MuJoCo's viewer instead")
+    return parser
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.strip().lower())
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    inside = all(a <= b <= c for a, b, c in zip(_SMALLEST, size, _LARGEST, strict=True))
+    if not inside or any(edge % 2 for edge in size):
+        raise InputError(
+            f"--size: expected WIDTHxHEIGHT, even numbers of pixels from {_SMALLEST[0]}x"
+            f"{_SMALLEST[1]} to {_LARGEST[0]}x{_LARGEST[1]}; found {text!r}"
+        )
+    return size
+
+
+def _whole(text: str | None, name: str, low: int, high: int) -> int | None:
+    if text is None:
+        return None
+    if not re.fullmatch(r"\d{1,12}", text.strip()) or not low <= int(text) <= high:
+        raise InputError(f"{name}: expected a whole number from {low} to {high}; found {text!r}")
+    return int(text)
+
+
+def _seconds(text: str | None) -> float | None:
+    if text is None:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"--duration: expected seconds > 0; found {text!r}")
+    return value
+
+
+def _named_paths(out: str | None, html: bool) -> dict[str, Path] | None:
+    """Where `--out` wants which kind of file; None where it says nothing."""
+    if out is None:
+        return None
+    path = Path(out)
+    kind = path.suffix.lower()
+    if kind not in _KINDS or path.is_dir():
+        if path.exists() and not path.is_dir():
+            raise InputError(
+                f"--out {out}: expected a folder, or a name that ends in {', '.join(_KINDS)}; "
+                "found another file"
+            )
+        return {k: path / f"swim{k}" for k in (_KINDS if not html else (".html",))}
+    if html and kind != ".html":
+        raise InputError(f"--out {out}: expected a name that ends in .html, with --html")
+    return {kind: path}
+
+
+def _usual_paths(place: Path, name: str, html: bool) -> dict[str, Path]:
+    """Where files go that were given no name: never over files that are there."""
+    paths = {kind: place / f"{name}{kind}" for kind in (_KINDS if not html else (".html",))}
+    for path in paths.values():
+        if path.exists():
+            raise InputError(
+                f"{path}: expected no such file yet; say where with --out to replace it"
+            )
+    return paths
+
+
+def _run_folder(path: Path) -> Path | None:
+    """The run folder that a path belongs to, before anything is read."""
+    if path.is_file():
+        path = path.parent if path.name == "genes.yaml" else Path(os.devnull)
+    for folder in (path, path.parent):
+        if (folder / "config.yaml").is_file():
+            return folder
+    return None
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Films a champion, or a morphology.
+
+    Args:
+        argv: the arguments; None: those of the process.
+
+    Returns:
+        0; 1 where a file could not be written; 130 when interrupted.
+
+    Raises:
+        InputError: an argument or a file is wrong, or there is no OpenGL to draw with.
+    """
+    arguments = _parser().parse_args(argv)
+    size, fps = _size(arguments.size), _whole(arguments.fps, "--fps", 1, _MOST_FPS)
+    seed = _whole(arguments.seed, "--seed", 0, 2**32 - 1)
+    duration = _seconds(arguments.duration)
+    assert fps is not None
+    try:
+        return _replay(arguments, size, fps, duration, seed)
+    except OSError as error:
+        print(f"error: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; no half-written film is left", file=sys.stderr)
+        return 130
+
+
+def _replay(
+    arguments: argparse.Namespace,
+    size: tuple[int, int],
+    fps: int,
+    duration: float | None,
+    seed: int | None,
+) -> int:
+    """Everything after the arguments are known to be right."""
+    path = Path(arguments.path)
+    paths = _named_paths(arguments.out, arguments.html)
+    folder = _run_folder(path)
+    if arguments.view:
+        if arguments.out is not None or arguments.html:
+            raise InputError("--view: expected neither --out nor --html: it writes nothing")
+        _check_screen()
+    elif paths is None and folder is not None:
+        paths = _usual_paths(folder, "swim", arguments.html)
+    if not path.exists():
+        raise InputError(f"{path}: expected a run folder, a genes.yaml or a morphology; found none")
+    opengl = ""
+    if not arguments.view and (paths is None or set(paths) != {".html"}) and not arguments.html:
+        # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
+        from mjx_revolve.opengl import find_opengl
+
+        opengl = find_opengl()
+
+    from mjx_revolve.runtime import prepare_process
+
+    prepare_process()
+    from mjx_revolve.episode import load_episode
+
+    episode = load_episode(path, arguments.world or "lake", duration, seed)
+    if arguments.world is not None and episode.fitness is not None:
+        raise InputError("--world: expected none: a champion swims in the world it evolved in")
+    if arguments.view:
+        _view(episode)
+        return 0
+    if paths is None:
+        paths = _usual_paths(Path(), str(episode.robot.morphology.name), arguments.html)
+    if opengl:
+        _film(episode, paths, opengl, size, fps)
+    if ".html" in paths:
+        from mjx_revolve.viewer import write_viewer
+
+        write_viewer(episode, paths[".html"])
+        _say(paths[".html"], "open it in a browser")
+    return 0
+
+
+def _film(
+    episode: Episode, paths: dict[str, Path], opengl: str, size: tuple[int, int], fps: int
+) -> None:
+    """Draws the film and says what was written."""
+    from mjx_revolve.film import make_film
+
+    film = make_film(episode, size, fps)
+    _note_lost(film)
+    mp4, gif = paths.get(".mp4"), paths.get(".gif")
+    live = sys.stderr.isatty()
+
+    def progress(number: int, count: int) -> None:
+        if live:
+            end = "\r" if number < count else "\r\033[K"
+            print(f"drawing frame {number} of {count}", end=end, file=sys.stderr, flush=True)
+
+    write_film(film, opengl, mp4, gif, progress)
+    seconds = len(film.time) / fps
+    if mp4 is not None:
+        _say(mp4, f"{seconds:.3g} s, {size[0]} x {size[1]}, {fps} frames/s")
+    if gif is not None:
+        _say(gif, f"{seconds:.3g} s")
+
+
+def _note_lost(film: Film) -> None:
+    if film.lost is not None:
+        print(
+            f"note: the trajectory is not finite from {film.lost:.4g} s on; shown up to there",
+            file=sys.stderr,
+        )
+
+
+def _say(path: Path, words: str) -> None:
+    print(f"{path}: {words}, {path.stat().st_size / 1e6:.2f} MB")
+
+
+# --- MuJoCo's viewer -----------------------------------------------------------------------------
+
+
+def _check_screen() -> None:
+    """Refuses `--view` where nobody could see it."""
+    hint = "(without --view a film is written, which needs none)"
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise InputError(
+            f"--view: expected a screen; found neither DISPLAY nor WAYLAND_DISPLAY set {hint}"
+        )
+    # MuJoCo's viewer would end the process with a complaint of its own.
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = glfw.init()
+    if not found:
+        raise InputError(f"--view: expected a screen; found none that lets us open a window {hint}")
+
+
+def _view(episode: Episode) -> None:
+    """Plays an episode over and over in MuJoCo's viewer, until its window is closed."""
+    import threading
+    import time
+
+    import mujoco
+    import mujoco.viewer
+
+    from mjx_revolve.film import make_film
+    from mjx_revolve.scene import build_scene
+
+    film = make_film(episode, fps=60)
+    _note_lost(film)
+    shots = film.shots
+    model = build_scene(film.robot, sight=9.0 * shots.distance, origin=film.origin.tolist())
+    data = mujoco.MjData(model)
+    before = set(threading.enumerate())
+    try:
+        window = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+    except Exception as error:  # GLFW's, X's and macOS's reasons come in many kinds
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"--view: expected a screen with OpenGL; found: {reason}") from None
+    with window:
+        with window.lock():
+            axes = shots.axes(0)
+            window.cam.lookat[:] = shots.target[0] - film.origin
+            window.cam.distance = shots.distance
+            window.cam.azimuth = math.degrees(math.atan2(axes[2, 1], axes[2, 0]))
+            window.cam.elevation = math.degrees(math.asin(axes[2, 2]))
+        begun, last = time.monotonic(), 0
+        while window.is_running():
+            frame = int((time.monotonic() - begun) * film.fps) % len(film.time)
+            with window.lock():
+                data.qpos[:] = film.qpos[frame]
+                data.qpos[:3] -= film.origin
+                # The user may turn the camera; it goes along with the robot.
+                window.cam.lookat[:] += shots.target[frame] - shots.target[last]
+                mujoco.mj_forward(model, data)
+            last = frame
+            window.sync()
+            time.sleep(0.5 / film.fps)
+    # The viewer's thread must be through with GLFW before Python ends, and GLFW with it.
+    for thread in set(threading.enumerate()) - before:
+        thread.join(timeout=10.0)
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main))
