@@ -29,6 +29,7 @@ _WHERE = {
     "bind_genes": "controllers",
     "simulate": "rollout",
     "make_fitness": "fitness",
+    "make_mixed_fitness": "mixed_fitness",
 }
 
 __all__ = ["__version__", *sorted(_WHERE)]
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from mjx_revolve.controllers import make_sine as make_sine
     from mjx_revolve.errors import InputError as InputError
     from mjx_revolve.fitness import make_fitness as make_fitness
+    from mjx_revolve.mixed_fitness import make_mixed_fitness as make_mixed_fitness
     from mjx_revolve.modules import MODULES as MODULES
     from mjx_revolve.modules import THESIS_MODULES as THESIS_MODULES
     from mjx_revolve.modules import load_modules as load_modules

@@ -3,6 +3,7 @@
 `make_mixed_fitness` fixes the world, the task, the controller's kind and the largest body once;
 then any bodies within that size run through one compiled program, generation after generation.
 Where all individuals happen to have one body, the faster program for that body is used instead.
+Derivatives are for bodies of one kind (`fitness`): here, XLA takes minutes to compile them.
 """
 
 from __future__ import annotations

@@ -87,6 +87,7 @@ def test_accelerations_are_those_of_each_body_alone(name):
         assert np.all(here[len(v) :] == 0)
 
 
+@pytest.mark.slow
 def test_more_padding_and_more_riders_change_nothing():
     """More rows, a deeper stack, and bodies cut into more or fewer rows."""
     robots = zoo("default")
@@ -120,6 +121,7 @@ def test_a_short_stack_holds_any_tree():
                 stack[row.slot] = None if row.rider else row.body
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_that_of_the_body_alone():
     robots = zoo("default")
     shape, each = fit_shape(robots), 2
@@ -204,15 +206,6 @@ def test_one_body_for_all_takes_its_own_program(config, fitness):
 
 
 @pytest.mark.slow
-def test_gradients_go_through(fitness):
-    robots = [fitness.build(random_body(3, 6)), fitness.build(body("snake"))]
-    bodies = jax.tree.map(jnp.asarray, fitness.pack(robots))
-    genes = 0.3 * jax.random.normal(jax.random.key(2), (2, fitness.num_genes))
-    loss = lambda g: jnp.sum(fitness.evaluate(bodies, g, jax.random.key(0))[1]["speed_m_s"])  # noqa: E731
-    slope = jax.grad(loss)(genes)
-    assert np.all(np.isfinite(slope)) and np.any(slope != 0)
-
-
 def test_what_it_cannot_do_is_refused_by_name(config, fitness):
     tank = world(**WATER)
     cases = [
