@@ -135,6 +135,8 @@ class EvolutionConfig(_Model):
     """Generations between checkpoints."""
     keep_checkpoints: int = Field(3, ge=1)
     """How many of the newest checkpoints are kept."""
+    tensorboard: bool = False
+    """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
     strategy_params: dict[str, Any] = {}
     """Settings of the strategy itself, by evosax's names."""
 

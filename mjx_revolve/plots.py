@@ -11,41 +11,91 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-_BLUE, _DEEP, _ORANGE, _GREY = "#1f77b4", "#0b3c5d", "#e07b00", "#6b7680"
+# Okabe and Ito's palette (2008), which all readers can tell apart, and its neighbours.
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#3b3b3b")
+_BLUE, _DEEP, _ORANGE, _GREY = COLORS[0], "#0b3c5d", COLORS[1], "#6b7680"
 _WATER = "#eaf3f9"
 # Axis labels of the measures that the tasks report; others are shown by their name.
-_LABELS = {
+LABELS = {
     "speed_bl_s": "speed (body lengths/s)",
     "speed_m_s": "speed (m/s)",
     "straightness": "straightness (–)",
     "energy_j": "energy (J)",
     "depth_m": "depth (m)",
     "cost_of_transport": "cost of transport (–)",
+    "depth_error_m": "depth error (m)",
 }
 _FIGURES = {
-    "generation", "evaluations", "best", "mean", "std", "median", "champion", "step_size", "failed",
-    "restarts", "seconds", "evaluations_per_second",
+    "generation", "evaluations", "best", "mean", "std", "median", "lower_quartile",
+    "upper_quartile", "champion", "step_size", "failed", "restarts", "seconds",
+    "evaluations_per_second",
 }  # fmt: skip
+# A path is drawn in at most so many pieces, and a curve over time through so many points; the eye
+# sees no more.
+_PIECES, _POINTS = 300, 4000
 
 
-def _new_figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), dpi=120, layout="constrained", facecolor="white")
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure.
+
+    Args:
+        width: [inches].
+        height: [inches].
+
+    Returns:
+        The figure, with a canvas that needs no screen.
+    """
+    figure = Figure(figsize=(width, height), dpi=120, facecolor="white")
+    figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.06)  # [inches]
     FigureCanvasAgg(figure)
     return figure
 
 
-def _dress(axes: Axes) -> None:
+def dress(axes: Axes) -> None:
+    """Gives axes the look of all our figures.
+
+    Args:
+        axes: which.
+    """
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(_GREY)
     axes.tick_params(colors="#333333", labelsize=9)
     axes.grid(True, color="#d9dfe3", linewidth=0.6)
     axes.set_axisbelow(True)
+
+
+def draw_curve(axes: Axes, x: np.ndarray, y: np.ndarray, **style: Any) -> None:
+    """Draws a curve over time, long ones through every so many of their points.
+
+    Args:
+        axes: where.
+        x: `[T]`.
+        y: `[T]`.
+        **style: of the line.
+    """
+    stride = -(-len(x) // _POINTS)
+    axes.plot(x[::stride] if stride else x, y[::stride] if stride else y, **style)
+
+
+def legend_above(axes: Axes, side: float = 1.0) -> None:
+    """Puts the legend into one line above the axes, where it hides nothing.
+
+    Args:
+        axes: which; nothing happens where no line has a label.
+        side: 0: at the left, 1: at the right.
+    """
+    handles, labels = axes.get_legend_handles_labels()
+    if labels:
+        axes.legend(handles, labels, loc="lower left" if side < 0.5 else "lower right",
+                    bbox_to_anchor=(side, 1.0), borderaxespad=0.2, borderpad=0.2, fontsize=8.5,
+                    ncols=len(labels), frameon=False, columnspacing=1.4)  # fmt: skip
 
 
 def figure_png(figure: Figure) -> bytes:
@@ -62,6 +112,21 @@ def figure_png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+def figure_svg(figure: Figure) -> bytes:
+    """Renders a figure as lines that stay sharp in print.
+
+    Args:
+        figure: the figure.
+
+    Returns:
+        The bytes of an SVG that needs no fonts; the same figure gives the same bytes.
+    """
+    buffer = io.BytesIO()
+    with rc_context({"svg.fonttype": "path", "svg.hashsalt": "mjx_revolve"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return buffer.getvalue()
+
+
 def plot_fitness(
     metrics: Mapping[str, np.ndarray], title: str = "", label: str = "fitness"
 ) -> Figure:
@@ -69,7 +134,8 @@ def plot_fitness(
 
     Args:
         metrics: columns of `metrics.csv`, each `[T]`: generation, best, mean, std, champion,
-            step_size, and any measures of the generations' best.
+            step_size, and, where there are such columns, median, the quartiles and measures of the
+            generations' best. Other versions may lack any but the generation.
         title: a line above the picture.
         label: what the fitness measures, with its unit.
 
@@ -78,41 +144,38 @@ def plot_fitness(
     """
     generation = np.asarray(metrics["generation"])
     measures = [name for name in metrics if name not in _FIGURES]
-    figure = _new_figure(8.0, 6.0)
+    figure = new_figure(8.0, 6.0)
     grid = figure.add_gridspec(2, 2, height_ratios=(2.4, 1.0))
     top = figure.add_subplot(grid[0, :])
-    mean, std = np.asarray(metrics["mean"]), np.asarray(metrics["std"])
     dot = "o" if len(generation) < 3 else None
-    top.fill_between(generation, mean - std, mean + std, color=_BLUE, alpha=0.15, linewidth=0,
-                     label="mean ± standard deviation")  # fmt: skip
-    top.plot(generation, mean, color=_BLUE, linewidth=1.6, label="mean", marker=dot)
-    top.plot(generation, metrics["best"], color=_ORANGE, linewidth=1.1, label="best", marker=dot)
-    top.step(generation, metrics["champion"], where="post", color=_DEEP, linewidth=1.4,
-             linestyle=(0, (5, 2)), label="best so far")  # fmt: skip
+    band = _draw_population(top, generation, metrics, dot)
+    if "best" in metrics:
+        top.plot(generation, metrics["best"], color=_ORANGE, linewidth=1.1, label="best",
+                 marker=dot)  # fmt: skip
+    if "champion" in metrics:
+        top.step(generation, metrics["champion"], where="post", color=_DEEP, linewidth=1.4,
+                 linestyle=(0, (5, 2)), label="best so far")  # fmt: skip
     top.set_ylabel(label)
-    _limit_to_the_many(top, metrics)
-    # Fitness grows towards the top right, so the lower right stays free.
-    top.legend(loc="lower right", fontsize=8.5, frameon=True, framealpha=0.9, edgecolor="none")
+    _limit_to_the_many(top, metrics, band)
+    legend_above(top, 0.0)
     if title:
-        top.set_title(title, loc="left", fontsize=11, color="#222222")
-    known = [name for name in _LABELS if name in measures]
-    name = (known + measures + ["evaluations_per_second"])[0]
-    left = figure.add_subplot(grid[1, 0], sharex=top)
-    left.plot(generation, metrics[name], color=_ORANGE, linewidth=1.1, marker=dot)
-    words = _LABELS.get(name, name.replace("_", " "))
-    left.set_ylabel(words.replace(" (", "\n(") + ("\nof the best" if measures else ""), fontsize=9)
-    right = figure.add_subplot(grid[1, 1], sharex=top)
-    right.plot(generation, metrics["step_size"], color=_GREY, linewidth=1.3, marker=dot)
-    if np.all(np.asarray(metrics["step_size"]) > 0):
-        right.set_yscale("log")
-        plain = FuncFormatter(lambda value, _: f"{value:g}")
-        right.yaxis.set_major_formatter(plain)
-        few = np.ptp(np.log10(metrics["step_size"])) < 1  # otherwise the decades suffice
-        right.yaxis.set_minor_formatter(plain if few else FuncFormatter(lambda value, _: ""))
-    right.set_ylabel("step size\n(gene units)", fontsize=9)
+        top.set_title(title, loc="left", fontsize=11, color="#222222", pad=24)
+    known = [name for name in LABELS if name in measures]
+    rate = ["evaluations_per_second"] if "evaluations_per_second" in metrics else []
+    left, right = figure.add_subplot(grid[1, 0], sharex=top), None
+    for name in (known + measures + rate)[:1]:
+        left.plot(generation, metrics[name], color=_ORANGE, linewidth=1.1, marker=dot)
+        words = LABELS.get(name, name.replace("_", " "))
+        left.set_ylabel(words.replace(" (", "\n(") + ("\nof the best" if measures else ""),
+                        fontsize=9)  # fmt: skip
+    if "step_size" in metrics:
+        right = figure.add_subplot(grid[1, 1], sharex=top)
+        _draw_step_size(right, generation, np.asarray(metrics["step_size"]), dot)
     for axes in (top, left, right):
+        if axes is None:
+            continue
         axes.set_xlabel("generation")
-        _dress(axes)
+        dress(axes)
         axes.tick_params(which="minor", labelsize=8, colors="#333333")
     top.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
     span = max(float(generation[-1] - generation[0]), 1.0)
@@ -120,10 +183,49 @@ def plot_fitness(
     return figure
 
 
-def _limit_to_the_many(axes: Axes, metrics: Mapping[str, np.ndarray]) -> None:
+def _draw_population(
+    axes: Axes, generation: np.ndarray, metrics: Mapping[str, np.ndarray], dot: str | None
+) -> np.ndarray:
+    """The middle of the population and its spread; returns the spread's lower edge `[T]`."""
+    quartiles = ("lower_quartile", "upper_quartile")
+    if all(name in metrics for name in quartiles):
+        low, high = (np.asarray(metrics[name]) for name in quartiles)
+        axes.fill_between(generation, low, high, color=_BLUE, alpha=0.18, linewidth=0,
+                          label="quartiles")  # fmt: skip
+    elif all(name in metrics for name in ("mean", "std")):
+        mean, std = np.asarray(metrics["mean"]), np.asarray(metrics["std"])
+        low, high = mean - std, mean + std
+        axes.fill_between(generation, low, high, color=_BLUE, alpha=0.15, linewidth=0,
+                          label="mean ± standard deviation")  # fmt: skip
+        axes.plot(generation, mean, color=_BLUE, linewidth=1.6, label="mean", marker=dot)
+    else:
+        low = np.asarray(metrics.get("best", generation * np.nan))
+    if "median" in metrics:
+        dash = "-" if quartiles[0] in metrics else (0, (2, 1.2))
+        axes.plot(generation, metrics["median"], color=COLORS[2], linewidth=1.1, label="median",
+                  linestyle=dash, marker=dot)  # fmt: skip
+    return low
+
+
+def _draw_step_size(axes: Axes, generation: np.ndarray, size: np.ndarray, dot: str | None) -> None:
+    axes.plot(generation, size, color=_GREY, linewidth=1.3, marker=dot)
+    if np.all(size > 0):
+        axes.set_yscale("log")
+        plain = FuncFormatter(lambda value, _: f"{value:g}")
+        axes.yaxis.set_major_formatter(plain)
+        # Few decades need more numbers than the powers of ten, but not so many that they meet.
+        decades = float(np.ptp(np.log10(size)))
+        digits = "123456789" if decades < 0.4 else "235" if decades < 1.2 else ""
+        axes.yaxis.set_minor_formatter(
+            FuncFormatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in digits else "")
+        )
+    axes.set_ylabel("step size\n(gene units)", fontsize=9)
+
+
+def _limit_to_the_many(axes: Axes, metrics: Mapping[str, np.ndarray], low: np.ndarray) -> None:
     """Keeps one terrible generation from squeezing all the others into a line."""
-    low = np.asarray(metrics["mean"]) - np.asarray(metrics["std"])
-    high = np.concatenate([metrics["best"], metrics["champion"]])
+    high = np.concatenate([metrics[name] for name in ("best", "champion") if name in metrics]
+                          or [low])  # fmt: skip
     low, high = low[np.isfinite(low)], high[np.isfinite(high)]
     if not low.size or not high.size:
         return
@@ -147,24 +249,29 @@ def plot_trajectory(
         body: the body to follow; 1 is the robot's root.
 
     Returns:
-        The figure: x-y and x-z paths coloured by time, depth and speed over time.
+        The figure: paths from above and from the side, coloured by time, and depth and speed over
+        time.
     """
     seconds = np.asarray(trajectory.time, float)
     path = np.asarray(trajectory.xpos, float)[:, body]
-    figure = _new_figure(9.0, 6.6)
+    figure = new_figure(9.0, 6.6)
     outer = figure.add_gridspec(2, 1, height_ratios=(1.7, 1.0))
     paths = outer[0].subgridspec(1, 2)
     curves = outer[1].subgridspec(1, 2)
     above = figure.add_subplot(paths[0])
     side = figure.add_subplot(paths[1])
     line = _draw_path(above, path[:, [0, 1]], seconds)
-    _draw_path(side, path[:, [0, 2]], seconds)
+    # From the side on which it can be seen to get ahead.
+    ahead = int(np.argmax(np.ptp(path[:, :2], axis=0)))
+    _draw_path(side, path[:, [ahead, 2]], seconds)
     above.set(xlabel="x (m)", ylabel="y (m)")
+    for axes in (above, side):
+        axes.locator_params(nbins=6)
     above.set_title("from above", fontsize=9.5, color=_GREY)
-    side.set(xlabel="x (m)", ylabel="z (m)")
+    side.set(xlabel=f"{'xy'[ahead]} (m)", ylabel="z (m)")
     side.set_title("from the side", fontsize=9.5, color=_GREY)
     _square_limits(above, path[:, 0], path[:, 1])
-    _square_limits(side, path[:, 0], path[:, 2])
+    _square_limits(side, path[:, ahead], path[:, 2])
     _draw_surface(side, surface_height)
     bar = figure.colorbar(line, ax=[above, side], shrink=0.85, aspect=30, pad=0.015)
     bar.set_label("time (s)", fontsize=9)
@@ -175,22 +282,22 @@ def plot_trajectory(
                  edgecolor="none")  # fmt: skip
 
     depth, speed = figure.add_subplot(curves[0]), figure.add_subplot(curves[1])
-    depth.plot(seconds, surface_height - path[:, 2], color=_BLUE, linewidth=1.4)
+    draw_curve(depth, seconds, surface_height - path[:, 2], color=_BLUE, linewidth=1.4)
     depth.set(xlabel="time (s)", ylabel="depth (m)")
     _widen(depth, surface_height - path[:, 2], least=0.1)
     depth.invert_yaxis()
     if len(seconds) > 2:
         velocity = np.gradient(path, seconds, axis=0)
-        speed.plot(seconds, np.linalg.norm(velocity, axis=1), color="#b9c6cf", linewidth=0.8,
-                   label="momentary")  # fmt: skip
+        draw_curve(speed, seconds, np.linalg.norm(velocity, axis=1), color="#b9c6cf",
+                   linewidth=0.8, label="momentary")  # fmt: skip
         window, smooth = _smooth_velocity(path, seconds)
-        speed.plot(window, np.linalg.norm(smooth, axis=1), color=_ORANGE, linewidth=1.8,
+        draw_curve(speed, window, np.linalg.norm(smooth, axis=1), color=_ORANGE, linewidth=1.8,
                    label="over 1 s")  # fmt: skip
-        speed.legend(loc="best", fontsize=8, frameon=True, framealpha=0.85, edgecolor="none")
+        legend_above(speed)
     speed.set(xlabel="time (s)", ylabel="speed (m/s)")
     speed.set_ylim(bottom=0)
     for axes in (above, side, depth, speed):
-        _dress(axes)
+        dress(axes)
     for axes in (depth, speed):
         axes.set_xlim(seconds[0], max(seconds[-1], seconds[0] + 1e-6))
     if title:
@@ -200,6 +307,8 @@ def plot_trajectory(
 
 def _draw_path(axes: Axes, points: np.ndarray, seconds: np.ndarray) -> LineCollection:
     """A line whose colour tells the time, its start and its end marked."""
+    kept = np.unique(np.linspace(0, len(points) - 1, min(len(points), _PIECES)).astype(int))
+    points, seconds = points[kept], seconds[kept]
     segments = np.stack([points[:-1], points[1:]], axis=1)
     line = LineCollection(list(segments), cmap="viridis", linewidth=2.2, capstyle="round")
     line.set_array(seconds[:-1])
