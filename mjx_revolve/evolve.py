@@ -3,12 +3,16 @@
     python -m mjx_revolve.evolve configs/lake_swim.yaml [--seed N] [--out DIR]
     python -m mjx_revolve.evolve --resume DIR
 
+The population is spread over this host's cores, and over several hosts where `--hosts` says so (see
+`mjx_revolve.pool` and `mjx_revolve.hosts`); results do not depend on it.
+
 Heavy imports stand inside functions: thread settings must be made before NumPy and JAX are loaded.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 import json
 import os
@@ -21,15 +25,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjx_revolve import runtime
+from mjx_revolve.crew import WorkerError
 from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.hosts import parse_place, parse_workers, serve
+from mjx_revolve.progress import Progress
 
 if TYPE_CHECKING:
     from mjx_revolve.config import Config
+    from mjx_revolve.hosts import Place
     from mjx_revolve.loop import Champion, Search
+    from mjx_revolve.pool import Pool
     from mjx_revolve.runs import Checkpoint, Run
+    from mjx_revolve.tensorboard import TensorBoardLog
 
 # What may change when a run is resumed; everything else would make it another run.
-_FREE = ("generations", "checkpoint_every", "keep_checkpoints")
+_FREE = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard")
 # What the bits of a run depend on, besides its configuration.
 _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
 
@@ -47,6 +57,12 @@ def _parser() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="KEY.PATH=VALUE", dest="settings",
         help="replace one value of the configuration; may be repeated",
     )  # fmt: skip
+    parser.add_argument(
+        "--workers", metavar="N", help="processes on this host (default: its cores)"
+    )
+    parser.add_argument("--hosts", metavar="N", help="run this same command on N hosts")
+    parser.add_argument("--coordinator", metavar="HOST:PORT", help="where host 0 listens")
+    parser.add_argument("--host-index", metavar="I", help="of this host (default: the launcher's)")
     return parser
 
 
@@ -79,44 +95,6 @@ class _Stop:
             signal.signal(other, signal.SIG_DFL)
         # No print: the signal may have come in the middle of one.
         os.write(2, b"\nfinishing what is under way; press Ctrl-C again to quit at once\n")
-
-
-# --- progress -------------------------------------------------------------------------------------
-
-
-class _Progress:
-    """A live bar on a terminal, plain lines elsewhere."""
-
-    def __init__(self, done: int, total: int) -> None:
-        self._total = total
-        self._bar: Any = None
-        if sys.stdout.isatty():
-            from tqdm import tqdm
-
-            # A terminal that does not know its size would get no bar at all.
-            known = min(os.get_terminal_size(sys.stdout.fileno())) > 1
-            size: dict[str, Any] = {"dynamic_ncols": True} if known else {"ncols": 100, "nrows": 24}
-            self._bar = tqdm(
-                total=total, initial=done, file=sys.stdout, unit="gen", desc="compiling", **size
-            )
-
-    def show(self, row: dict[str, float]) -> None:
-        figures = {
-            "best": f"{row['best']:.4g}",
-            "mean": f"{row['mean']:.4g}",
-            "evaluations/s": f"{row['evaluations_per_second']:.4g}",
-        }
-        if self._bar is not None:
-            self._bar.set_description_str("evolving")
-            self._bar.set_postfix(figures, refresh=False)
-            self._bar.update(1)
-            return
-        words = "  ".join(f"{name} {value}" for name, value in figures.items())
-        print(f"generation {row['generation']:.0f}/{self._total}  {words}", flush=True)
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
 
 
 # --- the run --------------------------------------------------------------------------------------
@@ -167,6 +145,9 @@ def _describe(config: Config, fitness: Any, folder: Path) -> str:
     device = jax.devices()[0].device_kind
     if device == "cpu":
         device = f"cpu with {runtime.usable_cores()} cores"
+    if fitness.workers > 1:
+        device += f", {fitness.workers} workers"
+        device += f" on {len(fitness.hosts)} hosts" if len(fitness.hosts) > 1 else ""
     return (
         f"{body}{fitness.num_genes} genes | {config.task.type} in {world} | "
         f"{evolution.strategy} {evolution.population_size} x {evolution.generations}, "
@@ -225,11 +206,14 @@ def _begin(arguments: argparse.Namespace, make_fitness: Callable) -> tuple[Run, 
     from mjx_revolve.config import load_config
     from mjx_revolve.runs import check_new_folder, create_run
     from mjx_revolve.strategies import find_strategy, make_strategy
+    from mjx_revolve.tensorboard import check_tensorboard
 
     if arguments.config is None:
         raise InputError("expected a CONFIG, or --resume DIR; found neither")
     settings = _seed_setting(arguments)
     config = load_config(arguments.config, settings)
+    if config.evolution.tensorboard:
+        check_tensorboard(config.source)
     folder = Path(arguments.out) if arguments.out else _default_folder(config)
     check_new_folder(folder)  # before the expensive part
     try:
@@ -272,6 +256,7 @@ def _continue(
     """A run that was stopped."""
     from mjx_revolve.config import load_config, override_config
     from mjx_revolve.runs import open_run
+    from mjx_revolve.tensorboard import check_tensorboard
 
     label = f"--resume {arguments.resume}"
     if arguments.out is not None:
@@ -287,6 +272,8 @@ def _continue(
     _check_unchanged(old, config, label)
     free = {key: getattr(config.evolution, key) for key in _FREE}
     config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
+    if config.evolution.tensorboard:
+        check_tensorboard(label)
     checkpoint = run.load_checkpoint()
     for name in checkpoint.damaged:
         print(f"passed over a damaged checkpoint: {name}", file=sys.stderr)
@@ -327,7 +314,7 @@ def _checkpoint_meta(config: Config, fitness: Any) -> dict[str, Any]:
     return {
         "settings_hash": _settings_hash(config),
         "model_hash": _model_hash(fitness),
-        "chunk_shape": [config.evolution.population_size, fitness.num_genes],
+        "chunk_shape": [fitness.block or config.evolution.population_size, fitness.num_genes],
         "strategy": config.evolution.strategy,
         "host": _host(),
     }
@@ -341,34 +328,68 @@ def _save_body(run: Run, fitness: Any) -> None:
         run.write("champion/robot.xml", robot.mj_spec.to_xml().encode())
 
 
+def _open_log(run: Run, done: int) -> TensorBoardLog:
+    """TensorBoard's copy of the metrics."""
+    from mjx_revolve.tensorboard import TensorBoardLog
+
+    table = run.load_metrics() if done else {}
+    rows = [dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True)]
+    return TensorBoardLog(run.folder / "tensorboard", done, rows)
+
+
 def _evolve(run: Run, config: Config, fitness: Any, begin: Search | None, stop: _Stop) -> Search:
-    """All generations, or as many as there are before a request to stop."""
-    from mjx_revolve.loop import evolve, search_to_arrays
+    """All generations, or as many as there are before a request to stop or a worker's death.
+
+    Raises:
+        WorkerError: a worker died or hangs; what was done until then is saved.
+    """
+    from mjx_revolve.loop import evolve, start_search
+    from mjx_revolve.strategies import make_strategy
 
     evolution = config.evolution
-    meta = _checkpoint_meta(config, fitness)
     search = begin
-    progress = _Progress(0 if begin is None else begin.generation, evolution.generations)
+    before = 0 if begin is None else begin.generation
+    log = _open_log(run, before) if evolution.tensorboard else None
+    progress = Progress(before, evolution.generations)
     try:
         for search, row in evolve(evolution, fitness, begin):
             run.append_metrics(row)
+            if log is not None:
+                log.add(row)
             progress.show(row)
             done = search.generation
             last = done == evolution.generations
             if last or stop.signal or done % evolution.checkpoint_every == 0:
-                arrays = search_to_arrays(evolution, search)
-                run.save_checkpoint(done, arrays, meta, evolution.keep_checkpoints)
-                run.save_champion(
-                    search.elites[0], score=float(search.elite_scores[0]), final=False,
-                    origin=f"best of generation {search.elite_generations[0]}, not yet judged on "
-                    "fresh starts",
-                )  # fmt: skip
+                _save(run, config, fitness, search)
             if stop.signal:
                 break
+    except WorkerError as error:
+        if search is None:
+            search = start_search(evolution, make_strategy(evolution, fitness.num_genes))
+        _save(run, config, fitness, search)
+        done = search.generation
+        what = f"generation {done}" if done else "the start, before any generation,"
+        raise WorkerError(f"{error}; {what} is saved") from None
     finally:
         progress.close()
+        if log is not None:
+            log.close()
     assert search is not None  # there is at least one generation, or a checkpoint
     return search
+
+
+def _save(run: Run, config: Config, fitness: Any, search: Search) -> None:
+    """A checkpoint, and the champion so far."""
+    from mjx_revolve.loop import search_to_arrays
+
+    arrays, meta = search_to_arrays(config.evolution, search), _checkpoint_meta(config, fitness)
+    run.save_checkpoint(search.generation, arrays, meta, config.evolution.keep_checkpoints)
+    if search.generation:
+        run.save_champion(
+            search.elites[0], score=float(search.elite_scores[0]), final=False,
+            origin=f"best of generation {search.elite_generations[0]}, not yet judged on "
+            "fresh starts",
+        )  # fmt: skip
 
 
 def _finish(run: Run, config: Config, fitness: Any, search: Search) -> None:
@@ -419,26 +440,53 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
 
     Args:
         argv: the arguments; None: `sys.argv[1:]`.
-        make_fitness: makes a fitness (see `loop.Fitness`) from a `Config`; None: the real one.
+        make_fitness: makes a fitness (see `loop.Fitness`) from a `Config`; None: the real one. See
+            `pool.make_pool`.
 
     Returns:
         The exit code: 0 when the run is finished, 130 or 143 when it was interrupted, 1 when the
-        disk refused a file.
+        disk refused a file or a worker failed.
 
     Raises:
         InputError: the arguments, the configuration or the run folder are wrong.
     """
     arguments = _parser().parse_args(argv)
+    workers, place = parse_workers(arguments.workers), parse_place(arguments)
+    with contextlib.ExitStack() as open_pools:
+        if place is None or place.index == 0:
+            return _lead(arguments, workers, make_fitness, place, open_pools)
+        try:
+            settings, cache = _seed_setting(arguments), runtime.prepare_process()
+            return serve(arguments, settings, make_fitness, workers, place, cache)
+        except WorkerError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 1
+
+
+def _lead(
+    arguments: argparse.Namespace,
+    workers: int | None,
+    make_fitness: Callable | None,
+    place: Place | None,
+    open_pools: contextlib.ExitStack,
+) -> int:
+    """A whole run; `open_pools` ends its workers."""
+
+    def make(config: Config) -> Pool:
+        from mjx_revolve.pool import make_pool
+
+        return open_pools.enter_context(make_pool(config, workers, make_fitness, place))
+
     try:
         runtime.prepare_process()
-        make: Any = make_fitness
-        if make is None:
-            from mjx_revolve.fitness import make_fitness as make
         start = _begin if arguments.resume is None else _continue
         run, config, fitness, checkpoint = start(arguments, make)
     except KeyboardInterrupt:
         print("interrupted before the first generation", file=sys.stderr)
         return 130
+    except WorkerError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except OSError as error:
         print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
         return 1
@@ -446,6 +494,9 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
         return _work(run, config, fitness, checkpoint)
     except KeyboardInterrupt:
         return 130
+    except WorkerError as error:
+        print(f"error: {error}\nresume: {_resume_command(run.folder)}", file=sys.stderr)
+        return 1
     except OSError as error:
         print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
         if run.checkpoints():
@@ -478,6 +529,7 @@ def _work(run: Run, config: Config, fitness: Any, checkpoint: Checkpoint | None)
         resumed = [*run.info.get("resumed", []),
                    {"time": _now(), "generation": search.generation, "argv": sys.argv}]  # fmt: skip
         run.update_info(resumed=resumed, finished=None, champion=None)
+    run.update_info(workers=fitness.describe())
     print(_describe(config, fitness, run.folder), flush=True)
     if search is not None:
         print(f"resuming after generation {search.generation}", flush=True)

@@ -41,7 +41,8 @@ _REPORT_STREAM = 2**32 - 2
 class Fitness(Protocol):
     """What the loop needs of a fitness; any object with these two will do.
 
-    It may also have a number `worst_score`: scores at or below it count as failed rollouts, too.
+    It may also have a number `worst_score`: scores at or below it count as failed rollouts, too;
+    and a number `block`: it fills populations up to multiples of that many rows by itself.
     """
 
     num_genes: int
@@ -224,12 +225,15 @@ def _evaluate(
 def _summary(scores: np.ndarray) -> dict[str, float]:
     finite = scores[np.isfinite(scores)].astype(np.float64)
     if not finite.size:
-        return dict.fromkeys(("best", "mean", "std", "median"), float("nan"))
+        names = ("best", "mean", "std", "median", "lower_quartile", "upper_quartile")
+        return dict.fromkeys(names, float("nan"))
     return {
         "best": float(finite.max()),
         "mean": float(finite.mean()),
         "std": float(finite.std()),
         "median": float(np.median(finite)),
+        "lower_quartile": float(np.quantile(finite, 0.25)),
+        "upper_quartile": float(np.quantile(finite, 0.75)),
     }
 
 
@@ -274,7 +278,8 @@ def choose_champion(config: EvolutionConfig, fitness: Fitness, search: Search) -
         origins.append("mean of the last distribution")
     count = len(candidates)
     size = config.population_size
-    candidates += [candidates[0]] * (size - count if size <= _FILL_UP_TO else 0)
+    fills_up = getattr(fitness, "block", None) is not None
+    candidates += [candidates[0]] * (size - count if size <= _FILL_UP_TO and not fills_up else 0)
     rows = np.stack(candidates).astype(np.float32)
     root = jax.random.key(config.seed)
     scores, _ = _fresh(fitness, rows, jax.random.fold_in(root, _CHOOSE_STREAM), CHOOSE_EPISODES)

@@ -6,6 +6,7 @@ imports them at the top.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import os
@@ -22,8 +23,9 @@ _PACKAGES = (
     "mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "numpy", "scipy",
 )  # fmt: skip
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-# Programs that compile faster than this are not worth a file [s].
-_MIN_COMPILE_TIME = 0.5
+# What a worker compiles faster than this is not worth a file [s]. The leader keeps everything: a
+# start runs a hundred small programs, 2 s to compile and .3 s to read back.
+_WORKER_MIN_COMPILE_TIME = 0.5
 
 
 def prepare_process() -> Path | None:
@@ -50,11 +52,39 @@ def prepare_process() -> Path | None:
             print(f"no compilation cache: {error.strerror}: {folder}", file=sys.stderr)
             folder = None
 
+    _use_cache(folder, 0.0)
+    return folder
+
+
+def _use_cache(folder: Path | None, min_compile_time: float) -> None:
     import jax
 
     jax.config.update("jax_compilation_cache_dir", str(folder) if folder else None)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _MIN_COMPILE_TIME)
-    return folder
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time)
+
+
+def prepare_worker(core: int | None, cache: str | None) -> None:
+    """What `prepare_process` is to a command, this is to a worker process; imports JAX.
+
+    Args:
+        core: the only core it is to use; None: any. XLA makes as many threads as there are cores
+            to use, so with one core a worker is single-threaded.
+        cache: the compilation cache's folder, as the process that started the worker uses it. That
+            one has removed broken entries; doing so again could hit one that is being written.
+    """
+    for name in _THREAD_SETTINGS:
+        os.environ.setdefault(name, "1")
+    if core is not None and hasattr(os, "sched_setaffinity"):
+        # No longer one of ours (a shrunk container): any will do.
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(0, {core})
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    _use_cache(Path(cache) if cache else None, _WORKER_MIN_COMPILE_TIME)
+
+
+def list_cores() -> list[int]:
+    """The CPU cores this process may use, by number; empty where the system does not say."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 def cache_folder() -> Path:
@@ -68,13 +98,6 @@ def cache_folder() -> Path:
     return Path(home).absolute() / "mjx_revolve" / "xla" / f"{version}-{_cpu_hash()}"
 
 
-def _cpu_model() -> str:
-    for line in _cpuinfo():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
 def _cpuinfo() -> list[str]:
     try:
         return Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -85,7 +108,7 @@ def _cpuinfo() -> list[str]:
 def _cpu_hash() -> str:
     """XLA compiles for the host's instruction set: the same model name and flags, the same code."""
     flags = {line for line in _cpuinfo() if line.startswith(("model name", "flags", "Features"))}
-    text = "\n".join([platform.machine(), _cpu_model(), *sorted(flags)])
+    text = "\n".join([platform.machine(), cpu_model(), *sorted(flags)])
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -162,6 +185,22 @@ def _git_revision() -> str | None:
     return commit + ("+" if changes else "")
 
 
+def cpu_model() -> str:
+    """The host's kind of CPU, in its maker's words."""
+    for line in _cpuinfo():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def source_hash() -> str:
+    """A fingerprint of this package's Python files: two checkouts of one version may differ."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).resolve().parent.glob("*.py")):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]
+
+
 def describe_process() -> dict[str, Any]:
     """What the bits of a run depend on, and who ran it: for `run.json`. Imports JAX.
 
@@ -181,7 +220,7 @@ def describe_process() -> dict[str, Any]:
         "git": _git_revision(),
         "argv": sys.argv,
         "platform": platform.platform(),
-        "cpu": _cpu_model(),
+        "cpu": cpu_model(),
         "cpu_count": usable_cores(),
         "device": jax.devices()[0].device_kind,
         "threads": {name: os.environ.get(name) for name in (*_THREAD_SETTINGS, "NPROC")},

@@ -4,12 +4,14 @@ Bits are compared within one process or on one machine with the same thread sett
 """
 
 import errno
+import io
 import itertools
 import json
 import os
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
@@ -23,7 +25,7 @@ import pytest
 
 from laboratory import XLA_FLAGS
 from mjx_revolve import evolve as command
-from mjx_revolve import loop, runs
+from mjx_revolve import loop, progress, runs
 from mjx_revolve.config import EvolutionConfig
 from mjx_revolve.errors import InputError, run_command
 from mjx_revolve.loop import choose_champion, evolve, search_from_arrays, search_to_arrays
@@ -536,7 +538,8 @@ def stopped(folder):
     ("argv", "message"),
     [
         (["--set", "task.duration=4"], "--resume run: task.duration: expected 10.0 as in the run; "
-         "found 4.0; only evolution.generations, checkpoint_every, keep_checkpoints may change"),
+         "found 4.0; only evolution.generations, checkpoint_every, keep_checkpoints, tensorboard "
+         "may change"),
         (["--seed", "9"], "--resume run: evolution.seed: expected 0 as in the run; found 9"),
         (["--set", "world=empty_underwater"], "--resume run: world.name: expected 'lake' as in"),
         (["--set", "world.current=[1, 0, 0]"], "--resume run: world.current: expected None as in"),
@@ -682,7 +685,7 @@ def read_until(process, words):
 
 def test_ctrl_c_saves_and_says_how_to_go_on(folder):
     process = start(folder, "toy.yaml", "--out", "run", "--set", "evolution.generations=2000")
-    read_until(process, "generation 3/")
+    read_until(process, "generation 50/")
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=60)
     assert process.returncode == 130
@@ -702,7 +705,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(folder):
 @pytest.mark.slow
 def test_sigterm_and_impatience(folder):
     process = start(folder, "toy.yaml", "--out", "run", "--set", "evolution.generations=2000")
-    read_until(process, "generation 3/")
+    read_until(process, "generation 1/")
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
     process = start(folder, "--resume", "run")
@@ -727,6 +730,232 @@ def test_kill_nine_costs_only_time(folder):
     out, _ = again.communicate(timeout=120)
     assert (whole.returncode, again.returncode) == (0, 0), out
     assert contents(folder / "part") == contents(folder / "whole")
+
+
+# --- what it says while it goes on ---
+
+
+class Terminal(io.StringIO):
+    """A terminal of so many columns; `lines` is what stands on it in the end."""
+
+    def __init__(self, columns, encoding="utf-8"):
+        super().__init__()
+        self.columns, self.code = columns, encoding
+
+    encoding = property(lambda self: self.code)
+
+    def isatty(self):
+        return True
+
+    @property
+    def drawn(self):
+        return [line.replace("\x1b[K", "") for line in self.getvalue().split("\r")[1:]]
+
+
+def row(generation, **more):
+    return {"generation": generation, "best": 0.25, "mean": 1 / 3, "std": 0.1,
+            "evaluations_per_second": 1234.5} | more  # fmt: skip
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time that passes only when told to."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setenv("TERM", "xterm")
+    return now
+
+
+@pytest.mark.parametrize(
+    ("total", "stride"), [(1, 1), (60, 1), (61, 2), (120, 2), (200, 5), (500, 10), (2000, 50)]
+)
+def test_a_log_has_sixty_lines_at_most(total, stride, clock):
+    assert progress.choose_stride(total) == stride
+    out = io.StringIO()
+    shown = progress.Progress(0, total, out)
+    for generation in range(1, total + 1):
+        shown.show(row(generation))
+    shown.close()
+    told = [int(line.split("/")[0].split()[1]) for line in out.getvalue().splitlines()]
+    middle = range(stride, total + 1, stride)
+    assert told == sorted({1, total, *middle})
+
+
+def test_a_log_is_never_silent_for_long(clock):
+    out = io.StringIO()
+    shown = progress.Progress(0, 500, out)
+    for generation in range(1, 6):
+        shown.show(row(generation))
+        clock[0] += 31.0
+    assert len(out.getvalue().splitlines()) == 5
+
+
+def test_plain_lines_tell_the_time_left(clock):
+    out = io.StringIO()
+    shown = progress.Progress(4, 10, out)
+    clock[0] += 40.0  # compiling does not count
+    shown.show(row(5))
+    clock[0] += 15.0
+    shown.show(row(6, failed=3))
+    assert out.getvalue().splitlines() == [
+        "generation 5/10  best 0.25  mean 0.3333  evaluations/s 1234",
+        "generation 6/10  best 0.25  mean 0.3333  evaluations/s 1234  failed 3  left 1:00",
+    ]
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0:00"), (59.6, "1:00"), (11159, "3:05:59")])
+def test_times_left(seconds, text):
+    assert progress._clock(seconds) == text
+
+
+@pytest.mark.parametrize("columns", [20, 50, 80, 200])
+def test_the_live_line_fits_its_terminal(columns, clock, monkeypatch):
+    monkeypatch.setattr(progress.Progress, "_columns", lambda self: columns)
+    out = Terminal(columns)
+    shown = progress.Progress(0, 4, out)
+    for generation in (1, 2, 3):
+        clock[0] += 2.0
+        shown.show(row(generation))
+    clock[0] += 0.01
+    shown.show(row(4))  # the last one, too soon for any other
+    shown.close()
+    assert all(len(line.rstrip("\n")) < columns for line in out.drawn)
+    assert out.drawn[0].startswith("generation 0/4  ")
+    assert out.drawn[-1].startswith("generation 4/4  ")
+    assert len(out.drawn) == 5
+    assert out.getvalue().endswith("\n")
+    if columns == 200:
+        assert out.drawn[3].split("  ") == [
+            "generation 3/4", "━" * 22 + "─" * 8, "best 0.25", "mean 0.3333", "evaluations/s 1234",
+            "left 0:02",
+        ]  # fmt: skip
+
+
+def test_the_live_line_is_not_drawn_too_often(clock, monkeypatch):
+    monkeypatch.setattr(progress.Progress, "_columns", lambda self: 120)
+    out = Terminal(120, "ascii")
+    shown = progress.Progress(0, 1000, out)
+    for generation in range(1, 101):
+        clock[0] += 0.01
+        shown.show(row(generation))
+    assert len(out.drawn) < 15
+    shown.close()  # interrupted: the last generation is there
+    assert out.drawn[-1].startswith("generation 100/1000  ###")
+    out.getvalue().replace("\x1b", "").encode("ascii")
+
+
+def test_dumb_terminals_get_plain_lines(clock, monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    out = Terminal(80)
+    progress.Progress(0, 4, out).show(row(1))
+    assert out.getvalue() == "generation 1/4  best 0.25  mean 0.3333  evaluations/s 1234\n"
+
+
+@pytest.mark.slow
+def test_pandas_opens_the_metrics_of_a_run_that_goes_on(folder):
+    pandas = pytest.importorskip("pandas")
+    process = start(folder, "toy.yaml", "--out", "run", "--set", "evolution.generations=40")
+    read_until(process, "generation 1/")
+    seen = set()
+    while process.poll() is None:
+        frame = pandas.read_csv(folder / "run" / "metrics.csv")
+        assert frame["generation"].tolist() == list(range(1, len(frame) + 1))
+        assert frame.notna().all(axis=None)
+        seen.add(len(frame))
+        time.sleep(0.02)
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert len(seen) > 10
+
+
+# --- TensorBoard ---
+
+
+def events(folder):
+    """The scalars that a reader of the event files keeps: by tag, (step, value)."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    found = []
+    for path in sorted((folder / "tensorboard").iterdir()):
+        data, at = path.read_bytes(), 0
+        while at < len(data):
+            (size,) = struct.unpack("<Q", data[at : at + 8])
+            found.append(Event.FromString(data[at + 12 : at + 12 + size]))
+            at += 12 + size + 4
+    scalars = {}
+    for event in found:
+        if event.HasField("session_log"):  # what TensorBoard does: later steps are purged
+            scalars = {tag: [x for x in xs if x[0] < event.step] for tag, xs in scalars.items()}
+        for value in event.summary.value:
+            scalars.setdefault(value.tag, []).append((event.step, value.simple_value))
+    return scalars
+
+
+def test_tensorboard_has_what_the_metrics_have(folder):
+    pytest.importorskip("tensorboardX")
+    board = ("--set", "evolution.tensorboard=true")
+    assert run_main("toy.yaml", "--out", "whole", *board) == 0
+    with pytest.raises(DroppedError):
+        run_main("toy.yaml", "--out", "part", *board, make_fitness=dropping(6))
+    assert [step for step, _ in events(folder / "part")["fitness/best"]] == [1, 2, 3, 4, 5]
+    assert run_main("--resume", "part") == 0
+    assert len(list((folder / "part" / "tensorboard").iterdir())) == 2
+    for name in ("whole", "part"):
+        table = runs.load_metrics(folder / name / "metrics.csv")
+        scalars = events(folder / name)
+        assert len(scalars) == len(table) - 1  # the generation is the step
+        assert {tag.split("/")[0] for tag in scalars} == {"fitness", "search", "measures", "time"}
+        for tag, points in scalars.items():
+            column = table[tag.split("/")[1]]
+            assert [step for step, _ in points] == list(range(1, 8))
+            assert np.allclose([value for _, value in points], column, rtol=1e-6)
+    assert contents(folder / "part") == contents(folder / "whole")
+
+
+def test_tensorboard_itself_reads_it(folder):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    pytest.importorskip("tensorboardX")
+    board = ("--set", "evolution.tensorboard=true")
+    with pytest.raises(DroppedError):
+        run_main("toy.yaml", "--out", "run", *board, make_fitness=dropping(6))
+    assert run_main("--resume", "run") == 0
+    reader = accumulator.EventAccumulator(str(folder / "run" / "tensorboard"))
+    reader.Reload()
+    assert [event.step for event in reader.Scalars("fitness/best")] == list(range(1, 8))
+
+
+def test_tensorboard_may_begin_late_and_end_early(folder):
+    pytest.importorskip("tensorboardX")
+    assert run_main("toy.yaml", "--out", "run") == 0
+    board = ("--set", "evolution.generations=9", "--set", "evolution.tensorboard=true")
+    assert run_main("--resume", "run", *board) == 0
+    assert [step for step, _ in events(folder / "run")["search/step_size"]] == list(range(1, 10))
+    less = ("--set", "evolution.generations=10", "--set", "evolution.tensorboard=false")
+    assert run_main("--resume", "run", *less) == 0
+    assert len(events(folder / "run")["search/step_size"]) == 9
+
+
+@pytest.mark.parametrize("argv", [("toy.yaml", "--out", "new"), ("--resume", "run")])
+def test_tensorboard_is_missed_before_anything_begins(stopped, argv, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    assert run_main(*argv, "--set", "evolution.tensorboard=true") == 2
+    err = capsys.readouterr().err
+    assert "evolution.tensorboard: expected the package tensorboardX (pip install" in err
+    assert err.count("\n") == 1
+    assert not (stopped / "new").exists()
+
+
+def test_a_full_disk_is_noticed_by_tensorboard(folder, capsys, monkeypatch):
+    pytest.importorskip("tensorboardX")
+    from tensorboardX.event_file_writer import EventsWriter
+
+    def full(self, event):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(EventsWriter, "write_event", full)
+    assert run_main("toy.yaml", "--out", "run", "--set", "evolution.tensorboard=true") == 1
+    err = capsys.readouterr().err
+    assert err == f"error: {folder / 'run' / 'tensorboard'}: No space left on device\n"
 
 
 @pytest.mark.slow

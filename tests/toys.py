@@ -1,0 +1,81 @@
+"""Fitnesses that cost nothing and that worker processes can import by name."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Toy:
+    """The higher, the nearer to a target, in blocks of 4; noise by key, as real starts have it."""
+
+    num_genes = 5
+    block_size: int | None = 4
+
+    def __init__(self) -> None:
+        self.target = np.linspace(-1, 1, self.num_genes).astype(np.float32)
+
+    def evaluate(self, population, key):
+        distance = jnp.sum((population - self.target) ** 2, axis=1)
+        # Rows see one another's places, as padded rows must not.
+        noise = 0.1 * jax.random.normal(key, (self.num_genes,))
+        return jnp.tanh(population @ noise) - distance, {"distance_m": jnp.sqrt(distance)}
+
+
+def make_toy(config):
+    return Toy()
+
+
+class SlowToy(Toy):
+    def evaluate(self, population, key):
+        time.sleep(0.02)
+        return super().evaluate(population, key)
+
+
+def make_slow(config):
+    return SlowToy()
+
+
+class TroubledToy(Toy):
+    """Gets into trouble once: $TOY_TROUBLE is `kill`, `stop`, `raise` or `exit`, then `:FILE`.
+
+    The file says that it has happened already.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def evaluate(self, population, key):
+        self.count += 1
+        kind, _, path = os.environ["TOY_TROUBLE"].partition(":")
+        if self.count == 8 and not Path(path).exists():
+            Path(path).write_text(str(os.getpid()))
+            match kind:
+                case "kill":
+                    os.kill(os.getpid(), signal.SIGKILL)
+                case "stop":
+                    os.kill(os.getpid(), signal.SIGSTOP)
+                case "raise":
+                    raise FloatingPointError("all is lost\nreally")
+                case "exit":
+                    os.write(2, b"out of luck\n")
+                    os._exit(3)
+        return super().evaluate(population, key)
+
+
+def make_troubled(config):
+    return TroubledToy()
+
+
+def make_broken(config):
+    """Can be built by the leader only."""
+    if os.environ.get("TOY_LEADER") != str(os.getpid()):
+        raise RuntimeError("no such luck")
+    return Toy()
