@@ -85,6 +85,8 @@ def bed_contact(
     Returns:
         Force on each point, same frame [N], and its damping along the normal and across it [N·s/m].
     """
+    stiffness: Scalar
+    damper: Scalar
     if isinstance(point_mass, jax.Array):  # bodies differ from lane to lane
         stiffness = jnp.where(point_mass > 0, bed.stiffness, 0)
         damper = 2 * _DAMPING_RATIO * jnp.sqrt(bed.stiffness * point_mass)

@@ -99,7 +99,8 @@ def load_episode(
     if water.gust is not None:
         gust_key = jax.random.fold_in(jax.random.key(seed or 0), 1)
         steps = max(1, round(seconds / water.timestep))
-        gusty = gusty_water(water, gust_path(water.gust, gust_key, steps, water.timestep, 1)[..., 0])
+        gusts = gust_path(water.gust, gust_key, steps, water.timestep, 1)
+        gusty = gusty_water(water, gusts[..., 0])
     trajectory = simulate(robot, None, seconds, key=key, water=gusty)
     return Episode(morphology.name, robot, trajectory, water=gusty)
 

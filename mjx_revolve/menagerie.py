@@ -427,7 +427,7 @@ def pack_bodies(robots: Sequence[Robot], shape: Shape, dtype: Any = np.float32) 
     constants = dict(shape.constants)
     places = {k: v for k, v in _padding(shape).items() if k not in constants}
     known: dict[int, int] = {}
-    columns: list[tuple[dict[str, np.ndarray], np.ndarray, ...]] = []
+    columns: list[tuple[Any, ...]] = []
     order = []
     for robot in robots:
         if id(robot) not in known:

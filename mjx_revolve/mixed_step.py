@@ -239,10 +239,11 @@ def _acceleration(
         source, own_slot, inner, table, motion, turn, angle, speed, midway, target = row
         level = level_of(shape, table)
         seen = _lift(motion)
+        spin, velocity = seen["rate"]
+        x_axis, y_axis = seen.get("axes", (None, None))
         moving = Motion(
-            *seen["rate"], seen["up"], seen["height"],
-            *seen.get("axes", (None, None)), seen.get("place"),
-        )  # fmt: skip
+            spin, velocity, seen["up"], seen["height"], x_axis, y_axis, seen.get("place")
+        )
         gravity = felt_gravity(world, water, moving)
         swirling = seen.get("middle", seen["rate"])
         own = own_inertia(world, shape.carries, level, moving, swirling, water, (), gravity, dt)
