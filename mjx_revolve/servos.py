@@ -67,8 +67,9 @@ def servo(
     per_base = dt / _cast(level.base_inertia, torque)
     gain = dt * (push + jnp.maximum(forward * load, 0)) / inertia + per_base * push
     beyond = line(rate) < push
-    near = (line(rate + _MARGIN * gain) < push) & ~beyond
-    chord = jnp.maximum(push - friction, 0) / jnp.where(near, top - rate, 1)
+    # A push that friction outweighs needs no limit, and has no chord at the top speed itself.
+    near = (line(rate + _MARGIN * gain) < push) & ~beyond & (push > friction)
+    chord = (push - friction) / jnp.where(near, top - rate, 1)
     torque = jnp.where(beyond, forward * line(rate), torque)
     return torque, dt * jnp.where(beyond, slope, jnp.where(near, chord, 0))
 

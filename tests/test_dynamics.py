@@ -350,8 +350,8 @@ def test_convergence_in_the_time_step():
 
 @pytest.mark.slow
 def test_convergence_of_a_jointed_body():
-    """From 1 ms on: when a servo's torque leaves its limit is known to a step."""
-    check_order(elbow_robot, (0.001, 0.0005, 0.00025))
+    """From half a millisecond on: when a servo's torque leaves its limit is known to a step."""
+    check_order(elbow_robot, (0.0005, 0.00025, 0.000125))
 
 
 # ------------------------------------------------------------------------- what it refuses
