@@ -95,7 +95,7 @@ def make_bare(job: dict[str, Any]) -> Case:
 
     from mjx_revolve.rollout import flow_at, roll_out
     from mjx_revolve.water import water_of
-    from mjx_revolve.xla import compiler_options, one_loop, over_chunks
+    from mjx_revolve.xla import compiler_options, over_chunks
 
     fitness = _fitness(job)
     robot, engine = fitness.robot, fitness.engine
@@ -115,10 +115,11 @@ def make_bare(job: dict[str, Any]) -> Case:
             records=steps // 20,
             every=20,
             timestep=world.timestep,
+            mode="fused",
         )
         return jnp.stack(state.position)
 
-    run = jax.jit(over_chunks(one_loop(chunk, chunk)), compiler_options=compiler_options())
+    run = jax.jit(over_chunks(chunk), compiler_options=compiler_options())
     qpos = jnp.tile(jnp.asarray(robot.start_qpos(DEPTH), jnp.float32)[:, None], (1, count))
     low, high = robot.mj_model.actuator_ctrlrange[engine.order].T[:, :, None]
     share = jax.random.uniform(jax.random.key(0), (robot.num_hinges, count))

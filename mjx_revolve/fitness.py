@@ -35,7 +35,7 @@ from mjx_revolve.tasks import TASKS, Track, measure
 from mjx_revolve.terrain import bed_height
 from mjx_revolve.water import Water, gust_path, water_of
 from mjx_revolve.world import World, load_world
-from mjx_revolve.xla import compiler_options, one_loop, over_chunks
+from mjx_revolve.xla import compiler_options, derived_by, over_chunks
 
 # Score of a rollout that blew up. Finite, because optimisers' averages and sorts are not made for
 # infinities, and below anything that a task gives.
@@ -223,7 +223,7 @@ class Fitness:
                 lambda x: jnp.broadcast_to(x, (gusts.shape[0] - 1, qpos.shape[-1])), rows
             )
 
-        def loop(qpos: Any, parameters: Any, water: Any, rows: Any, derived: bool = False) -> Any:
+        def loop(qpos: Any, parameters: Any, water: Any, rows: Any, mode: str = "plain") -> Any:
             qvel = jnp.zeros((self.robot.mj_model.nv, qpos.shape[-1]), qpos.dtype)
             still = water_of(world) if water is None else water
             _, kept = roll_out(
@@ -237,12 +237,12 @@ class Fitness:
                 records=self._records,
                 every=self._every,
                 timestep=world.timestep,
-                derived=derived,
+                mode=mode,
             )
             return kept
 
         if self.config.engine == "population":
-            episode = one_loop(loop, partial(loop, derived=True))
+            episode = derived_by(partial(loop, mode="fused"), partial(loop, mode="derived"))
         else:
             episode = loop
         place, energy = episode(qpos, parameters, water, rows)

@@ -36,7 +36,7 @@ from mjx_revolve.robot import Robot, build_robot, check_timestep
 from mjx_revolve.rollout import flow_at, gusty_water, make_engine, roll_out
 from mjx_revolve.water import water_of
 from mjx_revolve.world import World, load_world
-from mjx_revolve.xla import compiler_options, on_cpu, one_loop, over_chunks
+from mjx_revolve.xla import compiler_options, derived_by, on_cpu, over_chunks
 
 _INTERVAL = 0.1  # the track is sampled at least this often [s], as in `fitness`
 
@@ -224,9 +224,7 @@ class MixedFitness:
             steps = gusts.shape[0] - 1
             rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps, count)), rows)
 
-        def loop(
-            bodies: Any, start: Any, parameters: Any, water: Any, rows: Any, derived: bool = False
-        ) -> Any:
+        def loop(bodies: Any, start: Any, parameters: Any, water: Any, rows: Any, mode: str) -> Any:
             engine = make_mixed_engine(world, shape, bodies)
             still = water_of(world) if water is None else water
             _, kept = roll_out(
@@ -240,11 +238,11 @@ class MixedFitness:
                 records=self._records,
                 every=self._every,
                 timestep=world.timestep,
-                derived=derived,
+                mode=mode,
             )
             return kept
 
-        episode = one_loop(loop, partial(loop, derived=True))
+        episode = derived_by(partial(loop, mode="fused"), partial(loop, mode="derived"))
         place, energy = episode(bodies, start, parameters, water, rows)
         return jnp.stack(place, 1), energy
 

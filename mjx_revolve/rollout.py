@@ -17,7 +17,7 @@ from mjx_revolve.errors import InputError
 from mjx_revolve.robot import Robot
 from mjx_revolve.water import Water, gust_path, water_of
 from mjx_revolve.world import World
-from mjx_revolve.xla import compiler_options, share_once
+from mjx_revolve.xla import compiler_options, fused_scan, share_once
 
 ENGINES = ("population", "mjx")
 
@@ -89,7 +89,7 @@ def roll_out(
     records: int,
     every: int,
     timestep: float,
-    derived: bool = False,
+    mode: str = "plain",
 ) -> tuple[Any, Any]:
     """Steps a chunk of a population and records it now and then.
 
@@ -105,8 +105,9 @@ def roll_out(
         records: how many records.
         every: steps between them.
         timestep: [s].
-        derived: whether it is to be differentiated: then each step is computed again on the way
-            back, so that memory grows with the state and not with the step's working.
+        mode: how it is compiled. "plain"; "fused", for many steps of the population step (or
+            another that is element-wise); "derived", to be differentiated: each step is computed
+            again on the way back, so that memory grows with the state and not with its working.
 
     Returns:
         The last state, and the records, `[records, ...]` each.
@@ -120,27 +121,36 @@ def roll_out(
         state, power = engine.step(state, ctrl, flow(time, now))
         return (state, drive_state, energy + timestep * power, count + 1), ctrl
 
-    shared = share_once(step)
-    if derived:
-        shared = jax.checkpoint(shared, prevent_cse=False)
-
-    def block(carry: Any, rows: Any) -> tuple[Any, Any]:
-        state, drive_state, energy, count = carry
-        start = (state, drive_state, jnp.zeros_like(energy), count)
-        if every == 1:
-            row = None if rows is None else jax.tree.map(lambda x: x[0], rows)
-            carry, ctrl = shared(start, row)
-        else:
-            carry, ctrls = jax.lax.scan(shared, start, rows, length=every)
-            ctrl = jax.tree.map(lambda x: x[-1], ctrls)
-        return carry, record(carry[0], ctrl, carry[2])
-
     energy = jnp.zeros_like(engine.root(state)[0])
     carry = (state, drive_state, energy, jnp.zeros((), jnp.int32))
+    first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)
+    pack = unpack = wrap = lambda x: x
+    if mode == "fused":
+        step, pack, unpack, wrap = fused_scan(step, carry, first)
+    else:
+        step = share_once(step)
+        if mode == "derived":
+            step = jax.checkpoint(step, prevent_cse=False)
+
+    def block(packed: Any, rows: Any) -> tuple[Any, Any]:
+        state, drive_state, energy, count = unpack(packed)
+        start = pack((state, drive_state, jnp.zeros_like(energy), count))
+        if every == 1:
+            row = None if rows is None else jax.tree.map(lambda x: x[0], rows)
+            packed, ctrl = step(start, row)
+        else:
+            packed, ctrls = jax.lax.scan(step, start, rows, length=every)
+            ctrl = jax.tree.map(lambda x: x[-1], ctrls)
+        state, _, energy, _ = unpack(packed)
+        return packed, record(state, ctrl, energy)
+
+    def loop(carry: Any, inputs: Any) -> tuple[Any, Any]:
+        packed, kept = jax.lax.scan(block, pack(carry), inputs, length=records)
+        return unpack(packed)[0], kept
+
     if inputs is not None:
         inputs = jax.tree.map(lambda x: x.reshape(records, every, *x.shape[1:]), inputs)
-    carry, kept = jax.lax.scan(block, carry, inputs, length=records)
-    return carry[0], kept
+    return wrap(loop)(carry, inputs)
 
 
 def body_positions(robot: Robot, qpos: jax.Array) -> jax.Array:
@@ -213,7 +223,7 @@ def _compiled(
     dt = robot.world.timestep
 
     def run(
-        qpos: Any, qvel: Any, drive_input: Any, water: Water | None, derived: bool = False
+        qpos: Any, qvel: Any, drive_input: Any, water: Water | None, mode: str = "plain"
     ) -> Trajectory:
         parameters, drive_state, targets = None, (), None
         if controller is None:
@@ -243,7 +253,7 @@ def _compiled(
             records=steps,
             every=1,
             timestep=dt,
-            derived=derived,
+            mode=mode,
         )
         qs, vs = jax.vmap(simulator.observe)(states)
         back = np.argsort(simulator.order)
@@ -257,7 +267,7 @@ def _compiled(
             command=jax.vmap(simulator.command)(states)[..., 0],
         )
 
-    return jax.jit(run, compiler_options=compiler_options()), partial(run, derived=True)
+    return jax.jit(run, compiler_options=compiler_options()), partial(run, mode="derived")
 
 
 def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Water:

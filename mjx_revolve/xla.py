@@ -8,7 +8,10 @@ their sake; tests/test_xla.py notices if they lose their effect; results do not 
    as the CPU compiler drops it before fusion. A call that is never inlined does: `share_once`.
 2. Each kernel that the loop runs costs about 300 ns to dispatch, more than the arithmetic on a
    chunk of 64 individuals. A call marked `xla_cpu_small_call` is compiled into one function:
-   `one_loop`. Inside it there is no scatter and no reduction: the population step writes sums out.
+   `small_call`. Inside it there is no scatter and no reduction: the population step writes sums
+   out. Compiling such a function takes time that grows with the square of its length, as LLVM
+   forgets all that it knows of the outermost loop with every inner loop that it turns: so long
+   steps are cut into several functions, and the loop stays outside (`fused_scan`).
 
 Both are plain identities to JAX: jit, vmap and grad go through them. On other back ends they are
 left out.
@@ -16,8 +19,9 @@ left out.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +35,12 @@ LANES = 64
 
 # Least cost, in plain operations, at which storing and loading a value beats computing it twice.
 _WORTH = 4
+
+# Up to so many stored values, a step and the loops around it become one function ...
+_WHOLE = 400
+# ... and longer ones several functions of about so many each. Measured: half of that costs more in
+# calls than it saves in compilation, twice of it compiles for half as long again.
+_PIECE = 250
 
 # Operations that cost more than a plain one; views cost nothing.
 _COST = {"sqrt": 8, "rsqrt": 8, "div": 8, "tanh": 20, "exp": 15, "atan2": 40, "sin": 20, "cos": 20}
@@ -47,6 +57,7 @@ _VIEWS = {
 }
 
 _COST |= dict.fromkeys(_VIEWS, 0)
+_LOOPS = {"cond", "scan", "while"}
 
 
 def on_cpu() -> bool:
@@ -74,99 +85,271 @@ def share_once(fun: Callable[..., Any], worth: float = _WORTH) -> Callable[..., 
         The same function, its multiply-used floating-point values behind calls that are not
         inlined.
     """
-
-    def shared(*args: Any) -> Any:
-        if not on_cpu():
-            return fun(*args)
-        leaves, tree = jax.tree.flatten(args)
-        out_tree: list[Any] = []
-
-        def flat(*xs: Any) -> list[Any]:
-            out, structure = jax.tree.flatten(fun(*jax.tree.unflatten(tree, xs)))
-            out_tree.append(structure)
-            return out
-
-        closed = jax.make_jaxpr(flat)(*leaves)
-        out = _evaluate(closed.jaxpr, closed.consts, leaves, worth)
-        return jax.tree.unflatten(out_tree[0], out)
-
-    return shared
+    return lambda *args: Graph(fun, args, worth)(*args) if on_cpu() else fun(*args)
 
 
-def _evaluate(jaxpr: Any, consts: list[Any], args: list[Any], worth: float) -> list[Any]:
-    """Runs a jaxpr again with a barrier behind each value that several equations read."""
-    uses: dict[Any, int] = {}
-    for eqn in jaxpr.eqns:
-        for v in {v for v in eqn.invars if not isinstance(v, core.Literal)}:
-            uses[v] = uses.get(v, 0) + 1
-    for v in jaxpr.outvars:
-        if not isinstance(v, core.Literal):
-            uses[v] = uses.get(v, 0) + 1
-    env: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
-    env.update(zip(jaxpr.invars, args, strict=True))
-    # What it costs to compute a value again from what is already in memory.
-    cost: dict[Any, int] = {}
+def small_call(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """Makes XLA:CPU compile `fun`, element-wise but for loops, as one function."""
 
-    def read(v: Any) -> Any:
-        if not isinstance(v, core.Literal):
-            return env[v]
-        # Its dtype is in its aval: a bare Python number would take the mode's, 32 or 64 bits.
-        aval: Any = v.aval
-        return np.asarray(v.val, aval.dtype)
-
-    for eqn in jaxpr.eqns:
-        inputs = [read(v) for v in eqn.invars]
-        inner = eqn.params.get("jaxpr") if eqn.primitive.name in ("jit", "pjit") else None
-        if inner is not None:
-            # jnp.clip, jnp.where and their like are small jitted functions.
-            out = _evaluate(inner.jaxpr, inner.consts, inputs, worth)
-        else:
-            out = eqn.primitive.bind(*inputs, **eqn.params)
-            out = out if eqn.primitive.multiple_results else [out]
-        name = eqn.primitive.name
-        spent = _COST.get(name, 1) + sum(
-            cost.get(v, 0) for v in eqn.invars if not isinstance(v, core.Literal)
-        )
-        for v, x in zip(eqn.outvars, out, strict=True):
-            stored = (
-                uses.get(v, 0) > 1
-                and spent >= worth
-                and name not in _VIEWS
-                and jnp.issubdtype(v.aval.dtype, jnp.floating)
-                and v.aval.ndim > 0
-                and inner is None
-            )
-            env[v] = _never_inlined(x) if stored else x
-            cost[v] = 0 if stored or inner is not None else spent
-    return [read(v) for v in jaxpr.outvars]
-
-
-def one_loop(fun: Callable[..., Any], derived: Callable[..., Any]) -> Callable[..., Any]:
-    """Makes XLA:CPU compile `fun`, a scan of element-wise steps, as one function.
-
-    Args:
-        fun: a function of pytrees of arrays.
-        derived: the same function as it is to be differentiated: XLA takes minutes over the
-            derivative of one long function, and seconds over many short ones.
-
-    Returns:
-        The same function.
-    """
-
-    @jax.custom_jvp
     def called(*args: Any) -> Any:
-        if not on_cpu():
-            return fun(*args)
         return jax.tree.map(
             lambda x: set_xla_metadata(x, inlineable="false", xla_cpu_small_call="true"),
             jax.jit(fun)(*args),
         )
+
+    return called if on_cpu() else fun
+
+
+def derived_by(fun: Callable[..., Any], derived: Callable[..., Any]) -> Callable[..., Any]:
+    """`fun`, but differentiated as `derived`.
+
+    XLA takes minutes over the derivative of one long function, and seconds over many short ones.
+
+    Args:
+        fun: a function of pytrees of arrays.
+        derived: the same function as it is to be differentiated.
+
+    Returns:
+        The same function.
+    """
+    called = jax.custom_jvp(fun)
 
     @called.defjvp
     def _derive(primals: Any, tangents: Any) -> Any:
         return jax.jvp(derived, primals, tangents)
 
     return called
+
+
+class _Operation(NamedTuple):
+    """One primitive: its equation, its inputs (numbers of values, or literals) and its outputs."""
+
+    equation: Any
+    inputs: list[Any]
+    outputs: list[int]
+
+
+class Graph:
+    """A function as a list of operations on numbered values, and which of these are stored.
+
+    Calling it computes the function, stored values behind calls that are not inlined.
+
+    Attributes:
+        size: how many values are stored.
+    """
+
+    def __init__(self, fun: Callable[..., Any], examples: Any, worth: float = _WORTH) -> None:
+        """Traces `fun` (of pytrees of arrays) on arguments like `examples`."""
+        leaves, tree = jax.tree.flatten(examples)
+        structure: list[Any] = []
+
+        def flat(*xs: Any) -> list[Any]:
+            out, out_tree = jax.tree.flatten(fun(*jax.tree.unflatten(tree, xs)))
+            structure.append(out_tree)
+            return out
+
+        closed = jax.make_jaxpr(flat)(*leaves)
+        self._structure = structure[0]
+        self._operations: list[_Operation] = []
+        self._constants: dict[int, Any] = {}
+        self._count = 0
+        env = {v: self._number() for v in closed.jaxpr.invars}
+        self._arguments = list(env.values())
+        self._results = self._inline(closed.jaxpr, closed.consts, env)
+        self._stored = self._choose(worth)
+        self.size = len(self._stored)
+
+    def __call__(self, *args: Any) -> Any:
+        """Computes the function."""
+        values = self._constants | dict(zip(self._arguments, jax.tree.leaves(args), strict=True))
+        self._compute(self._operations, values)
+        return self._finish(values)
+
+    def in_pieces(self, size: int, pack: Callable[[Any], Any], unpack: Callable[[Any], Any]) -> Any:
+        """The function cut into several, each compiled as one: `small_call`.
+
+        XLA's time for a function grows faster than its length, and several compile at once.
+
+        Args:
+            size: of a piece, in stored values.
+            pack: what becomes of the results within the last piece.
+            unpack: the function's arguments from what is given instead, within each piece.
+
+        Returns:
+            A function of what `unpack` takes that returns what `pack` gives.
+        """
+        order = list(self._stored)
+        count = max(1, round(len(order) / size))
+        piece = {v: k * count // len(order) for k, v in enumerate(order)}
+        made = {v: k for k, op in enumerate(self._operations) for v in op.outputs}
+        ends = [v for v in self._results if isinstance(v, int)]
+        cuts = []
+        for number in range(count):
+            wanted = [v for v in order if piece[v] == number]
+            cuts.append(
+                self._cut(number, wanted + (ends if number == count - 1 else []), piece, made)
+            )
+        read = {v for _, inputs, _ in cuts for v in inputs}
+
+        def run(*args: Any) -> Any:
+            values: dict[int, Any] = {}
+            for number, (operations, inputs, wanted) in enumerate(cuts):
+                last = number == count - 1
+                outputs = [v for v in wanted if v in read and v not in values]
+
+                def compute(
+                    given: Any, *xs: Any, cut: Any = (operations, inputs, outputs, last)
+                ) -> Any:
+                    operations, inputs, outputs, last = cut
+                    local = self._constants | dict(zip(inputs, xs, strict=True))
+                    local |= zip(self._arguments, jax.tree.leaves(unpack(*given)), strict=True)
+                    self._compute(operations, local)
+                    if last:
+                        return pack(self._finish(local))
+                    return [local[v] for v in outputs]
+
+                found = small_call(compute)(args, *(values[v] for v in inputs))
+                if last:
+                    return found
+                values.update(zip(outputs, found, strict=True))
+
+        return run
+
+    def _cut(
+        self, number: int, wanted: list[int], piece: dict[int, int], made: dict[int, int]
+    ) -> tuple[list[_Operation], list[int], list[int]]:
+        """Operations of one piece, the stored values of earlier ones that it reads, its own."""
+        needed, inputs, seen, todo = set(), [], set(), list(wanted)
+        while todo:
+            v = todo.pop()
+            if v in seen or v not in made:  # arguments and constants are everywhere
+                continue
+            seen.add(v)
+            if piece.get(v, number) < number:
+                inputs.append(v)
+                continue
+            needed.add(made[v])
+            todo += [x for x in self._operations[made[v]].inputs if isinstance(x, int)]
+        return [self._operations[k] for k in sorted(needed)], inputs, wanted
+
+    def _number(self) -> int:
+        self._count += 1
+        return self._count
+
+    def _inline(self, jaxpr: Any, consts: Any, env: dict[Any, Any]) -> list[Any]:
+        """Lists a jaxpr's operations, those of the small jitted functions in it among them."""
+        for v, x in zip(jaxpr.constvars, consts, strict=True):
+            env[v] = self._number()
+            self._constants[env[v]] = x
+        read = lambda v: v if isinstance(v, core.Literal) else env[v]  # noqa: E731
+        for eqn in jaxpr.eqns:
+            inputs = [read(v) for v in eqn.invars]
+            inner = eqn.params.get("jaxpr") if eqn.primitive.name in ("jit", "pjit") else None
+            if inner is not None:
+                # jnp.clip, jnp.where and their like.
+                inside = dict(zip(inner.jaxpr.invars, inputs, strict=True))
+                outputs = self._inline(inner.jaxpr, inner.consts, inside)
+            else:
+                outputs = [self._number() for _ in eqn.outvars]
+                self._operations.append(_Operation(eqn, inputs, outputs))
+            env.update(zip(eqn.outvars, outputs, strict=True))
+        return [read(v) for v in jaxpr.outvars]
+
+    def _choose(self, worth: float) -> dict[int, bool]:
+        """Values to be stored, in order; False: a loop's, stored without our doing."""
+        uses: dict[int, int] = {}
+        for inputs in [*(op.inputs for op in self._operations), self._results]:
+            for v in {v for v in inputs if isinstance(v, int)}:
+                uses[v] = uses.get(v, 0) + 1
+        # What it costs to compute a value again from what is already in memory.
+        cost: dict[int, int] = {}
+        stored: dict[int, bool] = {}
+        for op in self._operations:
+            name = op.equation.primitive.name
+            spent = _COST.get(name, 1) + sum(
+                cost.get(v, 0) for v in op.inputs if isinstance(v, int)
+            )
+            for v, variable in zip(op.outputs, op.equation.outvars, strict=True):
+                if name in _LOOPS:
+                    stored[v] = False
+                elif (
+                    uses.get(v, 0) > 1
+                    and spent >= worth
+                    and name not in _VIEWS
+                    and jnp.issubdtype(variable.aval.dtype, jnp.floating)
+                    and variable.aval.ndim > 0
+                ):
+                    stored[v] = True
+                cost[v] = 0 if v in stored else spent
+        return stored
+
+    def _compute(self, operations: list[_Operation], values: dict[int, Any]) -> None:
+        for op in operations:
+            inputs = [_value(values, v) for v in op.inputs]
+            out = op.equation.primitive.bind(*inputs, **op.equation.params)
+            out = out if op.equation.primitive.multiple_results else [out]
+            for v, x in zip(op.outputs, out, strict=True):
+                values[v] = _never_inlined(x) if self._stored.get(v) else x
+
+    def _finish(self, values: dict[int, Any]) -> Any:
+        return jax.tree.unflatten(self._structure, [_value(values, v) for v in self._results])
+
+
+def _value(values: dict[int, Any], v: Any) -> Any:
+    if isinstance(v, int):
+        return values[v]
+    # A literal's dtype is in its aval: a bare Python number would take the mode's, 32 or 64 bits.
+    return np.asarray(v.val, v.aval.dtype)
+
+
+def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any) -> Any:
+    """How to repeat a step of a chunk of a population fastest.
+
+    A short step's loop is compiled as one function, all around it. A long one is cut into several
+    functions, which a loop of XLA's own calls: 5 to 10 % slower, and quicker to compile by the
+    factors that docs/performance.md lists. There the carry travels as one array, because every
+    array that a loop carries costs as much as a call.
+
+    Args:
+        step: (carry, row) → (carry, output); element-wise. The carry's leaves are `[..., lanes]`
+            of one floating-point type, but for scalars.
+        carry: one like those that it will get.
+        row: likewise.
+
+    Returns:
+        (step, pack, unpack, wrap): the step on packed carries; functions between carries and packed
+        ones; and what to wrap around the function that holds all loops.
+    """
+    same = lambda x: x  # noqa: E731
+    if not on_cpu():
+        return step, same, same, same
+    graph = Graph(step, (carry, row))
+    if graph.size <= _WHOLE:
+        return graph, same, same, small_call
+    leaves, tree = jax.tree.flatten(carry)
+    wide = [x.ndim > 0 for x in leaves]
+    rows = np.cumsum([0] + [x.size // x.shape[-1] for x, w in zip(leaves, wide, strict=True) if w])
+
+    def pack(carry: Any) -> Any:
+        leaves = jax.tree.leaves(carry)
+        blocks = [x.reshape(-1, x.shape[-1]) for x in leaves if x.ndim > 0]
+        return jnp.concatenate(blocks), [x for x in leaves if x.ndim == 0]
+
+    def unpack(packed: Any) -> Any:
+        block, scalars = packed[0], iter(packed[1])
+        slices = (block[a:b] for a, b in itertools.pairwise(rows))
+        found = [
+            next(slices).reshape(x.shape) if w else next(scalars)
+            for x, w in zip(leaves, wide, strict=True)
+        ]
+        return jax.tree.unflatten(tree, found)
+
+    pieces = graph.in_pieces(
+        _PIECE,
+        pack=lambda result: (pack(result[0]), result[1]),
+        unpack=lambda packed, row: (unpack(packed), row),
+    )
+    return pieces, pack, unpack, same
 
 
 def over_chunks(fun: Callable[..., Any], lanes: int | None = None) -> Callable[..., Any]:
