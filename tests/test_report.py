@@ -30,6 +30,7 @@ from mjx_revolve import (
 )
 from mjx_revolve.config import load_config, make_config
 from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.fingerprints import model_hash, settings_hash
 from mjx_revolve.fitness import make_fitness
 from mjx_revolve.loop import replay_key
 from mjx_revolve.report_champion import cpg_phases, judge, path_of, replay_champion
@@ -72,7 +73,7 @@ def make_run(folder, config, fitness, seed=0, generations=6, finished=True, scor
     settings = ["controller.max_frequency=1.0", f"evolution.seed={seed}"]
     run, config = runs.create_run(
         folder, config, started="2026-01-02T03:04:05+00:00", seed=seed,
-        config_file=config.source, settings=settings, model_hash=evolve._model_hash(fitness),
+        config_file=config.source, settings=settings, model_hash=model_hash(fitness),
         **runtime.describe_process(),
     )  # fmt: skip
     for generation in range(1, generations + 1):
@@ -234,6 +235,12 @@ def cut(path, share=0.5):
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
 
 
+def made_by(run, package, version):
+    record = json.loads((run / "run.json").read_text())
+    record["versions"][package] = version
+    (run / "run.json").write_text(json.dumps(record))
+
+
 def edit(path, old, new):
     text = path.read_text()
     assert old in text
@@ -268,7 +275,7 @@ DAMAGES = [
      "of another version", "this version does not know task.trails; read without"),
     (lambda run: edit(run / "run.json", f'"jax": "{jax.__version__}"', '"jax": "0.0.7"'),
      "of another version", f"made with older jax 0.0.7 (here {jax.__version__}): a replay may"),
-    (lambda run: edit(run / "run.json", '"versions": {', '"versions": {"mjx_revolve": "99.1",'),
+    (lambda run: made_by(run, "mjx_revolve", "99.1"),
      "of another version", "made with newer mjx_revolve 99.1 (here "),
     (lambda run: edit(run / "run.json", '"versions"', '"visions"'), "of another version",
      "run.json names no versions"),
@@ -535,7 +542,7 @@ def test_the_commands_give_the_same_settings(lab, copy):
         assert command.startswith("python -m mjx_revolve.evolve ")
         arguments = evolve._parser().parse_args(command.split()[3:])
         config = load_config(arguments.config, evolve._seed_setting(arguments))
-        assert evolve._settings_hash(config) == evolve._settings_hash(record.config)
+        assert settings_hash(config) == settings_hash(record.config)
     assert "--seed 0 --set controller.max_frequency=1.0" in started
 
 
