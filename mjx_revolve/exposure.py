@@ -46,11 +46,12 @@ def exposed_shares(morphology: Morphology) -> list[np.ndarray]:
                 }
             )
     centers = np.array([part["center"] for part in parts])
-    radii = np.array([np.abs(part["bounds"]).sum(0).max() for part in parts])
+    radii = np.array([np.linalg.norm(np.abs(part["bounds"]).max(0)) for part in parts])
+    radii += max(_DISTANCES)
     shares = []
     for i, here in enumerate(parts):
         apart = np.linalg.norm(centers - here["center"], axis=1)
-        near = [parts[j] for j in np.flatnonzero(apart < 2 * (radii + radii[i])) if j != i]
+        near = [parts[j] for j in np.flatnonzero(apart < radii + radii[i]) if j != i]
         shares.append(np.array([_exposed_share(here, near, axis) for axis in range(3)]))
     return shares
 
@@ -66,17 +67,18 @@ def _exposed_share(part: dict[str, Any], near: list[dict[str, Any]], axis: int) 
     silhouette = np.zeros(len(points), bool)
     for position, half in part["boxes"]:
         silhouette |= np.all(np.abs(points[:, beside] - position[beside]) <= half[beside], axis=1)
+    count = int(silhouette.sum())
     shown = []
-    for side in (low, high):
-        covered = np.zeros(int(silhouette.sum()), bool)
-        for distance in _DISTANCES:
-            face = points[silhouette]
-            face[:, axis] = side[axis] + (distance if side is high else -distance)
-            face = part["center"] + face @ part["rotation"].T
-            for other in near:
-                local = (face - other["center"]) @ other["rotation"]
-                for position, half in other["boxes"]:
-                    # A hair of slack, so that flush neighbours count whatever the rounding.
-                    covered |= np.all(np.abs(local - position) <= half + 1e-6, axis=1)
-        shown.append(1 - covered.mean())
+    for side, out in ((low, -1), (high, 1)):
+        faces = np.repeat(points[None, silhouette], len(_DISTANCES), 0)
+        faces[:, :, axis] = side[axis] + out * np.array(_DISTANCES)[:, None]
+        faces = part["center"] + faces.reshape(-1, 3) @ part["rotation"].T
+        covered = np.zeros(len(faces), bool)
+        for other in near:
+            local = (faces - other["center"]) @ other["rotation"]
+            for position, half in other["boxes"]:
+                # A hair of slack, so that flush neighbours count whatever the rounding.
+                x, y, z = (np.abs(local - position) <= half + 1e-6).T
+                covered |= x & y & z
+        shown.append(1 - covered.reshape(-1, count).any(0).mean())
     return float(np.mean(shown))
