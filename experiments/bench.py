@@ -1,12 +1,13 @@
 """How fast it is, beside MuJoCo C and plain MJX, all from one run.
 
-``python -m experiments.bench [--quick] [--population N] [--robot FILE] [--json FILE]``
+``python -m experiments.bench [--quick] [--only CASE ...] [--parts] [--json FILE]``
 
-Every engine runs in a process of its own, as a user would start it: no pinning, no environment
-variables but those that `mjx_revolve.evolve` sets, compilation cache off. The processes are started
-one after the other, which times their compilation, and then measured in turn, several rounds, the
-order reversed in every other round; while one is measured the others wait. What is counted is steps
-of one robot. docs/performance.md says what the numbers mean.
+Case by case: every engine runs in a process of its own, as a user would start it: no environment
+variables but those that `mjx_revolve.evolve` sets, compilation cache off. Ours has one process for
+each of two cores, as `evolve` does; MuJoCo C has as many threads. The processes of a case are
+started one after the other, which times their compilation, and then measured in turn, several
+rounds, the order reversed in every other round; while one is measured the others wait. What is
+counted is steps of one robot. docs/performance.md says what the numbers mean.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -28,57 +30,164 @@ from typing import IO, Any
 from experiments.common import ROOT, align, count, make_folder, make_parser, shown
 from mjx_revolve.errors import InputError, run_command
 
-# Longest wait for an answer [s]; the slowest compiles for a quarter of a minute.
-_PATIENCE = 300.0
-_MEMORY_POPULATION = 1024
+# Longest wait for an answer [s]; 256 bodies are built, and the largest compile, in two minutes.
+_PATIENCE = 600.0
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table.
+    """One engine in one case.
 
     Attributes:
         name: what is measured.
-        case: which of `bench_cases.MAKERS`.
+        engine: which of `bench_cases.MAKERS`.
         physics: which of `bench_cases.PHYSICS`.
-        quick: whether `--quick` keeps it.
-        limits: whether joint limits are left on (plain MJX).
+        robot: whose morphology.
+        population: individuals, over all processes.
         task: what the episodes are, ours only.
-        cores: the cores that its processes are pinned to, one process each; None: one, not pinned.
+        duration: of the episodes [s], ours only.
+        limits: whether joint limits are left on (plain MJX).
+        each_core: one process pinned to each core, rather than one of all cores.
     """
 
     name: str
-    case: str
+    engine: str
     physics: str
-    quick: bool = False
-    limits: bool = True
+    robot: str = "spider"
+    population: int = 2048
     task: str = "directed_swim"
-    cores: tuple[int, ...] | None = None
+    duration: float = 10.0
+    limits: bool = True
+    each_core: bool = False
 
 
-ROWS = (
-    Row("ours, evaluation, default water", "evaluation", "default", quick=True),
-    Row("ours, whole generation, default water", "generation", "default"),
-    Row("ours, bare steps, default water", "bare", "default"),
-    Row("ours, evaluation, ellipsoid law", "evaluation", "ellipsoid"),
-    Row("ours, evaluation, no fluid", "evaluation", "none"),
-    Row("plain MJX, no fluid", "mjx", "none", quick=True),
-    Row("plain MJX, no fluid, no joint limits", "mjx", "none", limits=False),
-    Row("plain MJX, inertia box", "mjx", "inertia_box"),
-    Row("MuJoCo C, rollout, ellipsoid law", "rollout", "ellipsoid", quick=True),
-    Row("MuJoCo C, Batch, ellipsoid law", "batch", "ellipsoid", quick=True),
-    Row("MuJoCo C, rollout, no fluid", "rollout", "none"),
-    Row("MuJoCo C, Batch, no fluid", "batch", "none"),
+@dataclass(frozen=True)
+class Group:
+    """A case: what its first row is, relative to the best of those that it is held against.
+
+    Attributes:
+        name: of the case.
+        rows: the engines; the first is what the case is about.
+        against: how many rows from the second on it is held against; the rest is for information.
+        goal: the least ratio to be reached; None: no ratio is asked for.
+    """
+
+    name: str
+    rows: tuple[Row, ...]
+    against: int
+    goal: float | None
+
+
+def _c(physics: str, **other: Any) -> tuple[Row, Row]:
+    law = {"ellipsoid": "ellipsoid law", "bed": "ellipsoid law, contacts"}[physics]
+    return (
+        Row(f"MuJoCo C, rollout, {law}", "rollout", physics, **other),
+        Row(f"MuJoCo C, Batch, {law}", "batch", physics, **other),
+    )
+
+
+def _ours(physics: str, law: str, **other: Any) -> Row:
+    return Row(f"ours, {law}", "evaluation", physics, each_core=True, **other)
+
+
+_MJX = {"population": 256}  # ten times as many take it minutes
+GROUPS = (
+    Group(
+        "spider, ellipsoid law",
+        (
+            _ours("ellipsoid", "ellipsoid law"),
+            *_c("ellipsoid"),
+            Row("plain MJX, inertia box", "mjx", "inertia_box", **_MJX),
+        ),
+        2,
+        40.0,
+    ),
+    Group(
+        "spider, default water",
+        (
+            _ours("default", "default water"),
+            *_c("ellipsoid"),
+            Row("plain MJX, no fluid", "mjx", "none", **_MJX),
+            Row("plain MJX, no fluid, no joint limits", "mjx", "none", limits=False, **_MJX),
+        ),
+        2,
+        25.0,
+    ),
+    Group(
+        "snake of 8 hinges, ellipsoid law",
+        (_ours("ellipsoid", "ellipsoid law", robot="snake"), *_c("ellipsoid", robot="snake")),
+        2,
+        30.0,
+    ),
+    Group(
+        "centipede of 30 modules and 21 hinges, ellipsoid law",
+        (
+            _ours("ellipsoid", "ellipsoid law", robot="centipede"),
+            *_c("ellipsoid", robot="centipede"),
+            _ours("default", "default water", robot="centipede"),
+        ),
+        2,
+        20.0,
+    ),
+    Group(
+        "256 bodies of 4 to 16 hinges, ellipsoid law",
+        (
+            Row("ours, ellipsoid law", "mixed", "ellipsoid", population=256, each_core=True),
+            Row("MuJoCo C, threads, ellipsoid law", "threads", "ellipsoid", population=256),
+            Row("ours, default water", "mixed", "default", population=256, each_core=True),
+        ),
+        1,
+        8.0,
+    ),
+    Group(
+        "spider on the lake's bed",
+        (_ours("default", "default water, contact", task="crawl", duration=4.0), *_c("bed")),
+        2,
+        10.0,
+    ),
+    Group(
+        "whole generation, spider, default water",
+        (
+            Row("ours, ask, evaluate, tell, log", "generation", "default"),
+            Row("ours, bare steps", "bare", "default", each_core=True),
+        ),
+        1,
+        0.85,
+    ),
+    Group(
+        "16,384 individuals to 256, spider, default water, one core",
+        tuple(
+            Row(f"ours, {n}", "evaluation", "default", population=n, duration=2.0)
+            for n in (16384, 256, 1024, 4096)
+        ),
+        1,
+        0.9,
+    ),
+)
+# `--quick`: enough to see that all is well.
+QUICK = Group(
+    "spider, default water",
+    (
+        Row("ours, default water", "evaluation", "default", population=64),
+        *_c("ellipsoid", population=64),
+        Row("plain MJX, no fluid", "mjx", "none", population=64),
+    ),
+    2,
+    None,
 )
 # `--parts`: the default water with one thing left out, or added.
-PARTS = (
-    Row("evaluation, default water", "evaluation", "default"),
-    Row("mask for partial submersion", "evaluation", "mask"),
-    Row("no drag", "evaluation", "no_drag"),
-    Row("no added mass", "evaluation", "no_added_mass"),
-    Row("no water at all", "evaluation", "none"),
-    Row("no controller, track and score", "bare", "default"),
-    Row("with contact: crawl on the bed", "evaluation", "default", task="crawl"),
+PARTS = Group(
+    "parts",
+    (
+        Row("evaluation, default water", "evaluation", "default", population=512),
+        Row("mask for partial submersion", "evaluation", "mask", population=512),
+        Row("no drag", "evaluation", "no_drag", population=512),
+        Row("no added mass", "evaluation", "no_added_mass", population=512),
+        Row("no water at all", "evaluation", "none", population=512),
+        Row("no controller, track and score", "bare", "default", population=512),
+    ),
+    0,
+    None,
 )
 
 
@@ -87,7 +196,7 @@ class Worker:
 
     def __init__(self, job: dict[str, Any]) -> None:
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (closed in `close`)
-        self._case = job["case"]
+        self._engine = job["case"]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "experiments.bench_cases", json.dumps(job)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True, cwd=ROOT,
@@ -115,7 +224,7 @@ class Worker:
             self._errors.seek(0)
             last = self._errors.read().decode(errors="replace").strip().splitlines()[-1:]
             reason = (last or ["no message"])[0] if ready else f"no answer in {_PATIENCE:g} s"
-            raise RuntimeError(f"{self._case}: {reason}")
+            raise RuntimeError(f"{self._engine}: {reason}")
         values = json.loads(line)
         if "error" in values:
             raise InputError(values["error"])
@@ -156,14 +265,26 @@ class Result:
         return statistics.median(self.rates)
 
 
-def start(row: Row, job: dict[str, Any]) -> Result:
+def start(row: Row, threads: int) -> Result:
     """Starts a row's processes and waits until they are ready."""
     result = Result(row)
-    job = job | {"case": row.case, "physics": row.physics}
-    job |= {"limits": row.limits, "task": row.task}
+    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+    cores = usable[:threads] if row.each_core else [None]
+    job = {
+        "case": row.engine,
+        "physics": row.physics,
+        "robot": str(ROOT / "morphologies" / f"{row.robot}.yaml"),
+        "config": str(ROOT / "configs" / "lake_swim.yaml"),
+        "population": max(1, row.population // len(cores)),
+        "threads": threads,
+        "limits": row.limits,
+        "task": row.task,
+        "duration": row.duration,
+    }
     try:
-        for core in row.cores or (None,):
-            result.workers.append(Worker(job | {"core": core}))
+        for number, core in enumerate(cores):
+            share = (number, len(cores))
+            result.workers.append(Worker(job | {"core": core, "share": share}))
         answers = [worker.answer() for worker in result.workers]
     except BaseException:
         for worker in result.workers:
@@ -184,105 +305,89 @@ def measure(result: Result, seconds: float) -> None:
     result.peak = sum(answer["peak_bytes"] for answer in answers)
 
 
-def run(
-    rows: list[Row], job: dict[str, Any], rounds: int, seconds: float
-) -> tuple[list[Result], Result]:
-    """Measures all rows in turn.
+def run(group: Group, threads: int, rounds: int, seconds: float) -> list[Result]:
+    """Measures a case's rows in turn.
 
     Args:
-        rows: what to measure.
-        job: robot, configuration, population and threads.
+        group: the case.
+        threads: of MuJoCo C; as many processes of ours.
         rounds: how often.
         seconds: each time, at least [s].
 
     Returns:
-        The results, and that of the large population, measured once, before the others.
+        The results.
     """
     results: list[Result] = []
     say = lambda text: print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)  # noqa: E731
     quiet = not sys.stderr.isatty()
     try:
-        large = Row(f"ours, evaluation, population {_MEMORY_POPULATION}", "evaluation", "default")
-        memory = start(large, job | {"population": _MEMORY_POPULATION})
-        results.append(memory)
-        measure(memory, seconds)
-        memory.workers.pop().close()
-        for row in rows:
-            quiet or say(f"starting {row.name}")
-            results.append(start(row, job))
+        for row in group.rows:
+            quiet or say(f"{group.name}: starting {row.name}")
+            results.append(start(row, threads))
         for k in range(rounds):
-            for result in results[1:] if k % 2 == 0 else results[:0:-1]:
-                quiet or say(f"round {k + 1} of {rounds}: {result.row.name}")
+            for result in results if k % 2 == 0 else results[::-1]:
+                quiet or say(f"{group.name}: round {k + 1} of {rounds}, {result.row.name}")
                 measure(result, seconds)
         quiet or say("")
     finally:
         for result in results:
             for worker in result.workers:
                 worker.close()
-    return results[1:], memory
+    return results
 
 
 # ------------------------------------------------------------------ what is written
 
 
-def baselines(results: list[Result]) -> dict[str, float]:
-    """Rates to compare with: C's best with "ellipsoid" and with "none", and plain MJX ("mjx")."""
-    found = {}
-    for physics in ("ellipsoid", "none"):
-        rates = [
-            r.rate
-            for r in results
-            if r.row.case in ("rollout", "batch") and r.row.physics == physics
-        ]
-        if rates:
-            found[physics] = max(rates)
-    for r in results:
-        if r.row.case == "mjx" and r.row.physics == "none" and r.row.limits:
-            found["mjx"] = r.rate
-    return found
+def ratio(group: Group, results: Sequence[Result]) -> float | None:
+    """The first row's rate to the best of those that it is held against."""
+    if not group.against:
+        return None
+    return results[0].rate / max(result.rate for result in results[1 : 1 + group.against])
 
 
-def ratios(result: Result, base: dict[str, float]) -> tuple[float | None, float | None]:
-    """To C's best with the same or the nearest physics, and to plain MJX with nothing added."""
-    physics = "none" if result.row.physics == "none" else "ellipsoid"
-    to_c, to_mjx = (result.rate / base[x] if x in base else None for x in (physics, "mjx"))
-    return to_c, to_mjx
-
-
-def table(results: list[Result]) -> str:
-    """The results as an aligned table."""
-    base = baselines(results)
+def table(group: Group, results: Sequence[Result]) -> str:
+    """A case's results as an aligned table."""
     rows = [
-        (
-            "engine",
-            "median",
-            "lowest",
-            "highest",
-            "to C's",
-            "to plain",
-            "cores",
-            "compile",
-            "memory",
-        ),
-        ("", "Msteps/s", "Msteps/s", "Msteps/s", "best", "MJX", "busy", "s", "MiB"),
+        ("", "median", "lowest", "highest", "first to", "cores", "compile", "memory"),
+        ("", "Msteps/s", "Msteps/s", "Msteps/s", "this", "busy", "s", "MiB"),
     ]
     for r in results:
-        to_c, to_mjx = ratios(r, base)
         rows.append(
             (
                 r.row.name,
                 *(f"{x / 1e6:.3f}" for x in (r.rate, min(r.rates), max(r.rates))),
-                "-" if to_c is None else f"{to_c:.2f}",
-                "-" if to_mjx is None else f"{to_mjx:.2f}",
+                f"{results[0].rate / r.rate:.2f}",
                 f"{statistics.median(r.cores):.1f}",
-                f"{r.compile_s:.1f}" if r.row.case not in ("rollout", "batch") else "-",
+                f"{r.compile_s:.1f}" if r.row.engine not in _C else "-",
                 f"{r.peak / 2**20:.0f}",
             )
         )
     return align(rows)
 
 
-def parts_table(results: list[Result]) -> str:
+_C = ("rollout", "batch", "threads")
+
+
+def verdict(group: Group, results: Sequence[Result]) -> str:
+    """How the case stands, in a line."""
+    found = ratio(group, results)
+    if found is None:
+        return ""
+    if group.goal is None:
+        return f"{found:.1f} times the best of C"
+    met = "reached" if found >= group.goal else "not reached"
+    return f"{found:.3g} (goal {group.goal:g}: {met})"
+
+
+def memory_per_individual(results: Sequence[Result]) -> float:
+    """Bytes that each individual of a large population adds to a small one's peak."""
+    most = max(results, key=lambda r: r.row.population)
+    least = min(results, key=lambda r: r.row.population)
+    return max(0.0, most.peak - least.peak) / (most.row.population - least.row.population)
+
+
+def parts_table(results: Sequence[Result]) -> str:
     """What one step of one robot costs, with parts left out."""
     whole = 1e9 / results[0].rate
     rows = [("", "a step", "less", "share"), ("", "ns", "ns", "%")]
@@ -310,117 +415,90 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
-def to_json(
-    results: list[Result], memory: Result, settings: dict[str, Any], load: tuple[float, float]
-) -> dict[str, Any]:
-    """Everything that was measured, as plain values."""
-    base = baselines(results)
-
-    def plain(r: Result) -> dict[str, Any]:
-        return {
+def to_json(group: Group, results: Sequence[Result]) -> dict[str, Any]:
+    """Everything that was measured of a case, as plain values."""
+    rows = [
+        {
             "name": r.row.name,
-            "case": r.row.case,
+            "engine": r.row.engine,
             "physics": r.row.physics,
+            "robot": r.row.robot,
+            "population": r.row.population,
             "joint_limits": r.row.limits,
-            "pinned_processes": len(r.row.cores or ()),
+            "processes": len(r.workers),
             "steps_per_second": r.rates,
             "median": r.rate,
             "cores_busy": r.cores,
             "compile_s": r.compile_s,
             "peak_bytes": r.peak,
         }
-
-    rows = []
-    for r in results:
-        to_c, to_mjx = ratios(r, base)
-        rows.append(plain(r) | {"to_c": to_c, "to_plain_mjx": to_mjx})
-    return {
-        "settings": settings,
-        "machine": describe_machine(),
-        "load_average": {"before": load[0], "after": load[1]},
-        "rows": rows,
-        "large_population": plain(memory) | {"population": _MEMORY_POPULATION},
-    }
+        for r in results
+    ]
+    return {"name": group.name, "ratio": ratio(group, results), "goal": group.goal, "rows": rows}
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the benchmark, prints the table and writes the JSON."""
+    """Runs the benchmark, prints the tables and writes the JSON."""
     parser = make_parser("bench", "Throughput beside MuJoCo C and plain MJX, from the same run.")
     whole = {"type": count, "metavar": "N"}
-    parser.add_argument("--population", default=256, help="individuals (default: 256)", **whole)
-    parser.add_argument("--robot", metavar="FILE", help="a morphology (default: the spider)")
     parser.add_argument("--rounds", default=3, help="measurements of each (default: 3)", **whole)
-    parser.add_argument("--threads", default=2, help="of MuJoCo C (default: 2)", **whole)
-    parser.add_argument("--quick", action="store_true", help="fewer rows, shorter rounds")
+    parser.add_argument("--threads", default=2, help="of C, and processes of ours (2)", **whole)
+    parser.add_argument("--quick", action="store_true", help="one small case, shorter rounds")
+    parser.add_argument("--only", metavar="TEXT", help="cases whose name contains this")
     parser.add_argument(
         "--parts", action="store_true", help="instead, what the parts of our step cost"
     )
     parser.add_argument("--json", metavar="FILE", help="where to (default: bench.json in --out)")
     options = parser.parse_args(argv)
-    robot = Path(options.robot or ROOT / "morphologies" / "spider.yaml").absolute()
-
-    from mjx_revolve.morphology import load_morphology
-
-    if load_morphology(robot).num_hinges == 0:
-        raise InputError(f"--robot: expected a robot with hinges; found none in {options.robot}")
+    groups = [QUICK] if options.quick else [PARTS] if options.parts else list(GROUPS)
+    if options.only:
+        groups = [group for group in groups if options.only in group.name]
+        if not groups:
+            names = "; ".join(group.name for group in GROUPS)
+            raise InputError(f"--only: expected part of one of: {names}; found {options.only!r}")
     folder = make_folder(options.out, "bench")
     target = Path(options.json or folder / ("parts.json" if options.parts else "bench.json"))
-    rows = list(PARTS) if options.parts else [r for r in ROWS if r.quick or not options.quick]
-    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    if len(usable) > 1 and not options.quick and not options.parts:
-        pinned = Row("ours, two pinned processes", "evaluation", "default", cores=tuple(usable[:2]))
-        rows.insert(3, pinned)
-    job = {
-        "robot": str(robot),
-        "config": str(ROOT / "configs" / "lake_swim.yaml"),
-        "population": options.population,
-        "threads": options.threads,
-    }
     began, before = time.monotonic(), os.getloadavg()[0]
-    try:
-        results, memory = run(rows, job, options.rounds, 0.5 if options.quick else 1.5)
-    except RuntimeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    settings = {
-        "robot": robot.name,
-        "population": options.population,
-        "rounds": options.rounds,
-        "c_threads": options.threads,
-        "quick": options.quick,
+    machine = describe_machine()
+    versions = machine["versions"]
+    print(
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB; "
+        f"jax {versions['jax']}, mujoco {versions['mujoco']}, mujoco-mjx {versions['mujoco-mjx']}; "
+        f"{options.threads} threads of MuJoCo C; load average before {before:.1f}"
+    )
+    report: dict[str, Any] = {
+        "settings": {
+            name: getattr(options, name) for name in ("rounds", "threads", "quick", "only")
+        },
+        "machine": machine,
+        "load_average": before,
+        "cases": [],
     }
-    report = to_json(results, memory, settings, (before, os.getloadavg()[0]))
-    machine, versions = report["machine"], report["machine"]["versions"]
-    print(
-        f"{robot.stem}, population {options.population}; {machine['cpu']}, {machine['cores']} "
-        f"cores, {machine['memory_bytes'] / 2**30:.0f} GiB; jax {versions['jax']}, "
-        f"mujoco {versions['mujoco']}, mujoco-mjx {versions['mujoco-mjx']}\n"
-    )
-    print(parts_table(results) if options.parts else table(results))
-    generation = {r.row.case: r.rate for r in results if r.row.physics == "default"}
-    if "generation" in generation:
-        share = generation["generation"] / generation["bare"]
-        print(f"\nA whole generation runs at {100 * share:.0f} % of the bare steps' throughput.")
-    print(
-        f"\nPopulation {_MEMORY_POPULATION}: {memory.rate / 1e6:.3f} Msteps/s, peak memory "
-        f"{memory.peak / 2**20:.0f} MiB (to stay below 4096)."
-    )
-    print(
-        f"MuJoCo C has {options.threads} threads. Load average before {before:.1f}. "
-        f"{time.monotonic() - began:.0f} s in all."
-    )
+    served = []
+    for group in groups:
+        try:
+            results = run(group, options.threads, options.rounds, 0.5 if options.quick else 1.5)
+        except RuntimeError as error:
+            print(f"error: {group.name}: {error}", file=sys.stderr)
+            return 1
+        print(f"\n{group.name}: {verdict(group, results)}".rstrip(": "))
+        print(parts_table(results) if options.parts else table(group, results), flush=True)
+        if "individuals" in group.name:
+            each = memory_per_individual(results)
+            print(f"An individual adds {each:.0f} B to the peak memory (goal: below 2000).")
+        served += [x for r in results if r.row.engine in _C for x in r.cores]
+        report["cases"].append(to_json(group, results))
+        try:  # after each case: nothing measured is lost
+            target.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"--json: expected a file to write; found {error.strerror}") from None
     wanted = min(options.threads, machine["cores"])
-    served = [x for r in results if r.row.case == "rollout" for x in r.cores] or [wanted]
-    if statistics.median(served) < 0.8 * wanted:
+    if served and statistics.median(served) < 0.8 * wanted:
         print(
-            f"Other programs were running: C's threads got {statistics.median(served):.1f} of "
+            f"\nOther programs were running: C's threads got {statistics.median(served):.1f} of "
             f"{wanted} cores, so its rates are too low here, and the ratios to them too high."
         )
-    try:
-        target.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--json: expected a file to write; found {error.strerror}") from None
-    print(f"written: {shown(target)}")
+    print(f"\n{time.monotonic() - began:.0f} s in all; written: {shown(target)}")
     return 0
 
 

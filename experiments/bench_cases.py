@@ -13,6 +13,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 # Physics by the changes to the default world. In "ellipsoid" the robot is weightless and under
@@ -35,6 +36,11 @@ PHYSICS: dict[str, dict[str, Any]] = {
         "name": "empty_underwater", "gravity": 0.0, "buoyancy": "off", "drag": "off",
         "added_mass": False,
     },
+    # MuJoCo's own contacts with the lake's bed; gravity is cut to what buoyancy leaves of it.
+    "bed": {
+        "name": "lake", "buoyancy": "off", "drag": "ellipsoid", "added_mass": False,
+        "bed": {"kind": "lake", "contact": "mjx"},
+    },
 }  # fmt: skip
 # Steps in one call of an engine that is given plain controls.
 STEPS = 200
@@ -44,23 +50,29 @@ DEPTH = 2.0  # of the start [m]
 Case = tuple[Callable[[], Any], int]
 
 
-def _fitness(job: dict[str, Any]) -> Any:
-    from mjx_revolve import load_config, make_fitness
+def _config(job: dict[str, Any]) -> Any:
+    from mjx_revolve import load_config
 
     swims = job["task"] != "crawl"
-    config = load_config(
+    return load_config(
         job["config"],
         overrides={
             "morphology": job["robot"],
             "world": PHYSICS[job["physics"]],
             "task.type": job["task"],
+            "task.duration": job["duration"],
             # Without gravity there is nothing to trim, and a crawler had better sink.
             "trim": "neutral" if swims and PHYSICS[job["physics"]]["name"] == "lake" else "none",
             "evolution.population_size": job["population"],
             "evolution.generations": 10**6,
         },
     )
-    return make_fitness(config)
+
+
+def _fitness(job: dict[str, Any]) -> Any:
+    from mjx_revolve import make_fitness
+
+    return make_fitness(_config(job))
 
 
 def _episode_steps(fitness: Any) -> int:
@@ -80,12 +92,37 @@ def make_evaluation(job: dict[str, Any]) -> Case:
 
 
 def make_generation(job: dict[str, Any]) -> Case:
-    """A whole generation of the evolution loop: ask, evaluate, tell, and what it keeps."""
+    """A whole generation of the evolution loop on all cores: ask, evaluate, tell, what it keeps."""
     from mjx_revolve.loop import evolve
+    from mjx_revolve.pool import make_pool
 
-    fitness = _fitness(job)
-    generations = evolve(fitness.config.evolution, fitness)
-    return lambda: next(generations), job["population"] * _episode_steps(fitness)
+    pool = make_pool(_config(job))
+    generations = evolve(pool.config.evolution, pool)
+    return lambda: next(generations), job["population"] * _episode_steps(pool)
+
+
+def _bodies(job: dict[str, Any]) -> list[Any]:
+    """Different bodies of 4 to 16 hinges and 6 bricks, as many as individuals."""
+    from experiments.random_bodies import random_body
+
+    first, step = job["share"]
+    return [random_body(k, 4 + k % 13, 6) for k in range(first, step * job["population"], step)]
+
+
+def make_mixed(job: dict[str, Any]) -> Case:
+    """Whole episodes of a population in which every individual has another body."""
+    import jax
+
+    from mjx_revolve import make_mixed_fitness
+
+    bodies = _bodies(job)
+    fitness = make_mixed_fitness(_config(job), bodies, hinges=16)
+    packed = fitness.pack([fitness.build(body) for body in bodies])
+    genes = jax.random.normal(jax.random.key(0), (job["population"], fitness.num_genes))
+    key = jax.random.key(1)
+    steps = round(fitness.config.task.duration / fitness.world.timestep)
+    run = lambda: jax.block_until_ready(fitness.evaluate(packed, genes, key))  # noqa: E731
+    return run, job["population"] * steps
 
 
 def make_bare(job: dict[str, Any]) -> Case:
@@ -127,16 +164,23 @@ def make_bare(job: dict[str, Any]) -> Case:
     return lambda: jax.block_until_ready(run(qpos, ctrl)), count * steps
 
 
-def _c_model(job: dict[str, Any]) -> Any:
+def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
     """The compiled model; the water of "ellipsoid" and "inertia_box" is MuJoCo's own."""
     from mjx_revolve import build_robot, load_morphology, load_world
+    from mjx_revolve.fitness import reach_below
+    from mjx_revolve.terrain import bed_height
 
     fields = dict(PHYSICS[job["physics"]])
     world = load_world(fields.pop("name"), **fields)
-    model = build_robot(load_morphology(job["robot"]), world).mj_model
+    robot = build_robot(morphology or load_morphology(job["robot"]), world)
+    model = robot.mj_model
     if world.drag in ("ellipsoid", "inertia_box"):
         model.opt.density, model.opt.viscosity = world.density, world.viscosity
     model.qpos0[2] = -DEPTH
+    if world.bed is not None:
+        body = robot.morphology
+        model.opt.gravity[2] *= 1 - world.density * body.volume / body.mass
+        model.qpos0[2] = bed_height(world.bed, 0.0, 0.0) + reach_below(robot, _config(job).task)
     return model
 
 
@@ -214,6 +258,25 @@ def make_batch(job: dict[str, Any]) -> Case:
     return run, job["population"] * STEPS
 
 
+def make_threads(job: dict[str, Any]) -> Case:
+    """MuJoCo C on different bodies: `mj_step` in threads, as its batch engines take one body."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    import mujoco
+
+    models = [_c_model(job, body) for body in _bodies(job)]
+    worlds = [(model, mujoco.MjData(model)) for model in models]
+    pool = ThreadPoolExecutor(job["threads"])
+
+    def advance(world: Any) -> None:
+        model, data = world
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:] = 0.3
+        mujoco.mj_step(model, data, STEPS)  # without Python's lock
+
+    return lambda: list(pool.map(advance, worlds)), len(models) * STEPS
+
+
 MAKERS: dict[str, Callable[[dict[str, Any]], Case]] = {
     "evaluation": make_evaluation,
     "generation": make_generation,
@@ -221,6 +284,8 @@ MAKERS: dict[str, Callable[[dict[str, Any]], Case]] = {
     "mjx": make_mjx,
     "rollout": make_rollout,
     "batch": make_batch,
+    "mixed": make_mixed,
+    "threads": make_threads,
 }
 
 
@@ -246,6 +311,16 @@ def measure(run: Callable[[], Any], steps: int, seconds: float) -> dict[str, flo
     }
 
 
+def peak_memory() -> int:
+    """The largest resident memory of this process so far [B]."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return int(status.split("VmHWM:")[1].split()[0]) * 1024
+    except (OSError, IndexError):
+        # Where a process was started by a larger one, that one's memory counts here.
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
 def main() -> int:
     """Serves one case until standard input ends."""
     job = json.loads(sys.argv[1])
@@ -254,8 +329,7 @@ def main() -> int:
     os.dup2(2, 1)
 
     def answer(values: dict[str, Any]) -> None:
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # Linux: KiB
-        print(json.dumps(values | {"peak_bytes": peak}), file=answers, flush=True)
+        print(json.dumps(values | {"peak_bytes": peak_memory()}), file=answers, flush=True)
 
     if job.get("core") is not None:
         os.sched_setaffinity(0, {job["core"]})

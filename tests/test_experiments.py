@@ -140,14 +140,9 @@ def test_falling_spider_writes_its_table_and_its_plot(tmp_path, capsys):
         (falling_spider.main, ["--speed"], "unrecognized arguments: --speed"),
         (falling_spider.main, ["--data", "nowhere"], "--data: expected air_heights.txt and"),
         (falling_spider.main, ["--out", "/dev/null/x"], "--out: expected a folder to write into"),
-        (bench.main, ["--population", "0"], "expected a whole number above 0; found '0'"),
+        (bench.main, ["--threads", "0"], "expected a whole number above 0; found '0'"),
         (bench.main, ["--rounds", "two"], "expected a whole number above 0; found 'two'"),
-        (bench.main, ["--robot", "nowhere.yaml"], "nowhere.yaml: expected a file; found none"),
-        (
-            bench.main,
-            ["--robot", str(ROOT / "morphologies" / "core.yaml")],
-            "--robot: expected a robot with hinges; found none",
-        ),
+        (bench.main, ["--only", "tiger"], "--only: expected part of one of: spider, ellipsoid law"),
         (bench.main, ["spider"], "unrecognized arguments: spider"),
         (optimisers.main, ["--evaluations", "-3"], "expected a whole number above 0; found '-3'"),
         (optimisers.main, ["--out"], "argument --out: expected one argument"),
@@ -166,64 +161,62 @@ def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, caps
 # ------------------------------------------------------------------ benchmark
 
 
-def _result(case, physics, rates, limits=True):
-    row = bench.Row(f"{case} {physics}", case, physics, limits=limits)
-    return bench.Result(row, rates=rates, cores=[1.0] * len(rates), peak=2.0**20)
+def _result(name, rates, population=2048, peak=2.0**20):
+    row = bench.Row(name, "evaluation", "default", population=population)
+    return bench.Result(row, rates=rates, cores=[1.0] * len(rates), peak=peak)
 
 
-def test_ratios_are_to_the_better_of_cs_engines_and_to_plain_mjx():
-    ours = _result("evaluation", "default", [30.0, 20.0, 10.0])
-    free = _result("evaluation", "none", [40.0])
+def test_a_case_is_held_against_the_best_of_its_opponents():
     results = [
-        ours,
-        free,
-        _result("mjx", "none", [2.0]),
-        _result("mjx", "none", [5.0], limits=False),
-        _result("rollout", "ellipsoid", [1.0, 3.0, 100.0]),
-        _result("batch", "ellipsoid", [4.0]),
-        _result("rollout", "none", [8.0]),
-        _result("batch", "none", [7.0]),
+        _result("ours", [30.0, 20.0, 10.0]),
+        _result("rollout", [1.0, 3.0, 100.0]),
+        _result("batch", [4.0]),
+        _result("for information", [50.0]),
     ]
-    base = bench.baselines(results)
-    assert base == {"ellipsoid": 4.0, "none": 8.0, "mjx": 2.0}
-    assert ours.rate == 20.0
-    assert bench.ratios(ours, base) == (5.0, 10.0)
-    assert bench.ratios(free, base) == (5.0, 20.0)
-    lines = bench.table(results).splitlines()
+    group = bench.Group("case", tuple(r.row for r in results), 2, 6.0)
+    assert results[0].rate == 20.0
+    assert bench.ratio(group, results) == 5.0
+    assert "5 (goal 6: not reached)" in bench.verdict(group, results)
+    lines = bench.table(group, results).splitlines()
     assert len(lines) == 2 + len(results)
-    assert "5.00" in lines[2]
+    assert "5.00" in lines[4]
+
+
+def test_memory_of_an_individual():
+    sizes = [_result("a", [1.0], 16384, 5e8), _result("b", [1.0], 384, 4.84e8)]
+    assert bench.memory_per_individual(sizes) == pytest.approx(1000)
 
 
 def test_every_row_of_the_benchmark_can_be_made():
     from experiments.bench_cases import MAKERS, PHYSICS
 
-    for row in (*bench.ROWS, *bench.PARTS):
-        assert row.case in MAKERS
-        assert row.physics in PHYSICS
-    quick = {row.case for row in bench.ROWS if row.quick}
-    assert {"evaluation", "mjx", "rollout", "batch"} <= quick
+    for group in (*bench.GROUPS, bench.QUICK, bench.PARTS):
+        assert len(group.rows) > group.against
+        for row in group.rows:
+            assert row.engine in MAKERS
+            assert row.physics in PHYSICS
+            assert (ROOT / "morphologies" / f"{row.robot}.yaml").is_file()
 
 
 @pytest.mark.slow
 def test_a_quick_benchmark_runs_and_keeps_its_numbers(tmp_path, capsys):
-    assert bench.main(["--quick", "--population", "64", "--out", str(tmp_path)]) == 0
+    assert bench.main(["--quick", "--rounds", "2", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert "to C's" in printed
+    assert "times the best of C" in printed
     text = (tmp_path / "bench.json").read_text()
     assert str(ROOT) not in text
     report = json.loads(text)
-    assert report["settings"]["population"] == 64
     assert report["machine"]["cores"] >= 1
-    rows = {row["name"]: row for row in report["rows"]}
-    ours = rows["ours, evaluation, default water"]
-    assert len(ours["steps_per_second"]) == 3
-    assert ours["to_plain_mjx"] >= 1
-    assert report["large_population"]["peak_bytes"] < 4 * 2**30
+    (case,) = report["cases"]
+    ours, *others = case["rows"]
+    assert len(ours["steps_per_second"]) == 2
+    assert case["ratio"] == ours["median"] / max(row["median"] for row in others[:2])
+    assert 1e8 < ours["peak_bytes"] < 4 * 2**30
 
 
 def test_a_case_that_fails_says_why():
     with pytest.raises(RuntimeError, match="nonsense: KeyError"):
-        bench.start(bench.Row("no such case", "nonsense", "default"), {})
+        bench.start(bench.Row("no such case", "nonsense", "default"), 1)
 
 
 # ------------------------------------------------------------------ optimisers
