@@ -53,7 +53,10 @@ Case = tuple[Callable[[], Any], int]
 def _config(job: dict[str, Any]) -> Any:
     from mjx_revolve import load_config
 
-    swims = job["task"] != "crawl"
+    # Without gravity there is nothing to trim, a crawler had better sink, and a random body may
+    # float already.
+    lake = PHYSICS[job["physics"]]["name"] == "lake"
+    trimmed = lake and job["task"] != "crawl" and job["case"] != "mixed"
     return load_config(
         job["config"],
         overrides={
@@ -61,8 +64,7 @@ def _config(job: dict[str, Any]) -> Any:
             "world": PHYSICS[job["physics"]],
             "task.type": job["task"],
             "task.duration": job["duration"],
-            # Without gravity there is nothing to trim, and a crawler had better sink.
-            "trim": "neutral" if swims and PHYSICS[job["physics"]]["name"] == "lake" else "none",
+            "trim": "neutral" if trimmed else "none",
             "evolution.population_size": job["population"],
             "evolution.generations": 10**6,
         },
@@ -166,6 +168,8 @@ def make_bare(job: dict[str, Any]) -> Case:
 
 def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
     """The compiled model; the water of "ellipsoid" and "inertia_box" is MuJoCo's own."""
+    import numpy as np
+
     from mjx_revolve import build_robot, load_morphology, load_world
     from mjx_revolve.fitness import reach_below
     from mjx_revolve.terrain import bed_height
@@ -180,7 +184,8 @@ def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
     if world.bed is not None:
         body = robot.morphology
         model.opt.gravity[2] *= 1 - world.density * body.volume / body.mass
-        model.qpos0[2] = bed_height(world.bed, 0.0, 0.0) + reach_below(robot, _config(job).task)
+        start = float(bed_height(world.bed, np.zeros(1), np.zeros(1))[0])
+        model.qpos0[2] = start + reach_below(robot, _config(job).task)
     return model
 
 
