@@ -7,7 +7,7 @@ TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 READY  := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve test test-quick check format bench lock clean
+.PHONY: help install evolve test test-quick check format docs bench lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -39,6 +39,9 @@ check: $(READY)  ## lint, format and types
 format: $(READY)  ## let ruff mend what it can
 	$(RUN) -m ruff check --fix .
 	$(RUN) -m ruff format .
+
+docs: $(READY)  ## the documentation and a reference of all functions, as HTML in build/docs
+	$(RUN) docs/reference.py build/docs
 
 bench: $(READY)  ## throughput beside MuJoCo C and plain MJX, from the same run
 	$(RUN) -m experiments.bench

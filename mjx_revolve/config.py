@@ -31,6 +31,7 @@ from pydantic.fields import FieldInfo
 
 from mjx_revolve import errors
 from mjx_revolve.errors import InputError
+from mjx_revolve.own_code import parse_own, short_name
 
 
 def _as_tuple(value: Any) -> Any:
@@ -51,16 +52,47 @@ _Vector = Annotated[tuple[float, float, float], BeforeValidator(_as_tuple)]
 _World = Annotated[str | dict[str, Any], AfterValidator(_check_world)]
 
 
+def _names(*names: str) -> Any:
+    """What `Field` takes for a name of ours or a function in a file of the user's own."""
+    return {
+        "pattern": rf"^({'|'.join(names)}|.+\.py:[^\W\d]\w*)$",
+        "description": f"one of {', '.join(names)}, or FILE.py:FUNCTION",
+    }
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
     )
 
 
-class ControllerConfig(_Model):
+class Section(_Model):
+    """A section whose `type` names one of ours, or a function in a file of the user's own."""
+
+    type: str
+
+    @property
+    def name(self) -> str:
+        """What titles call it: its type, or the name of the user's own function."""
+        return short_name(self.type)
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it is a function in a file of the user's own."""
+        return parse_own(self.type) is not None
+
+    def _refuse(self, params: Mapping[str, Any]) -> None:
+        if params and not self.is_own:
+            raise ValueError(
+                f"params: none, as only own functions take them; found {', '.join(params)}"
+            )
+
+
+class ControllerConfig(Section):
     """What turns genes into joint targets."""
 
-    type: Literal["cpg", "sine", "feedback"] = "cpg"
+    type: str = Field("cpg", **_names("cpg", "sine", "feedback"))
+    """`cpg`, `sine`, `feedback`, or FILE.py:FUNCTION, a function like `controllers.make_sine`."""
     max_frequency: float = Field(2.0, gt=0, le=20)
     """The fastest oscillation [Hz]."""
     amplitude: float = Field(1.0, gt=0, le=1)
@@ -71,18 +103,23 @@ class ControllerConfig(_Model):
     """Largest answer to an error of normal size, as a share of the range; `type: feedback` [-]."""
     depth: float | None = Field(None, ge=0)
     """Depth that `type: feedback` holds; that of the task's start where none is given [m]."""
+    params: dict[str, Any] = {}
+    """Settings of a function of the user's own, which reads them as `settings.params`."""
 
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
-        if self.type != "sine" and self.harmonics != 1:
+        self._refuse(self.params)
+        if self.type in ("cpg", "feedback") and self.harmonics != 1:
             raise ValueError(f"harmonics: 1, as only type sine has more; found {self.harmonics}")
         return self
 
 
-class TaskConfig(_Model):
+class TaskConfig(Section):
     """What the robot is scored for, and how its episodes start."""
 
-    type: Literal["directed_swim", "speed", "reach_target", "hold_depth", "crawl"]
+    type: str = Field(**_names("directed_swim", "speed", "reach_target", "hold_depth", "crawl"))
+    """`directed_swim`, `speed`, `reach_target`, `hold_depth`, `crawl`, or FILE.py:FUNCTION, a
+    function like those in `tasks`."""
     duration: float = Field(10.0, gt=0)
     """Length of an episode [s]."""
     settle: float = Field(1.0, ge=0)
@@ -107,9 +144,12 @@ class TaskConfig(_Model):
     """Standard deviation of the start's place, along each axis [m]."""
     current_std: float = Field(0.0, ge=0)
     """Standard deviation of an extra horizontal current, drawn for each episode [m/s]."""
+    params: dict[str, Any] = {}
+    """Settings of a function of the user's own, which reads them as `settings.params`."""
 
     @model_validator(mode="after")
     def _check(self) -> TaskConfig:
+        self._refuse(self.params)
         if self.settle >= self.duration:
             raise ValueError(
                 f"settle: a time below task.duration ({self.duration:g} s); found {self.settle:g}"
@@ -395,8 +435,24 @@ def _resolve(data: dict[str, Any], key: str, folder: Path, origin: str) -> None:
     path = Path(os.path.abspath(folder / Path(value).expanduser()))
     if not path.is_file():
         what = "a folder" if path.is_dir() else "none"
-        raise InputError(f"{origin}{key}: expected a file; found {what} at {path}")
+        place = origin if key == "file" else f"{origin}{key}"
+        raise InputError(f"{place}: expected a file; found {what} at {path}")
     data[key] = str(path)
+
+
+def _resolve_own(section: dict[str, Any], folder: Path, origin: str) -> None:
+    """Makes the path of FILE.py:FUNCTION absolute in place, and refuses it if there is no file."""
+    own = parse_own(section.get("type"))
+    if own is not None:
+        held = {"file": own.path}
+        _resolve(held, "file", folder, origin)
+        section["type"] = f"{held['file']}:{own.function}"
+
+
+def _sets(settings: Mapping[str, Any], section: str, key: str) -> bool:
+    """Whether overrides set a key of a section, dotted or nested."""
+    inner = settings.get(section)
+    return f"{section}.{key}" in settings or (isinstance(inner, Mapping) and key in inner)
 
 
 # --- the public part ------------------------------------------------------------------------------
@@ -437,6 +493,11 @@ def make_config(
         typed = key in settings or f"{key}.name" in settings
         start, origin = (Path.cwd(), f"{label} ") if typed else (Path(folder), f"{source}: ")
         _resolve(merged, key, start, origin)
+    for key in ("controller", "task"):
+        if isinstance(merged.get(key), dict):
+            typed = _sets(settings, key, "type")
+            start, origin = (Path.cwd(), f"{label} ") if typed else (Path(folder), f"{source}: ")
+            _resolve_own(merged[key], start, f"{origin}{key}.type")
     try:
         config = Config.model_validate(merged)
     except ValidationError as error:
@@ -506,4 +567,8 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
     data = _copy(config.model_dump())
     data["morphology"] = shorten(data["morphology"])
     data["modules"] = shorten(data["modules"])
+    for section in ("controller", "task"):
+        own = parse_own(data[section]["type"])
+        if own is not None:
+            data[section]["type"] = f"{shorten(own.path)}:{own.function}"
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None)

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.dynamics import Sense
+from mjx_revolve.errors import InputError
+from mjx_revolve.own_code import call_own, load_own, parse_own, short_name
 from mjx_revolve.robot import Robot
 from mjx_revolve.spatial import safe_norm, sincos
 
@@ -294,3 +296,79 @@ CONTROLLERS: dict[str, Callable[[Robot, Any], Controller]] = {
     ),
     "feedback": lambda robot, settings: make_feedback(robot, settings.depth, settings.gain),
 }
+
+
+def find_controller(robot: Robot, settings: Any, source: str = "config") -> Controller:
+    """The controller that a configuration names, made for a robot.
+
+    Args:
+        robot: whose hinges and thrusters are driven.
+        settings: a `config.ControllerConfig`. Its `type` is a name in `CONTROLLERS`, or
+            FILE.py:FUNCTION for a function of the user's own, which takes the robot and these
+            settings and returns a `Controller`.
+        source: what messages call the configuration.
+
+    Returns:
+        The controller.
+
+    Raises:
+        InputError: the file or the function is missing, or what it makes is no controller of this
+            robot; one line says where.
+    """
+    if settings.type in CONTROLLERS:
+        return CONTROLLERS[settings.type](robot, settings)
+    name = settings.type
+    function = load_own(name, f"{source}: controller.type")
+    controller = call_own(
+        name, f"{short_name(name)} to make a controller", function, robot, settings
+    )
+    _check_own(name, controller, robot.mj_model.nu)
+    return controller
+
+
+def _check_own(name: str, controller: Any, nu: int) -> None:
+    """Refuses what is no controller of `nu` actuators, before anything is compiled."""
+    own = parse_own(name)
+    place = f"{own.path}: {own.function}" if own else name
+    if not isinstance(controller, Controller):
+        raise InputError(f"{place}: expected a Controller; found {type(controller).__name__}")
+    count = controller.num_genes
+    if not isinstance(count, int) or count < 0:
+        raise InputError(f"{place}: num_genes: expected a whole number >= 0; found {count!r}")
+    if len(controller.gene_names) != count:
+        raise InputError(
+            f"{place}: gene_names: expected {count} of them, as num_genes says; found "
+            f"{len(controller.gene_names)}"
+        )
+    lanes = 3
+    one: Any = jax.ShapeDtypeStruct((lanes,), jnp.float32)
+    order = np.arange(nu)
+
+    def run(genes: jax.Array, time: jax.Array, sense: Sense) -> Any:
+        parameters = controller.decode(genes, order)
+        state = controller.init(parameters)
+        return state, *controller.step(parameters, state, time, sense)
+
+    before, after, targets = call_own(
+        name,
+        f"{short_name(name)}'s decode, init and step to give targets",
+        jax.eval_shape,
+        run,
+        jax.ShapeDtypeStruct((count, lanes), jnp.float32),
+        jax.ShapeDtypeStruct((), jnp.float32),
+        Sense(one, one, (one, one, one), (one, one, one)),
+    )
+    if getattr(targets, "shape", None) != (nu, lanes):
+        raise InputError(
+            f"{place}: step: expected targets [nu, lanes], here [{nu}, {lanes}]; found "
+            f"{list(targets.shape) if hasattr(targets, 'shape') else type(targets).__name__}"
+        )
+    if _shapes(before) != _shapes(after):
+        raise InputError(
+            f"{place}: step: expected a state of the shapes that init gives, {_shapes(before)}; "
+            f"found {_shapes(after)}"
+        )
+
+
+def _shapes(state: Any) -> str:
+    return str(jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", state)).replace("'", "")

@@ -21,7 +21,7 @@ from mjx_revolve.morphology import load_morphology, trim_neutral
 from mjx_revolve.robot import Robot, build_robot
 from mjx_revolve.rollout import Trajectory, gusty_water, simulate
 from mjx_revolve.runs import load_genes
-from mjx_revolve.tasks import UNITS
+from mjx_revolve.tasks import score_unit
 from mjx_revolve.water import Water, gust_path
 from mjx_revolve.world import load_world
 
@@ -139,12 +139,12 @@ def _champion(path: Path, duration: float | None, seed: int | None) -> Episode:
     score = data.get("score")
     folder = source.parent.absolute()
     return Episode(
-        title=f"{fitness.robot.morphology.name}: {config.task.type.replace('_', ' ')}",
+        title=f"{fitness.robot.morphology.name}: {config.task.name.replace('_', ' ')}",
         robot=fitness.robot,
         trajectory=fitness.replay(genes, key),
         water=fitness.water(key),
         score=float(score) if isinstance(score, int | float) else None,
-        score_unit=UNITS[config.task.type],
+        score_unit=score_unit(config.task.type),
         genes=genes,
         fitness=fitness,
         folder=folder,

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import datetime
-import json
 import os
 import shlex
 import signal
@@ -27,7 +26,9 @@ from typing import TYPE_CHECKING, Any
 from mjx_revolve import runtime
 from mjx_revolve.crew import WorkerError
 from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.fingerprints import FREE_SETTINGS, model_hash, settings_hash
 from mjx_revolve.hosts import parse_place, parse_workers, serve
+from mjx_revolve.own_code import content_name
 from mjx_revolve.progress import Progress
 
 if TYPE_CHECKING:
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from mjx_revolve.runs import Checkpoint, Run
     from mjx_revolve.tensorboard import TensorBoardLog
 
-# What may change when a run is resumed; everything else would make it another run.
-_FREE = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard")
 # What the bits of a run depend on, besides its configuration.
 _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
 
@@ -110,27 +109,6 @@ def _default_folder(config: Config) -> Path:
     return folder
 
 
-def _settings_hash(config: Config) -> str:
-    """Of everything that may not change; the robot and the world have a hash of their own."""
-    from mjx_revolve.runs import hash_text
-
-    data = config.model_dump(exclude={"morphology", "modules"})
-    for key in _FREE:
-        del data["evolution"][key]
-    if isinstance(data["world"], str):
-        data["world"] = {"name": data["world"]}
-    data["world"]["name"] = Path(data["world"]["name"]).name
-    return hash_text(json.dumps(data, sort_keys=True))
-
-
-def _model_hash(fitness: Any) -> str:
-    """Of the compiled robot and the water around it."""
-    from mjx_revolve.runs import hash_text
-
-    robot = getattr(fitness, "robot", None)
-    return hash_text() if robot is None else hash_text(robot.mj_spec.to_xml(), repr(robot.world))
-
-
 def _describe(config: Config, fitness: Any, folder: Path) -> str:
     """The first line: what runs."""
     robot = getattr(fitness, "robot", None)
@@ -149,7 +127,7 @@ def _describe(config: Config, fitness: Any, folder: Path) -> str:
         device += f", {fitness.workers} workers"
         device += f" on {len(fitness.hosts)} hosts" if len(fitness.hosts) > 1 else ""
     return (
-        f"{body}{fitness.num_genes} genes | {config.task.type} in {world} | "
+        f"{body}{fitness.num_genes} genes | {config.task.name} in {world} | "
         f"{evolution.strategy} {evolution.population_size} x {evolution.generations}, "
         f"seed {evolution.seed} | {device} | {_shown(folder)}"
     )
@@ -183,17 +161,21 @@ def _check_unchanged(old: Config, new: Config, label: str) -> None:
     """Refuses a configuration that would make another run."""
     before, after = old.model_dump(), new.model_dump()
     for data in (before, after):
-        for key in _FREE:
+        for key in FREE_SETTINGS:
             del data["evolution"][key]
         if isinstance(data["world"], str):
             data["world"] = {"name": data["world"]}
     # The run holds a copy of the morphology: its words count, not its place.
     if Path(before["morphology"]).read_bytes() == Path(after["morphology"]).read_bytes():
         after["morphology"] = before["morphology"]
+    for section in ("controller", "task"):  # likewise code of the user's own
+        if content_name(before[section]["type"]) == content_name(after[section]["type"]):
+            after[section]["type"] = before[section]["type"]
     found = _differences(before, after)
     if found:
         more = f" (and {len(found) - 1} more)" if found[1:] else ""
-        raise InputError(f"{label}: {found[0]}{more}; only evolution.{', '.join(_FREE)} may change")
+        free = f"evolution.{', '.join(FREE_SETTINGS)}"
+        raise InputError(f"{label}: {found[0]}{more}; only {free} may change")
 
 
 def _seed_setting(arguments: argparse.Namespace) -> list[str]:
@@ -231,7 +213,7 @@ def _begin(arguments: argparse.Namespace, make_fitness: Callable) -> tuple[Run, 
         seed=config.evolution.seed,
         config_file=str(Path(arguments.config).absolute()),
         settings=_portable(settings, config),
-        model_hash=_model_hash(fitness),
+        model_hash=model_hash(fitness),
         **runtime.describe_process(),
     )
     return run, config, fitness, None
@@ -241,6 +223,7 @@ def _portable(settings: list[str], config: Config) -> list[str]:
     """Settings that mean the same in another folder."""
     places = {"morphology": config.morphology, "modules": config.modules}
     places |= {"world": config.world_name, "world.name": config.world_name}
+    places |= {"controller.type": config.controller.type, "task.type": config.task.type}
     portable = []
     for setting in settings:
         key, _, value = setting.partition("=")
@@ -270,17 +253,17 @@ def _continue(
     else:
         config = load_config(arguments.config, [*earlier, *settings])
     _check_unchanged(old, config, label)
-    free = {key: getattr(config.evolution, key) for key in _FREE}
+    free = {key: getattr(config.evolution, key) for key in FREE_SETTINGS}
     config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
     if config.evolution.tensorboard:
         check_tensorboard(label)
     checkpoint = run.load_checkpoint()
     for name in checkpoint.damaged:
         print(f"passed over a damaged checkpoint: {name}", file=sys.stderr)
-    if checkpoint.meta["settings_hash"] != _settings_hash(config):
+    if checkpoint.meta["settings_hash"] != settings_hash(config):
         raise InputError(f"{label}: expected the config.yaml that it began with; found it changed")
     fitness = make_fitness(config)
-    if checkpoint.meta["model_hash"] != _model_hash(fitness):
+    if checkpoint.meta["model_hash"] != model_hash(fitness):
         raise InputError(
             f"{label}: expected the robot and the world that it began with; found them changed (a "
             "file that config.yaml names, or the program)"
@@ -312,8 +295,8 @@ def _now() -> str:
 
 def _checkpoint_meta(config: Config, fitness: Any) -> dict[str, Any]:
     return {
-        "settings_hash": _settings_hash(config),
-        "model_hash": _model_hash(fitness),
+        "settings_hash": settings_hash(config),
+        "model_hash": model_hash(fitness),
         "chunk_shape": [fitness.block or config.evolution.population_size, fitness.num_genes],
         "strategy": config.evolution.strategy,
         "host": _host(),
@@ -396,15 +379,18 @@ def _finish(run: Run, config: Config, fitness: Any, search: Search) -> None:
     """Chooses the champion, draws the pictures, and says what came out."""
     from mjx_revolve import plots
     from mjx_revolve.loop import REPORT_EPISODES, choose_champion
-    from mjx_revolve.tasks import UNITS
+    from mjx_revolve.tasks import score_unit
 
     champion = choose_champion(config.evolution, fitness, search)
     facts = _champion_facts(config, champion)
     run.save_champion(champion.genes, final=True, **facts)
-    unit = UNITS[config.task.type]
-    result = f"{champion.score:.3g} ± {champion.std:.2g} {unit} over {REPORT_EPISODES} fresh starts"
+    unit = score_unit(config.task.type)
+    spread = f"{champion.score:.3g} ± {champion.std:.2g} {unit}".rstrip()
+    result = f"{spread} over {REPORT_EPISODES} fresh starts"
     title = f"{run.folder.name}: {result}"
-    figure = plots.plot_fitness(run.load_metrics(), title, f"fitness ({unit})")
+    figure = plots.plot_fitness(
+        run.load_metrics(), title, f"fitness ({unit})" if unit else "fitness"
+    )
     run.write("fitness.png", plots.figure_png(figure))
     if hasattr(fitness, "replay"):
         trajectory = fitness.replay(champion.genes, champion.key)
@@ -429,8 +415,8 @@ def _champion_facts(config: Config, champion: Champion) -> dict[str, Any]:
         "score": champion.score,
         "score_std": champion.std,
         "origin": champion.origin,
-        "controller": config.controller.type,
-        "task": config.task.type,
+        "controller": config.controller.name,
+        "task": config.task.name,
         "measures": champion.measures,
     }
 

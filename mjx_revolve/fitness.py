@@ -7,6 +7,7 @@ vmap and grad.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.config import Config, TaskConfig, load_config, make_config
-from mjx_revolve.controllers import CONTROLLERS, Controller, bind_genes
+from mjx_revolve.controllers import Controller, bind_genes, find_controller
 from mjx_revolve.dynamics import Engine
 from mjx_revolve.errors import InputError
 from mjx_revolve.modules import MODULES, load_modules
@@ -31,7 +32,7 @@ from mjx_revolve.rollout import (
     roll_out,
     simulate,
 )
-from mjx_revolve.tasks import TASKS, Track, measure
+from mjx_revolve.tasks import Track, find_task, measure
 from mjx_revolve.terrain import bed_height
 from mjx_revolve.water import Water, gust_path, water_of
 from mjx_revolve.world import World, load_world
@@ -72,6 +73,11 @@ class Fitness:
     def num_genes(self) -> int:
         """Length of an individual's genes."""
         return self.controller.num_genes
+
+    @cached_property
+    def task(self) -> Callable[[Track, TaskConfig], jax.Array]:
+        """What scores an episode: (track, settings) → `[lanes]`."""
+        return find_task(self.config.task, self.config.source)
 
     @property
     def worst_score(self) -> float:
@@ -128,7 +134,7 @@ class Fitness:
         return simulate(
             self.robot,
             bind_genes(self.controller, genes),
-            self._records * self._every * self.robot.world.timestep,
+            self.num_records * self.record_every * self.robot.world.timestep,
             qpos=self.starts(key)[0][:, trial],
             water=self.water(key, trial),
             engine=self.config.engine,
@@ -145,12 +151,14 @@ class Fitness:
         return water
 
     @property
-    def _every(self) -> int:
+    def record_every(self) -> int:
+        """Timesteps between the rows of the track that tasks see."""
         return max(1, int(_INTERVAL / self.robot.world.timestep + 1e-6))
 
     @property
-    def _records(self) -> int:
-        interval = self._every * self.robot.world.timestep
+    def num_records(self) -> int:
+        """How many rows the track of an episode has, before the settling time is cut off."""
+        interval = self.record_every * self.robot.world.timestep
         return max(2, round(self.config.task.duration / interval))
 
     def starts(self, key: jax.Array) -> tuple[jax.Array, Water | None]:
@@ -177,7 +185,7 @@ class Fitness:
             `[steps + 1, 3, trials]` velocity around the episode's current [m/s], or None where the
             world has no gusts.
         """
-        steps = self._records * self._every
+        steps = self.num_records * self.record_every
         return draw_gusts(self.config.task, self.robot.world, key, steps)
 
     @cached_property
@@ -207,7 +215,8 @@ class Fitness:
             self.robot.morphology.length,
             self.robot.morphology.mass * max(world.gravity, 1e-9),
             _reach(self.config, self.robot),
-            self._every * world.timestep,
+            self.record_every * world.timestep,
+            self.task,
         )
 
     def _episode(
@@ -234,8 +243,8 @@ class Fitness:
                 self.engine.init(qpos, qvel),
                 controller.init(parameters),
                 rows,
-                records=self._records,
-                every=self._every,
+                records=self.num_records,
+                every=self.record_every,
                 timestep=world.timestep,
                 mode=mode,
             )
@@ -323,6 +332,7 @@ def score_tracks(
     weight: Any,
     farthest: float,
     interval: float,
+    score_track: Callable[[Track, TaskConfig], jax.Array] | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Scores and measures of individuals from the tracks of all their episodes.
 
@@ -336,6 +346,7 @@ def score_tracks(
         weight: in air, likewise [N].
         farthest: whoever gets further than this has blown up [m].
         interval: between rows [s].
+        score_track: from `tasks.find_task`; None: that of the configuration.
 
     Returns:
         `[P]` scores, and `[P]` measures.
@@ -357,7 +368,8 @@ def score_tracks(
         surface_height=world.surface_height,
     )
     measures = measure(track)
-    score = TASKS[task.type](track, task) - task.energy_weight * measures["energy_j"]
+    score_track = score_track or find_task(task, config.source)
+    score = score_track(track, task) - task.energy_weight * measures["energy_j"]
     away = jnp.max(jnp.abs(position - start), (0, 1))
     # Written so that NaN counts as too far.
     sane = jnp.isfinite(score) & (away < farthest)
@@ -417,9 +429,11 @@ def make_fitness(config: Config | str | Path | dict[str, Any], **overrides: Any)
     settings = config.controller
     if settings.depth is None:
         settings = settings.model_copy(update={"depth": config.task.depth})
-    controller = CONTROLLERS[settings.type](robot, settings)
+    controller = find_controller(robot, settings, config.source)
     contact = may_touch_bed(config, robot)
-    return Fitness(config, robot, controller, make_engine(robot, config.engine, contact))
+    fitness = Fitness(config, robot, controller, make_engine(robot, config.engine, contact))
+    _ = fitness.task  # found now, so that a mistake in a user's own shows before any rollout
+    return fitness
 
 
 def may_touch_bed(config: Config, robot: Robot) -> bool:

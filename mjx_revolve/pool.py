@@ -294,7 +294,7 @@ def _start_pool(
     import jax
 
     from mjx_revolve import leader
-    from mjx_revolve.evolve import _model_hash, _settings_hash
+    from mjx_revolve.fingerprints import model_hash, settings_hash
 
     limits = limits or leader.LIMITS
     make = name_function(make_fitness)
@@ -313,8 +313,8 @@ def _start_pool(
         fitness = load_function(make)(config)
         identity = {
             "versions": program_versions(),
-            "settings_hash": _settings_hash(config),
-            "model_hash": _model_hash(fitness),
+            "settings_hash": settings_hash(config),
+            "model_hash": model_hash(fitness),
         }
         lead = leader.Leader(listener, crew, secret, identity, hosts, limits)
         block = _block_of(fitness) or config.evolution.population_size

@@ -1,7 +1,7 @@
 """Command line and function: a film of a champion, or of a morphology in the water.
 
-``python -m mjx_revolve.replay runs/mine`` writes `swim.mp4`, `swim.gif` and `swim.html` into the
-run folder. Films are drawn by MuJoCo, with a screen or without; see `docs/replay.md`.
+``python -m mjx_revolve.replay runs/mine`` writes `swim.mp4`, `swim.gif` and `viewer.html` into
+the run folder. Films are drawn by MuJoCo, with a screen or without; see `docs/replay.md`.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> _Parser:
     parser = _Parser(
         prog="python -m mjx_revolve.replay",
-        description="Film a champion, or a morphology in the water: swim.mp4, swim.gif, swim.html.",
+        description="Film a champion, or a morphology in the water: MP4, GIF and viewer.html.",
     )
     parser.add_argument("path", help="run folder, champion's genes.yaml, or morphology YAML")
     parser.add_argument(
@@ -143,6 +143,11 @@ def _seconds(text: str | None) -> float | None:
     return value
 
 
+def _file_name(name: str, kind: str) -> str:
+    """What a file is called: in a run folder the page as `mjx_revolve.viewer` calls it."""
+    return "viewer.html" if (name, kind) == ("swim", ".html") else f"{name}{kind}"
+
+
 def _named_paths(out: str | None, html: bool) -> dict[str, Path] | None:
     """Where `--out` wants which kind of file; None where it says nothing."""
     if out is None:
@@ -155,15 +160,23 @@ def _named_paths(out: str | None, html: bool) -> dict[str, Path] | None:
                 f"--out {out}: expected a folder, or a name that ends in {', '.join(_KINDS)}; "
                 "found another file"
             )
-        return {k: path / f"swim{k}" for k in (_KINDS if not html else (".html",))}
+        return {k: path / _file_name("swim", k) for k in (_KINDS if not html else (".html",))}
     if html and kind != ".html":
         raise InputError(f"--out {out}: expected a name that ends in .html, with --html")
     return {kind: path}
 
 
 def _usual_paths(place: Path, name: str, html: bool) -> dict[str, Path]:
-    """Where files go that were given no name: never over files that are there."""
-    paths = {kind: place / f"{name}{kind}" for kind in (_KINDS if not html else (".html",))}
+    """Where files go that were given no name: never over files that are there.
+
+    A page that is there already does not keep a film from being made.
+    """
+    kinds = _KINDS if not html else (".html",)
+    paths = {kind: place / _file_name(name, kind) for kind in kinds}
+    page = paths.get(".html")
+    if not html and page is not None and page.exists():
+        print(f"{page}: there already, and left as it is")
+        del paths[".html"]
     for path in paths.values():
         if path.exists():
             raise InputError(

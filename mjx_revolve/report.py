@@ -103,7 +103,7 @@ def _replay(
     groups: Sequence[Group],
 ) -> tuple[dict[Path, Replay], list[tuple[str, Morphology]]]:
     """All champions' episodes by run folder, and the robots of the groups."""
-    from mjx_revolve import evolve
+    from mjx_revolve.fingerprints import model_hash
     from mjx_revolve.fitness import make_fitness
     from mjx_revolve.report_champion import replay_champion
 
@@ -118,7 +118,7 @@ def _replay(
                 # The seed is all that differs within a group, and the fitness does not know it.
                 fitness = make_fitness(record.config) if fitness is None else fitness
                 known = record.info.get("model_hash")
-                if isinstance(known, str) and known != evolve._model_hash(fitness):
+                if isinstance(known, str) and known != model_hash(fitness):
                     record.note("version", "the robot or its world is built differently by this "
                                 "version than when it evolved: the replay may differ")  # fmt: skip
                 if record.genes is not None:

@@ -17,7 +17,7 @@ from mjx_revolve.fitness import Fitness
 from mjx_revolve.loop import replay_key
 from mjx_revolve.report_data import RunRecord, number
 from mjx_revolve.rollout import Trajectory
-from mjx_revolve.tasks import TASKS, Track, measure
+from mjx_revolve.tasks import Track, measure
 from mjx_revolve.terrain import bed_height
 
 # A replay further than this from the recorded mean is another swim: standard deviations over the
@@ -97,7 +97,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
     trajectory = jax.tree.map(lambda x: x[:count], whole)
     phases = cpg_phases(fitness, record.genes, count) if has_phases(fitness) else None
     episode = Episode(
-        title=f"{fitness.robot.morphology.name}: {task.type.replace('_', ' ')}",
+        title=f"{fitness.robot.morphology.name}: {task.name.replace('_', ' ')}",
         robot=fitness.robot,
         trajectory=trajectory,
         score=number(record.champion.get("score")),
@@ -107,8 +107,8 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
         folder=record.folder,
     )
     _compare(record, score)
-    interval = fitness._every * fitness.robot.world.timestep
-    start = interval * (1 + _first(fitness, fitness._records))
+    interval = fitness.record_every * fitness.robot.world.timestep
+    start = interval * (1 + _first(fitness, fitness.num_records))
     return Replay(episode, score, measures, start, phases)
 
 
@@ -145,7 +145,7 @@ def judge(
     Returns:
         The score, NaN where the rollout blew up, and the measures.
     """
-    every, records = fitness._every, fitness._records
+    every, records = fitness.record_every, fitness.num_records
     position = np.asarray(trajectory.xpos)[every - 1 :: every, 1][:records]
     work = np.asarray(trajectory.power) * fitness.robot.world.timestep
     energy = work.reshape(records, every).sum(1)
@@ -155,7 +155,7 @@ def judge(
 
 def _first(fitness: Fitness, records: int) -> int:
     """The record at which the task begins to count; the first record is one interval late."""
-    interval = fitness._every * fitness.robot.world.timestep
+    interval = fitness.record_every * fitness.robot.world.timestep
     return min(round(fitness.config.task.settle / interval), records - 2)
 
 
@@ -163,7 +163,7 @@ def _first(fitness: Fitness, records: int) -> int:
 def _judge(fitness: Fitness) -> Any:
     """The task and the measures of one lane, compiled once for all runs of a configuration."""
     task, world, robot = fitness.config.task, fitness.robot.world, fitness.robot
-    interval = fitness._every * world.timestep
+    interval = fitness.record_every * world.timestep
 
     def run(position: jax.Array, energy: jax.Array, start_height: jax.Array) -> Any:
         first = _first(fitness, position.shape[0])
@@ -182,7 +182,7 @@ def _judge(fitness: Fitness) -> Any:
             surface_height=world.surface_height,
         )
         measures = measure(track)
-        return TASKS[task.type](track, task) - task.energy_weight * measures["energy_j"], measures
+        return fitness.task(track, task) - task.energy_weight * measures["energy_j"], measures
 
     return jax.jit(run)
 

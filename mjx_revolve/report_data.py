@@ -24,8 +24,9 @@ from pydantic import BaseModel
 import mjx_revolve
 from mjx_revolve.config import Config, make_config
 from mjx_revolve.errors import InputError, load_yaml
+from mjx_revolve.own_code import content_name
 from mjx_revolve.runs import Run, load_genes
-from mjx_revolve.tasks import UNITS
+from mjx_revolve.tasks import score_unit
 
 # Whose version decides what a replay gives.
 _PACKAGES = ("mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax")
@@ -102,14 +103,18 @@ class RunRecord:
 
     @property
     def task(self) -> str:
-        """The task's type; "" where it is not known."""
-        task = self.setting("task.type", "")
-        return task if isinstance(task, str) else ""
+        """The task's type; a user's own by what its file holds; "" where it is not known."""
+        return content_name(self._task_type)
 
     @property
     def unit(self) -> str:
         """Of the fitness; "" where it is not known."""
-        return UNITS.get(self.task, "")
+        return score_unit(self._task_type)
+
+    @property
+    def _task_type(self) -> str:
+        task = self.setting("task.type", "")
+        return task if isinstance(task, str) else ""
 
     @property
     def generations(self) -> int:

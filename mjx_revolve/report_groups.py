@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
+from mjx_revolve.fingerprints import hash_text
+from mjx_revolve.own_code import content_name, parse_own
 from mjx_revolve.report_data import RunRecord, number
-from mjx_revolve.runs import hash_text
 
 # Settings that do not make it another configuration: they only say how it is kept.
 _KEEPING = ("checkpoint_every", "keep_checkpoints", "tensorboard")
@@ -212,6 +213,10 @@ def _settings(record: RunRecord) -> dict[str, Any]:
             text = path.read_text(errors="replace") if path.is_file() else ""
             named = record.settings.get(key, value)  # another file may stand in for a lost one
             flat[key] = f"{Path(str(named)).stem} {hash_text(text)[:6]}"
+    for key in ("task.type", "controller.type"):
+        if parse_own(flat.get(key)):
+            function, _, digest = content_name(flat[key]).partition(" ")
+            flat[key] = f"{function} {digest[:6]}"
     return flat
 
 
@@ -296,7 +301,7 @@ def _words(key: str, value: Any) -> str:
     if key in ("morphology", "modules", "world.name"):
         return str(value).split(" ")[0] if key != "world.name" else Path(str(value)).stem
     if leaf in ("type", "strategy") and section:
-        return str(value)
+        return str(value).split(" ")[0]
     if leaf == "generations":
         return f"{value} generations"
     return f"{leaf.replace('_size', '').replace('_', ' ')} {value}"

@@ -8,6 +8,7 @@ from typing import Any
 
 from mjx_revolve.config import Config, load_config
 from mjx_revolve.errors import InputError
+from mjx_revolve.own_code import content_name
 from mjx_revolve.report_data import RunRecord
 
 # Set to 1 by the command itself where nobody sets them.
@@ -74,9 +75,11 @@ def _started(record: RunRecord) -> list[str] | None:
 
 
 def _content(config: Config) -> dict[str, Any]:
-    """All settings; the morphology by what it holds, because a run has a copy of its own."""
+    """All settings; files by what they hold, because a run has copies of its own."""
     data = config.model_dump()
     data["morphology"] = Path(config.morphology).read_bytes()
+    for section in ("controller", "task"):
+        data[section]["type"] = content_name(data[section]["type"])
     if isinstance(data["world"], str):
         data["world"] = {"name": data["world"]}
     return data

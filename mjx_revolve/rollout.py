@@ -267,7 +267,9 @@ def _compiled(
             command=jax.vmap(simulator.command)(states)[..., 0],
         )
 
-    return jax.jit(run, compiler_options=compiler_options()), partial(run, mode="derived")
+    mode = "fused" if engine == "population" else "plain"
+    jitted = jax.jit(partial(run, mode=mode), compiler_options=compiler_options())
+    return jitted, partial(run, mode="derived")
 
 
 def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Water:

@@ -1,6 +1,6 @@
 """The run folder: everything that an evolution writes to disk, and how it is read back.
 
-    config.yaml        the resolved configuration; inputs/ holds the morphology that it names
+    config.yaml        the resolved configuration; inputs/ holds the robot, and code, that it names
     run.json           versions, seed, arguments, platform, thread settings, times
     metrics.csv        one line per generation (RFC 4180), readable while the run goes on
     checkpoints/       the newest few, one npz each
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import hashlib
 import io
 import json
 import os
@@ -31,6 +30,7 @@ import yaml
 
 from mjx_revolve.config import Config, dump_config, load_config
 from mjx_revolve.errors import InputError, load_yaml
+from mjx_revolve.own_code import parse_own
 
 try:
     import fcntl
@@ -367,14 +367,6 @@ def load_genes(path: str | Path) -> np.ndarray:
     return np.asarray(genes, np.float32)
 
 
-def hash_text(*texts: str) -> str:
-    """A short fingerprint of some texts."""
-    digest = hashlib.sha256()
-    for text in texts:
-        digest.update(text.encode() + b"\0")
-    return digest.hexdigest()[:16]
-
-
 def check_new_folder(folder: str | Path, option: str = "--out") -> None:
     """Refuses a folder that holds something.
 
@@ -400,13 +392,13 @@ def create_run(folder: str | Path, config: Config, **info: Any) -> tuple[Run, Co
 
     Args:
         folder: a new or empty folder.
-        config: the configuration. Its morphology is copied into the folder, so that the run can be
-            moved and still be read; a world or modules file stays where it is, because it may
-            refer to files beside it.
+        config: the configuration. Its morphology, and the files of a task or controller of the
+            user's own, are copied into the folder, so that the run can be moved and still be read;
+            a world or modules file stays where it is, because it may refer to files beside it.
         **info: entries for `run.json`.
 
     Returns:
-        The run, and its configuration, which names the copy.
+        The run, and its configuration, which names the copies.
 
     Raises:
         InputError: the folder holds something.
@@ -423,9 +415,30 @@ def create_run(folder: str | Path, config: Config, **info: Any) -> tuple[Run, Co
     copy = folder / "inputs" / Path(config.morphology).name
     write_atomic(copy, Path(config.morphology).read_bytes())
     config = config.model_copy(update={"morphology": str(copy)})
+    config = _copy_own_code(config, folder / "inputs")
     run.save_config(config)
     run.update_info(**info)
     return run, config
+
+
+def _copy_own_code(config: Config, folder: Path) -> Config:
+    """Keeps the files of the user's own functions, and names the copies."""
+    copies: dict[str, Path] = {}
+    changes = {}
+    for section in ("controller", "task"):
+        settings = getattr(config, section)
+        own = parse_own(settings.type)
+        if own is None:
+            continue
+        if own.path not in copies:
+            copy = folder / Path(own.path).name
+            if copy in copies.values():  # two files of one name
+                copy = folder / f"{section}_{Path(own.path).name}"
+            write_atomic(copy, Path(own.path).read_bytes())
+            copies[own.path] = copy
+        named = f"{copies[own.path]}:{own.function}"
+        changes[section] = settings.model_copy(update={"type": named})
+    return config.model_copy(update=changes)
 
 
 def open_run(folder: str | Path) -> Run:

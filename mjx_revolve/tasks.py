@@ -1,10 +1,13 @@
 """Tasks: from the track of an episode to measures and a score. Knows nothing of simulators.
 
-A task is a plain function of a `Track`; adding one is adding a function to `TASKS`.
+A task is a plain function of a `Track` and the task's settings (`config.TaskConfig`). A task of
+one's own stands in a file of one's own: see `find_task`.
 """
 
 from __future__ import annotations
 
+import inspect
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.errors import InputError
+from mjx_revolve.own_code import call_own, load_own, parse_own, short_name
 from mjx_revolve.spatial import safe_norm
 
 # Units of the tasks' scores.
@@ -116,6 +121,68 @@ TASKS: Mapping[str, Callable[[Track, Any], jax.Array]] = {
     "hold_depth": hold_depth,
     "crawl": crawl,
 }
+
+
+def find_task(settings: Any, source: str = "config") -> Callable[[Track, Any], jax.Array]:
+    """The function that scores a task.
+
+    Args:
+        settings: a `config.TaskConfig`. Its `type` is a name in `TASKS`, or FILE.py:FUNCTION for a
+            function of the user's own: it takes a `Track` and these settings, and returns `[lanes]`
+            scores, higher is better, by JAX, so that it can be compiled.
+        source: what messages call the configuration.
+
+    Returns:
+        (track, settings) → `[lanes]` scores.
+
+    Raises:
+        InputError: the file or the function is missing, or it does not score a track; one line
+            says where.
+    """
+    if settings.type in TASKS:
+        return TASKS[settings.type]
+    name = settings.type
+    function = load_own(name, f"{source}: task.type")
+    rows, lanes = 7, 3  # unlike numbers, so that an axis taken for another shows
+
+    def score(
+        position: jax.Array, clearance: jax.Array, energy: jax.Array, start: jax.Array
+    ) -> Any:
+        return function(Track(position, clearance, energy, 0.1, start, 0.5, 1.0, 0.0), settings)
+
+    shapes = [(rows, 3, lanes), (rows, lanes), (rows, lanes), (lanes,)]
+    given = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    what = f"{short_name(name)} to score a track"
+    found = call_own(name, what, jax.eval_shape, score, *given)
+    if not isinstance(found, jax.ShapeDtypeStruct) or found.shape != (lanes,):
+        own = parse_own(name)
+        assert own is not None
+        shown = list(found.shape) if isinstance(found, jax.ShapeDtypeStruct) else type(found)
+        raise InputError(
+            f"{own.path}: {own.function}: expected a score for each lane, [{lanes}] for a position "
+            f"of [{rows}, 3, {lanes}]; found {shown}"
+        )
+    return function
+
+
+def score_unit(name: str) -> str:
+    """Unit of a task's scores.
+
+    Args:
+        name: `type` of a task. Own functions say it in brackets in the first line of their
+            docstring, as ours do: `Mean height above the bed [body lengths].`
+
+    Returns:
+        The unit; "" where it is not known.
+    """
+    if name in UNITS:
+        return UNITS[name]
+    try:
+        text = inspect.getdoc(load_own(name, "task.type")) or ""
+    except InputError:
+        return ""
+    units = re.findall(r"\[([^\[\]]+)\]", text.partition("\n")[0])
+    return units[-1] if units else ""
 
 
 def measure(track: Track) -> dict[str, jax.Array]:

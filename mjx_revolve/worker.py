@@ -84,7 +84,7 @@ def load_function(name: str) -> Any:
 
 def _work(job: dict[str, Any]) -> int:
     from mjx_revolve.config import make_config
-    from mjx_revolve.evolve import _model_hash, _settings_hash
+    from mjx_revolve.fingerprints import model_hash, settings_hash
 
     config = make_config(job["config"], "/", source=job["source"])
     fitness = load_function(job["make"])(config)
@@ -92,8 +92,8 @@ def _work(job: dict[str, Any]) -> int:
         "type": "hello",
         "protocol": PROTOCOL,
         "versions": program_versions(),
-        "settings_hash": _settings_hash(config),
-        "model_hash": _model_hash(fitness),
+        "settings_hash": settings_hash(config),
+        "model_hash": model_hash(fitness),
         "host": job["host"],
         "hosts": job["hosts"],
         "worker": job["worker"],

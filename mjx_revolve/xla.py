@@ -165,7 +165,7 @@ class Graph:
         self._compute(self._operations, values)
         return self._finish(values)
 
-    def in_pieces(self, size: int, pack: Callable[[Any], Any], unpack: Callable[[Any], Any]) -> Any:
+    def in_pieces(self, size: int, pack: Callable[[Any], Any], unpack: Callable[..., Any]) -> Any:
         """The function cut into several, each compiled as one: `small_call`.
 
         XLA's time for a function grows faster than its length, and several compile at once.
@@ -344,12 +344,13 @@ def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any
         ]
         return jax.tree.unflatten(tree, found)
 
-    pieces = graph.in_pieces(
-        _PIECE,
-        pack=lambda result: (pack(result[0]), result[1]),
-        unpack=lambda packed, row: (unpack(packed), row),
-    )
-    return pieces, pack, unpack, same
+    def pack_result(result: Any) -> Any:
+        return pack(result[0]), result[1]
+
+    def unpack_arguments(packed: Any, row: Any) -> Any:
+        return unpack(packed), row
+
+    return graph.in_pieces(_PIECE, pack_result, unpack_arguments), pack, unpack, same
 
 
 def over_chunks(fun: Callable[..., Any], lanes: int | None = None) -> Callable[..., Any]:

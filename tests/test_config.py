@@ -70,7 +70,16 @@ def test_it_is_frozen(folder):
         ("task.trials=0", "task.trials: expected a whole number >= 1; found 0"),
         ("task.trials=2.0", "task.trials: expected a whole number >= 1; found 2.0"),
         ("task.type=swim", "task.type: expected one of directed_swim, speed, reach_target, "
-         "hold_depth, crawl; found 'swim'"),
+         "hold_depth, crawl, or FILE.py:FUNCTION; found 'swim'"),
+        ("task.type=tasks.py", "or FILE.py:FUNCTION; found 'tasks.py'"),
+        ("task.type='tasks.py:'", "or FILE.py:FUNCTION; found 'tasks.py:'"),
+        ("task.type=tasks.py:3d", "or FILE.py:FUNCTION; found 'tasks.py:3d'"),
+        ("task.type=tasks.py:stay", "--set task.type: expected a file; found none at"),
+        ("task.type=3", "task.type: expected one of directed_swim, speed, reach_target, "),
+        ("task.params={a: 1}", "task.params: expected none, as only own functions take them; "
+         "found a"),
+        ("task.params=3", "task.params: expected a mapping; found 3"),
+        ("controller.params.a=1", "controller.params: expected none, as only own functions"),
         ("task.type=reach_target", "task.target: expected three numbers, because task.type is "
          "reach_target; found none"),
         ("task.target=[1, 2]", "task.target: expected three finite numbers or nothing; "
@@ -92,7 +101,7 @@ def test_it_is_frozen(folder):
         ("allow_overlap=1", "--set allow_overlap: expected true or false; found 1"),
         (
             "controller.type=splines",
-            "controller.type: expected one of cpg, sine, feedback; found 'splines'",
+            "expected one of cpg, sine, feedback, or FILE.py:FUNCTION; found 'splines'",
         ),
         ("controller.max_frequency=21", "expected a number > 0 and <= 20; found 21"),
         ("controller.amplitude=0", "expected a number > 0 and <= 1; found 0"),
@@ -135,6 +144,8 @@ def test_wrong_settings(folder, setting, message):
         (GOOD + "world: lake", "bad.yaml: line 6: expected each key once; found 'world' twice"),
         (GOOD.replace("lake", "no/pond.yaml"), "bad.yaml: world: expected a file; found none at"),
         (GOOD.replace("robot", "nobody"), "bad.yaml: morphology: expected a file; found none at"),
+        (GOOD.replace("directed_swim", "no/tasks.py:stay"),
+         "bad.yaml: task.type: expected a file; found none at"),
         (GOOD.replace("type: directed_swim", "trials: 2"), "bad.yaml: task.type: expected one of"),
         (GOOD.replace("\n  type: directed_swim", ""),
          "bad.yaml: task: expected a mapping; found None"),
@@ -213,6 +224,26 @@ def test_dump_reads_back_equal(folder):
     assert load_config(folder / "elsewhere" / "dumped.yaml").model_dump() == config.model_dump()
     inside = dump_config(config, folder)
     assert "morphology: robot.yaml" in inside
+    (folder / "inside.yaml").write_text(inside)
+    assert load_config(folder / "inside.yaml").model_dump() == config.model_dump()
+
+
+def test_own_functions_are_found_from_where_they_are_named(folder):
+    """In a file from its folder, typed ones from the current folder."""
+    (folder / "mine.py").touch()
+    (folder / "elsewhere" / "mine.py").touch()
+    (folder / "own.yaml").write_text(GOOD.replace("directed_swim", "mine.py:stay"))
+    config = load_config(folder / "own.yaml", ["controller.type=mine.py:wave", "task.params.a=2"])
+    assert config.task.type == f"{folder / 'mine.py'}:stay"
+    assert config.controller.type == f"{folder / 'elsewhere' / 'mine.py'}:wave"
+    assert (config.task.name, config.controller.name) == ("stay", "wave")
+    assert config.task.params == {"a": 2}
+    assert not load_config(folder / "good.yaml").task.is_own
+    nested = load_config(folder / "own.yaml", {"task": {"type": "mine.py:go"}})
+    assert nested.task.type == f"{folder / 'elsewhere' / 'mine.py'}:go"
+    assert override_config(config, {"task.trials": 3}).task.type == config.task.type
+    inside = dump_config(config, folder)
+    assert "type: mine.py:stay" in inside and "type: elsewhere/mine.py:wave" in inside
     (folder / "inside.yaml").write_text(inside)
     assert load_config(folder / "inside.yaml").model_dump() == config.model_dump()
 

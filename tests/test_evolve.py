@@ -562,7 +562,7 @@ def test_a_run_stays_the_same_run(stopped, argv, message, capsys):
 
 
 def test_a_changed_robot_or_config_is_noticed(stopped, capsys, monkeypatch):
-    monkeypatch.setattr(command, "_model_hash", lambda fitness: "another")
+    monkeypatch.setattr(command, "model_hash", lambda fitness: "another")
     assert run_main("--resume", "run") == 2
     assert "expected the robot and the world that it began with; found them changed" in (
         capsys.readouterr().err

@@ -483,11 +483,19 @@ def test_command_writes_film_gif_and_page(command, way, tmp_path, capsys):
     assert pictures[0].std() > 10
     with Image.open(tmp_path / "swim.gif") as gif:
         assert gif.size == SIZE and gif.n_frames == 10
-    assert (tmp_path / "swim.html").read_text() == "spider: carried along"
+    assert (tmp_path / "viewer.html").read_text() == "spider: carried along"
     out = capsys.readouterr().out
-    assert "swim.mp4: 1 s, 160 x 120, 10 frames/s" in out and "swim.html: open it" in out
+    assert "swim.mp4: 1 s, 160 x 120, 10 frames/s" in out and "viewer.html: open it" in out
     assert not list(tmp_path.glob(".*"))
-    # What is there stays, unless it is named.
+    # A page that is there stays, and keeps nobody from making a film.
+    for name in ("swim.mp4", "swim.gif"):
+        (tmp_path / name).unlink()
+    (tmp_path / "viewer.html").write_text("kept")
+    assert command(str(tmp_path), *small) == 0
+    assert "viewer.html: there already, and left as it is" in capsys.readouterr().out
+    assert (tmp_path / "viewer.html").read_text() == "kept"
+    assert (tmp_path / "swim.mp4").exists() and (tmp_path / "swim.gif").exists()
+    # So do films, unless they are named.
     assert command(str(tmp_path), *small) == 2
     assert "say where with --out" in capsys.readouterr().err
     old = (tmp_path / "swim.mp4").stat().st_mtime_ns
@@ -500,7 +508,7 @@ def test_page_alone_needs_no_opengl(command, tmp_path, monkeypatch):
     source = tmp_path / "spider.yaml"
     source.touch()
     assert command(str(source), "--html", "--out", str(tmp_path / "new")) == 0
-    assert [p.name for p in (tmp_path / "new").iterdir()] == ["swim.html"]
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["viewer.html"]
     assert command(str(source), "--out", str(tmp_path / "page.html")) == 0
     assert (tmp_path / "page.html").exists()
 
@@ -646,4 +654,4 @@ def test_a_run_from_end_to_end(way, tmp_path):
     assert run_command(replay.main, [str(run), "--size", "320x240"]) == 0
     _, _, _, pictures = read_mp4(run / "swim.mp4")
     assert len(pictures) == 30
-    assert (run / "swim.gif").stat().st_size < 8e6 and (run / "swim.html").stat().st_size < 5e6
+    assert (run / "swim.gif").stat().st_size < 8e6 and (run / "viewer.html").stat().st_size < 5e6

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laboratory import elbow_robot, world
 
+from laboratory import elbow_robot, world
 from mjx_revolve.servos import servo
 from mjx_revolve.tree import make_tree
 
