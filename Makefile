@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 RUN    := $(VENV)/bin/python
 # Tests that share compiled programs sit in one file, so each file stays with one worker.
-TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 READY  := $(VENV)/.ready
 
 .DEFAULT_GOAL := help

@@ -45,3 +45,16 @@ def fresh_traces():
     """Forgets traces after each file, and with them the memory that they hold."""
     yield
     jax.clear_caches()
+
+
+# Files are dealt out whole, in this order: those that take a minute or more go first, so that no
+# worker is left alone with one at the end.
+_LONGEST = (
+    "test_tutorial", "test_rollout", "test_step", "test_mixed", "test_fitness", "test_experiments",
+    "test_end_to_end", "test_pool", "test_mjx_contact", "test_evolve", "test_dynamics",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    place = {name: number for number, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
