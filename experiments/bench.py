@@ -157,7 +157,7 @@ GROUPS = (
     Group(
         "16,384 individuals to 256, spider, default water, one core",
         tuple(
-            Row(f"ours, {n}", "evaluation", "default", population=n, duration=2.0)
+            Row(f"ours, {n}", "evaluation", "default", population=n, duration=2.5)
             for n in (16384, 256, 1024, 4096)
         ),
         1,
