@@ -175,30 +175,47 @@ def submersion(up: Vec, depth: Scalar, half_size: Vec, mode: str) -> tuple[Scala
     return share, tuple(moment)
 
 
-def buoyancy(
-    up: Vec, share: Scalar, moment: Vec, volume: Scalar, center: Vec, weight_density: Scalar
-) -> tuple[Vec, Vec]:
-    """Archimedes' force on a part, and its torque about the box's centre.
+def displaced(
+    share: Scalar, moment: Vec, volume: Scalar, center: Vec, density: Scalar
+) -> tuple[Scalar, Vec]:
+    """The water that a part displaces: its mass and the first moment of it.
 
     The box's submerged share is that of the part's own volume, and its centre moves as the box's
     does: exact wholly under water, and for a part that fills its box.
 
     Args:
-        up: the world's vertical, part frame; times gravity plus the water's own acceleration when
-            the last argument is the density [kg/m³] alone.
         share: submerged share of the volume [-].
         moment: share times centre of the submerged piece, from the centre of volume [m].
         volume: displaced when wholly submerged [m³].
+        center: centre of volume, from where moments are taken, in the frame of `moment` [m].
+        density: of the water [kg/m³].
+
+    Returns:
+        Mass [kg], and mass times centre [kg·m].
+    """
+    whole = mul(density, volume)
+    return mul(whole, share), vscale(whole, vadd(moment, vscale(share, center)))
+
+
+def buoyancy(
+    up: Vec, share: Scalar, moment: Vec, volume: Scalar, center: Vec, weight_density: Scalar
+) -> tuple[Vec, Vec]:
+    """Archimedes' force on a part, and its torque about the box's centre.
+
+    Args:
+        up: the world's vertical, part frame; times gravity plus the water's own acceleration when
+            the last argument is the density [kg/m³] alone.
+        share: as in `displaced`.
+        moment: likewise.
+        volume: likewise.
         center: centre of volume, from the box's centre, part frame [m].
         weight_density: ρ g of the water [N/m³].
 
     Returns:
         Force [N] and torque [N·m], part frame, at the box's centre.
     """
-    lift = mul(mul(weight_density, volume), 1.0)
-    force = vscale(mul(lift, share), up)
-    torque = vscale(lift, cross(moment, up))
-    return force, vadd(torque, cross(center, force))
+    weight, first = displaced(share, moment, volume, center, weight_density)
+    return vscale(weight, up), cross(first, up)
 
 
 def surface_tension(

@@ -68,7 +68,7 @@ def quadratic_drag(rate: Scalar, coefficient: Scalar, share: Scalar) -> tuple[Sc
     Returns:
         Force [N] or torque [N·m], and damping [N·s/m] or [N·m·s].
     """
-    damping = mul(coefficient, jnp.abs(rate)) * share
+    damping = mul(mul(coefficient, jnp.abs(rate)), share)
     return -damping * rate, damping
 
 

@@ -205,6 +205,29 @@ def outer_forces(
     )
 
 
+def with_water(
+    level: Level, outer: Outer, swirling: tuple[Vec, Vec]
+) -> tuple[SpatialInertia, SpatialInertia, tuple[Vec, Vec]]:
+    """Inertia of each body alone and with the water that it carries, and the momentum of both.
+
+    Args:
+        level: the bodies.
+        outer: what the water does to them.
+        swirling: their angular and linear velocity, relative to the uniform current.
+
+    Returns:
+        The two inertias, and (angular, linear) momentum relative to the uniform current.
+    """
+    rigid = SpatialInertia(
+        level.inertia, skew(level.moment), (level.mass, 0.0, 0.0, level.mass, 0.0, level.mass)
+    )
+    whole = rigid if outer.carried is None else add_inertia(rigid, outer.carried)
+    momentum = apply_inertia(whole, *swirling)
+    if outer.momentum is not None:
+        momentum = tuple(vadd(a, b) for a, b in zip(momentum, outer.momentum, strict=True))
+    return rigid, whole, momentum
+
+
 def own_inertia(
     world: World,
     carries: bool,
@@ -221,23 +244,14 @@ def own_inertia(
     Where water is carried, the whole momentum h turns by K(h) ν in the middle of the step (see
     `_acceleration`), which makes the inertia's matrix unsymmetric.
     """
-    h = level.moment
-    rigid = SpatialInertia(
-        level.inertia, skew(h), (level.mass, 0.0, 0.0, level.mass, 0.0, level.mass)
-    )
-    momentum = apply_inertia(rigid, *swirling)
     outer = outer_forces(level, motion, swirling, gravity, water, thrusts, world)
     weight = tuple(neg(g) for g in gravity)
     force = vadd(outer.force, vscale(level.mass, weight))
-    torque = vadd(outer.torque, cross(h, weight))
-    inertia = rigid
-    if outer.carried is not None:
-        inertia = add_inertia(inertia, outer.carried)
+    torque = vadd(outer.torque, cross(level.moment, weight))
+    _, inertia, momentum = with_water(level, outer, swirling)
     if outer.damping is not None and dt:
         inertia = add_inertia(inertia, scale_inertia(dt, outer.damping))
     block = block_of(inertia)
-    if outer.momentum is not None:
-        momentum = tuple(vadd(a, b) for a, b in zip(momentum, outer.momentum, strict=True))
     if carries and dt:
         block = add_block(block, 0.5 * dt, gyroscope(*momentum))
     bias = cross_force(motion.spin, motion.velocity, *momentum)
@@ -247,6 +261,8 @@ def own_inertia(
 def turn_hinges(level: Level, angle: Scalar) -> Mat:
     """Rotation of each body's frame, parent from child."""
     sine, cosine = sincos(angle)
+    c, s = level.offset
+    cosine, sine = sub(mul(c, cosine), mul(s, sine)), add(mul(s, cosine), mul(c, sine))
     r = level.rotation
     return tuple(
         (

@@ -7,7 +7,7 @@ tuples of three arrays (see `spatial`), per-part tables are constants `[npart, n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +23,7 @@ from mjx_revolve.bodies import (
     shift_inertia,
     sum_parts,
 )
-from mjx_revolve.buoyancy import buoyancy, submersion, surface_tension
+from mjx_revolve.buoyancy import buoyancy, displaced, submersion, surface_tension
 from mjx_revolve.drag import (
     ELLIPSOID_COEFFICIENTS,
     ellipsoid,
@@ -36,6 +36,7 @@ from mjx_revolve.fluid_table import FluidTable
 from mjx_revolve.lift_drag import LiftDrag, lift_drag, lift_drag_damping, lift_drag_wrench
 from mjx_revolve.spatial import (
     Scalar,
+    Sym,
     Vec,
     add,
     cross,
@@ -43,6 +44,7 @@ from mjx_revolve.spatial import (
     matTvec,
     matvec,
     mul,
+    neg,
     rotate_sym,
     sub,
     total,
@@ -85,8 +87,9 @@ class Outer(NamedTuple):
         torque: [N·m].
         force: [N].
         carried: inertia of the water that the bodies carry along, or None.
-        momentum: of that water, (angular, linear) [kg·m²/s, kg·m/s], or None. That it turns with
-            the body asks for a force that the step adds.
+        momentum: what that water's momentum lacks for where the water flows by itself, (angular,
+            linear) [kg·m²/s, kg·m/s], or None: A (ν - u) is A ν and this. That it turns with the
+            body asks for a force that the step adds.
         damping: how force and torque fall with the bodies' velocity, as a 6×6 [N·s/m ...], for
             the implicit part of a step; or None.
     """
@@ -152,15 +155,19 @@ def _stream(world: World, water: Water, motion: Motion, position: Vec) -> _Strea
     return _Stream(_to_body(motion, _some(velocity)), _to_body(motion, _some(acceleration)))
 
 
-def _drag(
-    world: World, parts: Parts, v: Vec, w: Vec, share: Scalar
-) -> tuple[Vec, Vec, tuple[Vec, Vec] | None]:
-    """Force, torque and damping of the drag law on each part, part frame, at the box's centre."""
+def _of_parts(x: Scalar) -> bool:
+    """Whether a number differs from part to part, `[npart, nbody, lanes]`."""
+    return _is_array(x) and x.ndim == 3
+
+
+def _push(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Vec, Vec, Vec | None]:
+    """Force, torque and the force's damping of the drag law, part frame, at the box's centre.
+
+    All but the drag of faces against turning: `_twist`.
+    """
     if parts.drag == "faces":
         push = [quadratic_drag(x, c, share) for x, c in zip(v, parts.drag_linear, strict=True)]
-        twist = [quadratic_drag(x, c, share) for x, c in zip(w, parts.drag_angular, strict=True)]
-        damping = (tuple(d for _, d in push), tuple(d for _, d in twist))
-        return tuple(f for f, _ in push), tuple(t for t, _ in twist), damping
+        return tuple(f for f, _ in push), _ZERO, tuple(d for _, d in push)
     if parts.drag == "lift_drag":
         assert parts.plate is not None
         at = vadd(v, cross(w, parts.plate_center))
@@ -170,16 +177,66 @@ def _drag(
         slope = mul(lift_drag_damping(at, *plate, parts.plate), share)
         # Half of the slope: the step then takes the force in the middle of its velocities.
         half = mul(0.5, slope)
-        # The plugin knows no drag against turning; without one, a free plate spins up for ever.
-        twist = [quadratic_drag(x, c, share) for x, c in zip(w, parts.drag_angular, strict=True)]
-        torque = vadd(vscale(share, torque), tuple(t for t, _ in twist))
-        return vscale(share, force), torque, ((half, half, half), tuple(d for _, d in twist))
+        return vscale(share, force), vscale(share, torque), (half, half, half)
     if parts.drag == "ellipsoid":
         force, torque = ellipsoid(
             v, w, parts.ellipsoid, world.density, world.viscosity, not world.added_mass
         )
         return vscale(share, force), vscale(share, torque), None
     return _ZERO, _ZERO, None
+
+
+def _twist(
+    parts: Parts, spin: Vec, share: Scalar, gather: Callable[[Scalar], Scalar]
+) -> tuple[Vec, Sym]:
+    """Torque of the faces' drag against turning on each body, and its damping, body frame."""
+    w = matTvec(parts.rotation, spin)
+    strength = tuple(mul(c, share) for c in parts.drag_angular)
+    together = not any(map(_of_parts, w))
+    if together:  # all parts turn alike about their own axes
+        strength = tuple(map(gather, strength))
+    drag = [quadratic_drag(x, c, 1.0) for x, c in zip(w, strength, strict=True)]
+    torque = matvec(parts.rotation, tuple(t for t, _ in drag))
+    d = tuple(d for _, d in drag)
+    damping = rotate_sym(parts.rotation, (d[0], 0.0, 0.0, d[1], 0.0, d[2]))
+    if together:
+        return torque, damping
+    return tuple(map(gather, torque)), tuple(map(gather, damping))
+
+
+def _pressure(
+    world: World,
+    parts: Parts,
+    share: Scalar,
+    moment: Vec,
+    gradient: Vec,
+    gather: Callable[[Scalar], Scalar],
+) -> tuple[Vec, Vec]:
+    """Torque and force of the water's pressure on each body, body frame.
+
+    Args:
+        world: whose water.
+        parts: of the bodies.
+        share: of each part that is submerged.
+        moment: as from `submersion`, part frame.
+        gradient: of the pressure, over the density, body frame [m/s²].
+        gather: the sum over the parts.
+
+    Returns:
+        About the bodies' origins.
+    """
+    mass, first = displaced(
+        share,
+        matvec(parts.rotation, moment),
+        parts.volume,
+        parts.center_position,
+        world.density,
+    )
+    if not any(map(_of_parts, gradient)):
+        mass, first = gather(mass), tuple(map(gather, first))
+        return cross(first, gradient), vscale(mass, gradient)
+    torque, force = cross(first, gradient), vscale(mass, gradient)
+    return tuple(map(gather, torque)), tuple(map(gather, force))
 
 
 def _water_on_parts(
@@ -205,61 +262,55 @@ def _water_on_parts(
         steep = jax.lax.rsqrt(1 + slope[0] * slope[0] + slope[1] * slope[1])
         below = below * steep
         normal = _to_body(motion, (-slope[0] * steep, -slope[1] * steep, steep))
-    up = tuple(wide(x) for x in matTvec(parts.rotation, normal))
+    up = matTvec(parts.rotation, normal)
     depth = wide(below)
     # Without buoyancy the water still drags what is below its surface.
     mode = "mask" if parts.buoyancy == "off" else parts.buoyancy
     share, moment = submersion(up, depth, parts.half_size, mode)
-    force, torque, damping = _drag(world, parts, v, w, share)
+    force, torque, damping = _push(world, parts, v, w, share)
+    if parts.buoyancy != "off" and world.surface_tension is not None:
+        pull, turn = surface_tension(
+            tuple(map(wide, up)),
+            depth,
+            parts.half_size,
+            world.surface_tension.gamma,
+            world.density * world.gravity,
+            world.surface_tension.contact_angle,
+            parts.exposed,
+        )
+        force, torque = vadd(force, pull), vadd(torque, turn)
+    force = matvec(parts.rotation, force)
+    torque = vadd(matvec(parts.rotation, torque), cross(parts.position, force))
+    force, torque = tuple(map(gather, force)), tuple(map(gather, torque))
     if parts.buoyancy != "off":
         # The pressure's gradient holds up what is still, and pushes along with moving water.
         gradient = gravity
         if stream.acceleration is not None:
             gradient = vadd(gradient, stream.acceleration)
-        pressure = tuple(wide(x) for x in matTvec(parts.rotation, gradient))
-        lift, righting = buoyancy(
-            pressure, share, moment, parts.volume, parts.center, world.density
-        )
-        force, torque = vadd(force, lift), vadd(torque, righting)
-        if world.surface_tension is not None:
-            pull, turn = surface_tension(
-                up,
-                depth,
-                parts.half_size,
-                world.surface_tension.gamma,
-                world.density * world.gravity,
-                world.surface_tension.contact_angle,
-                parts.exposed,
-            )
-            force, torque = vadd(force, pull), vadd(torque, turn)
-    force = matvec(parts.rotation, force)
-    torque = vadd(matvec(parts.rotation, torque), cross(parts.position, force))
+        righting, lift = _pressure(world, parts, share, moment, gradient, gather)
+        torque, force = vadd(torque, righting), vadd(force, lift)
     resisting = None
     if damping is not None:
-        linear, angular = (
-            rotate_sym(parts.rotation, (d[0], 0.0, 0.0, d[1], 0.0, d[2])) for d in damping
-        )
-        one = shift_inertia(linear, angular, parts.position)
+        d = damping
+        linear = rotate_sym(parts.rotation, (d[0], 0.0, 0.0, d[1], 0.0, d[2]))
+        one = shift_inertia(linear, (0.0,) * 6, parts.position)
+        # No plate knows drag against turning; without one, a free plate spins up for ever.
+        twist, turning = _twist(parts, motion.spin, share, gather)
+        torque = vadd(torque, twist)
         resisting = SpatialInertia(
-            tuple(gather(x) for x in one.angular),
-            tuple(tuple(gather(x) for x in row) for row in one.cross),
-            tuple(gather(x) for x in one.linear),
+            vadd(tuple(map(gather, one.angular)), turning),
+            tuple(tuple(map(gather, row)) for row in one.cross),
+            tuple(map(gather, one.linear)),
         )
     carried = None
     if any(_present(x) for x in (*parts.carried_linear, *parts.carried_angular)):
         weigh = lambda x: sum_parts(mul(x, share), k) if _present(x) else 0.0  # noqa: E731
         carried = SpatialInertia(
-            tuple(weigh(x) for x in parts.carried_angular),
-            tuple(tuple(weigh(x) for x in row) for row in parts.carried_cross),
-            tuple(weigh(x) for x in parts.carried_linear),
+            tuple(map(weigh, parts.carried_angular)),
+            tuple(tuple(map(weigh, row)) for row in parts.carried_cross),
+            tuple(map(weigh, parts.carried_linear)),
         )
-    return (
-        tuple(gather(x) for x in torque),
-        tuple(gather(x) for x in force),
-        carried,
-        resisting,
-        share,
-    )
+    return torque, force, carried, resisting, share
 
 
 def _plus(a: SpatialInertia | None, b: SpatialInertia | None) -> SpatialInertia | None:
@@ -377,15 +428,15 @@ def water_on_level(
         return Outer(torque, force, None, None, damping)
     spin, velocity = swirling
     stream = _stream(world, water, motion, _ZERO)
-    if stream.velocity is not None:
-        velocity = vsub(velocity, stream.velocity)
-    momentum = apply_inertia(carried, spin, velocity)
-    if stream.velocity is not None:
-        # The step turns the momentum with the body's velocity, not with the relative one.
-        torque = vadd(torque, cross(stream.velocity, momentum[1]))
-        change = cross(spin, stream.velocity)
-        if stream.acceleration is not None:
-            change = vsub(change, stream.acceleration)
-        turning = apply_inertia(carried, _ZERO, change)
-        torque, force = vsub(torque, turning[0]), vsub(force, turning[1])
+    if stream.velocity is None:
+        return Outer(torque, force, carried, None, damping)
+    momentum = apply_inertia(carried, _ZERO, tuple(map(neg, stream.velocity)))
+    # The step turns the momentum with the body's velocity, not with the relative one.
+    linear = apply_inertia(carried, spin, vsub(velocity, stream.velocity))[1]
+    torque = vadd(torque, cross(stream.velocity, linear))
+    change = cross(spin, stream.velocity)
+    if stream.acceleration is not None:
+        change = vsub(change, stream.acceleration)
+    turning = apply_inertia(carried, _ZERO, change)
+    torque, force = vsub(torque, turning[0]), vsub(force, turning[1])
     return Outer(torque, force, carried, momentum, damping)

@@ -42,6 +42,7 @@ _FAR = 1e30
 # What the fields of the tables hold where there is nothing.
 _JOINT_PADDING: dict[str, Any] = {
     "rotation": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "offset": (1.0, 0.0),
     "position": (0.0, 0.0, 0.0),
     "armature": LOCKED,
     "damping": 0.0,
@@ -401,7 +402,7 @@ def _harmless(key: str) -> bool:
     owner, _, field = key.partition(".")
     idle = {"position", "rotation", "half_size", "center", "center_position"}
     if owner == "joint":
-        return field.partition(".")[0] not in {"armature", "rotation", "position"}
+        return field.partition(".")[0] not in {"armature", "rotation", "offset", "position"}
     return owner.startswith("parts/") and field.partition(".")[0] in idle
 
 

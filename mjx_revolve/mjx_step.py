@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_revolve.bodies import Motion, SpatialInertia, apply_inertia, cross_force, gyroscope
-from mjx_revolve.dynamics import Engine, Sense, outer_forces, run_thrusters, turn_quat
+from mjx_revolve.bodies import Motion, SpatialInertia, cross_force, gyroscope
+from mjx_revolve.dynamics import Engine, Sense, outer_forces, run_thrusters, turn_quat, with_water
 from mjx_revolve.robot import Robot, check_timestep, import_mjx
 from mjx_revolve.servos import end_stop, servo
-from mjx_revolve.spatial import full, quat_to_rows, skew, vadd
+from mjx_revolve.spatial import full, quat_to_rows
 from mjx_revolve.tree import make_tree
 from mjx_revolve.water import Water
 
@@ -144,15 +144,7 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
             if outer.damping is not None:
                 matrices.append(dt * _dense(outer.damping, n))
             if tree.carries:
-                h = level.moment
-                rigid = SpatialInertia(
-                    level.inertia, skew(h), (level.mass, 0.0, 0.0, level.mass, 0.0, level.mass)
-                )
-                momentum = apply_inertia(rigid, *swirling)
-                if outer.momentum is not None:
-                    momentum = tuple(
-                        vadd(a, b) for a, b in zip(momentum, outer.momentum, strict=True)
-                    )
+                rigid, _, momentum = with_water(level, outer, swirling)
                 turning = cross_force(motion.spin, motion.velocity, *momentum)
                 wrench = wrench - jnp.concatenate([_stack(x, n) for x in turning], -1)
                 # The mass matrix holds the rigid inertia; only its J̇ q̇ is missing.

@@ -35,6 +35,8 @@ class Parts:
 
     Attributes are those of `fluid_table.FluidTable`, in the level's body frames, times the water's
     density where a force needs it. Bodies with fewer parts are padded with parts that do nothing.
+    A part that stands square on its body is described along the body's axes, so that its rotation
+    folds away.
 
     Attributes:
         rows: `[npart][nbody]` rows of the fluid table, -1 for padding.
@@ -106,7 +108,9 @@ class Level:
         body: MuJoCo ids of the bodies.
         frame: `[nbody, 3, 3]` MuJoCo's body frame from ours, whose z is the hinge.
         parent: for each, where its parent stands in the level above.
-        rotation: parent from child at joint angle 0.
+        rotation: parent from child where the hinge stands at the angle `-offset`; the same for all
+            hinges that point the same way, so that it mostly folds away.
+        offset: cosine and sine of the angle that is added to the joint angle [-].
         position: of the joint in the parent's frame [m].
         mass: [kg].
         moment: mass times centre of mass [kg·m].
@@ -137,6 +141,7 @@ class Level:
     frame: np.ndarray
     parent: tuple[int, ...]
     rotation: Mat
+    offset: tuple[Scalar, Scalar]
     position: Vec
     mass: Scalar
     moment: Vec
@@ -192,6 +197,11 @@ def _rotation(quat: np.ndarray) -> np.ndarray:
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, np.asarray(quat, np.float64))
     return _clean(matrix.reshape(3, 3))
+
+
+def _is_permutation(rotation: np.ndarray) -> bool:
+    """Whether it only exchanges axes, and turns some round."""
+    return bool(np.all((rotation == 0) | (np.abs(rotation) == 1)))
 
 
 def _z_frame(axis: np.ndarray) -> np.ndarray:
@@ -308,13 +318,16 @@ def make_level(
     body that is listed more than once has its mass and its hinge in each place.
     """
     m = robot.mj_model
-    rotation, position, moment, inertia, box_rotation, box_position, box_size = (
-        [] for _ in "1234567"
+    rotation, offset, position, moment, inertia, box_rotation, box_position, box_size = (
+        [] for _ in "12345678"
     )
     for b in ids:
         c = frames[b]
         up = frames[int(m.body_parentid[b])] if above else np.eye(3)
-        rotation.append(up.T @ _rotation(m.body_quat[b]) @ c if above else np.eye(3))
+        rest = up.T @ _rotation(m.body_quat[b]) @ c if above else np.eye(3)
+        toward = _z_frame(_clean(rest[:, 2]))
+        rotation.append(toward)
+        offset.append((toward.T @ rest)[:2, 0])
         position.append(up.T @ m.body_pos[b] if above else np.zeros(3))
         com = c.T @ m.body_ipos[b]
         axes = c.T @ _rotation(m.body_iquat[b])
@@ -378,6 +391,7 @@ def make_level(
         frame=np.array([frames[b] for b in ids]),
         parent=tuple(where[int(m.body_parentid[b])] for b in ids) if above else (),
         rotation=_mat(rotation),
+        offset=tuple(_num(_clean(x)) for x in np.transpose(offset)),
         position=_vec(position),
         mass=_num(m.body_mass[ids]),
         moment=_vec(moment),
@@ -486,15 +500,29 @@ def _group(
     def centre(p: int, c: np.ndarray) -> np.ndarray:
         return c.T @ (table.position[p] + table.rotation[p] @ table.center_of_volume[p])
 
+    def swap(p: int, c: np.ndarray) -> np.ndarray:
+        """The part's axes in the frame that describes it: the body's where both have the same."""
+        t = turn(p, c)
+        return t if _is_permutation(t) else np.eye(3)
+
+    def vector(field: np.ndarray) -> np.ndarray:
+        return gather(lambda p, c: swap(p, c) @ field[p], zero3)
+
+    def size(field: np.ndarray, empty: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
+        """What a part has along each of its axes, either way."""
+        return gather(lambda p, c: np.abs(swap(p, c)) @ field[p], np.asarray(empty))
+
     zero3, zero33, eye = np.zeros(3), np.zeros((3, 3)), np.eye(3)
     plate, ellipsoid = None, None
     if drag == "lift_drag":
         plate = _plate(gather, table.plate, world.density)
     if drag == "ellipsoid":
-        geom_fluid, main = robot.mj_model.geom_fluid, _main_geoms(robot)
+        # Three columns of `geom_fluid` are along the geom's axes, and three about them.
+        geom_fluid = robot.mj_model.geom_fluid[_main_geoms(robot)]
+        laws = gather(lambda p, c: geom_fluid[p, :6], np.zeros(6))
+        along, about = size(geom_fluid[:, 6:9]), size(geom_fluid[:, 9:])
         k = ellipsoid_constants(
-            gather(lambda p, c: table.half_size[p], np.ones(3)),
-            gather(lambda p, c: geom_fluid[main[p]], np.zeros(12)),
+            size(table.half_size, np.ones(3)), np.concatenate([laws, along, about], -1)
         )
         ellipsoid = {
             name: tuple(fold(x[..., None]) for x in value)
@@ -507,22 +535,22 @@ def _group(
         buoyancy=buoyancy,
         drag=drag,
         position=_vec(gather(lambda p, c: c.T @ table.position[p], zero3)),
-        rotation=_mat(gather(turn, eye)),
-        half_size=_vec(gather(lambda p, c: table.half_size[p], np.ones(3))),
-        center=_vec(gather(lambda p, c: table.center_of_volume[p], zero3)),
+        rotation=_mat(gather(lambda p, c: turn(p, c) @ swap(p, c).T, eye)),
+        half_size=_vec(size(table.half_size, np.ones(3))),
+        center=_vec(vector(table.center_of_volume)),
         center_position=_vec(gather(centre, zero3)),
         volume=_num(gather(lambda p, c: table.volume[p], 0.0)),
-        exposed=_vec(gather(lambda p, c: table.exposed[p], zero3)),
-        drag_linear=_vec(gather(lambda p, c: world.density * table.drag_linear[p], zero3)),
-        drag_angular=_vec(gather(lambda p, c: world.density * table.drag_angular[p], zero3)),
+        exposed=_vec(size(table.exposed)),
+        drag_linear=_vec(size(world.density * table.drag_linear)),
+        drag_angular=_vec(size(world.density * table.drag_angular)),
         carried_linear=_sym(gather(lambda p, c: carried(p, c)[0], zero33)),
         carried_cross=_mat(gather(lambda p, c: carried(p, c)[1], zero33)),
         carried_angular=_sym(gather(lambda p, c: carried(p, c)[2], zero33)),
         plate=plate,
         plate_area=_num(gather(lambda p, c: table.plate_area[p], 0.0)),
-        plate_forward=_vec(gather(lambda p, c: table.plate_forward[p], eye[0])),
-        plate_upward=_vec(gather(lambda p, c: table.plate_upward[p], eye[2])),
-        plate_center=_vec(gather(lambda p, c: table.plate_center[p], zero3)),
+        plate_forward=_vec(gather(lambda p, c: swap(p, c) @ table.plate_forward[p], eye[0])),
+        plate_upward=_vec(gather(lambda p, c: swap(p, c) @ table.plate_upward[p], eye[2])),
+        plate_center=_vec(vector(table.plate_center)),
         ellipsoid=ellipsoid,
     )
 

@@ -37,7 +37,7 @@ LANES = 64
 _WORTH = 4
 
 # Up to so many stored values, a step and the loops around it become one function ...
-_WHOLE = 400
+_WHOLE = 500
 # ... and longer ones several functions of about so many each. Measured: half of that costs more in
 # calls than it saves in compilation, twice of it compiles for half as long again.
 _PIECE = 250
