@@ -1,13 +1,13 @@
 """Many different robots as tables of one shape: what lets one compiled program step them all.
 
-Every robot becomes a list of rows, padded to a stated number: a row is a body with a few of its
-parts; a body with more parts than a row holds gets riders, rows that are rigidly fixed to it. Rows
-stand in preorder, the child with the largest subtree last. Sweeps over the rows then need no list
-of parents, only a short stack: let a row's slot be the number of edges on its way from the root
-that do not lead to a largest subtree, at most log2(rows). When a row is reached in preorder, the
-slot of its parent still holds the parent's values, and when it is reached backwards, its own slot
-has gathered the sums of just its children (cf. heavy paths: Sleator & Tarjan 1983, A data structure
-for dynamic trees).
+Every robot becomes a root with all of its parts, and a list of rows, padded to a stated number: a
+row is a moving body with a few of its parts; a body with more parts than a row holds gets riders,
+rows that are rigidly fixed to it. Rows stand in preorder, the child with the largest subtree last.
+Sweeps over the rows then need no list of parents, only a short stack: let a row's slot be the
+number of edges on its way from the root that do not lead to a largest subtree, at most log2(rows).
+When a row is reached in preorder, the slot of its parent still holds the parent's values, and when
+it is reached backwards, its own slot has gathered the sums of just its children (cf. heavy paths:
+Sleator & Tarjan 1983, A data structure for dynamic trees).
 
 Here everything is NumPy, one robot at a time; `mixed_step` does the physics.
 """
@@ -36,8 +36,13 @@ from mjx_revolve.tree import (
 
 # A hinge of this inertia does not move [kg·m²]: that is how riders and padding are held.
 LOCKED = 1e30
+# What a row costs in a step beside its parts, in parts [-]; measured, alike under both drag laws.
+_ROW_COST = 5.0
 # Stands for infinity where arithmetic must stay finite.
 _FAR = 1e30
+
+# What the places of the root in the tables begin with.
+ROOT = "root."
 
 # What the fields of the tables hold where there is nothing.
 _JOINT_PADDING: dict[str, Any] = {
@@ -86,10 +91,12 @@ class Shape:
 
     Attributes:
         hinges: most hinges that a robot may have.
-        rows: most rows, the root's included.
+        rows: most rows, which the root is not one of.
         parts: parts in a row.
+        root_parts: parts of the root.
         slots: length of the stack.
         points: most contact points of a row, 0 without a bed within reach.
+        root_points: of the root, likewise.
         laws: laws of the parts, (buoyancy, drag) each.
         carries: whether water may be carried along.
         constants: those numbers of the tables that are the same in all robots, by their place:
@@ -99,8 +106,10 @@ class Shape:
     hinges: int
     rows: int
     parts: int
+    root_parts: int
     slots: int
     points: int
+    root_points: int
     laws: tuple[tuple[str, str], ...]
     carries: bool
     constants: tuple[tuple[str, float], ...] = ()
@@ -110,9 +119,9 @@ class Bodies(NamedTuple):
     """Robots side by side: leaves with the population on the last axis.
 
     Attributes:
-        tables: `[rows, P]`, or `[rows, parts, P]` of parts and points, by their place. The root
-            counts as held to a base: its hinge is locked.
-        slot: `[rows, P]` where each row stands in the stack, int32.
+        tables: `[rows, P]`, or `[rows, parts, P]` of parts and points, by their place; those of the
+            root, which begin with `root.`, without the axis of rows.
+        slot: `[rows, P]` where each row stands in the stack, int32; the root stands in slot 0.
         source: `[rows, P]` its parent's slot; -1 for padding, int32.
         inner: `[rows, P]` whether a row has children, bool.
         hinge: `[rows, P]` which hinge each row turns on, `hinges` for none, int32.
@@ -150,8 +159,8 @@ class _Row:
 def _rows(robot: Robot, parts: int) -> list[_Row]:
     """The rows of a robot, in preorder, the child with the largest subtree last."""
     m = robot.mj_model
-    chunks: dict[int, list[tuple[int, ...]]] = {}
-    for b in range(1, m.nbody):
+    chunks: dict[int, list[tuple[int, ...]]] = {1: [()]}
+    for b in range(2, m.nbody):
         own = np.flatnonzero(robot.fluid.body == b).tolist()
         pieces = [tuple(own[k : k + parts]) for k in range(0, len(own), parts)]
         chunks[b] = pieces or [()]
@@ -166,8 +175,10 @@ def _rows(robot: Robot, parts: int) -> list[_Row]:
     def visit(body: int, slot: int, source: int) -> None:
         below = sorted(children[body], key=lambda c: size[c])
         riders = chunks[body][1:]
-        inner = bool(below or riders)
-        rows.append(_Row(body, chunks[body][0], False, slot, source, inner))
+        if body > 1:
+            rows.append(
+                _Row(body, chunks[body][0], False, slot, source, inner=bool(below or riders))
+            )
         for k, piece in enumerate(riders):
             last = not below and k == len(riders) - 1
             rows.append(_Row(body, piece, True, slot if last else slot + 1, slot, False))
@@ -193,21 +204,35 @@ def _padding(shape: Shape) -> dict[str, tuple[float, tuple[int, ...]]]:
     places: dict[str, tuple[float, tuple[int, ...]]] = {}
     for name, value in _JOINT_PADDING.items():
         places |= {k: (x, (shape.rows,)) for k, x in _flat(f"joint.{name}", value).items()}
+    return (
+        places
+        | _body_padding(shape.laws, "", (shape.rows,), shape.parts, shape.points)
+        | _body_padding(shape.laws, ROOT, (), shape.root_parts, shape.root_points)
+    )
+
+
+def _body_padding(
+    laws: Sequence[tuple[str, str]], prefix: str, rows: tuple[int, ...], parts: int, points: int
+) -> dict[str, tuple[float, tuple[int, ...]]]:
+    """The same of bodies, so many `rows` of them."""
+    places: dict[str, tuple[float, tuple[int, ...]]] = {}
+
+    def put(name: str, value: Any, dims: tuple[int, ...]) -> None:
+        flat = _flat(f"{prefix}{name}", value)
+        places.update({k: (float(x), dims) for k, x in flat.items()})
+
     for name, value in _BODY_PADDING.items():
-        places |= {k: (x, (shape.rows,)) for k, x in _flat(f"body.{name}", value).items()}
-    for buoyancy, drag in shape.laws:
+        put(f"body.{name}", value, rows)
+    for buoyancy, drag in laws:
         group = f"parts/{buoyancy}/{drag}"
         for name, value in _PART_PADDING.items():
-            flat = _flat(f"{group}.{name}", value)
-            places |= {k: (x, (shape.rows, shape.parts)) for k, x in flat.items()}
+            put(f"{group}.{name}", value, (*rows, parts))
         if drag == "ellipsoid":
             for name, value in _no_ellipsoid().items():
-                flat = _flat(f"{group}.ellipsoid.{name}", value)
-                places |= {k: (float(x), (shape.rows, shape.parts)) for k, x in flat.items()}
-    if shape.points:
+                put(f"{group}.ellipsoid.{name}", value, (*rows, parts))
+    if points:
         for name, value in {"position": (0.0, 0.0, 0.0), "mass": 0.0}.items():
-            flat = _flat(f"points.{name}", value)
-            places |= {k: (x, (shape.rows, shape.points)) for k, x in flat.items()}
+            put(f"points.{name}", value, (*rows, points))
     return places
 
 
@@ -225,7 +250,7 @@ class _Description:
 
 
 def _describe(robot: Robot, shape: Shape) -> _Description:
-    """Tables of one robot, `[n]` or `[k, n]` without padding; `n` its rows or its joints."""
+    """Tables of one robot, `[n]` or `[n, k]` without padding, n rows; the root's `[]` or `[k]`."""
     m = robot.mj_model
     if robot.thrusters:
         raise InputError(
@@ -236,13 +261,7 @@ def _describe(robot: Robot, shape: Shape) -> _Description:
     rows = _rows(robot, shape.parts)
     servo = {int(m.actuator_trnid[k, 0]): k for k in robot.servos}
     bodies = list(range(1, m.nbody))
-    root = make_level(robot, [1], [], frames, servo, False, [[]])
-    rest = (
-        make_level(robot, bodies[1:], bodies, frames, servo, False, [[] for _ in bodies[1:]])
-        if len(bodies) > 1
-        else None
-    )
-    place = {b: k for k, b in enumerate(bodies[1:])}
+    moving = bodies[1:]
     tables: dict[str, np.ndarray] = {}
     empty = _padding(shape)
 
@@ -254,36 +273,37 @@ def _describe(robot: Robot, shape: Shape) -> _Description:
             blank = whole[0] if _harmless(name) else empty[name][0]
             tables[name] = np.array([blank if k is None else whole[k] for k in rows])
 
-    joints = [None if r.rider or r.body == 1 else place[r.body] for r in rows]
-    hinge = {r.body: k for k, r in enumerate(rows) if not r.rider and r.body > 1}
-    for name in _JOINT_PADDING:
-        value = _JOINT_PADDING[name] if rest is None else getattr(rest, name)
-        if value is None:  # no servo has a top speed
-            value = _JOINT_PADDING[name]
-        add(f"joint.{name}", value, joints, max(len(place), 1))
-    own = [None if r.rider else r.body - 1 for r in rows]
+    if moving:
+        level = make_level(robot, moving, bodies, frames, servo, False, [[] for _ in moving])
+        own: list[int | None] = [None if r.rider else r.body - 2 for r in rows]
+        for name, blank in _JOINT_PADDING.items():
+            value = getattr(level, name)
+            # None: no servo has a top speed.
+            add(f"joint.{name}", blank if value is None else value, own, len(moving))
+        for name in _BODY_PADDING:
+            add(f"body.{name}", getattr(level, name), own, len(moving))
+        held = [list(r.parts) for r in rows]
+        for group in make_parts(robot, [r.body for r in rows], frames, held):
+            tables |= _part_tables(group, len(rows), shape, robot)
+    root = make_level(robot, [1], [], frames, servo, False, [[]])
     for name in _BODY_PADDING:
-        values = []
-        for level in (root, rest):
-            if level is not None:
-                n = len(level.body)
-                flat = _flat(f"body.{name}", getattr(level, name))
-                values.append({k: np.broadcast_to(x, (n, 1))[:, 0] for k, x in flat.items()})
-        for key in values[0]:
-            whole = np.concatenate([v[key] for v in values])
-            blank = empty[key][0]
-            tables[key] = np.array([blank if k is None else whole[k] for k in own])
-    groups = make_parts(robot, [r.body for r in rows], frames, [list(r.parts) for r in rows])
-    for group in groups:
-        _add_parts(tables, group, len(rows), shape, robot)
-    if shape.points:
-        _add_points(tables, robot, frames, rows, shape)
-    return _Description(rows, tables, hinge)
+        add(f"{ROOT}body.{name}", getattr(root, name), [0], 1)
+        for key in _flat(f"{ROOT}body.{name}", getattr(root, name)):
+            tables[key] = tables[key][0]
+    for group in make_parts(robot, [1], frames, [list(np.flatnonzero(robot.fluid.body == 1))]):
+        found = _part_tables(group, 1, shape, robot)
+        tables |= {ROOT + key: x[0] for key, x in found.items()}
+    if shape.points or shape.root_points:
+        real = np.array([not r.rider for r in rows], bool)
+        found = _point_tables(robot, frames, [r.body for r in rows], shape.points)
+        tables |= {key: np.where(real[:, None], x, 0.0) for key, x in found.items()}
+        found = _point_tables(robot, frames, [1], shape.root_points)
+        tables |= {ROOT + key: x[0] for key, x in found.items()}
+    return _Description(rows, tables, {r.body: k for k, r in enumerate(rows) if not r.rider})
 
 
-def _add_parts(
-    tables: dict[str, np.ndarray], group: Parts, count: int, shape: Shape, robot: Robot
-) -> None:
+def _part_tables(group: Parts, count: int, shape: Shape, robot: Robot) -> dict[str, np.ndarray]:
+    """Parts of so many bodies, `[count, k]`."""
     law = (group.buoyancy, group.drag)
     if group.drag == "lift_drag" or law not in shape.laws:
         known = [x for x in shape.laws if x[1] != "lift_drag"]
@@ -295,35 +315,31 @@ def _add_parts(
     fields = {name: getattr(group, name) for name in _PART_PADDING}
     if group.drag == "ellipsoid":
         fields |= {f"ellipsoid.{name}": x for name, x in group.ellipsoid.items()}
-    k = len(group.rows)
+    k, tables = len(group.rows), {}
     for name, value in fields.items():
         for key, x in _flat(f"{prefix}.{name}", value).items():
-            whole = np.broadcast_to(np.asarray(x, np.float64), (k, count, 1))[..., 0]
-            tables[key] = whole.T
+            tables[key] = np.broadcast_to(np.asarray(x, np.float64), (k, count, 1))[..., 0].T
+    return tables
 
 
-def _add_points(
-    tables: dict[str, np.ndarray],
-    robot: Robot,
-    frames: dict[int, np.ndarray],
-    rows: list[_Row],
-    shape: Shape,
-) -> None:
-    points = make_points(robot, [r.body for r in rows], frames)
+def _point_tables(
+    robot: Robot, frames: dict[int, np.ndarray], bodies: list[int], most: int
+) -> dict[str, np.ndarray]:
+    """Contact points of bodies, `[len(bodies), k]`; nothing where they have none."""
+    points = make_points(robot, bodies, frames) if bodies else None
     if points is None:
-        return
-    real = np.array([not r.rider for r in rows])
-    leaves = _flat("points", (points.position, points.mass))
+        return {}
+    leaves = _flat("points.position", points.position) | {"points.mass": points.mass}
     k = max(np.shape(x)[0] if np.ndim(x) == 3 else 1 for x in leaves.values())
-    if k > shape.points:
+    if k > most:
         raise InputError(
-            f"engine population, different bodies: expected at most {shape.points} contact points "
+            f"engine population, different bodies: expected at most {most} contact points "
             f"in a body; found {k} in {robot.morphology.name!r}"
         )
-    flat = _flat("points.position", points.position) | {"points.mass": points.mass}
-    for key, x in flat.items():
-        whole = np.broadcast_to(np.asarray(x, np.float64), (k, len(rows), 1))[..., 0]
-        tables[key] = np.where(real, whole, 0.0).T
+    return {
+        key: np.broadcast_to(np.asarray(x, np.float64), (k, len(bodies), 1))[..., 0].T
+        for key, x in leaves.items()
+    }
 
 
 def fit_shape(
@@ -356,32 +372,42 @@ def fit_shape(
     carries = any(
         bool(np.any(r.fluid.carried_mass) or np.any(r.fluid.carried_inertia)) for r in robots
     )
-    points = 0
+    points, root_points = 0, 0
     if contact and robots[0].world.bed is not None:
         for robot in robots:
             _, frames = depths_and_frames(robot)
-            found = make_points(robot, list(range(1, robot.mj_model.nbody)), frames)
-            if found is not None:
-                sizes = [np.shape(x)[0] for x in (*found.position, found.mass) if np.ndim(x) == 3]
-                points = max(points, *sizes, 1)
+            found = [make_points(robot, [b], frames) for b in range(1, robot.mj_model.nbody)]
+            sizes = [_num_points(x) for x in found]
+            points, root_points = max(points, *sizes[1:], 0), max(root_points, sizes[0])
     best: tuple[float, int, int, int] | None = None
+    numbers = [np.bincount(r.fluid.body, minlength=r.mj_model.nbody) for r in robots]
     # The inertia box belongs to a body as a whole, and so does its submerged share: no riders.
     boxed = robots[0].world.drag == "inertia_box"
-    least = max(int(np.bincount(r.fluid.body).max()) for r in robots) if boxed else 1
+    least = max(1, *(int(x[2:].max(initial=0)) for x in numbers)) if boxed else 1
     for parts in range(least, max(9, least + 1)):
         listed = [_rows(robot, parts) for robot in robots]
-        count = max(rows, *(len(x) for x in listed), hinges + 1)
-        slots = 1 + max(r.slot for x in listed for r in x)
-        # What a row and a part cost, in operations [-]; measured on the spider's default water.
-        cost = count * (3.0 + parts)
+        count = max(1, rows, hinges, *map(len, listed))
+        slots = 1 + max((r.slot for x in listed for r in x), default=0)
+        # What a row costs, in parts (measured under the ellipsoid law and in the default water).
+        cost = count * (_ROW_COST + parts)
         if best is None or cost < best[0]:
             best = (cost, parts, count, slots)
     assert best is not None
     _, parts, count, slots = best
     if rows or hinges:
-        # 2^n - 1 rows are needed for n edges that do not lead to the largest subtree.
-        slots = max(slots, int(np.log2(count + 1)))
-    shape = Shape(max(most, hinges), count, parts, slots, points, tuple(sorted(laws)), carries)
+        # 2^n - 1 bodies are needed for n edges that do not lead to the largest subtree.
+        slots = max(slots, int(np.log2(count + 2)))
+    shape = Shape(
+        hinges=max(most, hinges),
+        rows=count,
+        parts=parts,
+        root_parts=max(1, *(int(x[1]) for x in numbers)),
+        slots=slots,
+        points=points,
+        root_points=root_points,
+        laws=tuple(sorted(laws)),
+        carries=carries,
+    )
     same: dict[str, set[float]] = {}
     for robot in robots:
         for key, x in _describe(robot, shape).tables.items():
@@ -399,11 +425,18 @@ def fit_shape(
 
 def _harmless(key: str) -> bool:
     """Whether padding and riders may have any value there, because others make them idle."""
-    owner, _, field = key.partition(".")
+    owner, _, field = key.removeprefix(ROOT).partition(".")
     idle = {"position", "rotation", "half_size", "center", "center_position"}
     if owner == "joint":
         return field.partition(".")[0] not in {"armature", "rotation", "offset", "position"}
     return owner.startswith("parts/") and field.partition(".")[0] in idle
+
+
+def _num_points(points: Points | None) -> int:
+    """How many points the body with the most of them has."""
+    if points is None:
+        return 0
+    return max(np.shape(x)[0] if np.ndim(x) == 3 else 1 for x in (*points.position, points.mass))
 
 
 def _round(x: float) -> float:
@@ -457,11 +490,17 @@ def _column(robot: Robot, shape: Shape, places: dict[str, Any], constants: dict[
             f"robot {name!r}: expected at most {shape.hinges} hinges; found {robot.num_hinges}"
         )
     found = _describe(robot, shape)
-    count, deepest = len(found.rows), max(r.slot for r in found.rows)
+    count, deepest = len(found.rows), max((r.slot for r in found.rows), default=0)
     if count > shape.rows or deepest >= shape.slots:
         raise InputError(
             f"robot {name!r}: expected at most {shape.rows} rows of {shape.parts} parts; found "
             f"{count}"
+        )
+    held = int(np.sum(robot.fluid.body == 1))
+    if held > shape.root_parts:
+        raise InputError(
+            f"robot {name!r}: expected at most {shape.root_parts} parts on the core's body; found "
+            f"{held}"
         )
     tables = {}
     for key, x in found.tables.items():
@@ -538,12 +577,13 @@ def _level(fields: dict[str, Any], parts: tuple[Parts, ...], points: Points | No
     )
 
 
-def level_of(shape: Shape, row: dict[str, Any]) -> Level:
-    """One row of many robots as a `tree.Level` of one body.
+def level_of(shape: Shape, row: dict[str, Any], prefix: str = "") -> Level:
+    """One row of many robots as a `tree.Level` of one body, or their roots.
 
     Args:
         shape: of the tables.
         row: of the tables: `[lanes]`, or `[parts, lanes]` of parts and points.
+        prefix: `ROOT` for the roots.
 
     Returns:
         The level, `[1, lanes]` and `[parts, 1, lanes]`.
@@ -560,21 +600,25 @@ def level_of(shape: Shape, row: dict[str, Any]) -> Level:
             return tuple(fill(f"{prefix}.{k}", x) for k, x in enumerate(like))
         return read(prefix)
 
-    fields = {name: fill(f"joint.{name}", like) for name, like in _JOINT_PADDING.items()}
-    fields |= {name: fill(f"body.{name}", like) for name, like in _BODY_PADDING.items()}
+    at_root = prefix == ROOT
+    fields = {
+        name: like if at_root else fill(f"joint.{name}", like)
+        for name, like in _JOINT_PADDING.items()
+    }
+    fields |= {name: fill(f"{prefix}body.{name}", like) for name, like in _BODY_PADDING.items()}
     parts, points = [], None
     for buoyancy, drag in shape.laws:
-        prefix = f"parts/{buoyancy}/{drag}"
-        numbers = {name: fill(f"{prefix}.{name}", like) for name, like in _PART_PADDING.items()}
+        group = f"{prefix}parts/{buoyancy}/{drag}"
+        numbers = {name: fill(f"{group}.{name}", like) for name, like in _PART_PADDING.items()}
         ellipsoid = None
         if drag == "ellipsoid":
             ellipsoid = {
-                name: fill(f"{prefix}.ellipsoid.{name}", like)
+                name: fill(f"{group}.ellipsoid.{name}", like)
                 for name, like in _no_ellipsoid().items()
             }
         parts.append(
             Parts(
-                rows=((-1,),) * shape.parts,
+                rows=((-1,),) * (shape.root_parts if at_root else shape.parts),
                 buoyancy=buoyancy,
                 drag=drag,
                 plate=None,
@@ -586,6 +630,7 @@ def level_of(shape: Shape, row: dict[str, Any]) -> Level:
                 **numbers,
             )
         )
-    if shape.points:
-        points = Points(fill("points.position", (0.0, 0.0, 0.0)), read("points.mass"))
+    if shape.root_points if at_root else shape.points:
+        at = fill(f"{prefix}points.position", (0.0, 0.0, 0.0))
+        points = Points(at, read(f"{prefix}points.mass"))
     return _level(fields, tuple(parts), points)

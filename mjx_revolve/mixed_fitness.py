@@ -30,13 +30,13 @@ from mjx_revolve.fitness import (
     score_tracks,
 )
 from mjx_revolve.menagerie import Bodies, Shape, fit_shape, joint_of, pack_bodies
-from mjx_revolve.mixed_step import LANES, make_mixed_engine, to_rows
+from mjx_revolve.mixed_step import make_mixed_engine, to_rows
 from mjx_revolve.morphology import Morphology, trim_neutral
 from mjx_revolve.robot import Robot, build_robot, check_timestep
 from mjx_revolve.rollout import flow_at, gusty_water, make_engine, roll_out
 from mjx_revolve.water import water_of
 from mjx_revolve.world import World, load_world
-from mjx_revolve.xla import compiler_options, derived_by, on_cpu, over_chunks
+from mjx_revolve.xla import compiler_options, derived_by, over_chunks
 
 _INTERVAL = 0.1  # the track is sampled at least this often [s], as in `fitness`
 
@@ -176,8 +176,7 @@ class MixedFitness:
         water = None if water is None else jax.tree.map(lanes, water)
         gusts = draw_gusts(task, world, key, self._records * self._every)
         trial = None if gusts is None else lanes(jnp.arange(trials))
-        chunk = LANES if on_cpu() else None
-        episode = over_chunks(partial(self._episode, gusts=gusts), chunk)
+        episode = over_chunks(partial(self._episode, gusts=gusts))
         position, energy = episode(bodies, wide(population.T), root, water, trial)
         return score_tracks(
             self.config,
@@ -194,7 +193,7 @@ class MixedFitness:
     @property
     def _longest(self) -> float:
         # Longer than any body of so many rows: what has blown up is far beyond it.
-        return 0.2 * self.shape.rows
+        return 0.2 * (1 + self.shape.rows)
 
     def _episode(
         self, bodies: Bodies, genes: Any, root: Any, water: Any, trial: Any, gusts: Any
@@ -294,7 +293,7 @@ def make_mixed_fitness(
         raise InputError(f"{where}: {error}") from None
     if config.task.type == "crawl" and world.bed is None:
         raise InputError(f"{where}: task.type: crawl expected a world with a bed; found none")
-    draft = MixedFitness(config, world, Shape(0, 1, 1, 1, 0, (), False), False)
+    draft = MixedFitness(config, world, Shape(0, 1, 1, 1, 1, 0, 0, (), False), False)
     robots = [draft.build(morphology) for morphology in examples]
     for robot in robots:
         check_timestep(robot)

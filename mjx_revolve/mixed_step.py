@@ -27,7 +27,7 @@ from mjx_revolve.dynamics import (
     own_inertia,
     turn_hinges,
 )
-from mjx_revolve.menagerie import Bodies, Shape, joint_of, level_of
+from mjx_revolve.menagerie import ROOT, Bodies, Shape, joint_of, level_of
 from mjx_revolve.servos import end_stop, servo
 from mjx_revolve.spatial import (
     Scalar,
@@ -45,15 +45,10 @@ from mjx_revolve.spatial import (
     vadd,
     vsub,
 )
+from mjx_revolve.tree import Level
 from mjx_revolve.water import Water, needs_place
 from mjx_revolve.world import World
 from mjx_revolve.xla import share_once
-
-# Least cost at which a value is stored rather than computed twice [-]; see `xla`. Less than for
-# bodies of one kind: the loops over rows hold few values at a time (measured: 15 % faster).
-_WORTH = 1
-# Individuals stepped together; see `xla.LANES` (measured: 15 % faster than 64).
-LANES = 128
 
 # ------------------------------------------------------------------ the stack
 
@@ -86,20 +81,15 @@ def _give(stack: list[Any], own: Scalar, to: Scalar, value: Any) -> list[Any]:
 
 
 def _sweep(
-    body: Callable[[Any, Any], tuple[Any, Any]],
-    carry: Any,
-    rows: Any,
-    kept: Any,
-    reverse: bool = False,
+    body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, reverse: bool = False
 ) -> tuple[Any, Any]:
-    """A loop over rows: upwards over all of them, downwards over all but the root.
+    """A loop over rows.
 
     Args:
         body: (carry, row) → (carry, what to keep of the row).
         carry: before the first row.
         rows: leaves `[rows, ...]`, or plain numbers that all rows share.
-        kept: what is kept of the root on the way down, leaves `[...]`.
-        reverse: upwards, from the last row to the root.
+        reverse: from the last row to the first.
 
     Returns:
         The carry behind the last row, and what was kept, leaves `[rows, ...]`.
@@ -112,11 +102,7 @@ def _sweep(
         row = [next(rest) if isinstance(x, jax.Array) else x for x in leaves]
         return body(carry, jax.tree.unflatten(tree, row))
 
-    shared = share_once(visit, _WORTH)
-    if reverse:
-        return jax.lax.scan(shared, carry, moving, reverse=True)
-    carry, new = jax.lax.scan(shared, carry, [x[1:] for x in moving])
-    return carry, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), kept, new)
+    return jax.lax.scan(share_once(visit), carry, moving, reverse=reverse)
 
 
 # ------------------------------------------------------------------ the sweeps
@@ -187,7 +173,8 @@ def _acceleration(
     """Accelerations, as `dynamics` has them; hinges `[rows, lanes]`."""
     symmetric = not (shape.carries and dt)
     dtype, lanes = state.position[0].dtype, state.position[0].shape[0]
-    located = is_pulled(water) or needs_place(world) or shape.points > 0
+    touches = shape.points > 0 or shape.root_points > 0
+    located = is_pulled(water) or needs_place(world) or touches
     angle, speed = state.angle[0], state.speed[0]
     midway = speed
     turn_root = quat_to_rows(state.quat)
@@ -201,7 +188,8 @@ def _acceleration(
     if located:
         root["axes"] = (turn_root[0], turn_root[1])
         root["place"] = tuple(state.position[:2])
-    joint_tables = {k: x for k, x in bodies.tables.items() if k.startswith("joint.")}
+    tables = {k: x for k, x in bodies.tables.items() if not k.startswith(ROOT)}
+    joint_tables = {k: x for k, x in tables.items() if k.startswith("joint.")}
 
     def down(stack: list[Any], row: Any) -> tuple[list[Any], Any]:
         source, own, table, angle, speed, midway = row
@@ -224,20 +212,13 @@ def _acceleration(
         value, turn = _wide((value, turn), lanes, dtype)
         return _put(stack, own, value), (value, turn)
 
-    one, zero = jnp.ones(lanes, dtype), jnp.zeros(lanes, dtype)
-    upright = tuple(tuple(one if i == j else zero for j in range(3)) for i in range(3))
     slots = (bodies.source, bodies.slot)
     _, (motions, turns) = _sweep(
-        down,
-        [root] * shape.slots,
-        (*slots, joint_tables, angle, speed, midway),
-        (root, upright),
+        down, [root] * shape.slots, (*slots, joint_tables, angle, speed, midway)
     )
 
-    def up(carry: Any, row: Any) -> tuple[Any, Any]:
-        stack, power = carry
-        source, own_slot, inner, table, motion, turn, angle, speed, midway, target = row
-        level = level_of(shape, table)
+    def own_of(level: Level, motion: dict[str, Any]) -> Any:
+        """Inertia and bias of a row or of the roots by themselves, `[lanes]` each."""
         seen = _lift(motion)
         spin, velocity = seen["rate"]
         x_axis, y_axis = seen.get("axes", (None, None))
@@ -247,10 +228,15 @@ def _acceleration(
         gravity = felt_gravity(world, water, moving)
         swirling = seen.get("middle", seen["rate"])
         own = own_inertia(world, shape.carries, level, moving, swirling, water, (), gravity, dt)
+        return _wide(_flatten(*own, symmetric), lanes, dtype)
+
+    def up(carry: Any, row: Any) -> tuple[Any, Any]:
+        stack, power = carry
+        source, own_slot, inner, table, motion, turn, angle, speed, midway, target = row
         # A slot that nobody has filled for this row holds what another row has left.
         summed = jax.tree.map(
             lambda a, b: a + jnp.where(inner, b, 0),
-            _wide(_flatten(*own, symmetric), lanes, dtype),
+            own_of(level_of(shape, table), motion),
             _pick(stack, own_slot),
         )
         block, bias = _unflatten(summed, symmetric)
@@ -275,12 +261,13 @@ def _acceleration(
     empty = _wide(_flatten(*_no_block(), symmetric), lanes, dtype)
     (stack, power), hinges = _sweep(
         up,
-        ([empty] * shape.slots, zero),
-        (*slots, bodies.inner, bodies.tables, motions, turns, angle, speed, midway, targets),
-        None,
+        ([empty] * shape.slots, jnp.zeros(lanes, dtype)),
+        (*slots, bodies.inner, tables, motions, turns, angle, speed, midway, targets),
         reverse=True,
     )
-    angular, linear = solve_root(*_unflatten(stack[0], symmetric), symmetric)
+    # Nobody has written into slot 0 where the root has no children.
+    whole = jax.tree.map(jnp.add, own_of(level_of(shape, bodies.tables, ROOT), root), stack[0])
+    angular, linear = solve_root(*_unflatten(whole, symmetric), symmetric)
 
     def out(stack: list[Any], row: Any) -> tuple[list[Any], Any]:
         source, own, table, turn, rate, midway, hinge = row
@@ -298,7 +285,6 @@ def _acceleration(
         out,
         [(angular, linear)] * shape.slots,
         (*slots, joint_tables, turns, rate, midway, hinges),
-        zero,
     )
     return linear, angular, found, power
 

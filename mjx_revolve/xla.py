@@ -74,18 +74,17 @@ def _never_inlined(x: jax.Array) -> jax.Array:
     return set_xla_metadata(jax.jit(lambda y: y)(x), inlineable="false")
 
 
-def share_once(fun: Callable[..., Any], worth: float = _WORTH) -> Callable[..., Any]:
+def share_once(fun: Callable[..., Any]) -> Callable[..., Any]:
     """Makes XLA compute each value that `fun` uses more than once exactly once.
 
     Args:
         fun: a function of pytrees of arrays.
-        worth: least cost of a value that is worth storing, in plain operations.
 
     Returns:
         The same function, its multiply-used floating-point values behind calls that are not
         inlined.
     """
-    return lambda *args: Graph(fun, args, worth)(*args) if on_cpu() else fun(*args)
+    return lambda *args: Graph(fun, args)(*args) if on_cpu() else fun(*args)
 
 
 def small_call(fun: Callable[..., Any]) -> Callable[..., Any]:
@@ -138,7 +137,7 @@ class Graph:
         size: how many values are stored.
     """
 
-    def __init__(self, fun: Callable[..., Any], examples: Any, worth: float = _WORTH) -> None:
+    def __init__(self, fun: Callable[..., Any], examples: Any) -> None:
         """Traces `fun` (of pytrees of arrays) on arguments like `examples`."""
         leaves, tree = jax.tree.flatten(examples)
         structure: list[Any] = []
@@ -156,7 +155,7 @@ class Graph:
         env = {v: self._number() for v in closed.jaxpr.invars}
         self._arguments = list(env.values())
         self._results = self._inline(closed.jaxpr, closed.consts, env)
-        self._stored = self._choose(worth)
+        self._stored = self._choose()
         self.size = len(self._stored)
 
     def __call__(self, *args: Any) -> Any:
@@ -255,7 +254,7 @@ class Graph:
             env.update(zip(eqn.outvars, outputs, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def _choose(self, worth: float) -> dict[int, bool]:
+    def _choose(self) -> dict[int, bool]:
         """Values to be stored, in order; False: a loop's, stored without our doing."""
         uses: dict[int, int] = {}
         for inputs in [*(op.inputs for op in self._operations), self._results]:
@@ -274,7 +273,7 @@ class Graph:
                     stored[v] = False
                 elif (
                     uses.get(v, 0) > 1
-                    and spent >= worth
+                    and spent >= _WORTH
                     and name not in _VIEWS
                     and jnp.issubdtype(variable.aval.dtype, jnp.floating)
                     and variable.aval.ndim > 0

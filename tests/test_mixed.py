@@ -89,13 +89,15 @@ def test_accelerations_are_those_of_each_body_alone(name):
 
 @pytest.mark.slow
 def test_more_padding_and_more_riders_change_nothing():
-    """More rows, a deeper stack, and bodies cut into more or fewer rows."""
+    """More rows, a deeper stack, a larger root, and bodies cut into more or fewer rows."""
     robots = zoo("default")
     shape = fit_shape(robots)
     arrays, _ = states(robots, shape, 2, 0.0)
     found = mixed_acceleration(robots, shape, 2, arrays)
     scale = np.abs(found).max(0)
-    padded = dataclasses.replace(shape, rows=shape.rows + 5, slots=shape.slots + 1)
+    padded = dataclasses.replace(
+        shape, rows=shape.rows + 5, slots=shape.slots + 1, root_parts=shape.root_parts + 2
+    )
     again = mixed_acceleration(robots, padded, 2, arrays)
     assert np.all(np.abs(again - found).max(0) < 1e-11 * scale)
     single = dataclasses.replace(shape, parts=1, rows=40, slots=5, constants=())
@@ -105,19 +107,18 @@ def test_more_padding_and_more_riders_change_nothing():
 
 
 def test_a_short_stack_holds_any_tree():
-    """Slots stay below log2 of the rows, and every row finds its parent in its slot."""
+    """Slots stay below log2 of the bodies, and every row finds its parent in its slot."""
     tank = world(**WATER)
     for seed in range(12):
         robot = build_robot(random_body(seed, 2 + seed, 3), tank)
         for parts in (1, 2, 5):
             rows = menagerie._rows(robot, parts)
-            assert 2 ** (max(r.slot for r in rows) + 1) - 1 <= len(rows)
+            assert 2 ** (max(r.slot for r in rows) + 1) - 1 <= len(rows) + 1
             parents = robot.mj_model.body_parentid
-            stack = {}
-            for k, row in enumerate(rows):
-                if k:
-                    host = row.body if row.rider else parents[row.body]
-                    assert stack[row.source] == host
+            stack = {0: 1}  # the root
+            for row in rows:
+                host = row.body if row.rider else parents[row.body]
+                assert stack[row.source] == host
                 stack[row.slot] = None if row.rider else row.body
 
 
