@@ -27,8 +27,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from experiments.common import ROOT, align, count, make_folder, make_parser, shown
-from mjx_revolve.errors import InputError, run_command
+from experiments.common import ROOT, align, make_folder, make_parser, shown
+from mjx_revolve.commands import run_command, whole
+from mjx_revolve.errors import InputError
 
 # Longest wait for an answer [s]; 256 bodies are built, and the largest compile, in two minutes.
 _PATIENCE = 600.0
@@ -440,9 +441,9 @@ def to_json(group: Group, results: Sequence[Result]) -> dict[str, Any]:
 def main(argv: list[str] | None = None) -> int:
     """Runs the benchmark, prints the tables and writes the JSON."""
     parser = make_parser("bench", "Throughput beside MuJoCo C and plain MJX, from the same run.")
-    whole = {"type": count, "metavar": "N"}
-    parser.add_argument("--rounds", default=3, help="measurements of each (default: 3)", **whole)
-    parser.add_argument("--threads", default=2, help="of C, and processes of ours (2)", **whole)
+    number = {"type": whole(1), "metavar": "N"}
+    parser.add_argument("--rounds", default=3, help="measurements of each (default: 3)", **number)
+    parser.add_argument("--threads", default=2, help="of C, and processes of ours (2)", **number)
     parser.add_argument("--quick", action="store_true", help="one small case, shorter rounds")
     parser.add_argument("--only", metavar="TEXT", help="cases whose name contains this")
     parser.add_argument(

@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
+from mjx_revolve.commands import Parser
 from mjx_revolve.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose complaints are one line and exit code 2, like all of ours."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raises `InputError` instead of printing the usage."""
-        raise InputError(f"{self.prog}: {message}")
 
 
 def make_parser(name: str, description: str) -> Parser:
@@ -35,17 +26,6 @@ def make_parser(name: str, description: str) -> Parser:
     )
     parser.add_argument("--out", metavar="DIR", help=f"folder to write into (default: runs/{name})")
     return parser
-
-
-def count(text: str) -> int:
-    """Reads a whole number above 0, for `add_argument(type=count)`."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number above 0; found {text!r}")
-    return value
 
 
 def make_folder(out: str | None, name: str) -> Path:

@@ -20,7 +20,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from experiments.common import ROOT, align, make_folder, make_parser, shown
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.commands import run_command
+from mjx_revolve.errors import InputError
 from mjx_revolve.plots import figure_png
 
 DROP = 0.25  # height of the release above the surface [m]

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common import ROOT, align, count, make_folder, make_parser, shown
-from mjx_revolve.errors import run_command
+from experiments.common import ROOT, align, make_folder, make_parser, shown
+from mjx_revolve.commands import run_command, whole
 
 SEED = 0
 # Genes are angles that the controllers fold by a sine; beyond this, values repeat.
@@ -230,7 +230,7 @@ def main(argv: list[str] | None = None) -> int:
     """Runs the experiment, prints the table and writes `optimisers.csv`."""
     parser = make_parser("optimisers", "One fitness function, three optimisers.")
     parser.add_argument(
-        "--evaluations", type=count, default=2000, metavar="N",
+        "--evaluations", type=whole(1), default=2000, metavar="N",
         help="budget of each optimiser (default: 2000)",
     )  # fmt: skip
     parser.add_argument(

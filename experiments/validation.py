@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from experiments.common import align, make_folder, make_parser, shown
-from mjx_revolve.errors import run_command
+from mjx_revolve.commands import run_command
 from mjx_revolve.plots import figure_png
 
 HEADINGS = ("case", "quantity", "expected", "found", "error", "tolerance", "unit", "")

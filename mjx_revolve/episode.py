@@ -58,7 +58,7 @@ class Episode:
 
 def load_episode(
     path: str | Path,
-    world: str = "lake",
+    world: str | None = None,
     duration: float | None = None,
     seed: int | None = None,
 ) -> Episode:
@@ -68,7 +68,8 @@ def load_episode(
         path: a run folder, its `champion` folder, a `genes.yaml`, or a morphology. A morphology is
             trimmed neutral where it can be, starts 1 m below the surface, and holds its hinges at
             0.
-        world: of a morphology; a champion swims in the world that it evolved in.
+        world: of a morphology, by default the lake; None for a champion, which swims in the world
+            that it evolved in.
         duration: [s]; by default the task's, or 10.
         seed: draws another start than the first on which the champion was judged.
 
@@ -76,20 +77,21 @@ def load_episode(
         The episode.
 
     Raises:
-        InputError: there is no champion, or a file holds something else.
+        InputError: there is no champion, a file holds something else, or a champion is to swim
+            in another world.
     """
     path = Path(path)
     if path.is_dir():
-        return _champion(_genes_file(path), duration, seed)
+        return _champion(_genes_file(path), world, duration, seed)
     data = load_yaml(path)
     if isinstance(data, dict) and "genes" in data:
-        return _champion(path, duration, seed)
+        return _champion(path, world, duration, seed)
     if not (isinstance(data, dict) and "body" in data):
         raise InputError(
             f"{path}: expected a run folder, a champion's genes.yaml or a morphology; found a file "
             "with neither genes nor body"
         )
-    water = load_world(world)
+    water = load_world("lake" if world is None else world)
     morphology = load_morphology(path)
     with suppress(InputError):  # what floats, floats
         morphology = trim_neutral(morphology, water.density)
@@ -118,7 +120,11 @@ def _genes_file(folder: Path) -> Path:
     raise InputError(f"{folder}: expected a run folder; found no config.yaml in it")
 
 
-def _champion(path: Path, duration: float | None, seed: int | None) -> Episode:
+def _champion(path: Path, world: str | None, duration: float | None, seed: int | None) -> Episode:
+    if world is not None:
+        raise InputError(
+            f"world: expected none: a champion swims in the world it evolved in; found {world!r}"
+        )
     genes = load_genes(path)
     data = load_yaml(path)
     named = data.get("config", "../config.yaml")

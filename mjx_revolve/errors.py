@@ -1,14 +1,14 @@
 """What reads a user's input: one kind of error, and YAML without its traps.
 
 Every function that reads user input raises `InputError` with one line that names the file, the
-place in it, what was expected and what was found. Command lines turn it into exit code 2.
+place in it, what was expected and what was found. Command lines turn it into exit code 2 (see
+`commands.run_command`).
 """
 
 from __future__ import annotations
 
 import re
-import sys
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
@@ -109,23 +109,3 @@ def load_yaml(path: str | Path) -> Any:
     except ValueError as error:  # e.g. an impossible date
         raise InputError(f"{path}: expected valid YAML values; found: {error}") from None
     return data
-
-
-def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
-    """Runs a command line's `main`, turning `InputError` into one line and exit code 2.
-
-    Args:
-        main: takes the arguments (None: `sys.argv[1:]`) and returns the exit code.
-        argv: the arguments.
-
-    Returns:
-        The exit code.
-    """
-    try:
-        return main(argv)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except BrokenPipeError:  # `| head` closed the pipe: not an error of ours
-        sys.stderr.close()
-        return 1

@@ -24,8 +24,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjx_revolve import runtime
+from mjx_revolve.commands import (
+    Parser,
+    check_place,
+    describe_refusal,
+    read_path,
+    read_seed,
+    run_command,
+)
 from mjx_revolve.crew import WorkerError
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.errors import InputError
 from mjx_revolve.fingerprints import FREE_SETTINGS, model_hash, settings_hash
 from mjx_revolve.hosts import parse_place, parse_workers, serve
 from mjx_revolve.own_code import content_name
@@ -44,14 +52,20 @@ _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m mjx_revolve.evolve",
         description="Evolves a robot's controller and documents the run in a folder.",
     )
-    parser.add_argument("config", nargs="?", metavar="CONFIG", help="a YAML file, see configs/")
-    parser.add_argument("--seed", type=int, metavar="N", help="replaces evolution.seed")
-    parser.add_argument("--out", metavar="DIR", help="run folder (default: runs/CONFIG-TIME)")
-    parser.add_argument("--resume", metavar="DIR", help="continue this run folder, bit for bit")
+    parser.add_argument(
+        "config", nargs="?", type=read_path, metavar="CONFIG", help="a YAML file, see configs/"
+    )
+    parser.add_argument("--seed", type=read_seed, metavar="N", help="replaces evolution.seed")
+    parser.add_argument(
+        "--out", type=read_path, metavar="DIR", help="run folder (default: runs/CONFIG-TIME)"
+    )
+    parser.add_argument(
+        "--resume", type=read_path, metavar="DIR", help="continue this run folder, bit for bit"
+    )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY.PATH=VALUE", dest="settings",
         help="replace one value of the configuration; may be repeated",
@@ -198,6 +212,7 @@ def _begin(arguments: argparse.Namespace, make_fitness: Callable) -> tuple[Run, 
         check_tensorboard(config.source)
     folder = Path(arguments.out) if arguments.out else _default_folder(config)
     check_new_folder(folder)  # before the expensive part
+    check_place(folder / "any", f"--out {folder}")
     try:
         find_strategy(config.evolution.strategy)
         fitness = make_fitness(config)
@@ -473,9 +488,6 @@ def _lead(
     except WorkerError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    except OSError as error:
-        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
-        return 1
     try:
         return _work(run, config, fitness, checkpoint)
     except KeyboardInterrupt:
@@ -484,7 +496,7 @@ def _lead(
         print(f"error: {error}\nresume: {_resume_command(run.folder)}", file=sys.stderr)
         return 1
     except OSError as error:
-        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
+        print(f"error: {describe_refusal(error)}", file=sys.stderr)
         if run.checkpoints():
             print(
                 f"the last checkpoint, {_shown(run.checkpoints()[0])}, is intact; make room, then\n"

@@ -9,15 +9,22 @@ did as a ROS 2 bag (MCAP).
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from mjx_revolve import runtime
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.commands import (
+    Parser,
+    add_episode_arguments,
+    check_episode_path,
+    check_place,
+    read_path,
+    run_command,
+)
+from mjx_revolve.errors import InputError
 
 if TYPE_CHECKING:
     from mjx_revolve.episode import Episode
@@ -30,13 +37,6 @@ _ENDINGS = {"mjcf": (".xml",), "urdf": (".urdf",), "sdf": (".sdf", ".world"), "m
 
 # Where meshes go, beside the files that name them.
 _MESHES = "meshes"
-
-
-class _Parser(argparse.ArgumentParser):
-    """Argument parser whose complaints are one line, like those about files."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see --help)")
 
 
 def export(
@@ -105,18 +105,19 @@ def export(
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="python -m mjx_revolve.export",
         description="Write a champion, or a morphology, for MuJoCo, ROS and Gazebo: all formats "
         "into a folder, or those that are given a file.",
     )
-    parser.add_argument("path", help="run folder, champion's genes.yaml, or morphology YAML")
+    add_episode_arguments(parser)
     parser.add_argument("--mjcf", metavar="FILE.xml", help="for stock MuJoCo")
     parser.add_argument("--urdf", metavar="FILE.urdf", help="for ROS")
     parser.add_argument("--sdf", metavar="FILE.sdf", help="a world for Gazebo, with the water")
     parser.add_argument("--mcap", metavar="FILE.mcap", help="the rollout, as a ROS 2 bag")
     parser.add_argument(
         "--out",
+        type=read_path,
         metavar="DIR",
         help="all formats into this folder (default: export in the run folder, or "
         "MORPHOLOGY_export here)",
@@ -127,9 +128,6 @@ def _parser() -> argparse.ArgumentParser:
         help="what URDF and SDF put before the names of mesh files, such as "
         "package://my_robot/meshes/ (default: meshes/, beside them)",
     )
-    parser.add_argument("--duration", type=float, help="[s] (default: the task's, or 10)")
-    parser.add_argument("--seed", type=int, help="draws another start")
-    parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
     return parser
 
 
@@ -148,6 +146,7 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
             )
         if path.is_dir():
             raise InputError(f"--{name} {path}: expected a file; found a folder")
+        check_place(path, f"--{name} {path}")
         files[name] = path
     if arguments.out is None:
         return files
@@ -156,6 +155,7 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
     folder = Path(arguments.out)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: expected a folder; found a file")
+    check_place(folder / "any", f"--out {folder}")
     return {name: folder / file for name, file in _FILES.items()}
 
 
@@ -177,44 +177,35 @@ def main(argv: list[str] | None = None) -> int:
         argv: the arguments; None: those of the process.
 
     Returns:
-        0; 1 where a file could not be written; 130 when interrupted.
+        0.
 
     Raises:
         InputError: an argument or a file is wrong.
+        OSError: a file cannot be written.
     """
     arguments = _parser().parse_args(argv)
     files = _named_files(arguments)
-    duration = arguments.duration
-    if duration is not None and not (math.isfinite(duration) and duration > 0):
-        raise InputError(f"--duration: expected seconds > 0; found {duration:g}")
-    try:
-        runtime.prepare_process()
-        # JAX takes seconds to import: not for those who ask for help.
-        from mjx_revolve.episode import load_episode
-        from mjx_revolve.ros_bag import check_rosbags
+    check_episode_path(arguments.path)
+    runtime.prepare_process()
+    # JAX takes seconds to import: not for those who ask for help.
+    from mjx_revolve.episode import load_episode
+    from mjx_revolve.ros_bag import check_rosbags
 
-        if arguments.mcap is not None:
+    if arguments.mcap is not None:
+        check_rosbags()
+    episode = load_episode(arguments.path, arguments.world, arguments.duration, arguments.seed)
+    files = files or _usual_files(episode)
+    lacking = None
+    if arguments.mcap is None and "mcap" in files:
+        try:
             check_rosbags()
-        episode = load_episode(arguments.path, arguments.world or "lake", duration, arguments.seed)
-        if arguments.world is not None and episode.fitness is not None:
-            raise InputError("--world: expected none: a champion swims in the world it evolved in")
-        files = files or _usual_files(episode)
-        lacking = None
-        if arguments.mcap is None and "mcap" in files:
-            try:
-                check_rosbags()
-            except InputError as error:  # the other formats do not need it
-                lacking = error
-                del files["mcap"]
-        for path, words in export(episode.robot, files, episode.trajectory, arguments.meshes):
-            print(f"{path}: {words}")
-        if lacking is not None:
-            print(f"no bag: {lacking}", file=sys.stderr)
-    except OSError as error:
-        print(f"error: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+        except InputError as error:  # the other formats do not need it
+            lacking = error
+            del files["mcap"]
+    for path, words in export(episode.robot, files, episode.trajectory, arguments.meshes):
+        print(f"{path}: {words}")
+    if lacking is not None:
+        print(f"no bag: {lacking}", file=sys.stderr)
     return 0
 
 

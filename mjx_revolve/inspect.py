@@ -5,15 +5,13 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from typing import NoReturn
 
 import numpy as np
 
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.commands import Parser, read_path, run_command
 from mjx_revolve.module_types import check_number
 from mjx_revolve.modules import MODULES, load_modules
 from mjx_revolve.morphology import Morphology, load_morphology
@@ -166,13 +164,6 @@ def _quantity(text: str, name: str, unit: str) -> float:
     return check_number(value, f"--{name}", unit, above=True)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Argument parser whose complaints are one line, like those about files."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see --help)")
-
-
 def main(argv: list[str] | None = None) -> int:
     """Prints what a morphology file holds; with `--picture`, draws it.
 
@@ -185,17 +176,19 @@ def main(argv: list[str] | None = None) -> int:
     Raises:
         InputError: an argument or a file is wrong.
     """
-    parser = _Parser(
+    parser = Parser(
         prog="python -m mjx_revolve.inspect",
         description="Show the modules, weights and descriptors of a morphology.",
     )
-    parser.add_argument("file", help="morphology YAML")
-    parser.add_argument("--picture", metavar="OUT.png", help="draw it as well")
+    parser.add_argument("file", type=read_path, help="morphology YAML")
+    parser.add_argument("--picture", type=read_path, metavar="OUT.png", help="draw it as well")
     parser.add_argument(
         "--density", default=str(_DENSITY), help="of the water [kg/m3] (default %(default)s)"
     )
     parser.add_argument("--gravity", default=str(_GRAVITY), help="[m/s2] (default %(default)s)")
-    parser.add_argument("--modules", metavar="MY.yaml", help="module types of your own")
+    parser.add_argument(
+        "--modules", type=read_path, metavar="MY.yaml", help="module types of your own"
+    )
     parser.add_argument(
         "--allow-overlap", action="store_true", help="accept modules that reach into each other"
     )

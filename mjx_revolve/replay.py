@@ -14,9 +14,18 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.commands import (
+    Parser,
+    add_episode_arguments,
+    check_episode_path,
+    check_place,
+    read_path,
+    run_command,
+    whole,
+)
+from mjx_revolve.errors import InputError
 
 if TYPE_CHECKING:
     from mjx_revolve.episode import Episode
@@ -78,32 +87,33 @@ def write_film(
 # --- the command line ----------------------------------------------------------------------------
 
 
-class _Parser(argparse.ArgumentParser):
-    """Argument parser whose complaints are one line, like those about files."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see --help)")
-
-
-def _parser() -> _Parser:
-    parser = _Parser(
+def _parser() -> Parser:
+    parser = Parser(
         prog="python -m mjx_revolve.replay",
         description="Film a champion, or a morphology in the water: MP4, GIF and viewer.html.",
     )
-    parser.add_argument("path", help="run folder, champion's genes.yaml, or morphology YAML")
+    add_episode_arguments(parser)
     parser.add_argument(
         "--out",
+        type=read_path,
         metavar="DIR_OR_FILE",
         help="a folder for all three, or one file that ends in .mp4, .gif or .html (default: the "
         "run folder, or files of the morphology's name in the current folder)",
     )
-    parser.add_argument("--duration", metavar="S", help="[s] (default: the task's, or 10)")
-    parser.add_argument("--seed", metavar="N", help="draws another start")
-    parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
     parser.add_argument(
-        "--size", default="640x480", help="of the film [pixels], both even (default: %(default)s)"
+        "--size",
+        type=_size,
+        default="640x480",
+        metavar="WIDTHxHEIGHT",
+        help="of the film [pixels], both even (default: %(default)s)",
     )
-    parser.add_argument("--fps", default="30", help="frames per second (default: %(default)s)")
+    parser.add_argument(
+        "--fps",
+        type=whole(1, _MOST_FPS),
+        default=30,
+        metavar="N",
+        help="frames per second (default: %(default)s)",
+    )
     parser.add_argument(
         "--html", action="store_true", help="only the page for a browser; needs no OpenGL"
     )
@@ -116,31 +126,11 @@ def _size(text: str) -> tuple[int, int]:
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     inside = all(a <= b <= c for a, b, c in zip(_SMALLEST, size, _LARGEST, strict=True))
     if not inside or any(edge % 2 for edge in size):
-        raise InputError(
-            f"--size: expected WIDTHxHEIGHT, even numbers of pixels from {_SMALLEST[0]}x"
+        raise argparse.ArgumentTypeError(
+            f"expected WIDTHxHEIGHT, even numbers of pixels from {_SMALLEST[0]}x"
             f"{_SMALLEST[1]} to {_LARGEST[0]}x{_LARGEST[1]}; found {text!r}"
         )
     return size
-
-
-def _whole(text: str | None, name: str, low: int, high: int) -> int | None:
-    if text is None:
-        return None
-    if not re.fullmatch(r"\d{1,12}", text.strip()) or not low <= int(text) <= high:
-        raise InputError(f"{name}: expected a whole number from {low} to {high}; found {text!r}")
-    return int(text)
-
-
-def _seconds(text: str | None) -> float | None:
-    if text is None:
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise InputError(f"--duration: expected seconds > 0; found {text!r}")
-    return value
 
 
 def _file_name(name: str, kind: str) -> str:
@@ -154,11 +144,14 @@ def _named_paths(out: str | None, html: bool) -> dict[str, Path] | None:
         return None
     path = Path(out)
     kind = path.suffix.lower()
+    check_place(path / "any" if path.is_dir() else path, f"--out {out}")
     if kind not in _KINDS or path.is_dir():
-        if path.exists() and not path.is_dir():
+        # A new folder may have a dot in its name (v0.2), but x.avi is a slip.
+        slip = re.fullmatch(r"\.[a-z][a-z0-9]{1,4}", kind) and not out.endswith("/")
+        if not path.is_dir() and (path.exists() or slip):
             raise InputError(
                 f"--out {out}: expected a folder, or a name that ends in {', '.join(_KINDS)}; "
-                "found another file"
+                f"found {'another file' if path.exists() else repr(path.suffix)}"
             )
         return {k: path / _file_name("swim", k) for k in (_KINDS if not html else (".html",))}
     if html and kind != ".html":
@@ -202,34 +195,13 @@ def main(argv: list[str] | None = None) -> int:
         argv: the arguments; None: those of the process.
 
     Returns:
-        0; 1 where a file could not be written; 130 when interrupted.
+        0.
 
     Raises:
         InputError: an argument or a file is wrong, or there is no OpenGL to draw with.
+        OSError: a file cannot be written.
     """
     arguments = _parser().parse_args(argv)
-    size, fps = _size(arguments.size), _whole(arguments.fps, "--fps", 1, _MOST_FPS)
-    seed = _whole(arguments.seed, "--seed", 0, 2**32 - 1)
-    duration = _seconds(arguments.duration)
-    assert fps is not None
-    try:
-        return _replay(arguments, size, fps, duration, seed)
-    except OSError as error:
-        print(f"error: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("interrupted; no half-written film is left", file=sys.stderr)
-        return 130
-
-
-def _replay(
-    arguments: argparse.Namespace,
-    size: tuple[int, int],
-    fps: int,
-    duration: float | None,
-    seed: int | None,
-) -> int:
-    """Everything after the arguments are known to be right."""
     path = Path(arguments.path)
     paths = _named_paths(arguments.out, arguments.html)
     folder = _run_folder(path)
@@ -239,8 +211,7 @@ def _replay(
         _check_screen()
     elif paths is None and folder is not None:
         paths = _usual_paths(folder, "swim", arguments.html)
-    if not path.exists():
-        raise InputError(f"{path}: expected a run folder, a genes.yaml or a morphology; found none")
+    check_episode_path(path)
     opengl = ""
     if not arguments.view and (paths is None or set(paths) != {".html"}) and not arguments.html:
         # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
@@ -253,16 +224,14 @@ def _replay(
     prepare_process()
     from mjx_revolve.episode import load_episode
 
-    episode = load_episode(path, arguments.world or "lake", duration, seed)
-    if arguments.world is not None and episode.fitness is not None:
-        raise InputError("--world: expected none: a champion swims in the world it evolved in")
+    episode = load_episode(path, arguments.world, arguments.duration, arguments.seed)
     if arguments.view:
         _view(episode)
         return 0
     if paths is None:
         paths = _usual_paths(Path(), str(episode.robot.morphology.name), arguments.html)
     if opengl:
-        _film(episode, paths, opengl, size, fps)
+        _film(episode, paths, opengl, arguments.size, arguments.fps)
     if ".html" in paths:
         from mjx_revolve.viewer import write_viewer
 

@@ -12,10 +12,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from mjx_revolve import runtime
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.commands import Parser, read_path, run_command
+from mjx_revolve.errors import InputError
 
 if TYPE_CHECKING:
     from mjx_revolve.morphology import Morphology
@@ -24,21 +25,14 @@ if TYPE_CHECKING:
     from mjx_revolve.report_groups import Group
 
 
-class _Parser(argparse.ArgumentParser):
-    """Argument parser whose complaints are one line, like those about files."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see --help)")
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="python -m mjx_revolve.report",
         description="Writes a page about runs: one HTML file that needs nothing else.",
     )
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="a run folder")
+    parser.add_argument("runs", nargs="+", type=read_path, metavar="RUN", help="a run folder")
     parser.add_argument(
-        "--out", metavar="FILE.html",
+        "--out", type=read_path, metavar="FILE.html",
         help="the page (default: RUN/report.html of one run, ./report.html of several)",
     )  # fmt: skip
     parser.add_argument(
@@ -228,32 +222,26 @@ def main(argv: list[str] | None = None) -> int:
         argv: the arguments; None: `sys.argv[1:]`.
 
     Returns:
-        The exit code: 0 when there is a page, 1 when the disk refused it.
+        0.
 
     Raises:
         InputError: the arguments are wrong, or nothing can be read of any run.
+        OSError: the page cannot be written.
     """
     arguments = _parser().parse_args(argv)
-    try:
-        runtime.prepare_process()
-        records, lost = _read(arguments)
-        path = _choose_file(arguments, records)
-        page = make_report(records, lost, arguments.every_champion)
-        for line in lost:
-            print(f"warning: nothing could be read: {line}", file=sys.stderr)
-        for record in records:
-            if record.problems:
-                print(f"warning: {record.warning}", file=sys.stderr)
+    runtime.prepare_process()
+    records, lost = _read(arguments)
+    path = _choose_file(arguments, records)
+    page = make_report(records, lost, arguments.every_champion)
+    for line in lost:
+        print(f"warning: nothing could be read: {line}", file=sys.stderr)
+    for record in records:
+        if record.problems:
+            print(f"warning: {record.warning}", file=sys.stderr)
 
-        from mjx_revolve.runs import write_atomic
+    from mjx_revolve.runs import write_atomic
 
-        write_atomic(path, page.encode())
-    except KeyboardInterrupt:
-        print("interrupted: no report was written", file=sys.stderr)
-        return 130
-    except OSError as error:
-        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
-        return 1
+    write_atomic(path, page.encode())
     print(f"report: {path} ({len(page.encode()) / 1e6:.1f} MB)")
     return 0
 

@@ -9,7 +9,6 @@ nothing over the network.
 
 from __future__ import annotations
 
-import argparse
 import base64
 import dataclasses
 import html
@@ -18,11 +17,19 @@ import math
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.commands import (
+    Parser,
+    add_episode_arguments,
+    check_episode_path,
+    check_place,
+    read_path,
+    run_command,
+)
+from mjx_revolve.errors import InputError
 
 if TYPE_CHECKING:
     from mjx_revolve.episode import Episode
@@ -426,13 +433,6 @@ def _round(value: float) -> float:
 # --------------------------------------------------------------------- the command line
 
 
-class _Parser(argparse.ArgumentParser):
-    """Argument parser whose complaints are one line, like those about files."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see --help)")
-
-
 def main(argv: list[str] | None = None) -> int:
     """Writes the replay of a champion, or of a morphology, as one HTML file.
 
@@ -440,44 +440,37 @@ def main(argv: list[str] | None = None) -> int:
         argv: the arguments; None: those of the process.
 
     Returns:
-        0; 1 where the file could not be written; 130 when interrupted.
+        0.
 
     Raises:
         InputError: an argument or a file is wrong.
+        OSError: the file cannot be written.
     """
-    parser = _Parser(
+    parser = Parser(
         prog="python -m mjx_revolve.viewer",
         description="Write one HTML file that replays an episode in any browser, offline.",
     )
-    parser.add_argument("path", help="run folder, champion's genes.yaml, or morphology YAML")
-    parser.add_argument("--out", metavar="FILE.html", help="default: viewer.html in the run "
-                        "folder, or the morphology's name in the current folder")  # fmt: skip
-    parser.add_argument("--duration", type=float, help="[s] (default: the task's, or 10)")
-    parser.add_argument("--seed", type=int, help="draws another start")
-    parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
+    add_episode_arguments(parser)
+    parser.add_argument(
+        "--out",
+        type=read_path,
+        metavar="FILE.html",
+        help="default: viewer.html in the run folder, or the morphology's name in the current "
+        "folder",
+    )
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_page_path(arguments.out)
-    duration = arguments.duration
-    if duration is not None and not (math.isfinite(duration) and duration > 0):
-        raise InputError(f"--duration: expected seconds > 0; found {duration:g}")
-    try:
-        # JAX takes seconds to import: not for those who ask for help.
-        from mjx_revolve.episode import load_episode
+        check_place(arguments.out, arguments.out)
+    check_episode_path(arguments.path)
+    # JAX takes seconds to import: not for those who ask for help.
+    from mjx_revolve.episode import load_episode
 
-        world = arguments.world or "lake"
-        episode = load_episode(arguments.path, world, duration, arguments.seed)
-        if arguments.world is not None and episode.fitness is not None:
-            raise InputError("--world: expected none: a champion swims in the world it evolved in")
-        out = arguments.out or _usual_path(episode)
-        write_viewer(episode, out)
-        size = Path(out).stat().st_size / 1e6
-        print(f"{out}: {episode.trajectory.time[-1]:.4g} s, {size:.2f} MB; open it in a browser")
-    except OSError as error:
-        print(f"error: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+    episode = load_episode(arguments.path, arguments.world, arguments.duration, arguments.seed)
+    out = arguments.out or _usual_path(episode)
+    write_viewer(episode, out)
+    size = Path(out).stat().st_size / 1e6
+    print(f"{out}: {episode.trajectory.time[-1]:.4g} s, {size:.2f} MB; open it in a browser")
     return 0
 
 

@@ -23,7 +23,8 @@ from experiments.falling_spider import (
 )
 from laboratory import QUICK
 from mjx_revolve import rollout
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.commands import run_command
+from mjx_revolve.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 THESIS = ROOT.parent / "shared" / "thesis"
@@ -140,12 +141,12 @@ def test_falling_spider_writes_its_table_and_its_plot(tmp_path, capsys):
         (falling_spider.main, ["--speed"], "unrecognized arguments: --speed"),
         (falling_spider.main, ["--data", "nowhere"], "--data: expected air_heights.txt and"),
         (falling_spider.main, ["--out", "/dev/null/x"], "--out: expected a folder to write into"),
-        (bench.main, ["--threads", "0"], "expected a whole number above 0; found '0'"),
-        (bench.main, ["--rounds", "two"], "expected a whole number above 0; found 'two'"),
+        (bench.main, ["--threads", "0"], "expected a whole number >= 1; found '0'"),
+        (bench.main, ["--rounds", "two"], "expected a whole number >= 1; found 'two'"),
         (bench.main, ["--only", "tiger"], "--only: expected part of one of: spider, ellipsoid law"),
         (bench.main, ["spider"], "unrecognized arguments: spider"),
-        (optimisers.main, ["--evaluations", "-3"], "expected a whole number above 0; found '-3'"),
-        (optimisers.main, ["--out"], "argument --out: expected one argument"),
+        (optimisers.main, ["--evaluations", "-3"], "expected a whole number >= 1; found '-3'"),
+        (optimisers.main, ["--out"], "--out: expected one argument"),
         (validation.main, ["--out", "/dev/null/x"], "--out: expected a folder to write into"),
     ],
 )

@@ -12,7 +12,8 @@ import pytest
 import yaml
 
 from mjx_revolve import inspect
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.commands import run_command
+from mjx_revolve.errors import InputError
 from mjx_revolve.morphology import load_morphology
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -286,7 +287,7 @@ def test_drawing_leaves_matplotlib_alone():
         (("--picture", "{tmp}/folder.png"), "{tmp}/folder.png: expected a file; found a folder"),
         (("--modules", "{tmp}/none.yaml"), "{tmp}/none.yaml: expected a file; found none"),
         (("--colour", "red"), "unrecognized arguments: --colour red (see --help)"),
-        (("--density",), "argument --density: expected one argument (see --help)"),
+        (("--density",), "--density: expected one argument (see --help)"),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_one_line_and_code_2(spider, tmp_path, capsys, arguments, message):

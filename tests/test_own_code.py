@@ -16,8 +16,9 @@ import pytest
 
 from laboratory import _ELBOW as ELBOW
 from mjx_revolve import evolve, own_code, runs
+from mjx_revolve.commands import run_command
 from mjx_revolve.config import load_config, override_config
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.errors import InputError
 from mjx_revolve.fingerprints import settings_hash
 from mjx_revolve.fitness import make_fitness
 from mjx_revolve.report_data import read_run

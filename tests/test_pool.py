@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 from pathlib import Path
@@ -24,9 +23,10 @@ import toys
 from laboratory import XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve import hosts, leader, runs, wire
-from mjx_revolve.config import make_config
+from mjx_revolve.commands import run_command
+from mjx_revolve.config import load_config
 from mjx_revolve.crew import Crew, WorkerError
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.errors import InputError
 from mjx_revolve.leader import Leader, Limits
 from mjx_revolve.loop import choose_champion, evolve
 from mjx_revolve.pool import Pool, block_size, make_pool, split_blocks
@@ -59,22 +59,12 @@ def own_settings(monkeypatch):
 def folder(tmp_path, monkeypatch):
     """A folder with a config, current."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "robot.yaml").write_text("id: robot\n")
-    (tmp_path / "toy.yaml").write_text(
-        textwrap.dedent("""
-        morphology: robot.yaml
-        world: lake
-        task: {type: speed}
-        evolution: {strategy: SNES, population_size: 10, generations: 7, checkpoint_every: 4}
-        """)
-    )
+    toys.write_config(tmp_path / "toy.yaml", population_size=10, checkpoint_every=4)
     return tmp_path
 
 
 def toy_config(path, **evolution):
-    (path / "robot.yaml").write_text("id: robot\n")
-    data = {"morphology": "robot.yaml", "world": "lake", "task": {"type": "speed"}}
-    return make_config(data | {"evolution": evolution}, path)
+    return load_config(toys.write_config(path / "toy.yaml", **evolution))
 
 
 def workers_of(pid):
@@ -310,7 +300,7 @@ SCRIPT = """
 import sys
 import toys
 from mjx_revolve import evolve
-from mjx_revolve.errors import run_command
+from mjx_revolve.commands import run_command
 
 sys.exit(run_command(lambda argv: evolve.main(argv, toys.make_slow), sys.argv[1:]))
 """

@@ -17,8 +17,9 @@ from PIL import Image
 from laboratory import body
 from mjx_revolve import opengl, replay
 from mjx_revolve.camera import plan_shots
+from mjx_revolve.commands import run_command
 from mjx_revolve.episode import Episode
-from mjx_revolve.errors import InputError, run_command
+from mjx_revolve.errors import InputError
 from mjx_revolve.film import draw_frames, enclosing_balls, make_film
 from mjx_revolve.robot import build_robot
 from mjx_revolve.rollout import Trajectory
@@ -608,12 +609,17 @@ def test_a_place_that_cannot_be_written(command, way, tmp_path, capsys):
     source = tmp_path / "spider.yaml"
     source.touch()
     (tmp_path / "file").touch()
-    small = ("--size", "64x64", "--fps", "1")
-    assert command(str(source), *small, "--out", str(tmp_path / "file" / "x.mp4")) == 1
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1 and "x.mp4" in error
-    assert command(str(source), *small, "--out", str(tmp_path / "file")) == 2
-    assert "expected a folder, or a name that ends in" in capsys.readouterr().err
+    for name, message in (
+        ("file/x.mp4", "file/x.mp4: expected the folder"),
+        ("file/x", "file/x: expected the folder"),
+        ("file", "expected a folder, or a name that ends in .mp4, .gif, .html; found another file"),
+        ("x.avi", "expected a folder, or a name that ends in .mp4, .gif, .html; found '.avi'"),
+    ):
+        assert command(str(source), "--out", str(tmp_path / name)) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+    assert command(str(source), "--html", "--out", str(tmp_path / "v0.2")) == 0
+    assert [path.name for path in (tmp_path / "v0.2").iterdir()] == ["viewer.html"]
 
 
 @pytest.mark.skipif(not os.sys.platform.startswith("linux"), reason="Linux's screens")

@@ -1,7 +1,8 @@
-"""Fitnesses that cost nothing and that worker processes can import by name."""
+"""Fitnesses that cost nothing and that worker processes can import by name, and a config."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -10,6 +11,19 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+
+def write_config(path: Path, **evolution) -> Path:
+    """Writes a configuration for any of them, beside the robot that it names; 7 generations."""
+    (path.parent / "robot.yaml").write_text("id: robot\n")
+    data = {
+        "morphology": "robot.yaml",
+        "world": "lake",
+        "task": {"type": "speed"},
+        "evolution": {"strategy": "SNES", "generations": 7} | evolution,
+    }
+    path.write_text(json.dumps(data))
+    return path
 
 
 class Toy:
