@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mjx_revolve import runtime
 from mjx_revolve.commands import (
     Parser,
     add_episode_arguments,
@@ -463,6 +464,7 @@ def main(argv: list[str] | None = None) -> int:
         check_page_path(arguments.out)
         check_place(arguments.out, arguments.out)
     check_episode_path(arguments.path)
+    runtime.prepare_process()
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episode import load_episode
 
