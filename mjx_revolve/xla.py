@@ -177,24 +177,22 @@ class Graph:
         Returns:
             A function of what `unpack` takes that returns what `pack` gives.
         """
-        order = list(self._stored)
-        count = max(1, round(len(order) / size))
-        piece = {v: k * count // len(order) for k, v in enumerate(order)}
+        count = max(1, round(self.size / size))
+        piece: dict[int, int] = {}
+        for op in self._operations:  # what one operation gives stays together
+            number = len(piece) * count // max(self.size, 1)
+            piece |= {v: number for v in op.outputs if v in self._stored}
         made = {v: k for k, op in enumerate(self._operations) for v in op.outputs}
         ends = [v for v in self._results if isinstance(v, int)]
-        cuts = []
-        for number in range(count):
-            wanted = [v for v in order if piece[v] == number]
-            cuts.append(
-                self._cut(number, wanted + (ends if number == count - 1 else []), piece, made)
-            )
-        read = {v for _, inputs, _ in cuts for v in inputs}
+        own = [[v for v in piece if piece[v] == number] for number in range(count)]
+        cuts = [self._cut(k, own[k] if k < count - 1 else ends, piece, made) for k in range(count)]
+        read = {v for _, inputs in cuts for v in inputs}
 
         def run(*args: Any) -> Any:
             values: dict[int, Any] = {}
-            for number, (operations, inputs, wanted) in enumerate(cuts):
+            for number, (operations, inputs) in enumerate(cuts):
                 last = number == count - 1
-                outputs = [v for v in wanted if v in read and v not in values]
+                outputs = [v for v in own[number] if v in read]
 
                 def compute(
                     given: Any, *xs: Any, cut: Any = (operations, inputs, outputs, last)
@@ -216,8 +214,8 @@ class Graph:
 
     def _cut(
         self, number: int, wanted: list[int], piece: dict[int, int], made: dict[int, int]
-    ) -> tuple[list[_Operation], list[int], list[int]]:
-        """Operations of one piece, the stored values of earlier ones that it reads, its own."""
+    ) -> tuple[list[_Operation], list[int]]:
+        """Operations of the piece that makes `wanted`, and what it reads of earlier pieces."""
         needed, inputs, seen, todo = set(), [], set(), list(wanted)
         while todo:
             v = todo.pop()
@@ -229,7 +227,7 @@ class Graph:
                 continue
             needed.add(made[v])
             todo += [x for x in self._operations[made[v]].inputs if isinstance(x, int)]
-        return [self._operations[k] for k in sorted(needed)], inputs, wanted
+        return [self._operations[k] for k in sorted(needed)], inputs
 
     def _number(self) -> int:
         self._count += 1
