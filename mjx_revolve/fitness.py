@@ -32,15 +32,19 @@ from mjx_revolve.rollout import (
     roll_out,
     simulate,
 )
-from mjx_revolve.tasks import Track, find_task, measure
+from mjx_revolve.scoring import (
+    WORST,
+    Scores,
+    average_trials,
+    list_episodes,
+    sample_rows,
+    score_episodes,
+)
+from mjx_revolve.tasks import Track, find_task
 from mjx_revolve.terrain import bed_height
 from mjx_revolve.water import Water, gust_path, water_of
 from mjx_revolve.world import World, load_world
 from mjx_revolve.xla import compiler_options, derived_by, over_chunks
-
-# Score of a rollout that blew up. Finite, because optimisers' averages and sorts are not made for
-# infinities, and below anything that a task gives.
-WORST = -1e3
 
 # Nothing made of these modules swims or sinks this fast: servos, drag and weight allow a tenth of
 # it. An individual that gets further than this allows has blown up [m/s].
@@ -48,9 +52,6 @@ _FASTEST = 3.0
 
 # How long a sea is before it begins again, as episodes see it [s].
 _SEA = 1000.0
-
-# The track is sampled at least this often [s].
-_INTERVAL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,13 +154,12 @@ class Fitness:
     @property
     def record_every(self) -> int:
         """Timesteps between the rows of the track that tasks see."""
-        return max(1, int(_INTERVAL / self.robot.world.timestep + 1e-6))
+        return sample_rows(self.config.task, self.robot.world.timestep)[0]
 
     @property
     def num_records(self) -> int:
         """How many rows the track of an episode has, before the settling time is cut off."""
-        interval = self.record_every * self.robot.world.timestep
-        return max(2, round(self.config.task.duration / interval))
+        return sample_rows(self.config.task, self.robot.world.timestep)[1]
 
     def starts(self, key: jax.Array) -> tuple[jax.Array, Water | None]:
         """Start poses and water of a key's episodes.
@@ -193,38 +193,42 @@ class Fitness:
         return reach_below(self.robot, self.config.task)
 
     def _evaluate(self, population: Any, key: jax.Array) -> Any:
-        task, world = self.config.task, self.robot.world
-        size, trials = population.shape[0], task.trials
+        trials = self.config.task.trials
         qpos, water = self.starts(key)
-        qpos = qpos.astype(population.dtype)
-        # Lanes run over individuals and, within each, over its episodes.
-        lanes = lambda x: jnp.tile(x, (1,) * (x.ndim - 1) + (size,))  # noqa: E731
-        genes = jnp.repeat(population.T, trials, 1)
-        water = None if water is None else jax.tree.map(lanes, water)
-        # Gusts are long: each chunk of lanes picks those of its episodes.
-        gusts = self.gusts(key)
-        trial = None if gusts is None else lanes(jnp.arange(trials))
-        episode = partial(self._episode, gusts=gusts)
-        position, energy = over_chunks(episode)(genes, lanes(qpos), water, trial)
-        return score_tracks(
-            self.config,
-            world,
-            position,
-            energy,
-            lanes(qpos)[:3],
-            self.robot.morphology.length,
-            self.robot.morphology.mass * max(world.gravity, 1e-9),
-            _reach(self.config, self.robot),
-            self.record_every * world.timestep,
-            self.task,
+        run = partial(
+            self._episode, population, qpos.astype(population.dtype), water, self.gusts(key)
         )
+        return average_trials(over_chunks(run)(*list_episodes(len(population), trials)), trials)
 
     def _episode(
-        self, genes: jax.Array, qpos: jax.Array, water: Water | None, trial: Any, gusts: Any
-    ) -> Any:
-        """Track of one chunk: `[S, 3, lanes]` positions and `[S, lanes]` energies."""
+        self,
+        population: jax.Array,
+        qpos: jax.Array,
+        water: Water | None,
+        gusts: Any,
+        individual: jax.Array,
+        trial: jax.Array,
+    ) -> Scores:
+        """Scores of one chunk of episodes.
+
+        A chunk picks what is its own from what all chunks share, so that nothing is kept for each
+        episode of a population but its scores.
+
+        Args:
+            population: `[P, num_genes]`.
+            qpos: `[nq, trials]` start poses.
+            water: `[trials]` where it varies.
+            gusts: `[steps + 1, 3, trials]` or None.
+            individual: `[lanes]` whose episode each is.
+            trial: `[lanes]` which of that individual's.
+
+        Returns:
+            The scores.
+        """
         world, controller = self.robot.world, self.controller
-        parameters = controller.decode(genes, self.engine.order)
+        parameters = controller.decode(population[individual].T, self.engine.order)
+        qpos = qpos[:, trial]
+        water = jax.tree.map(lambda x: x[trial], water)
         rows = None
         if gusts is not None:
             rows = gusty_water(world, gusts[..., trial], water)
@@ -255,7 +259,18 @@ class Fitness:
         else:
             episode = loop
         place, energy = episode(qpos, parameters, water, rows)
-        return jnp.stack(place, 1), energy
+        body = self.robot.morphology
+        return score_episodes(
+            self.config.task,
+            self.task,
+            world,
+            jnp.stack(place, 1),
+            energy,
+            qpos[:3],
+            body.length,
+            body.mass * max(world.gravity, 1e-9),
+            _reach(self.config, self.robot),
+        )
 
 
 def draw_starts(
@@ -320,63 +335,6 @@ def reach_below(robot: Robot, task: TaskConfig) -> float:
     tilt = min(3 * task.start_tilt, np.pi / 2)
     radius = np.linalg.norm(cloud[:, :2], axis=1).max()
     return float(-cloud[:, 2].min() * np.cos(tilt) + radius * np.sin(tilt))
-
-
-def score_tracks(
-    config: Config,
-    world: World,
-    position: jax.Array,
-    energy: jax.Array,
-    start: jax.Array,
-    length: Any,
-    weight: Any,
-    farthest: float,
-    interval: float,
-    score_track: Callable[[Track, TaskConfig], jax.Array] | None = None,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Scores and measures of individuals from the tracks of all their episodes.
-
-    Args:
-        config: task and trials; lanes run over individuals and, within each, over its episodes.
-        world: the world.
-        position: `[S, 3, lanes]` of the core [m].
-        energy: `[S, lanes]` since the row before [J].
-        start: `[3, lanes]` [m].
-        length: body length, a number or `[lanes]` [m].
-        weight: in air, likewise [N].
-        farthest: whoever gets further than this has blown up [m].
-        interval: between rows [s].
-        score_track: from `tasks.find_task`; None: that of the configuration.
-
-    Returns:
-        `[P]` scores, and `[P]` measures.
-    """
-    task = config.task
-    first = min(round(task.settle / interval), position.shape[0] - 2)
-    kept = position[first:]
-    clearance = jnp.full_like(kept[:, 0], jnp.inf)
-    if world.bed is not None:
-        clearance = kept[:, 2] - bed_height(world.bed, kept[:, 0], kept[:, 1])
-    track = Track(
-        position=kept,
-        clearance=clearance,
-        energy=energy[first:],
-        interval=interval,
-        start_height=start[2],
-        length=length,
-        weight=weight,
-        surface_height=world.surface_height,
-    )
-    measures = measure(track)
-    score_track = score_track or find_task(task, config.source)
-    score = score_track(track, task) - task.energy_weight * measures["energy_j"]
-    away = jnp.max(jnp.abs(position - start), (0, 1))
-    # Written so that NaN counts as too far.
-    sane = jnp.isfinite(score) & (away < farthest)
-    score = jnp.where(sane, score, WORST)
-    mean = lambda x: jnp.mean(x.reshape(-1, task.trials), 1)  # noqa: E731
-    sane_all = jnp.all(sane.reshape(-1, task.trials), 1)
-    return jnp.where(sane_all, mean(score), WORST), {k: mean(v) for k, v in measures.items()}
 
 
 def _euler_quat(roll: Any, pitch: Any, yaw: Any) -> jax.Array:

@@ -21,24 +21,29 @@ from mjx_revolve.config import Config, load_config, make_config
 from mjx_revolve.controllers import CONTROLLERS, decode_sine, step_sine
 from mjx_revolve.errors import InputError
 from mjx_revolve.fitness import (
-    WORST,
     Fitness,
     draw_gusts,
     draw_starts,
     farthest,
     may_touch_bed,
-    score_tracks,
 )
 from mjx_revolve.menagerie import Bodies, Shape, fit_shape, joint_of, pack_bodies
 from mjx_revolve.mixed_step import make_mixed_engine, to_rows
 from mjx_revolve.morphology import Morphology, trim_neutral
 from mjx_revolve.robot import Robot, build_robot, check_timestep
 from mjx_revolve.rollout import flow_at, gusty_water, make_engine, roll_out
+from mjx_revolve.scoring import (
+    WORST,
+    Scores,
+    average_trials,
+    list_episodes,
+    sample_rows,
+    score_episodes,
+)
+from mjx_revolve.tasks import find_task
 from mjx_revolve.water import water_of
 from mjx_revolve.world import World, load_world
 from mjx_revolve.xla import compiler_options, derived_by, over_chunks
-
-_INTERVAL = 0.1  # the track is sampled at least this often [s], as in `fitness`
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,40 +160,15 @@ class MixedFitness:
     def _jitted(self) -> Any:
         return jax.jit(self._evaluate, compiler_options=compiler_options())
 
-    @property
-    def _every(self) -> int:
-        return max(1, int(_INTERVAL / self.world.timestep + 1e-6))
-
-    @property
-    def _records(self) -> int:
-        return max(2, round(self.config.task.duration / (self._every * self.world.timestep)))
-
     def _evaluate(self, bodies: Bodies, population: Any, key: jax.Array) -> Any:
         task, world = self.config.task, self.world
-        size, trials = population.shape[0], task.trials
         place, quat, water = draw_starts(task, world, key, 0.0)
-        lanes = lambda x: jnp.tile(x, (1,) * (x.ndim - 1) + (size,))  # noqa: E731
-        wide = lambda x: jnp.repeat(jnp.asarray(x), trials, -1)  # noqa: E731
-        bodies = jax.tree.map(wide, bodies)
-        root = lanes(jnp.concatenate([place, quat])).astype(population.dtype)
-        if task.type == "crawl":
-            root = root.at[2].add(bodies.below)
-        water = None if water is None else jax.tree.map(lanes, water)
-        gusts = draw_gusts(task, world, key, self._records * self._every)
-        trial = None if gusts is None else lanes(jnp.arange(trials))
-        episode = over_chunks(partial(self._episode, gusts=gusts))
-        position, energy = episode(bodies, wide(population.T), root, water, trial)
-        return score_tracks(
-            self.config,
-            world,
-            position,
-            energy,
-            root[:3],
-            bodies.length,
-            jnp.maximum(bodies.weight, 1e-9),
-            farthest(self.config, world, self._longest, sinks=True),
-            self._every * world.timestep,
-        )
+        root = jnp.concatenate([place, quat]).astype(population.dtype)
+        every, records = sample_rows(task, world.timestep)
+        gusts = draw_gusts(task, world, key, records * every)
+        run = partial(self._episode, bodies, population, root, water, gusts)
+        episodes = list_episodes(len(population), task.trials)
+        return average_trials(over_chunks(run)(*episodes), task.trials)
 
     @property
     def _longest(self) -> float:
@@ -196,11 +176,27 @@ class MixedFitness:
         return 0.2 * (1 + self.shape.rows)
 
     def _episode(
-        self, bodies: Bodies, genes: Any, root: Any, water: Any, trial: Any, gusts: Any
-    ) -> Any:
-        """Track of one chunk: `[S, 3, lanes]` positions and `[S, lanes]` energies."""
+        self,
+        bodies: Bodies,
+        population: Any,
+        root: Any,
+        water: Any,
+        gusts: Any,
+        individual: jax.Array,
+        trial: jax.Array,
+    ) -> Scores:
+        """Scores of one chunk of episodes; arguments as of `Fitness._episode`.
+
+        `bodies` are of all individuals, and `root` are `[7, trials]` start poses of the core.
+        """
         world, shape, settings = self.world, self.shape, self.config.controller
-        count = root.shape[-1]
+        count = len(individual)
+        bodies = jax.tree.map(lambda x: jnp.asarray(x)[..., individual], bodies)
+        genes = population[individual].T
+        root = root[:, trial]
+        if self.config.task.type == "crawl":
+            root = root.at[2].add(bodies.below)
+        water = jax.tree.map(lambda x: x[trial], water)
         kinds = genes[:-1].reshape(-1, shape.hinges, count)
         low, high = joint_of(shape, bodies.tables).target
         half = jnp.broadcast_to(jnp.asarray((high - low) / 2, genes.dtype), (shape.rows, count))
@@ -223,6 +219,8 @@ class MixedFitness:
             steps = gusts.shape[0] - 1
             rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps, count)), rows)
 
+        every, records = sample_rows(self.config.task, world.timestep)
+
         def loop(bodies: Any, start: Any, parameters: Any, water: Any, rows: Any, mode: str) -> Any:
             engine = make_mixed_engine(world, shape, bodies)
             still = water_of(world) if water is None else water
@@ -234,8 +232,8 @@ class MixedFitness:
                 start,
                 (),
                 rows,
-                records=self._records,
-                every=self._every,
+                records=records,
+                every=every,
                 timestep=world.timestep,
                 mode=mode,
             )
@@ -243,7 +241,17 @@ class MixedFitness:
 
         episode = derived_by(partial(loop, mode="fused"), partial(loop, mode="derived"))
         place, energy = episode(bodies, start, parameters, water, rows)
-        return jnp.stack(place, 1), energy
+        return score_episodes(
+            self.config.task,
+            find_task(self.config.task, self.config.source),
+            world,
+            jnp.stack(place, 1),
+            energy,
+            root[:3],
+            bodies.length,
+            jnp.maximum(bodies.weight, 1e-9),
+            farthest(self.config, world, self._longest, sinks=True),
+        )
 
 
 def make_mixed_fitness(

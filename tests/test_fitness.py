@@ -84,6 +84,15 @@ def test_an_individual_does_not_feel_the_population_around_it(fitness, populatio
     np.testing.assert_array_equal(few, scores[:40])
 
 
+def test_an_individual_adds_little_memory_however_long_it_lives(settings):
+    """XLA's own sum of what lives beside arguments and results; a track alone would be 800 B."""
+    long = make_fitness(settings, **{"task.duration": 5.0, "task.trials": 1})
+    count = 2**16
+    population = jax.ShapeDtypeStruct((count, long.num_genes), jnp.float32)
+    compiled = jax.jit(long.evaluate, compiler_options=QUICK).lower(population, KEY).compile()
+    assert compiled.memory_analysis().temp_size_in_bytes / count < 200
+
+
 def test_a_blown_up_individual_scores_worst_and_spreads_nothing(fitness, population, scores):
     broken = population.at[3].set(jnp.nan)
     found = np.asarray(fitness(broken, KEY))
