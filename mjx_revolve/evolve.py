@@ -201,7 +201,6 @@ def _begin(arguments: argparse.Namespace, make_fitness: Callable) -> tuple[Run, 
     """A new run."""
     from mjx_revolve.config import load_config
     from mjx_revolve.runs import check_new_folder, create_run
-    from mjx_revolve.strategies import find_strategy, make_strategy
     from mjx_revolve.tensorboard import check_tensorboard
 
     if arguments.config is None:
@@ -213,9 +212,11 @@ def _begin(arguments: argparse.Namespace, make_fitness: Callable) -> tuple[Run, 
     folder = Path(arguments.out) if arguments.out else _default_folder(config)
     check_new_folder(folder)  # before the expensive part
     check_place(folder / "any", f"--out {folder}")
+    fitness = make_fitness(config)
+    # Not before: workers compile while evosax is imported, which takes a while.
+    from mjx_revolve.strategies import make_strategy
+
     try:
-        find_strategy(config.evolution.strategy)
-        fitness = make_fitness(config)
         make_strategy(config.evolution, fitness.num_genes)
     except InputError as error:
         if str(error).startswith("evolution."):

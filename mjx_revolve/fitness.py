@@ -405,8 +405,7 @@ def may_touch_bed(config: Config, robot: Robot) -> bool:
         return False
     reach = _reach(config, robot)
     line = np.linspace(-reach, reach, 101)
-    x, y = np.meshgrid(line, line)
-    highest = float(np.max(bed_height(world.bed, jnp.asarray(x), jnp.asarray(y))))
+    highest = float(np.max(bed_height(world.bed, *np.meshgrid(line, line))))
     return task.type == "crawl" or world.surface_height - task.depth - reach < highest
 
 

@@ -14,6 +14,7 @@ import platform
 import subprocess
 import sys
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,19 +68,35 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
     """What `prepare_process` is to a command, this is to a worker process; imports JAX.
 
     Args:
-        core: the only core it is to use; None: any. XLA makes as many threads as there are cores
-            to use, so with one core a worker is single-threaded.
+        core: the only core it is to use, once `pin_process` says so; None: any. XLA makes as many
+            threads as there are cores to use when it starts, so such a worker runs blocks in a
+            single thread. Compiling takes more threads, and cores that are still idle.
         cache: the compilation cache's folder, as the process that started the worker uses it. That
             one has removed broken entries; doing so again could hit one that is being written.
     """
     for name in _THREAD_SETTINGS:
         os.environ.setdefault(name, "1")
-    if core is not None and hasattr(os, "sched_setaffinity"):
-        # No longer one of ours (a shrunk container): any will do.
-        with contextlib.suppress(OSError):
-            os.sched_setaffinity(0, {core})
     os.environ["JAX_PLATFORMS"] = "cpu"
     _use_cache(Path(cache) if cache else None, _WORKER_MIN_COMPILE_TIME)
+    if core is not None:
+        import jax
+
+        cores = list_cores()
+        pin_process([core])
+        jax.devices()
+        pin_process(cores)
+
+
+def pin_process(cores: Sequence[int]) -> None:
+    """Keeps all threads of this process to these cores, by number, where the system can."""
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    folder = Path("/proc/self/task")
+    threads = [int(thread.name) for thread in folder.iterdir()] if folder.is_dir() else [0]
+    for thread in threads:
+        # The thread has ended, or the core is no longer one of ours (a shrunk container).
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(thread, cores)
 
 
 def list_cores() -> list[int]:

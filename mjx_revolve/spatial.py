@@ -178,6 +178,15 @@ def safe_norm(a: Vec) -> Scalar:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
+def namespace(x: Any) -> Any:
+    """The functions for an array: NumPy's for NumPy's own, else JAX's.
+
+    What is computed while a robot is built is computed once; JAX would compile a program for each
+    operation.
+    """
+    return np if isinstance(x, np.ndarray) else jnp
+
+
 def sincos(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine by one argument reduction and two short polynomials.
 
@@ -191,10 +200,11 @@ def sincos(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     Returns:
         (sin, cos), same shape.
     """
-    if angle.dtype != jnp.float32:
-        return jnp.sin(angle), jnp.cos(angle)
+    xp = namespace(angle)
+    if angle.dtype != np.float32:
+        return xp.sin(angle), xp.cos(angle)
     f = np.float32
-    turns = jnp.round(angle * f(2 / np.pi))
+    turns = xp.round(angle * f(2 / np.pi))
     # π/2 in two parts, so that the reduced angle keeps its digits (Cody & Waite).
     r = (angle - turns * f(1.5707963705062866)) - turns * f(-4.371139000186241e-08)
     z = r * r
@@ -202,12 +212,12 @@ def sincos(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     c = ((f(2.443315711809948e-5) * z + f(-1.388731625493765e-3)) * z + f(4.166664568298827e-2)) * (
         z * z
     ) + (f(1) - f(0.5) * z)
-    quadrant = turns.astype(jnp.int32)
+    quadrant = turns.astype(np.int32)
     odd = (quadrant & 1) != 0
-    sine = jnp.where(odd, c, s)
-    cosine = jnp.where(odd, s, c)
-    sine = jnp.where((quadrant & 2) != 0, -sine, sine)
-    cosine = jnp.where(((quadrant + 1) & 2) != 0, -cosine, cosine)
+    sine = xp.where(odd, c, s)
+    cosine = xp.where(odd, s, c)
+    sine = xp.where((quadrant & 2) != 0, -sine, sine)
+    cosine = xp.where(((quadrant + 1) & 2) != 0, -cosine, cosine)
     return sine, cosine
 
 

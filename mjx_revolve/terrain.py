@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.errors import InputError
-from mjx_revolve.spatial import sincos
+from mjx_revolve.spatial import namespace, sincos
 
 # The thesis's lake: bed about 998 m x 998 m, z from -112.8 m to +36.7 m (shared facts, section 2).
 LAKE_EXTENT = 998.0
@@ -83,23 +83,31 @@ def bed_height(bed: Bed, x: Any, y: Any) -> Any:
 
     Args:
         bed: the bed.
-        x: world x [m], any shape.
+        x: world x [m], any shape; NumPy's arrays are left to NumPy.
         y: world y [m], same shape.
 
     Returns:
         z of the bed, world frame [m], same shape.
     """
+    xp = namespace(x)
     if bed.kind == "flat":
-        return jnp.full_like(x, bed.height)
+        return xp.full_like(x, bed.height)
     half = bed.extent / 2
     # 1e-12 keeps the square root differentiable at the centre.
-    radius = jnp.sqrt((x / (1.05 * half)) ** 2 + (y / half) ** 2 + 1e-12)
-    rise = jnp.clip((radius - 0.3) / (0.98 - 0.3), 0.0, 1.0)
+    radius = xp.sqrt(_over(x, 1.05 * half) ** 2 + _over(y, half) ** 2 + 1e-12)
+    rise = xp.clip(_over(radius - 0.3, 0.98 - 0.3), 0.0, 1.0)
     dunes = _DUNES * sincos(x * (2 * np.pi / 61))[0] * sincos(y * (2 * np.pi / 43))[0]
     # Squared, like the smooth step's start: dunes that rose faster would dig below the bottom.
     where = 16 * (rise * (1 - rise)) ** 2
     smooth = rise * rise * (3 - 2 * rise)
     return bed.height + (bed.highest - bed.height) * (smooth + dunes * where)
+
+
+def _over(x: Any, number: float) -> Any:
+    """A quotient that is rounded alike by NumPy and XLA, which multiplies by the inverse."""
+    if isinstance(x, np.ndarray):
+        return x * (x.dtype.type(1) / x.dtype.type(number))
+    return x / number
 
 
 def bed_slope(bed: Bed, x: Any, y: Any) -> tuple[Any, Any]:
@@ -135,6 +143,7 @@ def sample_bed(bed: Bed, n: int = 201) -> np.ndarray:
     Returns:
         `[n, n]` heights, world frame [m]; rows run along y, columns along x, both upwards.
     """
-    line = np.linspace(-bed.extent / 2, bed.extent / 2, n)
+    # float32, as the population step computes it.
+    line = np.linspace(-bed.extent / 2, bed.extent / 2, n).astype(np.float32)
     x, y = np.meshgrid(line, line)
-    return np.asarray(bed_height(bed, jnp.asarray(x), jnp.asarray(y)), np.float64)
+    return bed_height(bed, x, y).astype(np.float64)

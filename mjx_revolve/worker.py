@@ -117,6 +117,7 @@ def _work(job: dict[str, Any]) -> int:
     if answer["type"] == "refused":
         raise InputError(answer["reason"])
     channel.set_patience(None)  # between generations it may take any time
+    warm = False
     while True:
         order, population = channel.receive()
         if order["type"] == "stop":
@@ -128,6 +129,9 @@ def _work(job: dict[str, Any]) -> int:
             lines = str(error).splitlines() or [""]
             channel.send({"type": "failed", "reason": f"{type(error).__name__}: {lines[0]}"})
             return 1
+        if not warm and job["core"] is not None:
+            runtime.pin_process([job["core"]])
+        warm = True
         channel.send({"type": "scores", "block": order["block"], "measures": names}, scores)
     channel.close()
     if order["reason"]:

@@ -208,7 +208,14 @@ def test_each_worker_has_a_core_of_its_own(crowd):
         pytest.skip("fewer workers than cores are not pinned")
     processes = [worker.process for worker in pool._leader._crew.workers]
     expected = [{cores[i % len(cores)]} for i in range(3)]
-    assert [os.sched_getaffinity(process.pid) for process in processes] == expected
+    pool(np.zeros((2, 5)), jax.random.key(0))
+    deadline = time.monotonic() + 30  # until the last one's first block is done
+    while (found := [os.sched_getaffinity(p.pid) for p in processes]) != expected:
+        assert time.monotonic() < deadline, found
+        time.sleep(0.05)
+    for process, core in zip(processes, expected, strict=True):
+        threads = [int(name) for name in os.listdir(f"/proc/{process.pid}/task")]
+        assert all(os.sched_getaffinity(thread) == core for thread in threads)
 
 
 def test_workers_ignore_interrupts(crowd):
