@@ -70,8 +70,14 @@ def compiler_options() -> dict[str, Any] | None:
     return {"xla_cpu_prefer_vector_width": 512} if on_cpu() else None
 
 
+@jax.jit
+def _same(x: jax.Array) -> jax.Array:
+    return x
+
+
 def _never_inlined(x: jax.Array) -> jax.Array:
-    return set_xla_metadata(jax.jit(lambda y: y)(x), inlineable="false")
+    # One function for all: tracing hundreds of them anew would take half a second.
+    return set_xla_metadata(_same(x), inlineable="false")
 
 
 def share_once(fun: Callable[..., Any]) -> Callable[..., Any]:
