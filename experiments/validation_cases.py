@@ -393,8 +393,8 @@ def mujoco_laws() -> Result:
                 if law == "inertia_box":
                     found = inertia_box(v, w, tuple(size), RHO, 0.3)
                 else:
-                    k = ellipsoid_constants(size / 2, model.geom_fluid[0])
-                    found = ellipsoid(v, w, k, RHO, 0.3, True)
+                    k = ellipsoid_constants(size / 2, model.geom_fluid[0], RHO, 0.3)
+                    found = ellipsoid(v, w, k, True)
             error = np.abs(np.concatenate([np.stack(x) for x in found]) - wanted)
             worst = max(worst, error.max() / np.abs(wanted).max())
         rows.append(Row(f"MuJoCo's {law}, worst of 20", 0.0, worst, 1e-10, "-"))

@@ -100,13 +100,17 @@ def inertia_box(v: Vec, w: Vec, size: Vec, density: float, viscosity: float) -> 
     return tuple(force), tuple(torque)
 
 
-def ellipsoid_constants(half_size: np.ndarray, coefficients: np.ndarray) -> dict[str, Any]:
-    """The numbers of MuJoCo's ellipsoid law that depend on the shape alone.
+def ellipsoid_constants(
+    half_size: np.ndarray, coefficients: np.ndarray, density: float, viscosity: float
+) -> dict[str, Any]:
+    """The numbers of MuJoCo's ellipsoid law that depend on the shape and the water alone.
 
     Args:
         half_size: `[..., 3]` semi-axes [m].
         coefficients: `[..., 12]` MuJoCo's `geom_fluid`: interaction, blunt, slender, angular,
             Kutta, Magnus, virtual mass (3), virtual inertia (3).
+        density: of the water [kg/m³].
+        viscosity: of the water [Pa·s].
 
     Returns:
         Constants for `ellipsoid`, each `[...]` or a tuple of three.
@@ -130,26 +134,24 @@ def ellipsoid_constants(half_size: np.ndarray, coefficients: np.ndarray) -> dict
     )
     diameter = 2 / 3 * s.sum(-1)
     turning = angular[..., None] * own + slender[..., None] * (inertia_max[..., None] - own)
-    scale = interaction
+    facing = np.pi * np.sqrt(largest)  # the largest area that may face the flow
+    scale, dense = interaction, density * interaction
     columns = lambda x: tuple(x[..., i] for i in range(3))  # noqa: E731
     return {
         "areas": columns(areas / largest[..., None]),
-        "project": np.pi * np.sqrt(largest),
-        "kutta": scale * kutta,
-        "magnus": scale * magnus * volume,
-        "blunt": scale * (blunt - slender),
-        "slender": scale * slender * np.pi * large * middle,
-        "turning": columns(scale[..., None] * turning),
-        "viscous": scale * 3 * np.pi * diameter,
-        "viscous_turning": scale * np.pi * diameter**3,
-        "mass": columns(scale[..., None] * g[..., 6:9]),
-        "inertia": columns(scale[..., None] * g[..., 9:12]),
+        "kutta": dense * kutta * facing,
+        "magnus": dense * magnus * volume,
+        "blunt": dense * (blunt - slender) * facing,
+        "slender": dense * slender * np.pi * large * middle,
+        "turning": columns(dense[..., None] * turning),
+        "viscous": viscosity * scale * 3 * np.pi * diameter,
+        "viscous_turning": viscosity * scale * np.pi * diameter**3,
+        "mass": columns(dense[..., None] * g[..., 6:9]),
+        "inertia": columns(dense[..., None] * g[..., 9:12]),
     }
 
 
-def ellipsoid(
-    v: Vec, w: Vec, k: dict[str, Any], density: float, viscosity: float, carried: bool
-) -> tuple[Vec, Vec]:
+def ellipsoid(v: Vec, w: Vec, k: dict[str, Any], carried: bool) -> tuple[Vec, Vec]:
     """MuJoCo's ellipsoid law for one geom, in its own frame.
 
     Source: MuJoCo documentation, Computation, "Ellipsoid model"; `mj_ellipsoidFluidModel`: blunt
@@ -160,8 +162,6 @@ def ellipsoid(
         v: velocity of the centre relative to the water [m/s].
         w: angular velocity [rad/s].
         k: constants from `ellipsoid_constants`.
-        density: [kg/m³].
-        viscosity: [Pa·s].
         carried: whether MuJoCo's virtual-mass terms are included (not when our own added mass is).
 
     Returns:
@@ -173,24 +173,24 @@ def ellipsoid(
     den = total(*[mul(a * a, x) for a, x in zip(k["areas"], squares, strict=True)])
     speed = safe_norm(v)
     moving = speed > 0
-    ratio = jnp.where(moving, den / jnp.maximum(num, tiny), 1.0)
-    projected = mul(k["project"], jnp.sqrt(ratio))
+    # The area that faces the flow, over the largest.
+    facing = jnp.sqrt(jnp.where(moving, den / jnp.maximum(num, tiny), 1.0))
     # As MuJoCo has it: the denominator is the normal's length squared, which scales `normal` below.
     normal = tuple(mul(a, x) for a, x in zip(k["areas"], v, strict=True))
     cosine = jnp.where(moving, num / jnp.maximum(speed * den, tiny), 0.0)
-    lift = vscale(mul(density * k["kutta"], cosine * projected), cross(cross(normal, v), v))
-    spin = vscale(density * k["magnus"], cross(w, v))
-    drag = add(
-        viscosity * k["viscous"],
-        density * speed * add(mul(k["blunt"], projected), k["slender"]),
-    )
-    moment = [mul(density * t, x) for t, x in zip(k["turning"], w, strict=True)]
-    turning = add(viscosity * k["viscous_turning"], safe_norm(tuple(moment)))
+    # (n × v) × v = (n · v) v - (v · v) n
+    square = total(*squares)
+    across = tuple(num * x - square * n for x, n in zip(v, normal, strict=True))
+    lift = vscale(mul(k["kutta"], cosine * facing), across)
+    spin = vscale(k["magnus"], cross(w, v))
+    drag = add(k["viscous"], speed * add(mul(k["blunt"], facing), k["slender"]))
+    moment = tuple(mul(t, x) for t, x in zip(k["turning"], w, strict=True))
+    turning = add(k["viscous_turning"], safe_norm(moment))
     force = tuple(total(a, b, neg(mul(drag, x))) for a, b, x in zip(lift, spin, v, strict=True))
     torque = tuple(neg(mul(turning, x)) for x in w)
     if carried:
-        momentum = tuple(mul(density * m, x) for m, x in zip(k["mass"], v, strict=True))
-        spin_momentum = tuple(mul(density * m, x) for m, x in zip(k["inertia"], w, strict=True))
+        momentum = tuple(mul(m, x) for m, x in zip(k["mass"], v, strict=True))
+        spin_momentum = tuple(mul(m, x) for m, x in zip(k["inertia"], w, strict=True))
         force = vadd(force, cross(momentum, w))
         torque = vadd(torque, vadd(cross(momentum, v), cross(spin_momentum, w)))
     return force, torque

@@ -296,9 +296,10 @@ def _drag(robot: Robot, rows: list[int], v: Vec, w: Vec) -> Vec:
             for module in modules
             for part in module.kind.parts
         ]
-        k = ellipsoid_constants(table.half_size[rows], model.geom_fluid[geoms][rows])
+        fluid = model.geom_fluid[geoms][rows]
+        k = ellipsoid_constants(table.half_size[rows], fluid, world.density, world.viscosity)
         k = jax.tree.map(lambda x: jnp.asarray(x)[:, None], k)
-        return ellipsoid(v, w, k, world.density, world.viscosity, not world.added_mass)[0]
+        return ellipsoid(v, w, k, not world.added_mass)[0]
     return (0.0, 0.0, 0.0)
 
 

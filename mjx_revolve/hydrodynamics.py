@@ -179,9 +179,7 @@ def _push(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Ve
         half = mul(0.5, slope)
         return vscale(share, force), vscale(share, torque), (half, half, half)
     if parts.drag == "ellipsoid":
-        force, torque = ellipsoid(
-            v, w, parts.ellipsoid, world.density, world.viscosity, not world.added_mass
-        )
+        force, torque = ellipsoid(v, w, parts.ellipsoid, not world.added_mass)
         return vscale(share, force), vscale(share, torque), None
     return _ZERO, _ZERO, None
 

@@ -237,7 +237,7 @@ def _body_padding(
 
 
 def _no_ellipsoid() -> dict[str, Any]:
-    return ellipsoid_constants(np.ones(3), np.zeros(12))
+    return ellipsoid_constants(np.ones(3), np.zeros(12), 0.0, 0.0)
 
 
 @dataclass(frozen=True)

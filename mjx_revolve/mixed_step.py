@@ -1,9 +1,10 @@
 """One step of a population in which every individual may have another body.
 
 The same physics as `dynamics`, from tables of numbers that differ from lane to lane
-(`menagerie.Bodies`). All that a body does by itself, water included, is computed for all rows at
-once; the three sweeps along the tree are loops over the rows with a short stack, so the program,
-and the time to compile it, do not grow with the trees.
+(`menagerie.Bodies`). What hinges do by themselves is computed for all rows at once; the three
+sweeps along the tree are loops over the rows with a short stack, so the program, and the time to
+compile it, do not grow with the trees. The water's part is in the loops, too: that of all rows at
+once would not fit into the first-level cache.
 """
 
 from __future__ import annotations
@@ -189,12 +190,14 @@ def _acceleration(
         root["axes"] = (turn_root[0], turn_root[1])
         root["place"] = tuple(state.position[:2])
     tables = {k: x for k, x in bodies.tables.items() if not k.startswith(ROOT)}
-    joint_tables = {k: x for k, x in tables.items() if k.startswith("joint.")}
+    joints = joint_of(shape, {k: x for k, x in tables.items() if k.startswith("joint.")})
+    turns, position = turn_hinges(joints, angle), joints.position
+    stop, stop_inertia = end_stop(joints, angle, speed, dt)
+    load = sub(stop, mul(joints.damping, speed))
+    inertia = add(joints.armature, add(mul(dt, joints.damping), stop_inertia))
 
     def down(stack: list[Any], row: Any) -> tuple[list[Any], Any]:
-        source, own, table, angle, speed, midway = row
-        joint = joint_of(shape, table)
-        turn, position = turn_hinges(joint, angle), joint.position
+        source, own, turn, position, speed, midway = row
         parent = _pick(stack, source)
         value: dict[str, Any] = {
             "rate": _child_rate(turn, position, parent["rate"], speed),
@@ -209,13 +212,11 @@ def _acceleration(
                 add(x, dot(axis, position))
                 for x, axis in zip(parent["place"], parent["axes"], strict=True)
             )
-        value, turn = _wide((value, turn), lanes, dtype)
-        return _put(stack, own, value), (value, turn)
+        value = _wide(value, lanes, dtype)
+        return _put(stack, own, value), value
 
     slots = (bodies.source, bodies.slot)
-    _, (motions, turns) = _sweep(
-        down, [root] * shape.slots, (*slots, joint_tables, angle, speed, midway)
-    )
+    _, motions = _sweep(down, [root] * shape.slots, (*slots, turns, position, speed, midway))
 
     def own_of(level: Level, motion: dict[str, Any]) -> Any:
         """Inertia and bias of a row or of the roots by themselves, `[lanes]` each."""
@@ -232,7 +233,8 @@ def _acceleration(
 
     def up(carry: Any, row: Any) -> tuple[Any, Any]:
         stack, power = carry
-        source, own_slot, inner, table, motion, turn, angle, speed, midway, target = row
+        source, own_slot, inner, table, motion, turn, load, inertia = row[:8]
+        angle, speed, midway, target = row[8:]
         # A slot that nobody has filled for this row holds what another row has left.
         summed = jax.tree.map(
             lambda a, b: a + jnp.where(inner, b, 0),
@@ -241,9 +243,6 @@ def _acceleration(
         )
         block, bias = _unflatten(summed, symmetric)
         joint = joint_of(shape, table)
-        stop, stop_inertia = end_stop(joint, angle, speed, dt)
-        load = sub(stop, mul(joint.damping, speed))
-        inertia = add(joint.armature, add(mul(dt, joint.damping), stop_inertia))
         motor, motor_inertia = servo(
             joint, angle, speed, target, dt,
             add(block.angular[2][2], inertia), sub(load, bias[0][2]),
@@ -262,7 +261,19 @@ def _acceleration(
     (stack, power), hinges = _sweep(
         up,
         ([empty] * shape.slots, jnp.zeros(lanes, dtype)),
-        (*slots, bodies.inner, tables, motions, turns, angle, speed, midway, targets),
+        (
+            *slots,
+            bodies.inner,
+            tables,
+            motions,
+            turns,
+            load,
+            inertia,
+            angle,
+            speed,
+            midway,
+            targets,
+        ),
         reverse=True,
     )
     # Nobody has written into slot 0 where the root has no children.
@@ -270,9 +281,9 @@ def _acceleration(
     angular, linear = solve_root(*_unflatten(whole, symmetric), symmetric)
 
     def out(stack: list[Any], row: Any) -> tuple[list[Any], Any]:
-        source, own, table, turn, rate, midway, hinge = row
+        source, own, turn, position, rate, midway, hinge = row
         row_a, row_l, inverse, rest = hinge
-        position, coriolis = joint_of(shape, table).position, _coriolis(rate, midway)
+        coriolis = _coriolis(rate, midway)
         above_a, above_l = _pick(stack, source)
         a = vadd(matTvec(turn, above_a), coriolis[0])
         b = vadd(matTvec(turn, vadd(above_l, cross(above_a, position))), coriolis[1])
@@ -284,7 +295,7 @@ def _acceleration(
     _, found = _sweep(
         out,
         [(angular, linear)] * shape.slots,
-        (*slots, joint_tables, turns, rate, midway, hinges),
+        (*slots, turns, position, rate, midway, hinges),
     )
     return linear, angular, found, power
 

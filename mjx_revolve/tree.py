@@ -522,7 +522,10 @@ def _group(
         laws = gather(lambda p, c: geom_fluid[p, :6], np.zeros(6))
         along, about = size(geom_fluid[:, 6:9]), size(geom_fluid[:, 9:])
         k = ellipsoid_constants(
-            size(table.half_size, np.ones(3)), np.concatenate([laws, along, about], -1)
+            size(table.half_size, np.ones(3)),
+            np.concatenate([laws, along, about], -1),
+            world.density,
+            world.viscosity,
         )
         ellipsoid = {
             name: tuple(fold(x[..., None]) for x in value)

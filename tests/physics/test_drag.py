@@ -114,9 +114,10 @@ def test_no_law_adds_energy():
     assert np.all(power(drag[:3], drag[3:], v, w) <= 0)
     force, torque = inertia_box(v, w, tuple(2 * half), RHO, 1e-3)
     assert np.all(power(force, torque, v, w) < 0)
-    constants = ellipsoid_constants(half, np.array([1.0, *ELLIPSOID_COEFFICIENTS, *[1e-5] * 6]))
+    coefficients = np.array([1.0, *ELLIPSOID_COEFFICIENTS, *[1e-5] * 6])
+    constants = ellipsoid_constants(half, coefficients, RHO, 1e-3)
     for carried in (False, True):
-        force, torque = ellipsoid(v, w, constants, RHO, 1e-3, carried)
+        force, torque = ellipsoid(v, w, constants, carried)
         assert np.all(power(force, torque, v, w) < 0)
     zero = (np.zeros(2000),) * 3
     for plate in (LiftDrag(), LiftDrag(a0=0.2, cda_stall=0.3, alpha_stall=0.4, cla_stall=-1.0)):
@@ -297,7 +298,7 @@ def test_mujoco_qfrc_passive(law, size):
         if law == "inertia_box":
             found = inertia_box(v, w, size, RHO, 0.3)
         else:
-            constants = ellipsoid_constants(np.array(size) / 2, model.geom_fluid[0])
-            found = ellipsoid(v, w, constants, RHO, 0.3, True)
+            constants = ellipsoid_constants(np.array(size) / 2, model.geom_fluid[0], RHO, 0.3)
+            found = ellipsoid(v, w, constants, True)
         found = np.concatenate([np.stack(x) for x in found])
     assert found == pytest.approx(expected, abs=1e-10 * np.abs(expected).max())
