@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import mujoco
 import numpy as np
@@ -28,6 +29,7 @@ from mjx_revolve.morphology import load_morphology
 from mjx_revolve.robot import build_robot
 from mjx_revolve.rollout import make_engine
 from mjx_revolve.terrain import Bed
+from references import clip_box
 
 NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 MUJOCO_LAWS = ["off", "inertia_box", "ellipsoid"]
@@ -109,6 +111,70 @@ def test_acceleration_of_the_spider_in_float64(drag):
     states = drawn(robot, 16)
     expected = mujoco_qacc(mujoco_model(robot, drag), *states)
     assert relative(accelerate(robot, *states), expected).max() < 1e-10
+
+
+LIMB = """
+body:
+  type: Core
+  children:
+    0: {type: FixedBrick}
+    1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {2: {type: FixedBrick}}}}}
+"""
+
+
+def slanted(text):
+    """A morphology whose modules are each turned by 20° more than the one before, any way round."""
+    morphology = read(text)
+    modules = []
+    for k, module in enumerate(morphology.modules):
+        turn, quat = np.zeros(9), np.zeros(4)
+        axis = np.array([1.0, 2.0, -2.0]) / 3
+        mujoco.mju_axisAngle2Quat(quat, axis, np.radians(20.0 * k))
+        mujoco.mju_quat2Mat(turn, quat)
+        rotation = module.rotation @ turn.reshape(3, 3)
+        modules.append(dataclasses.replace(module, rotation=rotation))
+    return dataclasses.replace(morphology, modules=tuple(modules))
+
+
+def test_slanted_modules_have_mujocos_water():
+    """Boxes that do not stand square on their bodies, and hinges that point anywhere."""
+    robot = stock(build_robot(slanted(LIMB), world(drag="ellipsoid", current=CURRENT)))
+    qpos, qvel, ctrl = drawn(robot, 8)
+    expected = mujoco_qacc(mujoco_model(robot, "ellipsoid"), qpos, qvel, ctrl)
+    assert np.all(relative(accelerate(robot, qpos, qvel, ctrl), expected) < 1e-10)
+
+
+def test_slanted_modules_have_our_water():
+    """A rigid body at the surface, its acceleration from the sum over its parts, in NumPy."""
+    rigid = LIMB.replace("ActiveHinge", "FixedBrick")
+    robot = build_robot(slanted(rigid), world(**WATER | {"added_mass": False}))
+    model, table, density = robot.mj_model, robot.fluid, robot.world.density
+    qpos, qvel = random_states(robot, 6)
+    qpos[2] = np.linspace(-0.06, 0.06, 6)
+    found, data = accelerate(robot, qpos, qvel), mujoco.MjData(model)
+    for lane in range(6):
+        data.qpos[:], data.qvel[:] = qpos[:, lane], qvel[:, lane]
+        mujoco.mj_forward(model, data)
+        force, mass = -data.qfrc_bias, np.zeros((6, 6))
+        mujoco.mj_fullM(model, data, mass)
+        for p, half in enumerate(table.half_size):
+            turn = data.xmat[1].reshape(3, 3)
+            place = data.xpos[1] + turn @ table.position[p]
+            axes = turn @ table.rotation[p]
+            jacobians = np.zeros((3, 6)), np.zeros((3, 6))
+            mujoco.mj_jac(model, data, *jacobians, place, 1)
+            v, w = (axes.T @ j @ qvel[:, lane] for j in jacobians)
+            center = table.center_of_volume[p]
+            share, moment = clip_box(axes[2], -(place + axes @ center)[2], half)
+            lift = density * 9.81 * table.volume[p] * axes[2]
+            push = share * (lift - density * table.drag_linear[p] * np.abs(v) * v)
+            twist = -share * density * table.drag_angular[p] * np.abs(w) * w
+            twist += np.cross(moment + share * center, lift)
+            force = force + jacobians[0].T @ axes @ push + jacobians[1].T @ axes @ twist
+        expected = np.linalg.solve(mass, force)
+        assert found[:, lane] == pytest.approx(
+            expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()
+        )
 
 
 def test_a_body_of_equal_siblings_in_a_vacuum():
