@@ -124,9 +124,9 @@ def roll_out(
     energy = jnp.zeros_like(engine.root(state)[0])
     carry = (state, drive_state, energy, jnp.zeros((), jnp.int32))
     first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)
-    pack = unpack = wrap = lambda x: x
+    pack = unpack = lambda x: x
     if mode == "fused":
-        step, pack, unpack, wrap = fused_scan(step, carry, first)
+        step, pack, unpack = fused_scan(step, carry, first)
     else:
         step = share_once(step)
         if mode == "derived":
@@ -144,13 +144,10 @@ def roll_out(
         state, _, energy, _ = unpack(packed)
         return packed, record(state, ctrl, energy)
 
-    def loop(carry: Any, inputs: Any) -> tuple[Any, Any]:
-        packed, kept = jax.lax.scan(block, pack(carry), inputs, length=records)
-        return unpack(packed)[0], kept
-
     if inputs is not None:
         inputs = jax.tree.map(lambda x: x.reshape(records, every, *x.shape[1:]), inputs)
-    return wrap(loop)(carry, inputs)
+    packed, kept = jax.lax.scan(block, pack(carry), inputs, length=records)
+    return unpack(packed)[0], kept
 
 
 def body_positions(robot: Robot, qpos: jax.Array) -> jax.Array:

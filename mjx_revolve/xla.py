@@ -9,9 +9,11 @@ their sake; tests/test_xla.py notices if they lose their effect; results do not 
 2. Each kernel that the loop runs costs about 300 ns to dispatch, more than the arithmetic on a
    chunk of 64 individuals. A call marked `xla_cpu_small_call` is compiled into one function:
    `small_call`. Inside it there is no scatter and no reduction: the population step writes sums
-   out. Compiling such a function takes time that grows with the square of its length, as LLVM
-   forgets all that it knows of the outermost loop with every inner loop that it turns: so long
-   steps are cut into several functions, and the loop stays outside (`fused_scan`).
+   out. Compiling such a function takes time that grows with the square of its length: so long
+   steps are cut into several functions. The loop over time stays outside (`fused_scan`): inside, it
+   would be a tenth faster, but LLVM takes twice as long, as it forgets all that it knows of it with
+   every inner loop that it turns, and XLA:CPU aborts over some ("All or none of the slices should
+   have an explicit index") where nothing else is around the function.
 
 Both are plain identities to JAX: jit, vmap and grad go through them. On other back ends they are
 left out.
@@ -36,11 +38,9 @@ LANES = 64
 # Least cost, in plain operations, at which storing and loading a value beats computing it twice.
 _WORTH = 4
 
-# Up to so many stored values, a step and the loops around it become one function ...
-_WHOLE = 500
-# ... and longer ones several functions of about so many each. Measured: half of that costs more in
+# A step becomes functions of about so many stored values each. Measured: half of that costs more in
 # calls than it saves in compilation, twice of it compiles for half as long again.
-_PIECE = 250
+_PIECE = 350
 
 # Operations that cost more than a plain one; views cost nothing.
 _COST = {"sqrt": 8, "rsqrt": 8, "div": 8, "tanh": 20, "exp": 15, "atan2": 40, "sin": 20, "cos": 20}
@@ -308,10 +308,8 @@ def _value(values: dict[int, Any], v: Any) -> Any:
 def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any) -> Any:
     """How to repeat a step of a chunk of a population fastest.
 
-    A short step's loop is compiled as one function, all around it. A long one is cut into several
-    functions, which a loop of XLA's own calls: 5 to 10 % slower, and quicker to compile by the
-    factors that docs/performance.md lists. There the carry travels as one array, because every
-    array that a loop carries costs as much as a call.
+    A step becomes one function, or several if it is long, which a loop of XLA's own calls. The
+    carry travels as one array, because every array that a loop carries costs as much as a call.
 
     Args:
         step: (carry, row) → (carry, output); element-wise. The carry's leaves are `[..., lanes]`
@@ -320,15 +318,12 @@ def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any
         row: likewise.
 
     Returns:
-        (step, pack, unpack, wrap): the step on packed carries; functions between carries and packed
-        ones; and what to wrap around the function that holds all loops.
+        (step, pack, unpack): the step on packed carries, and functions between carries and packed
+        ones.
     """
-    same = lambda x: x  # noqa: E731
     if not on_cpu():
-        return step, same, same, same
+        return step, lambda x: x, lambda x: x
     graph = Graph(step, (carry, row))
-    if graph.size <= _WHOLE:
-        return graph, same, same, small_call
     leaves, tree = jax.tree.flatten(carry)
     wide = [x.ndim > 0 for x in leaves]
     rows = np.cumsum([0] + [x.size // x.shape[-1] for x, w in zip(leaves, wide, strict=True) if w])
@@ -353,7 +348,7 @@ def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any
     def unpack_arguments(packed: Any, row: Any) -> Any:
         return unpack(packed), row
 
-    return graph.in_pieces(_PIECE, pack_result, unpack_arguments), pack, unpack, same
+    return graph.in_pieces(_PIECE, pack_result, unpack_arguments), pack, unpack
 
 
 def over_chunks(fun: Callable[..., Any], lanes: int | None = None) -> Callable[..., Any]:

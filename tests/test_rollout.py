@@ -105,8 +105,18 @@ def test_all_forms_of_joint_targets(elbow, still):
     assert clock.ctrl[:, 0] == pytest.approx(DT * np.arange(STEPS), abs=1e-7)
 
 
+def test_a_controller_in_a_vacuum_and_for_one_step(arm):
+    """The shortest programs: nothing of them may be left that XLA:CPU aborts over."""
+    controller = make_sine(arm)
+    genes = np.full(controller.num_genes, 0.3)
+    for steps in (1, 3):
+        trajectory = simulate(arm, bind_genes(controller, genes), steps * DT)
+        assert trajectory.qpos.shape[0] == steps and np.all(np.isfinite(trajectory.qpos))
+
+
 @pytest.mark.parametrize("make", [make_cpg, make_sine])
 def test_a_controller_with_its_genes(elbow, make):
+    """Played from its genes, without rows of controls (XLA:CPU has aborted over such a rollout)."""
     controller = make(elbow)
     genes = np.random.default_rng(3).normal(size=controller.num_genes)
     trajectory = simulate(elbow, bind_genes(controller, genes), SPAN)
