@@ -96,7 +96,7 @@ class ControllerConfig(Section):
     max_frequency: float = Field(2.0, gt=0, le=20)
     """The fastest oscillation [Hz]."""
     amplitude: float = Field(1.0, gt=0, le=1)
-    """The largest joint target, as a fraction of the hinge's range [-]."""
+    """Of each sine at most, as a fraction of the hinge's range, which clips their sum [-]."""
     harmonics: int = Field(1, ge=1, le=8)
     """How many sines add up at each hinge; `type: sine` only [-]."""
     gain: float = Field(2.0, gt=0)

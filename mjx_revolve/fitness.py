@@ -108,11 +108,13 @@ class Fitness:
             `[P]` scores and `[P]` measures (see `tasks.measure`), means over the episodes.
 
         Raises:
-            InputError: the population has another shape, or there are no genes to evolve.
+            InputError: the population has another shape, there are no genes to evolve, or the key
+                is none.
         """
         shape = jnp.shape(population)
         if len(shape) != 2 or shape[1] != self.num_genes or shape[0] < 1:
             raise InputError(f"population: expected [P, {self.num_genes}]; found {list(shape)}")
+        check_key(key)
         traced = any(isinstance(x, jax.core.Tracer) for x in (population, key))
         return (self._evaluate if traced else self._jitted)(jnp.asarray(population), key)
 
@@ -271,6 +273,20 @@ class Fitness:
             body.mass * max(world.gravity, 1e-9),
             _reach(self.config, self.robot),
         )
+
+
+def check_key(key: Any) -> None:
+    """Refuses what `jax.random` would not draw from, such as a bare seed.
+
+    Args:
+        key: from `jax.random.key`, or one of the older arrays of uint32.
+
+    Raises:
+        InputError: it is something else.
+    """
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not (jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32):
+        raise InputError(f"key: expected jax.random.key(SEED); found {key!r}")
 
 
 def draw_starts(

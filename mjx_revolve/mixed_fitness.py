@@ -22,6 +22,7 @@ from mjx_revolve.controllers import CONTROLLERS, decode_sine, step_sine
 from mjx_revolve.errors import InputError
 from mjx_revolve.fitness import (
     Fitness,
+    check_key,
     draw_gusts,
     draw_starts,
     farthest,
@@ -125,19 +126,29 @@ class MixedFitness:
             `[P]` scores and `[P]` measures, as `Fitness.evaluate` has them.
 
         Raises:
-            InputError: the numbers of bodies and of individuals differ, or a body does not fit.
+            InputError: the numbers of bodies and of individuals differ, a body does not fit or is
+                none, or the key is none.
         """
         population = jnp.asarray(population)
         if population.ndim != 2 or population.shape[1] != self.num_genes:
             raise InputError(
                 f"population: expected [P, {self.num_genes}]; found {list(population.shape)}"
             )
+        if not isinstance(robots, Bodies):
+            if len(robots) != len(population):
+                raise InputError(
+                    f"robots: expected {len(population)}, one each; found {len(robots)}"
+                )
+            for robot in robots:
+                if not isinstance(robot, Robot):
+                    raise InputError(
+                        f"robots: expected what `build` returns; found {type(robot).__name__}"
+                    )
+        check_key(key)
         traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((population, key)))
         run = self._evaluate if traced else self._jitted
         if isinstance(robots, Bodies):
             return run(robots, population, key)
-        if len(robots) != len(population):
-            raise InputError(f"robots: expected {len(population)}, one each; found {len(robots)}")
         if all(robot is robots[0] for robot in robots):
             single = self._alone(robots[0])
             return single.evaluate(self.own_genes(population, robots[0]), key)

@@ -345,8 +345,8 @@ def champion(record: RunRecord, replay: Replay) -> str:
         parts.append(picture(
             figure_svg(report_motion.plot_joints(replay)), "svg+xml",
             "Angle and target of each joint over time",
-            "Angle of each joint and the target that the controller sets; a servo has limited "
-            "speed and effort, so it lags behind.",
+            "Angle of each joint and the target that the controller sets; the servo clips targets "
+            "at the joint's range, and lags behind, as its speed and effort are limited.",
         ))  # fmt: skip
     if replay.phases is not None:
         parts.append(picture(
@@ -367,7 +367,7 @@ def champion(record: RunRecord, replay: Replay) -> str:
         "Power, energy and cost of transport over time",
         "Mechanical power at the servos, summed without sign, with what ideal propellers need; "
         "energy so far; cost of transport: energy over weight in air times net distance, from the "
-        f"end of the settling time ({replay.counted_from:.3g} s, dashed) on.",
+        f"first row of the track after the settling time ({replay.counted_from:.3g} s, dashed) on.",
     ))  # fmt: skip
     return "".join(parts)
 

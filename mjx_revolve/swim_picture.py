@@ -460,16 +460,48 @@ def _write(axes: Axes, spot: Sequence[float], words: str, **style: Any) -> Text:
 def _scale_bars(axes: Axes, panel: _Panel, swim: _Swim, places: _Places) -> None:
     """Bars of a round number of metres and of one body length, parallel to the way.
 
-    In a parallel projection they may lie anywhere: where the lower left corner is free.
+    In a parallel projection they may lie anywhere: where the lower left corner is free. If there is
+    no room for both, the first has to do, or a shorter one; over the robot they would be read
+    wrongly.
     """
     rounds = _round_values(0.0, swim.length, 4)
-    metres = float(rounds[rounds <= 1.001 * swim.length][-1])
-    sizes = ((metres, f"{metres:g} m"), (swim.length, f"1 body length ({swim.length:.2g} m)"))
+    metres = [float(x) for x in rounds[(rounds > 0) & (rounds <= 1.001 * swim.length)]]
+    bars = [(x, f"{x:g} m") for x in metres]
+    own = (swim.length, f"1 body length ({swim.length:.2g} m)")
     unit = np.subtract(*panel.pixels([[*swim.along, 0.0], [0.0, 0.0, 0.0]]))  # pixels per metre
+    for sizes in ((bars[-1], own), bars[-1:], bars[:1]):
+        marks = _scale_marks(axes, unit, sizes)
+        corners = np.concatenate(
+            [line for _, line in marks] + [places.extent(text) for text, _ in marks]
+        )
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        columns, rows = panel.size
+        # Columns first: better further right than up beside the robot.
+        spots = (
+            np.array([x, y]) for y in range(16, rows // 3, 8) for x in range(20, columns // 2, 24)
+        )
+        spot = next((s for s in spots if places.free(s, s + high - low, 8)), None)
+        if spot is None:
+            for text, _ in marks:
+                text.remove()
+            continue
+        shift = spot - low
+        places.take(low + shift, high + shift)
+        for text, line in marks:
+            text.set_position(np.asarray(text.get_position()) + shift)
+            axes.plot(*(line + shift).T, color=_INK, lw=1.8, solid_capstyle="butt",
+                      solid_joinstyle="miter", zorder=7)  # fmt: skip
+        return
+
+
+def _scale_marks(
+    axes: Axes, unit: np.ndarray, sizes: Sequence[tuple[float, str]]
+) -> list[tuple[Any, np.ndarray]]:
+    """Texts and lines of bars from a common origin; `unit` are pixels per metre, `[2]`."""
     angle = math.degrees(math.atan2(unit[1], unit[0]))
     ahead = unit / np.linalg.norm(unit)
     across = np.array([ahead[1], -ahead[0]])
-    marks = []  # of both bars from a common origin
+    marks = []
     for k, (size, label) in enumerate(sizes):
         start = 26 * k * across
         end = start + size * unit
@@ -478,19 +510,7 @@ def _scale_bars(axes: Axes, panel: _Panel, swim: _Swim, places: _Places) -> None
         tick = 5 * across
         line = np.array([start - tick, start + tick, start, end, end - tick, end + tick])
         marks.append((text, line))
-    columns, rows = panel.size
-    extents = [places.extent(text) for text, _ in marks]
-    corners = np.concatenate([line for _, line in marks] + extents)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    # Columns first: better further right than up beside the robot.
-    spots = [np.array([x, y]) for y in range(16, rows // 3, 8) for x in range(20, columns // 2, 24)]
-    free = (spot for spot in spots if places.free(spot, spot + high - low, 8))
-    shift = next(free, spots[0]) - low
-    places.take(low + shift, high + shift)
-    for text, line in marks:
-        text.set_position(np.asarray(text.get_position()) + shift)
-        axes.plot(*(line + shift).T, color=_INK, lw=1.8, solid_capstyle="butt",
-                  solid_joinstyle="miter", zorder=7)  # fmt: skip
+    return marks
 
 
 def _depth_scale(
@@ -656,7 +676,7 @@ def _facts(swim: _Swim) -> str:
     net = float(np.linalg.norm(swim.path[-1] - swim.path[0]))
     return (
         f"{net:.2g} m ({net / swim.length:.2g} body lengths) in "
-        f"{swim.time[-1] - swim.time[0]:.3g} s"
+        f"{swim.time[-1] - swim.time[0]:.3g} s, getting under way included"
     )
 
 

@@ -148,6 +148,8 @@ def test_mjx_scores_the_same(settings, population, scores):
 def test_wrong_populations_are_refused(fitness):
     with pytest.raises(InputError, match=r"population: expected \[P, 4\]; found \[3, 9\]"):
         fitness(jnp.zeros((3, 9)), KEY)
+    with pytest.raises(InputError, match=r"key: expected jax.random.key\(SEED\); found 1"):
+        fitness(jnp.zeros((3, 4)), 1)
 
 
 def track(x, z=None, clearance=1.0, start=0.0):

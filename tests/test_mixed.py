@@ -239,6 +239,10 @@ def test_what_it_cannot_do_is_refused_by_name(config, fitness):
             "robots: expected 2, one each; found 1",
         ),
         (
+            lambda: fitness([body("snake")], np.zeros((1, fitness.num_genes)), None),
+            "robots: expected what `build` returns; found Morphology",
+        ),
+        (
             lambda: fitness([], np.zeros((2, 3)), None),
             f"population: expected [P, {fitness.num_genes}]; found [2, 3]",
         ),

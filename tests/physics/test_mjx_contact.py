@@ -319,8 +319,11 @@ def test_a_core_lands_in_the_lake():
         assert clear.min() > -0.01
         assert abs(clear[-1]) < 5e-3
     assert np.abs(v[-1, :3, :3]).max() < 2e-3
-    # The last place is steeper than friction can hold.
-    assert np.linalg.norm(q[-1, :2, 3] - places[:, 3]) > 0.1
+    # Landed after 1.5 s, they stay; but the last place is steeper than friction can hold. How far
+    # that one slides, from dune to dune, depends on how it tumbled.
+    slid = np.linalg.norm(q[-1, :2] - q[75, :2], axis=0)
+    assert np.all(slid[:3] < 1e-3)
+    assert slid[3] > 0.02
 
 
 @pytest.mark.slow
