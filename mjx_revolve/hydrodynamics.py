@@ -185,10 +185,12 @@ def _push(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Ve
 
 
 def _twist(
-    parts: Parts, spin: Vec, share: Scalar, gather: Callable[[Scalar], Scalar]
+    parts: Parts, w: Vec, share: Scalar, gather: Callable[[Scalar], Scalar]
 ) -> tuple[Vec, Sym]:
-    """Torque of the faces' drag against turning on each body, and its damping, body frame."""
-    w = matTvec(parts.rotation, spin)
+    """Torque of the faces' drag against turning on each body, and its damping, body frame.
+
+    `w` is the angular velocity, part frame.
+    """
     strength = tuple(mul(c, share) for c in parts.drag_angular)
     together = not any(map(_of_parts, w))
     if together:  # all parts turn alike about their own axes
@@ -289,11 +291,11 @@ def _water_on_parts(
         torque, force = vadd(torque, righting), vadd(force, lift)
     resisting = None
     if damping is not None:
-        d = damping
-        linear = rotate_sym(parts.rotation, (d[0], 0.0, 0.0, d[1], 0.0, d[2]))
+        x, y, z = damping
+        linear = rotate_sym(parts.rotation, (x, 0.0, 0.0, y, 0.0, z))
         one = shift_inertia(linear, (0.0,) * 6, parts.position)
         # No plate knows drag against turning; without one, a free plate spins up for ever.
-        twist, turning = _twist(parts, motion.spin, share, gather)
+        twist, turning = _twist(parts, w, share, gather)
         torque = vadd(torque, twist)
         resisting = SpatialInertia(
             vadd(tuple(map(gather, one.angular)), turning),

@@ -73,7 +73,6 @@ _PART_PADDING: dict[str, Any] = {
     "position": (0.0, 0.0, 0.0),
     "rotation": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "half_size": (1.0, 1.0, 1.0),
-    "center": (0.0, 0.0, 0.0),
     "center_position": (0.0, 0.0, 0.0),
     "volume": 0.0,
     "exposed": (0.0, 0.0, 0.0),
@@ -426,7 +425,7 @@ def fit_shape(
 def _harmless(key: str) -> bool:
     """Whether padding and riders may have any value there, because others make them idle."""
     owner, _, field = key.removeprefix(ROOT).partition(".")
-    idle = {"position", "rotation", "half_size", "center", "center_position"}
+    idle = {"position", "rotation", "half_size", "center_position"}
     if owner == "joint":
         return field.partition(".")[0] not in {"armature", "rotation", "offset", "position"}
     return owner.startswith("parts/") and field.partition(".")[0] in idle

@@ -190,7 +190,7 @@ def _acceleration(
         root["axes"] = (turn_root[0], turn_root[1])
         root["place"] = tuple(state.position[:2])
     tables = {k: x for k, x in bodies.tables.items() if not k.startswith(ROOT)}
-    joints = joint_of(shape, {k: x for k, x in tables.items() if k.startswith("joint.")})
+    joints = joint_of(shape, tables)
     turns, position = turn_hinges(joints, angle), joints.position
     stop, stop_inertia = end_stop(joints, angle, speed, dt)
     load = sub(stop, mul(joints.damping, speed))

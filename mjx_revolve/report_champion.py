@@ -17,8 +17,7 @@ from mjx_revolve.fitness import Fitness
 from mjx_revolve.loop import replay_key
 from mjx_revolve.report_data import RunRecord, number
 from mjx_revolve.rollout import Trajectory
-from mjx_revolve.tasks import Track, measure
-from mjx_revolve.terrain import bed_height
+from mjx_revolve.scoring import first_counted, judge_tracks
 
 # A replay further than this from the recorded mean is another swim: standard deviations over the
 # fresh starts, and a share of the score itself where those hardly differ.
@@ -108,7 +107,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
     )
     _compare(record, score)
     interval = fitness.record_every * fitness.robot.world.timestep
-    start = interval * (1 + _first(fitness, fitness.num_records))
+    start = interval * (1 + first_counted(fitness.config.task, fitness.robot.world.timestep))
     return Replay(episode, score, measures, start, phases)
 
 
@@ -153,36 +152,23 @@ def judge(
     return float(score[0]), {name: float(value[0]) for name, value in measures.items()}
 
 
-def _first(fitness: Fitness, records: int) -> int:
-    """The record at which the task begins to count; the first record is one interval late."""
-    interval = fitness.record_every * fitness.robot.world.timestep
-    return min(round(fitness.config.task.settle / interval), records - 2)
-
-
 @lru_cache(maxsize=8)
 def _judge(fitness: Fitness) -> Any:
     """The task and the measures of one lane, compiled once for all runs of a configuration."""
     task, world, robot = fitness.config.task, fitness.robot.world, fitness.robot
-    interval = fitness.record_every * world.timestep
 
     def run(position: jax.Array, energy: jax.Array, start_height: jax.Array) -> Any:
-        first = _first(fitness, position.shape[0])
-        kept = position[first:, :, None]
-        clearance = jnp.full_like(kept[:, 0], jnp.inf)
-        if world.bed is not None:
-            clearance = kept[:, 2] - bed_height(world.bed, kept[:, 0], kept[:, 1])
-        track = Track(
-            position=kept,
-            clearance=clearance,
-            energy=energy[first:, None],
-            interval=interval,
-            start_height=start_height,
-            length=robot.morphology.length,
-            weight=robot.morphology.mass * max(world.gravity, 1e-9),
-            surface_height=world.surface_height,
+        body = robot.morphology
+        return judge_tracks(
+            task,
+            fitness.task,
+            world,
+            position[..., None],
+            energy[:, None],
+            start_height,
+            body.length,
+            body.mass * max(world.gravity, 1e-9),
         )
-        measures = measure(track)
-        return fitness.task(track, task) - task.energy_weight * measures["energy_j"], measures
 
     return jax.jit(run)
 

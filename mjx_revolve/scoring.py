@@ -70,6 +70,56 @@ def list_episodes(population: int, trials: int) -> tuple[jax.Array, jax.Array]:
     return lane // trials, lane % trials
 
 
+def first_counted(task: TaskConfig, timestep: float) -> int:
+    """The row of a track at which the task begins to count; row 0 is one interval late."""
+    every, rows = sample_rows(task, timestep)
+    return min(round(task.settle / (every * timestep)), rows - 2)
+
+
+def judge_tracks(
+    task: TaskConfig,
+    score_track: Callable[[Track, TaskConfig], jax.Array],
+    world: World,
+    position: jax.Array,
+    energy: jax.Array,
+    start_height: jax.Array,
+    length: Any,
+    weight: Any,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """What a task says of tracks, blown up or not; arguments as of `score_episodes`.
+
+    Args:
+        task: what they are about.
+        score_track: from `tasks.find_task`.
+        world: the world.
+        position: `[S, 3, lanes]` of the core, world frame [m].
+        energy: `[S, lanes]` since the row before [J].
+        start_height: `[lanes]` z of the core at the start [m].
+        length: body length, a number or `[lanes]` [m].
+        weight: in air, likewise [N].
+
+    Returns:
+        `[lanes]` scores, and `[lanes]` measures (see `tasks.measure`).
+    """
+    first = first_counted(task, world.timestep)
+    kept = position[first:]
+    clearance = jnp.full_like(kept[:, 0], jnp.inf)
+    if world.bed is not None:
+        clearance = kept[:, 2] - bed_height(world.bed, kept[:, 0], kept[:, 1])
+    track = Track(
+        position=kept,
+        clearance=clearance,
+        energy=energy[first:],
+        interval=sample_rows(task, world.timestep)[0] * world.timestep,
+        start_height=start_height,
+        length=length,
+        weight=weight,
+        surface_height=world.surface_height,
+    )
+    measures = measure(track)
+    return score_track(track, task) - task.energy_weight * measures["energy_j"], measures
+
+
 def score_episodes(
     task: TaskConfig,
     score_track: Callable[[Track, TaskConfig], jax.Array],
@@ -98,25 +148,9 @@ def score_episodes(
     Returns:
         The scores.
     """
-    every, rows = sample_rows(task, world.timestep)
-    interval = every * world.timestep
-    first = min(round(task.settle / interval), rows - 2)
-    kept = position[first:]
-    clearance = jnp.full_like(kept[:, 0], jnp.inf)
-    if world.bed is not None:
-        clearance = kept[:, 2] - bed_height(world.bed, kept[:, 0], kept[:, 1])
-    track = Track(
-        position=kept,
-        clearance=clearance,
-        energy=energy[first:],
-        interval=interval,
-        start_height=start[2],
-        length=length,
-        weight=weight,
-        surface_height=world.surface_height,
+    score, measures = judge_tracks(
+        task, score_track, world, position, energy, start[2], length, weight
     )
-    measures = measure(track)
-    score = score_track(track, task) - task.energy_weight * measures["energy_j"]
     away = jnp.max(jnp.abs(position - start), (0, 1))
     # Written so that NaN counts as too far.
     sane = jnp.isfinite(score) & (away < farthest)

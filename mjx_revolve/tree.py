@@ -50,7 +50,6 @@ class Parts:
     position: Vec
     rotation: Mat
     half_size: Vec
-    center: Vec
     center_position: Vec
     volume: Scalar
     exposed: Vec
@@ -505,9 +504,6 @@ def _group(
         t = turn(p, c)
         return t if _is_permutation(t) else np.eye(3)
 
-    def vector(field: np.ndarray) -> np.ndarray:
-        return gather(lambda p, c: swap(p, c) @ field[p], zero3)
-
     def size(field: np.ndarray, empty: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
         """What a part has along each of its axes, either way."""
         return gather(lambda p, c: np.abs(swap(p, c)) @ field[p], np.asarray(empty))
@@ -540,7 +536,6 @@ def _group(
         position=_vec(gather(lambda p, c: c.T @ table.position[p], zero3)),
         rotation=_mat(gather(lambda p, c: turn(p, c) @ swap(p, c).T, eye)),
         half_size=_vec(size(table.half_size, np.ones(3))),
-        center=_vec(vector(table.center_of_volume)),
         center_position=_vec(gather(centre, zero3)),
         volume=_num(gather(lambda p, c: table.volume[p], 0.0)),
         exposed=_vec(size(table.exposed)),
@@ -553,7 +548,7 @@ def _group(
         plate_area=_num(gather(lambda p, c: table.plate_area[p], 0.0)),
         plate_forward=_vec(gather(lambda p, c: swap(p, c) @ table.plate_forward[p], eye[0])),
         plate_upward=_vec(gather(lambda p, c: swap(p, c) @ table.plate_upward[p], eye[2])),
-        plate_center=_vec(vector(table.plate_center)),
+        plate_center=_vec(gather(lambda p, c: swap(p, c) @ table.plate_center[p], zero3)),
         ellipsoid=ellipsoid,
     )
 
