@@ -28,8 +28,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from experiments.common import ROOT, align, make_folder, make_parser, shown
-from mjx_revolve.commands import run_command, whole
-from mjx_revolve.errors import InputError
+from mjx_revolve.inputs.commands import run_command, whole
+from mjx_revolve.inputs.errors import InputError
 
 # Longest wait for an answer [s]; 256 bodies are built, and the largest compile, in two minutes.
 _PATIENCE = 600.0
@@ -401,7 +401,7 @@ def parts_table(results: Sequence[Result]) -> str:
 
 def describe_machine() -> dict[str, Any]:
     """Processor, cores, memory and versions; no names and no paths."""
-    from mjx_revolve.runtime import describe_process
+    from mjx_revolve.numerics.runtime import describe_process
 
     known = describe_process()
     return {

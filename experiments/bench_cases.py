@@ -98,8 +98,8 @@ def make_evaluation(job: dict[str, Any]) -> Case:
 
 def make_generation(job: dict[str, Any]) -> Case:
     """A whole generation of the evolution loop on all cores: ask, evaluate, tell, what it keeps."""
-    from mjx_revolve.loop import evolve
-    from mjx_revolve.pool import make_pool
+    from mjx_revolve.evolution.loop import evolve
+    from mjx_revolve.evolution.pool import make_pool
 
     pool = make_pool(_config(job))
     generations = evolve(pool.config.evolution, pool)
@@ -135,9 +135,9 @@ def make_bare(job: dict[str, Any]) -> Case:
     import jax
     import jax.numpy as jnp
 
-    from mjx_revolve.rollout import flow_at, roll_out
-    from mjx_revolve.water import water_of
-    from mjx_revolve.xla import compiler_options, over_chunks
+    from mjx_revolve.episodes.rollout import flow_at, roll_out
+    from mjx_revolve.numerics.xla import compiler_options, over_chunks
+    from mjx_revolve.water.flow import water_of
 
     fitness = _fitness(job)
     robot, engine = fitness.robot, fitness.engine
@@ -174,8 +174,8 @@ def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
     import numpy as np
 
     from mjx_revolve import build_robot, load_morphology, load_world
-    from mjx_revolve.fitness import reach_below
-    from mjx_revolve.terrain import bed_height
+    from mjx_revolve.episodes.fitness import reach_below
+    from mjx_revolve.water.bed import bed_height
 
     fields = dict(PHYSICS[job["physics"]])
     world = load_world(fields.pop("name"), **fields)
@@ -352,8 +352,8 @@ def main() -> int:
 
     if job.get("core") is not None:
         os.sched_setaffinity(0, {job["core"]})
-    from mjx_revolve.errors import InputError
-    from mjx_revolve.runtime import prepare_process
+    from mjx_revolve.inputs.errors import InputError
+    from mjx_revolve.numerics.runtime import prepare_process
 
     began = time.perf_counter()
     prepare_process()

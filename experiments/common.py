@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjx_revolve.commands import Parser
-from mjx_revolve.errors import InputError
+from mjx_revolve.inputs.commands import Parser
+from mjx_revolve.inputs.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 

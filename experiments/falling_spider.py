@@ -20,9 +20,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from experiments.common import ROOT, align, make_folder, make_parser, shown
-from mjx_revolve.commands import run_command
-from mjx_revolve.errors import InputError
-from mjx_revolve.plots import figure_png
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.plots import figure_png
 
 DROP = 0.25  # height of the release above the surface [m]
 ROW = 0.2  # time between two rows of the thesis's data, by its own account [s]
@@ -499,7 +499,7 @@ def main(argv: list[str] | None = None) -> int:
         raise InputError(f"--data: expected air_heights.txt and water_heights.txt in {source}")
     folder = make_folder(options.out, "falling_spider")
 
-    from mjx_revolve.runtime import prepare_process
+    from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
     still = read_tables()

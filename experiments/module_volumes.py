@@ -2,8 +2,8 @@
 
 ``python -m experiments.module_volumes``
 
-The meshes of `mjx_revolve.shapes` are drawn to enclose the tabulated volumes, so the first table is
-a check of the whole way (shape, closed surface, signed tetrahedra) and not an independent
+The meshes of `mjx_revolve.body.solids` are drawn to enclose the tabulated volumes, so the first
+table is a check of the whole way (shape, closed surface, signed tetrahedra) and not an independent
 measurement of RoboGen's printed parts, whose files are not ours to ship.
 """
 
@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_revolve.meshes import Mesh, check_mesh, mesh_center_of_volume, mesh_volume
-from mjx_revolve.modules import MODULES
-from mjx_revolve.shapes import part_mesh
+from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.meshes import Mesh, check_mesh, mesh_center_of_volume, mesh_volume
+from mjx_revolve.body.solids import part_mesh
 
 # Table 1 of the thesis as Revolve's code has it (the thesis prints the two hinge masses the other
 # way round): mesh volume [m³], mass [kg].
@@ -30,7 +30,7 @@ def printed_volume(mesh: Mesh, shift: tuple[float, float, float] = (0.0, 0.0, 0.
     """Volume by the formula as the thesis prints it, with x1 y2 z2 for x1 y2 z3 [m³].
 
     Args:
-        mesh: as for `mjx_revolve.meshes.mesh_volume`.
+        mesh: as for `mjx_revolve.body.meshes.mesh_volume`.
         shift: moves the mesh first [m]; a volume would not change.
     """
     vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common import ROOT, align, make_folder, make_parser, shown
-from mjx_revolve.commands import run_command, whole
+from mjx_revolve.inputs.commands import run_command, whole
 
 SEED = 0
 # Genes are angles that the controllers fold by a sine; beyond this, values repeat.
@@ -240,7 +240,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     folder = make_folder(options.out, "optimisers")
 
-    from mjx_revolve.runtime import prepare_process
+    from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
     outcomes, still = optimise(options.evaluations)

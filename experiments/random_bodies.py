@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
-from mjx_revolve.errors import InputError
-from mjx_revolve.modules import MODULES
-from mjx_revolve.morphology import Morphology, load_morphology
+from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.morphology import Morphology, load_morphology
+from mjx_revolve.inputs.errors import InputError
 
 
 def random_body(seed: int, hinges: int, bricks: int | None = None) -> Morphology:

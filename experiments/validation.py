@@ -14,8 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from experiments.common import align, make_folder, make_parser, shown
-from mjx_revolve.commands import run_command
-from mjx_revolve.plots import figure_png
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.view.plots import figure_png
 
 HEADINGS = ("case", "quantity", "expected", "found", "error", "tolerance", "unit", "")
 
@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     folder = make_folder(options.out, "validation")
 
-    from mjx_revolve.runtime import prepare_process
+    from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
     from experiments.validation_cases import CASES, QUICK_CASES

@@ -17,17 +17,22 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from experiments.common import ROOT
-from mjx_revolve.buoyancy import submersion
-from mjx_revolve.drag import ELLIPSOID_COEFFICIENTS, ellipsoid, ellipsoid_constants, inertia_box
-from mjx_revolve.dynamics import acceleration
-from mjx_revolve.lift_drag import LiftDrag, lift_drag
-from mjx_revolve.module_types import Box, ModuleType, Part, Thruster
-from mjx_revolve.morphology import Module, Morphology, load_morphology
-from mjx_revolve.robot import Robot, build_robot
-from mjx_revolve.rollout import flow_at, make_engine, roll_out, simulate
-from mjx_revolve.water import gust_path, water_of
-from mjx_revolve.world import World, load_world
-from mjx_revolve.xla import on_cpu
+from mjx_revolve.body.module_types import Box, ModuleType, Part, Thruster
+from mjx_revolve.body.morphology import Module, Morphology, load_morphology
+from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.engine.step import acceleration
+from mjx_revolve.episodes.rollout import flow_at, make_engine, roll_out, simulate
+from mjx_revolve.numerics.xla import on_cpu
+from mjx_revolve.water.buoyancy import submersion
+from mjx_revolve.water.drag import (
+    ELLIPSOID_COEFFICIENTS,
+    ellipsoid,
+    ellipsoid_constants,
+    inertia_box,
+)
+from mjx_revolve.water.flow import gust_path, water_of
+from mjx_revolve.water.lift_drag import LiftDrag, lift_drag
+from mjx_revolve.water.world import World, load_world
 
 RHO, G = 999.1026, 9.81
 # Nothing but inertia: what a case does not name is off.

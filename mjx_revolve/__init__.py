@@ -12,47 +12,47 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _WHERE = {
-    "InputError": "errors",
-    "load_config": "config",
-    "load_modules": "modules",
-    "MODULES": "modules",
-    "THESIS_MODULES": "modules",
-    "load_morphology": "morphology",
-    "save_morphology": "morphology",
-    "trim_neutral": "morphology",
-    "load_world": "world",
-    "make_world": "world",
-    "build_robot": "robot",
-    "export_mjcf": "robot",
-    "make_cpg": "controllers",
-    "make_sine": "controllers",
-    "bind_genes": "controllers",
-    "simulate": "rollout",
-    "make_fitness": "fitness",
-    "make_mixed_fitness": "mixed_fitness",
+    "InputError": "inputs.errors",
+    "load_config": "episodes.config",
+    "load_modules": "body.catalogue",
+    "MODULES": "body.catalogue",
+    "THESIS_MODULES": "body.catalogue",
+    "load_morphology": "body.morphology",
+    "save_morphology": "body.morphology",
+    "trim_neutral": "body.morphology",
+    "load_world": "water.world",
+    "make_world": "water.world",
+    "build_robot": "engine.robot",
+    "export_mjcf": "engine.robot",
+    "make_cpg": "control.controllers",
+    "make_sine": "control.controllers",
+    "bind_genes": "control.controllers",
+    "simulate": "episodes.rollout",
+    "make_fitness": "episodes.fitness",
+    "make_mixed_fitness": "episodes.mixed_fitness",
 }
 
 __all__ = ["__version__", *sorted(_WHERE)]
 
 if TYPE_CHECKING:
-    from mjx_revolve.config import load_config as load_config
-    from mjx_revolve.controllers import bind_genes as bind_genes
-    from mjx_revolve.controllers import make_cpg as make_cpg
-    from mjx_revolve.controllers import make_sine as make_sine
-    from mjx_revolve.errors import InputError as InputError
-    from mjx_revolve.fitness import make_fitness as make_fitness
-    from mjx_revolve.mixed_fitness import make_mixed_fitness as make_mixed_fitness
-    from mjx_revolve.modules import MODULES as MODULES
-    from mjx_revolve.modules import THESIS_MODULES as THESIS_MODULES
-    from mjx_revolve.modules import load_modules as load_modules
-    from mjx_revolve.morphology import load_morphology as load_morphology
-    from mjx_revolve.morphology import save_morphology as save_morphology
-    from mjx_revolve.morphology import trim_neutral as trim_neutral
-    from mjx_revolve.robot import build_robot as build_robot
-    from mjx_revolve.robot import export_mjcf as export_mjcf
-    from mjx_revolve.rollout import simulate as simulate
-    from mjx_revolve.world import load_world as load_world
-    from mjx_revolve.world import make_world as make_world
+    from mjx_revolve.body.catalogue import MODULES as MODULES
+    from mjx_revolve.body.catalogue import THESIS_MODULES as THESIS_MODULES
+    from mjx_revolve.body.catalogue import load_modules as load_modules
+    from mjx_revolve.body.morphology import load_morphology as load_morphology
+    from mjx_revolve.body.morphology import save_morphology as save_morphology
+    from mjx_revolve.body.morphology import trim_neutral as trim_neutral
+    from mjx_revolve.control.controllers import bind_genes as bind_genes
+    from mjx_revolve.control.controllers import make_cpg as make_cpg
+    from mjx_revolve.control.controllers import make_sine as make_sine
+    from mjx_revolve.engine.robot import build_robot as build_robot
+    from mjx_revolve.engine.robot import export_mjcf as export_mjcf
+    from mjx_revolve.episodes.config import load_config as load_config
+    from mjx_revolve.episodes.fitness import make_fitness as make_fitness
+    from mjx_revolve.episodes.mixed_fitness import make_mixed_fitness as make_mixed_fitness
+    from mjx_revolve.episodes.rollout import simulate as simulate
+    from mjx_revolve.inputs.errors import InputError as InputError
+    from mjx_revolve.water.world import load_world as load_world
+    from mjx_revolve.water.world import make_world as make_world
 
 
 def __getattr__(name: str) -> Any:

@@ -4,7 +4,7 @@
     python -m mjx_revolve.evolve --resume DIR
 
 The population is spread over this host's cores, and over several hosts where `--hosts` says so (see
-`mjx_revolve.pool` and `mjx_revolve.hosts`); results do not depend on it.
+`mjx_revolve.evolution.pool` and `mjx_revolve.evolution.hosts`); results do not depend on it.
 
 Heavy imports stand inside functions: thread settings must be made before NumPy and JAX are loaded.
 """
@@ -23,8 +23,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_revolve import runtime
-from mjx_revolve.commands import (
+from mjx_revolve.evolution.crew import WorkerError
+from mjx_revolve.evolution.fingerprints import FREE_SETTINGS, model_hash, settings_hash
+from mjx_revolve.evolution.hosts import parse_place, parse_workers, serve
+from mjx_revolve.evolution.progress import Progress
+from mjx_revolve.inputs.commands import (
     Parser,
     check_place,
     describe_refusal,
@@ -32,20 +35,17 @@ from mjx_revolve.commands import (
     read_seed,
     run_command,
 )
-from mjx_revolve.crew import WorkerError
-from mjx_revolve.errors import InputError
-from mjx_revolve.fingerprints import FREE_SETTINGS, model_hash, settings_hash
-from mjx_revolve.hosts import parse_place, parse_workers, serve
-from mjx_revolve.own_code import content_name
-from mjx_revolve.progress import Progress
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
-    from mjx_revolve.config import Config
-    from mjx_revolve.hosts import Place
-    from mjx_revolve.loop import Champion, Search
-    from mjx_revolve.pool import Pool
-    from mjx_revolve.runs import Checkpoint, Run
-    from mjx_revolve.tensorboard import TensorBoardLog
+    from mjx_revolve.episodes.config import Config
+    from mjx_revolve.evolution.hosts import Place
+    from mjx_revolve.evolution.loop import Champion, Search
+    from mjx_revolve.evolution.pool import Pool
+    from mjx_revolve.evolution.runs import Checkpoint, Run
+    from mjx_revolve.evolution.tensorboard import TensorBoardLog
 
 # What the bits of a run depend on, besides its configuration.
 _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
@@ -199,9 +199,9 @@ def _seed_setting(arguments: argparse.Namespace) -> list[str]:
 
 def _begin(arguments: argparse.Namespace, make_fitness: Callable) -> tuple[Run, Config, Any, None]:
     """A new run."""
-    from mjx_revolve.config import load_config
-    from mjx_revolve.runs import check_new_folder, create_run
-    from mjx_revolve.tensorboard import check_tensorboard
+    from mjx_revolve.episodes.config import load_config
+    from mjx_revolve.evolution.runs import check_new_folder, create_run
+    from mjx_revolve.evolution.tensorboard import check_tensorboard
 
     if arguments.config is None:
         raise InputError("expected a CONFIG, or --resume DIR; found neither")
@@ -214,7 +214,7 @@ def _begin(arguments: argparse.Namespace, make_fitness: Callable) -> tuple[Run, 
     check_place(folder / "any", f"--out {folder}")
     fitness = make_fitness(config)
     # Not before: workers compile while evosax is imported, which takes a while.
-    from mjx_revolve.strategies import make_strategy
+    from mjx_revolve.evolution.strategies import make_strategy
 
     try:
         make_strategy(config.evolution, fitness.num_genes)
@@ -253,9 +253,9 @@ def _continue(
     arguments: argparse.Namespace, make_fitness: Callable
 ) -> tuple[Run, Config, Any, Checkpoint]:
     """A run that was stopped."""
-    from mjx_revolve.config import load_config, override_config
-    from mjx_revolve.runs import open_run
-    from mjx_revolve.tensorboard import check_tensorboard
+    from mjx_revolve.episodes.config import load_config, override_config
+    from mjx_revolve.evolution.runs import open_run
+    from mjx_revolve.evolution.tensorboard import check_tensorboard
 
     label = f"--resume {arguments.resume}"
     if arguments.out is not None:
@@ -329,7 +329,7 @@ def _save_body(run: Run, fitness: Any) -> None:
 
 def _open_log(run: Run, done: int) -> TensorBoardLog:
     """TensorBoard's copy of the metrics."""
-    from mjx_revolve.tensorboard import TensorBoardLog
+    from mjx_revolve.evolution.tensorboard import TensorBoardLog
 
     table = run.load_metrics() if done else {}
     rows = [dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True)]
@@ -342,8 +342,8 @@ def _evolve(run: Run, config: Config, fitness: Any, begin: Search | None, stop: 
     Raises:
         WorkerError: a worker died or hangs; what was done until then is saved.
     """
-    from mjx_revolve.loop import evolve, start_search
-    from mjx_revolve.strategies import make_strategy
+    from mjx_revolve.evolution.loop import evolve, start_search
+    from mjx_revolve.evolution.strategies import make_strategy
 
     evolution = config.evolution
     search = begin
@@ -379,7 +379,7 @@ def _evolve(run: Run, config: Config, fitness: Any, begin: Search | None, stop: 
 
 def _save(run: Run, config: Config, fitness: Any, search: Search) -> None:
     """A checkpoint, and the champion so far."""
-    from mjx_revolve.loop import search_to_arrays
+    from mjx_revolve.evolution.loop import search_to_arrays
 
     arrays, meta = search_to_arrays(config.evolution, search), _checkpoint_meta(config, fitness)
     run.save_checkpoint(search.generation, arrays, meta, config.evolution.keep_checkpoints)
@@ -393,9 +393,9 @@ def _save(run: Run, config: Config, fitness: Any, search: Search) -> None:
 
 def _finish(run: Run, config: Config, fitness: Any, search: Search) -> None:
     """Chooses the champion, draws the pictures, and says what came out."""
-    from mjx_revolve import plots
-    from mjx_revolve.loop import REPORT_EPISODES, choose_champion
-    from mjx_revolve.tasks import score_unit
+    from mjx_revolve.episodes.tasks import score_unit
+    from mjx_revolve.evolution.loop import REPORT_EPISODES, choose_champion
+    from mjx_revolve.view import plots
 
     champion = choose_champion(config.evolution, fitness, search)
     facts = _champion_facts(config, champion)
@@ -415,7 +415,7 @@ def _finish(run: Run, config: Config, fitness: Any, search: Search) -> None:
         figure = plots.plot_trajectory(trajectory, height, title)
         run.write("trajectory.png", plots.figure_png(figure))
         if robot is not None:
-            from mjx_revolve.swim_picture import plot_swim
+            from mjx_revolve.view.swim_picture import plot_swim
 
             run.write("swim.png", plots.figure_png(plot_swim(robot, trajectory)))
     run.update_info(finished=_now(), generations=search.generation, champion=facts)
@@ -475,7 +475,7 @@ def _lead(
     """A whole run; `open_pools` ends its workers."""
 
     def make(config: Config) -> Pool:
-        from mjx_revolve.pool import make_pool
+        from mjx_revolve.evolution.pool import make_pool
 
         return open_pools.enter_context(make_pool(config, workers, make_fitness, place))
 
@@ -511,7 +511,7 @@ def _lead(
 
 def _work(run: Run, config: Config, fitness: Any, checkpoint: Checkpoint | None) -> int:
     """Everything after the arguments are known to be right."""
-    from mjx_revolve.loop import search_from_arrays
+    from mjx_revolve.evolution.loop import search_from_arrays
 
     search = None
     if checkpoint is not None:

@@ -15,8 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_revolve import runtime
-from mjx_revolve.commands import (
+from mjx_revolve.inputs.commands import (
     Parser,
     add_episode_arguments,
     check_episode_path,
@@ -24,12 +23,13 @@ from mjx_revolve.commands import (
     read_path,
     run_command,
 )
-from mjx_revolve.errors import InputError
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
-    from mjx_revolve.episode import Episode
-    from mjx_revolve.robot import Robot
-    from mjx_revolve.rollout import Trajectory
+    from mjx_revolve.engine.robot import Robot
+    from mjx_revolve.episodes.champion import Episode
+    from mjx_revolve.episodes.rollout import Trajectory
 
 # Formats: what their files are called in a folder, and what they may end in.
 _FILES = {"mjcf": "robot.xml", "urdf": "robot.urdf", "sdf": "robot.sdf", "mcap": "rollout.mcap"}
@@ -66,11 +66,11 @@ def export(
     """
     import numpy as np
 
-    from mjx_revolve.links import make_links, make_meshes
-    from mjx_revolve.mjcf import make_mjcf
-    from mjx_revolve.runs import write_atomic
-    from mjx_revolve.sdf import make_sdf
-    from mjx_revolve.urdf import make_urdf
+    from mjx_revolve.formats.links import make_links, make_meshes
+    from mjx_revolve.formats.mjcf import make_mjcf
+    from mjx_revolve.formats.sdf import make_sdf
+    from mjx_revolve.formats.urdf import make_urdf
+    from mjx_revolve.inputs.files import write_atomic
 
     done: list[tuple[Path, str]] = []
     start = None if trajectory is None else np.asarray(trajectory.qpos)[0]
@@ -93,7 +93,7 @@ def export(
             write_atomic(folder / f"{name}.stl", content)
         done.append((folder, f"{len(shapes)} meshes (STL, m)"))
     if "mcap" in files:
-        from mjx_revolve.ros_bag import pick_rows, write_bag
+        from mjx_revolve.formats.ros_bag import pick_rows, write_bag
 
         if trajectory is None:
             raise InputError("mcap: expected a trajectory; found none")
@@ -188,8 +188,8 @@ def main(argv: list[str] | None = None) -> int:
     check_episode_path(arguments.path)
     runtime.prepare_process()
     # JAX takes seconds to import: not for those who ask for help.
-    from mjx_revolve.episode import load_episode
-    from mjx_revolve.ros_bag import check_rosbags
+    from mjx_revolve.episodes.champion import load_episode
+    from mjx_revolve.formats.ros_bag import check_rosbags
 
     if arguments.mcap is not None:
         check_rosbags()

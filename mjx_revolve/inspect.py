@@ -11,10 +11,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from mjx_revolve.commands import Parser, read_path, run_command
-from mjx_revolve.module_types import check_number
-from mjx_revolve.modules import MODULES, load_modules
-from mjx_revolve.morphology import Morphology, load_morphology
+from mjx_revolve.body.catalogue import MODULES, load_modules
+from mjx_revolve.body.module_types import check_number
+from mjx_revolve.body.morphology import Morphology, load_morphology
+from mjx_revolve.inputs.commands import Parser, read_path, run_command
 
 # Fresh water at 15 °C, the thesis's value [kg/m³].
 _DENSITY = 999.1026
@@ -203,7 +203,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     if arguments.picture is not None:
         # Matplotlib takes a second to import: only for those who ask for a picture.
-        from mjx_revolve.pictures import draw_morphology
+        from mjx_revolve.view.pictures import draw_morphology
 
         draw_morphology(morphology, arguments.picture)
     print(f"{arguments.file}: {morphology.name}")

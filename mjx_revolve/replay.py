@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_revolve.commands import (
+from mjx_revolve.inputs.commands import (
     Parser,
     add_episode_arguments,
     check_episode_path,
@@ -25,11 +25,11 @@ from mjx_revolve.commands import (
     run_command,
     whole,
 )
-from mjx_revolve.errors import InputError
+from mjx_revolve.inputs.errors import InputError
 
 if TYPE_CHECKING:
-    from mjx_revolve.episode import Episode
-    from mjx_revolve.film import Film
+    from mjx_revolve.episodes.champion import Episode
+    from mjx_revolve.view.film.film import Film
 
 _KINDS = (".mp4", ".gif", ".html")
 _SMALLEST, _LARGEST = (64, 64), (3840, 2160)  # pixels
@@ -57,9 +57,9 @@ def write_film(
     Raises:
         OSError: a file cannot be written.
     """
-    from mjx_revolve.film import draw_frames
-    from mjx_revolve.runs import write_atomic
-    from mjx_revolve.video import GifMaker, Mp4Writer
+    from mjx_revolve.inputs.files import write_atomic
+    from mjx_revolve.view.film.film import draw_frames
+    from mjx_revolve.view.film.video import GifMaker, Mp4Writer
 
     count = len(film.time)
     small = None if gif is None else GifMaker(film.size, film.fps, count)
@@ -215,14 +215,14 @@ def main(argv: list[str] | None = None) -> int:
     opengl = ""
     if not arguments.view and (paths is None or set(paths) != {".html"}) and not arguments.html:
         # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
-        from mjx_revolve.opengl import find_opengl
+        from mjx_revolve.view.film.opengl import find_opengl
 
         opengl = find_opengl()
 
-    from mjx_revolve.runtime import prepare_process
+    from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
-    from mjx_revolve.episode import load_episode
+    from mjx_revolve.episodes.champion import load_episode
 
     episode = load_episode(path, arguments.world, arguments.duration, arguments.seed)
     if arguments.view:
@@ -244,7 +244,7 @@ def _film(
     episode: Episode, paths: dict[str, Path], opengl: str, size: tuple[int, int], fps: int
 ) -> None:
     """Draws the film and says what was written."""
-    from mjx_revolve.film import make_film
+    from mjx_revolve.view.film.film import make_film
 
     film = make_film(episode, size, fps)
     _note_lost(film)
@@ -306,8 +306,8 @@ def _view(episode: Episode) -> None:
     import mujoco
     import mujoco.viewer
 
-    from mjx_revolve.film import make_film
-    from mjx_revolve.scene import build_scene
+    from mjx_revolve.view.film.film import make_film
+    from mjx_revolve.view.film.scene import build_scene
 
     film = make_film(episode, fps=60)
     _note_lost(film)

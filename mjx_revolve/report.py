@@ -14,15 +14,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mjx_revolve import runtime
-from mjx_revolve.commands import Parser, read_path, run_command
-from mjx_revolve.errors import InputError
+from mjx_revolve.inputs.commands import Parser, read_path, run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
-    from mjx_revolve.morphology import Morphology
-    from mjx_revolve.report_champion import Replay
-    from mjx_revolve.report_data import RunRecord
-    from mjx_revolve.report_groups import Group
+    from mjx_revolve.body.morphology import Morphology
+    from mjx_revolve.view.report.champion import Replay
+    from mjx_revolve.view.report.data import RunRecord
+    from mjx_revolve.view.report.groups import Group
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -44,7 +44,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _choose_file(arguments: argparse.Namespace, records: Sequence[RunRecord]) -> Path:
     """Where the page goes; a file of somebody else's is replaced only where it was named."""
-    from mjx_revolve.report_page import GENERATOR
+    from mjx_revolve.view.report.page import GENERATOR
 
     if arguments.out is not None:
         path = Path(arguments.out)
@@ -70,7 +70,7 @@ def _choose_file(arguments: argparse.Namespace, records: Sequence[RunRecord]) ->
 
 def _read(arguments: argparse.Namespace) -> tuple[list[RunRecord], list[str]]:
     """The runs, and a line about each folder of which nothing could be read."""
-    from mjx_revolve.report_data import read_run
+    from mjx_revolve.view.report.data import read_run
 
     records: list[RunRecord] = []
     lost: list[str] = []
@@ -97,9 +97,9 @@ def _replay(
     groups: Sequence[Group],
 ) -> tuple[dict[Path, Replay], list[tuple[str, Morphology]]]:
     """All champions' episodes by run folder, and the robots of the groups."""
-    from mjx_revolve.fingerprints import model_hash
-    from mjx_revolve.fitness import make_fitness
-    from mjx_revolve.report_champion import replay_champion
+    from mjx_revolve.episodes.fitness import make_fitness
+    from mjx_revolve.evolution.fingerprints import model_hash
+    from mjx_revolve.view.report.champion import replay_champion
 
     replays: dict[Path, Replay] = {}
     robots: list[tuple[str, Morphology]] = []
@@ -128,7 +128,7 @@ def _replay(
 
 def _robot_alone(group: Group) -> list[tuple[str, Morphology]]:
     """The body that a run left behind, where its configuration cannot be used."""
-    from mjx_revolve.morphology import load_morphology
+    from mjx_revolve.body.morphology import load_morphology
 
     for record in group.records:
         path = record.folder / "champion" / "morphology.yaml"
@@ -144,8 +144,8 @@ def _champions(
     groups: Sequence[Group], replays: dict[Path, Replay], every: bool
 ) -> list[tuple[str, str, str]]:
     """A section for each champion that is shown in full."""
-    from mjx_revolve import report_sections as sections
-    from mjx_revolve.report_plots import letter
+    from mjx_revolve.view.report import sections
+    from mjx_revolve.view.report.plots import letter
 
     found = []
     for k, group in enumerate(groups):
@@ -183,10 +183,9 @@ def make_report(
     import datetime
 
     from mjx_revolve import __version__
-    from mjx_revolve import report_appendix as appendix
-    from mjx_revolve import report_sections as sections
-    from mjx_revolve.report_groups import group_runs
-    from mjx_revolve.report_page import escape, make_page
+    from mjx_revolve.view.report import appendix, sections
+    from mjx_revolve.view.report.groups import group_runs
+    from mjx_revolve.view.report.page import escape, make_page
 
     groups = group_runs(records)
     replays, robots = _replay(groups)
@@ -239,7 +238,7 @@ def main(argv: list[str] | None = None) -> int:
         if record.problems:
             print(f"warning: {record.warning}", file=sys.stderr)
 
-    from mjx_revolve.runs import write_atomic
+    from mjx_revolve.inputs.files import write_atomic
 
     write_atomic(path, page.encode())
     print(f"report: {path} ({len(page.encode()) / 1e6:.1f} MB)")

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_revolve import runtime
-from mjx_revolve.commands import (
+from mjx_revolve.inputs.commands import (
     Parser,
     add_episode_arguments,
     check_episode_path,
@@ -30,15 +29,16 @@ from mjx_revolve.commands import (
     read_path,
     run_command,
 )
-from mjx_revolve.errors import InputError
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
-    from mjx_revolve.episode import Episode
-    from mjx_revolve.robot import Robot
-    from mjx_revolve.water import Water
-    from mjx_revolve.world import World
+    from mjx_revolve.engine.robot import Robot
+    from mjx_revolve.episodes.champion import Episode
+    from mjx_revolve.water.flow import Water
+    from mjx_revolve.water.world import World
 
-_PAGE = Path(__file__).parent / "viewer_page"
+_PAGE = Path(__file__).parent / "view" / "viewer_page"
 
 # Poses per second, and how many at most: a long episode gets fewer per second.
 _RATE, _MOST = 50.0, 3000
@@ -72,7 +72,7 @@ def write_viewer(episode: Episode, path: str | Path) -> None:
         InputError: `path` has another ending, or the episode has no finite row.
         OSError: the file cannot be written.
     """
-    from mjx_revolve.runs import write_atomic
+    from mjx_revolve.inputs.files import write_atomic
 
     write_atomic(check_page_path(path), make_page(episode).encode())
 
@@ -155,8 +155,8 @@ def page_data(episode: Episode) -> dict[str, Any]:
     Raises:
         InputError: the episode has no finite row.
     """
-    from mjx_revolve.forces import module_forces, sum_modules
-    from mjx_revolve.swim_picture import smooth_path, stroke_period
+    from mjx_revolve.view.forces import module_forces, sum_modules
+    from mjx_revolve.view.swim_picture import smooth_path, stroke_period
 
     robot, trajectory = episode.robot, _finite(episode)
     world, length = robot.world, robot.morphology.length
@@ -239,7 +239,7 @@ def _poses(robot: Robot, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _robot(robot: Robot, place: np.ndarray, quat: np.ndarray, step: float) -> dict[str, Any]:
     """Meshes of the parts, on which bodies they are, and how those move."""
-    from mjx_revolve.pictures import make_pieces
+    from mjx_revolve.view.pictures import make_pieces
 
     fluid, modules = robot.fluid, robot.morphology.modules
     row = np.cumsum([0] + [len(module.kind.parts) for module in modules])
@@ -328,8 +328,8 @@ def _drift(
     step: float,
 ) -> np.ndarray:
     """How far the water around the robot has gone, its waves apart: `[S, 3]` [m]."""
-    from mjx_revolve.forces import water_at
-    from mjx_revolve.water import flow
+    from mjx_revolve.view.forces import water_at
+    from mjx_revolve.water.flow import flow
 
     now = water_at(robot, rows, time, len(trajectory.time), water)
     still = dataclasses.replace(robot.world, waves=())
@@ -357,7 +357,7 @@ def _lowest(robot: Robot, place: np.ndarray) -> float:
 
 def _bed(world: World, center: np.ndarray, low: float) -> dict[str, Any] | None:
     """The bed on rings around the way, or None where it is out of sight."""
-    from mjx_revolve.terrain import bed_height
+    from mjx_revolve.water.bed import bed_height
 
     if world.bed is None:
         return None
@@ -466,7 +466,7 @@ def main(argv: list[str] | None = None) -> int:
     check_episode_path(arguments.path)
     runtime.prepare_process()
     # JAX takes seconds to import: not for those who ask for help.
-    from mjx_revolve.episode import load_episode
+    from mjx_revolve.episodes.champion import load_episode
 
     episode = load_episode(arguments.path, arguments.world, arguments.duration, arguments.seed)
     out = arguments.out or _usual_path(episode)

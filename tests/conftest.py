@@ -6,8 +6,8 @@ import jax
 import pytest
 
 from laboratory import WATER, arm_robot, body, elbow_robot, world
-from mjx_revolve.robot import build_robot
-from mjx_revolve.world import load_world
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.water.world import load_world
 
 
 @pytest.fixture(scope="session")

@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.dynamics import acceleration
-from mjx_revolve.module_types import Box, ModuleType, Part
-from mjx_revolve.morphology import Module, Morphology, load_morphology
-from mjx_revolve.robot import Robot, build_robot
-from mjx_revolve.rollout import flow_at, make_engine, roll_out
-from mjx_revolve.water import water_of
-from mjx_revolve.world import World, load_world
-from mjx_revolve.xla import on_cpu, share_once
+from mjx_revolve.body.module_types import Box, ModuleType, Part
+from mjx_revolve.body.morphology import Module, Morphology, load_morphology
+from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.engine.step import acceleration
+from mjx_revolve.episodes.rollout import flow_at, make_engine, roll_out
+from mjx_revolve.numerics.xla import on_cpu, share_once
+from mjx_revolve.water.flow import water_of
+from mjx_revolve.water.world import World, load_world
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = sorted((ROOT / "morphologies").glob("*.yaml"))

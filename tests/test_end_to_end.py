@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[1]
 # What the clock writes; everything else is reproducible.
 CLOCK = {"seconds", "evaluations_per_second"}
 

@@ -25,18 +25,18 @@ import pytest
 import toys
 from laboratory import XLA_FLAGS
 from mjx_revolve import evolve as command
-from mjx_revolve import loop, progress, runs
-from mjx_revolve.commands import run_command
-from mjx_revolve.config import EvolutionConfig
-from mjx_revolve.errors import InputError
-from mjx_revolve.loop import choose_champion, evolve, search_from_arrays, search_to_arrays
-from mjx_revolve.strategies import (
+from mjx_revolve.episodes.config import EvolutionConfig
+from mjx_revolve.evolution import loop, progress, runs
+from mjx_revolve.evolution.loop import choose_champion, evolve, search_from_arrays, search_to_arrays
+from mjx_revolve.evolution.strategies import (
     FAILED_SCORE,
     STRATEGIES,
     find_strategy,
     losses_from_scores,
     make_strategy,
 )
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 # In metrics.csv, all but these is reproducible.
@@ -641,7 +641,7 @@ def test_a_full_disk_costs_one_generation(folder, capsys, monkeypatch):
 SCRIPT = """
 import sys, time
 from mjx_revolve import evolve
-from mjx_revolve.commands import run_command
+from mjx_revolve.inputs.commands import run_command
 
 def make_fitness(config):
     from test_evolve import Quadratic

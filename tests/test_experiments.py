@@ -22,11 +22,11 @@ from experiments.falling_spider import (
     row_ticks,
 )
 from laboratory import QUICK
-from mjx_revolve import rollout
-from mjx_revolve.commands import run_command
-from mjx_revolve.errors import InputError
+from mjx_revolve.episodes import rollout
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[1]
 THESIS = ROOT.parent / "shared" / "thesis"
 SHARE = 0.93818  # ρ V / m of the spider
 

@@ -12,11 +12,11 @@ import pytest
 import yaml
 
 from mjx_revolve import inspect
-from mjx_revolve.commands import run_command
-from mjx_revolve.errors import InputError
-from mjx_revolve.morphology import load_morphology
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def _leg() -> dict:
@@ -221,8 +221,8 @@ def test_thrusts_are_drawn_as_green_arrows(tmp_path):
 
 @pytest.mark.parametrize("name", ["Thruster", "LiftThruster", "Fin"])
 def test_thrusters_and_fins_have_shapes_of_their_volume_within_their_box(name):
-    from mjx_revolve.modules import MODULES
-    from mjx_revolve.shapes import part_mesh
+    from mjx_revolve.body.catalogue import MODULES
+    from mjx_revolve.body.solids import part_mesh
 
     kind = MODULES[name]
     (part,) = kind.parts
@@ -235,7 +235,7 @@ def test_thrusters_and_fins_have_shapes_of_their_volume_within_their_box(name):
 def test_an_arrow_is_closed_and_points_along_its_axis():
     import trimesh
 
-    from mjx_revolve.pictures import _spindle
+    from mjx_revolve.view.pictures import _spindle
 
     corners = _spindle((0, 0, 2), [(0.0, 0.0), (0.0, 1.0), (3.0, 1.0), (3.0, 2.0), (5.0, 0.0)])
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
@@ -246,7 +246,7 @@ def test_an_arrow_is_closed_and_points_along_its_axis():
 
 
 def test_what_is_nearer_hides_what_is_farther():
-    from mjx_revolve.pictures import _depth_buffer
+    from mjx_revolve.view.pictures import _depth_buffer
 
     square = np.array([[(0, 0), (4, 0), (4, 4)], [(0, 0), (4, 4), (0, 4)]], float)
     low = np.concatenate([square, np.zeros((2, 3, 1))], axis=2)
@@ -263,7 +263,7 @@ def test_what_is_nearer_hides_what_is_farther():
 def test_drawing_leaves_matplotlib_alone():
     code = (
         "import sys, matplotlib; before = matplotlib.rcParams.copy(); "
-        "import mjx_revolve.pictures; "
+        "import mjx_revolve.view.pictures; "
         "sys.exit('matplotlib.pyplot' in sys.modules or before != matplotlib.rcParams)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
@@ -330,7 +330,7 @@ def test_without_a_file_the_command_says_so(capsys):
 def test_a_picture_that_cannot_be_written_leaves_nothing(spider, tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
-    from mjx_revolve import pictures
+    from mjx_revolve.view import pictures
 
     def full(self, file, **options):
         file.write(b"half")

@@ -23,9 +23,9 @@ from typing import NamedTuple
 import pytest
 import yaml
 
-from mjx_revolve.config import load_config
-from mjx_revolve.report_data import read_run
-from mjx_revolve.tasks import score_unit
+from mjx_revolve.episodes.config import load_config
+from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.view.report.data import read_run
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "docs" / "tutorial.md").read_text()

@@ -1,0 +1,431 @@
+"""The catalogue of module types, and users' own.
+
+Users add their own types in YAML with `load_modules` and merge them:
+`MODULES | load_modules("my_modules.yaml")`.
+
+Frames follow Revolve: core and brick look along +y, all others along +x. Slots are
+0 back (-y, where a brick is attached), 1 front (+y), 2 (+x) and 3 (-x); a hinge has slot 1 only;
+sensor, thrusters and fin have none.
+
+Sources: boxes, masses, attachment faces, offsets and the servo's limits are those of Revolve
+(github.com/ci-group/revolve, `pyrevolve/revolve_bot/revolve_module.py` and the SDF it writes);
+mesh volumes are those of RoboGen's meshes as the thesis tabulates them (Table 1).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_revolve.body.boxes import union_measure
+from mjx_revolve.body.module_types import (
+    Box,
+    Hinge,
+    ModuleType,
+    Mount,
+    Part,
+    Slot,
+    Thruster,
+    Vector,
+    show,
+)
+from mjx_revolve.body.plates import LiftDrag
+from mjx_revolve.inputs.errors import InputError, load_yaml
+
+__all__ = [
+    "MODULES",
+    "THESIS_MODULES",
+    "Box",
+    "Hinge",
+    "LiftDrag",
+    "ModuleType",
+    "Mount",
+    "Part",
+    "Slot",
+    "Thruster",
+    "load_modules",
+]
+
+
+# ------------------------------------------------------------------------- the catalogue
+
+
+def _with_aliases(*kinds: ModuleType) -> dict[str, ModuleType]:
+    return {name: kind for kind in kinds for name in (kind.name, *kind.aliases)}
+
+
+def _level_slots(reach: float) -> dict[int, Slot]:
+    """Revolve's numbers of the four level faces, `reach` m from the centre."""
+    directions = {0: (0, -1, 0), 1: (0, 1, 0), 2: (1, 0, 0), 3: (-1, 0, 0)}
+    return {
+        number: Slot((reach * d[0], reach * d[1], reach * d[2]), d)
+        for number, d in directions.items()
+    }
+
+
+_CORE_REACH = 0.0445  # Revolve: half the core's edge
+_BRICK_REACH = 0.019  # Revolve: SLOT_COORDINATES; the collision box stands 1.5 mm proud of it
+
+_CORE = ModuleType(
+    name="Core",
+    aliases=("CoreComponent",),  # the name in Revolve's own code
+    parts=(Part("core", (Box((0.089, 0.089, 0.045)),), mass=0.0900, volume=5.054e-5),),
+    slots=_level_slots(_CORE_REACH),
+)
+
+_BRICK = ModuleType(
+    name="FixedBrick",
+    parts=(Part("brick", (Box((0.041, 0.041, 0.0355)),), mass=0.0102, volume=1.070e-5),),
+    mount=Mount((0.0, -_BRICK_REACH, 0.0), (0.0, 1.0, 0.0)),
+    slots={number: slot for number, slot in _level_slots(_BRICK_REACH).items() if number != 0},
+)
+
+# Places along the hinge's x, from the centre of its frame box, as in Revolve's SDF of the spider
+# (there from the core's centre, .0555 m further).
+_HINGE_ANCHOR = 0.00465  # .06015 - .0555
+_SERVO = 0.015525  # .071025 - .0555
+_PLATE = 0.01175  # from the servo's centre: COLLISION_BOX_SERVO_2 and its translation
+_FRAME_BACK = 0.011  # half the frame box
+_SERVO_FRONT = _SERVO + 0.01225  # half the servo box
+
+_HINGE = ModuleType(
+    name="ActiveHinge",
+    parts=(
+        Part("frame", (Box((0.022, 0.03575, 0.010)),), mass=0.0017, volume=3.032e-6),
+        Part(
+            "servo",
+            # The plate weighs nothing in Revolve; its mass is the servo holder's.
+            (Box((0.0245, 0.02575, 0.015)), Box((0.001, 0.034, 0.034), (_PLATE, 0.001, 0.0))),
+            mass=0.0090,
+            volume=1.014e-5,
+            position=(_SERVO, 0.0, 0.0),
+        ),
+    ),
+    mount=Mount((-_FRAME_BACK, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    slots={1: Slot((_SERVO_FRONT, 0.0, 0.0), (1.0, 0.0, 0.0))},
+    hinge=Hinge(
+        axis=(0.0, 1.0, 0.0),
+        anchor=(_HINGE_ANCHOR, 0.0, 0.0),
+        range=(-math.pi / 4, math.pi / 4),  # Revolve, SDF/joint.py
+        effort=0.17658,  # ditto
+        speed=5.235988,  # ditto
+    ),
+)
+
+# Revolve gives no pose to its touch sensor; that the thin side looks outwards is a choice. Revolve
+# names a FixedBrickSensor but never implemented it; reading it as a touch sensor is a choice too.
+_TOUCH_SENSOR = ModuleType(
+    name="TouchSensor",
+    aliases=("FixedBrickSensor",),
+    parts=(Part("sensor", (Box((0.0041, 0.031, 0.0155)),), mass=0.0030, volume=2.735e-6),),
+    mount=Mount((-0.00205, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    sensor=True,
+)
+
+# Thrusters and fin are ours: Revolve has neither. What has no source below is a choice.
+
+# A ducted propeller of the hobby class, 30 mm across: half a newton, for which an ideal propeller
+# needs .3 W, and .1 s to answer. Mesh volume: a duct with a wall of 2 mm (7.0 cm³) and a motor of
+# 12 × 35 mm (4.0 cm³); half of the room that they leave is taken to go along. Reaction torque:
+# K_Q / K_T of about 1/7 at standstill (Carlton, Marine Propellers and Propulsion, chapter 6) times
+# a propeller of 24.5 mm.
+_DUCT, _DUCT_LENGTH = 0.030, 0.040
+_PROPELLER = Thruster(axis=(1.0, 0.0, 0.0), gain=0.5, time_constant=0.1, torque_ratio=0.0035)
+_THRUSTER = ModuleType(
+    name="Thruster",
+    parts=(
+        Part(
+            "duct",
+            (Box((_DUCT_LENGTH, _DUCT, _DUCT)),),
+            mass=0.025,
+            volume=1.1e-5,
+            entrained_water=0.5,
+            thruster=_PROPELLER,
+        ),
+    ),
+    mount=Mount((-_DUCT_LENGTH / 2, 0.0, 0.0), (1.0, 0.0, 0.0)),
+)
+# The same, held at its side: it pushes across the way in which it is mounted, along its own z,
+# which is up where its parent is level, or level where it is turned by ±90°.
+_LIFT_THRUSTER = ModuleType(
+    name="LiftThruster",
+    parts=(
+        replace(
+            _THRUSTER.parts[0],
+            boxes=(Box((_DUCT, _DUCT, _DUCT_LENGTH)),),
+            thruster=replace(_PROPELLER, axis=(0.0, 0.0, 1.0)),
+        ),
+    ),
+    mount=Mount((-_DUCT / 2, 0.0, 0.0), (1.0, 0.0, 0.0)),
+)
+
+# A stiff plate of ABS (1050 kg/m³), 60 × 50 × 2 mm with corners rounded to 10 mm, whose leading
+# edge is where it is mounted, as a tail's. Its box's face stands for its area, 3 % too much.
+# Lift before the stall: 2π A / (2 + √(A² + 4)) per rad (Helmbold 1942) for the aspect ratio
+# A = 50/60, which makes 1.26. Such plates stall late, at 30° to 40° (Torres and Mueller, AIAA
+# Journal 42, 2004): 30°; from there the lift falls to none at 90°. Drag: what a force normal to the
+# plate has, lift × tan α, whose mean before the stall is that of .465 |α|; then up to the 1.17 of a
+# square plate across the flow (Hoerner, Fluid-Dynamic Drag, 1965, chapter 3). That friction is left
+# out, and that the centre of pressure stays in the middle, are choices: a tail works at large
+# angles.
+_FIN_STALL = math.pi / 6
+_FIN_LIFT = 2 * math.pi * (50 / 60) / (2 + math.hypot(50 / 60, 2))
+_FIN_DRAG = 0.465
+_TO_ACROSS = math.pi / 2 - _FIN_STALL  # from the stall to a plate across the flow [rad]
+_FIN = ModuleType(
+    name="Fin",
+    parts=(
+        Part(
+            "plate",
+            (Box((0.060, 0.050, 0.002)),),
+            mass=0.0061,
+            volume=5.828e-6,
+            lift_drag=LiftDrag(
+                cla=_FIN_LIFT,
+                cda=_FIN_DRAG,
+                alpha_stall=_FIN_STALL,
+                cla_stall=-_FIN_LIFT * _FIN_STALL / _TO_ACROSS,
+                cda_stall=(1.17 - _FIN_DRAG * _FIN_STALL) / _TO_ACROSS,
+                forward=(-1.0, 0.0, 0.0),
+                upward=(0.0, 0.0, 1.0),
+            ),
+        ),
+    ),
+    mount=Mount((-0.030, 0.0, 0.0), (1.0, 0.0, 0.0)),
+)
+
+MODULES: dict[str, ModuleType] = _with_aliases(
+    _CORE, _BRICK, _HINGE, _TOUCH_SENSOR, _THRUSTER, _LIFT_THRUSTER, _FIN
+)
+"""The catalogue by name and alias: the values of Revolve's code, and our thrusters and fin."""
+
+# The thesis's Table 1 prints the two hinge masses the other way round. It also gives the touch
+# sensor the brick's box; that is not taken over, since it says nowhere how such a box is attached.
+THESIS_MODULES: dict[str, ModuleType] = MODULES | _with_aliases(
+    replace(
+        _HINGE,
+        parts=(replace(_HINGE.parts[0], mass=0.009), replace(_HINGE.parts[1], mass=0.0017)),
+    )
+)
+"""The catalogue with the hinge masses of the thesis's Table 1."""
+
+
+# ------------------------------------------------------------------------- users' own types
+
+
+def load_modules(path: str | Path) -> dict[str, ModuleType]:
+    """Reads module types from YAML.
+
+    A file looks like this (SI units; three numbers are x, y, z in the module's or part's frame)::
+
+        modules:
+          Flipper:
+            mount: -x                # or {position: [...], outward: [1, 0, 0]}; null: a core
+            hinge:                   # leave out for a rigid module
+              axis: [0, 1, 0]
+              anchor: [0.00465, 0, 0]
+              range: [-0.6, 0.6]                  # rad; default ±π/4, as Revolve's servo
+              effort: 0.17658                     # N·m; default Revolve's servo
+              speed: 5.235988                     # rad/s; default Revolve's servo
+            parts:
+              - name: holder                      # default: part0, part1, ...
+                size: [0.022, 0.036, 0.010]       # a single box; or `boxes`
+                mass: 0.002
+              - name: blade
+                position: [0.04, 0, 0]            # default [0, 0, 0]
+                boxes:                            # the first is the main box, at [0, 0, 0]
+                  - size: [0.06, 0.04, 0.002]
+                  - {size: [0.002, 0.04, 0.01], position: [0.03, 0, 0]}
+                mass: 0.006
+                volume: 4.0e-6                    # default: that of the boxes, solid
+                electronics_volume: 0.0           # default
+                center_of_volume: [0, 0, 0]       # default
+                ballast_mass: 0.0                 # default; a point mass
+                ballast_volume: 0.0               # default; a point volume
+                ballast_position: [0, 0, 0]       # default; of both
+                entrained_water: 0.0              # default; share of the free volume, 0 to 1
+                buoyancy: partial                 # or mask, off; default: the world's
+                drag: lift_drag                   # or faces, ellipsoid, off; default: the world's,
+                                                  # of a fin lift_drag
+                added_mass: true                  # default: the world's
+                drag_coefficient: 1.05            # default
+                added_mass_coefficient: 1.0       # default
+                contact: true                     # default
+            slots:                   # default: none
+              1: +x                  # or {position: [...], direction: [...], up: [0, 0, 1]}
+            sensor: false            # default
+            aliases: [Paddle]        # default: those of the catalogue's type of that name, if any
+          PectoralFin:
+            mount: -x
+            parts:
+              - size: [0.06, 0.04, 0.002]
+                mass: 0.005
+                lift_drag:           # makes it a fin; fields of `LiftDrag`
+                  {cla: 2.0, cda: 0.3, alpha_stall: 0.5, forward: [0, 1, 0], upward: [0, 0, 1]}
+          Jet:
+            mount: -x
+            parts:
+              - size: [0.03, 0.02, 0.02]
+                mass: 0.012
+                volume: 4.0e-6
+                thruster:            # makes it a thruster; fields of `Thruster`
+                  axis: [1, 0, 0]                 # default
+                  curve: dead_band                # or basic, interpolated
+                  gain: 0.3                       # N at command 1
+                  dead_band: [-0.05, 0.05]
+                  range: [-1, 1]                  # default
+                  time_constant: 0.05             # s; default 0
+                  torque_ratio: 0.002             # m; default 0
+
+    `-x`, `+y` and so on name a level face of a main box: of the first part for `mount`, and for
+    `slots` of the last part with a hinge, of the first without. Unknown keys are refused.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The types by name and alias, to be merged: `MODULES | load_modules(path)`.
+
+    Raises:
+        InputError: the file cannot be read or something in it is wrong; the message says where.
+    """
+    data = _check_keys(load_yaml(path), str(path), ("modules",))
+    table = data["modules"]
+    if not isinstance(table, dict) or not table:
+        raise InputError(
+            f"{path}: modules: expected a mapping from names to module types; found {show(table)}"
+        )
+    kinds: dict[str, ModuleType] = {}
+    for name, item in table.items():
+        if not isinstance(name, str):
+            raise InputError(f"{path}: modules: expected names of types; found {show(name)}")
+        kind = _read_type(name, item, f"{path}: modules.{name}")
+        for key in (kind.name, *kind.aliases):
+            if key in kinds:
+                raise InputError(
+                    f"{path}: modules.{name}: expected each name and alias once; found {key} twice"
+                )
+            kinds[key] = kind
+    return kinds
+
+
+def _check_keys(
+    item: Any, place: str, required: Sequence[str], optional: Sequence[str] = ()
+) -> dict[str, Any]:
+    """A mapping that has all of `required` and nothing beyond `optional`."""
+    known = (*required, *optional)
+    if not isinstance(item, dict):
+        raise InputError(f"{place}: expected a mapping with {', '.join(known)}; found {show(item)}")
+    for key in item:
+        if key not in known:
+            raise InputError(f"{place}: expected only {', '.join(known)}; found {show(key)}")
+    for key in required:
+        if key not in item:
+            raise InputError(f"{place}: expected the key {key}; found none")
+    return item
+
+
+def _make(kind: Callable[..., Any], place: str, **values: Any) -> Any:
+    """Builds a value; its message gets the place in the file in front."""
+    try:
+        return kind(**values)
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
+
+
+def _read_type(name: Any, item: Any, place: str) -> ModuleType:
+    _check_keys(item, place, ("parts", "mount"), ("slots", "hinge", "sensor", "aliases"))
+    listed = item["parts"]
+    if not isinstance(listed, list) or not listed:
+        raise InputError(f"{place}.parts: expected a list of parts; found {show(listed)}")
+    parts = [_read_part(part, i, f"{place}.parts.{i}") for i, part in enumerate(listed)]
+    hinge = item.get("hinge")
+    if hinge is not None:
+        servo = _HINGE.hinge
+        assert servo is not None
+        usual = {"range": servo.range, "effort": servo.effort, "speed": servo.speed}
+        _check_keys(hinge, f"{place}.hinge", ("axis", "anchor"), tuple(usual))
+        hinge = _make(Hinge, place, **(usual | hinge))
+    slots = item.get("slots") or {}
+    if not isinstance(slots, dict):
+        raise InputError(
+            f"{place}.slots: expected a mapping from numbers to faces; found {show(slots)}"
+        )
+    holder = parts[-1] if hinge is not None else parts[0]
+    usual_aliases = MODULES[name].aliases if name in MODULES else ()
+    aliases = item.get("aliases", usual_aliases)
+    if not isinstance(aliases, list | tuple):
+        raise InputError(f"{place}.aliases: expected a list of names; found {show(aliases)}")
+    return _make(
+        ModuleType,
+        place,
+        name=name,
+        parts=tuple(parts),
+        mount=_read_mount(item["mount"], parts[0], f"{place}.mount"),
+        slots={key: _read_slot(s, holder, f"{place}.slots.{key}") for key, s in slots.items()},
+        hinge=hinge,
+        sensor=item.get("sensor", False),
+        aliases=tuple(aliases),
+    )
+
+
+def _read_part(item: Any, index: int, place: str) -> Part:
+    sized = ("size", "boxes")
+    plain = tuple(f.name for f in fields(Part) if f.name not in ("mass", *sized))
+    _check_keys(item, place, ("mass",), (*sized, *plain))
+    if ("size" in item) == ("boxes" in item):
+        raise InputError(f"{place}: expected one of size and boxes; found both or neither")
+    listed = item.get("boxes", [{"size": item.get("size")}])
+    if not isinstance(listed, list) or not listed:
+        raise InputError(f"{place}.boxes: expected a list of boxes; found {show(listed)}")
+    boxes = []
+    for i, box in enumerate(listed):
+        at = f"{place}.boxes.{i}" if "boxes" in item else place
+        boxes.append(_make(Box, at, **_check_keys(box, at, ("size",), ("position",))))
+    center = np.array([box.position for box in boxes])
+    half = np.array([box.size for box in boxes]) / 2
+    values = {"name": f"part{index}", "volume": union_measure(center - half, center + half)}
+    values |= {key: item[key] for key in (*plain, "mass") if key in item}
+    for key, kind in (("lift_drag", LiftDrag), ("thruster", Thruster)):
+        if values.get(key) is not None:
+            known = [f.name for f in fields(kind)]
+            given = _check_keys(values[key], f"{place}.{key}", (), known)
+            values[key] = _make(kind, place, **given)
+    # YAML 1.1 reads a bare `off` as False.
+    values |= {key: "off" for key in ("buoyancy", "drag") if values.get(key) is False}
+    return _make(Part, place, boxes=tuple(boxes), **values)
+
+
+def _read_face(text: str, part: Part, place: str) -> tuple[Vector, Vector]:
+    """Centre of a level face of a part's main box, module frame [m], and its outward normal."""
+    if not re.fullmatch(r"[-+]?[xy]", text):
+        raise InputError(
+            f"{place}: expected -x, +x, -y, +y or a mapping with position; found {show(text)}"
+        )
+    normal = [0.0, 0.0, 0.0]
+    axis = "xy".index(text[-1])
+    normal[axis] = -1.0 if text[0] == "-" else 1.0
+    position = list(part.position)
+    position[axis] += normal[axis] * part.boxes[0].size[axis] / 2
+    return (position[0], position[1], position[2]), (normal[0], normal[1], normal[2])
+
+
+def _read_mount(item: Any, part: Part, place: str) -> Mount | None:
+    if item is None:
+        return None
+    if isinstance(item, str):
+        position, (x, y, z) = _read_face(item, part, place)
+        return Mount(position, (-x, -y, -z))
+    return _make(Mount, place, **_check_keys(item, place, ("position", "outward")))
+
+
+def _read_slot(item: Any, part: Part, place: str) -> Slot:
+    if isinstance(item, str):
+        return Slot(*_read_face(item, part, place))
+    return _make(Slot, place, **_check_keys(item, place, ("position", "direction"), ("up",)))

@@ -1,0 +1,181 @@
+"""Contact with the bed: a penalty law with Coulomb friction at the corners of the modules.
+
+Under water a robot weighs a sixteenth of its weight in air, so a soft ground is enough, and it
+costs a few operations where a contact solver would cost the whole speed of the population step.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.engine.tree import Level, Points
+from mjx_revolve.numerics.inertia import Motion, SpatialInertia, sum_parts
+from mjx_revolve.numerics.spatial import (
+    SYM,
+    Scalar,
+    Vec,
+    add,
+    cross,
+    dot,
+    full,
+    matmul,
+    matTvec,
+    mul,
+    neg,
+    skew,
+    sub,
+    total,
+    vadd,
+    vscale,
+)
+from mjx_revolve.water.bed import Bed, bed_height, bed_slope
+from mjx_revolve.water.flow import Water
+from mjx_revolve.water.world import World
+
+# Damping of a point as a share of the critical one, 2 √(k m). A choice: no bouncing.
+_DAMPING_RATIO = 1.0
+# The damper fades in over this depth [m], so that touching down is no jump in force.
+_FADE = 5e-4
+# Below this speed [m/s] friction is viscous, as Coulomb's law has no value at rest.
+_CREEP = 0.001
+
+
+def bed_plane(bed: Bed, place: tuple[Scalar, Scalar]) -> tuple[Scalar, Vec]:
+    """The bed's tangent plane below each body.
+
+    A body's points share it, because the beds are smooth at the size of a module: below the lake's
+    steepest dune the plane is off by 0.1 mm at 10 cm.
+
+    Args:
+        bed: the ground.
+        place: world x and y of the bodies' origins [m].
+
+    Returns:
+        Height at the origins [m], and the unit normal, world frame.
+    """
+    x, y = place
+    slope_x, slope_y = bed_slope(bed, x, y)
+    inverse = 1 / jnp.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
+    return bed_height(bed, x, y), (-slope_x * inverse, -slope_y * inverse, inverse)
+
+
+def bed_contact(
+    bed: Bed, depth: Scalar, normal: Vec, velocity: Vec, point_mass: Scalar, timestep: float
+) -> tuple[Vec, Scalar, Scalar]:
+    """Force of the bed on points of the robot, and the damping of its implicit part.
+
+    Normal, with d the depth and ḋ the speed inwards: F_n = k max(0, d + dt ḋ) + c ḋ while the sum
+    pushes outwards: a spring at the end of the step, k the bed's stiffness, c critical damping of
+    the point's mass. Tangential: Coulomb, F_t = -μ F_n v_t / √(v_t² + v_c²) with v_c = 1 mm/s, so
+    that on a slope the point creeps at v_c tan(slope) / μ and slides where that passes μ.
+
+    Both are linear in the velocity at the end of the step, with the damping that is returned: a
+    body of any mass can rest on a bed of any stiffness.
+
+    Args:
+        bed: the ground.
+        depth: of the points below the bed, along its normal [m], positive inside, `[...]`.
+        normal: of the bed, any frame.
+        velocity: of the points, same frame [m/s].
+        point_mass: m, each point's share of its body's mass [kg]; 0 for padding.
+        timestep: dt [s].
+
+    Returns:
+        Force on each point, same frame [N], and its damping along the normal and across it [N·s/m].
+    """
+    stiffness: Scalar
+    damper: Scalar
+    if isinstance(point_mass, jax.Array):  # bodies differ from lane to lane
+        stiffness = jnp.where(point_mass > 0, bed.stiffness, 0)
+        damper = 2 * _DAMPING_RATIO * jnp.sqrt(bed.stiffness * point_mass)
+    else:
+        stiffness = mul(bed.stiffness, np.asarray(np.greater(point_mass, 0), np.float64))
+        damper = np.asarray(2 * _DAMPING_RATIO * np.sqrt(bed.stiffness * np.asarray(point_mass)))
+    outward = dot(velocity, normal)
+    ahead = jnp.maximum(depth - timestep * outward, 0)
+    damping = mul(damper, jnp.minimum(ahead / _FADE, 1))
+    push = sub(mul(stiffness, ahead), damping * outward)
+    touching = (ahead > 0) & (push > 0)
+    push = jnp.where(touching, push, 0)
+    resistance = jnp.where(touching, add(mul(timestep, stiffness), damping), 0)
+    sliding = tuple(v - outward * n for v, n in zip(velocity, normal, strict=True))
+    grip = bed.friction * push / jnp.sqrt(dot(sliding, sliding) + _CREEP**2)
+    force = tuple(push * n - grip * s for n, s in zip(normal, sliding, strict=True))
+    return force, resistance, grip
+
+
+def bed_on_level(
+    world: World, level: Level, motion: Motion, points: Points, water: Water
+) -> tuple[Vec, Vec, SpatialInertia]:
+    """What the bed does to the bodies of a level.
+
+    Args:
+        world: with a bed.
+        level: the bodies.
+        motion: where they are and how they move, relative to the uniform current.
+        points: of them that may touch.
+        water: its uniform current is how fast the bed passes by.
+
+    Returns:
+        Torque [N·m] and force [N] about each body's origin, body frame, and their damping.
+    """
+    n, lanes = len(level.body), jnp.shape(motion.height)[-1]
+    k = max(np.shape(x)[0] if np.ndim(x) == 3 else 1 for x in points.position)
+    wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
+    assert world.bed is not None  # there are points only above a bed
+    rows = (motion.x_axis, motion.y_axis, motion.up)
+    ground, normal = bed_plane(world.bed, motion.place)
+    normal = matTvec(rows, normal)
+    # Depth of the body's origin below the tangent plane, then of each point.
+    origin = mul(sub(ground, motion.height), dot(normal, motion.up))
+    depth = wide(sub(origin, dot(normal, points.position)))
+    velocity = vadd(motion.velocity, cross(motion.spin, points.position))
+    for speed, axis in zip(water.current, rows, strict=True):
+        velocity = vadd(velocity, vscale(speed, axis))
+    wide_normal, velocity = tuple(wide(x) for x in normal), tuple(wide(x) for x in velocity)
+    force, stiff, grip = bed_contact(
+        world.bed, depth, wide_normal, velocity, points.mass, world.timestep
+    )
+    torque = cross(points.position, force)
+    gather = lambda x: sum_parts(wide(x), k)  # noqa: E731
+    return (
+        tuple(gather(x) for x in torque),
+        tuple(gather(x) for x in force),
+        _damping(points.position, normal, stiff - grip, grip, gather),
+    )
+
+
+def _damping(position: Vec, normal: Vec, along: Scalar, alike: Scalar, gather) -> SpatialInertia:
+    """Σ over points of what resists their motion, b 1 + a n nᵀ at r, about the body's origin.
+
+    The points share n, so only moments of a and b over the points are summed: 20 numbers, and no
+    matrix for each point.
+    """
+    sums = []
+    for weight in (alike, along):
+        weighted = [mul(weight, x) for x in position]
+        first = tuple(gather(x) for x in weighted)
+        second = tuple(gather(mul(weighted[i], position[j])) for i, j in SYM)
+        sums.append((gather(weight), first, second))
+    (b, br, brr), (a, ar, arr) = sums
+    outer = tuple(mul(normal[i], normal[j]) for i, j in SYM)
+    unit = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+    linear = tuple(add(mul(b, u), mul(a, o)) for u, o in zip(unit, outer, strict=True))
+    # Σ [r] (b 1 + a n nᵀ) and -Σ [r] (b 1 + a n nᵀ) [r].
+    nn = full(outer)
+    across = tuple(vadd(p, q) for p, q in zip(skew(br), matmul(skew(ar), nn), strict=True))
+    trace = total(brr[0], brr[3], brr[5])
+    angular = tuple(
+        add(sub(mul(u, trace), s), t)
+        for u, s, t in zip(unit, brr, _turned(full(arr), normal), strict=True)
+    )
+    return SpatialInertia(angular, across, linear)
+
+
+def _turned(moment, normal: Vec):
+    """Σ a (r × n)(r × n)ᵀ from Σ a r rᵀ: [n] M [n]ᵀ."""
+    x = skew(normal)
+    turned = matmul(matmul(x, moment), tuple(tuple(neg(e) for e in row) for row in x))
+    return tuple(turned[i][j] for i, j in SYM)

@@ -1,0 +1,442 @@
+"""The water on a robot: the sum of all laws over the parts of a level of bodies.
+
+The laws are pure functions in files of their own (`buoyancy`, `drag`, `lift_drag`, `added_mass`,
+`thrusters`, `water`); this file puts them together for whole levels of a robot's tree. Vectors are
+tuples of three arrays (see `spatial`), per-part tables are constants `[npart, nbody, 1]`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.engine.fluid_table import FluidTable
+from mjx_revolve.engine.tree import Level, Parts
+from mjx_revolve.numerics.inertia import (
+    Motion,
+    SpatialInertia,
+    add_inertia,
+    apply_inertia,
+    shift_inertia,
+    sum_parts,
+)
+from mjx_revolve.numerics.spatial import (
+    Scalar,
+    Sym,
+    Vec,
+    add,
+    cross,
+    dot,
+    matTvec,
+    matvec,
+    mul,
+    neg,
+    rotate_sym,
+    sub,
+    total,
+    vadd,
+    vscale,
+    vsub,
+)
+from mjx_revolve.water.added_mass import box_added_mass, entrained_water, lamb_coefficients
+from mjx_revolve.water.buoyancy import buoyancy, displaced, submersion, surface_tension
+from mjx_revolve.water.drag import (
+    ELLIPSOID_COEFFICIENTS,
+    ellipsoid,
+    ellipsoid_constants,
+    face_drag_coefficients,
+    inertia_box,
+    quadratic_drag,
+)
+from mjx_revolve.water.flow import Water, flow, is_uniform, surface, water_of, wave_convection
+from mjx_revolve.water.lift_drag import LiftDrag, lift_drag, lift_drag_damping, lift_drag_wrench
+from mjx_revolve.water.world import World
+
+__all__ = [
+    "ELLIPSOID_COEFFICIENTS",
+    "FluidTable",
+    "LiftDrag",
+    "Outer",
+    "Water",
+    "box_added_mass",
+    "buoyancy",
+    "ellipsoid",
+    "ellipsoid_constants",
+    "entrained_water",
+    "face_drag_coefficients",
+    "inertia_box",
+    "lamb_coefficients",
+    "lift_drag",
+    "quadratic_drag",
+    "submersion",
+    "water_of",
+    "water_on_level",
+]
+
+_ZERO = (0.0, 0.0, 0.0)
+
+
+class Outer(NamedTuple):
+    """What acts on the bodies of a level from outside, about each body's origin, body frame.
+
+    Attributes:
+        torque: [N·m].
+        force: [N].
+        carried: inertia of the water that the bodies carry along, or None.
+        momentum: what that water's momentum lacks for where the water flows by itself, (angular,
+            linear) [kg·m²/s, kg·m/s], or None: A (ν - u) is A ν and this. That it turns with the
+            body asks for a force that the step adds.
+        damping: how force and torque fall with the bodies' velocity, as a 6×6 [N·s/m ...], for
+            the implicit part of a step; or None.
+    """
+
+    torque: Vec
+    force: Vec
+    carried: SpatialInertia | None
+    momentum: tuple[Vec, Vec] | None
+    damping: SpatialInertia | None
+
+
+class _Stream(NamedTuple):
+    """The water's velocity and acceleration, body frame; None where there is none."""
+
+    velocity: Any
+    acceleration: Any
+
+
+def _is_array(x: Scalar) -> bool:
+    return hasattr(x, "shape")
+
+
+def _present(x: Scalar) -> bool:
+    """Whether it is more than a plain zero; what is traced counts as something."""
+    return isinstance(x, jax.Array) or bool(np.any(x))
+
+
+def _some(vector: Any) -> Any:
+    """A vector, or None where it is plainly zero: a traced zero counts as something."""
+    if vector is None or all(isinstance(x, int | float) and x == 0 for x in vector):
+        return None
+    return vector
+
+
+def _to_body(motion: Motion, vector: Any) -> Any:
+    """A vector of the world seen from each body's frame."""
+    if vector is None:
+        return None
+    axes = (motion.x_axis, motion.y_axis, motion.up)
+    return tuple(
+        total(*[mul(c, axis[i]) for c, axis in zip(vector, axes, strict=True)]) for i in range(3)
+    )
+
+
+def _world_place(motion: Motion, position: Vec) -> Vec:
+    """World coordinates of places in the bodies' frames."""
+    return (
+        add(motion.place[0], dot(motion.x_axis, position)),
+        add(motion.place[1], dot(motion.y_axis, position)),
+        add(motion.height, dot(motion.up, position)),
+    )
+
+
+def _stream(world: World, water: Water, motion: Motion, position: Vec) -> _Stream:
+    """The water's motion at places of the bodies, relative to the uniform current."""
+    if is_uniform(world):
+        return _Stream(None, None)
+    rest = water._replace(current=_ZERO, acceleration=_ZERO)
+    place = _world_place(motion, position)
+    velocity, acceleration = flow(world, rest, *place)
+    if world.waves:
+        acceleration = vadd(acceleration, wave_convection(world, rest, *place))
+    return _Stream(_to_body(motion, _some(velocity)), _to_body(motion, _some(acceleration)))
+
+
+def _of_parts(x: Scalar) -> bool:
+    """Whether a number differs from part to part, `[npart, nbody, lanes]`."""
+    return _is_array(x) and x.ndim == 3
+
+
+def _push(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Vec, Vec, Vec | None]:
+    """Force, torque and the force's damping of the drag law, part frame, at the box's centre.
+
+    All but the drag of faces against turning: `_twist`.
+    """
+    if parts.drag == "faces":
+        push = [quadratic_drag(x, c, share) for x, c in zip(v, parts.drag_linear, strict=True)]
+        return tuple(f for f, _ in push), _ZERO, tuple(d for _, d in push)
+    if parts.drag == "lift_drag":
+        assert parts.plate is not None
+        at = vadd(v, cross(w, parts.plate_center))
+        plate = (parts.plate_forward, parts.plate_upward, parts.plate_area, world.density)
+        force, torque = lift_drag_wrench(at, *plate, parts.plate)
+        torque = vadd(torque, cross(parts.plate_center, force))
+        slope = mul(lift_drag_damping(at, *plate, parts.plate), share)
+        # Half of the slope: the step then takes the force in the middle of its velocities.
+        half = mul(0.5, slope)
+        return vscale(share, force), vscale(share, torque), (half, half, half)
+    if parts.drag == "ellipsoid":
+        force, torque = ellipsoid(v, w, parts.ellipsoid, not world.added_mass)
+        return vscale(share, force), vscale(share, torque), None
+    return _ZERO, _ZERO, None
+
+
+def _twist(
+    parts: Parts, w: Vec, share: Scalar, gather: Callable[[Scalar], Scalar]
+) -> tuple[Vec, Sym]:
+    """Torque of the faces' drag against turning on each body, and its damping, body frame.
+
+    `w` is the angular velocity, part frame.
+    """
+    strength = tuple(mul(c, share) for c in parts.drag_angular)
+    together = not any(map(_of_parts, w))
+    if together:  # all parts turn alike about their own axes
+        strength = tuple(map(gather, strength))
+    drag = [quadratic_drag(x, c, 1.0) for x, c in zip(w, strength, strict=True)]
+    torque = matvec(parts.rotation, tuple(t for t, _ in drag))
+    d = tuple(d for _, d in drag)
+    damping = rotate_sym(parts.rotation, (d[0], 0.0, 0.0, d[1], 0.0, d[2]))
+    if together:
+        return torque, damping
+    return tuple(map(gather, torque)), tuple(map(gather, damping))
+
+
+def _pressure(
+    world: World,
+    parts: Parts,
+    share: Scalar,
+    moment: Vec,
+    gradient: Vec,
+    gather: Callable[[Scalar], Scalar],
+) -> tuple[Vec, Vec]:
+    """Torque and force of the water's pressure on each body, body frame.
+
+    Args:
+        world: whose water.
+        parts: of the bodies.
+        share: of each part that is submerged.
+        moment: as from `submersion`, part frame.
+        gradient: of the pressure, over the density, body frame [m/s²].
+        gather: the sum over the parts.
+
+    Returns:
+        About the bodies' origins.
+    """
+    mass, first = displaced(
+        share,
+        matvec(parts.rotation, moment),
+        parts.volume,
+        parts.center_position,
+        world.density,
+    )
+    if not any(map(_of_parts, gradient)):
+        mass, first = gather(mass), tuple(map(gather, first))
+        return cross(first, gradient), vscale(mass, gradient)
+    torque, force = cross(first, gradient), vscale(mass, gradient)
+    return tuple(map(gather, torque)), tuple(map(gather, force))
+
+
+def _water_on_parts(
+    world: World, parts: Parts, n: int, motion: Motion, gravity: Vec, water: Water
+) -> tuple[Vec, Vec, SpatialInertia | None, SpatialInertia | None, Scalar]:
+    """Torque, force, carried water, damping and submerged share of one group of parts."""
+    k, lanes = len(parts.rows), jnp.shape(motion.height)[-1]
+    wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
+    gather = lambda x: sum_parts(wide(x) if _is_array(x) else x, k)  # noqa: E731
+    stream = _stream(world, water, motion, parts.position)
+    velocity = vadd(motion.velocity, cross(motion.spin, parts.position))
+    relative = velocity if stream.velocity is None else vsub(velocity, stream.velocity)
+    v = matTvec(parts.rotation, relative)
+    w = matTvec(parts.rotation, motion.spin)
+    height, slope = water.surface_height, None
+    if world.waves:
+        x, y, _ = _world_place(motion, parts.center_position)
+        height, slope = surface(world, water, x, y)
+    below = sub(height, add(motion.height, dot(motion.up, parts.center_position)))
+    normal = motion.up
+    if slope is not None:
+        # Distance to the surface's tangent plane, and its normal.
+        steep = jax.lax.rsqrt(1 + slope[0] * slope[0] + slope[1] * slope[1])
+        below = below * steep
+        normal = _to_body(motion, (-slope[0] * steep, -slope[1] * steep, steep))
+    up = matTvec(parts.rotation, normal)
+    depth = wide(below)
+    # Without buoyancy the water still drags what is below its surface.
+    mode = "mask" if parts.buoyancy == "off" else parts.buoyancy
+    share, moment = submersion(up, depth, parts.half_size, mode)
+    force, torque, damping = _push(world, parts, v, w, share)
+    if parts.buoyancy != "off" and world.surface_tension is not None:
+        pull, turn = surface_tension(
+            tuple(map(wide, up)),
+            depth,
+            parts.half_size,
+            world.surface_tension.gamma,
+            world.density * world.gravity,
+            world.surface_tension.contact_angle,
+            parts.exposed,
+        )
+        force, torque = vadd(force, pull), vadd(torque, turn)
+    force = matvec(parts.rotation, force)
+    torque = vadd(matvec(parts.rotation, torque), cross(parts.position, force))
+    force, torque = tuple(map(gather, force)), tuple(map(gather, torque))
+    if parts.buoyancy != "off":
+        # The pressure's gradient holds up what is still, and pushes along with moving water.
+        gradient = gravity
+        if stream.acceleration is not None:
+            gradient = vadd(gradient, stream.acceleration)
+        righting, lift = _pressure(world, parts, share, moment, gradient, gather)
+        torque, force = vadd(torque, righting), vadd(force, lift)
+    resisting = None
+    if damping is not None:
+        x, y, z = damping
+        linear = rotate_sym(parts.rotation, (x, 0.0, 0.0, y, 0.0, z))
+        one = shift_inertia(linear, (0.0,) * 6, parts.position)
+        # No plate knows drag against turning; without one, a free plate spins up for ever.
+        twist, turning = _twist(parts, w, share, gather)
+        torque = vadd(torque, twist)
+        resisting = SpatialInertia(
+            vadd(tuple(map(gather, one.angular)), turning),
+            tuple(tuple(map(gather, row)) for row in one.cross),
+            tuple(map(gather, one.linear)),
+        )
+    carried = None
+    if any(_present(x) for x in (*parts.carried_linear, *parts.carried_angular)):
+        weigh = lambda x: sum_parts(mul(x, share), k) if _present(x) else 0.0  # noqa: E731
+        carried = SpatialInertia(
+            tuple(map(weigh, parts.carried_angular)),
+            tuple(tuple(map(weigh, row)) for row in parts.carried_cross),
+            tuple(map(weigh, parts.carried_linear)),
+        )
+    return torque, force, carried, resisting, share
+
+
+def _plus(a: SpatialInertia | None, b: SpatialInertia | None) -> SpatialInertia | None:
+    if a is None or b is None:
+        return a if b is None else b
+    return add_inertia(a, b)
+
+
+def _share_of_body(level: Level, shares: Sequence[Scalar]) -> Scalar:
+    """Submerged share of each body, its parts weighted by volume."""
+    n = len(level.body)
+    wet, whole = 0.0, 1e-30
+    for parts, share in zip(level.parts, shares, strict=True):
+        k, volume = len(parts.rows), parts.volume
+        if not isinstance(volume, jax.Array):
+            volume = np.broadcast_to(np.asarray(volume), (k, n, 1))
+        wet = add(wet, sum_parts(mul(volume, share), k))
+        whole = add(whole, sum(volume[i] for i in range(k)))
+    return mul(1 / whole, wet)
+
+
+def _inertia_box(
+    world: World, level: Level, motion: Motion, water: Water, share: Scalar
+) -> tuple[Vec, Vec]:
+    """Torque and force of MuJoCo's inertia-box law on each body."""
+    stream = _stream(world, water, motion, level.box_position)
+    at = vadd(motion.velocity, cross(motion.spin, level.box_position))
+    at = at if stream.velocity is None else vsub(at, stream.velocity)
+    force, torque = inertia_box(
+        matTvec(level.box_rotation, at),
+        matTvec(level.box_rotation, motion.spin),
+        level.box_size,
+        world.density,
+        world.viscosity,
+    )
+    force = vscale(share, matvec(level.box_rotation, force))
+    torque = vscale(share, matvec(level.box_rotation, torque))
+    return vadd(torque, cross(level.box_position, force)), force
+
+
+def _thrust(level: Level, shares: Sequence[Scalar], thrusts: Sequence[Scalar]) -> tuple[Vec, Vec]:
+    """Torque and force of the thrusters on each body."""
+    n = len(level.body)
+    torques: list[list[Any]] = [[0.0] * n for _ in range(3)]
+    forces: list[list[Any]] = [[0.0] * n for _ in range(3)]
+    for p in level.propellers:
+        # Out of the water a propeller finds nothing to push.
+        wet = shares[p.group][p.slot, p.body]
+        force = vscale(mul(thrusts[p.index], wet), p.axis)
+        torque = vsub(cross(p.position, force), vscale(p.thruster.torque_ratio, force))
+        for i in range(3):
+            forces[i][p.body] = add(forces[i][p.body], force[i])
+            torques[i][p.body] = add(torques[i][p.body], torque[i])
+
+    def rows(values: list[Any]) -> Scalar:
+        arrays = [x for x in values if _is_array(x)]
+        if not arrays:
+            return 0.0
+        zero = jnp.zeros_like(arrays[0])
+        return jnp.stack([x if _is_array(x) else zero for x in values])
+
+    return tuple(rows(x) for x in torques), tuple(rows(x) for x in forces)
+
+
+def water_on_level(
+    world: World,
+    level: Level,
+    motion: Motion,
+    swirling: tuple[Vec, Vec],
+    gravity: Vec,
+    water: Water,
+    thrusts: Sequence[Scalar] = (),
+) -> Outer:
+    """What the water does to the bodies of a level.
+
+    All of it is seen from a frame that goes with the uniform current, in which the current's
+    acceleration adds to gravity. The carried water enters as an inertia A and as a momentum A ν_r
+    that turns with the body (Kirchhoff; Fossen 2011, Handbook of Marine Craft Hydrodynamics,
+    § 6.3). Where the water's velocity u differs from place to place (shear, field, waves), drag
+    sees it at each part and the carried water at the body's origin, where d(v - u)/dt in the body's
+    frame is dv/dt + ω × u - Rᵀ du/dt.
+
+    Args:
+        world: which laws act.
+        level: the bodies.
+        motion: where they are and how they move, relative to the uniform current.
+        swirling: their angular and linear velocity [rad/s, m/s] for the carried water's momentum;
+            a step takes them in its middle.
+        gravity: upwards, body frames, with the uniform current's acceleration [m/s²].
+        water: surface, current, time.
+        thrusts: of the robot's thrusters, `[lanes]` each [N].
+
+    Returns:
+        Forces, torques and inertias.
+    """
+    n = len(level.body)
+    torque, force = _ZERO, _ZERO
+    carried, damping, shares = None, None, []
+    for parts in level.parts:
+        on_torque, on_force, more_carried, more_damping, share = _water_on_parts(
+            world, parts, n, motion, gravity, water
+        )
+        torque, force = vadd(torque, on_torque), vadd(force, on_force)
+        carried, damping = _plus(carried, more_carried), _plus(damping, more_damping)
+        shares.append(share)
+    if level.propellers:
+        on_torque, on_force = _thrust(level, shares, thrusts)
+        torque, force = vadd(torque, on_torque), vadd(force, on_force)
+    if world.drag == "inertia_box":
+        on_torque, on_force = _inertia_box(
+            world, level, motion, water, _share_of_body(level, shares)
+        )
+        torque, force = vadd(torque, on_torque), vadd(force, on_force)
+    if carried is None:
+        return Outer(torque, force, None, None, damping)
+    spin, velocity = swirling
+    stream = _stream(world, water, motion, _ZERO)
+    if stream.velocity is None:
+        return Outer(torque, force, carried, None, damping)
+    momentum = apply_inertia(carried, _ZERO, tuple(map(neg, stream.velocity)))
+    # The step turns the momentum with the body's velocity, not with the relative one.
+    linear = apply_inertia(carried, spin, vsub(velocity, stream.velocity))[1]
+    torque = vadd(torque, cross(stream.velocity, linear))
+    change = cross(spin, stream.velocity)
+    if stream.acceleration is not None:
+        change = vsub(change, stream.acceleration)
+    turning = apply_inertia(carried, _ZERO, change)
+    torque, force = vsub(torque, turning[0]), vsub(force, turning[1])
+    return Outer(torque, force, carried, momentum, damping)

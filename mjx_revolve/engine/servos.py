@@ -1,0 +1,105 @@
+"""Servos and end stops of the hinges: torques, and what an implicit step adds to the inertia."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.engine.tree import Level
+from mjx_revolve.numerics.spatial import Scalar, mul, sub
+
+# Ratio of the end stops' damper to their spring [s]. A choice: a leg arrives over-damped.
+STOP_TIME = 0.005
+# A hinge counts as near its top speed where twice the gain in speed that is foreseen for the step
+# would bring it there: servos that push each other on make more of it than each by itself. A
+# choice: 1 leaves spikes of twice the top speed, 4 costs accuracy in every stroke.
+_MARGIN = 2.0
+
+
+def servo(
+    level: Level,
+    angle: Scalar,
+    speed: Scalar,
+    target: Scalar,
+    dt: float,
+    inertia: Scalar,
+    load: Scalar,
+) -> tuple[Scalar, Scalar]:
+    """Torque of the position servos, and what an implicit step adds to the joints' inertia.
+
+    MuJoCo's position actuator, clip(k_p (target - q), ± effort), on a motor whose driver limits its
+    current: full effort up to three quarters of its top speed w, from there a line that the
+    joint's friction d q̇ meets at the top speed,
+
+        τ ≤ d w + k (w - q̇),   k = (effort - d w) / (w / 4),
+
+    and likewise backwards. Below the knee it is stock MuJoCo. A light limb goes from rest to its
+    top speed within one step, so the curve is taken at the speed at the end of the step: on the
+    line, the line itself; below it, where the step may lead onto it, the chord from here to the
+    top speed, which lies below the curve, so that no push, however the hinges are coupled, drives
+    a hinge past its top speed; elsewhere the push is constant.
+
+    Args:
+        level: whose hinges.
+        angle: q `[nbody, lanes]` [rad].
+        speed: q̇ `[nbody, lanes]` [rad/s].
+        target: `[nbody, lanes]` [rad].
+        dt: for which the line is implicit [s]; 0 for none.
+        inertia: that the hinge moves, its parent held still, with all that is implicit [kg·m²].
+        load: torque of all but the motor [N·m].
+
+    Returns:
+        Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
+    """
+    target = jnp.clip(target, _cast(level.target[0], target), _cast(level.target[1], target))
+    torque = sub(mul(level.gain, target), mul(level.stiffness, angle))
+    torque = sub(torque, mul(level.servo_damping, speed))
+    low, high = (_cast(x, torque) for x in level.effort)
+    torque = jnp.clip(torque, low, high)
+    if level.motor is None:
+        return torque, jnp.zeros_like(torque)
+    friction, slope, top = (_cast(x, torque) for x in level.motor)
+    forward = jnp.sign(torque)
+    rate, push = forward * speed, jnp.abs(torque)
+    line = lambda x: friction + slope * (top - x)  # noqa: E731
+    # The motor turns its base, too, the other way.
+    per_base = dt / _cast(level.base_inertia, torque)
+    gain = dt * (push + jnp.maximum(forward * load, 0)) / inertia + per_base * push
+    beyond = line(rate) < push
+    # A push that friction outweighs needs no limit, and has no chord at the top speed itself.
+    near = (line(rate + _MARGIN * gain) < push) & ~beyond & (push > friction)
+    chord = (push - friction) / jnp.where(near, top - rate, 1)
+    torque = jnp.where(beyond, forward * line(rate), torque)
+    return torque, dt * jnp.where(beyond, slope, jnp.where(near, chord, 0))
+
+
+def _cast(x: Scalar, like: jax.Array) -> Scalar:
+    return x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)
+
+
+def end_stop(level: Level, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:
+    """Torque of the joint's end stops, and what an implicit step adds to the joint's inertia.
+
+    A spring with a damper, both of which act on angle and speed at the end of the step: linearly
+    implicit, so stable at any stiffness (cf. MuJoCo's soft limit constraint, which it stands in
+    for). The damper lets go within `STOP_TIME`: hinges arrive and stay, they do not bounce.
+
+    Args:
+        level: whose hinges.
+        angle: q `[nbody, lanes]` [rad].
+        speed: q̇ `[nbody, lanes]` [rad/s].
+        dt: for which it is implicit [s]; 0 for none.
+
+    Returns:
+        Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
+    """
+    low, high = (_cast(x, angle) for x in level.range)
+    ahead = angle + dt * speed
+    over = jnp.maximum(ahead - high, 0) - jnp.maximum(low - ahead, 0)
+    stop = _cast(level.stop, angle)
+    # The damper never holds a hinge that swings back.
+    outward = jnp.where(over * speed > 0, speed, 0)
+    torque = -stop * (over + STOP_TIME * outward)
+    stiff = jnp.where(over * speed > 0, dt + STOP_TIME, dt)
+    return torque, jnp.where(over != 0, dt * stop * stiff, jnp.zeros_like(angle))

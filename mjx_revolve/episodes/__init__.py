@@ -1,0 +1,1 @@
+"""Episodes: configurations, starts, rollouts, tasks, scores, the fitness of a population."""

@@ -1,0 +1,1 @@
+"""Evolution: strategies, the loop, run folders, and where a population is evaluated."""

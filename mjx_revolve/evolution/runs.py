@@ -1,0 +1,415 @@
+"""The run folder: everything that an evolution writes to disk, and how it is read back.
+
+    config.yaml        the resolved configuration; inputs/ holds the robot, and code, that it names
+    run.json           versions, seed, arguments, platform, thread settings, times
+    metrics.csv        one line per generation (RFC 4180), readable while the run goes on
+    checkpoints/       the newest few, one npz each
+    champion/          genes.yaml, morphology.yaml, robot.xml
+    fitness.png, trajectory.png
+
+Files appear whole or not at all: they are written beside their place, flushed to the disk, and
+moved there. Nothing here knows what the numbers mean.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import re
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import yaml
+
+from mjx_revolve.episodes.config import Config, dump_config, load_config
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import with_path, write_atomic
+from mjx_revolve.inputs.own_code import parse_own
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there, nothing keeps two processes off one folder
+    fcntl = None  # type: ignore[assignment]
+
+_TEMPORARY = re.compile(r"\.\d+-")
+_CHECKPOINT = re.compile(r"generation_(\d+)\.npz")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint holds.
+
+    Attributes:
+        path: the file.
+        arrays: the arrays that were saved.
+        meta: the plain values that were saved.
+        damaged: names of newer checkpoints that could not be used, and why.
+    """
+
+    path: Path
+    arrays: dict[str, np.ndarray]
+    meta: dict[str, Any]
+    damaged: tuple[str, ...] = ()
+
+
+@dataclass
+class Run:
+    """An open run folder. Closing it, or the end of the process, lets others open it.
+
+    Attributes:
+        folder: the folder.
+    """
+
+    folder: Path
+    _lock: IO[str] | None = field(default=None, repr=False)
+
+    # --- plain files ---
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """The contents of `run.json`."""
+        path = self.folder / "run.json"
+        try:
+            info = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise InputError(f"{path}: expected a file; found none") from None
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: expected JSON; found: {error}") from None
+        if not isinstance(info, dict):
+            raise InputError(f"{path}: expected a JSON object; found {type(info).__name__}")
+        return info
+
+    def update_info(self, **changes: Any) -> None:
+        """Sets entries of `run.json`; None removes one."""
+        info = (self.info if (self.folder / "run.json").exists() else {}) | changes
+        info = {key: value for key, value in info.items() if value is not None}
+        text = json.dumps(info, indent=2, ensure_ascii=False) + "\n"
+        write_atomic(self.folder / "run.json", text.encode())
+
+    def save_config(self, config: Config) -> None:
+        """Writes `config.yaml`, paths inside the folder relative to it."""
+        head = "# The resolved configuration of this run; it loads again as it stands.\n"
+        text = head + dump_config(config, self.folder)
+        write_atomic(self.folder / "config.yaml", text.encode())
+
+    def load_config(self) -> Config:
+        """Reads `config.yaml`."""
+        return load_config(self.folder / "config.yaml")
+
+    def write(self, name: str, content: bytes | Callable[[Path], None]) -> Path:
+        """Writes any file below the folder.
+
+        Args:
+            name: relative to the folder.
+            content: see `write_atomic`.
+
+        Returns:
+            The file's path.
+        """
+        write_atomic(self.folder / name, content)
+        return self.folder / name
+
+    # --- metrics ---
+
+    @property
+    def metrics_path(self) -> Path:
+        """Where the metrics are."""
+        return self.folder / "metrics.csv"
+
+    def append_metrics(self, row: Mapping[str, float]) -> None:
+        """Adds a line to `metrics.csv`; the first one brings the header.
+
+        Args:
+            row: the figures by column; the same columns every time.
+        """
+        new = not self.metrics_path.exists() or self.metrics_path.stat().st_size == 0
+        text = io.StringIO()
+        writer = csv.writer(text)
+        if new:
+            writer.writerow(row)
+        writer.writerow(_number(value) for value in row.values())
+        try:
+            with open(self.metrics_path, "ab") as file:
+                file.write(text.getvalue().encode())
+        except OSError as error:
+            raise with_path(error, self.metrics_path) from None
+
+    def load_metrics(self) -> dict[str, np.ndarray]:
+        """Reads `metrics.csv` as one float array per column."""
+        return load_metrics(self.metrics_path)
+
+    def _metrics_position(self) -> int:
+        if not self.metrics_path.exists():
+            return 0
+        with open(self.metrics_path, "rb+") as file:
+            os.fsync(file.fileno())  # the checkpoint will count on these lines
+            return file.seek(0, os.SEEK_END)
+
+    # --- checkpoints ---
+
+    def checkpoints(self) -> list[Path]:
+        """The checkpoint files, newest first."""
+        folder = self.folder / "checkpoints"
+        found = [path for path in folder.glob("*.npz") if _CHECKPOINT.fullmatch(path.name)]
+        return sorted(found, key=_generation, reverse=True)
+
+    def save_checkpoint(
+        self, generation: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], keep: int
+    ) -> Path:
+        """Saves a checkpoint and removes the oldest ones.
+
+        Args:
+            generation: for its name.
+            arrays: any arrays but object arrays.
+            meta: plain values that JSON can hold.
+            keep: how many checkpoints to keep.
+
+        Returns:
+            The file.
+        """
+        meta = {**meta, "generation": generation, "metrics_position": self._metrics_position()}
+        path = self.folder / "checkpoints" / f"generation_{generation:06d}.npz"
+        buffer = io.BytesIO()
+        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+        # Names go into the zip as they are; "meta" cannot collide with an "array:" one.
+        named: dict[str, Any] = {f"array:{name}": value for name, value in arrays.items()}
+        np.savez(buffer, meta=text, **named)
+        write_atomic(path, buffer.getvalue())
+        for old in self.checkpoints()[keep:]:
+            old.unlink(missing_ok=True)
+        return path
+
+    def load_checkpoint(self) -> Checkpoint:
+        """Reads the newest checkpoint that is whole.
+
+        Returns:
+            The checkpoint; `damaged` says which newer ones were passed over.
+
+        Raises:
+            InputError: there is none.
+        """
+        damaged: list[str] = []
+        for path in self.checkpoints():
+            try:
+                arrays, meta = _read_checkpoint(path)
+                have = self.metrics_path.stat().st_size if self.metrics_path.exists() else 0
+                if have < meta["metrics_position"]:
+                    raise ValueError(f"metrics.csv lacks lines: {have} bytes long")
+            # Whatever a damaged zip, header or JSON makes the readers raise.
+            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError,
+                    NotImplementedError, MemoryError, SyntaxError) as error:  # fmt: skip
+                damaged.append(f"{path.name} ({str(error).splitlines()[0] if str(error) else ''})")
+                continue
+            return Checkpoint(path, arrays, meta, tuple(damaged))
+        found = f"only damaged ones: {', '.join(damaged)}" if damaged else "none"
+        raise InputError(
+            f"{self.folder / 'checkpoints'}: expected a checkpoint to resume from; found {found}"
+        )
+
+    def rewind(self, checkpoint: Checkpoint) -> None:
+        """Forgets what came after a checkpoint: metrics, checkpoints, half-written files."""
+        position = checkpoint.meta["metrics_position"]
+        if self.metrics_path.exists():
+            os.truncate(self.metrics_path, position)
+        for path in self.checkpoints():
+            if _generation(path) > checkpoint.meta["generation"]:
+                path.unlink(missing_ok=True)
+        for path in self.folder.rglob(".*"):
+            if _TEMPORARY.match(path.name):
+                path.unlink(missing_ok=True)
+
+    # --- champion ---
+
+    def save_champion(self, genes: np.ndarray, **facts: Any) -> None:
+        """Writes `champion/genes.yaml`.
+
+        Args:
+            genes: `[G]`.
+            **facts: plain values to go with them (score, origin, ...).
+        """
+        data = {**facts, "config": "../config.yaml", "genes": [float(gene) for gene in genes]}
+        text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
+        self.write("champion/genes.yaml", text.encode())
+
+    def close(self) -> None:
+        """Lets other processes open the folder."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
+def _number(value: float) -> str:
+    """Few digits, but enough to read the same float32 back."""
+    return str(value) if isinstance(value, int | np.integer) else f"{value:.9g}"
+
+
+def _generation(path: Path) -> int:
+    match = _CHECKPOINT.fullmatch(path.name)
+    return int(match.group(1)) if match else -1
+
+
+def _read_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    with zipfile.ZipFile(path) as file:
+        broken = file.testzip()  # every checksum; np.load looks only at what it happens to read
+    if broken:
+        raise ValueError(f"{broken} is damaged")
+    with np.load(path, allow_pickle=False) as file:
+        meta = json.loads(file["meta"].tobytes())
+        arrays = {
+            name.removeprefix("array:"): file[name]
+            for name in file.files
+            if name.startswith("array:")
+        }
+    if not isinstance(meta, dict) or not isinstance(meta["metrics_position"], int):
+        raise ValueError("meta is no mapping")
+    return arrays, meta
+
+
+def load_metrics(path: str | Path) -> dict[str, np.ndarray]:
+    """Reads a metrics file, also one that is being written.
+
+    Args:
+        path: the CSV.
+
+    Returns:
+        One float array per column; a last line that is still incomplete is left out.
+
+    Raises:
+        InputError: there is no such file, or it holds something else.
+    """
+    try:
+        text = Path(path).read_bytes().decode()
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file; found none") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected a CSV file; found: {error}") from None
+    rows = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))
+    if not rows:
+        return {}
+    header, lines = rows[0], rows[1:]
+    try:
+        values = np.array([[float(cell) for cell in line] for line in lines], float)
+        values = values.reshape(len(lines), len(header))
+    except ValueError as error:
+        raise InputError(f"{path}: expected a number in every cell; found: {error}") from None
+    return {name: values[:, column] for column, name in enumerate(header)}
+
+
+def check_new_folder(folder: str | Path, option: str = "--out") -> None:
+    """Refuses a folder that holds something.
+
+    Args:
+        folder: where a new run is to go.
+        option: what messages call it.
+
+    Raises:
+        InputError: there is a file, or a folder that is not empty.
+    """
+    folder = Path(folder)
+    if folder.is_dir() and not any(folder.iterdir()):
+        return
+    if folder.is_dir():
+        hint = "; continue it with --resume" if (folder / "run.json").exists() else ""
+        raise InputError(f"{option} {folder}: expected a new or empty folder; found files{hint}")
+    if folder.exists():
+        raise InputError(f"{option} {folder}: expected a new or empty folder; found a file")
+
+
+def create_run(folder: str | Path, config: Config, **info: Any) -> tuple[Run, Config]:
+    """Makes a run folder and writes down what will run.
+
+    Args:
+        folder: a new or empty folder.
+        config: the configuration. Its morphology, and the files of a task or controller of the
+            user's own, are copied into the folder, so that the run can be moved and still be read;
+            a world or modules file stays where it is, because it may refer to files beside it.
+        **info: entries for `run.json`.
+
+    Returns:
+        The run, and its configuration, which names the copies.
+
+    Raises:
+        InputError: the folder holds something.
+        OSError: it cannot be written.
+    """
+    check_new_folder(folder)
+    folder = Path(folder).absolute()
+    try:
+        (folder / "inputs").mkdir(parents=True, exist_ok=True)
+        (folder / "checkpoints").mkdir(exist_ok=True)
+    except OSError as error:
+        raise with_path(error, folder) from None
+    run = _lock_run(folder)
+    copy = folder / "inputs" / Path(config.morphology).name
+    write_atomic(copy, Path(config.morphology).read_bytes())
+    config = config.model_copy(update={"morphology": str(copy)})
+    config = _copy_own_code(config, folder / "inputs")
+    run.save_config(config)
+    run.update_info(**info)
+    return run, config
+
+
+def _copy_own_code(config: Config, folder: Path) -> Config:
+    """Keeps the files of the user's own functions, and names the copies."""
+    copies: dict[str, Path] = {}
+    changes = {}
+    for section in ("controller", "task"):
+        settings = getattr(config, section)
+        own = parse_own(settings.type)
+        if own is None:
+            continue
+        if own.path not in copies:
+            copy = folder / Path(own.path).name
+            if copy in copies.values():  # two files of one name
+                copy = folder / f"{section}_{Path(own.path).name}"
+            write_atomic(copy, Path(own.path).read_bytes())
+            copies[own.path] = copy
+        named = f"{copies[own.path]}:{own.function}"
+        changes[section] = settings.model_copy(update={"type": named})
+    return config.model_copy(update=changes)
+
+
+def open_run(folder: str | Path) -> Run:
+    """Opens a run folder to continue it.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: it is no run folder, or another process is writing it.
+    """
+    folder = Path(folder).absolute()
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "none"
+        raise InputError(f"{folder}: expected a run folder; found {found}")
+    for name in ("config.yaml", "run.json"):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder}: expected a run folder; found no {name} in it")
+    return _lock_run(folder)
+
+
+def _lock_run(folder: Path) -> Run:
+    """Keeps a second process from writing the same folder; the lock dies with the process."""
+    if fcntl is None:
+        return Run(folder)
+    try:
+        lock = open(folder / ".lock", "a", encoding="utf-8")  # noqa: SIM115  (kept open)
+    except OSError as error:
+        raise with_path(error, folder / ".lock") from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        raise InputError(f"{folder}: expected a run that has stopped; found it running") from None
+    except OSError:  # a file system without locks
+        pass
+    return Run(folder, lock)

@@ -1,0 +1,1 @@
+"""Robots and rollouts for other programs: MJCF, URDF, SDF, ROS bags."""

@@ -1,0 +1,166 @@
+"""What the command lines share: how arguments are read, and how mistakes end.
+
+A mistake is one line on stderr and an exit code. Nothing heavy is imported here: `--help` is there
+at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+from mjx_revolve.inputs.errors import InputError
+
+_SEEDS = 2**32  # what JAX's keys take, and a run's configuration
+# A day [s]: its poses already take several GB.
+_LONGEST = 86_400.0
+
+
+class Parser(argparse.ArgumentParser):
+    """Argument parser whose complaints are one line, like those about files."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raises `InputError` instead of printing the usage and ending the process."""
+        raise InputError(f"{message.removeprefix('argument ')} (see --help)")
+
+
+def read_path(text: str) -> str:
+    """Reads a path, for `add_argument(type=read_path)`: refuses what an unset variable leaves."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f"expected a path; found {text!r}")
+    return text
+
+
+def read_seconds(text: str) -> float:
+    """Reads a duration [s], for `add_argument(type=read_seconds)`."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"expected seconds > 0; found {text!r}")
+    if value > _LONGEST:
+        raise argparse.ArgumentTypeError(f"expected at most {_LONGEST:.0f} s; found {text!r}")
+    return value
+
+
+def whole(low: int, high: int | None = None) -> Callable[[str], int]:
+    """Makes a reader of whole numbers, for `add_argument(type=whole(1))`.
+
+    Args:
+        low: the smallest.
+        high: the largest; None: there is none.
+
+    Returns:
+        Takes what was typed and returns the number.
+    """
+
+    def read(text: str) -> int:
+        """Reads a whole number within the bounds."""
+        digits = text.strip()
+        # Fewer digits than Python refuses to read.
+        value = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 100 else None
+        if value is None or value < low or (high is not None and value > high):
+            bounds = f">= {low}" if high is None else f"from {low} to {high}"
+            raise argparse.ArgumentTypeError(f"expected a whole number {bounds}; found {text!r}")
+        return value
+
+    return read
+
+
+read_seed = whole(0, _SEEDS - 1)
+
+
+def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds what `episode.load_episode` is to be told: path, duration, seed and world.
+
+    Args:
+        parser: of a command that shows an episode.
+    """
+    parser.add_argument(
+        "path", type=read_path, help="run folder, champion's genes.yaml, or morphology YAML"
+    )
+    parser.add_argument(
+        "--duration", type=read_seconds, metavar="S", help="[s] (default: the task's, or 10)"
+    )
+    parser.add_argument("--seed", type=read_seed, metavar="N", help="draws another start")
+    parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
+
+
+def check_episode_path(path: str | Path) -> None:
+    """Refuses a path at which there is nothing, before anything heavy is imported.
+
+    Args:
+        path: of a run folder, a `genes.yaml` or a morphology.
+
+    Raises:
+        InputError: there is nothing.
+    """
+    if not Path(path).exists():
+        raise InputError(f"{path}: expected a run folder, a genes.yaml or a morphology; found none")
+
+
+def check_place(path: str | Path, label: str) -> None:
+    """Refuses a place where no file can be, before any work is done for it.
+
+    Args:
+        path: of a file or a folder to write; the folders that it names are made later.
+        label: what messages call it.
+
+    Raises:
+        InputError: a file is in its way, or the folder may not be written.
+    """
+    for folder in Path(path).parents:
+        if folder.is_dir():
+            if not os.access(folder, os.W_OK | os.X_OK):
+                raise InputError(
+                    f"{label}: expected a folder to write into; found {folder} read-only"
+                )
+            return
+        if folder.exists():
+            raise InputError(f"{label}: expected the folder {folder}; found a file")
+
+
+def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
+    """Runs a command line's `main`; what goes wrong by no fault of ours becomes one line.
+
+    Args:
+        main: takes the arguments (None: `sys.argv[1:]`) and returns the exit code.
+        argv: the arguments.
+
+    Returns:
+        The exit code: `main`'s; 2 where the input is wrong (`InputError`), 1 where the system
+        refused something (a full disk, too little memory), and 130 when interrupted.
+    """
+    try:
+        return main(argv)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # `| head` closed the pipe: not an error of ours
+        sys.stderr.close()
+        return 1
+    except OSError as error:
+        print(f"error: {describe_refusal(error)}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except Exception as error:
+        # XLA's kind of error; its class cannot be named without importing JAX.
+        if not (isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)):
+            raise
+        reason = str(error).partition("\n")[0].removeprefix("RESOURCE_EXHAUSTED:").strip()
+        print(f"error: too little memory: {reason or 'none is left'}", file=sys.stderr)
+        return 1
+
+
+def describe_refusal(error: OSError) -> str:
+    """What the system refused, in one line: the file, where one is known, and why."""
+    reason = error.strerror or " ".join(str(error).split()) or type(error).__name__
+    return f"{error.filename}: {reason}" if error.filename else reason

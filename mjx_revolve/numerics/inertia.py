@@ -1,0 +1,171 @@
+"""How the bodies of one level move, and their spatial inertias.
+
+Spatial quantities are (angular, linear), in each body's own frame, about its own origin
+(Featherstone 2008, Rigid Body Dynamics Algorithms, chapter 2).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from mjx_revolve.numerics.spatial import (
+    SYM,
+    Mat,
+    Scalar,
+    Sym,
+    Vec,
+    add,
+    cross,
+    full,
+    matmul,
+    matvec,
+    mul,
+    neg,
+    skew,
+    sub,
+    symvec,
+    total,
+    transpose,
+    vadd,
+)
+
+
+class Motion(NamedTuple):
+    """Where the bodies of a level are and how they move, `[nbody, lanes]` each.
+
+    Attributes:
+        spin: angular velocity, body frame [rad/s].
+        velocity: of the body's origin, body frame [m/s].
+        up: world z in the body frame.
+        height: world z of the origin [m].
+        x_axis: world x in the body frame, where something needs it, else None.
+        y_axis: world y likewise.
+        place: world x and y of the origin [m], likewise.
+    """
+
+    spin: Vec
+    velocity: Vec
+    up: Vec
+    height: Scalar
+    x_axis: Any
+    y_axis: Any
+    place: Any
+
+
+class SpatialInertia(NamedTuple):
+    """A 6×6 spatial inertia [[angular, cross], [crossᵀ, linear]]."""
+
+    angular: Sym
+    cross: Mat
+    linear: Sym
+
+
+class Block(NamedTuple):
+    """A 6×6 matrix that need not be symmetric, [[angular, across], [back, linear]]."""
+
+    angular: Mat
+    across: Mat
+    back: Mat
+    linear: Mat
+
+
+def block_of(inertia: SpatialInertia) -> Block:
+    """A spatial inertia with all of its entries."""
+    return Block(
+        full(inertia.angular), inertia.cross, transpose(inertia.cross), full(inertia.linear)
+    )
+
+
+def gyroscope(angular: Vec, linear: Vec) -> Block:
+    """K(h) with K(h) ν = ν ×* h: what a momentum h asks for when its body moves by ν.
+
+    It is antisymmetric: whatever h, that force does no work.
+    """
+    turned = tuple(tuple(neg(x) for x in row) for row in skew(linear))
+    zero = ((0.0, 0.0, 0.0),) * 3
+    return Block(tuple(tuple(neg(x) for x in row) for row in skew(angular)), turned, turned, zero)
+
+
+def add_block(a: Block, s: Scalar, b: Block) -> Block:
+    """A + s b."""
+    return Block(
+        *(
+            tuple(
+                tuple(add(x, mul(s, y)) for x, y in zip(p, q, strict=True))
+                for p, q in zip(m, n, strict=True)
+            )
+            for m, n in zip(a, b, strict=True)
+        )
+    )
+
+
+def apply_block(a: Block, spin: Vec, velocity: Vec) -> tuple[Vec, Vec]:
+    """Matrix times a motion, (angular, linear)."""
+    return (
+        vadd(matvec(a.angular, spin), matvec(a.across, velocity)),
+        vadd(matvec(a.back, spin), matvec(a.linear, velocity)),
+    )
+
+
+def apply_inertia(inertia: SpatialInertia, spin: Vec, velocity: Vec) -> tuple[Vec, Vec]:
+    """Inertia times a motion: its momentum, (angular, linear)."""
+    angular = vadd(symvec(inertia.angular, spin), matvec(inertia.cross, velocity))
+    linear = vadd(matvec(transpose(inertia.cross), spin), symvec(inertia.linear, velocity))
+    return angular, linear
+
+
+def add_inertia(a: SpatialInertia, b: SpatialInertia) -> SpatialInertia:
+    """The sum of two."""
+    return SpatialInertia(
+        vadd(a.angular, b.angular),
+        tuple(vadd(x, y) for x, y in zip(a.cross, b.cross, strict=True)),
+        vadd(a.linear, b.linear),
+    )
+
+
+def scale_inertia(s: Scalar, a: SpatialInertia) -> SpatialInertia:
+    """One, times a number."""
+    return SpatialInertia(
+        tuple(mul(s, x) for x in a.angular),
+        tuple(tuple(mul(s, x) for x in row) for row in a.cross),
+        tuple(mul(s, x) for x in a.linear),
+    )
+
+
+def shift_inertia(linear: Sym, angular: Sym, position: Vec) -> SpatialInertia:
+    """What resists motion at a place, seen from the body's origin.
+
+    Args:
+        linear: 3×3 against the place's velocity, body frame.
+        angular: 3×3 against rotation.
+        position: of the place, body frame [m].
+
+    Returns:
+        The 6×6 about the origin: [[angular - [r] L [r], [r] L], [·, L]].
+    """
+    x = skew(position)
+    across = matmul(x, full(linear))
+    second = matmul(across, x)
+    return SpatialInertia(
+        tuple(sub(angular[k], second[i][j]) for k, (i, j) in enumerate(SYM)), across, linear
+    )
+
+
+def cross_force(spin: Vec, velocity: Vec, angular: Vec, linear: Vec) -> tuple[Vec, Vec]:
+    """The force cross product (Featherstone's v ×*): rate of change of a momentum seen turning."""
+    return vadd(cross(spin, angular), cross(velocity, linear)), cross(spin, linear)
+
+
+def sum_parts(x: Scalar, n: int) -> Scalar:
+    """Sum over the first of three axes, written out: XLA cannot reduce inside a called loop.
+
+    Args:
+        x: `[n or 1, nbody, lanes]`, or anything smaller that stands for n equal terms.
+        n: how many terms.
+
+    Returns:
+        `[nbody, lanes]`.
+    """
+    if not hasattr(x, "shape") or x.ndim < 3:
+        return mul(float(n), x)
+    return total(*[x[k] for k in range(x.shape[0])]) if x.shape[0] > 1 else mul(float(n), x[0])

@@ -1,0 +1,254 @@
+"""The process around a run: thread settings, JAX's compilation cache, and what to write down.
+
+`prepare_process` comes first in a command's `main`, before NumPy and JAX are loaded; nothing here
+imports them at the top.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+# CMA-ES's eigendecomposition gives other bits with other numbers of BLAS threads.
+_THREAD_SETTINGS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_PACKAGES = (
+    "mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "numpy", "scipy",
+)  # fmt: skip
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+# What a worker compiles faster than this is not worth a file [s]. The leader keeps everything: a
+# start runs a hundred small programs, 2 s to compile and .3 s to read back.
+_WORKER_MIN_COMPILE_TIME = 0.5
+
+
+def prepare_process() -> Path | None:
+    """Fixes the thread settings and turns on JAX's persistent compilation cache.
+
+    Settings that are already in the environment (`OPENBLAS_NUM_THREADS`,
+    `JAX_COMPILATION_CACHE_DIR`) are respected, and so is a cache folder that JAX was already told;
+    an empty `JAX_COMPILATION_CACHE_DIR` turns the cache off. Imports JAX.
+
+    Returns:
+        The cache folder in use, or None.
+    """
+    for name in _THREAD_SETTINGS:
+        os.environ.setdefault(name, "1")
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if "jax" in sys.modules and (known := sys.modules["jax"].config.jax_compilation_cache_dir):
+        chosen = known
+    folder = cache_folder() if chosen is None else (Path(chosen).absolute() if chosen else None)
+    if folder is not None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            remove_broken_entries(folder)
+        except OSError as error:  # a read-only home: slower starts, the same results
+            print(f"no compilation cache: {error.strerror}: {folder}", file=sys.stderr)
+            folder = None
+
+    _use_cache(folder, 0.0)
+    return folder
+
+
+def _use_cache(folder: Path | None, min_compile_time: float) -> None:
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(folder) if folder else None)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time)
+
+
+def prepare_worker(core: int | None, cache: str | None) -> None:
+    """What `prepare_process` is to a command, this is to a worker process; imports JAX.
+
+    Args:
+        core: the only core it is to use, once `pin_process` says so; None: any. XLA makes as many
+            threads as there are cores to use when it starts, so such a worker runs blocks in a
+            single thread. Compiling takes more threads, and cores that are still idle.
+        cache: the compilation cache's folder, as the process that started the worker uses it. That
+            one has removed broken entries; doing so again could hit one that is being written.
+    """
+    for name in _THREAD_SETTINGS:
+        os.environ.setdefault(name, "1")
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    _use_cache(Path(cache) if cache else None, _WORKER_MIN_COMPILE_TIME)
+    if core is not None:
+        import jax
+
+        cores = list_cores()
+        pin_process([core])
+        jax.devices()
+        pin_process(cores)
+
+
+def pin_process(cores: Sequence[int]) -> None:
+    """Keeps all threads of this process to these cores, by number, where the system can."""
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    folder = Path("/proc/self/task")
+    threads = [int(thread.name) for thread in folder.iterdir()] if folder.is_dir() else [0]
+    for thread in threads:
+        # The thread has ended, or the core is no longer one of ours (a shrunk container).
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(thread, cores)
+
+
+def list_cores() -> list[int]:
+    """The CPU cores this process may use, by number; empty where the system does not say."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
+def cache_folder() -> Path:
+    """Where compiled programs are kept: one folder per jaxlib and kind of host CPU.
+
+    Returns:
+        An absolute path below `$XDG_CACHE_HOME`, or `~/.cache`.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    version = importlib.metadata.version("jaxlib")
+    return Path(home).absolute() / "mjx_revolve" / "xla" / f"{version}-{_cpu_hash()}"
+
+
+def _cpuinfo() -> list[str]:
+    try:
+        return Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return []
+
+
+def _cpu_hash() -> str:
+    """XLA compiles for the host's instruction set: the same model name and flags, the same code."""
+    flags = {line for line in _cpuinfo() if line.startswith(("model name", "flags", "Features"))}
+    text = "\n".join([platform.machine(), cpu_model(), *sorted(flags)])
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _is_whole(data: bytes) -> bool:
+    """Whether a cache entry can be read to its end; unknown kinds count as whole."""
+    if not data:
+        return False
+    if data.startswith(_ZSTD_MAGIC):  # what JAX writes where a zstd module is installed
+        try:
+            import zstandard
+        except ImportError:
+            return True
+        try:
+            zstandard.ZstdDecompressor().decompressobj().decompress(data)
+        except zstandard.ZstdError:
+            return False
+        return True
+    decompressor = zlib.decompressobj()
+    try:
+        decompressor.decompress(data)
+    except zlib.error:
+        return False
+    return decompressor.eof
+
+
+def remove_broken_entries(folder: Path) -> list[str]:
+    """Removes compilation-cache entries that a killed process left half written.
+
+    JAX warns about such an entry and compiles anew at every start, for ever, because it never
+    overwrites one. Entries that were found whole are not read again.
+
+    Args:
+        folder: the cache folder.
+
+    Returns:
+        The names of the removed entries.
+    """
+    marker = folder / ".checked"
+    checked = marker.stat().st_mtime if marker.exists() else 0.0
+    removed = []
+    newest = checked
+    for entry in sorted(folder.glob("*-cache")):
+        try:
+            changed = entry.stat().st_mtime
+            if changed <= checked:
+                continue
+            newest = max(newest, changed)
+            if not _is_whole(entry.read_bytes()):
+                entry.unlink()
+                removed.append(entry.name)
+        except FileNotFoundError:  # another process was faster
+            continue
+    if newest > checked:
+        marker.touch()
+        # One tick earlier than the newest entry: one written within the same tick is read again.
+        os.utime(marker, (newest - 0.001, newest - 0.001))
+    return removed
+
+
+def _git_revision() -> str | None:
+    """The checkout's commit, with `+` when files differ from it; None outside a checkout."""
+    folder = Path(__file__).resolve().parent
+    command = ["git", "-C", str(folder)]
+    try:
+        commit = subprocess.run(
+            [*command, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
+        ).stdout.strip()
+        changes = subprocess.run(
+            [*command, "status", "--porcelain", "--untracked-files=no", "."],
+            capture_output=True, text=True, timeout=5, check=True,
+        ).stdout.strip()  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return commit + ("+" if changes else "")
+
+
+def cpu_model() -> str:
+    """The host's kind of CPU, in its maker's words."""
+    for line in _cpuinfo():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def source_hash() -> str:
+    """A fingerprint of this package's Python files: two checkouts of one version may differ."""
+    digest = hashlib.sha256()
+    package = Path(__file__).resolve().parents[1]
+    for path in sorted(package.rglob("*.py")):
+        name = path.relative_to(package).as_posix()
+        digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]
+
+
+def describe_process() -> dict[str, Any]:
+    """What the bits of a run depend on, and who ran it: for `run.json`. Imports JAX.
+
+    Returns:
+        Versions, git revision, arguments, platform, CPU, device and thread settings.
+    """
+    import jax
+
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "versions": versions,
+        "git": _git_revision(),
+        "argv": sys.argv,
+        "platform": platform.platform(),
+        "cpu": cpu_model(),
+        "cpu_count": usable_cores(),
+        "device": jax.devices()[0].device_kind,
+        "threads": {name: os.environ.get(name) for name in (*_THREAD_SETTINGS, "NPROC")},
+        "xla_flags": os.environ.get("XLA_FLAGS"),
+    }
+
+
+def usable_cores() -> int:
+    """The number of CPU cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

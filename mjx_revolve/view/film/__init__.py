@@ -1,0 +1,1 @@
+"""The film of a robot's episode: scene, camera, light, captions, video."""

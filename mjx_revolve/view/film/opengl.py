@@ -1,0 +1,81 @@
+"""Finds an OpenGL that works, with a screen or without.
+
+MuJoCo chooses OpenGL when it is imported, by the environment variable MUJOCO_GL, and then has no
+second try. Here each way of making a context is tried in a process of its own, where a driver that
+crashes does no harm. Nothing here imports MuJoCo, so it can be asked before.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+from mjx_revolve.inputs.errors import InputError
+
+# What makes a context, by the name that MUJOCO_GL has for it, in the order of trying.
+_WAYS = {
+    "linux": ("egl", "osmesa", "glfw"),
+    "darwin": ("cgl", "glfw"),
+    "win32": ("glfw",),
+}
+_PROBE = """
+import importlib, sys
+import mujoco
+context = importlib.import_module("mujoco." + sys.argv[1]).GLContext(64, 64)
+context.make_current()
+mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontScale.mjFONTSCALE_100)
+"""
+_PATIENCE = 60  # s for one try
+
+
+def find_opengl() -> str:
+    """Which way of making a context works here.
+
+    Returns:
+        "egl", "osmesa", "glfw" or "cgl". Where MUJOCO_GL names one of them, only that is tried.
+
+    Raises:
+        InputError: none works; the message says what to install.
+    """
+    system = "linux" if sys.platform.startswith("linux") else sys.platform
+    ways: tuple[str, ...] = _WAYS.get(system, ("glfw",))
+    wish = os.environ.get("MUJOCO_GL", "").strip().lower()
+    wish = {"glx": "glfw", "wgl": "glfw"}.get(wish, wish)
+    if wish in ("disable", "disabled", "off", "false", "0"):
+        raise InputError(f"MUJOCO_GL={wish}: expected OpenGL to draw with; found it switched off")
+    if wish and wish not in ("enable", "enabled", "on", "true", "1"):
+        if wish not in ways:
+            raise InputError(f"MUJOCO_GL: expected one of {', '.join(ways)}; found {wish!r}")
+        ways = (wish,)
+    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if system == "linux" and not screen and not wish:
+        ways = tuple(way for way in ways if way != "glfw")
+    for way in ways:
+        if _works(way):
+            return way
+    asked = f" by MUJOCO_GL={wish}" if wish in ways else ""
+    hint = ": apt-get install libegl1 libgl1-mesa-dri" if system == "linux" else ""
+    raise InputError(
+        f"OpenGL: expected one of {', '.join(ways)} to draw with{asked}; found none that works "
+        f"(install one{hint})"
+    )
+
+
+def _works(way: str) -> bool:
+    """Whether a context can be made so, tried in a process of its own."""
+    known = ("PYOPENGL_PLATFORM", "MUJOCO_GL")
+    environment = {name: value for name, value in os.environ.items() if name not in known}
+    # MuJoCo's own choice at import is harmless and of no interest: ours follows.
+    environment["MUJOCO_GL"] = "disable"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", _PROBE, way],
+            env=environment,
+            capture_output=True,
+            timeout=_PATIENCE,
+            check=False,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return False
+    return done.returncode == 0

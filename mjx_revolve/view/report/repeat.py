@@ -1,0 +1,119 @@
+"""How to repeat a run: commands to paste, and what its bits depend on."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+from mjx_revolve.episodes.config import Config, load_config
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.view.report.data import RunRecord
+
+# Set to 1 by the command itself where nobody sets them.
+_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def repeat_commands(record: RunRecord) -> list[tuple[str, str]]:
+    """Command lines that evolve the same run again.
+
+    Args:
+        record: the run.
+
+    Returns:
+        A few words and a command line each: from the run folder, which holds all settings; and
+        from the configuration file that it began with, where that still gives the same settings.
+        None of them without settings.
+    """
+    if record.config is None:
+        return []
+    again = f"{record.label.rstrip('/')}-again"
+    own = [f"{record.label.rstrip('/')}/config.yaml", "--out", again]
+    found = [("from this run folder", _line(record, own))]
+    started = _started(record)
+    if started is not None:
+        found.append(("as it was started", _line(record, [*started, "--out", again])))
+    return found
+
+
+def _line(record: RunRecord, arguments: list[str]) -> str:
+    """The command, with the environment that its bits depend on."""
+    before = []
+    threads = record.info.get("threads")
+    for name in _THREADS:
+        value = threads.get(name) if isinstance(threads, dict) else None
+        if isinstance(value, str) and value != "1":
+            before.append(f"{name}={shlex.quote(value)}")
+    flags = record.info.get("xla_flags")
+    if isinstance(flags, str) and flags:
+        before.append(f"XLA_FLAGS={shlex.quote(flags)}")
+    return " ".join([*before, shlex.join(["python", "-m", "mjx_revolve.evolve", *arguments])])
+
+
+def _started(record: RunRecord) -> list[str] | None:
+    """Configuration file, seed and settings of the command, if they still give this run."""
+    file, settings = record.info.get("config_file"), record.info.get("settings", [])
+    if not isinstance(file, str) or not isinstance(settings, list) or record.config is None:
+        return None
+    if not all(isinstance(setting, str) for setting in settings):
+        return None
+    try:
+        config = load_config(file, settings)
+        if _content(config) != _content(record.config):
+            return None
+    except (InputError, OSError):
+        return None
+    path = Path(file)
+    near = path.is_relative_to(Path.cwd())
+    words = [str(path.relative_to(Path.cwd())) if near else file]
+    words += ["--seed", str(record.config.evolution.seed)]
+    for setting in settings:
+        if setting.partition("=")[0].strip() != "evolution.seed":
+            words += ["--set", setting]
+    return words
+
+
+def _content(config: Config) -> dict[str, Any]:
+    """All settings; files by what they hold, because a run has copies of its own."""
+    data = config.model_dump()
+    data["morphology"] = Path(config.morphology).read_bytes()
+    for section in ("controller", "task"):
+        data[section]["type"] = content_name(data[section]["type"])
+    if isinstance(data["world"], str):
+        data["world"] = {"name": data["world"]}
+    return data
+
+
+def environment(record: RunRecord) -> list[tuple[str, str]]:
+    """What the bits of a run depend on beside its settings.
+
+    Args:
+        record: the run.
+
+    Returns:
+        Names and values, as far as `run.json` knows them.
+    """
+    info = record.info
+    rows: list[tuple[str, str]] = []
+    versions = info.get("versions")
+    if isinstance(versions, dict):
+        rows.append(("versions", ", ".join(f"{name} {value}" for name, value in versions.items())))
+    git = info.get("git")
+    if isinstance(git, str):
+        rows.append(("git revision", f"{git.rstrip('+')}{' with changes' * git.endswith('+')}"))
+    names = {"platform": "platform", "cpu": "processor", "cpu_count": "cores", "device": "device"}
+    rows += [(words, str(info[name])) for name, words in names.items() if info.get(name)]
+    threads = info.get("threads")
+    if isinstance(threads, dict):
+        known = ", ".join(f"{name} {value}" for name, value in threads.items() if value)
+        rows.append(("threads", known))
+    times = [f"{words} {info[name]}" for name, words in
+             (("started", "started"), ("finished", "finished")) if info.get(name)]  # fmt: skip
+    if times:
+        rows.append(("time", ", ".join(times)))
+    resumed = info.get("resumed")
+    if isinstance(resumed, list) and resumed:
+        after = [str(entry.get("generation")) for entry in resumed if isinstance(entry, dict)]
+        rows.append(("resumed after generation", ", ".join(after)))
+    return rows

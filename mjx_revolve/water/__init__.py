@@ -1,0 +1,1 @@
+"""The world and its laws: bed, currents, waves, buoyancy, drag, lift, added mass, thrusters."""

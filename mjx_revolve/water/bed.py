@@ -1,0 +1,149 @@
+"""The bed under the water: its height and slope at any place, as closed forms.
+
+A bed is a function z = height(x, y). Closed forms rather than a stored grid because the population
+step evaluates them inside one compiled loop, where a table look-up costs more than the formula;
+MuJoCo gets a height field sampled from the same function, so pictures and physics agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import namespace, sincos
+
+# The thesis's lake: bed about 998 m x 998 m, z from -112.8 m to +36.7 m (shared facts, section 2).
+LAKE_EXTENT = 998.0
+LAKE_LOWEST = -112.8
+LAKE_HIGHEST = 36.7
+# Height of the dunes as a share of the lake's: 0.8 m in the thesis's lake. A choice.
+_DUNES = 0.8 / (LAKE_HIGHEST - LAKE_LOWEST)
+
+CONTACTS = ("penalty", "mjx")
+
+
+@dataclass(frozen=True)
+class Bed:
+    """The ground below the water.
+
+    Attributes:
+        kind: "flat" (a plane) or "lake" (a basin, a slope, a shore and low dunes).
+        height: height of the plane, or of the lake's deepest place, world frame [m].
+        highest: height of the lake's shore [m]; unused by "flat".
+        extent: side of the square that is drawn and that "lake" is shaped in [m].
+        stiffness: largest stiffness of one contact point [N/m]; the step uses less where the
+            body is too light for it to be stable (see `contact`).
+        friction: Coulomb coefficient [-].
+        contact: what keeps robots out of it: "penalty" (see `contact.bed_contact`), or "mjx", the
+            modules' boxes by MuJoCo's constraint solver (see `mjx_step`), which needs `engine: mjx`
+            and ignores `stiffness`.
+    """
+
+    kind: str = "flat"
+    height: float = -100.0
+    highest: float = LAKE_HIGHEST
+    extent: float = 2000.0
+    stiffness: float = 3000.0
+    friction: float = 0.6
+    contact: str = "penalty"
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("flat", "lake"):
+            raise InputError(f"bed.kind: expected 'flat' or 'lake'; found {self.kind!r}")
+        if self.contact not in CONTACTS:
+            raise InputError(f"bed.contact: expected 'penalty' or 'mjx'; found {self.contact!r}")
+        for name in ("height", "highest", "extent", "stiffness", "friction"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise InputError(f"bed.{name}: expected a number; found {value!r}")
+            if not np.isfinite(value):
+                raise InputError(f"bed.{name}: expected a finite number; found {value!r}")
+        if self.extent <= 0 or self.stiffness <= 0 or self.friction < 0:
+            raise InputError(
+                "bed: expected extent > 0, stiffness > 0 and friction >= 0; found "
+                f"{self.extent}, {self.stiffness}, {self.friction}"
+            )
+        if self.kind == "lake" and self.highest <= self.height:
+            raise InputError(
+                f"bed.highest: expected more than bed.height ({self.height}); found {self.highest}"
+            )
+
+
+def bed_height(bed: Bed, x: Any, y: Any) -> Any:
+    """Height of the bed.
+
+    The lake is a basin that is flat out to 30 % of its half width, climbs along a smooth-step slope
+    and ends in a shore at 98 %; the waterline lies two thirds up. It is a little longer in x
+    than in y, and carries low dunes (0.8 m in the thesis's lake) that vanish at the bottom and on
+    the shore, so that the stated extremes are exact.
+
+    Args:
+        bed: the bed.
+        x: world x [m], any shape; NumPy's arrays are left to NumPy.
+        y: world y [m], same shape.
+
+    Returns:
+        z of the bed, world frame [m], same shape.
+    """
+    xp = namespace(x)
+    if bed.kind == "flat":
+        return xp.full_like(x, bed.height)
+    half = bed.extent / 2
+    # 1e-12 keeps the square root differentiable at the centre.
+    radius = xp.sqrt(_over(x, 1.05 * half) ** 2 + _over(y, half) ** 2 + 1e-12)
+    rise = xp.clip(_over(radius - 0.3, 0.98 - 0.3), 0.0, 1.0)
+    dunes = _DUNES * sincos(x * (2 * np.pi / 61))[0] * sincos(y * (2 * np.pi / 43))[0]
+    # Squared, like the smooth step's start: dunes that rose faster would dig below the bottom.
+    where = 16 * (rise * (1 - rise)) ** 2
+    smooth = rise * rise * (3 - 2 * rise)
+    return bed.height + (bed.highest - bed.height) * (smooth + dunes * where)
+
+
+def _over(x: Any, number: float) -> Any:
+    """A quotient that is rounded alike by NumPy and XLA, which multiplies by the inverse."""
+    if isinstance(x, np.ndarray):
+        return x * (x.dtype.type(1) / x.dtype.type(number))
+    return x / number
+
+
+def bed_slope(bed: Bed, x: Any, y: Any) -> tuple[Any, Any]:
+    """Slope of the bed by central differences over 2 cm.
+
+    Differences, because they are cheap, need no second formula, and average over about the size of
+    a module's edge.
+
+    Args:
+        bed: the bed.
+        x: world x [m], any shape.
+        y: world y [m], same shape.
+
+    Returns:
+        (dz/dx, dz/dy) [-], same shape.
+    """
+    if bed.kind == "flat":
+        return jnp.zeros_like(x), jnp.zeros_like(y)
+    d = 0.01
+    return (
+        (bed_height(bed, x + d, y) - bed_height(bed, x - d, y)) / (2 * d),
+        (bed_height(bed, x, y + d) - bed_height(bed, x, y - d)) / (2 * d),
+    )
+
+
+def sample_bed(bed: Bed, n: int = 201) -> np.ndarray:
+    """The bed on a grid, for MuJoCo's height field and for pictures.
+
+    Args:
+        bed: the bed.
+        n: points along each side.
+
+    Returns:
+        `[n, n]` heights, world frame [m]; rows run along y, columns along x, both upwards.
+    """
+    # float32, as the population step computes it.
+    line = np.linspace(-bed.extent / 2, bed.extent / 2, n).astype(np.float32)
+    x, y = np.meshgrid(line, line)
+    return bed_height(bed, x, y).astype(np.float64)

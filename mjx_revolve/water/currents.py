@@ -1,0 +1,455 @@
+"""Parameters of the water's own motion: shear, gusts, waves, velocities on a grid.
+
+Worlds hold them and need no JAX for it; `water.py` has their laws.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_revolve.inputs.errors import InputError
+
+PROFILES = ("linear", "power", "exponential")
+
+# Shortest wave [m]. Far below 0.1 m surface tension drives waves, which these laws do not know.
+_SHORTEST = 0.01
+
+
+def listed(choices: Sequence[str]) -> str:
+    """Choices as messages list them."""
+    return ", ".join(map(repr, choices))
+
+
+def check_number(
+    place: str, value: Any, low: float | None = None, high: float | None = None
+) -> None:
+    """Refuses what is no finite number between two bounds.
+
+    Args:
+        place: what messages call it.
+        value: what was given.
+        low: smallest allowed.
+        high: largest allowed.
+
+    Raises:
+        InputError: it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{place}: expected a number; found {value!r}")
+    try:
+        finite = math.isfinite(value)
+    except OverflowError:  # an integer of more than 308 digits
+        finite, value = False, "a huge integer"
+    if not finite:
+        raise InputError(f"{place}: expected a finite number; found {value!r}")
+    if low is not None and value < low:
+        raise InputError(f"{place}: expected at least {low:g}; found {value!r}")
+    if high is not None and value > high:
+        raise InputError(f"{place}: expected at most {high:g}; found {value!r}")
+
+
+def read_vector(place: str, value: Any) -> tuple[float, ...]:
+    """Any sequence of three finite numbers as three floats.
+
+    Args:
+        place: what messages call it.
+        value: what was given.
+
+    Returns:
+        The three.
+
+    Raises:
+        InputError: it is something else.
+    """
+    try:
+        vector = tuple(value) if not isinstance(value, str) else None
+    except TypeError:
+        vector = None
+    if vector is None or len(vector) != 3:
+        raise InputError(f"{place}: expected 3 numbers; found {value!r}")
+    plain = [v.item() if hasattr(v, "item") else v for v in vector]
+    for axis, v in zip("xyz", plain, strict=True):
+        check_number(f"{place}.{axis}", v)
+    return tuple(float(v) for v in plain)
+
+
+@dataclass(frozen=True)
+class Shear:
+    """A current that fades with depth, on top of the uniform one; see `water.shear_flow`.
+
+    Attributes:
+        velocity: at the surface, world frame [m/s], length 3.
+        depth: at which it is gone, or has fallen to 1/e ("exponential") [m].
+        profile: "linear", "power" or "exponential".
+        exponent: of "power" [-].
+    """
+
+    velocity: tuple[float, ...]
+    depth: float = 10.0
+    profile: str = "linear"
+    exponent: float = 1 / 7
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        object.__setattr__(self, "velocity", read_vector("shear.velocity", self.velocity))
+        check_number("shear.depth", self.depth, low=1e-3)
+        check_number("shear.exponent", self.exponent, low=1e-3)
+        if self.profile not in PROFILES:
+            raise InputError(
+                f"shear.profile: expected one of {listed(PROFILES)}; found {self.profile!r}"
+            )
+
+
+@dataclass(frozen=True)
+class Gust:
+    """A current that wanders around its mean and returns; see `water.gust_path`.
+
+    Attributes:
+        std: its standard deviation along world x, y, z [m/s]; one number counts for x and y.
+        time: over which its correlation falls to 1/e [s].
+    """
+
+    std: tuple[float, ...]
+    time: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        std: Any = self.std
+        if isinstance(std, np.generic):
+            std = std.item()
+        if isinstance(std, int | float) and not isinstance(std, bool):
+            check_number("gust.std", std, low=0.0)
+            std = (std, std, 0.0)
+        elif not isinstance(std, Sequence | np.ndarray) or isinstance(std, str) or len(std) != 3:
+            raise InputError(f"gust.std: expected a number or 3 numbers; found {std!r}")
+        object.__setattr__(self, "std", read_vector("gust.std", std))
+        for axis, value in zip("xyz", self.std, strict=True):
+            check_number(f"gust.std.{axis}", value, low=0.0)
+        check_number("gust.time", self.time, low=1e-3)
+
+
+@dataclass(frozen=True)
+class Wave:
+    """One regular wave, η = a cos(k·x - ωt + φ); see `water.wave_flow`.
+
+    Attributes:
+        amplitude: a, half the height from trough to crest [m].
+        wavelength: from crest to crest [m]; or instead
+        period: from crest to crest, felt by what drifts with the uniform current [s].
+        direction: towards which it runs, from world x towards y [rad].
+        phase: φ, at the world's origin at time 0 [rad].
+    """
+
+    amplitude: float
+    wavelength: float | None = None
+    period: float | None = None
+    direction: float = 0.0
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        check_number("waves.amplitude", self.amplitude, low=0.0)
+        if (self.wavelength is None) == (self.period is None):
+            found = "none" if self.period is None else "both"
+            raise InputError(f"waves: expected either wavelength or period; found {found}")
+        if self.wavelength is not None:
+            check_number("waves.wavelength", self.wavelength, low=_SHORTEST)
+        else:
+            check_number("waves.period", self.period, low=1e-3)
+        for name in ("direction", "phase"):
+            value = getattr(self, name)
+            check_number(f"waves.{name}", value)
+            # Degrees would otherwise pass for radians unseen.
+            if abs(value) > 2 * math.pi + 1e-6:
+                raise InputError(
+                    f"waves.{name}: expected an angle between -2 pi and 2 pi [rad]; found {value!r}"
+                )
+
+    def wavenumber(self, gravity: float, water_depth: float | None) -> float:
+        """k, from its length, or from its period by the dispersion relation ω² = g k tanh(k h).
+
+        Newton's method in x = k h from Eckart's x ≈ y / √tanh y, y = ω² h / g (Eckart 1952, within
+        5 %; Dean & Dalrymple 1991, § 3.4), to the last digit.
+
+        Args:
+            gravity: g, above 0 [m/s²].
+            water_depth: h [m], or None for deep water.
+
+        Returns:
+            [rad/m].
+        """
+        if self.wavelength is not None:
+            return 2 * math.pi / self.wavelength
+        assert self.period is not None
+        deep = (2 * math.pi / self.period) ** 2 / gravity
+        if water_depth is None:
+            return deep
+        y = deep * water_depth
+        x = y / math.sqrt(math.tanh(y))
+        for _ in range(8):
+            t = math.tanh(x)
+            x -= (x * t - y) / (t + x * (1 - t * t))
+        return x / water_depth
+
+    def frequency(self, gravity: float, water_depth: float | None) -> float:
+        """ω as the moving water sees it, ω² = g k tanh(k h).
+
+        Args:
+            gravity: g, above 0 [m/s²].
+            water_depth: h [m], or None for deep water.
+
+        Returns:
+            [rad/s].
+        """
+        if self.period is not None:
+            return 2 * math.pi / self.period
+        k = self.wavenumber(gravity, water_depth)
+        return math.sqrt(gravity * k * (1.0 if water_depth is None else math.tanh(k * water_depth)))
+
+
+def check_wave(wave: Wave, gravity: float, water_depth: float | None) -> None:
+    """Refuses a wave that would break, or that is too short to be driven by gravity.
+
+    Args:
+        wave: the wave.
+        gravity: [m/s²].
+        water_depth: [m], or None for deep water.
+
+    Raises:
+        InputError: the message calls it `waves`.
+    """
+    if gravity <= 0:
+        raise InputError(f"waves: expected gravity above 0; found {gravity:g}")
+    k = wave.wavenumber(gravity, water_depth)
+    length = 2 * math.pi / k
+    if length < 0.999 * _SHORTEST:
+        raise InputError(
+            f"waves.period: expected that of a wave of at least {_SHORTEST:g} m; found "
+            f"{wave.period:g} s, a wave of {length:.3g} m"
+        )
+    # Miche 1944 (Dean & Dalrymple 1991, § 4.8): height over length where crests break.
+    highest = 0.142 * length * (1.0 if water_depth is None else math.tanh(k * water_depth))
+    if 2 * wave.amplitude > highest:
+        raise InputError(
+            f"waves.amplitude: expected at most {highest / 2:.3g}, or a wave {length:.4g} m long "
+            f"breaks; found {wave.amplitude!r}"
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CurrentField:
+    """Steady velocities of the water on a grid; see `water.field_flow`.
+
+    Two are equal if their numbers are, wherever they were read.
+
+    Attributes:
+        x: `[nx]` rising world x of the grid's planes [m].
+        y: `[ny]` likewise.
+        z: `[nz]` likewise; a single one where the current is the same at all depths.
+        velocity: `[nx, ny, nz, 3]` world frame [m/s].
+        path: where it was read.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+    velocity: np.ndarray
+    path: str = ""
+
+    def __post_init__(self) -> None:
+        """Checks the numbers, and keeps copies that nobody can change."""
+        digest = hashlib.sha256()
+        shape = []
+        for name in ("x", "y", "z", "velocity"):
+            given = np.asarray(getattr(self, name))
+            if given.dtype.kind not in "iuf":
+                raise InputError(f"{name}: expected real numbers; found {given.dtype}")
+            array = np.array(given, np.float64)
+            if name != "velocity":
+                _check_axis(name, array)
+                shape.append(len(array))
+            elif array.shape != (*shape, 3):
+                raise InputError(
+                    f"velocity: expected shape {[*shape, 3]}, as x, y and z have it; found "
+                    f"{list(array.shape)}"
+                )
+            if not np.all(np.isfinite(array)):
+                raise InputError(f"{name}: expected finite numbers; found NaN or infinity")
+            array += 0.0  # -0.0 and 0.0 are one number
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+            digest.update(f"{name}{array.shape}".encode() + array.tobytes())
+        object.__setattr__(self, "_digest", digest.hexdigest()[:16])
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all numbers are the same."""
+        return isinstance(other, CurrentField) and self._key == other._key
+
+    def __hash__(self) -> int:
+        """Of the numbers."""
+        return hash(self._key)
+
+    def __repr__(self) -> str:
+        """Says which numbers, as runs are told apart by their worlds' text."""
+        nx, ny, nz = self.velocity.shape[:3]
+        return f"CurrentField({nx} x {ny} x {nz} points, {self._key})"
+
+    @property
+    def _key(self) -> str:
+        return self.__dict__["_digest"]
+
+
+def _check_axis(name: str, axis: np.ndarray) -> None:
+    if axis.ndim != 1 or not len(axis):
+        raise InputError(f"{name}: expected a row of numbers [m]; found shape {list(axis.shape)}")
+    falls = np.flatnonzero(np.diff(axis) <= 0)
+    if len(falls):
+        first, second = axis[falls[0] : falls[0] + 2]
+        raise InputError(f"{name}: expected rising numbers [m]; found {second:g} after {first:g}")
+
+
+_COLUMNS = ("x", "y", "z", "u", "v", "w")
+_ARRAYS = ("x", "y", "z", "velocity")
+
+
+def find_field(path: str | Path, folder: str | Path) -> Path:
+    """The file that a relative path names, which must lie inside a folder.
+
+    A world that was passed on must not reach out into its reader's files unseen. An absolute path
+    says openly where it leads.
+
+    Args:
+        path: what was written.
+        folder: from which relative paths start.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        InputError: a relative path leads out of the folder.
+    """
+    if Path(path).is_absolute():
+        return Path(path)
+    try:
+        inside = Path(folder).resolve()
+        full = (inside / path).resolve()
+    except ValueError:
+        raise InputError(f"{str(path)!r}: expected a file name; found a null byte") from None
+    except (OSError, RuntimeError):
+        raise InputError(f"{path}: expected a readable file; found a loop of links") from None
+    if not full.is_relative_to(inside):
+        raise InputError(f"{path}: expected a path inside {inside}; found one that leads out")
+    return Path(folder) / path
+
+
+def load_current_field(path: str | Path) -> CurrentField:
+    """Reads velocities of the water on a grid.
+
+    NPZ: arrays `x` `[nx]`, `y` `[ny]`, `z` `[nz]` [m] and `velocity` `[nx, ny, nz, 3]` [m/s]. CSV:
+    columns x, y, z, u, v, w under a line of their names, one row for each point of a full grid, in
+    any order. The planes of the grid need not be equally spaced.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The field.
+
+    Raises:
+        InputError: it cannot be read or is no full grid; the message names file and place.
+    """
+    path = Path(path)
+    try:
+        if path.suffix.lower() == ".npz":
+            return _read_arrays(path)
+        if path.suffix.lower() == ".csv":
+            return _read_table(path)
+        raise InputError("expected a file .npz or .csv")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file; found none") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: expected a file; found a folder") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
+
+
+def _read_arrays(path: Path) -> CurrentField:
+    try:
+        with path.open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise InputError("expected an NPZ archive; found something else")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as data:
+                for name in _ARRAYS:
+                    if name not in data:
+                        raise InputError(f"expected arrays {', '.join(_ARRAYS)}; found no {name}")
+                x, y, z, velocity = (data[name] for name in _ARRAYS)
+                return CurrentField(x, y, z, velocity, str(path))
+    except InputError:
+        raise
+    except (ValueError, EOFError, zlib.error, zipfile.BadZipFile, NotImplementedError) as error:
+        raise InputError(f"expected arrays of numbers; found: {error}") from None
+
+
+def _read_table(path: Path) -> CurrentField:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"expected UTF-8 text; found {error.reason}") from None
+    heading = [name.strip() for name in lines[0].split(",")] if lines else []
+    for name in _COLUMNS:
+        if heading.count(name) != 1:
+            found = f"{name} twice" if name in heading else f"no {name}"
+            raise InputError(f"line 1: expected columns {', '.join(_COLUMNS)}; found {found}")
+    try:
+        table = np.array([line.split(",") for line in lines[1:] if line.strip()], np.float64)
+        sound = bool(np.all(np.isfinite(table)))
+    except ValueError:
+        sound = False
+    if not sound or table.ndim != 2 or table.shape[1] != len(heading):
+        _refuse_line(lines, len(heading))
+    columns = {name: table[:, heading.index(name)] for name in _COLUMNS}
+    axes = [np.unique(columns[name]) for name in "xyz"]
+    shape = tuple(len(axis) for axis in axes)
+    index = tuple(np.searchsorted(axis, columns[n]) for axis, n in zip(axes, "xyz", strict=True))
+    expected = f"one row for each of {' x '.join(map(str, shape))} points of a full grid"
+    order = np.lexsort(index)
+    flat = np.stack(index)[:, order]
+    twice = np.flatnonzero(np.all(flat[:, 1:] == flat[:, :-1], axis=0))
+    if len(twice):
+        point = ", ".join(f"{axis[i]:g}" for axis, i in zip(axes, flat[:, twice[0]], strict=True))
+        raise InputError(f"expected {expected}; found ({point}) twice")
+    if len(table) != math.prod(shape):
+        raise InputError(f"expected {expected}; found {len(table)} rows")
+    velocity = np.empty((*shape, 3))
+    velocity[index] = np.stack([columns[n] for n in "uvw"], -1)
+    return CurrentField(axes[0], axes[1], axes[2], velocity, str(path))
+
+
+def _refuse_line(lines: Sequence[str], count: int) -> None:
+    """Says which line of a table is wrong."""
+    for number, line in enumerate(lines[1:], 2):
+        if not line.strip():
+            continue
+        cells = [cell.strip() for cell in line.split(",")]
+        if len(cells) != count:
+            raise InputError(f"line {number}: expected {count} numbers; found {len(cells)}")
+        for cell in cells:
+            try:
+                finite = math.isfinite(float(cell))
+            except ValueError:
+                raise InputError(f"line {number}: expected a number; found {cell!r}") from None
+            if not finite:
+                raise InputError(f"line {number}: expected a finite number; found {cell!r}")
+    raise InputError("line 2: expected rows of numbers; found none")

@@ -1,0 +1,611 @@
+"""The catalogue against the tabulated values; box geometry; users' own types; refusals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from mjx_revolve.body.boxes import boxes_overlap, quarter_turn, union_measure
+from mjx_revolve.body.catalogue import (
+    MODULES,
+    THESIS_MODULES,
+    Box,
+    Hinge,
+    LiftDrag,
+    ModuleType,
+    Mount,
+    Part,
+    Slot,
+    Thruster,
+    load_modules,
+)
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.inputs.errors import InputError
+
+# ------------------------------------------------------------------------- the catalogue
+
+# type, part, box [m], box volume [m³] as printed, mesh volume [m³], mass [kg]
+TABLE = [
+    ("Core", 0, (0.089, 0.089, 0.045), 3.564e-4, 5.054e-5, 0.0900),
+    ("FixedBrick", 0, (0.041, 0.041, 0.0355), 5.968e-5, 1.070e-5, 0.0102),
+    ("ActiveHinge", 0, (0.022, 0.03575, 0.010), 7.865e-6, 3.032e-6, 0.0017),
+    ("ActiveHinge", 1, (0.0245, 0.02575, 0.015), 1.062e-5, 1.014e-5, 0.0090),
+    ("TouchSensor", 0, (0.0041, 0.031, 0.0155), 1.970e-6, 2.735e-6, 0.0030),
+]
+
+
+@pytest.mark.parametrize("kind, index, size, box_volume, volume, mass", TABLE)
+def test_values_are_those_of_the_table(kind, index, size, box_volume, volume, mass):
+    part = MODULES[kind].parts[index]
+    assert part.boxes[0].size == size
+    assert part.box_volume == pytest.approx(box_volume, rel=5e-4)  # the table's four digits
+    assert part.volume == part.total_volume == volume
+    assert part.mass == mass
+    assert part.drag_coefficient == 1.05
+
+
+def test_aliases_name_the_same_type():
+    assert MODULES["CoreComponent"] is MODULES["Core"]
+    assert MODULES["FixedBrickSensor"] is MODULES["TouchSensor"]
+    assert set(MODULES) == set(THESIS_MODULES)
+
+
+def test_hinge_limits_are_those_of_the_servo():
+    hinge = MODULES["ActiveHinge"].hinge
+    assert hinge.range == (-math.pi / 4, math.pi / 4)
+    assert (hinge.effort, hinge.speed) == (0.17658, 5.235988)
+    assert hinge.axis == (0.0, 1.0, 0.0)
+
+
+def test_thesis_swaps_the_hinge_masses_only():
+    ours, theirs = MODULES["ActiveHinge"], THESIS_MODULES["ActiveHinge"]
+    assert [p.mass for p in theirs.parts] == [p.mass for p in reversed(ours.parts)]
+    assert theirs.mass == pytest.approx(ours.mass)
+    assert theirs.volume == ours.volume
+    assert all(THESIS_MODULES[n] is MODULES[n] for n in MODULES if n != "ActiveHinge")
+
+
+@pytest.mark.parametrize("name, free", [("Core", 4), ("FixedBrick", 3), ("ActiveHinge", 1)])
+def test_slots_look_away_from_the_module(name, free):
+    kind = MODULES[name]
+    assert len(kind.slots) == free
+    for slot in kind.slots.values():
+        assert np.dot(slot.position, slot.direction) > 0
+
+
+@pytest.mark.parametrize("name, axis", [("Thruster", 0), ("LiftThruster", 2)])
+def test_thrusters_push_half_a_newton_through_their_length(name, axis):
+    kind = MODULES[name]
+    (duct,) = kind.parts
+    thruster = duct.thruster
+    assert kind.is_thruster and not kind.is_fin and not kind.slots
+    assert thruster.axis == tuple(np.eye(3)[axis])
+    assert duct.boxes[0].size[axis] == max(duct.boxes[0].size)
+    assert (thruster.thrust_at(-2.0), thruster.thrust_at(0.5)) == (-0.5, 0.125)
+    # It is attached by the face of its box that looks along -x.
+    assert kind.mount.position == (-duct.boxes[0].size[0] / 2, 0.0, 0.0)
+    # The pieces that the comment counts: a duct with a wall of 2 mm and a motor.
+    ring = math.pi * (0.015**2 - 0.013**2) * 0.040
+    assert duct.volume == pytest.approx(ring + math.pi * 0.006**2 * 0.035, rel=0.01)
+
+
+def test_the_fin_is_a_plate_of_abs_with_lift():
+    (plate,) = MODULES["Fin"].parts
+    length, width, thickness = plate.boxes[0].size
+    corners = (4 - math.pi) * 0.01**2
+    assert plate.volume == pytest.approx((length * width - corners) * thickness, rel=1e-3)
+    assert plate.mass / plate.volume == pytest.approx(1050, rel=0.005)
+    p, aspect = plate.lift_drag, width / length
+    assert p.cla == pytest.approx(2 * math.pi * aspect / (2 + math.sqrt(aspect**2 + 4)))
+    stall, across = p.alpha_stall, math.pi / 2 - p.alpha_stall
+    assert p.cla * stall + p.cla_stall * across == pytest.approx(0.0)
+    assert p.cda * stall + p.cda_stall * across == pytest.approx(1.17)
+    # Before the stall the mean drag is that of a force normal to the plate.
+    angle = (np.arange(1000) + 0.5) / 1000 * stall
+    assert (p.cda * angle).mean() == pytest.approx((p.cla * angle * np.tan(angle)).mean(), rel=0.01)
+
+
+# ------------------------------------------------------------------- masses, volumes, centres
+
+
+def test_ballast_moves_the_centres_of_mass_and_volume():
+    part = Part(
+        "p",
+        (Box((0.1, 0.1, 0.1)),),
+        mass=0.3,
+        volume=2e-4,
+        electronics_volume=1e-4,
+        center_of_volume=(0.0, 0.01, 0.02),
+        ballast_mass=0.1,
+        ballast_volume=1e-4,
+        ballast_position=(0.04, 0.0, -0.04),
+    )
+    assert part.total_mass == pytest.approx(0.4)
+    assert part.total_volume == pytest.approx(4e-4)
+    assert part.free_volume == pytest.approx(6e-4)
+    assert part.center_of_mass == pytest.approx((0.01, 0.0, -0.01))
+    assert part.displaced_center == pytest.approx((0.01, 0.0075, 0.005))
+    bare = replace(part, ballast_mass=0.0, ballast_volume=0.0)
+    assert bare.center_of_mass == (0.0, 0.0, 0.0)
+    assert bare.displaced_center == part.center_of_volume
+    kind = ModuleType("M", (part,))
+    assert (kind.mass, kind.volume) == pytest.approx((0.4, 4e-4))
+
+
+def test_what_weighs_or_displaces_nothing_has_its_centres_in_the_middle():
+    part = Part("p", (Box((1, 1, 1)),), mass=0.0, volume=0.0)
+    assert part.center_of_mass == part.displaced_center == (0.0, 0.0, 0.0)
+
+
+def test_a_part_fuller_than_its_box_has_no_room_for_water():
+    assert MODULES["TouchSensor"].parts[0].free_volume == 0.0
+
+
+# ------------------------------------------------------------------------- box geometry
+
+
+def test_faces_of_a_single_box_are_its_faces():
+    part = Part("p", (Box((2.0, 3.0, 5.0)),), 1.0, 30.0)
+    assert part.face_areas == pytest.approx([15.0, 10.0, 6.0])
+    low, high = part.bounds
+    assert low == pytest.approx([-1.0, -1.5, -2.5])
+    assert high == pytest.approx([1.0, 1.5, 2.5])
+
+
+def test_faces_count_shared_silhouettes_once():
+    # Two unit cubes: the second half a unit to the right and 2 up.
+    part = Part("p", (Box((1, 1, 1)), Box((1, 1, 1), (0.5, 0.0, 2.0))), 1.0, 1.0)
+    assert part.face_areas == pytest.approx([2.0, 2.0, 1.5])
+    assert part.box_volume == pytest.approx(2.0)
+
+
+def test_faces_of_the_servo_with_its_plate():
+    servo = MODULES["ActiveHinge"].parts[1]
+    x = 0.034 * 0.034  # the plate hides the box
+    y = 0.0245 * 0.015 + 0.001 * (0.034 - 0.015)
+    z = 0.0245 * 0.02575 + 0.001 * (0.034 - 0.02575)
+    assert servo.face_areas == pytest.approx([x, y, z])
+    assert servo.bounds[1] == pytest.approx([0.01225, 0.018, 0.017])
+
+
+def test_union_of_many_random_boxes_agrees_with_sampling():
+    rng = np.random.default_rng(0)
+    low = rng.uniform(0, 0.7, (12, 2))
+    high = low + rng.uniform(0.05, 0.3, (12, 2))
+    points = rng.uniform(0, 1, (200_000, 1, 2))
+    inside = ((points > low) & (points < high)).all(-1).any(-1).mean()
+    assert union_measure(low, high) == pytest.approx(inside, abs=0.005)
+
+
+def test_quarter_turns_are_exact():
+    for axis in np.eye(3):
+        turned = quarter_turn(axis, 1)
+        assert set(np.unique(np.abs(turned))) == {0.0, 1.0}
+        assert turned @ np.roll(axis, 1) == pytest.approx(np.roll(axis, 2))  # x to y about z
+        assert np.array_equal(quarter_turn(axis, 2), turned @ turned)
+        assert np.array_equal(quarter_turn(axis, 3), turned.T)
+
+
+def _turn_z(angle: float) -> np.ndarray:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    "angle, distance",
+    [(0.0, 1.0), (math.pi / 4, (1 + math.sqrt(2)) / 2)],
+    ids=["aligned", "corner first"],
+)
+def test_unit_cubes_part_where_they_should(angle, distance):
+    half, turn = np.full(3, 0.5), _turn_z(angle)
+    for gap, expected in ((-1e-6, True), (1e-6, False)):
+        center = np.array([[distance + gap, 0.0, 0.0]])
+        hit = boxes_overlap(np.zeros(3), np.eye(3), half, center, turn[None], half[None])
+        assert hit.tolist() == [expected]
+
+
+def test_edge_against_edge_needs_the_cross_products():
+    # Two long rods, crossed and each turned 45 degrees about its own length: only the cross product
+    # of their edges sees that they are apart.
+    half = np.array([2.0, 0.5, 0.5])
+    c = math.sqrt(0.5)
+    lying = np.array([[1.0, 0.0, 0.0], [0.0, c, -c], [0.0, c, c]])
+    crossed = _turn_z(math.pi / 2) @ lying
+    for gap, expected in ((-1e-6, True), (1e-6, False)):
+        center = np.array([[0.0, 0.0, 2 * 0.5 * math.sqrt(2) + gap]])
+        hit = boxes_overlap(np.zeros(3), lying, half, center, crossed[None], half[None])
+        assert hit.tolist() == [expected]
+
+
+# ------------------------------------------------------------------------- refusals in code
+
+PART = Part("p", (Box((1, 1, 1)),), 1.0, 1.0)
+HINGE = Hinge((0, 1, 0), (0, 0, 0), (-1, 1), 1.0, 1.0)
+LINE = Thruster(curve="interpolated", commands=(-1, 0, 1), thrusts=(-1, 0, 2))
+MOUNT = Mount((-0.5, 0, 0), (1, 0, 0))
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: Box((1, 0, 1)), "box: size.1: expected a number > 0 [m]; found 0"),
+        (lambda: Box((1, 1)), "box: size: expected three numbers [m]; found (1, 1)"),
+        (lambda: Box("abc"), "box: size: expected three numbers [m]; found 'abc'"),
+        (lambda: Box((1, 1, math.nan)), "box: size.2: expected a number > 0 [m]; found nan"),
+        (lambda: Box((1, 1, True)), "box: size.2: expected a number > 0 [m]; found True"),
+        (lambda: Box((1, 1, 10**400)), "box: size.2: expected a number > 0 [m]; found 1000"),
+        (lambda: replace(PART, mass=-1), "part 'p': mass: expected a number >= 0 [kg]; found -1"),
+        (lambda: replace(PART, volume=math.inf), "part 'p': volume: expected a number >= 0 [m3]"),
+        (lambda: replace(PART, drag_coefficient="1"), "drag_coefficient: expected a number >= 0"),
+        (lambda: replace(PART, added_mass_coefficient=-1), "added_mass_coefficient: expected"),
+        (lambda: replace(PART, contact=1), "part 'p': contact: expected true or false; found 1"),
+        (lambda: replace(PART, name="a/b"), "_ or -, beginning with a letter; found 'a/b'"),
+        (lambda: replace(PART, boxes=()), "part 'p': boxes: expected at least one box; found 0"),
+        (
+            lambda: replace(PART, boxes=(Box((1, 1, 1), (1, 0, 0)),)),
+            "part 'p': boxes.0.position: expected [0, 0, 0]",
+        ),
+        (
+            lambda: replace(PART, buoyancy="some"),
+            "part 'p': buoyancy: expected one of partial, mask, off; found 'some'",
+        ),
+        (
+            lambda: replace(PART, drag="inertia_box"),
+            "part 'p': drag: expected one of faces, lift_drag, ellipsoid, off (a law of whole "
+            "bodies: the world's); found 'inertia_box'",
+        ),
+        (lambda: replace(PART, drag=["off"]), "part 'p': drag: expected one of faces, lift_drag"),
+        (
+            lambda: replace(PART, added_mass=1),
+            "part 'p': added_mass: expected true or false; found",
+        ),
+        (
+            lambda: replace(PART, entrained_water=1.5),
+            "part 'p': entrained_water: expected a share from 0 to 1 [-]; found 1.5",
+        ),
+        (lambda: replace(PART, entrained_water=-0.1), "entrained_water: expected a number >= 0"),
+        (lambda: replace(PART, ballast_mass=-1), "ballast_mass: expected a number >= 0 [kg]"),
+        (lambda: replace(PART, ballast_volume=-1), "ballast_volume: expected a number >= 0 [m3]"),
+        (lambda: replace(PART, ballast_position=1), "ballast_position: expected three numbers [m]"),
+        (lambda: replace(PART, lift_drag={}), "part 'p': lift_drag: expected a LiftDrag; found {}"),
+        (lambda: replace(PART, thruster=True), "part 'p': thruster: expected a Thruster; found Tr"),
+        (
+            lambda: Thruster(curve="linear"),
+            "thruster: curve: expected one of basic, dead_band, interpolated; found 'linear'",
+        ),
+        (lambda: Thruster(axis=(0, 0, 0)), "thruster: axis: expected a direction, not zero"),
+        (lambda: Thruster(position=(0, 0)), "thruster: position: expected three numbers [m]"),
+        (lambda: Thruster(gain=-1), "thruster: gain: expected a number >= 0 [N]; found -1"),
+        (lambda: Thruster(gain=math.nan), "thruster: gain: expected a number >= 0 [N]; found nan"),
+        (lambda: Thruster(time_constant=-1), "thruster: time_constant: expected a number >= 0 [s]"),
+        (lambda: Thruster(torque_ratio="a"), "thruster: torque_ratio: expected a number [m]"),
+        (lambda: Thruster(range=(-1, 0, 1)), "thruster: range: expected 2 numbers [-]"),
+        (
+            lambda: Thruster(range=(0.1, 1)),
+            "thruster: range: expected [lowest, highest] around the command 0 [-]; found [0.1, 1.0",
+        ),
+        (lambda: Thruster(range=(0, 0)), "thruster: range: expected [lowest, highest] around the"),
+        (
+            lambda: Thruster(gain_backward=1),
+            "thruster: gain_backward: expected none with curve basic; found 1.0",
+        ),
+        (
+            lambda: Thruster(dead_band=(-1, 1)),
+            "thruster: dead_band: expected none with curve basic",
+        ),
+        (lambda: Thruster(commands=(0, 1)), "thruster: commands: expected none with curve basic"),
+        (lambda: Thruster(thrusts=(0, 1)), "thruster: thrusts: expected none with curve basic; f"),
+        (lambda: replace(LINE, gain=2), "gain: expected none with curve interpolated; found 2.0"),
+        (
+            lambda: Thruster(curve="dead_band", dead_band=(0.1, 0.2)),
+            "thruster: dead_band: expected [at most 0, at least 0] [-]; found [0.1, 0.2]",
+        ),
+        (
+            lambda: Thruster(curve="dead_band", gain_backward=-1),
+            "thruster: gain_backward: expected a number >= 0 [N]; found -1",
+        ),
+        (
+            lambda: Thruster(curve="interpolated"),
+            "thruster: commands and thrusts: expected two or more, as many of both; found 0 and 0",
+        ),
+        (lambda: replace(LINE, thrusts=(0, 1)), "as many of both; found 3 and 2"),
+        (
+            lambda: replace(LINE, commands=(-1, 1, 1)),
+            "thruster: commands: expected numbers that rise from each to the next [-]; found",
+        ),
+        (lambda: replace(LINE, commands="abc"), "commands: expected a list of numbers [-]; found"),
+        (
+            lambda: replace(LINE, commands=(0, 1, "a")),
+            "commands.2: expected a number [-]; found 'a",
+        ),
+        (lambda: replace(HINGE, axis=(0, 0, 0)), "hinge: axis: expected a direction, not zero"),
+        (lambda: replace(HINGE, range=(0.5, 1)), "hinge: range: expected [lowest, highest] around"),
+        (lambda: replace(HINGE, range=(1, -1)), "hinge: range: expected [lowest, highest] around"),
+        (lambda: replace(HINGE, range=1), "hinge: range: expected two angles [rad]; found 1"),
+        (lambda: replace(HINGE, effort=0), "hinge: effort: expected a number > 0 [N m]; found 0"),
+        (lambda: replace(HINGE, speed=-1), "hinge: speed: expected a number > 0 [rad/s]; found -1"),
+        (lambda: Slot((0, 0, 1), (0, 0, 1)), "slot: up: expected a vector perpendicular"),
+        (lambda: Mount((0, 0, 0), (0, 0, 1)), "mount: outward: expected a vector perpendicular"),
+        (lambda: ModuleType("M", ()), "module 'M': parts: expected parts, each name once"),
+        (lambda: ModuleType("M", (PART, PART)), "parts: expected parts, each name once"),
+        (lambda: ModuleType("M M", (PART,)), "module 'M M': name: expected letters"),
+        (
+            lambda: ModuleType("M", (PART,), MOUNT, {0: Slot((0, 0, 0), (1, 0, 0))}),
+            "module 'M': slots: expected numbers >= 1 (0 is where it is attached); found 0",
+        ),
+        (
+            lambda: ModuleType("M", (PART,), None, {"a": Slot((0, 0, 0), (1, 0, 0))}),
+            "module 'M': slots: expected numbers >= 0; found 'a'",
+        ),
+        (lambda: ModuleType("M", (PART,), sensor="no"), "sensor: expected true or false"),
+        (lambda: ModuleType("M", (replace(PART, mass=0),)), "expected a core heavier than 0 kg"),
+        (lambda: ModuleType("M", (PART, replace(PART, name="q")), None, {}, HINGE), "mount: exp"),
+        (lambda: ModuleType("M", (PART,), MOUNT, {}, HINGE), "expected a moving part"),
+        (
+            lambda: ModuleType("M", (PART, replace(PART, name="q", mass=0)), MOUNT, {}, HINGE),
+            "parts: expected a moving part (the second or later) heavier than 0 kg",
+        ),
+    ],
+)
+def test_wrong_values_are_refused(make, message):
+    with pytest.raises(InputError) as error:
+        make()
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+# ------------------------------------------------------------------------- users' own types
+
+FIN = """
+modules:
+  Fin:
+    mount: -x
+    hinge:
+      axis: [0, 2, 0]
+      anchor: [.00465, 0, 0]
+      range: [-0.6, 0.6]
+    parts:
+      - name: holder
+        size: [.022, .036, .010]
+        mass: 2e-3
+      - name: blade
+        position: [.04, 0, 0]
+        boxes:
+          - size: [.06, .04, .002]
+          - {size: [.002, .04, .01], position: [.03, 0, 0]}
+        mass: .006
+        drag_coefficient: 1.9
+    slots:
+      1: +x
+  Ring:
+    mount: {position: [0, -0.02, 0], outward: [0, 1, 0]}
+    parts:
+      - size: [.04, .04, .04]
+        mass: .01
+        volume: 3e-5
+        contact: false
+    slots:
+      1: +y
+      5: {position: [0, 0, .02], direction: [0, 0, 1], up: [0, -1, 0]}
+    aliases: [Hoop]
+"""
+
+
+def write(folder: Path, text: str, name: str = "mine.yaml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_own_types_are_read(tmp_path):
+    kinds = load_modules(write(tmp_path, FIN))
+    assert set(kinds) == {"Fin", "Ring", "Hoop"}
+    fin, ring = kinds["Fin"], kinds["Ring"]
+    assert fin.mount == Mount((-0.011, 0.0, 0.0), (1.0, 0.0, 0.0))
+    assert fin.slots == {1: Slot((0.07, 0.0, 0.0), (1.0, 0.0, 0.0))}
+    assert fin.hinge.axis == (0.0, 1.0, 0.0)
+    assert fin.hinge.effort == MODULES["ActiveHinge"].hinge.effort
+    holder, blade = fin.parts
+    assert holder.volume == pytest.approx(0.022 * 0.036 * 0.010)
+    # The end plate reaches from .029 to .031: half of it is inside the blade.
+    assert blade.volume == pytest.approx(
+        0.06 * 0.04 * 0.002 + 0.04 * (0.002 * 0.01 - 0.001 * 0.002)
+    )
+    assert (blade.drag_coefficient, blade.contact) == (1.9, True)
+    assert ring.parts[0].name == "part0"
+    assert (ring.parts[0].volume, ring.parts[0].contact) == (3e-5, False)
+    assert kinds["Hoop"] is ring
+
+
+def test_the_example_in_the_docstring_works(tmp_path):
+    lines = load_modules.__doc__.split("::\n\n")[1].split("\n\n    `-x`")[0]
+    kinds = load_modules(write(tmp_path, lines))
+    flipper = kinds["Paddle"]
+    assert flipper.name == "Flipper"
+    assert [part.mass for part in flipper.parts] == [0.002, 0.006]
+    assert (flipper.parts[1].buoyancy, flipper.parts[1].drag) == ("partial", "lift_drag")
+    # What it calls a default is one.
+    defaults = Part("blade", flipper.parts[1].boxes, 0.006, 4e-6, position=(0.04, 0, 0))
+    assert replace(flipper.parts[1], buoyancy=None, drag=None, added_mass=None) == defaults
+    (fin,), (jet,) = kinds["PectoralFin"].parts, kinds["Jet"].parts
+    assert fin.lift_drag == LiftDrag(
+        cla=2.0, cda=0.3, alpha_stall=0.5, forward=(0, 1, 0), upward=(0, 0, 1)
+    )
+    assert jet.thruster == Thruster(
+        curve="dead_band", gain=0.3, dead_band=(-0.05, 0.05), time_constant=0.05, torque_ratio=2e-3
+    )
+
+
+def test_switches_may_be_off_without_quotes(tmp_path):
+    text = "{size: [1, 1, 1], mass: 1, buoyancy: off, drag: off, added_mass: off}"
+    kinds = load_modules(write(tmp_path, f"modules: {{M: {{mount: null, parts: [{text}]}}}}"))
+    (part,) = kinds["M"].parts
+    assert (part.buoyancy, part.drag, part.added_mass) == ("off", "off", False)
+
+
+def test_own_types_make_a_robot(tmp_path):
+    mine = MODULES | load_modules(write(tmp_path, FIN))
+    robot = """
+body:
+  type: Core
+  children:
+    1:
+      type: Ring
+      children:
+        1: {type: Fin, orientation: 90, id: tail}
+        5: {type: FixedBrick, id: top}
+    2:
+      type: Hoop
+"""
+    morphology = load_morphology(write(tmp_path, robot, "robot.yaml"), modules=mine)
+    places = {m.name: m for m in morphology.modules}
+    assert places["Ring1"].position == pytest.approx([0, 0.0445 + 0.02, 0])
+    assert places["tail"].position == pytest.approx([0, 0.0445 + 0.04 + 0.011, 0])
+    assert places["tail"].rotation[:, 0] == pytest.approx([0, 1, 0])
+    # The slot on top: the brick looks up, and its z points back towards the core.
+    assert places["top"].position == pytest.approx([0, 0.0645, 0.02 + 0.019])
+    assert places["top"].rotation[:, 1] == pytest.approx([0, 0, 1])
+    assert places["top"].rotation[:, 2] == pytest.approx([0, -1, 0])
+    morphology.save(tmp_path / "again.yaml")
+    again = load_morphology(tmp_path / "again.yaml", modules=mine)
+    assert again.modules == morphology.modules
+    with pytest.raises(InputError, match=r"expected one of ActiveHinge, Fin, FixedBr.*'Ring'"):
+        load_morphology(tmp_path / "again.yaml")
+
+
+def test_own_core_replaces_the_catalogues_under_all_its_names(tmp_path):
+    text = "modules: {Core: {mount: null, parts: [{size: [.1, .1, .1], mass: .5}], slots: {1: +y}}}"
+    mine = MODULES | load_modules(write(tmp_path, text))
+    assert mine["CoreComponent"] is mine["Core"]
+    robot = write(tmp_path, "body: {type: CoreComponent}", "robot.yaml")
+    assert load_morphology(robot, modules=mine).mass == 0.5
+
+
+def _changed(change) -> str:
+    data = yaml.safe_load(FIN)
+    change(data["modules"])
+    return yaml.safe_dump(data)
+
+
+def _set(*keys_and_value):
+    *keys, last, value = keys_and_value
+
+    def change(data):
+        for key in keys:
+            data = data[key]
+        data[last] = value
+
+    return change
+
+
+def _drop(*keys):
+    *keys, last = keys
+
+    def change(data):
+        for key in keys:
+            data = data[key]
+        del data[last]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "mine.yaml: expected a mapping with modules; found None"),
+        ("[]", "mine.yaml: expected a mapping with modules; found []"),
+        ("module: {}", "mine.yaml: expected only modules; found 'module'"),
+        ("{}", "mine.yaml: expected the key modules; found none"),
+        ("modules: []", "modules: expected a mapping from names to module types; found []"),
+        ("modules: {A: 3}", "modules.A: expected a mapping with parts, mount"),
+        (_changed(_set("Fin", "wings", 2)), "modules.Fin: expected only parts, mount, slots, hin"),
+        (_changed(_drop("Fin", "mount")), "modules.Fin: expected the key mount; found none"),
+        (_changed(_set("Fin", "parts", {})), "modules.Fin.parts: expected a list of parts"),
+        (_changed(_drop("Fin", "parts", 0, "mass")), "Fin.parts.0: expected the key mass; found"),
+        (
+            _changed(_set("Fin", "parts", 0, "mass", "2 g")),
+            "modules.Fin.parts.0: part 'holder': mass: expected a number >= 0 [kg]; found '2 g'",
+        ),
+        (_changed(_set("Fin", "parts", 0, "masse", 1)), "Fin.parts.0: expected only mass, size"),
+        (
+            _changed(_drop("Fin", "parts", 0, "size")),
+            "modules.Fin.parts.0: expected one of size and boxes; found both or neither",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "size", [1, 1, 1])),
+            "modules.Fin.parts.1: expected one of size and boxes; found both or neither",
+        ),
+        (_changed(_set("Fin", "parts", 1, "boxes", [])), "parts.1.boxes: expected a list of box"),
+        (
+            _changed(_set("Fin", "parts", 1, "boxes", 0, "size", [1, -1, 1])),
+            "modules.Fin.parts.1.boxes.0: box: size.1: expected a number > 0 [m]; found -1",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "lift_drag", {"clap": 1})),
+            "modules.Fin.parts.1.lift_drag: expected only a0, cla, cda",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "lift_drag", {"cla": "steep"})),
+            "modules.Fin.parts.1: lift_drag.cla: expected a number; found 'steep'",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "lift_drag", {"cla": 10**400})),
+            "modules.Fin.parts.1: lift_drag.cla: expected a finite number; found 'a huge integer'",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "lift_drag", True)),
+            "lift_drag: expected a mapping with",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "thruster", {"power": 1})),
+            "modules.Fin.parts.1.thruster: expected only axis, position, curve, gain",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "thruster", {"range": [1, 2]})),
+            "modules.Fin.parts.1: thruster: range: expected [lowest, highest] around",
+        ),
+        (_changed(_set("Fin", "parts", 1, "thruster", [1])), "thruster: expected a mapping with"),
+        (
+            _changed(_set("Fin", "parts", 1, "drag", "inertia_box")),
+            "modules.Fin.parts.1: part 'blade': drag: expected one of faces, lift_drag, ellipsoid",
+        ),
+        (
+            _changed(_set("Fin", "parts", 1, "ballast_position", [0, 0])),
+            "modules.Fin.parts.1: part 'blade': ballast_position: expected three numbers [m]",
+        ),
+        (_changed(_set("Fin", "mount", "-z")), "Fin.mount: expected -x, +x, -y, +y or a mapping"),
+        (_changed(_set("Fin", "mount", 3)), "Fin.mount: expected a mapping with position, outward"),
+        (_changed(_set("Fin", "mount", None)), "modules.Fin: module 'Fin': mount: expected one"),
+        (
+            _changed(_set("Fin", "slots", [1])),
+            "Fin.slots: expected a mapping from numbers to faces",
+        ),
+        (_changed(_set("Fin", "slots", 1, "up")), "Fin.slots.1: expected -x, +x, -y, +y"),
+        (_changed(_set("Fin", "slots", 1, {})), "Fin.slots.1: expected the key position"),
+        (_changed(_set("Fin", "slots", 0, "+x")), "slots: expected numbers >= 1 (0 is where"),
+        (_changed(_drop("Fin", "hinge", "axis")), "Fin.hinge: expected the key axis; found none"),
+        (_changed(_set("Fin", "hinge", "torque", 1)), "Fin.hinge: expected only axis, anchor, ran"),
+        (_changed(_set("Fin", "hinge", "range", [1, 2])), "modules.Fin: hinge: range: expected"),
+        (_changed(_set("Fin", "aliases", "Hoop")), "Fin.aliases: expected a list of names"),
+        (
+            _changed(_set("Fin", "aliases", ["Hoop"])),
+            "modules.Ring: expected each name and alias once; found Hoop twice",
+        ),
+        (_changed(_set("3d", {"parts": [], "mount": None})), "modules.3d.parts: expected a list"),
+        (
+            "modules: {3: {mount: null, parts: [{size: [1, 1, 1], mass: 1}]}}",
+            "modules: expected names of types; f",
+        ),
+    ],
+)
+def test_wrong_files_are_refused(tmp_path, text, message):
+    with pytest.raises(InputError) as error:
+        load_modules(write(tmp_path, text))
+    assert message in str(error.value)
+    assert str(error.value).startswith(str(tmp_path / "mine.yaml"))
+    assert "\n" not in str(error.value)

@@ -1,0 +1,971 @@
+"""Robots from files: rest pose, masses, round trips, wild and wrong files, descriptors."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
+from mjx_revolve.body.morphology import (
+    MAX_MODULES,
+    Morphology,
+    load_morphology,
+    save_morphology,
+    trim_neutral,
+)
+from mjx_revolve.inputs.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+OURS = sorted((ROOT / "morphologies").glob("*.yaml"))
+WILD_FOLDER = ROOT.parent / "shared" / "revolve_robots"
+WILD_NAMES = ["babyA", "gecko", "robot_5", "snake", "spider", "spider17"]
+WATER = 999.1026  # kg/m³, the thesis's
+
+
+def ours(name: str) -> Morphology:
+    return load_morphology(ROOT / "morphologies" / f"{name}.yaml")
+
+
+def wild(name: str) -> Path:
+    path = WILD_FOLDER / f"{name}.yaml"
+    if not path.exists():
+        pytest.skip("Revolve's own robots (../shared/revolve_robots) are not on this machine")
+    return path
+
+
+def write(folder: Path, text: str, name: str = "robot.yaml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def read(folder: Path, text: str, **options) -> Morphology:
+    return load_morphology(write(folder, text), **options)
+
+
+# ------------------------------------------------------------------------- the spider
+
+# Read off Revolve's own SDF of the spider: metres along a leg from the core's centre.
+FIRST_FRAME, FIRST_AXIS, FIRST_SERVO, FIRST_PLATE = 0.0555, 0.06015, 0.071025, 0.082775
+FIRST_BRICK, SECOND_FRAME, SECOND_AXIS, SECOND_BRICK = 0.102275, 0.132275, 0.136925, 0.17905
+LEGS = {0: (0, -1, 0), 1: (0, 1, 0), 2: (1, 0, 0), 3: (-1, 0, 0)}
+
+
+@pytest.fixture(params=["ours", "Revolve's"])
+def spider(request) -> Morphology:
+    return ours("spider") if request.param == "ours" else load_morphology(wild("spider"))
+
+
+def leg(morphology: Morphology, slot: int) -> list:
+    """Modules of one leg from the core outwards."""
+    index = next(i for i, m in enumerate(morphology.modules) if m.parent == 0 and m.slot == slot)
+    return list(morphology.modules[index : index + 4])
+
+
+@pytest.mark.parametrize("slot", LEGS)
+def test_spider_lies_where_revolve_puts_it(spider, slot):
+    along = np.array(LEGS[slot], float)
+    hip, thigh, knee, foot = leg(spider, slot)
+
+    def at(distance):
+        return pytest.approx(distance * along, abs=1e-6)
+
+    assert hip.position == at(FIRST_FRAME)
+    assert thigh.position == at(FIRST_BRICK)
+    assert knee.position == at(SECOND_FRAME)
+    assert foot.position == at(SECOND_BRICK)
+    assert hip.position + hip.rotation @ hip.kind.hinge.anchor == at(FIRST_AXIS)
+    assert knee.position + knee.rotation @ knee.kind.hinge.anchor == at(SECOND_AXIS)
+    servo = hip.position + hip.rotation @ hip.kind.parts[1].position
+    assert servo == at(FIRST_SERVO)
+    plate = servo + hip.rotation @ hip.kind.parts[1].boxes[1].position
+    assert plate @ along == pytest.approx(FIRST_PLATE, abs=1e-6)
+
+
+@pytest.mark.parametrize("slot", LEGS)
+def test_spider_hips_are_vertical_and_knees_across_the_leg(spider, slot):
+    along = np.array(LEGS[slot], float)
+    hip, thigh, knee, foot = leg(spider, slot)
+    assert hip.rotation @ hip.kind.hinge.axis == pytest.approx([0, 0, 1])
+    across = knee.rotation @ knee.kind.hinge.axis
+    assert across[2] == pytest.approx(0) and across @ along == pytest.approx(0)
+    for module, forward in ((hip, 0), (thigh, 1), (knee, 0), (foot, 1)):
+        assert module.rotation[:, forward] == pytest.approx(along)
+        assert np.linalg.det(module.rotation) == pytest.approx(1.0)
+    assert thigh.rotation[:, 2] == pytest.approx([0, 0, 1])
+
+
+def test_spider_totals(spider):
+    assert (spider.num_modules, spider.num_hinges) == (17, 8)
+    assert spider.mass == pytest.approx(0.2572, abs=1e-12)
+    assert spider.volume == pytest.approx(2.41516e-4, rel=1e-12)
+    assert WATER * spider.volume / spider.mass == pytest.approx(0.93818, abs=5e-6)
+    # With the boxes' volumes it would shoot up at 27.6 m/s².
+    assert 9.81 * (WATER * spider.box_volume / spider.mass - 1) == pytest.approx(27.6, abs=0.05)
+    reach = SECOND_BRICK + 0.041 / 2
+    assert spider.extent == pytest.approx([2 * reach, 2 * reach, 0.045])
+    assert spider.length == pytest.approx(2 * reach)
+
+
+def link_masses(morphology: Morphology) -> list[float]:
+    """Masses of what is welded together: a hinge's first part stays, the rest moves."""
+    carrier: list[int] = []
+    masses: dict[int, float] = defaultdict(float)
+    for index, module in enumerate(morphology.modules):
+        link = carrier[module.parent] if module.parent >= 0 else -1
+        parts = module.kind.parts
+        if module.kind.hinge is not None:
+            masses[link] += parts[0].mass
+            link, parts = index, parts[1:]
+        masses[link] += sum(part.mass for part in parts)
+        carrier.append(link)
+    return sorted(masses.values())
+
+
+def test_spider_links(spider):
+    assert link_masses(spider) == pytest.approx([0.0192] * 4 + [0.0209] * 4 + [0.0968])
+
+
+def test_thesis_masses_move_between_links_only():
+    path = ROOT / "morphologies" / "spider.yaml"
+    thesis = load_morphology(path, modules=THESIS_MODULES)
+    assert thesis.mass == pytest.approx(0.2572, abs=1e-12)
+    assert thesis.volume == ours("spider").volume
+    masses = [0.0119] * 4 + [0.0209] * 4 + [0.126]
+    assert link_masses(thesis) == pytest.approx(masses)
+    assert thesis != ours("spider")
+
+
+def test_spider_hinges_share_links(spider):
+    hinges, pairs = spider.hinges, spider.hinge_neighbours()
+    assert [spider.modules[i].kind.hinge is not None for i in hinges] == [True] * 8
+    # Order along the file: hip, knee, hip, knee ...
+    hips = [(i, j) for i in (0, 2, 4, 6) for j in (0, 2, 4, 6) if i < j]
+    assert pairs == tuple(sorted([*hips, (0, 1), (2, 3), (4, 5), (6, 7)]))
+    assert len(pairs) == 10
+
+
+def test_hinge_neighbours_of_a_chain_and_of_none():
+    assert ours("core").hinge_neighbours() == ()
+    snake = ours("snake")
+    assert len(snake.hinge_neighbours()) == 7  # eight in a row, the core's link in the middle
+
+
+# ------------------------------------------------------------------------- our robots, wild robots
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
+def test_our_robots_load_and_have_colours_and_names(path):
+    robot = load_morphology(path)
+    assert robot.name == path.stem
+    assert robot.overlaps == ()
+    assert all(m.rgb is not None for m in robot.modules)
+    assert not any(m.name.startswith(m.type) for m in robot.modules)
+
+
+def test_our_robots_are_what_they_promise():
+    assert {p.stem for p in OURS} >= {
+        "spider",
+        "gecko",
+        "snake",
+        "centipede",
+        "core",
+        "auv",
+        "fish",
+    }
+    assert (ours("core").num_modules, ours("core").num_hinges) == (1, 0)
+    centipede, snake = ours("centipede"), ours("snake")
+    assert centipede.num_modules == 30 and centipede.num_hinges >= 16
+    assert snake.num_hinges == 8
+    for i in snake.hinges:
+        hinge = snake.modules[i]
+        assert hinge.rotation @ hinge.kind.hinge.axis == pytest.approx([0, 0, 1])
+        assert hinge.position[[0, 2]] == pytest.approx([0, 0])
+    for robot in map(load_morphology, OURS):  # all can be trimmed
+        assert trim_neutral(robot, WATER).volume * WATER == pytest.approx(robot.mass)
+
+
+@pytest.mark.parametrize(
+    "name, modules, hinges",
+    [
+        ("babyA", 16, 8),
+        ("gecko", 13, 6),
+        ("robot_5", 7, 2),
+        ("snake", 9, 4),
+        ("spider", 17, 8),
+        ("spider17", 33, 16),
+    ],
+)
+def test_wild_robots_load(name, modules, hinges):
+    robot = load_morphology(wild(name))
+    assert (robot.num_modules, robot.num_hinges) == (modules, hinges)
+    assert len({m.name for m in robot.modules}) == modules
+
+
+def test_wild_brains_are_kept():
+    assert load_morphology(wild("gecko")).brain == {"type": "rlpower-splines"}
+    assert load_morphology(wild("spider17")).brain is None
+    robot = load_morphology(wild("robot_5"))
+    assert robot.name == "1"
+    assert robot.brain["params"]["node1"]["period"] == 7.95243
+    assert [m.type for m in robot.modules if m.kind.sensor] == ["TouchSensor"] * 2
+
+
+# ------------------------------------------------------------------- as found in the wild
+
+WILD = """---
+id: 7
+body:
+  id: 1
+  type: CoreComponent
+  orientation: null
+  params: {red: 0.04, green: 1;, blue: "0.707;"}
+  children:
+    '1':
+      slot: 0
+      type: ActiveHinge
+      orientation: 90.0
+      children:
+        1: {type: FixedBrick, id: Leg, orientation: -90, params: null}
+    3:
+      slot: 3
+      id: Leg
+      type: FixedBrick
+      params: {mass: "0.02,", note: kept;, "lift;": 3}
+    0: {type: FixedBrickSensor, id: world}
+brain: [neurons, 1e-3]
+"""
+
+
+def test_loose_spellings_are_understood(tmp_path):
+    robot = read(tmp_path, WILD)
+    assert robot.name == "7"
+    assert [m.name for m in robot.modules] == ["1", "ActiveHinge1", "Leg", "Leg_2", "world_2"]
+    assert [m.slot for m in robot.modules] == [-1, 1, 1, 3, 0]
+    assert [m.parent for m in robot.modules] == [-1, 0, 1, 0, 0]
+    assert [m.orientation for m in robot.modules] == [0.0, 90.0, -90.0, 0.0, 0.0]
+    assert robot.modules[0].rgb == (0.04, 1.0, 0.707)
+    assert robot.modules[1].rgb is None
+    assert robot.modules[3].kind.mass == 0.02
+    assert robot.modules[3].params == {"mass": 0.02, "note": "kept;", "lift;": 3}
+    assert robot.modules[4].type == "TouchSensor"
+    assert robot.brain == ["neurons", 1e-3]
+
+
+def test_a_file_without_id_is_named_after_itself(tmp_path):
+    text = "body: {type: Core}"
+    assert load_morphology(write(tmp_path, text, "eel.yaml")).name == "eel"
+
+
+@pytest.mark.parametrize("a, b", [(-90, 270), (90, -270), (180, -180), (0, "0;")])
+def test_equal_orientations_make_equal_poses(tmp_path, a, b):
+    text = "body: {{type: Core, children: {{2: {{type: FixedBrick, orientation: {}}}}}}}"
+    first, second = (read(tmp_path, text.format(x)).modules[1] for x in (a, b))
+    assert np.array_equal(first.rotation, second.rotation)
+
+
+def test_orientation_turns_right_handed_about_the_attachment(tmp_path):
+    text = "body: {type: Core, children: {2: {type: ActiveHinge, orientation: 90}}}"
+    hinge = read(tmp_path, text).modules[1]
+    # Looking along +x; before the turn y is y and z is z, a right-handed quarter turn takes y to z.
+    assert hinge.rotation == pytest.approx(np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
+
+
+def test_slots_of_a_child_are_relative_to_it(tmp_path):
+    text = """
+body:
+  type: Core
+  children:
+    0:
+      type: FixedBrick
+      children:
+        2: {type: TouchSensor}
+"""
+    brick, sensor = read(tmp_path, text).modules[1:]
+    assert brick.position == pytest.approx([0, -0.0635, 0])
+    # The brick looks along -y, so its +x is the core's -x.
+    assert sensor.position == pytest.approx([-0.019 - 0.00205, -0.0635, 0])
+    assert sensor.rotation[:, 0] == pytest.approx([-1, 0, 0])
+
+
+# ------------------------------------------------------------------------- params
+
+
+def test_overrides_change_a_module(tmp_path):
+    text = """
+body:
+  type: Core
+  params: {mass: 0.2, volume: 1e-4, electronics_volume: 2e-5, ballast: 0.05}
+  children:
+    1:
+      type: ActiveHinge
+      params: {mass: 0.0214, volume: 2.6344e-5, electronics_volume: 1e-6, ballast: 0.001}
+      children: {1: {type: FixedBrick, params: {mass: 0}}}
+"""
+    core, hinge, brick = read(tmp_path, text).modules
+    assert core.kind.mass == pytest.approx(0.25)
+    assert core.kind.volume == pytest.approx(1.2e-4)
+    frame, servo = hinge.kind.parts  # doubled, in the catalogue's proportion
+    assert (frame.mass, servo.mass) == pytest.approx((2 * 0.0017 + 0.001, 2 * 0.0090))
+    assert (frame.volume, servo.volume) == pytest.approx((2 * 3.032e-6, 2 * 1.014e-5))
+    assert (frame.electronics_volume, servo.electronics_volume) == (0.0, 1e-6)
+    assert brick.kind.mass == 0.0
+    assert MODULES["Core"].mass == 0.09
+
+
+def test_ballast_without_a_place_is_spread_and_with_one_is_a_point(tmp_path):
+    text = "body: {type: Core, params: {mass: 0.1, volume: 1e-4, ballast: 0.1%s}}"
+    (spread,) = read(tmp_path, text % "").modules[0].kind.parts
+    assert (spread.mass, spread.ballast_mass) == (0.2, 0.0)
+    (placed,) = read(tmp_path, text % ", ballast_position: [0, 0, -0.02]").modules[0].kind.parts
+    assert (placed.mass, placed.ballast_mass, placed.ballast_volume) == (0.1, 0.1, 0.0)
+    robot = read(tmp_path, text % ", ballast_position: [0, '.01;', -0.02], ballast_volume: 1e-4")
+    (part,) = robot.modules[0].kind.parts
+    assert part.ballast_position == (0.0, 0.01, -0.02)
+    assert robot.mass == part.total_mass == pytest.approx(0.2)
+    assert robot.volume == part.total_volume == pytest.approx(2e-4)
+    assert robot.center_of_mass == pytest.approx([0.0, 0.005, -0.01])
+    assert robot.center_of_volume == pytest.approx([0.0, 0.005, -0.01])
+
+
+def test_own_ballast_stays_where_only_its_place_is_given(tmp_path):
+    core = MODULES["Core"]
+    heavy = replace(core, parts=(replace(core.parts[0], ballast_mass=0.5),))
+    text = "body: {type: Core, params: {ballast_position: [0, 0, 0.01]}}"
+    robot = read(tmp_path, text, modules=MODULES | {"Core": heavy})
+    assert robot.center_of_mass == pytest.approx([0, 0, 0.01 * 0.5 / 0.59])
+
+
+def test_centres_are_those_of_all_parts_at_rest(tmp_path):
+    text = """
+body:
+  type: Core
+  params: {electronics_volume: 2e-5, center_of_volume: [0.01, 0, 0.002]}
+  children:
+    2:
+      type: ActiveHinge
+      orientation: 90
+      params: {ballast: 0.01, ballast_position: [0, 0.01, 0.002], center_of_volume: [0, 0, 0.001]}
+"""
+    robot = read(tmp_path, text)
+    # Along +x, turned by 90 degrees: the hinge's y is up and its z is -y.
+    x, servo = 0.0555, 0.0555 + 0.015525
+    mass = [
+        (0.09, [0, 0, 0]),
+        (0.0017, [x, 0, 0]),
+        (0.01, [x, -0.002, 0.01]),
+        (0.009, [servo, 0, 0]),
+    ]
+    volume = [
+        (7.054e-5, [0.01, 0, 0.002]),
+        (3.032e-6, [x, 0, 0]),
+        (1.014e-5, [servo, -0.001, 0]),
+    ]
+    for found, rows in ((robot.center_of_mass, mass), (robot.center_of_volume, volume)):
+        weight = np.array([w for w, _ in rows])
+        assert found == pytest.approx(weight @ np.array([at for _, at in rows]) / weight.sum())
+    assert robot.mass == pytest.approx(sum(w for w, _ in mass))
+    assert robot.volume == pytest.approx(sum(w for w, _ in volume))
+
+
+def test_laws_and_coefficients_of_a_module(tmp_path):
+    text = """
+body:
+  type: Core
+  params: {buoyancy: mask, drag: off, added_mass: off, entrained_water: "0.5;"}
+  children:
+    1:
+      type: ActiveHinge
+      params: {drag: ellipsoid, drag_coefficient: 2, added_mass_coefficient: 3}
+    2: {type: FixedBrick, params: {lift_drag: {cla: 2.0}}}
+    3: {type: Fin, params: {lift_drag: {cla: 2.0}, drag: faces}}
+"""
+    robot = read(tmp_path, text)
+    core, hinge, brick, fin = (module.kind.parts for module in robot.modules)
+    (core,), (brick,), (fin,) = core, brick, fin
+    assert (core.buoyancy, core.drag, core.added_mass) == ("mask", "off", False)
+    assert core.entrained_water == 0.5
+    for part in hinge:
+        assert (part.drag, part.drag_coefficient, part.added_mass_coefficient) == (
+            "ellipsoid",
+            2,
+            3,
+        )
+    assert brick.lift_drag == LiftDrag(cla=2.0)
+    assert fin.lift_drag == replace(MODULES["Fin"].parts[0].lift_drag, cla=2.0)
+    assert fin.drag == "faces"
+    assert robot.num_fins == 2 and robot.descriptors["num_bricks"] == 0
+    check_round_trip(robot, tmp_path)
+
+
+def test_numbers_of_a_thruster(tmp_path):
+    text = """
+body:
+  type: Core
+  children:
+    1:
+      type: Thruster
+      id: jet
+      params: {thrust: 0.8, thruster: {axis: [0, 0, 2], range: [-1, 0.5]}}
+    2: {type: LiftThruster, id: lift, params: {thruster: {torque_ratio: -0.002, time_constant: 0}}}
+    3:
+      type: Thruster
+      id: line
+      params:
+        thrust: 3
+        thruster:
+          {curve: interpolated, gain: 1, commands: [-1, 0, 1], thrusts: [-0.5, 0, 1]}
+"""
+    robot = read(tmp_path, text)
+    assert robot.thrusters == ((1, 0), (2, 0), (3, 0))
+    assert (robot.num_thrusters, robot.num_hinges) == (3, 0)
+    jet, lift, line = (robot.modules[i].kind.parts[k].thruster for i, k in robot.thrusters)
+    assert jet.axis == (0.0, 0.0, 1.0) and jet.thrust_at(1.0) == pytest.approx(0.8)
+    assert jet.gain == pytest.approx(3.2)  # full ahead is command .5
+    assert (lift.torque_ratio, lift.time_constant, lift.gain) == (-0.002, 0.0, 0.5)
+    assert line.thrusts == pytest.approx((-1.5, 0.0, 3.0))
+    check_round_trip(robot, tmp_path)
+
+
+def test_a_dead_band_is_scaled_on_both_sides(tmp_path):
+    thruster = "{curve: dead_band, gain: 2, gain_backward: 1, dead_band: [-0.5, 0.5]}"
+    text = "body: {type: Core, children: {1: {type: Thruster, params: {thrust: 4, thruster: %s}}}}"
+    (part,) = read(tmp_path, text % thruster).modules[1].kind.parts
+    assert (part.thruster.gain, part.thruster.gain_backward) == (8.0, 4.0)
+    assert [part.thruster.thrust_at(x) for x in (-1, 0.7, 1)] == [-2.0, 0.0, 4.0]
+
+
+# ------------------------------------------------------------------------- the AUV and the fish
+
+
+def test_the_auv_pushes_up_and_ahead_without_torque():
+    robot = ours("auv")
+    force, torque = np.zeros((4, 3)), np.zeros((4, 3))
+    for i, (index, k) in enumerate(robot.thrusters):
+        module = robot.modules[index]
+        thruster = module.kind.parts[k].thruster
+        force[i] = module.rotation @ np.array(thruster.axis) * thruster.thrust_at(1.0)
+        torque[i] = np.cross(module.position, force[i]) - thruster.torque_ratio * force[i]
+    up, ahead = slice(0, 2), slice(2, 4)
+    assert force[up].sum(0) == pytest.approx([0, 0, 1]) and torque[up].sum(0) == pytest.approx(0)
+    assert force[ahead].sum(0) == pytest.approx([0, 1, 0])
+    assert torque[ahead].sum(0) == pytest.approx(0)
+    # Against each other: pitch about x with bow and stern, yaw about z with the sides.
+    assert (torque[0] - torque[1])[0] == pytest.approx(0.0595)
+    assert (torque[2] - torque[3])[2] == pytest.approx(0.0595)
+
+
+def test_the_fish_has_a_tail_that_beats_sideways():
+    robot = ours("fish")
+    tail = robot.modules[robot.num_modules - 3]
+    plate = tail.kind.parts[0].lift_drag
+    assert tail.rotation @ np.array(plate.forward) == pytest.approx([0, 1, 0])
+    assert np.abs(tail.rotation @ np.array(plate.upward)) == pytest.approx([1, 0, 0])
+    for i in robot.hinges:
+        hinge = robot.modules[i]
+        assert np.abs(hinge.rotation @ hinge.kind.hinge.axis) == pytest.approx([0, 0, 1])
+    for name in ("right_fin", "left_fin"):
+        (fin,) = [m for m in robot.modules if m.name == name]
+        plate = fin.kind.parts[0].lift_drag
+        assert fin.rotation @ np.array(plate.forward) == pytest.approx([0, 1, 0])
+        assert fin.rotation @ np.array(plate.upward) == pytest.approx([0, 0, 1])
+    assert robot.hinge_neighbours() == ((0, 1), (1, 2))
+
+
+@pytest.mark.parametrize("name", ["auv", "fish"])
+def test_swimmers_with_ballast_are_neutral_level_and_upright(name):
+    robot = ours(name)
+    assert robot.volume * WATER == pytest.approx(robot.mass, rel=1e-9)
+    apart = robot.center_of_volume - robot.center_of_mass
+    assert apart[:2] == pytest.approx([0, 0], abs=1e-7)
+    assert apart[2] > 0.004
+
+
+def test_trim_neutral(tmp_path):
+    robot = ours("spider")
+    trimmed = trim_neutral(robot, WATER)
+    assert trimmed.volume * WATER == pytest.approx(trimmed.mass, rel=1e-12)
+    assert trimmed.mass == robot.mass and trimmed.modules[1:] == robot.modules[1:]
+    added = trimmed.modules[0].kind.parts[0].electronics_volume
+    assert added == pytest.approx(0.2572 / WATER - 2.41516e-4)
+    assert trim_neutral(trimmed, WATER).volume == pytest.approx(trimmed.volume)
+    # Salt water carries more: the electronics shrink.
+    salt = trim_neutral(trimmed, 1025.0)
+    assert salt.volume * 1025.0 == pytest.approx(salt.mass)
+    trimmed.save(tmp_path / "trimmed.yaml")
+    assert load_morphology(tmp_path / "trimmed.yaml") == trimmed != robot
+
+
+def test_trim_neutral_refuses_what_floats(tmp_path):
+    robot = read(tmp_path, "body: {type: Core, params: {mass: 0.01}}")
+    with pytest.raises(InputError, match=r"found one that floats.*ballast of 0\.04049 kg would do"):
+        trim_neutral(robot, WATER)
+    with pytest.raises(InputError, match="density: expected a number > 0"):
+        trim_neutral(robot, 0.0)
+
+
+# ------------------------------------------------------------------------- round trips
+
+
+def check_round_trip(robot: Morphology, folder: Path, **options) -> None:
+    save_morphology(robot, folder / "saved.yaml")
+    again = load_morphology(folder / "saved.yaml", **options)
+    assert again == robot
+    assert again.path != robot.path
+    again.save(folder / "twice.yaml")
+    assert (folder / "twice.yaml").read_text() == (folder / "saved.yaml").read_text()
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
+def test_our_robots_round_trip(path, tmp_path):
+    check_round_trip(load_morphology(path), tmp_path)
+
+
+@pytest.mark.parametrize("name", WILD_NAMES)
+def test_wild_robots_round_trip(name, tmp_path):
+    check_round_trip(load_morphology(wild(name)), tmp_path)
+
+
+def test_odd_values_round_trip(tmp_path):
+    text = """
+id: "1e-3"
+body:
+  id: "12e4"
+  type: Core
+  params: {electronics_volume: 1e-05, text: "1e-3", nothing: null, list: [1, [2.5, .nan]]}
+  children: {1: {id: "naïve: #\\n☃", type: FixedBrick}, 2: {id: "no", type: FixedBrick}}
+brain: {a: "0x10", b: "1e5", c: 1.0e+20, d: .inf, e: "yes", f: 2001-01-01}
+"""
+    robot = read(tmp_path, text)
+    assert [robot.name, *(m.name for m in robot.modules)] == ["1e-3", "12e4", "naïve: #\n☃", "no"]
+    check_round_trip(robot, tmp_path)
+
+
+def random_tree(rng: random.Random, size: int) -> dict:
+    """A body of random modules; it may overlap with itself."""
+
+    def module(kind):
+        item = {"type": kind, "orientation": rng.choice([0, 90, 180, 270, -90])}
+        if rng.random() < 0.7:
+            item["id"] = rng.choice(["a", "b", f"m{rng.randrange(1000)}", rng.randrange(100)])
+        params = {}
+        if rng.random() < 0.5:
+            params |= {c: round(rng.random(), rng.randrange(1, 17)) for c in ("red", "green")}
+            params["blue"] = 1
+        for key in ("mass", "volume", "electronics_volume", "ballast", "entrained_water"):
+            if rng.random() < 0.2:
+                params[key] = rng.uniform(1e-9, 0.1)
+        if rng.random() < 0.2:
+            params["ballast_position"] = [rng.uniform(-0.1, 0.1), 0, 1]
+        if rng.random() < 0.2:
+            params |= {"drag": rng.choice(["faces", False]), "added_mass": rng.random() < 0.5}
+        return item | ({"params": params} if params else {})
+
+    root = module("Core") | {"orientation": 0}
+    free = [(root, slot) for slot in MODULES["Core"].slots]
+    for _ in range(size - 1):
+        if not free:
+            break
+        parent, slot = free.pop(rng.randrange(len(free)))
+        kind = rng.choice(["FixedBrick", "ActiveHinge", "TouchSensor", "Thruster", "Fin"])
+        child = module(kind)
+        key = str(slot) if rng.random() < 0.5 else slot
+        parent.setdefault("children", {})[key] = child
+        free += [(child, s) for s in MODULES[kind].slots]
+    return root
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_random_trees_round_trip(seed, tmp_path):
+    rng = random.Random(seed)
+    tree = random_tree(rng, 30)
+    robot = read(tmp_path, yaml.safe_dump({"body": tree}, sort_keys=False), allow_overlap=True)
+    check_round_trip(robot, tmp_path, allow_overlap=True)
+    assert len({m.name for m in robot.modules}) == robot.num_modules
+    for index, module in enumerate(robot.modules[1:], start=1):
+        assert 0 <= module.parent < index  # depth first
+        assert module.rotation.T @ module.rotation == pytest.approx(np.eye(3))
+        parent = robot.modules[module.parent]
+        slot, mount = parent.kind.slots[module.slot], module.kind.mount
+        # Slot and mount meet, and look the same way.
+        assert module.position + module.rotation @ mount.position == pytest.approx(
+            parent.position + parent.rotation @ slot.position
+        )
+        assert module.rotation @ mount.outward == pytest.approx(parent.rotation @ slot.direction)
+    assert all(math.isfinite(x) for x in robot.descriptors.values())
+
+
+def test_equality_sees_every_field(tmp_path):
+    base = (
+        "id: a\nbody: {type: Core, id: c, params: {ballast: 1}, children: {1: {type: FixedBrick}}}"
+    )
+    robot = read(tmp_path, base)
+    assert robot == read(tmp_path, base)
+    assert robot != 1
+    for old, new in [
+        ("id: a", "id: b"),
+        ("id: c", "id: d"),
+        ("ballast: 1", "ballast: 2"),
+        ("{1: {type: F", "{2: {type: F"),
+        ("FixedBrick", "ActiveHinge"),
+        ("FixedBrick", "FixedBrick, orientation: 90"),
+        ("FixedBrick", "FixedBrick, params: {red: 1, green: 1, blue: 1}"),
+        ("\nbody", "\nbrain: {}\nbody"),
+    ]:
+        assert robot != read(tmp_path, base.replace(old, new))
+
+
+def test_saving_where_nothing_can_be_written_is_refused(tmp_path):
+    with pytest.raises(InputError, match="expected a file to write; found"):
+        ours("core").save(tmp_path / "no folder" / "robot.yaml")
+
+
+# ------------------------------------------------------------------------- overlap
+
+# A brick on each side of the core's front, and from one of them a chain that turns back into it.
+RING = """
+body:
+  type: Core
+  children:
+    1:
+      id: a
+      type: FixedBrick
+      children:
+        2:
+          id: b
+          type: FixedBrick
+          children:
+            2:
+              id: c
+              type: FixedBrick
+              children: {1: {id: d, type: FixedBrick}}
+"""
+
+
+def test_overlapping_modules_are_named(tmp_path):
+    with pytest.raises(InputError) as error:
+        read(tmp_path, RING)
+    assert str(error.value) == (
+        f"{tmp_path / 'robot.yaml'}: body: expected modules that do not overlap at rest; found "
+        "overlapping: Core0 and c, Core0 and d (allow_overlap loads them all the same)"
+    )
+    robot = read(tmp_path, RING, allow_overlap=True)
+    assert robot.overlaps == (("Core0", "c"), ("Core0", "d"))
+
+
+def test_bricks_side_by_side_do_not_overlap(tmp_path):
+    # Four bricks in a square, and neighbours on one brick: boxes share 3 mm by design.
+    text = """
+body:
+  type: Core
+  children:
+    1:
+      type: FixedBrick
+      children:
+        1:
+          type: FixedBrick
+          children:
+            2: {type: FixedBrick, children: {2: {type: FixedBrick, id: fourth}}}
+            3: {type: FixedBrick}
+            1: {type: FixedBrick}
+"""
+    assert read(tmp_path, text).overlaps == ()
+    fifth = "id: fourth, children: {1: {type: FixedBrick, id: fifth}}"  # reaches into the core
+    with pytest.raises(InputError, match="overlapping: Core0 and fifth"):
+        read(tmp_path, text.replace("id: fourth", fifth))
+
+
+def test_many_overlaps_are_summed_up(tmp_path):
+    def turn(depth):
+        child = {"type": "FixedBrick"}
+        return child if depth == 0 else child | {"children": {2: turn(depth - 1)}}
+
+    tree = {"body": {"type": "Core", "children": {1: turn(9)}}}
+    with pytest.raises(InputError, match=r"and \d+ more \(allow_overlap"):
+        read(tmp_path, yaml.safe_dump(tree))
+
+
+# ------------------------------------------------------------------------- descriptors
+
+
+def test_descriptors_of_the_spider(spider):
+    found = spider.descriptors
+    expected = {
+        "num_modules": 17,
+        "num_bricks": 8,
+        "num_hinges": 8,
+        "num_sensors": 0,
+        "num_limbs": 4,
+        "chain_length": 4,
+        "limbs": 4 / (2 * 3 + 2 + 4),  # Miras et al.: 2 floor((m - 6)/3) + (m - 6) mod 3 + 4
+        "length_of_limbs": 12 / 15,
+        "branching": 1 / 5,  # the core alone; floor((17 - 2)/3)
+        "joints": 8 / 15,
+        "sensors": 0,
+        "symmetry": 1,
+        "proportion": 1,
+    }
+    assert {key: found[key] for key in expected} == pytest.approx(expected)
+    assert found["mass"] == spider.mass
+    assert found["coverage"] == pytest.approx(spider.box_volume / np.prod(spider.extent))
+
+
+def test_descriptors_of_a_core():
+    found = ours("core").descriptors
+    zero = ("limbs", "branching", "joints", "sensors", "symmetry", "chain_length", "num_limbs")
+    assert all(found[key] == 0 for key in zero)
+    assert found["coverage"] == pytest.approx(1.0)
+
+
+def test_sensors_are_not_part_of_the_body(tmp_path):
+    text = "body: {type: Core, children: {1: {type: FixedBrick%s}, 2: {type: TouchSensor}}}"
+    plain = read(tmp_path, text % "").descriptors
+    assert plain["num_sensors"] == 1 and plain["num_limbs"] == 1 and plain["num_bricks"] == 1
+    assert plain["sensors"] == pytest.approx(1 / 6)  # three free slots each
+    more = read(tmp_path, text % ", children: {1: {type: TouchSensor}}").descriptors
+    assert more["num_limbs"] == 1 and more["chain_length"] == 2
+
+
+def test_thrusters_and_fins_are_counted():
+    auv, fish = ours("auv").descriptors, ours("fish").descriptors
+    expected = {"num_thrusters": 4, "num_fins": 0, "num_bricks": 0, "num_limbs": 4, "symmetry": 1}
+    assert {key: auv[key] for key in expected} == expected
+    expected = {"num_thrusters": 0, "num_fins": 3, "num_bricks": 2, "num_limbs": 3, "symmetry": 1}
+    assert {key: fish[key] for key in expected} == expected
+
+
+def test_symmetry_needs_a_mirror_image(tmp_path):
+    text = "body: {type: Core, children: {2: {type: FixedBrick}%s}}"
+    assert read(tmp_path, text % "").descriptors["symmetry"] == 0
+    assert read(tmp_path, text % ", 3: {type: FixedBrick}").descriptors["symmetry"] == 1
+    assert read(tmp_path, text % ", 3: {type: ActiveHinge}").descriptors["symmetry"] == 0
+
+
+# ------------------------------------------------------------------------- wrong files
+
+HINGE_ON = "body: {type: Core, children: {1: {type: ActiveHinge, %s}}}"
+JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "expected a mapping with id, body and brain; found an empty file"),
+        ("- body", "expected a mapping with id, body and brain; found ['body']"),
+        ("just text", "expected a mapping with id, body and brain; found 'just text'"),
+        ("id: x\nbrain: {}", "expected the key body; found ['id', 'brain']"),
+        ("{}", "expected the key body; found []"),
+        ("body: {type: Core}\nbrian: {}", "expected only id, body, brain; found 'brian'"),
+        ("body:", "body: expected a module (a mapping with a type); found nothing"),
+        ("body: [1]", "body: expected a module (a mapping with a type); found [1]"),
+        ("body: {}", "body.type: expected one of Core, CoreComponent; found none"),
+        ("body: {type: Bric}", "body.type: expected one of Core, CoreComponent; found 'Bric'"),
+        ("body: {type: [Core]}", "body.type: expected one of Core, CoreComponent; found ['Core']"),
+        ("body: {type: NO}", "body.type: expected one of Core, CoreComponent; found False"),
+        (
+            "body: {type: FixedBrick}",
+            "body.type: expected one of Core, CoreComponent (the root is a core); found 'FixedBri",
+        ),
+        (
+            "body: {type: Core, children: {1: {type: Core}}}",
+            "body.children.1.type: expected one of ActiveHinge, Fin, FixedBrick, FixedBrickSensor, "
+            "LiftThruster, Thruster, TouchSensor (a core is always the root); found 'Core'",
+        ),
+        (
+            "body: {type: Core, children: {0: {type: Bric}}}",
+            "body.children.0.type: expected one of ActiveHinge, Fin, FixedBrick, FixedBrickSensor, "
+            "LiftThruster, Thruster, TouchSensor; found 'Bric'",
+        ),
+        ("body: {type: Core, orientaton: 0}", "body: expected only id, type, slot, orientation, p"),
+        ("body: {type: Core, orientation: 90}", "body.orientation: expected 0 (the core is attac"),
+        ("body: {type: Core, children: []}", "body.children: expected a mapping from slots to mod"),
+        ("body: {type: Core, children: {1: }}", "body.children.1: expected a module (a mapping"),
+        (
+            "body: {type: Core, children: {4: {type: FixedBrick}}}",
+            "body.children: expected one of the slots 0, 1, 2, 3 of type Core; found 4",
+        ),
+        ("body: {type: Core, children: {x: {}}}", "0, 1, 2, 3 of type Core; found 'x'"),
+        ("body: {type: Core, children: {-1: {}}}", "0, 1, 2, 3 of type Core; found -1"),
+        ("body: {type: Core, children: {1.0: {}}}", "0, 1, 2, 3 of type Core; found 1.0"),
+        ("body: {type: Core, children: {yes: {}}}", "0, 1, 2, 3 of type Core; found True"),
+        (
+            "body: {type: Core, children: {1: {type: FixedBrick}, '1': {type: FixedBrick}}}",
+            "body.children: expected each slot once; found slot 1 twice",
+        ),
+        (
+            HINGE_ON % "children: {2: {type: FixedBrick}}",
+            "body.children.1.children: expected one of the slots 1 of type ActiveHinge; found 2",
+        ),
+        (
+            "body: {type: Core, children: {1: {type: FixedBrick, children: {0: {}}}}}",
+            "the slots 1, 2, 3 of type FixedBrick (slot 0 is where it is attached); found 0",
+        ),
+        (
+            "body: {type: Core, children: {1: {type: TouchSensor, children: {1: {}}}}}",
+            "body.children.1.children: expected none, since type TouchSensor has no slots; f",
+        ),
+        (HINGE_ON % "orientation: 45", "expected 0, 90, 180, 270 or -90 [deg]; found 45"),
+        (HINGE_ON % "orientation: north", "children.1.orientation: expected 0, 90, 180, 270 or"),
+        (HINGE_ON % "orientation: .nan", "expected 0, 90, 180, 270 or -90 [deg]; found nan"),
+        (HINGE_ON % "orientation: yes", "expected 0, 90, 180, 270 or -90 [deg]; found True"),
+        (HINGE_ON % "orientation: [90]", "expected 0, 90, 180, 270 or -90 [deg]; found [90]"),
+        (HINGE_ON % "orientation: 360", "expected 0, 90, 180, 270 or -90 [deg]; found 360"),
+        (HINGE_ON % "id: no", "children.1.id: expected a name or a number (YAML reads yes, no,"),
+        (HINGE_ON % f"id: 0x{'f' * 4000}", "expected a name or a number; found a huge integer"),
+        (HINGE_ON % "id: [a]", "children.1.id: expected a name or a number"),
+        ("id: {}\nbody: {type: Core}", "id: expected a name or a number"),
+        (HINGE_ON % "params: 3", "children.1.params: expected a mapping; found 3"),
+        (HINGE_ON % "params: {red: 1}", "params: expected red, green and blue, or none; found red"),
+        (
+            HINGE_ON % "params: {red: 1, green: 2, blue: 0}",
+            "body.children.1.params.green: expected a number from 0 to 1; found 2",
+        ),
+        (
+            HINGE_ON % "params: {red: 1, green: x;, blue: 0}",
+            "params.green: expected a number from 0 to 1; found 'x;'",
+        ),
+        (
+            HINGE_ON % "params: {red: 1, green: -0.1, blue: 0}",
+            "params.green: expected a number from 0 to 1; found -0.1",
+        ),
+        (HINGE_ON % "params: {mass: -1}", "params.mass: expected a number >= 0 [kg]; found -1"),
+        (HINGE_ON % "params: {mass: 2 g}", "params.mass: expected a number >= 0 [kg]; found '2 g'"),
+        (HINGE_ON % "params: {mass: }", "params.mass: expected a number >= 0 [kg]; found None"),
+        (HINGE_ON % "params: {volume: .inf}", "params.volume: expected a number >= 0 [m3]; found"),
+        (HINGE_ON % "params: {volume: 1e999}", "params.volume: expected a number >= 0 [m3]"),
+        (HINGE_ON % "params: {ballast: yes}", "ballast: expected a number >= 0 [kg]; found True"),
+        (HINGE_ON % "params: {electronics_volume: -1}", "electronics_volume: expected a number >="),
+        (
+            HINGE_ON % "params: {ballast_position: [0, 1]}",
+            "body.children.1.params.ballast_position: expected three numbers [m]; found [0, 1]",
+        ),
+        (
+            HINGE_ON % "params: {ballast_position: 1}",
+            "ballast_position: expected three numbers [m]",
+        ),
+        (
+            HINGE_ON % "params: {ballast_position: [0, 0, x]}",
+            "position.2: expected a number [m]; f",
+        ),
+        (HINGE_ON % "params: {center_of_volume: [0]}", "center_of_volume: expected three numbers"),
+        (HINGE_ON % "params: {ballast_volume: -1}", "ballast_volume: expected a number >= 0 [m3]"),
+        (
+            HINGE_ON % "params: {entrained_water: 2}",
+            "body.children.1.params: part 'frame': entrained_water: expected a share from 0 to 1",
+        ),
+        (HINGE_ON % "params: {entrained_water: x}", "params.entrained_water: expected a number >="),
+        (HINGE_ON % "params: {drag_coefficient: -1}", "params.drag_coefficient: expected a number"),
+        (HINGE_ON % "params: {added_mass_coefficient: }", "added_mass_coefficient: expected a num"),
+        (
+            HINGE_ON % "params: {buoyancy: on}",
+            "children.1.params: part 'frame': buoyancy: expected one of partial, mask, off; foun",
+        ),
+        (HINGE_ON % "params: {drag: 3}", "drag: expected one of faces, lift_drag, ellipsoid, off;"),
+        (
+            HINGE_ON % "params: {drag: inertia_box}",
+            "ellipsoid, off (a law of whole bodies: the world's); found 'inertia_box'",
+        ),
+        (HINGE_ON % "params: {added_mass: 2}", "added_mass: expected true or false; found 2"),
+        (
+            HINGE_ON % "params: {thrust: 1}",
+            "body.children.1.params: thrust: expected a module with a thruster; found type Ac",
+        ),
+        (
+            HINGE_ON % "params: {thruster: {gain: 1}}",
+            "params: thruster: expected a module with a thruster; found type Ac",
+        ),
+        (
+            HINGE_ON % "params: {thruster: {power: 1}}",
+            "body.children.1.params.thruster: expected only axis, position, curve, gain",
+        ),
+        (
+            HINGE_ON % "params: {thruster: 1}",
+            "params.thruster: expected a mapping with any",
+        ),
+        (
+            HINGE_ON % "params: {lift_drag: {}}",
+            "params.lift_drag: expected a mapping with any",
+        ),
+        (
+            HINGE_ON % "params: {lift_drag: {Cla: 1}}",
+            "params.lift_drag: expected only a0, cla, cda",
+        ),
+        (
+            HINGE_ON % "params: {lift_drag: {cla: x}}",
+            "body.children.1.params: lift_drag.cla: expected a number; found 'x'",
+        ),
+        (JET_ON % "thrust: -1", "params.thrust: expected a number >= 0 [N]; found -1"),
+        (
+            JET_ON % "thruster: {gain: x}",
+            "body.children.1.params: thruster: gain: expected a number >= 0 [N]; found 'x'",
+        ),
+        (
+            JET_ON % "thrust: 1, thruster: {range: [-1, 0]}",
+            "thrust: expected a thruster that pushes at its highest command 0; found 0 N there",
+        ),
+        (HINGE_ON % "params: {mass: 0}", "children.1.params: module 'ActiveHinge': parts: expec"),
+        (
+            "body: {type: Core, params: {mass: 0}}",
+            "body.params: module 'Core': mass: expected a co",
+        ),
+        ("body: {type: Core\n", "expected valid YAML; found"),
+        ("body: {type: Core, type: Core}", "expected each key once; found 'type' twice"),
+    ],
+)
+def test_wrong_files_are_refused(tmp_path, text, message):
+    with pytest.raises(InputError) as error:
+        read(tmp_path, text)
+    found = str(error.value)
+    assert message in found
+    assert found.startswith(f"{tmp_path / 'robot.yaml'}: ")
+    assert "\n" not in found
+
+
+def test_what_yaml_cannot_hold_is_refused(tmp_path):
+    robot = read(tmp_path, f"body: {{type: Core}}\nbrain: 0x{'f' * 4000}")
+    with pytest.raises(InputError, match="expected values that YAML can hold; found: Exceeds"):
+        robot.save(tmp_path / "saved.yaml")
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"none.yaml: expected a file; found none"):
+        load_morphology(tmp_path / "none.yaml")
+
+
+def chain(depth: int) -> str:
+    """A snake of bricks that goes up through `depth` modules, in YAML's flow style."""
+    return (
+        "body: {type: Core, children: {1: "
+        + "{type: FixedBrick, children: {1: " * depth
+        + "{type: FixedBrick}"
+        + "}}" * depth
+        + "}}"
+    )
+
+
+def test_long_chains_load_and_endless_ones_are_refused(tmp_path):
+    robot = read(tmp_path, chain(60))
+    assert robot.descriptors["chain_length"] == 61
+    check_round_trip(robot, tmp_path)
+    for depth in (120, 10_000):
+        with pytest.raises(InputError, match="levels"):
+            read(tmp_path, chain(depth))
+
+
+def test_too_many_modules_are_refused(tmp_path):
+    def bush(depth):
+        child = {"type": "FixedBrick"}
+        if depth > 0:
+            child["children"] = {slot: bush(depth - 1) for slot in (1, 2, 3)}
+        return child
+
+    tree = {"body": {"type": "Core", "children": {1: bush(6)}}}  # 1 + (3⁷ - 1)/2 = 1094
+    with pytest.raises(InputError, match=f"expected at most {MAX_MODULES} modules; found more"):
+        read(tmp_path, yaml.safe_dump(tree))

@@ -1,0 +1,290 @@
+"""Controllers from genes to targets, and the servos that follow them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import WATER, at_rest, body, elbow_robot, march, random_states, read, world
+from mjx_revolve.control.controllers import CONTROLLERS, bind_genes, make_cpg, make_sine
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.step import Sense
+from mjx_revolve.episodes.config import ControllerConfig
+
+EFFORT, SPEED = 0.17658, 5.235988
+# What those that do not listen are told of their robot.
+STILL = Sense(0.0, 0.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+
+
+@lru_cache
+def robot_of(name):
+    return build_robot(body(name), world())
+
+
+def play(controller, genes, steps, dt=0.005, order=None):
+    """`[steps, nu, lanes]` targets and the controller's states, in float64."""
+    with jax.enable_x64(True):
+        parameters = controller.decode(jnp.asarray(genes, jnp.float64), order)
+
+        def step(state, k):
+            state, target = controller.step(parameters, state, k * dt, STILL)
+            return state, (target, state)
+
+        run = jax.jit(lambda: jax.lax.scan(step, controller.init(parameters), jnp.arange(steps)))
+        targets, states = run()[1]
+        return np.asarray(targets), jax.tree.map(np.asarray, states)
+
+
+def drawn(controller, lanes=4, seed=0, scale=1.5):
+    return scale * np.random.default_rng(seed).normal(size=(controller.num_genes, lanes))
+
+
+MAKERS = {
+    "cpg": make_cpg,
+    "sine": make_sine,
+    "sine3": lambda robot, **options: make_sine(robot, harmonics=3, **options),
+}
+
+
+# ------------------------------------------------------------------------- genes
+
+
+@pytest.mark.parametrize("name", ["spider", "gecko", "snake", "centipede", "core"])
+def test_the_number_of_genes_follows_from_the_body(name):
+    robot = robot_of(name)
+    n, pairs = robot.num_hinges, len(robot.morphology.hinge_neighbours())
+    assert make_cpg(robot).num_genes == n + pairs
+    assert make_sine(robot).num_genes == 3 * n + 1
+    assert make_sine(robot, harmonics=3).num_genes == 7 * n + 1
+
+
+def test_spider_has_18_cpg_genes_and_25_sine_genes():
+    """Eight hinges; four hips round the core make six pairs, and each leg one more."""
+    assert make_cpg(robot_of("spider")).num_genes == 8 + 10
+    assert make_sine(robot_of("spider")).num_genes == 25
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_every_gene_has_a_name_of_its_own(kind):
+    controller = MAKERS[kind](robot_of("spider"))
+    assert len(controller.gene_names) == controller.num_genes
+    assert len(set(controller.gene_names)) == controller.num_genes
+    assert all(
+        "hip" in name or "knee" in name or name == "frequency" for name in controller.gene_names
+    )
+
+
+def test_the_names_that_a_configuration_gives():
+    robot = robot_of("spider")
+    assert set(CONTROLLERS) == {"cpg", "sine", "feedback"}
+    for kind, genes in (("cpg", 18), ("sine", 25), ("feedback", 8 * (1 + 7))):
+        assert CONTROLLERS[kind](robot, ControllerConfig(type=kind)).num_genes == genes
+    assert CONTROLLERS["sine"](robot, ControllerConfig(type="sine", harmonics=2)).num_genes == 41
+
+
+def test_bound_controllers_keep_what_they_were_given():
+    controller = make_sine(robot_of("spider"))
+    genes = np.zeros(25)
+    bound = bind_genes(controller, genes)
+    assert bound.controller is controller
+    assert bound.genes is genes
+
+
+# ------------------------------------------------------------------------- targets
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_zero_genes_keep_still(kind):
+    robot = robot_of("spider")
+    controller = MAKERS[kind](robot)
+    targets, _ = play(controller, np.zeros((controller.num_genes, 2)), 400, order=np.arange(8))
+    assert not targets.any()
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+@pytest.mark.parametrize("amplitude", [1.0, 0.4])
+def test_targets_stay_within_the_range(kind, amplitude):
+    """CPG and plain sine by themselves; offsets and harmonics add up, and the servo clips them."""
+    robot = robot_of("spider")
+    controller = MAKERS[kind](robot, amplitude=amplitude)
+    targets, _ = play(controller, drawn(controller, 64, scale=5.0), 800, order=np.arange(8))
+    widest = {"cpg": 1.0, "sine": 1.5, "sine3": 0.5 + 1 + 1 / 2 + 1 / 3}[kind]
+    assert np.abs(targets).max() <= widest * amplitude * np.pi / 4 + 1e-9
+    assert np.abs(targets).max() > 0.5 * amplitude * np.pi / 4
+    # No joint jumps: neither from rest nor later.
+    fastest = 3 * 2 * np.pi * 2.0 * widest + 2 * widest
+    moved = np.diff(targets, axis=0, prepend=np.zeros((1, 8, 64)))
+    assert np.abs(moved).max() < 0.005 * fastest * amplitude * np.pi / 4
+
+
+def test_cpg_keeps_its_norm():
+    """The system matrix is antisymmetric: Σ x² + y² is constant to what Runge-Kutta errs by."""
+    controller = make_cpg(robot_of("spider"))
+    _, (x, y) = play(controller, drawn(controller, 16), 4000, order=np.arange(8))
+    norm = (x**2 + y**2).sum(1)
+    assert norm == pytest.approx(8.0, rel=2e-3)
+    assert np.abs(x).max() > 1.2  # the coupling moves energy between hinges
+
+
+def test_an_uncoupled_cpg_is_a_sine():
+    """x = sin(w t) where the couplings are zero; w = 2π f_max sin(gene)."""
+    robot = robot_of("spider")
+    controller = make_cpg(robot, max_frequency=1.5)
+    genes = np.zeros((18, 1))
+    genes[:8, 0] = np.linspace(-1.2, 1.2, 8)
+    targets, _ = play(controller, genes, 400, order=np.arange(8))
+    time = 0.005 * np.arange(1, 401)
+    w = 2 * np.pi * 1.5 * np.sin(genes[:8, 0])
+    expected = np.pi / 4 * np.tanh(np.sin(w * time[:, None]))
+    assert targets[..., 0] == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_coupled_pair_against_the_matrix_exponential():
+    from scipy.linalg import expm
+
+    robot = elbow_robot(world())
+    controller = make_cpg(robot, max_frequency=1.0)
+    assert controller.num_genes == 3
+    genes = np.array([[0.7], [-0.4], [0.9]])
+    w, c = 2 * np.pi * np.sin(genes[:2, 0]), np.pi * np.sin(0.9)
+    matrix = np.array([[0, c, w[0], 0], [-c, 0, 0, w[1]], [-w[0], 0, 0, 0], [0, -w[1], 0, 0]])
+    _, (x, y) = play(controller, genes, 400, order=np.arange(2))
+    expected = expm(matrix * 2.0) @ [0, 0, 1, 1]
+    assert np.concatenate([x[-1, :, 0], y[-1, :, 0]]) == pytest.approx(expected, abs=1e-5)
+
+
+def test_sine_is_a_sine():
+    """a sin(2π f t + φ) + offset after the fade: amplitude and phase from a point in the plane."""
+    robot = robot_of("spider")
+    controller = make_sine(robot, max_frequency=1.2)
+    genes = np.zeros((25, 1))
+    genes[0], genes[8], genes[16], genes[24] = 0.5, -0.8, 0.3, 0.6
+    targets, _ = play(controller, genes, 600, order=np.arange(8))
+    time = 0.005 * np.arange(600)
+    size, phase = np.hypot(0.5, 0.8), np.arctan2(-0.8, 0.5)
+    frequency = 1.2 * (1 + np.sin(0.6)) / 2
+    wave = np.sin(size) * np.sin(2 * np.pi * frequency * time + phase)
+    expected = np.pi / 4 * (0.5 * np.sin(0.3) + wave)
+    assert targets[120:, 0, 0] == pytest.approx(expected[120:], abs=1e-9)
+    assert not targets[:, 1:].any()
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_order_only_permutes_the_rows(kind):
+    """What reaches each hinge does not depend on the order in which an engine lists them."""
+    controller = MAKERS[kind](robot_of("spider"))
+    genes = drawn(controller)
+    plain, _ = play(controller, genes, 200, order=np.arange(8))
+    order = np.random.default_rng(1).permutation(8)
+    turned, _ = play(controller, genes, 200, order=order)
+    assert turned == pytest.approx(plain[:, order], abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_gradients_are_finite_at_zero_genes(kind):
+    controller = MAKERS[kind](elbow_robot(world()))
+
+    def last(genes):
+        parameters = controller.decode(genes, np.arange(2))
+        state = controller.init(parameters)
+        for k in range(3):
+            state, target = controller.step(parameters, state, jnp.asarray(0.3 * k), STILL)
+        return jnp.sum(target)
+
+    slope = jax.jit(jax.grad(last))(jnp.zeros((controller.num_genes, 1)))
+    assert jnp.all(jnp.isfinite(slope))
+
+
+# ------------------------------------------------------------------------- servos
+
+
+def strokes(robot, lanes=32):
+    """From any angle to any target, at full effort, in a second."""
+    draw = np.random.default_rng(0)
+    n = robot.num_hinges
+    qpos, qvel = at_rest(robot, lanes, -5.0)
+    qpos[7:] = draw.uniform(-0.75, 0.75, (n, lanes))
+    ctrl = draw.choice([-1.0, -0.3, 0.3, 1.0], (n, lanes))
+    return np.clip(ctrl, -np.pi / 4, np.pi / 4), *march(robot, 1.0, qpos, qvel, ctrl)
+
+
+def test_servos_keep_the_speed_limit(elbow):
+    """Under water, hinges stay below 5.236 rad/s, and get where they are told to go."""
+    targets, _, q, v, _ = strokes(elbow)
+    assert np.abs(v[:, 6:]).max() < 1.05 * SPEED
+    assert np.abs(v[:, 6:]).max() > 0.8 * SPEED
+    assert np.abs(q[-1, 7:] - targets).max() < 0.02
+
+
+def test_servos_keep_the_speed_limit_in_a_vacuum():
+    """Limbs without water are so light that recoil throws them past it, by less than a fifth."""
+    robot = read(
+        "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: {type: FixedBrick}}}}}"
+    )
+    _, _, _, v, _ = strokes(build_robot(robot, world()))
+    assert np.abs(v[:, 6]).max() < 1.2 * SPEED
+    assert np.mean(np.abs(v[:, 6]) > 1.01 * SPEED) < 0.01
+
+
+def test_servos_keep_their_effort():
+    """Torque by Newton's law, on a limb too heavy to gain speed; 0.05 rad off is full effort."""
+    robot = build_robot(
+        read("""
+body:
+  type: Core
+  params: {mass: 1.0e6}
+  children:
+    1: {type: ActiveHinge, params: {mass: 1000}}
+"""),
+        world(),
+    )
+    model = robot.mj_model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    qpos, qvel = at_rest(robot, 5)
+    ctrl = np.array([[-2.0, -0.7, 0.0, 0.02, 0.7]])
+    _, _, v, _ = march(robot, 0.005, qpos, qvel, ctrl)
+    torque = mass[6] @ v[0] / 0.005
+    # The joint's own damping, implicit in the step, is a millionth of this inertia.
+    assert torque == pytest.approx(np.clip(ctrl[0] * EFFORT / 0.05, -EFFORT, EFFORT), rel=1e-3)
+
+
+def test_a_hinge_at_its_top_speed_gets_no_more_push():
+    """At 5.236 rad/s friction eats all that the motor gives; above, the servo brakes."""
+    robot = elbow_robot(world())
+    for factor, sign in ((0.5, 1), (1.0, 0), (1.1, -1)):
+        qpos, qvel = at_rest(robot, 1)
+        qvel[7] = factor * SPEED  # the outer hinge
+        _, _, v, _ = march(robot, 0.005, qpos, qvel, np.array([[0.0], [0.7]]))
+        gained = v[0, 7, 0] - qvel[7, 0]
+        if sign:
+            assert gained * sign > 0
+        else:
+            assert abs(gained) < 0.02 * SPEED
+
+
+def test_a_hinge_that_carries_nothing_comes_to_rest():
+    """A hinge at the end of a limb, nudged by 1 mrad/s, as in the centipede's feet."""
+    robot = build_robot(
+        read("body: {type: Core, children: {1: {type: ActiveHinge}}}"), world(**WATER)
+    )
+    qpos, qvel = at_rest(robot, 2, -5.0)
+    qvel[6] = 1e-3
+    _, _, v, _ = march(robot, 2.0, qpos, qvel, np.array([[0.0, 0.1]]))
+    assert np.abs(v[-20:, 6]).max() < 1e-2
+
+
+def test_a_hinge_that_carries_a_brick_comes_to_rest(elbow):
+    qpos, qvel = random_states(elbow, 8, speed=0.1)
+    qvel[6:] = 1.0
+    ctrl = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 8))
+    _, q, v, _ = march(elbow, 2.0, qpos, qvel, ctrl)
+    assert np.abs(v[-1, 6:]).max() < 0.01
+    assert np.abs(q[-1, 7:] - ctrl).max() < 0.01

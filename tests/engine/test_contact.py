@@ -1,0 +1,200 @@
+"""The bed: a penalty law at corners. Robots land, stay on top, gain no energy, and grip."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import at_rest, body, march, random_states, world
+from mjx_revolve.engine.contact import bed_contact, bed_plane
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.water.bed import Bed, bed_height, bed_slope
+from mjx_revolve.water.world import load_world
+from references import Lagrangian
+
+RHO, G = 999.1026, 9.81
+LAKE = load_world("lake").bed
+FLAT = Bed(kind="flat", height=-2.0)
+# Places in the lake by the tangent of their slope; the bed's friction is 0.6.
+LEVEL, GENTLE, STEEP = (0.0, 0.0), (200.0, 50.0), (150.0, -250.0)
+
+
+def lowest(robot, qpos):
+    """Clearance of the lowest corner of any module above the bed, negative inside [m]."""
+    data = mujoco.MjData(robot.mj_model)
+    found = []
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(robot.mj_model, data)
+        turn = data.xmat[robot.contact_body].reshape(-1, 3, 3)
+        corner = data.xpos[robot.contact_body] + np.einsum(
+            "nij,nj->ni", turn, robot.contact_position
+        )
+        found.append(np.min(corner[:, 2] - bed_height(robot.world.bed, *corner[:, :2].T)))
+    return np.array(found)
+
+
+def sink(bed, name="core", **fields):
+    """A robot with water, drag and a bed."""
+    on = {"gravity": G, "buoyancy": "partial", "drag": "faces", "added_mass": True}
+    return build_robot(body(name), world(**on | fields, bed=bed))
+
+
+def above(robot, places, clear, seed=0, speed=0.1):
+    """Random attitudes, hinges at rest, slowly moving, with the core `clear` above the bed."""
+    qpos, qvel = random_states(robot, len(places), seed=seed, speed=speed)
+    qpos[7:] = 0.0
+    qpos[:2] = np.array(places).T
+    qpos[2] = bed_height(robot.world.bed, qpos[0], qpos[1]) + clear
+    return qpos, qvel
+
+
+# ------------------------------------------------------------------------- the law
+
+
+def test_force_on_a_point():
+    """Only ever outwards; friction against the sliding, within Coulomb's cone; nothing outside."""
+    draw = np.random.default_rng(0)
+    depth = draw.uniform(-2e-3, 5e-3, 500)
+    normal = draw.normal(size=(3, 500))
+    normal /= np.linalg.norm(normal, axis=0)
+    velocity = draw.normal(size=(3, 500))
+    force = np.stack(
+        bed_contact(
+            FLAT, jnp.asarray(depth), tuple(normal), tuple(map(jnp.asarray, velocity)), 0.01, 0.005
+        )[0]
+    )
+    outward = (force * normal).sum(0)
+    sliding = force - outward * normal
+    slip = velocity - (velocity * normal).sum(0) * normal
+    # The spring is that of the end of the step: what arrives within it is met.
+    ahead = depth - 0.005 * (velocity * normal).sum(0)
+    assert not force[:, ahead <= 0].any()
+    # float32 leaves a millionth of the largest force.
+    assert outward.min() > -1e-6 * np.abs(force).max()
+    assert np.all(np.linalg.norm(sliding, axis=0) < FLAT.friction * outward + 1e-5)
+    assert np.all((sliding * slip).sum(0) <= 1e-5)
+    assert outward.max() > 1.0
+
+
+def test_force_is_continuous_where_a_point_touches_down():
+    depth = jnp.linspace(-1e-5, 1e-5, 2001)
+    for speed in (0.0, -0.5):
+        velocity = (0.3, 0.0, jnp.full_like(depth, speed))
+        force = np.stack(bed_contact(FLAT, depth, (0.0, 0.0, 1.0), velocity, 0.01, 0.005)[0])
+        assert np.abs(np.diff(force, axis=1)).max() < 1e-3
+
+
+def test_gradient_is_finite_at_rest_and_at_touch_down():
+    def pull(depth, speed):
+        return sum(bed_contact(FLAT, depth, (0.0, 0.0, 1.0), (speed, 0.0, -speed), 0.01, 0.005)[0])
+
+    for depth in (-1e-3, 0.0, 1e-3):
+        for speed in (0.0, 0.1):
+            assert np.all(np.isfinite(jax.grad(pull, (0, 1))(depth, speed)))
+
+
+def test_plane_below_a_body():
+    """Its height, and a unit normal across both slopes; flat beds have (0, 0, 1)."""
+    x, y = np.random.default_rng(1).uniform(-450, 450, (2, 200)).astype(np.float32)
+    height, normal = bed_plane(LAKE, (jnp.asarray(x), jnp.asarray(y)))
+    assert np.asarray(height) == pytest.approx(np.asarray(bed_height(LAKE, x, y)), abs=1e-4)
+    assert sum(np.square(n) for n in normal) == pytest.approx(1.0, abs=1e-5)
+    slope = bed_slope(LAKE, x, y)
+    for k in range(2):
+        # float32 knows heights of 100 m to 8 µm, and the slope is a difference over 2 cm.
+        assert -normal[k] / normal[2] == pytest.approx(np.asarray(slope[k]), abs=2e-3)
+    height, normal = bed_plane(FLAT, (jnp.asarray(x), jnp.asarray(y)))
+    assert np.all(np.asarray(height) == FLAT.height)
+    assert np.all(np.asarray(normal[2]) == 1)
+
+
+# ------------------------------------------------------------------------- landing
+
+
+def test_a_core_lands_on_a_flat_bed_and_stays():
+    """From half a metre, in eight attitudes: 7 mm deep at most while landing, .5 mm at rest."""
+    robot = sink(FLAT)
+    qpos, qvel = above(robot, [(0.0, 0.0)] * 8, 0.5)
+    _, q, v, _ = march(robot, 10.0, qpos, qvel, every=4)
+    clear = np.array([lowest(robot, q[:, :, lane]) for lane in range(8)]).T
+    assert clear.min() > -8e-3
+    assert np.abs(v[-1]).max() < 1e-4
+    assert np.all((clear[-1] > -1e-3) & (clear[-1] < 0))
+    # It came to rest on a side, not on an edge: a corner's height says so.
+    heights = np.abs(q[-1, 2] - FLAT.height)
+    assert np.all(np.minimum(np.abs(heights - 0.0225), np.abs(heights - 0.0445)) < 1e-3)
+    # No bounce, tumble or shove ever adds to what it came with.
+    lagrangian, net = Lagrangian(robot, RHO), (0.09 - RHO * 5.054e-5) * G
+    for lane in range(8):
+        energy = [
+            lagrangian.energy(a, b) + net * a[2]
+            for a, b in zip(q[:, :, lane], v[:, :, lane], strict=True)
+        ]
+        start = lagrangian.energy(qpos[:, lane], qvel[:, lane]) + net * qpos[2, lane]
+        assert max(energy) < start
+        # What rises is what the ground had stored.
+        assert np.diff(energy).max() < 0.05 * (start - energy[-1])
+
+
+@pytest.fixture(scope="module")
+def lake_core():
+    """A core dropped in the lake: on level ground, on a gentle slope and on a steep one."""
+    robot = sink(LAKE)
+    qpos, qvel = above(robot, [LEVEL, GENTLE, STEEP], 0.3)
+    return robot, *march(robot, 12.0, qpos, qvel, every=20)[1:3]
+
+
+@pytest.mark.slow
+def test_a_core_lands_in_the_lake_and_does_not_fall_through(lake_core):
+    robot, q, v = lake_core
+    clear = np.array([lowest(robot, q[:, :, lane]) for lane in range(3)])
+    assert clear.min() > -8e-3
+    assert np.all(clear[:, -1] > -1e-3)
+    assert np.all(clear[:, -1] < 0)
+    assert np.abs(v[-1, :, 0]).max() < 1e-3
+
+
+def test_a_core_creeps_slowly_on_a_slope_below_the_friction_angle(lake_core):
+    """Friction is viscous at low speed: below μ F_n / (m_point / 2 dt), here some cm/s."""
+    _, q, _ = lake_core
+    crept = np.linalg.norm(q[-1, :2, 1] - q[-51, :2, 1]) / 5.0
+    slope = np.hypot(*bed_slope(LAKE, q[-1, 0, 1], q[-1, 1, 1]))
+    assert 0.25 < slope < 0.35
+    assert crept < 0.03
+
+
+def test_creep_stays_below_the_stated_speed(lake_core):
+    """Where tan(slope) is half of μ, the docstring's 1 mm/s law creeps at .6 mm/s."""
+    _, q, _ = lake_core
+    assert np.linalg.norm(q[-1, :2, 1] - q[-51, :2, 1]) / 5.0 < 0.0012
+
+
+def test_sliding_friction_is_coulombs():
+    """A core on dry ground at 1 m/s loses μ g until it is slow."""
+    robot = sink(FLAT, surface_height=-50.0, drag="off", added_mass=False)
+    sunk = 0.09 * G / 4 / FLAT.stiffness  # four corners carry its weight
+    qpos, qvel = at_rest(robot, 1, FLAT.height + 0.0225 - sunk)
+    qvel[0] = 1.0
+    time, _, v, _ = march(robot, 0.11, qpos, qvel)
+    assert v[-1, 0, 0] == pytest.approx(1.0 - 0.6 * G * time[-1], abs=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bed", [FLAT, LAKE], ids=["flat", "lake"])
+def test_a_spider_lands_and_stays(bed):
+    """Legs first, on its back, on a slope: on top of the bed in float32 after 15 s, and calm."""
+    robot = sink(bed, "spider")
+    places = [LEVEL, LEVEL, LEVEL, GENTLE] if bed is LAKE else [LEVEL] * 4
+    qpos, qvel = above(robot, places, 0.5)
+    qpos[3:7, 0] = 1, 0, 0, 0
+    _, q, v, _ = march(robot, 15.0, qpos, qvel, every=20, x64=False)
+    clear = np.array([lowest(robot, q[:, :, lane]) for lane in range(4)])
+    assert np.all(np.isfinite(v))
+    assert clear.min() > -0.015
+    assert np.all((clear[:, -1] > -0.003) & (clear[:, -1] < 0.001))
+    speed = np.linalg.norm(v[-1, :3], axis=0)
+    assert speed.max() < (0.08 if bed is LAKE else 0.02)

@@ -1,0 +1,428 @@
+"""The population step against MuJoCo C, against MJX's step, and against itself."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import (
+    OURS,
+    WATER,
+    WILD,
+    accelerate,
+    arm_robot,
+    at_rest,
+    body,
+    elbow_robot,
+    march,
+    random_states,
+    read,
+    world,
+)
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.engine.hydrodynamics import Water
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.rollout import make_engine
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.bed import Bed
+from references import clip_box
+
+NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+MUJOCO_LAWS = ["off", "inertia_box", "ellipsoid"]
+CURRENT = (0.2, -0.1, 0.05)
+
+
+def drawn(robot, lanes, seed=0, speed=1.0):
+    """Random states far below the surface, and targets that saturate some servos."""
+    qpos, qvel = random_states(robot, lanes, seed=seed, speed=speed, depth=50.0)
+    ctrl = np.random.default_rng(seed + 1).uniform(-1, 1, (robot.mj_model.nu, lanes))
+    return qpos, qvel, ctrl
+
+
+def stock(robot):
+    """The robot with MuJoCo's own servos, which know no top speed; before anything compiles it."""
+    robot.mj_model.jnt_user[:] = np.inf
+    return robot
+
+
+def mujoco_model(robot, drag):
+    """A copy of the model with MuJoCo's own fluid, and without its limit constraints."""
+    model = copy.copy(robot.mj_model)
+    model.opt.disableflags |= NO_LIMITS
+    if drag != "off":
+        model.opt.density, model.opt.viscosity = robot.world.density, robot.world.viscosity
+        model.opt.wind = robot.world.current
+    return model
+
+
+def mujoco_qacc(model, qpos, qvel, ctrl):
+    data, found = mujoco.MjData(model), []
+    for q, v, c in zip(qpos.T, qvel.T, ctrl.T, strict=True):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, c
+        mujoco.mj_forward(model, data)
+        found.append(data.qacc.copy())
+    return np.array(found).T
+
+
+def relative(found, expected):
+    """Largest error of each lane over its largest acceleration."""
+    return np.abs(found - expected).max(0) / np.abs(expected).max(0)
+
+
+# ------------------------------------------------------------------------- accelerations
+
+
+@pytest.mark.parametrize("drag", MUJOCO_LAWS)
+def test_acceleration_is_mujocos(drag):
+    """To rounding of float64, with a current as MuJoCo's wind."""
+    robot = stock(arm_robot(world(gravity=9.81, drag=drag, current=CURRENT)))
+    states = drawn(robot, 32)
+    expected = mujoco_qacc(mujoco_model(robot, drag), *states)
+    assert relative(accelerate(robot, *states), expected).max() < 1e-10
+
+
+def test_acceleration_in_float32():
+    """Within 1e-5, what the population works with."""
+    robot = stock(elbow_robot(world(gravity=9.81)))
+    states = drawn(robot, 32)
+    expected = mujoco_qacc(mujoco_model(robot, "off"), *states)
+    assert relative(accelerate(robot, *states, x64=False), expected).max() < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", OURS + WILD, ids=lambda p: f"{p.parent.name}-{p.stem}")
+def test_acceleration_of_real_bodies(path):
+    """Every shipped and wild morphology, drag off and inertia box, float64 and float32."""
+    morphology = load_morphology(path, allow_overlap=True)
+    robot = stock(build_robot(morphology, world(gravity=9.81, drag="inertia_box")))
+    states = drawn(robot, 16)
+    expected = mujoco_qacc(mujoco_model(robot, "inertia_box"), *states)
+    assert relative(accelerate(robot, *states, x64=False), expected).max() < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drag", MUJOCO_LAWS)
+def test_acceleration_of_the_spider_in_float64(drag):
+    robot = stock(build_robot(body("spider"), world(gravity=9.81, drag=drag)))
+    states = drawn(robot, 16)
+    expected = mujoco_qacc(mujoco_model(robot, drag), *states)
+    assert relative(accelerate(robot, *states), expected).max() < 1e-10
+
+
+LIMB = """
+body:
+  type: Core
+  children:
+    0: {type: FixedBrick}
+    1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {2: {type: FixedBrick}}}}}
+"""
+
+
+def slanted(text):
+    """A morphology whose modules are each turned by 20° more than the one before, any way round."""
+    morphology = read(text)
+    modules = []
+    for k, module in enumerate(morphology.modules):
+        turn, quat = np.zeros(9), np.zeros(4)
+        axis = np.array([1.0, 2.0, -2.0]) / 3
+        mujoco.mju_axisAngle2Quat(quat, axis, np.radians(20.0 * k))
+        mujoco.mju_quat2Mat(turn, quat)
+        rotation = module.rotation @ turn.reshape(3, 3)
+        modules.append(dataclasses.replace(module, rotation=rotation))
+    return dataclasses.replace(morphology, modules=tuple(modules))
+
+
+def test_slanted_modules_have_mujocos_water():
+    """Boxes that do not stand square on their bodies, and hinges that point anywhere."""
+    robot = stock(build_robot(slanted(LIMB), world(drag="ellipsoid", current=CURRENT)))
+    qpos, qvel, ctrl = drawn(robot, 8)
+    expected = mujoco_qacc(mujoco_model(robot, "ellipsoid"), qpos, qvel, ctrl)
+    assert np.all(relative(accelerate(robot, qpos, qvel, ctrl), expected) < 1e-10)
+
+
+def test_slanted_modules_have_our_water():
+    """A rigid body at the surface, its acceleration from the sum over its parts, in NumPy."""
+    rigid = LIMB.replace("ActiveHinge", "FixedBrick")
+    robot = build_robot(slanted(rigid), world(**WATER | {"added_mass": False}))
+    model, table, density = robot.mj_model, robot.fluid, robot.world.density
+    qpos, qvel = random_states(robot, 6)
+    qpos[2] = np.linspace(-0.06, 0.06, 6)
+    found, data = accelerate(robot, qpos, qvel), mujoco.MjData(model)
+    for lane in range(6):
+        data.qpos[:], data.qvel[:] = qpos[:, lane], qvel[:, lane]
+        mujoco.mj_forward(model, data)
+        force, mass = -data.qfrc_bias, np.zeros((6, 6))
+        mujoco.mj_fullM(model, data, mass)
+        for p, half in enumerate(table.half_size):
+            turn = data.xmat[1].reshape(3, 3)
+            place = data.xpos[1] + turn @ table.position[p]
+            axes = turn @ table.rotation[p]
+            jacobians = np.zeros((3, 6)), np.zeros((3, 6))
+            mujoco.mj_jac(model, data, *jacobians, place, 1)
+            v, w = (axes.T @ j @ qvel[:, lane] for j in jacobians)
+            center = table.center_of_volume[p]
+            share, moment = clip_box(axes[2], -(place + axes @ center)[2], half)
+            lift = density * 9.81 * table.volume[p] * axes[2]
+            push = share * (lift - density * table.drag_linear[p] * np.abs(v) * v)
+            twist = -share * density * table.drag_angular[p] * np.abs(w) * w
+            twist += np.cross(moment + share * center, lift)
+            force = force + jacobians[0].T @ axes @ push + jacobians[1].T @ axes @ twist
+        expected = np.linalg.solve(mass, force)
+        assert found[:, lane] == pytest.approx(
+            expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()
+        )
+
+
+def test_a_body_of_equal_siblings_in_a_vacuum():
+    """Constants that are the same for a whole level must still be summed once per child."""
+    text = "id: x\nbody:\n  id: core\n  type: Core\n  children:\n"
+    leg = (
+        "{type: ActiveHinge, orientation: 90, children: {1: {type: FixedBrick, children: {1: %s}}}}"
+    )
+    text += "".join(
+        f"    {slot}: {leg % '{type: ActiveHinge, orientation: 90}'}\n" for slot in (1, 0)
+    )
+    robot = stock(build_robot(read(text), world(gravity=9.81)))
+    states = drawn(robot, 16)
+    expected = mujoco_qacc(mujoco_model(robot, "off"), *states)
+    assert relative(accelerate(robot, *states), expected).max() < 1e-10
+
+
+def test_several_children_upon_one_of_several_equal_links():
+    """Two links alike, one with two children and one with none."""
+    text = """
+id: tree
+body:
+  id: core
+  type: Core
+  children:
+    0: {id: left, type: ActiveHinge, children: {1: {id: a, type: FixedBrick}}}
+    1:
+      id: right
+      type: ActiveHinge
+      children:
+        1:
+          id: b
+          type: FixedBrick
+          children:
+            1: {id: c, type: ActiveHinge}
+            2: {id: d, type: ActiveHinge}
+            3: {id: e, type: ActiveHinge}
+"""
+    robot = stock(build_robot(read(text), world(gravity=9.81)))
+    states = drawn(robot, 16)
+    expected = mujoco_qacc(mujoco_model(robot, "off"), *states)
+    assert relative(accelerate(robot, *states), expected).max() < 1e-10
+
+
+# ------------------------------------------------------------------------- trajectories
+
+
+@pytest.mark.parametrize("drag", ["off", pytest.param("inertia_box", marks=pytest.mark.slow)])
+def test_trajectory_is_mujocos(drag):
+    """300 steps of `mj_step`, joints within their limits: Euler with implicit joint damping."""
+    robot = stock(elbow_robot(world(gravity=9.81, drag=drag)))
+    qpos, qvel, ctrl = drawn(robot, 6, speed=0.5)
+    ctrl *= 0.4
+    _, q, v, _ = march(robot, 1.5, qpos, qvel, ctrl)
+    model = mujoco_model(robot, drag)
+    data = mujoco.MjData(model)
+    for lane in range(6):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[:, lane], qvel[:, lane], ctrl[:, lane]
+        for k in range(300):
+            mujoco.mj_step(model, data)
+            assert data.qpos == pytest.approx(q[k, :, lane], abs=1e-6)
+        assert data.qvel == pytest.approx(v[-1, :, lane], abs=1e-5)
+        assert np.all(np.abs(q[:, 7:, lane]) < np.pi / 4)
+
+
+FULL = {
+    "still": {},
+    "bed": {"bed": Bed(kind="flat", height=-0.3), "current": (0.1, 0.0, 0.0)},
+    "ellipsoid": {"drag": "ellipsoid"},
+    "plates": {"drag": "lift_drag", "buoyancy": "mask", "current": CURRENT},
+}
+
+
+def check_engines(robot):
+    qpos, qvel, ctrl = drawn(robot, 4, speed=0.3)
+    qpos[2] = [-0.2, -0.05, 0.0, 0.1]
+    ctrl[:, 1] *= 3.0  # beyond its range: the servo stops there
+    _, q, v, energy = march(robot, 0.5, qpos, qvel, ctrl)
+    _, other_q, other_v, other_energy = march(robot, 0.5, qpos, qvel, ctrl, engine="mjx")
+    assert np.abs(q[-1] - qpos).max() > 0.05
+    assert other_q == pytest.approx(q, abs=1e-9)
+    assert other_v == pytest.approx(v, abs=1e-7)
+    assert other_energy == pytest.approx(energy, abs=1e-9)
+
+
+def test_the_two_engines_agree_on_one_module():
+    """Through the surface, with drag, carried water and a current, half a second in float64."""
+    check_engines(build_robot(body("core"), world(**WATER, current=CURRENT)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", FULL)
+def test_the_two_engines_agree(case):
+    """The same with hinges and servos, and each of the other laws."""
+    check_engines(elbow_robot(world(**WATER | FULL[case])))
+
+
+@pytest.mark.slow
+def test_joints_stop_at_their_limits():
+    """Neither target nor swing takes a hinge past its end by more than a fraction of a degree."""
+    robot = elbow_robot(world())
+    qpos, qvel = at_rest(robot, 2)
+    qvel[6:, 0], qvel[6:, 1] = 8.0, -8.0
+    ctrl = np.tile([[2.0, -2.0]], (robot.num_hinges, 1))
+    _, q, v, _ = march(robot, 2.0, qpos, qvel, ctrl)
+    assert np.abs(q[:, 7:]).max() < np.pi / 4 + np.radians(0.5)
+    assert np.abs(q[-1, 7:]) == pytest.approx(np.pi / 4, abs=1e-3)
+    assert np.abs(v[-1, 6:]).max() < 1e-3
+
+
+def test_power_is_what_the_servos_deliver():
+    """|torque × speed| summed over the hinges, the torque within the servo's effort."""
+    robot = stock(elbow_robot(world()))
+    qpos, qvel = at_rest(robot, 2)
+    ctrl = np.array([[0.5, -0.05], [-0.03, 0.7]])
+    time, q, v, worked = march(robot, 0.3, qpos, qvel, ctrl)
+    model = robot.mj_model
+    angle = np.concatenate([qpos[None, 7:], q[:-1, 7:]])
+    speed = np.concatenate([qvel[None, 6:], v[:-1, 6:]])
+    torque = np.clip(model.actuator_gainprm[:, :1] * (ctrl - angle), -0.17658, 0.17658)
+    assert worked == pytest.approx(np.abs(torque * speed).sum(1) * time[0], rel=1e-9)
+    assert worked.sum(0).min() > 0
+
+
+# ------------------------------------------------------------------------- lanes
+
+
+@pytest.mark.slow
+def test_lanes_do_not_know_of_each_other(elbow):
+    """A lane's bits depend neither on where it stands nor on a neighbour that blew up."""
+    qpos, qvel, ctrl = drawn(elbow, 8)
+    _, q, v, _ = march(elbow, 0.5, qpos, qvel, ctrl)
+    assert np.all(np.isfinite(v))
+    sick = qvel.copy()
+    sick[3, 5] = np.nan
+    _, sick_q, sick_v, _ = march(elbow, 0.5, qpos, sick, ctrl)
+    others = np.arange(8) != 5
+    assert np.all(np.isnan(sick_v[-1, :6, 5]))
+    assert np.array_equal(sick_q[..., others], q[..., others])
+    assert np.array_equal(sick_v[..., others], v[..., others])
+    turned = np.roll(np.arange(8), 3)
+    _, rolled, _, _ = march(elbow, 0.5, qpos[:, turned], qvel[:, turned], ctrl[:, turned])
+    assert np.array_equal(rolled, q[..., turned])
+
+
+def test_a_population_against_one_at_a_time(elbow):
+    """The same up to rounding: another shape is another program."""
+    qpos, qvel, ctrl = drawn(elbow, 8)
+    _, together, _, _ = march(elbow, 0.5, qpos, qvel, ctrl)
+    for lane in (0, 7):
+        one = slice(lane, lane + 1)
+        _, alone, _, _ = march(elbow, 0.5, qpos[:, one], qvel[:, one], ctrl[:, one])
+        assert alone == pytest.approx(together[..., one], abs=1e-10)
+
+
+def test_the_water_may_differ_between_lanes():
+    """Each lane's surface and current are its own."""
+    robot = build_robot(body("core"), world(gravity=9.81, buoyancy="partial", drag="faces"))
+    qpos, qvel = at_rest(robot, 3, -1.0)
+    water = Water(np.array([0.0, -9.0, 0.0]), (np.array([0.0, 0.0, 0.3]), 0.0, 0.0))
+    qacc = accelerate(robot, qpos, qvel, water=water)
+    sunk = -9.81 * (1 - 999.1026 * 5.054e-5 / 0.09)
+    assert qacc[2] == pytest.approx([sunk, -9.81, sunk])
+    drag = 0.5 * 999.1026 * 1.05 * 0.089 * 0.045 * 0.3**2 / 0.09
+    assert qacc[0] == pytest.approx([0.0, 0.0, drag])
+
+
+# ------------------------------------------------------------------------- symmetries, convergence
+
+
+def test_momentum_of_a_jointed_body_in_a_vacuum(arm):
+    """Linear and angular momentum do not change, whatever the servos do: differences over 20 µs."""
+    qpos, qvel, ctrl = drawn(arm, 32, speed=0.5)
+    qpos[:3] = 0.0
+    qacc = accelerate(arm, qpos, qvel, ctrl)
+    model = arm.mj_model
+    data = mujoco.MjData(model)
+
+    def momentum(q, v):
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_forward(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        linear = model.body_subtreemass[0] * data.subtree_linvel[0]
+        spin = data.subtree_angmom[0] + np.cross(data.subtree_com[0], linear)
+        return np.concatenate([linear, spin])
+
+    for q, v, a in zip(qpos.T, qvel.T, qacc.T, strict=True):
+        states = []
+        for s in (-1e-5, 1e-5):
+            moved = q.copy()
+            mujoco.mj_integratePos(model, moved, v + s * a / 2, s)
+            states.append(momentum(moved, v + s * a))
+        # The servos' 0.18 N m would show in the first digits.
+        assert (states[1] - states[0]) / 2e-5 == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_mirrored_spider_swims_a_mirrored_way():
+    """The spider is its own mirror image in y = 0: front and back swapped, hips turned back."""
+    robot = build_robot(body("spider"), world(**WATER))
+    names = [robot.mj_model.actuator(k).name for k in range(robot.num_hinges)]
+    swap = {"front": "back", "back": "front", "left": "left", "right": "right"}
+    parts = [name.split("_") for name in names]
+    other = [names.index(f"{swap[side]}_{joint}") for side, joint in parts]
+    sign = np.array([-1.0 if joint == "hip" else 1.0 for _, joint in parts])[:, None]
+    qpos, qvel = at_rest(robot, 2, -0.5)
+    ctrl = np.random.default_rng(2).uniform(-0.6, 0.6, (8, 1))
+    ctrl = np.hstack([ctrl, (sign * ctrl)[other]])
+    _, q, _, _ = march(robot, 2.0, qpos, qvel, ctrl, every=10)
+    there, back = q[..., 0], q[..., 1]
+    assert np.abs(there[:, :3] - qpos[:3, 0]).max() > 0.01
+    mirrored = there[:, :7] * [1, -1, 1, 1, -1, 1, -1]
+    assert back[:, :7] == pytest.approx(mirrored, abs=1e-6)
+    assert back[:, 7:] == pytest.approx((there[:, 7:] * sign.T)[:, other], abs=1e-6)
+
+
+def check_order(make, steps):
+    """The end of half a second: what changes when the step halves, halves too, or better.
+
+    Carried water and drag are second order; servos, end stops and friction are first.
+    """
+    ends = []
+    for dt in steps:
+        robot = make(world(**WATER, timestep=dt))
+        qpos, qvel = at_rest(robot, 2, -0.5)
+        qpos[2, 1] = 0.0
+        qvel[:6] = 0.2
+        ctrl = np.full((robot.num_hinges, 2), 0.3)
+        ends.append(march(robot, 0.5, qpos, qvel, ctrl, every=round(0.1 / dt))[1][-1])
+    ratio = np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(ends[2] - ends[1])
+    assert ratio > 1.7
+
+
+@pytest.mark.slow
+def test_convergence_in_the_time_step():
+    check_order(lambda tank: build_robot(body("core"), tank), (0.004, 0.002, 0.001))
+
+
+@pytest.mark.slow
+def test_convergence_of_a_jointed_body():
+    """From half a millisecond on: when a servo's torque leaves its limit is known to a step."""
+    check_order(elbow_robot, (0.0005, 0.00025, 0.000125))
+
+
+# ------------------------------------------------------------------------- what it refuses
+
+
+def test_an_unknown_engine_is_refused(arm):
+    with pytest.raises(InputError, match=r"^engine: expected one of population, mjx; found 'c'$"):
+        make_engine(arm, "c")

@@ -1,0 +1,281 @@
+"""The compiled robot: Revolve's geometry, masses, limits; tables that add up; MJCF that reloads."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import OURS, ROOT, WILD, body, box_robot, read, world
+from mjx_revolve.body.catalogue import MODULES, load_modules
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.engine.robot import build_robot, export_mjcf
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.bed import Bed, bed_height
+from mjx_revolve.water.world import load_world
+
+EFFORT, SPEED = 0.17658, 5.235988
+# Along one leg of the spider from the core's centre [m], from Revolve's own SDF.
+LEG = {
+    "frame": 0.0555,
+    "first axis": 0.06015,
+    "servo": 0.071025,
+    "plate": 0.082775,
+    "brick": 0.102275,
+    "second frame": 0.132275,
+    "second axis": 0.136925,
+    "second brick": 0.17905,
+}
+SIDES = {"back": (0, -1, 0), "front": (0, 1, 0), "right": (1, 0, 0), "left": (-1, 0, 0)}
+
+
+def forward(robot):
+    data = mujoco.MjData(robot.mj_model)
+    mujoco.mj_forward(robot.mj_model, data)
+    return data
+
+
+# ------------------------------------------------------------------------- the spider
+
+
+def test_spider_has_nine_bodies_fourteen_degrees_of_freedom(spider):
+    model = spider.mj_model
+    assert model.nbody - 1 == 9
+    assert (model.nv, model.nq, model.nu, model.njnt) == (14, 15, 8, 9)
+    assert spider.num_hinges == 8
+    assert spider.morphology.num_modules == 17
+    # A core, and a frame and a servo for each hinge, and a brick upon each.
+    assert len(spider.fluid.volume) == 1 + 8 * 2 + 8
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_spider_geometry_is_revolves(spider, side):
+    """Axes, anchors and modules of each leg to 0.1 mm."""
+    model, data = spider.mj_model, forward(spider)
+    out = np.array(SIDES[side], float)
+    hip, knee = (data.joint(f"{side}_{name}") for name in ("hip", "knee"))
+    for joint, key in ((hip, "first axis"), (knee, "second axis")):
+        assert joint.xanchor == pytest.approx(out * LEG[key], abs=1e-4)
+    # The first axis is vertical, the second horizontal and across the leg.
+    assert np.abs(hip.xaxis) == pytest.approx([0, 0, 1], abs=1e-6)
+    assert np.abs(knee.xaxis) == pytest.approx(np.abs(np.cross(out, [0, 0, 1])), abs=1e-6)
+    places = {
+        "hip/frame": "frame",
+        "hip/servo": "servo",
+        "thigh/brick": "brick",
+        "knee/frame": "second frame",
+        "foot/brick": "second brick",
+    }
+    for name, key in places.items():
+        assert data.geom(f"{side}_{name}").xpos == pytest.approx(out * LEG[key], abs=1e-4)
+    # The plate stands 1 mm off centre, along the hinge's axis.
+    plate = data.geom(f"{side}_hip/servo/1").xpos
+    assert plate @ out == pytest.approx(LEG["plate"], abs=1e-4)
+    assert np.linalg.norm(plate - out * (plate @ out)) == pytest.approx(0.001, abs=1e-4)
+    assert model.body(f"{side}_hip").parentid[0] == model.body("core").id
+
+
+def test_spider_masses_are_revolves(spider):
+    model = spider.mj_model
+    assert model.body("core").mass[0] == pytest.approx(0.0968)
+    for side in SIDES:
+        assert model.body(f"{side}_hip").mass[0] == pytest.approx(0.0209)
+        assert model.body(f"{side}_knee").mass[0] == pytest.approx(0.0192)
+    assert model.body_subtreemass[0] == pytest.approx(0.2572)
+    assert spider.fluid.volume.sum() == pytest.approx(2.41516e-4)
+
+
+def test_inertia_of_a_link_by_hand(spider):
+    """The foot: servo box and brick about their common centre of mass, by Steiner's rule."""
+    size = {"servo": (0.0245, 0.02575, 0.015), "brick": (0.041, 0.041, 0.0355)}
+    mass = {"servo": 0.009, "brick": 0.0102}
+    along = {"servo": LEG["second axis"] + 0.010875, "brick": LEG["second brick"]}
+    center = sum(mass[k] * along[k] for k in mass) / 0.0192
+    # About the vertical: servo and brick lie flat in the second hinge (turned by -90 and 0).
+    expected = 0.0
+    for k, edges in size.items():
+        x, y, z = edges
+        # In the foot's own frame the hinge's axis is y and the leg runs along x.
+        across = {"servo": x * x + z * z, "brick": y * y + z * z}[k]
+        expected += mass[k] * (across / 12 + (along[k] - center) ** 2)
+    body_id = spider.mj_model.body("front_knee").id
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, spider.mj_model.body_iquat[body_id])
+    axes = turn.reshape(3, 3)
+    inertia = axes @ np.diag(spider.mj_model.body_inertia[body_id]) @ axes.T
+    axis = spider.mj_model.jnt_axis[spider.mj_model.body_jntadr[body_id]]
+    assert axis @ inertia @ axis == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["spider", "gecko", "snake", "centipede"])
+def test_every_hinge_is_revolves(name):
+    """Range, torque and speed limits; friction below the effort; servo from one to the other."""
+    robot = build_robot(body(name), world())
+    model = robot.mj_model
+    assert model.nu == robot.morphology.num_hinges == model.njnt - 1
+    for joint in range(1, model.njnt):
+        assert model.jnt_range[joint] == pytest.approx([-np.pi / 4, np.pi / 4])
+        assert model.jnt_limited[joint]
+        assert model.jnt_user[joint, 0] == SPEED
+    assert model.actuator_forcerange == pytest.approx(np.tile([-EFFORT, EFFORT], (model.nu, 1)))
+    assert model.actuator_ctrlrange == pytest.approx(model.jnt_range[1:])
+    assert model.actuator_trnid[:, 0].tolist() == list(range(1, model.njnt))
+    assert np.all(model.dof_damping[6:] * SPEED < EFFORT)
+    assert np.all(model.dof_damping[:6] == 0)
+    # ctrl follows the morphology's order of hinges.
+    hinges = [robot.morphology.modules[i].name for i in robot.morphology.hinges]
+    assert [model.actuator(k).name for k in range(model.nu)] == hinges
+
+
+# ------------------------------------------------------------------------- every robot
+
+
+@pytest.mark.parametrize("path", OURS + WILD, ids=lambda p: f"{p.parent.name}-{p.stem}")
+def test_every_morphology_builds(path):
+    morphology = load_morphology(path, allow_overlap=True)
+    robot = build_robot(morphology, load_world("lake"))
+    model, fluid, data = robot.mj_model, robot.fluid, forward(robot)
+    assert model.nbody - 1 == 1 + morphology.num_hinges
+    assert model.nv == 6 + morphology.num_hinges
+    assert model.opt.density == model.opt.viscosity == 0
+    assert model.body_subtreemass[0] == pytest.approx(morphology.mass)
+    assert fluid.mass.sum() == pytest.approx(morphology.mass)
+    assert fluid.volume.sum() == pytest.approx(morphology.volume)
+    # Every part's box lies where the morphology has it at rest.
+    turn = data.xmat[fluid.body].reshape(-1, 3, 3)
+    place = data.xpos[fluid.body] + np.einsum("nij,nj->ni", turn, fluid.position)
+    k = 0
+    for index, module in enumerate(morphology.modules):
+        for center, half in module.boxes(main=True):
+            assert fluid.module[k] == index
+            assert place[k] == pytest.approx(center, abs=1e-9)
+            assert turn[k] @ fluid.rotation[k] == pytest.approx(module.rotation, abs=1e-9)
+            assert fluid.half_size[k] == pytest.approx(half)
+            k += 1
+    assert k == len(fluid.volume)
+    # Corners for the bed: eight of each part, and as wide as the robot.
+    corners = data.xpos[robot.contact_body] + np.einsum(
+        "nij,nj->ni", data.xmat[robot.contact_body].reshape(-1, 3, 3), robot.contact_position
+    )
+    low, high = morphology.bounds
+    assert corners.min(0) == pytest.approx(low, abs=1e-9)
+    assert corners.max(0) == pytest.approx(high, abs=1e-9)
+
+
+def test_the_wild_robots_are_there_or_known_to_be_absent():
+    if not WILD:
+        pytest.skip(f"no third-party robots at {ROOT.parent / 'shared' / 'revolve_robots'}")
+    assert len(WILD) >= 5
+
+
+def test_fluid_table_of_the_catalogue():
+    """Drag of a lone core: all faces meet the water; of a hinge's joined faces, none do."""
+    robot = build_robot(body("core"), world(drag="faces", added_mass=True))
+    fluid = robot.fluid
+    faces = np.array([0.089 * 0.045, 0.089 * 0.045, 0.089 * 0.089])
+    assert fluid.exposed[0] == pytest.approx(1.0)
+    assert fluid.drag_linear[0] == pytest.approx(0.5 * 1.05 * faces)
+    assert fluid.center_of_volume[0] == pytest.approx(0.0)
+    assert fluid.plate_area[0] == pytest.approx(0.089 * 0.089)
+    # Two bricks on a core, face to face: each hides a face of the other.
+    chain = build_robot(
+        read("""
+body:
+  type: Core
+  children:
+    1: {type: FixedBrick, children: {1: {type: FixedBrick}}}
+"""),
+        world(),
+    ).fluid
+    middle, last = 1, 2
+    assert chain.exposed[middle][1] == pytest.approx(0.0, abs=0.02)
+    assert chain.exposed[last][1] == pytest.approx(0.5, abs=0.02)
+    assert chain.exposed[last][[0, 2]] == pytest.approx(1.0, abs=0.1)
+    brick = robot.fluid.added_mass.sum(), chain.added_mass[last]
+    assert brick[1][1] < brick[1][0]
+
+
+# ------------------------------------------------------------------------- options and files
+
+
+@pytest.mark.parametrize("name", ["spider", "gecko"])
+def test_exported_mjcf_reloads_in_stock_mujoco(tmp_path, name):
+    robot = build_robot(body(name), load_world("empty_underwater"))
+    path = tmp_path / "robot.xml"
+    export_mjcf(robot, path)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    ours, data = robot.mj_model, mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert model.nbody == ours.nbody
+    # XML keeps six to nine digits.
+    assert model.body_mass == pytest.approx(ours.body_mass, rel=1e-6)
+    assert model.body_inertia == pytest.approx(ours.body_inertia, rel=1e-5)
+    assert data.xpos == pytest.approx(forward(robot).xpos, abs=1e-6)
+    assert model.jnt_range == pytest.approx(ours.jnt_range, abs=1e-6)
+    assert model.actuator_gainprm == pytest.approx(ours.actuator_gainprm, rel=1e-5)
+    assert [model.body(i).name for i in range(model.nbody)] == [
+        ours.body(i).name for i in range(ours.nbody)
+    ]
+
+
+def test_the_bed_is_part_of_the_model():
+    """A plane at the flat bed's height, a height field whose samples are the lake's heights."""
+    flat = build_robot(body("core"), world(bed=Bed(kind="flat", height=-2.0))).mj_model
+    assert flat.geom("bed").type[0] == mujoco.mjtGeom.mjGEOM_PLANE
+    assert flat.geom("bed").pos[2] == -2.0
+    lake = build_robot(body("core"), load_world("lake"))
+    model = lake.mj_model
+    assert model.hfield_nrow[0] == model.hfield_ncol[0] == 201
+    grid = model.hfield_data.reshape(201, 201) * model.hfield_size[0, 2] + model.geom("bed").pos[2]
+    line = np.linspace(-499, 499, 201)
+    for i, j in ((100, 100), (0, 0), (150, 60), (60, 150)):
+        expected = bed_height(lake.world.bed, np.float64(line[j]), np.float64(line[i]))
+        assert grid[i, j] == pytest.approx(float(expected), abs=1e-4)
+    assert model.geom("bed").contype[0] == model.geom("bed").conaffinity[0] == 0
+    assert build_robot(body("core"), world()).mj_model.ngeom == 1
+
+
+def test_world_options_reach_the_model():
+    robot = build_robot(body("core"), world(gravity=3.7, timestep=0.002, surface_height=4.0))
+    assert robot.mj_model.opt.gravity.tolist() == [0, 0, -3.7]
+    assert robot.mj_model.opt.timestep == 0.002
+    assert robot.start_qpos()[2] == 3.0
+    assert robot.start_qpos(0.5)[2] == 3.5
+    assert robot.qpos0.tolist() == [0, 0, 0, 1, 0, 0, 0]
+    robot.qpos0[2] = 7.0  # a copy
+    assert robot.qpos0[2] == 0.0
+
+
+def test_overrides_and_own_modules_reach_the_model(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("""
+modules:
+  Float:
+    mount: -x
+    parts:
+      - {name: foam, size: [0.04, 0.06, 0.02], mass: 0.01, center_of_volume: [0, 0, 0.002]}
+""")
+    text = """
+body:
+  type: Core
+  params: {mass: 0.12, electronics_volume: 3.0e-5}
+  children:
+    2: {id: foam, type: Float}
+"""
+    file = tmp_path / "boat.yaml"
+    file.write_text(text)
+    robot = build_robot(load_morphology(file, MODULES | load_modules(path)), world())
+    fluid = robot.fluid
+    assert robot.mj_model.nbody == 2
+    assert fluid.mass == pytest.approx([0.12, 0.01])
+    assert fluid.volume == pytest.approx([5.054e-5 + 3e-5, 0.04 * 0.06 * 0.02])
+    assert fluid.center_of_volume[1] == pytest.approx([0, 0, 0.002])
+    # Outward along +x: the foam's centre is half its length beyond the core's face.
+    assert fluid.position[1] == pytest.approx([0.0445 + 0.02, 0, 0], abs=1e-9)
+
+
+def test_a_body_that_mujoco_refuses_is_an_input_error():
+    with pytest.raises(InputError) as caught:
+        box_robot((0.1, 0.1, 0.1), 1e-20, world())
+    assert str(caught.value).startswith("box: expected a body that MuJoCo can simulate; found: ")
+    assert "\n" not in str(caught.value)

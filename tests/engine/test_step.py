@@ -1,0 +1,466 @@
+"""Whole steps with all laws at work: conserved, carried along, righted, differentiable."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from laboratory import (
+    QUICK,
+    WATER,
+    accelerate,
+    arm_robot,
+    at_rest,
+    body,
+    box_robot,
+    march,
+    random_states,
+    read,
+    world,
+)
+from mjx_revolve.body.morphology import trim_neutral
+from mjx_revolve.engine.hydrodynamics import Water, box_added_mass
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes import rollout
+from mjx_revolve.episodes.rollout import gusty_water, simulate
+from mjx_revolve.water.bed import Bed
+from mjx_revolve.water.flow import gust_path
+from references import Lagrangian
+
+RHO, G = 999.1026, 9.81
+CUBE = (0.1, 0.1, 0.1)  # carries the same water along every axis, so no Munk moment turns it
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compiles():
+    """Leaves out the compiler's optimisations: they cost more than these short runs save."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rollout, "compiler_options", lambda: QUICK)
+        yield
+
+
+# ------------------------------------------------------------------------- conservation
+
+
+def limp(robot):
+    """The robot without servos, friction and end stops; before anything compiles it."""
+    model = robot.mj_model
+    model.actuator_gainprm[:, 0], model.actuator_biasprm[:] = 1e-12, 0.0
+    model.dof_damping[:], model.jnt_limited[:], model.jnt_user[:] = 0.0, 0, np.inf
+    return robot
+
+
+def impulse(lagrangian, qpos, qvel):
+    """Linear and angular impulse of body and water, the latter about the world's origin.
+
+    Momenta of the root's six coordinates are those of the whole, in the frames of its velocities.
+    """
+    momentum, turn = lagrangian.inertia(qpos) @ qvel, np.zeros(9)
+    mujoco.mju_quat2Mat(turn, qpos[3:7] / np.linalg.norm(qpos[3:7]))
+    spin = turn.reshape(3, 3) @ momentum[3:6] + np.cross(qpos[:3], momentum[:3])
+    return np.concatenate([momentum[:3], spin])
+
+
+def _each(function, qpos, qvel):
+    """A function of one state, of every lane."""
+    return np.array([function(*state) for state in zip(qpos.T, qvel.T, strict=True)])
+
+
+@pytest.mark.slow
+def test_a_limp_jointed_body_keeps_energy_and_impulse():
+    """Without drag, within a few per cent; what is lost halves with the step.
+
+    Nothing here has a time of its own, so 2.5 ms at 0.2 m/s stand for 5 ms at 0.1 m/s. The arm's
+    light tips whip round at up to 40 rad/s.
+    """
+    lost = []
+    for dt in (0.0025, 0.00125):
+        robot = limp(arm_robot(world(added_mass=True, timestep=dt)))
+        qpos, qvel = random_states(robot, 8, speed=0.2)
+        _, q, v, _ = march(robot, 1.0, qpos, qvel, every=round(0.1 / dt))
+        lagrangian = Lagrangian(robot, RHO)
+        energies = [_each(lagrangian.energy, *s) for s in zip(q, v, strict=True)]
+        momenta = [_each(partial(impulse, lagrangian), *s) for s in zip(q, v, strict=True)]
+        first = _each(partial(impulse, lagrangian), qpos, qvel)
+        scale = np.abs(first).max(1)
+        kept = [energy / _each(lagrangian.energy, qpos, qvel) - 1 for energy in energies]
+        moved = [np.abs(momentum - first).max(1) / scale for momentum in momenta]
+        assert np.abs(kept).max() < 0.05
+        assert np.max(moved) < 0.02
+        lost.append([np.median(np.abs(kept[-1])), np.max(moved)])
+    assert np.divide(*lost) == pytest.approx(2.0, abs=0.4)
+
+
+def test_servos_give_no_more_energy_than_they_deliver():
+    """At the default step, without drag, from a tumble of 1 m/s: start + work bounds the energy."""
+    robot = arm_robot(world(added_mass=True))
+    qpos, qvel = random_states(robot, 16, speed=1.0)
+    ctrl = np.random.default_rng(1).uniform(-0.6, 0.6, (robot.num_hinges, 16))
+    _, q, v, work = march(robot, 2.0, qpos, qvel, ctrl, every=20)
+    lagrangian = Lagrangian(robot, RHO)
+    start = np.array([lagrangian.energy(*s) for s in zip(qpos.T, qvel.T, strict=True)])
+    for row, rate, done in zip(q, v, np.cumsum(work, 0), strict=True):
+        energy = [lagrangian.energy(*s) for s in zip(row.T, rate.T, strict=True)]
+        # End stops and friction take some; the step errs by a few per cent.
+        assert np.all(energy < 1.02 * (start + done))
+
+
+# ------------------------------------------------------------------------- water that moves
+
+
+def gusty(tank, seed, seconds):
+    """The same gusts that `simulate` draws, and the water that they make."""
+    steps = round(seconds / tank.timestep)
+    path = gust_path(tank.gust, jax.random.key(seed), steps, tank.timestep, 1)[..., 0]
+    return np.asarray(path), gusty_water(tank, path)
+
+
+def test_a_neutral_body_goes_with_the_water_whatever_its_shape():
+    """Without drag; pressure and carried water move it as they would the water in its place."""
+    gust = {"std": [0.2, 0.1, 0.1], "time": 0.5}
+    tank = world(added_mass=True, buoyancy="partial", gravity=G, gust=gust, current=(0.3, 0, 0))
+    size = (0.2, 0.1, 0.02)
+    robot = box_robot(size, RHO * np.prod(size), tank)
+    qpos, _ = random_states(robot, 1, seed=3)
+    with jax.enable_x64(True):
+        path, water = gusty(tank, 0, 2.0)
+        start = np.concatenate([path[0] + tank.current, np.zeros(3)])
+        found = simulate(robot, None, 2.0, qpos=qpos[:, 0], qvel=start, water=water)
+    assert path.std(0) == pytest.approx([0.2, 0.1, 0.1], rel=0.6)
+    assert np.asarray(found.qvel[:, :3]) == pytest.approx(path[1:] + tank.current, abs=1e-12)
+    assert np.abs(found.qvel[:, 3:]).max() < 1e-9
+
+
+def test_gusts_move_a_heavy_body_less():
+    """m v' = ρ V u' + m_a (u' - v'), so v - v₀ = (ρ V + m_a) / (m + m_a) (u - u₀).
+
+    To rounding without carried water; with it, the step extrapolates momentum from the step before,
+    which knows nothing of the next gust, and a cube gets a spin that it should not have.
+    """
+    gust = {"std": 0.2, "time": 0.5}
+    for added_mass, error in ((False, 1e-12), (True, 1e-4)):
+        # Without weight, or it would fall at several metres per second.
+        tank = world(added_mass=added_mass, buoyancy="partial", gust=gust)
+        robot = box_robot(CUBE, 2.0, tank)
+        with jax.enable_x64(True):
+            path, water = gusty(tank, 1, 1.0)
+            start = robot.start_qpos(5.0)
+            found = simulate(robot, None, 1.0, qpos=start, water=water)
+        carried = RHO * robot.fluid.carried_mass[0, 0]
+        share = (RHO * 1e-3 + carried) / (2.0 + carried)
+        assert found.qvel[:, :2] == pytest.approx(share * (path[1:] - path[0])[:, :2], abs=error)
+        assert np.abs(found.qvel[:, 3:]).max() < (0.05 if added_mass else 1e-12)
+
+
+def test_the_worlds_own_gusts_come_from_the_key():
+    """As `gust_path` draws them from the key that `simulate` is given."""
+    tank = world(added_mass=True, buoyancy="partial", gust={"std": 0.2, "time": 0.5})
+    robot = box_robot(CUBE, RHO * 1e-3, tank)
+    key = jax.random.key(4)
+    path = gust_path(tank.gust, jax.random.fold_in(key, 1), 100, tank.timestep, 1)[..., 0]
+    start = np.concatenate([path[0], np.zeros(3)])
+    found = simulate(robot, None, 0.5, qpos=robot.start_qpos(), qvel=start, key=key)
+    assert found.qvel[:, :3] == pytest.approx(np.asarray(path[1:]), abs=1e-5)
+
+
+def test_a_whole_rollout_does_not_know_how_fast_its_water_goes():
+    """Galilei: in a uniform current, moving along with it, an arm strokes as in still water."""
+    robot = arm_robot(world(**WATER))
+    current = np.array([0.3, -0.2, 0.05])
+    qpos, qvel = random_states(robot, 8, speed=0.3)
+    moving = qvel.copy()
+    moving[:3] += current[:, None]
+    ctrl = np.random.default_rng(2).uniform(-0.7, 0.7, (robot.num_hinges, 8))
+    zero = (np.float64(0),) * 3
+    time, q, v, work = march(robot, 1.0, qpos, qvel, ctrl, water=Water(0.0, zero), every=10)
+    _, other_q, other_v, other_work = march(
+        robot, 1.0, qpos, moving, ctrl, water=Water(0.0, tuple(current)), every=10
+    )
+    other_q, other_v = other_q.copy(), other_v.copy()
+    other_q[:, :3] -= time[:, None, None] * current[:, None]
+    other_v[:, :3] -= current[:, None]
+    assert np.abs(q[-1, 7:] - qpos[7:]).max() > 0.3
+    assert other_q == pytest.approx(q, abs=1e-9)
+    assert other_v == pytest.approx(v, abs=1e-8)
+    assert other_work == pytest.approx(work, abs=1e-9)
+
+
+def closing(speed, drag, inertia, time):
+    """A body that quadratic drag takes along with the water: u - v = u / (1 + c u t / m)."""
+    return speed / (1 + drag * np.abs(speed) * time / inertia)
+
+
+@pytest.mark.parametrize("added_mass", [False, True])
+def test_a_body_drifts_to_the_current(added_mass):
+    """From rest, in three currents at once; 0.5 % of the current at 5 ms."""
+    current = np.array([0.3, -0.2, 0.1])
+    robot = box_robot(CUBE, 1.0, world(drag="faces", added_mass=added_mass, current=current))
+    time, _, v, _ = march(robot, 10.0, *at_rest(robot, 1, -5.0), every=20)
+    inertia = 1.0 + (RHO * robot.fluid.added_mass[0, 0] if added_mass else 0.0)
+    drag = RHO * robot.fluid.drag_linear[0, 0]
+    expected = current - closing(current, drag, inertia, time[:, None])
+    assert v[:, :3, 0] == pytest.approx(expected, abs=0.005 * 0.3)
+    assert np.linalg.norm(v[-1, :3, 0] - current) < 0.05
+
+
+def test_boxes_at_several_depths_see_several_currents():
+    """Linear shear: u₀ at the surface, half of it half way down, nothing below."""
+    shear = {"velocity": [0.4, -0.2, 0.0], "depth": 10.0}
+    robot = box_robot(CUBE, 1.0, world(drag="faces", added_mass=True, shear=shear))
+    qpos, qvel = at_rest(robot, 3)
+    qpos[2] = -1.0, -5.0, -12.0
+    time, q, v, _ = march(robot, 5.0, qpos, qvel, every=20)
+    inertia = 1.0 + RHO * robot.fluid.added_mass[0, 0]
+    drag = RHO * robot.fluid.drag_linear[0, 0]
+    for lane, share in enumerate((0.9, 0.5, 0.0)):
+        u = share * np.array([0.4, -0.2, 0.0])
+        expected = u - closing(u, drag, inertia, time[:, None])
+        assert v[:, :3, lane] == pytest.approx(expected, abs=0.005 * 0.4)
+    assert q[-1, 2] == pytest.approx(qpos[2], abs=1e-9)
+
+
+def test_a_floating_box_goes_with_a_long_wave():
+    """Its height is the surface's where it is, its velocity the water's, its deck level with it."""
+    amplitude, length = 0.2, 40.0
+    tank = world(**WATER, waves=[{"amplitude": amplitude, "wavelength": length}])
+    size = (0.2, 0.2, 0.06)
+    robot = box_robot(size, RHO * np.prod(size) / 2, tank)
+    k = 2 * np.pi / length
+    omega = np.sqrt(G * k)
+    qpos, qvel = at_rest(robot, 1, amplitude)
+    qvel[0] = amplitude * omega
+    time, q, v, _ = march(robot, 10.0, qpos, qvel, every=10)
+    theta = k * q[:, 0, 0] - omega * time
+    # Of second order, k a = 0.03, is what linear theory and a body of finite size leave out.
+    assert q[:, 2, 0] == pytest.approx(amplitude * np.cos(theta), abs=0.03 * amplitude)
+    fast = amplitude * omega
+    assert v[:, 0, 0] == pytest.approx(fast * np.cos(theta), abs=0.1 * fast)
+    pitch = 2 * q[:, 5, 0]
+    # Rotation about +y by θ turns the deck's normal to (θ, 0, 1); the surface's is (-η', 0, 1).
+    assert pitch == pytest.approx(k * amplitude * np.sin(theta), abs=0.2 * k * amplitude)
+    assert np.ptp(q[:, 2, 0]) > 1.9 * amplitude
+
+
+# ------------------------------------------------------------------------- parts
+
+
+def test_entrained_water_is_mass_without_weight():
+    """A box flooded to 70 % moves as one that is heavier by that water, spread evenly over it."""
+    size, mass, volume, share = (0.2, 0.1, 0.06), 0.4, 3e-4, 0.7
+    tank = world(added_mass=True, drag="faces")
+    flooded = box_robot(size, mass, tank, volume, entrained_water=share)
+    inside = RHO * share * (np.prod(size) - volume)
+    heavy = box_robot(size, mass + inside, tank, volume)
+    states = random_states(flooded, 16, speed=0.5)
+    _, q, v, _ = march(flooded, 1.0, *states)
+    _, other_q, other_v, _ = march(heavy, 1.0, *states)
+    assert q == pytest.approx(other_q, abs=1e-9)
+    assert v == pytest.approx(other_v, abs=1e-9)
+    assert inside > mass
+
+
+def winged(switch, tank):
+    """A core with a brick at either side, to which the switch belongs."""
+    text = "body: {type: Core, children: {"
+    text += ", ".join(f"{k}: {{type: FixedBrick, params: {{{switch}}}}}" for k in (2, 3)) + "}}"
+    return build_robot(read(text), tank)
+
+
+SWITCHES = {
+    "none": "",
+    "buoyancy": 'buoyancy: "off"',
+    "mask": "buoyancy: mask",
+    "drag": 'drag: "off"',
+    "added_mass": "added_mass: false",
+}
+
+
+def check_switch(switch, height, speed, engines):
+    """Vertical acceleration, summed by hand over the parts that still take part."""
+    tank = world(**WATER)
+    robot, plain = winged(SWITCHES[switch], tank), winged("", tank).fluid
+    qpos, qvel = at_rest(robot, 1, height)
+    qvel[2] = speed
+    mass, wings = robot.mj_model.body_mass.sum(), np.array([False, True, True])
+    half = plain.half_size[:, 2]
+    partial = np.clip(0.5 - height / (2 * half), 0, 1)
+    share = np.where(wings & (switch == "mask"), float(height < 0), partial)
+    # Without buoyancy of its own, a part is wet or dry by its centre.
+    share = np.where(wings & (switch == "buoyancy"), float(height < 0), share)
+    on = lambda name: np.where(wings & (switch == name), 0.0, share)  # noqa: E731
+    force = RHO * G * on("buoyancy") @ plain.volume - mass * G
+    force -= RHO * on("drag") @ plain.drag_linear[:, 2] * speed * abs(speed)
+    carried = RHO * on("added_mass") @ plain.added_mass[:, 2]
+    found = accelerate(robot, qpos, qvel)[:, 0]
+    assert found[2] == pytest.approx(force / (mass + carried), rel=1e-9)
+    assert found[[0, 1, 3, 4, 5]] == pytest.approx(0.0, abs=1e-9)
+    ends = [march(robot, 0.01, qpos, qvel, engine=engine)[2][-1] for engine in engines]
+    assert ends[-1] == pytest.approx(ends[0], abs=1e-12)
+    if speed == 0:
+        _, _, v, _ = march(robot, 0.005, qpos, qvel, engine=engines[-1])
+        assert v[0, 2, 0] / 0.005 == pytest.approx(force / (mass + carried), rel=1e-9)
+
+
+@pytest.mark.parametrize("switch", SWITCHES)
+def test_switches_of_single_modules(switch):
+    """Half out of the water at rest, and deep in it at speed."""
+    check_switch(switch, -0.001, 0.0, ("population",))
+    check_switch(switch, -2.0, -0.5, ("population",))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("switch", ["buoyancy", "added_mass"])
+def test_switches_of_single_modules_in_mjx(switch):
+    """Both engines share the water; one switch of its forces and one of the inertia will do."""
+    check_switch(switch, -2.0, -0.5, ("population", "mjx"))
+
+
+def test_what_a_world_switches_off_stays_off():
+    """A module may not turn a law on that its world has turned off."""
+    robot = winged("buoyancy: partial, drag: faces, added_mass: true", world(gravity=G))
+    qpos, qvel = at_rest(robot, 1, -2.0)
+    qvel[2] = -0.5
+    assert accelerate(robot, qpos, qvel)[:, 0] == pytest.approx([0, 0, -G, 0, 0, 0], abs=1e-12)
+
+
+def test_ballast_in_the_keel_rights_a_body():
+    """Neutral, rolled by 0.02 rad, without drag: a pendulum in its carried water.
+
+    With T = ½ (m + A) v² - m z v φ' + ½ (I + A') φ'² (z of the centre of mass; I about the box's
+    centre, at which the water's mass acts) and no force sideways, v follows φ' and
+    ω² = m g (z_b - z) / (I + A' - (m z)² / (m + A)). Semi-implicit Euler errs by (ω dt)² / 24.
+    """
+    size, hull, lead, low, high = (0.2, 0.1, 0.06), 0.5, 0.3, -0.025, 0.005
+    tank = world(gravity=G, buoyancy="partial", added_mass=True)
+    mass = hull + lead
+    robot = box_robot(
+        size,
+        hull,
+        tank,
+        mass / RHO,
+        center_of_volume=(0, 0, high),
+        ballast_mass=lead,
+        ballast_position=(0, 0, low),
+    )
+    z = lead * low / mass
+    added, turning = box_added_mass(np.array(size) / 2)
+    for axis, edges, sideways in ((0, (0.1, 0.06), 1), (1, (0.2, 0.06), 0)):
+        inertia = hull / 12 * np.sum(np.square(edges)) + lead * low**2 + RHO * turning[axis]
+        inertia -= (mass * z) ** 2 / (mass + RHO * added[sideways])
+        omega = np.sqrt(mass * G * (high - z) / inertia)
+        qpos, qvel = at_rest(robot, 1, -5.0)
+        qpos[3], qpos[4 + axis] = np.cos(0.01), np.sin(0.01)
+        time, q, _, _ = march(robot, 3.0, qpos, qvel)
+        angle = 2 * np.arcsin(q[:, 4 + axis, 0])
+        assert omega * 3.0 / (2 * np.pi) > 0.5
+        assert angle == pytest.approx(0.02 * np.cos(omega * time), abs=0.02 * 0.04)
+
+
+# ------------------------------------------------------------------------- gradients
+
+
+def check_slope(robot, inputs, steps=20, tolerance=1e-4):
+    """In float64, the gradient through a rollout against central differences over 2 µ."""
+
+    def end(inputs):
+        qpos = jnp.asarray(robot.qpos0).at[:3].set(inputs["place"]).at[3:7].set(inputs["quat"])
+        trajectory = simulate(
+            robot,
+            jnp.broadcast_to(inputs["ctrl"], (steps, robot.mj_model.nu)),
+            qpos=qpos,
+            qvel=inputs["qvel"],
+            water=Water(0.0, tuple(inputs["current"]), time=inputs["time"]),
+        )
+        # Weights, so that no slope vanishes by symmetry alone.
+        weights = jnp.arange(1, robot.mj_model.nq + 1) / 10
+        return jnp.sum(weights * trajectory.qpos[-1]) + trajectory.qvel[-1] @ weights[:-1]
+
+    usual = {
+        "place": np.array([0.0, 0.0, -2.0]),
+        "quat": np.array([1.0, 0.0, 0.0, 0.0]),
+        "ctrl": np.zeros(robot.mj_model.nu),
+        "qvel": np.zeros(robot.mj_model.nv),
+        "current": np.zeros(3),
+        "time": 0.0,
+    }
+    with jax.enable_x64(True):
+        inputs = jax.tree.map(jnp.asarray, usual | inputs)
+        value = jax.jit(end, compiler_options=QUICK)
+        slope = jax.jit(jax.grad(end), compiler_options=QUICK)
+        flat, build = ravel_pytree(inputs)
+        found = np.asarray(ravel_pytree(slope(inputs))[0])
+        assert np.all(np.isfinite(found))
+        expected = [
+            (float(value(build(flat + s))) - float(value(build(flat - s)))) / 2e-6
+            for s in 1e-6 * np.eye(len(flat))
+        ]
+        assert found == pytest.approx(expected, rel=tolerance, abs=1e-6)
+    assert np.sum(np.abs(found) > 1e-3) > 5
+
+
+def trimmed(tank):
+    return build_robot(trim_neutral(body("core"), RHO), tank)
+
+
+@pytest.mark.slow
+def test_gradient_at_rest():
+    """Level, still, deep: drag's |v| and every angle stand at their kinks."""
+    check_slope(trimmed(world(**WATER)), {})
+
+
+def test_gradient_at_the_waterline():
+    """The core's centre in the surface, and its deck or its keel just in it."""
+    robot = build_robot(body("core"), world(**WATER))
+    check_slope(robot, {"place": np.array([0.0, 0.0, -0.001]), "qvel": np.full(6, 0.05)})
+
+
+@pytest.mark.slow
+def test_gradient_is_finite_where_deck_and_keel_touch_the_surface():
+    """There the submerged share has its kinks: one-sided slopes, but numbers."""
+    robot = build_robot(body("core"), world(**WATER))
+
+    def end(height):
+        qpos = jnp.asarray(robot.qpos0).at[2].set(height)
+        return jnp.sum(simulate(robot, None, 0.05, qpos=qpos).qpos[-1] ** 2)
+
+    heights = jnp.array([0.0, 0.0225, -0.0225, -3.0])
+    slopes = jax.jit(jax.vmap(jax.grad(end)), compiler_options=QUICK)(heights)
+    assert np.all(np.isfinite(slopes))
+
+
+@pytest.mark.slow
+def test_gradient_in_waves():
+    """In the moment at which the sea is met, too."""
+    tank = world(**WATER, waves=[{"amplitude": 0.05, "wavelength": 2.0, "direction": 0.5}])
+    inputs = {
+        "place": np.array([0.2, 0.1, 0.02]),
+        "quat": np.array([1.0, 0.02, -0.03, 0.1]),
+        "qvel": np.full(6, 0.1),
+        "current": np.array([0.05, 0.02, 0.01]),
+        "time": 0.3,
+    }
+    check_slope(build_robot(body("core"), tank), inputs)
+
+
+@pytest.mark.slow
+def test_gradient_through_thrusters():
+    """In the commands, behind their lag; one of them stands still."""
+    inputs = {"ctrl": np.array([0.5, -0.3, 0.0, 0.8]), "qvel": np.full(6, 0.05)}
+    check_slope(build_robot(body("auv"), world(**WATER)), inputs)
+
+
+@pytest.mark.slow
+def test_gradient_in_contact():
+    """Sliding over the bed with all corners in it."""
+    tank = world(**WATER, bed=Bed(kind="flat", height=-1.0))
+    inputs = {
+        "place": np.array([0.0, 0.0, -1.0 + 0.0215]),
+        "qvel": np.array([0.1, 0.05, -0.02, 0.1, 0.05, 0.2]),
+    }
+    check_slope(build_robot(body("core"), tank), inputs)

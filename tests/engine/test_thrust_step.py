@@ -1,0 +1,223 @@
+"""Thrusters and fins in whole steps: steady speed, lag, torque, MuJoCo's actuators, the fish."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import (
+    QUICK,
+    WATER,
+    accelerate,
+    at_rest,
+    body,
+    box_robot,
+    march,
+    random_states,
+    world,
+)
+from mjx_revolve.body.module_types import Thruster
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes import rollout
+from mjx_revolve.episodes.rollout import simulate
+
+RHO, G = 999.1026, 9.81
+CUBE = (0.1, 0.1, 0.1)
+NEUTRAL = RHO * 1e-3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compiles():
+    """Leaves out the compiler's optimisations: they cost more than these short runs save."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rollout, "compiler_options", lambda: QUICK)
+        yield
+
+
+def driven(tank, **thruster):
+    """A neutral cube with a thruster in its centre."""
+    return box_robot(CUBE, NEUTRAL, tank, thruster=Thruster(**thruster))
+
+
+# ------------------------------------------------------------------------- one thruster
+
+
+def test_speed_under_thrust():
+    """v = v_t tanh(t / τ), v_t² = T / (½ ρ C_d A), τ = (m + m_a) v_t / T; 0.2 % of it at 5 ms."""
+    robot = driven(world(**WATER), gain=0.5)
+    qpos, qvel = at_rest(robot, 3, -5.0)
+    commands = np.array([[1.0, 0.5, -0.7]])
+    time, _, v, work = march(robot, 20.0, qpos, qvel, commands, every=10)
+    force = 0.5 * commands[0] * np.abs(commands[0])
+    steady = np.sqrt(np.abs(force) / (RHO * robot.fluid.drag_linear[0, 0])) * np.sign(force)
+    inertia = NEUTRAL + RHO * robot.fluid.added_mass[0, 0]
+    expected = steady * np.tanh(time[:, None] * force / (inertia * steady))
+    assert v[:, 0] == pytest.approx(expected, abs=0.002 * steady[0])
+    assert v[-1, 0, 0] == pytest.approx(steady[0], rel=1e-4)
+    assert np.abs(v[:, 1:]).max() < 1e-9
+    # Froude's ideal propeller, over the face across its axis unless it says otherwise.
+    assert np.all(work > 0)
+    assert work[0, 0] / work[0, 1] == pytest.approx(0.25**-1.5, rel=1e-3)
+
+
+def test_a_trajectory_tells_the_command_behind_its_lag():
+    """s = x (1 - e^(-t/τ)), held or beyond the range, in float64; thrust follows it by a step."""
+    tau, dt = 0.1, 0.005
+    robot = driven(world(**WATER), gain=0.5, time_constant=tau)
+    start = robot.start_qpos(5.0)
+    with jax.enable_x64(True):
+        found = simulate(robot, [3.0], 0.5, qpos=start)
+    time = np.asarray(found.time)
+    assert found.command[:, 0] == pytest.approx(1 - np.exp(-time / tau), rel=1e-12)
+    assert np.all(np.asarray(found.ctrl) == 3.0)
+    inertia = NEUTRAL + RHO * robot.fluid.added_mass[0, 0]
+    assert found.qvel[0, 0] == pytest.approx(0.0, abs=1e-12)
+    second = dt * 0.5 * (1 - np.exp(-dt / tau)) ** 2 / inertia
+    assert found.qvel[1, 0] == pytest.approx(second, rel=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [0.02, -0.02])
+def test_a_propeller_turns_its_robot_the_other_way(ratio):
+    """α = -c T / (I + A') about the axis, whichever way that points; a cube carries no spin."""
+    axis = np.array([1.0, 2.0, -2.0]) / 3
+    robot = driven(world(added_mass=True), gain=0.5, torque_ratio=ratio, axis=tuple(axis))
+    qacc = accelerate(robot, *at_rest(robot, 1, -5.0), np.ones((1, 1)))[:, 0]
+    inertia = NEUTRAL * 0.1**2 / 6 + RHO * robot.fluid.added_inertia[0, 0]
+    carried = NEUTRAL + RHO * robot.fluid.added_mass[0, 0]
+    assert qacc[:3] == pytest.approx(0.5 * axis / carried, rel=1e-9)
+    assert qacc[3:] == pytest.approx(-ratio * 0.5 * axis / inertia, rel=1e-9)
+
+
+def test_thrust_off_the_centre_turns_too():
+    robot = driven(world(), gain=0.5, position=(0.0, 0.03, 0.0))
+    qacc = accelerate(robot, *at_rest(robot, 1, -5.0), np.ones((1, 1)))[:, 0]
+    assert qacc[5] == pytest.approx(-0.5 * 0.03 / (NEUTRAL * 0.1**2 / 6), rel=1e-9)
+
+
+@pytest.mark.parametrize(("height", "share"), [(1.0, 0.0), (0.0, 0.5), (-1.0, 1.0)])
+def test_out_of_the_water_there_is_nothing_to_push(height, share):
+    """In the air it falls, and neither flies nor spins; half in it, it has half of its thrust."""
+    robot = driven(world(**WATER), gain=0.5, torque_ratio=0.02)
+    qacc = accelerate(robot, *at_rest(robot, 1, height), np.ones((1, 1)))[:, 0]
+    inertia = NEUTRAL + share * RHO * robot.fluid.added_mass[0, 0]
+    assert qacc[0] == pytest.approx(0.5 * share / inertia, abs=1e-12)
+    assert qacc[2] == pytest.approx(-(1 - share) * NEUTRAL * G / inertia, abs=1e-9)
+    assert qacc[3] == pytest.approx(-0.02 * 0.5 * share / (NEUTRAL * 0.1**2 / 6), rel=1e-6)
+
+
+# ------------------------------------------------------------------------- MuJoCo's actuators
+
+
+def linear(morphology):
+    """The robot with thrusters as stock MuJoCo can have them: linear in the command."""
+    modules = []
+    for module in morphology.modules:
+        parts = []
+        for part in module.kind.parts:
+            if part.thruster is not None:
+                part = replace(
+                    part,
+                    thruster=replace(
+                        part.thruster,
+                        curve="interpolated",
+                        gain=1.0,
+                        commands=(-1.0, 1.0),
+                        thrusts=(-0.4, 0.4),
+                    ),
+                )
+            parts.append(part)
+        modules.append(replace(module, kind=replace(module.kind, parts=tuple(parts))))
+    return replace(morphology, modules=tuple(modules))
+
+
+def test_a_linear_thruster_is_mujocos_filtered_actuator():
+    """200 steps of `mj_step` with `filterexact` forces at sites, in weight but without water."""
+    robot = build_robot(linear(body("auv")), world(gravity=G))
+    assert robot.num_thrusters == 4
+    qpos, qvel = random_states(robot, 4, depth=50.0, speed=0.3)
+    ctrl = np.random.default_rng(1).uniform(-1.3, 1.3, (4, 4))
+    _, q, v, _ = march(robot, 1.0, qpos, qvel, ctrl)
+    model = robot.mj_model
+    data = mujoco.MjData(model)
+    for lane in range(4):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[:, lane], qvel[:, lane], ctrl[:, lane]
+        for k in range(200):
+            mujoco.mj_step(model, data)
+            assert data.qpos == pytest.approx(q[k, :, lane], abs=1e-9)
+        assert data.qvel == pytest.approx(v[-1, :, lane], abs=1e-9)
+        assert np.clip(ctrl[:, lane], -1, 1) * (1 - np.exp(-10)) == pytest.approx(data.act)
+
+
+# ------------------------------------------------------------------------- auv and fish
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["auv", "fish"])
+def test_the_two_engines_agree(name):
+    """Through the surface, in a current, thrusters and fins at work; half a second in float64."""
+    robot = build_robot(body(name), world(**WATER, current=(0.2, -0.1, 0.05)))
+    qpos, qvel = random_states(robot, 4, speed=0.3)
+    qpos[2] = [-0.5, -0.05, 0.0, 0.1]
+    ctrl = np.random.default_rng(1).uniform(-1.2, 1.2, (robot.mj_model.nu, 4))
+    _, q, v, work = march(robot, 0.5, qpos, qvel, ctrl)
+    _, other_q, other_v, other_work = march(robot, 0.5, qpos, qvel, ctrl, engine="mjx")
+    assert np.abs(q[-1] - qpos).max() > 0.05
+    assert other_q == pytest.approx(q, abs=1e-9)
+    assert other_v == pytest.approx(v, abs=1e-7)
+    assert other_work == pytest.approx(work, abs=1e-9)
+
+
+def test_the_auv_surges_without_pitch_and_heaves_without_drift():
+    """Pairs of thrusters: what one does across, the other undoes."""
+    robot = build_robot(body("auv"), world(**WATER))
+    names = [robot.mj_model.actuator(k).name for k in range(4)]
+    ctrl = np.zeros((4, 2))
+    for name in ("port", "starboard"):
+        ctrl[names.index(name), 0] = 0.5
+    for name in ("bow", "stern"):
+        ctrl[names.index(name), 1] = 0.5
+    _, q, _, _ = march(robot, 2.0, *at_rest(robot, 2, -2.0), ctrl, every=20)
+    surge, heave = q[..., 0], q[..., 1]
+    assert surge[-1, 1] > 0.1
+    assert np.abs(surge[:, 0]).max() < 1e-6
+    assert heave[-1, 2] > -2.0 + 0.1
+    assert np.abs(heave[:, :2]).max() < 1e-3
+    # Yaw stays, as propellers of a pair turn against each other.
+    assert np.abs(q[:, 6]).max() < 1e-3
+
+
+def tail_wave(t):
+    """A wave that runs down the tail, 1 Hz, growing towards the fin [rad]."""
+    phase = 2 * np.pi * t - np.arange(3)
+    return jnp.minimum(t, 1.0) * jnp.array([0.2, 0.4, 0.6]) * jnp.sin(phase)
+
+
+@pytest.mark.slow
+def test_the_fish_swims_ahead_and_halving_the_step_changes_little():
+    """By its tail alone, level and at its depth."""
+    ends = []
+    for dt in (0.005, 0.0025):
+        robot = build_robot(body("fish"), world(**WATER, timestep=dt))
+        found = simulate(robot, tail_wave, 6.0, qpos=robot.start_qpos(2.0))
+        assert np.all(np.isfinite(found.qpos))
+        ends.append(np.asarray(found.qpos[-1]))
+        assert found.qpos[-1, 1] > 0.07
+        up = 1 - 2 * (found.qpos[:, 4] ** 2 + found.qpos[:, 5] ** 2)
+        assert up.min() > 0.95
+        assert np.abs(found.qpos[:, 2] + 2.0).max() < 0.05
+    assert np.linalg.norm(ends[1][:3] - ends[0][:3]) < 0.02 * ends[0][1]
+
+
+@pytest.mark.slow
+def test_a_fish_that_does_not_move_stays_where_it_is():
+    """Neutral and trimmed: a centimetre and a degree in 5 s."""
+    robot = build_robot(body("fish"), world(**WATER))
+    found = simulate(robot, None, 5.0, qpos=robot.start_qpos(2.0))
+    assert np.abs(found.qpos[-1, :3] - np.array([0, 0, -2.0])).max() < 0.01
+    assert np.abs(found.qpos[-1, 4:7]).max() < 0.01

@@ -1,0 +1,260 @@
+"""The configuration: every wrong input with its message, paths, overrides, and the way back."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from mjx_revolve.episodes.config import dump_config, load_config, make_config, override_config
+from mjx_revolve.inputs.errors import InputError
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+GOOD = """
+morphology: robot.yaml
+world: lake
+task:
+  type: directed_swim
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a valid config; the current folder is another one."""
+    (tmp_path / "robot.yaml").write_text("id: robot\n")
+    (tmp_path / "pond.yaml").write_text("density: 1000\n")
+    (tmp_path / "good.yaml").write_text(GOOD)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    return tmp_path
+
+
+def check_message(message, action):
+    with pytest.raises(InputError) as caught:
+        action()
+    assert "\n" not in str(caught.value)
+    assert re.search(re.escape(message), str(caught.value)), str(caught.value)
+
+
+def test_defaults(folder):
+    config = load_config(folder / "good.yaml")
+    assert config.morphology == str(folder / "robot.yaml")
+    assert config.written["morphology"] == "robot.yaml"
+    assert config.source == str(folder / "good.yaml")
+    assert config.name == "good"
+    assert (config.world_name, config.world_overrides) == ("lake", {})
+    assert (config.controller.type, config.controller.max_frequency) == ("cpg", 2.0)
+    assert (config.task.duration, config.task.settle, config.task.trials) == (10.0, 1.0, 2)
+    assert config.task.direction == (1.0, 0.0, 0.0)
+    assert (config.evolution.strategy, config.evolution.population_size) == ("CMA_ES", 64)
+    assert (config.trim, config.engine, config.modules) == ("none", "population", None)
+
+
+def test_it_is_frozen(folder):
+    config = load_config(folder / "good.yaml")
+    with pytest.raises(ValueError, match="frozen"):
+        config.task.duration = 3.0
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("task.duration=-3", "--set task.duration: expected a number > 0; found -3"),
+        ("task.duration=abc", "--set task.duration: expected a number > 0; found 'abc'"),
+        ("task.duration=.nan", "--set task.duration: expected a number > 0; found nan"),
+        ("task.duration=.inf", "--set task.duration: expected a number > 0; found inf"),
+        ("task.duration=true", "--set task.duration: expected a number > 0; found True"),
+        ("task.duration=", "--set task.duration: expected a number > 0; found None"),
+        ("task.duration.x=3", "--set task.duration: expected a number > 0; found {'x': 3}"),
+        ("task.settle=10", "task.settle: expected a time below task.duration (10 s); found 10"),
+        ("task.trials=0", "task.trials: expected a whole number >= 1; found 0"),
+        ("task.trials=2.0", "task.trials: expected a whole number >= 1; found 2.0"),
+        ("task.type=swim", "task.type: expected one of directed_swim, speed, reach_target, "
+         "hold_depth, crawl, or FILE.py:FUNCTION; found 'swim'"),
+        ("task.type=tasks.py", "or FILE.py:FUNCTION; found 'tasks.py'"),
+        ("task.type='tasks.py:'", "or FILE.py:FUNCTION; found 'tasks.py:'"),
+        ("task.type=tasks.py:3d", "or FILE.py:FUNCTION; found 'tasks.py:3d'"),
+        ("task.type=tasks.py:stay", "--set task.type: expected a file; found none at"),
+        ("task.type=3", "task.type: expected one of directed_swim, speed, reach_target, "),
+        ("task.params={a: 1}", "task.params: expected none, as only own functions take them; "
+         "found a"),
+        ("task.params=3", "task.params: expected a mapping; found 3"),
+        ("controller.params.a=1", "controller.params: expected none, as only own functions"),
+        ("task.type=reach_target", "task.target: expected three numbers, because task.type is "
+         "reach_target; found none"),
+        ("task.target=[1, 2]", "task.target: expected three finite numbers or nothing; "
+         "found [1, 2]"),
+        ("task.direction=[1, 0, a]", "task.direction: expected three finite numbers; "
+         "found [1, 0, 'a']"),
+        ("task.direction=[0, 0, 0]", "task.direction: expected a vector of some length; found"),
+        ("task.depth=-1", "task.depth: expected a number >= 0; found -1"),
+        ("task.depth_tolerance=0", "task.depth_tolerance: expected a number > 0; found 0"),
+        ("task.start_tilt=-1", "task.start_tilt: expected a number >= 0; found -1"),
+        ("task.durtion=5", "task.durtion: expected one of type, duration, settle"),
+        ("task.durtion=5", "found an unknown key; did you mean task.duration?"),
+        ("duration=5", "found an unknown key; did you mean task.duration?"),
+        ("wrld=lake", "found an unknown key; did you mean world?"),
+        ("qqqqqq=1", "task, evolution; found an unknown key"),
+        ("task=3", "--set task: expected a mapping; found 3"),
+        ("trim=no", "--set trim: expected one of neutral, none; found False"),
+        ("engine=gpu", "--set engine: expected one of population, mjx; found 'gpu'"),
+        ("allow_overlap=1", "--set allow_overlap: expected true or false; found 1"),
+        (
+            "controller.type=splines",
+            "expected one of cpg, sine, feedback, or FILE.py:FUNCTION; found 'splines'",
+        ),
+        ("controller.max_frequency=21", "expected a number > 0 and <= 20; found 21"),
+        ("controller.amplitude=0", "expected a number > 0 and <= 1; found 0"),
+        ("world=3", "--set world: expected a world's name or path, or a mapping of name and "
+         "overrides; found 3"),
+        ("world={density: 1}", "expected a `name` (a world's name or path) beside the overrides"),
+        ("world=pond.yaml", "--set world: expected a file; found none at"),
+        ("world.name=pond.yaml", "--set world.name: expected a file; found none at"),
+        ("morphology=robot.yaml", "--set morphology: expected a file; found none at"),
+        ("morphology=.", "--set morphology: expected a file; found a folder at"),
+        ("morphology=3", "--set morphology: expected the path of a morphology YAML; found 3"),
+        ("modules=mine.yaml", "--set modules: expected a file; found none at"),
+        ("evolution.population_size=3", "expected a whole number >= 4; found 3"),
+        ("evolution.generations=0", "expected a whole number >= 1; found 0"),
+        ("evolution.seed=-1", "expected a whole number >= 0 and < 4294967296; found -1"),
+        ("evolution.std_init=0", "evolution.std_init: expected a number > 0; found 0"),
+        ("evolution.strategy_params=3", "evolution.strategy_params: expected a mapping; found 3"),
+        ("task.duration", "--set task.duration: expected KEY.PATH=VALUE; found 'task.duration'"),
+        ("=3", "--set =3: expected KEY.PATH=VALUE; found '=3'"),
+        ("task..type=3", "expected KEY.PATH=VALUE"),
+        ("task.target=[1", "--set task.target: expected a YAML value; found: expected ',' or ']'"),
+        ("task.type.deep.deeper=1", "--set task.type.deep.deeper: expected task.type to be a "
+         "mapping; found 'directed_swim'"),
+    ],
+)  # fmt: skip
+def test_wrong_settings(folder, setting, message):
+    check_message(message, lambda: load_config(folder / "good.yaml", [setting]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "bad.yaml: expected a mapping of settings; found an empty file"),
+        ("- 1", "bad.yaml: expected a mapping of settings; found [1]"),
+        ("world: lake", "bad.yaml: morphology: expected the path of a morphology YAML; found none "
+         "(and 1 more: task)"),
+        (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0; found -3"),
+        (GOOD + "  2: 3", "bad.yaml: task.2: expected the name of a setting"),
+        (GOOD + "3: 3", "bad.yaml: 3: expected the name of a setting"),
+        (GOOD + "world: lake", "bad.yaml: line 6: expected each key once; found 'world' twice"),
+        (GOOD.replace("lake", "no/pond.yaml"), "bad.yaml: world: expected a file; found none at"),
+        (GOOD.replace("robot", "nobody"), "bad.yaml: morphology: expected a file; found none at"),
+        (GOOD.replace("directed_swim", "no/tasks.py:stay"),
+         "bad.yaml: task.type: expected a file; found none at"),
+        (GOOD.replace("type: directed_swim", "trials: 2"), "bad.yaml: task.type: expected one of"),
+        (GOOD.replace("\n  type: directed_swim", ""),
+         "bad.yaml: task: expected a mapping; found None"),
+        ("a: [", "bad.yaml: line 1: expected valid YAML"),
+    ],
+)  # fmt: skip
+def test_wrong_files(folder, text, message):
+    (folder / "bad.yaml").write_text(text)
+    check_message(message, lambda: load_config(folder / "bad.yaml"))
+
+
+def test_missing_file(folder):
+    check_message(
+        "none.yaml: expected a file; found none", lambda: load_config(folder / "none.yaml")
+    )
+
+
+def test_several_problems_are_one_line(folder):
+    check_message(
+        "--set task.duration: expected a number > 0; found -1 (and 2 more: task.trials, "
+        "evolution.seed)",
+        lambda: load_config(
+            folder / "good.yaml", ["task.duration=-1", "task.trials=0", "evolution.seed=-1"]
+        ),
+    )
+
+
+def test_settings_are_yaml(folder):
+    settings = [
+        "task.duration=20",
+        "task.energy_weight=1e-3",
+        "task.direction=[0, 1, 0]",
+        "task.target=null",
+        "evolution.strategy_params.std_min=0.1",
+        "world.current=[0.1, 0, 0]",
+    ]
+    config = load_config(folder / "good.yaml", settings)
+    assert config.task.duration == 20.0
+    assert config.task.energy_weight == 1e-3
+    assert config.task.direction == (0.0, 1.0, 0.0)
+    assert config.evolution.strategy_params == {"std_min": 0.1}
+    assert config.world_name == "lake"
+    assert config.world_overrides == {"current": [0.1, 0, 0]}
+
+
+def test_mappings_override_too(folder):
+    config = load_config(folder / "good.yaml", {"task.trials": 3, "task": {"duration": 4.0}})
+    assert (config.task.trials, config.task.duration, config.task.type) == (3, 4.0, "directed_swim")
+    check_message(
+        "override task.trials: expected a whole number >= 1; found 0",
+        lambda: load_config(folder / "good.yaml", {"task": {"trials": 0}}),
+    )
+    again = override_config(config, {"task.trials": 5, "task.direction": (0, 0, 1)})
+    assert (again.task.trials, again.task.duration) == (5, 4.0)
+    assert again.task.direction == (0, 0, 1)
+    assert config.task.trials == 3
+
+
+def test_typed_paths_start_from_the_current_folder(folder):
+    config = load_config(folder / "good.yaml", ["morphology=../robot.yaml", "world=../pond.yaml"])
+    assert config.morphology == str(folder / "robot.yaml")
+    assert config.world == str(folder / "pond.yaml")
+
+
+def test_written_paths_start_from_the_file(folder):
+    (folder / "good.yaml").write_text(GOOD.replace("lake", "{name: pond.yaml, drag: mask}"))
+    config = load_config(folder / "good.yaml")
+    assert config.world_name == str(folder / "pond.yaml")
+    assert config.world_overrides == {"drag": "mask"}
+
+
+def test_dump_reads_back_equal(folder):
+    settings = ["task.energy_weight=1e-5", "world.current=[0.1, 0, 0]", "task.target=[1, 2, 3]"]
+    config = load_config(folder / "good.yaml", settings)
+    (folder / "elsewhere" / "dumped.yaml").write_text(dump_config(config))
+    assert load_config(folder / "elsewhere" / "dumped.yaml").model_dump() == config.model_dump()
+    inside = dump_config(config, folder)
+    assert "morphology: robot.yaml" in inside
+    (folder / "inside.yaml").write_text(inside)
+    assert load_config(folder / "inside.yaml").model_dump() == config.model_dump()
+
+
+def test_own_functions_are_found_from_where_they_are_named(folder):
+    """In a file from its folder, typed ones from the current folder."""
+    (folder / "mine.py").touch()
+    (folder / "elsewhere" / "mine.py").touch()
+    (folder / "own.yaml").write_text(GOOD.replace("directed_swim", "mine.py:stay"))
+    config = load_config(folder / "own.yaml", ["controller.type=mine.py:wave", "task.params.a=2"])
+    assert config.task.type == f"{folder / 'mine.py'}:stay"
+    assert config.controller.type == f"{folder / 'elsewhere' / 'mine.py'}:wave"
+    assert (config.task.name, config.controller.name) == ("stay", "wave")
+    assert config.task.params == {"a": 2}
+    assert not load_config(folder / "good.yaml").task.is_own
+    nested = load_config(folder / "own.yaml", {"task": {"type": "mine.py:go"}})
+    assert nested.task.type == f"{folder / 'elsewhere' / 'mine.py'}:go"
+    assert override_config(config, {"task.trials": 3}).task.type == config.task.type
+    inside = dump_config(config, folder)
+    assert "type: mine.py:stay" in inside and "type: elsewhere/mine.py:wave" in inside
+    (folder / "inside.yaml").write_text(inside)
+    assert load_config(folder / "inside.yaml").model_dump() == config.model_dump()
+
+
+def test_made_in_code(folder):
+    data = {"morphology": "robot.yaml", "world": "lake", "task": {"type": "speed"}}
+    assert make_config(data, folder).morphology == str(folder / "robot.yaml")
+    assert data["morphology"] == "robot.yaml"
+    check_message("config: expected a mapping; found 3", lambda: make_config(3))
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
+def test_our_own_files_load(path):
+    assert load_config(path).world_name

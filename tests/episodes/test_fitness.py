@@ -1,0 +1,203 @@
+"""The fitness function: pure, batched, safe from one individual's failure. Known answers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from laboratory import QUICK
+from mjx_revolve import InputError, make_fitness
+from mjx_revolve.episodes import fitness as fitness_module
+from mjx_revolve.episodes.fitness import WORST
+from mjx_revolve.episodes.tasks import TASKS, Track, measure
+
+ROOT = Path(__file__).resolve().parents[2]
+KEY = jax.random.key(7)
+# The smallest robot with joints: compiles fast.
+ROBOT = """
+id: oar
+body:
+  id: core
+  type: Core
+  children:
+    1:
+      id: hinge
+      type: ActiveHinge
+      orientation: 90
+      children:
+        1: {id: blade, type: FixedBrick, orientation: -90}
+"""
+TASK = {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 2}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compiles():
+    """Leaves out the compiler's optimisations; test_end_to_end.py runs with them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitness_module, "compiler_options", lambda: QUICK)
+        yield
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    path = tmp_path_factory.mktemp("fitness") / "oar.yaml"
+    path.write_text(ROBOT)
+    return {
+        "morphology": str(path),
+        "world": "lake",
+        "trim": "neutral",
+        "controller": {"type": "sine"},
+        "task": TASK,
+    }
+
+
+@pytest.fixture(scope="module")
+def fitness(settings):
+    return make_fitness(settings)
+
+
+@pytest.fixture(scope="module")
+def population(fitness):
+    return 0.5 * jax.random.normal(jax.random.key(0), (70, fitness.num_genes))
+
+
+@pytest.fixture(scope="module")
+def scores(fitness, population):
+    return np.asarray(fitness(population, KEY))
+
+
+def test_one_score_each_and_the_same_again(fitness, population, scores):
+    assert scores.shape == (70,) and np.all(np.isfinite(scores))
+    np.testing.assert_array_equal(scores, fitness(population, KEY))
+    assert not np.array_equal(scores, fitness(population, jax.random.key(8)))
+
+
+@pytest.mark.slow
+def test_an_individual_does_not_feel_the_population_around_it(fitness, population, scores):
+    """70 individuals of 2 episodes are 3 chunks of 64 lanes, 40 are two, the last one padded."""
+    few = np.asarray(fitness(population[:40], KEY))
+    np.testing.assert_array_equal(few, scores[:40])
+
+
+def test_an_individual_adds_little_memory_however_long_it_lives(settings):
+    """XLA's own sum of what lives beside arguments and results; a track alone would be 800 B."""
+    long = make_fitness(settings, **{"task.duration": 5.0, "task.trials": 1})
+    count = 2**16
+    population = jax.ShapeDtypeStruct((count, long.num_genes), jnp.float32)
+    compiled = jax.jit(long.evaluate, compiler_options=QUICK).lower(population, KEY).compile()
+    assert compiled.memory_analysis().temp_size_in_bytes / count < 200
+
+
+def test_a_blown_up_individual_scores_worst_and_spreads_nothing(fitness, population, scores):
+    broken = population.at[3].set(jnp.nan)
+    found = np.asarray(fitness(broken, KEY))
+    assert found[3] == WORST == fitness.worst_score
+    others = np.arange(70) != 3
+    np.testing.assert_array_equal(found[others], scores[others])
+
+
+def test_zero_genes_do_no_work(fitness):
+    score, measures = fitness.evaluate(jnp.zeros((1, fitness.num_genes)), KEY)
+    # The oar is heavier at one end and lighter at the other, so it turns a little, without work.
+    assert float(measures["energy_j"][0]) < 1e-3
+    assert abs(float(score[0])) < 0.1
+
+
+@pytest.mark.slow
+def test_the_trimmed_spider_stays_where_it_is_without_genes():
+    spider = make_fitness(ROOT / "configs" / "lake_swim.yaml", **{"task.duration": 5.0})
+    score, measures = spider.evaluate(jnp.zeros((1, spider.num_genes)), KEY)
+    assert abs(float(score[0])) < 1e-3
+    assert float(measures["depth_error_m"][0]) < 1e-3
+
+
+@pytest.mark.slow
+def test_under_jit_and_vmap(fitness, population, scores):
+    jitted = jax.jit(fitness, compiler_options=QUICK)(population[:40], KEY)
+    # Another compilation: equal to rounding, which a second of stroking may amplify a little.
+    np.testing.assert_allclose(jitted, scores[:40], atol=2e-4)
+    mapped = jax.vmap(lambda genes: fitness(genes, KEY))
+    both = jax.jit(mapped, compiler_options=QUICK)(population[:40].reshape(2, 20, -1))
+    np.testing.assert_allclose(both.reshape(-1), scores[:40], atol=2e-4)
+
+
+@pytest.mark.slow
+def test_gradient_points_uphill(settings):
+    short = make_fitness(settings, **{"task.duration": 0.6, "task.trials": 1})
+    genes = 0.3 * jnp.ones((1, short.num_genes))
+    slope = jax.jit(jax.grad(lambda g: short(g, KEY)[0]), compiler_options=QUICK)(genes)
+    assert np.all(np.isfinite(slope)) and np.any(np.asarray(slope) != 0)
+    step = 0.02 * slope / jnp.linalg.norm(slope)
+    up, down = float(short(genes + step, KEY)[0]), float(short(genes - step, KEY)[0])
+    found = (up - down) / (2 * 0.02)
+    # Central differences in float32 over 0.02: a few per cent.
+    assert found == pytest.approx(float(jnp.linalg.norm(slope)), rel=0.1)
+
+
+@pytest.mark.slow
+def test_mjx_scores_the_same(settings, population, scores):
+    slow = make_fitness(settings, engine="mjx")
+    np.testing.assert_allclose(slow(population[:2], KEY), scores[:2], atol=2e-4)
+
+
+def test_wrong_populations_are_refused(fitness):
+    with pytest.raises(InputError, match=r"population: expected \[P, 4\]; found \[3, 9\]"):
+        fitness(jnp.zeros((3, 9)), KEY)
+    with pytest.raises(InputError, match=r"key: expected jax.random.key\(SEED\); found 1"):
+        fitness(jnp.zeros((3, 4)), 1)
+
+
+def track(x, z=None, clearance=1.0, start=0.0):
+    """One individual that moves along x in steps of 1 s."""
+    x = np.asarray(x, np.float32)
+    z = np.zeros_like(x) if z is None else np.asarray(z, np.float32)
+    return Track(
+        position=jnp.asarray(np.stack([x, 0 * x, z], 1)[:, :, None]),
+        clearance=jnp.full((len(x), 1), clearance),
+        energy=jnp.ones((len(x), 1)),
+        interval=1.0,
+        start_height=jnp.full(1, start),
+        length=0.5,
+        weight=2.0,
+        surface_height=3.0,
+    )
+
+
+SETTINGS = SimpleNamespace(direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, target=(4.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("task", "given", "score"),
+    [
+        ("directed_swim", track([0, 1, 2]), 2.0),  # 1 m/s, half a metre long
+        ("directed_swim", track([0, -1, -2]), -2.0),
+        ("directed_swim", track([0, 1, 2], z=[-1, -1, -1]), 0.0),  # not at its depth
+        ("directed_swim", track([0, 1, 2], z=[0, 0, 2]), 1.0),  # for the first metre only
+        ("speed", track([0, -1, -2]), 2.0),
+        ("reach_target", track([0, 1, 3]), 6.0),  # from 4 m away to 1 m
+        ("hold_depth", track([0, 1], z=[0.5, 0.5]), -1.0),
+        ("crawl", track([0, 1, 2], clearance=0.05), 2.0),
+        ("crawl", track([0, 1, 2], clearance=0.5), 0.0),  # it swam
+    ],
+)
+def test_tasks_with_known_scores(task, given, score):
+    assert float(TASKS[task](given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
+
+
+def test_measures_with_known_values():
+    found = {k: float(v[0]) for k, v in measure(track([0, 2, 1, 3], z=[1, 1, 1, 1])).items()}
+    expected = {
+        "speed_m_s": 1.0,
+        "speed_bl_s": 2.0,
+        "straightness": 3 / 5,
+        "energy_j": 3.0,
+        "cost_of_transport": 3 / (2 * 3),
+        "depth_m": 2.0,
+        "depth_error_m": 1.0,
+    }
+    assert found == pytest.approx(expected, rel=1e-5)

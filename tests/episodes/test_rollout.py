@@ -1,0 +1,360 @@
+"""`simulate`: what it takes, what it refuses, what it returns, and the gradient through it."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from laboratory import QUICK, USUAL, WATER, body, elbow_robot, march, read, world
+from mjx_revolve.body.morphology import trim_neutral
+from mjx_revolve.control.controllers import bind_genes, make_cpg, make_sine
+from mjx_revolve.engine.hydrodynamics import Water
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes import rollout
+from mjx_revolve.episodes.rollout import Trajectory, body_positions, simulate
+from mjx_revolve.inputs.errors import InputError
+
+STEPS, DT = 40, 0.005
+SPAN = STEPS * DT
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compiles():
+    """Leaves out the compiler's optimisations: they cost more than these short runs save."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rollout, "compiler_options", lambda: QUICK)
+        yield
+
+
+@pytest.fixture(scope="module")
+def still(elbow):
+    """The elbow left alone for 0.2 s."""
+    return simulate(elbow, None, SPAN)
+
+
+# ------------------------------------------------------------------------- what comes back
+
+
+def test_shapes_and_time(elbow, still):
+    assert isinstance(still, Trajectory)
+    assert still.time == pytest.approx(DT * np.arange(1, STEPS + 1), rel=1e-6)
+    assert still.qpos.shape == (STEPS, 9)
+    assert still.qvel.shape == (STEPS, 8)
+    assert still.xpos.shape == (STEPS, elbow.mj_model.nbody, 3)
+    assert still.ctrl.shape == (STEPS, 2)
+    assert still.power.shape == (STEPS,)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(still))
+    # From rest, 1 m deep: a heavy robot begins to sink.
+    assert still.qpos[0, 2] == pytest.approx(-1.0, abs=1e-3)
+    assert still.qpos[-1, 2] < -1.001
+    assert np.linalg.norm(still.qpos[:, 3:7], axis=1) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_default_duration_is_five_seconds(core):
+    trajectory = simulate(core)
+    assert trajectory.time[-1] == pytest.approx(5.0)
+    assert trajectory.ctrl.shape == (1000, 0)
+    assert trajectory.xpos.shape == (1000, 2, 3)
+    assert not trajectory.power.any()
+
+
+def test_xpos_is_mujocos(elbow):
+    rows = np.random.default_rng(0).uniform(-0.7, 0.7, (STEPS, 2))
+    trajectory = simulate(elbow, rows)
+    data = mujoco.MjData(elbow.mj_model)
+    for k in range(0, STEPS, 7):
+        data.qpos[:] = trajectory.qpos[k]
+        mujoco.mj_kinematics(elbow.mj_model, data)
+        assert trajectory.xpos[k] == pytest.approx(data.xpos, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["spider", "snake"])
+def test_body_positions_of_real_bodies(name):
+    robot = build_robot(body(name), world())
+    qpos = np.random.default_rng(1).normal(size=(5, robot.mj_model.nq)).astype(np.float32)
+    found = jax.jit(lambda q: body_positions(robot, q))(qpos)
+    data = mujoco.MjData(robot.mj_model)
+    for row, places in zip(qpos, found, strict=True):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(robot.mj_model, data)
+        assert places == pytest.approx(data.xpos, abs=1e-5)
+
+
+# ------------------------------------------------------------------------- what goes in
+
+
+def test_all_forms_of_joint_targets(elbow, still):
+    """None, held, a row for each step, and a function of time."""
+    held = simulate(elbow, [0.3, -0.2], SPAN)
+    assert held.ctrl == pytest.approx(np.tile([0.3, -0.2], (STEPS, 1)))
+    rows = simulate(elbow, np.tile([0.3, -0.2], (STEPS, 1)))
+    assert np.array_equal(rows.qpos, held.qpos)
+    timed = simulate(elbow, lambda t: jnp.array([0.3, -0.2]) * (t >= 0), SPAN)
+    assert np.array_equal(timed.qpos, held.qpos)
+    zero = simulate(elbow, [0, 0], SPAN)
+    assert np.array_equal(zero.qpos, still.qpos)
+    assert np.abs(held.qpos - still.qpos).max() > 0.01
+    # The function sees the time at the start of each step.
+    clock = simulate(elbow, lambda t: jnp.array([t, 0.0]), SPAN)
+    assert clock.ctrl[:, 0] == pytest.approx(DT * np.arange(STEPS), abs=1e-7)
+
+
+def test_a_controller_in_a_vacuum_and_for_one_step(arm):
+    """The shortest programs: nothing of them may be left that XLA:CPU aborts over."""
+    controller = make_sine(arm)
+    genes = np.full(controller.num_genes, 0.3)
+    for steps in (1, 3):
+        trajectory = simulate(arm, bind_genes(controller, genes), steps * DT)
+        assert trajectory.qpos.shape[0] == steps and np.all(np.isfinite(trajectory.qpos))
+
+
+@pytest.mark.parametrize("make", [make_cpg, make_sine])
+def test_a_controller_with_its_genes(elbow, make):
+    """Played from its genes, without rows of controls (XLA:CPU has aborted over such a rollout)."""
+    controller = make(elbow)
+    genes = np.random.default_rng(3).normal(size=controller.num_genes)
+    trajectory = simulate(elbow, bind_genes(controller, genes), SPAN)
+    parameters = controller.decode(jnp.asarray(genes, jnp.float32)[:, None], np.arange(2))
+    state, expected = controller.init(parameters), []
+    for k in range(STEPS):
+        state, target = controller.step(parameters, state, jnp.float32(k * DT), None)
+        expected.append(target[:, 0])
+    assert trajectory.ctrl == pytest.approx(np.array(expected), abs=1e-5)
+    # The same as playing the rows back.
+    again = simulate(elbow, trajectory.ctrl)
+    assert np.asarray(again.qpos) == pytest.approx(np.asarray(trajectory.qpos), abs=1e-5)
+
+
+@pytest.mark.slow
+def test_controls_reach_the_hinges_they_name():
+    """MuJoCo's order of hinges is not the population step's: one limb is deeper than the other."""
+    robot = build_robot(
+        read("""
+body:
+  type: Core
+  children:
+    1:
+      id: a
+      type: ActiveHinge
+      children:
+        1:
+          type: FixedBrick
+          children: {1: {id: b, type: ActiveHinge, children: {1: {type: FixedBrick}}}}
+    2: {id: c, type: ActiveHinge, children: {1: {type: FixedBrick}}}
+"""),
+        world(**WATER),
+    )
+    assert [robot.mj_model.actuator(k).name for k in range(3)] == ["a", "b", "c"]
+    trajectory = simulate(robot, [0.1, -0.2, 0.3], 1.0)
+    assert trajectory.ctrl[-1] == pytest.approx([0.1, -0.2, 0.3])
+    assert trajectory.qpos[-1, 7:] == pytest.approx([0.1, -0.2, 0.3], abs=0.01)
+
+
+def test_start_states(elbow):
+    qpos = elbow.start_qpos(2.0)
+    qpos[3:7] = 0, 0, 0, 2.0  # any length: MuJoCo normalises too
+    qvel = np.zeros(8)
+    qvel[0] = 1.0
+    trajectory = simulate(elbow, None, SPAN, qpos=qpos, qvel=qvel)
+    assert trajectory.qpos[0, :3] == pytest.approx([0.005, 0.0, -2.0], abs=1e-3)
+    assert trajectory.qpos[0, 3:7] == pytest.approx([0, 0, 0, 1], abs=1e-2)
+    assert 0.1 < trajectory.qvel[-1, 0] < 1.0
+
+
+def test_a_key_turns_the_start_about_the_vertical(elbow):
+    quats = []
+    for seed in (0, 0, 1):
+        trajectory = simulate(elbow, None, SPAN, key=jax.random.key(seed))
+        assert trajectory.qpos[0, 4:6] == pytest.approx(0.0, abs=1e-3)
+        quats.append(np.asarray(trajectory.qpos[0, 3:7]))
+    assert np.array_equal(quats[0], quats[1])
+    assert np.abs(quats[0] - quats[2]).max() > 0.01
+
+
+def test_water_of_its_own():
+    """A surface below the robot and a current, without compiling the robot anew."""
+    # Trimmed, so that it drifts and does not flutter as it sinks.
+    robot = build_robot(trim_neutral(body("core"), world().density), world(**WATER))
+    dry = simulate(robot, None, SPAN, water=Water(-5.0, (0.0, 0.0, 0.0)))
+    assert dry.qvel[-1, 2] == pytest.approx(-9.81 * SPAN, rel=1e-5)
+    wet = simulate(robot, None, 4.0, water=Water(0.0, (0.2, 0.0, 0.0)))
+    assert 0.15 < wet.qvel[-1, 0] < 0.2  # it drifts along, ever slower to close the gap
+    plain = simulate(robot, None, SPAN)
+    same = simulate(robot, None, SPAN, water=Water(0.0, (0.0, 0.0, 0.0)))
+    assert np.asarray(same.qpos) == pytest.approx(np.asarray(plain.qpos), abs=1e-6)
+
+
+def test_simulate_is_the_population_step_with_one_lane(elbow):
+    trajectory = simulate(elbow, [0.3, -0.2], SPAN)
+    qpos, qvel = elbow.start_qpos()[:, None], np.zeros((8, 1))
+    _, q, v, work = march(elbow, SPAN, qpos, qvel, np.array([[0.3], [-0.2]]), x64=False)
+    assert trajectory.qpos == pytest.approx(q[..., 0], abs=1e-5)
+    assert trajectory.qvel == pytest.approx(v[..., 0], abs=1e-3)
+    assert trajectory.power == pytest.approx(work[:, 0] / DT, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_mjx_behind_the_same_call(elbow):
+    ours = simulate(elbow, [0.3, -0.2], SPAN)
+    mjx = simulate(elbow, [0.3, -0.2], SPAN, engine="mjx")
+    assert np.asarray(mjx.qpos) == pytest.approx(np.asarray(ours.qpos), abs=1e-4)
+    assert np.asarray(mjx.xpos) == pytest.approx(np.asarray(ours.xpos), abs=1e-4)
+    assert np.array_equal(mjx.ctrl, ours.ctrl)
+
+
+# ------------------------------------------------------------------------- wrong inputs
+
+
+WRONG = [
+    ({"ctrl": [0.1]}, "ctrl: expected [2] or [T, 2]; found [1]"),
+    ({"ctrl": np.zeros((4, 3))}, "ctrl: expected [2] or [T, 2]; found [4, 3]"),
+    ({"ctrl": np.zeros((4, 2, 1))}, "ctrl: expected [2] or [T, 2]; found [4, 2, 1]"),
+    ({"ctrl": 0.1}, "ctrl: expected [2] or [T, 2]; found []"),
+    ({"ctrl": "swim"}, "ctrl: expected numbers; found 'swim'"),
+    ({"ctrl": [0.1, math.nan]}, "ctrl: expected finite numbers; found NaN or infinity"),
+    ({"ctrl": lambda t: jnp.zeros(3)}, "ctrl: expected 2 targets; found 3"),
+    (
+        {"ctrl": np.zeros((100, 2)), "duration": 3.0},
+        "duration: expected 0.5 s, as ctrl has 100 rows of 0.005 s; found 3",
+    ),
+    ({"duration": 0}, "duration: expected seconds > 0; found 0"),
+    ({"duration": -1.0}, "duration: expected seconds > 0; found -1.0"),
+    ({"duration": math.nan}, "duration: expected seconds > 0; found nan"),
+    ({"duration": True}, "duration: expected seconds > 0; found True"),
+    ({"duration": "5"}, "duration: expected seconds > 0; found '5'"),
+    ({"qpos": np.zeros(7)}, "qpos: expected shape [9]; found [7]"),
+    ({"qpos": np.zeros((9, 1))}, "qpos: expected shape [9]; found [9, 1]"),
+    ({"qpos": np.full(9, np.inf)}, "qpos: expected finite numbers; found NaN or infinity"),
+    ({"qvel": np.zeros(9)}, "qvel: expected shape [8]; found [9]"),
+    ({"qvel": ["a"] * 8}, f"qvel: expected numbers; found {['a'] * 8}"),
+    ({"engine": "c"}, "engine: expected one of population, mjx; found 'c'"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), WRONG, ids=[m[:40] for _, m in WRONG])
+def test_wrong_inputs(elbow, given, message):
+    with pytest.raises(InputError) as caught:
+        simulate(elbow, **{"duration": SPAN} | given if "ctrl" not in given else given)
+    assert str(caught.value) == message
+
+
+def test_wrong_genes(elbow):
+    controller = make_cpg(elbow)
+    with pytest.raises(InputError, match=r"^genes: expected 3 numbers; found 4$"):
+        simulate(elbow, bind_genes(controller, np.zeros(4)), SPAN)
+    with pytest.raises(InputError, match=r"^genes: expected shape \[-1\]; found \[3, 1\]$"):
+        simulate(elbow, bind_genes(controller, np.zeros((3, 1))), SPAN)
+
+
+# ------------------------------------------------------------------------- transformations
+
+
+def check_gradient(robot, inputs, steps):
+    """In float64 against central differences of a program that is compiled as users' are."""
+
+    def end(inputs):
+        trajectory = simulate(
+            robot,
+            jnp.broadcast_to(inputs["ctrl"], (steps, robot.num_hinges)),
+            qpos=jnp.asarray(robot.qpos0).at[2].set(inputs["height"]),
+            qvel=inputs["qvel"],
+            water=Water(0.0, (inputs["current"], 0.0, 0.0)),
+        )
+        return jnp.sum(trajectory.qpos[-1] ** 2) + trajectory.qvel[-1, 0]
+
+    with jax.enable_x64(True):
+        inputs = jax.tree.map(jnp.asarray, inputs)
+        slope = jax.jit(jax.grad(end), compiler_options=QUICK)
+        value = jax.jit(end, compiler_options=USUAL)
+        flat, build = ravel_pytree(inputs)
+        found = np.asarray(ravel_pytree(slope(inputs))[0])
+        for k in range(len(flat)):
+            step = 1e-6 * (np.arange(len(flat)) == k)
+            ahead, behind = (float(value(build(flat + s * step))) for s in (1, -1))
+            # Differences over 2 µ leave 1e-10 of the value, and what bends within them.
+            assert found[k] == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_gradient_through_a_rollout():
+    """In start, speed and current, while a core drops through the surface."""
+    robot = build_robot(body("core"), world(**WATER))
+    inputs = {
+        "ctrl": np.zeros(0),
+        "height": 0.06,
+        "qvel": np.array([0.1, -0.05, -0.5, 0.1, 0.2, 0.1]),
+        "current": 0.1,
+    }
+    check_gradient(robot, inputs, 40)
+
+
+@pytest.mark.slow
+def test_gradient_through_a_rollout_of_a_jointed_body():
+    """In a joint's target and speed too; half out of the water."""
+    robot = build_robot(
+        read(
+            "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: "
+            "{type: FixedBrick}}}}}"
+        ),
+        world(**WATER),
+    )
+    inputs = {
+        "ctrl": np.array([0.03]),
+        "height": -0.005,
+        "qvel": np.array([0.1, -0.05, 0.02, 0.1, 0.2, 0.1, 0.5]),
+        # Not the body's own speed: there |v|, of which drag's implicit part is made, has its kink.
+        "current": 0.12,
+    }
+    check_gradient(robot, inputs, 20)
+
+
+@pytest.mark.slow
+def test_vmap_over_simulate(core):
+    """A batch by JAX's own hand is what single calls give."""
+    heights = jnp.array([-1.0, -0.01, 0.2])
+    start = jnp.asarray(core.qpos0)
+    run = lambda z: simulate(core, None, SPAN, qpos=start.at[2].set(z)).qpos  # noqa: E731
+    batch = jax.jit(jax.vmap(run), compiler_options=QUICK)(heights)
+    for z, found in zip(heights, batch, strict=True):
+        assert np.asarray(found) == pytest.approx(np.asarray(run(z)), abs=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("engine", "first"),
+    [("population", "float32"), ("population", "float64"), ("mjx", "float64")],
+)
+def test_both_precisions_in_one_process(engine, first):
+    """The second one's program is what it would be alone.
+
+    JAX 0.10.2 keeps one typed copy of a NumPy array that a trace meets, and hands it to the traces
+    of the other mode as well: an index array of 64 bits then ends in an error, a constant in
+    float64 silently has the digits of float32.
+    """
+
+    def program(robot, controller, kind):
+        def end(genes):
+            qpos = jnp.asarray(robot.qpos0).at[2].set(-0.005)
+            trajectory = simulate(
+                robot, bind_genes(controller, genes), 4 * DT, qpos=qpos, engine=engine
+            )
+            return jnp.sum(trajectory.qpos[-1] ** 2)
+
+        with jax.enable_x64(kind == "float64"):
+            jitted = jax.jit(end)
+            return jitted, jitted.lower(jnp.zeros(controller.num_genes)).as_text()
+
+    second = {"float32": "float64", "float64": "float32"}[first]
+    used, fresh = (elbow_robot(world(**WATER)) for _ in range(2))
+    controller = make_cpg(used)
+    # Kept alive, and with it the copies that its trace made.
+    jitted, _ = program(used, controller, first)
+    _, after = program(used, controller, second)
+    assert after == program(fresh, make_cpg(fresh), second)[1]
+    del jitted

@@ -1,0 +1,332 @@
+"""The run folder: atomic files, metrics, checkpoints good and damaged, pictures."""
+
+import csv
+import errno
+import io
+import json
+import os
+import zlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mjx_revolve.episodes.config import make_config
+from mjx_revolve.evolution import runs
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics import runtime
+from mjx_revolve.view import plots
+
+ARRAYS = {
+    "state['algorithm'].mean": np.arange(5, dtype=np.float32),
+    "state['fresh']": np.asarray(False),
+    "counter": np.asarray(7, np.int32),
+    "wide": np.ones((2, 3), np.float64),
+}
+
+
+@pytest.fixture
+def config(tmp_path):
+    (tmp_path / "robot.yaml").write_text("id: robot\n")
+    data = {"morphology": "robot.yaml", "world": "lake", "task": {"type": "speed"}}
+    return make_config(data, tmp_path)
+
+
+@pytest.fixture
+def run(tmp_path, config):
+    run, _ = runs.create_run(tmp_path / "run", config, seed=3)
+    yield run
+    run.close()
+
+
+def save(run, generation, keep=3):
+    run.append_metrics({"generation": generation, "best": 0.1 * generation})
+    return run.save_checkpoint(generation, ARRAYS, {"note": "x"}, keep)
+
+
+# --- the folder ---
+
+
+def test_new_folder(tmp_path, config):
+    run, own = runs.create_run(tmp_path / "a" / "run", config, seed=3, model_hash="ab")
+    assert own.morphology == str(tmp_path / "a" / "run" / "inputs" / "robot.yaml")
+    assert run.info == {"seed": 3, "model_hash": "ab"}
+    assert "morphology: inputs/robot.yaml" in (run.folder / "config.yaml").read_text()
+    run.close()
+    # The folder can be moved, and the original may go.
+    (tmp_path / "robot.yaml").unlink()
+    os.rename(run.folder, tmp_path / "moved")
+    with_moved = runs.open_run(tmp_path / "moved")
+    assert with_moved.load_config().task.type == "speed"
+    with_moved.close()
+
+
+def test_full_folder_is_refused(tmp_path, config):
+    (tmp_path / "run").mkdir()
+    run, _ = runs.create_run(tmp_path / "run", config)  # empty is fine
+    run.close()
+    with pytest.raises(InputError, match="found files; continue it with --resume"):
+        runs.create_run(tmp_path / "run", config)
+    with pytest.raises(InputError, match="expected a new or empty folder; found a file"):
+        runs.check_new_folder(tmp_path / "robot.yaml")
+
+
+def test_only_run_folders_open(tmp_path):
+    with pytest.raises(InputError, match="nowhere: expected a run folder; found none"):
+        runs.open_run(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"expected a run folder; found no config.yaml in it"):
+        runs.open_run(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="expected a run folder; found a file"):
+        runs.open_run(tmp_path / "file")
+
+
+def test_one_process_at_a_time(run):
+    with pytest.raises(InputError, match="expected a run that has stopped; found it running"):
+        runs.open_run(run.folder)
+    run.close()
+    runs.open_run(run.folder).close()
+
+
+def test_info_is_json(run):
+    run.update_info(seed=None, finished="now")
+    assert json.loads((run.folder / "run.json").read_text()) == {"finished": "now"}
+    (run.folder / "run.json").write_text("{")
+    with pytest.raises(InputError, match=r"run.json: expected JSON; found"):
+        _ = run.info
+
+
+# --- files ---
+
+
+def test_a_failed_write_leaves_the_old_file(run):
+    path = run.write("note.txt", b"old")
+
+    def fail(path):
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left") as caught:
+        run.write("note.txt", fail)
+    assert caught.value.filename == str(path)
+    assert path.read_bytes() == b"old"
+    assert not list(run.folder.glob(".*note.txt"))
+
+
+# --- metrics ---
+
+
+def test_metrics_are_rfc_4180_at_any_time(run):
+    for generation in (1, 2):
+        run.append_metrics({"generation": generation, "best, so far": np.float32(0.1) * generation})
+        text = run.metrics_path.read_bytes().decode()
+        assert text.endswith("\r\n")
+        assert len(list(csv.reader(io.StringIO(text)))) == generation + 1
+    read = run.load_metrics()
+    assert list(read) == ["generation", "best, so far"]
+    # Enough digits to get the same float32 back.
+    assert np.array_equal(read["best, so far"].astype(np.float32), np.float32([0.1, 0.2]))
+
+
+def test_pandas_reads_metrics(run):
+    pandas = pytest.importorskip("pandas")
+    run.append_metrics({"generation": 1, "best": float("nan")})
+    run.append_metrics({"generation": 2, "best": -1e-12})
+    frame = pandas.read_csv(run.metrics_path)
+    assert frame["generation"].tolist() == [1, 2]
+    assert np.isnan(frame["best"][0])
+    assert frame["best"][1] == -1e-12
+
+
+def test_an_incomplete_last_line_is_left_out(run):
+    run.append_metrics({"generation": 1, "best": 2.0})
+    with open(run.metrics_path, "ab") as file:
+        file.write(b"2,3.")
+    assert run.load_metrics()["generation"].tolist() == [1]
+
+
+@pytest.mark.parametrize("text", ["a,b\r\n1,x\r\n", "a,b\r\n1\r\n"])
+def test_broken_metrics(tmp_path, text):
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(InputError, match=r"m.csv: expected a number in every cell"):
+        runs.load_metrics(tmp_path / "m.csv")
+
+
+def test_missing_metrics(tmp_path):
+    with pytest.raises(InputError, match=r"m.csv: expected a file; found none"):
+        runs.load_metrics(tmp_path / "m.csv")
+
+
+# --- checkpoints ---
+
+
+def test_checkpoint_keeps_every_bit_and_dtype(run):
+    save(run, 5)
+    checkpoint = run.load_checkpoint()
+    assert checkpoint.meta["generation"] == 5
+    assert checkpoint.meta["note"] == "x"
+    assert checkpoint.damaged == ()
+    assert set(checkpoint.arrays) == set(ARRAYS)
+    for name, value in ARRAYS.items():
+        found = checkpoint.arrays[name]
+        assert (found.dtype, found.shape) == (value.dtype, value.shape)
+        assert found.tobytes() == value.tobytes()
+
+
+def test_only_the_newest_stay(run):
+    for generation in range(1, 6):
+        save(run, generation, keep=2)
+    names = [path.name for path in run.checkpoints()]
+    assert names == ["generation_000005.npz", "generation_000004.npz"]
+
+
+def flip(data, at):
+    return data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: b"",
+        lambda data: data[: len(data) // 2],
+        lambda data: data[:-1],
+        lambda data: b"\0" * len(data),
+        lambda data: flip(data, data.index(ARRAYS["state['algorithm'].mean"].tobytes()) + 5),
+        lambda data: flip(data, 200),
+    ],
+    ids=["empty", "half", "one byte short", "zeros", "bit in an array", "bit in the meta"],
+)
+def test_a_damaged_checkpoint_is_passed_over(run, damage):
+    save(run, 1)
+    newest = save(run, 2)
+    newest.write_bytes(damage(newest.read_bytes()))
+    checkpoint = run.load_checkpoint()
+    assert checkpoint.meta["generation"] == 1
+    assert len(checkpoint.damaged) == 1
+    assert checkpoint.damaged[0].startswith("generation_000002.npz (")
+
+
+def test_pickles_are_not_read(run):
+    save(run, 1)
+    path = run.folder / "checkpoints" / "generation_000002.npz"
+    np.savez(path, meta=np.array([{"a": 1}], object))
+    assert run.load_checkpoint().meta["generation"] == 1
+
+
+def test_no_usable_checkpoint(run):
+    with pytest.raises(InputError, match="checkpoints: expected a checkpoint to resume from; "
+                       "found none"):  # fmt: skip
+        run.load_checkpoint()
+    save(run, 1).write_bytes(b"x")
+    with pytest.raises(InputError, match=r"found only damaged ones: generation_000001.npz"):
+        run.load_checkpoint()
+
+
+def test_rewind_forgets_what_came_later(run):
+    save(run, 1)
+    text = run.metrics_path.read_bytes()
+    newest = save(run, 2)
+    newest.write_bytes(b"x")
+    (run.folder / "checkpoints" / ".123-generation_000003.npz").touch()
+    run.append_metrics({"generation": 3, "best": 1.0})
+    run.rewind(run.load_checkpoint())
+    assert run.metrics_path.read_bytes() == text
+    assert [path.name for path in run.checkpoints()] == ["generation_000001.npz"]
+    assert not list((run.folder / "checkpoints").glob(".*"))
+
+
+def test_a_checkpoint_ahead_of_its_metrics_is_passed_over(run):
+    save(run, 1)
+    length = run.metrics_path.stat().st_size
+    save(run, 2)
+    os.truncate(run.metrics_path, length)
+    checkpoint = run.load_checkpoint()
+    assert checkpoint.meta["generation"] == 1
+    assert "metrics.csv lacks lines" in checkpoint.damaged[0]
+
+
+# --- champion ---
+
+
+def test_champion_genes_come_back_bit_for_bit(run):
+    genes = np.random.default_rng(0).normal(size=30).astype(np.float32)
+    run.save_champion(genes, score=0.25, origin="test")
+    for place in (run.folder, run.folder / "champion", run.folder / "champion" / "genes.yaml"):
+        assert runs.load_genes(place).tobytes() == genes.tobytes()
+    (run.folder / "champion" / "genes.yaml").write_text("genes: [1, a]")
+    with pytest.raises(InputError, match=r"genes.yaml: genes: expected a list of numbers; found"):
+        runs.load_genes(run.folder)
+    with pytest.raises(InputError, match=r"genes.yaml: expected a file; found none"):
+        runs.load_genes(run.folder / "inputs")
+
+
+# --- the compilation cache ---
+
+
+def test_half_written_cache_entries_are_removed_once(tmp_path):
+    whole = zlib.compress(os.urandom(1000))
+    entries = {"whole-cache": whole, "empty-cache": b"", "half-cache": whole[:500], "other": b""}
+    for name, data in entries.items():
+        (tmp_path / name).write_bytes(data)
+    assert runtime.remove_broken_entries(tmp_path) == ["empty-cache", "half-cache"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".checked", "other", "whole-cache"]
+    assert runtime.remove_broken_entries(tmp_path) == []
+    (tmp_path / "late-cache").write_bytes(whole[:500])
+    assert runtime.remove_broken_entries(tmp_path) == ["late-cache"]
+
+
+def test_cache_folder_is_absolute_and_names_the_jaxlib(monkeypatch, tmp_path):
+    import jaxlib
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = runtime.cache_folder()
+    assert folder.is_absolute()
+    assert folder.is_relative_to(tmp_path / "mjx_revolve" / "xla")
+    assert folder.name.startswith(jaxlib.__version__)
+
+
+# --- pictures ---
+
+
+def swim(depth, steps=200):
+    time = np.arange(steps) * 0.05
+    path = np.stack([0.1 * time, 0.05 * np.sin(time), -depth + 0 * time], axis=-1)
+    return SimpleNamespace(time=time, xpos=np.stack([0 * path, path], axis=1))
+
+
+@pytest.mark.parametrize("generations", [1, 2, 40])
+def test_fitness_plot(generations):
+    column = np.linspace(0.1, 0.2, generations)
+    names = ("best", "mean", "std", "champion", "step_size", "energy_j", "speed_bl_s")
+    metrics = {"generation": np.arange(generations) + 1.0} | dict.fromkeys(names, column)
+    if generations > 2:
+        metrics["mean"] = np.where(np.arange(generations) == 3, np.nan, column)
+    figure = plots.plot_fitness(metrics, "title", "fitness (m/s)")
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels[0] == "fitness (m/s)"
+    assert labels[1].startswith("speed\n(body lengths/s)")
+    assert figure.axes[0].get_xlabel() == "generation"
+    assert plots.figure_png(figure).startswith(b"\x89PNG")
+
+
+def test_trajectory_plot():
+    figure = plots.plot_trajectory(swim(depth=2.0), surface_height=0.0)
+    above, side, _, depth, speed = figure.axes
+    assert (above.get_xlabel(), above.get_ylabel()) == ("x (m)", "y (m)")
+    assert (side.get_xlabel(), side.get_ylabel()) == ("x (m)", "z (m)")
+    assert above.get_aspect() == side.get_aspect() == 1.0
+    assert np.allclose(depth.lines[0].get_ydata(), 2.0)
+    # Over one second the wiggle and the edges hardly count: 0.1 m/s along x, up to 0.05 along y.
+    smooth = speed.lines[1].get_ydata()
+    assert smooth.min() >= 0.1 and smooth.max() < np.hypot(0.1, 0.05) + 1e-6
+    assert plots.figure_png(figure).startswith(b"\x89PNG")
+
+
+def test_trajectory_plot_shows_a_near_surface():
+    side = plots.plot_trajectory(swim(depth=0.1), surface_height=0.0).axes[1]
+    assert any(text.get_text() == "water surface" for text in side.texts)
+
+
+def test_trajectory_plot_of_almost_nothing():
+    figure = plots.plot_trajectory(swim(depth=0.0, steps=2))
+    assert plots.figure_png(figure).startswith(b"\x89PNG")

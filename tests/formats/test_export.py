@@ -1,0 +1,138 @@
+"""The command that writes robots and rollouts for other programs."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import importlib.util
+
+import mujoco
+import pytest
+
+from exports import ODD, odd_episode
+from mjx_revolve.episodes import champion as episodes
+from mjx_revolve.evolution import runs
+from mjx_revolve.export import main
+from mjx_revolve.inputs.commands import run_command
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return odd_episode()
+
+
+@pytest.mark.slow
+def test_command_simulates_a_morphology(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("rosbags", reason="the package rosbags writes bags")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "odd.yaml").write_text(ODD)
+    code, out, _ = run(capsys, "odd.yaml", "--duration", "0.2", "--out", "x", "--seed", "3")
+    assert code == 0
+    assert "ROS 2 bag: 0.2 s, 20 poses of 3 links" in out
+
+
+@pytest.fixture
+def quick(monkeypatch, episode, tmp_path):
+    """The command without its seconds of compiling, in a folder of its own."""
+    monkeypatch.setattr(episodes, "load_episode", lambda *_: episode)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "odd.yaml").touch()
+    (tmp_path / "run").mkdir()
+    return tmp_path
+
+
+def run(capsys, *arguments):
+    code = run_command(main, [str(one) for one in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_command_writes_everything_once(quick, capsys):
+    pytest.importorskip("rosbags", reason="the package rosbags writes bags")
+    code, out, err = run(capsys, "odd.yaml")
+    assert (code, err) == (0, "")
+    folder = quick / "odd <one>_export"
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"robot.xml", "robot.urdf", "robot.sdf", "rollout.mcap", "meshes"}
+    assert len(out.splitlines()) == 5
+    mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    mujoco.MjModel.from_xml_path(str(folder / "robot.urdf"))  # finds its meshes
+    code, _, err = run(capsys, "odd.yaml")
+    assert code == 2 and err.startswith("error: odd <one>_export: expected no such folder yet")
+    assert run(capsys, "odd.yaml", "--out", folder)[0] == 0  # by name, it may
+
+
+def test_command_writes_only_what_is_named(quick, capsys):
+    code, _, _ = run(capsys, "odd.yaml", "--mjcf", quick / "new" / "a.xml")
+    assert code == 0
+    assert [path.name for path in quick.rglob("*.xml")] == ["a.xml"]
+
+
+def test_command_puts_a_champions_files_into_its_run(quick, capsys, monkeypatch, episode):
+    champion = dataclasses.replace(episode, folder=quick / "run", fitness=object())
+    monkeypatch.setattr(episodes, "load_episode", lambda *_: champion)
+    assert run(capsys, "run")[0] == 0
+    assert (quick / "run" / "export" / "robot.urdf").is_file()
+
+
+def test_command_without_rosbags(quick, capsys, monkeypatch):
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *a: None if name == "rosbags" else real(name, *a)
+    )
+    code, out, err = run(capsys, "odd.yaml", "--out", "here")
+    assert code == 0 and "rollout.mcap" not in out
+    assert err.startswith("no bag: --mcap: expected the package rosbags; found none (pip install")
+    code, _, err = run(capsys, "odd.yaml", "--mcap", "a.mcap")
+    assert code == 2 and err.startswith("error: --mcap: expected the package rosbags")
+
+
+WRONG = [
+    ([], "the following arguments are required: path (see --help)"),
+    (
+        ["a.yaml", "--mjcf", "a.txt"],
+        "--mjcf a.txt: expected a name that ends in .xml; found '.txt'",
+    ),
+    (["a.yaml", "--urdf", "a"], "--urdf a: expected a name that ends in .urdf; found ''"),
+    (["a.yaml", "--sdf", "a.x"], "--sdf a.x: expected a name that ends in .sdf or .world; found"),
+    (["a.yaml", "--mcap", "a.bag"], "--mcap a.bag: expected a name that ends in .mcap; found"),
+    (["a.yaml", "--mjcf", "dir.xml"], "--mjcf dir.xml: expected a file; found a folder"),
+    (["a.yaml", "--out", "file"], "--out file: expected a folder; found a file"),
+    (["a.yaml", "--out", "b", "--sdf", "a.sdf"], "--out: expected a folder or single files; found"),
+    (["a.yaml", "--duration", "x"], "--duration: expected seconds > 0; found 'x' (see --help)"),
+    (["a.yaml", "--duration", "0"], "--duration: expected seconds > 0; found '0'"),
+    (["a.yaml", "--duration", "nan"], "--duration: expected seconds > 0; found 'nan'"),
+    (
+        ["a.yaml", "--seed", "1.5"],
+        "--seed: expected a whole number from 0 to 4294967295; found",
+    ),
+    (["a.yaml", "--out", "file/a"], "--out file/a: expected the folder file; found a file"),
+    (["a.yaml", "--mjcf", "file/a.xml"], "--mjcf file/a.xml: expected the folder file; found a"),
+    (["none.yaml"], "none.yaml: expected a run folder, a genes.yaml or a morphology; found none"),
+    (["run", "--world", "lake"], "world: expected none: a champion swims in the world it evolved"),
+    (["other.yaml"], "other.yaml: expected a run folder, a champion's genes.yaml or a morphology"),
+    (["dir.xml"], "dir.xml: expected a run folder; found no config.yaml in it"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG)
+def test_command_refuses_in_one_line(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dir.xml").mkdir()
+    (tmp_path / "file").write_text("")
+    (tmp_path / "other.yaml").write_text("a: 1\n")
+    (tmp_path / "run" / "champion").mkdir(parents=True)
+    (tmp_path / "run" / "champion" / "genes.yaml").write_text("genes: [0]\n")
+    code, _, err = run(capsys, *arguments)
+    assert code == 2
+    assert err.startswith(f"error: {message}")
+    assert len(err.splitlines()) == 1
+
+
+def test_command_names_what_the_disk_refuses(quick, capsys, monkeypatch):
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(runs, "write_atomic", full)
+    code, _, err = run(capsys, "odd.yaml", "--mjcf", "a.xml")
+    assert (code, err) == (1, "error: a.xml: No space left on device\n")

@@ -1,0 +1,129 @@
+"""What all command lines share: quick help, complaints in one line, exit codes."""
+
+import argparse
+import errno
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mjx_revolve.inputs.commands import (
+    Parser,
+    check_place,
+    read_path,
+    read_seconds,
+    run_command,
+    whole,
+)
+from mjx_revolve.inputs.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("evolve", "--resume DIR"),
+        ("export", "--mcap FILE.mcap"),
+        ("inspect", "--picture OUT.png"),
+        ("replay", "--size WIDTHxHEIGHT"),
+        ("report", "RUN [RUN ...]"),
+        ("viewer", "--out FILE.html"),
+    ],
+)
+def test_help_loads_nothing_heavy(name, words):
+    heavy = {"jax", "mujoco", "matplotlib", "scipy"}
+    # BLAS's threads are set before NumPy is loaded, where results depend on them.
+    heavy |= set() if name in ("inspect", "viewer") else {"numpy"}
+    code = (
+        f"import sys; from mjx_revolve import {name}\n"
+        f"try: {name}.main(['--help'])\n"
+        "except SystemExit: pass\n"
+        f"assert not {heavy} & set(sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert words in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["a", "--fast"], "unrecognized arguments: --fast (see --help)"),
+        ([], "the following arguments are required: path (see --help)"),
+        ([""], "path: expected a path; found '' (see --help)"),
+        (["a", "--duration"], "--duration: expected one argument (see --help)"),
+        (["a", "--duration", "-1"], "--duration: expected seconds > 0; found '-1' (see --help)"),
+        (["a", "--duration", "inf"], "--duration: expected seconds > 0; found 'inf' (see --help)"),
+        (["a", "--duration", "1e300"], "--duration: expected at most 86400 s; found '1e300' (see"),
+        (
+            ["a", "--rate", "0"],
+            "--rate: expected a whole number from 1 to 9; found '0' (see --help)",
+        ),
+        (["a", "--rate", "3.0"], "--rate: expected a whole number from 1 to 9; found '3.0' (see"),
+        (["a", "--rate", "²"], "--rate: expected a whole number from 1 to 9; found '²' (see"),
+        (["a", "--count", "0"], "--count: expected a whole number >= 1; found '0' (see --help)"),
+        (["a", "--count", "9" * 5000], "--count: expected a whole number >= 1; found '999"),
+    ],
+)
+def test_wrong_arguments_are_one_line_and_code_2(argv, message, capsys):
+    parser = Parser()
+    parser.add_argument("path", type=read_path)
+    parser.add_argument("--duration", type=read_seconds)
+    parser.add_argument("--rate", type=whole(1, 9))
+    parser.add_argument("--count", type=whole(1))
+    assert run_command(lambda argv: parser.parse_args(argv) and 0, argv) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"error: {message}") and captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_right_arguments():
+    assert read_seconds("1e-3") == 0.001
+    assert whole(1, 9)(" 7 ") == 7
+    with pytest.raises(argparse.ArgumentTypeError):
+        read_seconds("nan")
+
+
+FULL = OSError(errno.ENOSPC, "No space left on device", "a.xml")
+LARGE = RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 64 bytes.\nmore")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (InputError("a.yaml: expected a file; found none"), 2, "error: a.yaml: expected a file; "),
+        (FULL, 1, "error: a.xml: No space left on device\n"),
+        (OSError("cannot\nwrite"), 1, "error: cannot write\n"),
+        (TimeoutError(), 1, "error: TimeoutError\n"),
+        (LARGE, 1, "error: too little memory: Out of memory allocating 64 bytes.\n"),
+        (MemoryError(), 1, "error: too little memory: none is left\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+    ],
+)
+def test_what_is_no_fault_of_ours_is_one_line(error, code, line, capsys):
+    def main(argv):
+        raise error
+
+    assert run_command(main, []) == code
+    written = capsys.readouterr().err
+    assert written.startswith(line) and written.count("\n") == 1
+
+
+def test_our_own_faults_keep_their_traceback():
+    with pytest.raises(ZeroDivisionError):
+        run_command(lambda argv: 1 // 0, [])
+
+
+def test_places_that_cannot_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    check_place(tmp_path / "new" / "deep" / "a.xml", "--out")
+    for place in ("file/a.xml", "file/new/a.xml"):
+        with pytest.raises(InputError, match=r"^--out: expected the folder .*file; found a file$"):
+            check_place(tmp_path / place, "--out")
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(InputError, match=r"^--out: expected a folder to write into; found .* read"):
+        check_place(tmp_path / "a.xml", "--out")

@@ -1,0 +1,323 @@
+"""Tasks and controllers in users' own files: every mistake is one line, and runs keep the code."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from laboratory import _ELBOW as ELBOW
+from mjx_revolve import evolve
+from mjx_revolve.episodes.config import load_config, override_config
+from mjx_revolve.episodes.fitness import make_fitness
+from mjx_revolve.episodes.tasks import TASKS, UNITS, score_unit
+from mjx_revolve.evolution import runs
+from mjx_revolve.evolution.fingerprints import settings_hash
+from mjx_revolve.inputs import own_code
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.report.data import read_run
+from mjx_revolve.view.report.groups import group_runs
+from mjx_revolve.view.report.repeat import repeat_commands
+
+OWN = '''
+"""A task and a controller of one's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.control.controllers import Controller
+
+
+@dataclass(frozen=True)
+class Wish:
+    height: float
+
+
+def rise(track, settings):
+    """How far the robot ends above where it began, beyond a wish [m]. Not [kg].
+
+    Further [words].
+    """
+    wish = Wish(settings.params.get("height", 0.0))
+    return track.position[-1, 2] - track.start_height - wish.height
+
+
+def bare(track, settings):
+    return rise(track, settings)
+
+
+def make_hold(robot, settings):
+    """Each actuator holds an angle of its own."""
+    n = robot.mj_model.nu
+    reach = settings.amplitude * robot.mj_model.actuator_ctrlrange[:, 1:]
+
+    def decode(genes, order):
+        return (jnp.asarray(reach, genes.dtype) * jnp.sin(genes))[np.asarray(order)]
+
+    def step(parameters, state, time, sense):
+        return state + 1, parameters + 0 * state
+
+    names = tuple(f"angle {i}" for i in range(n))
+    return Controller(n, names, decode, lambda parameters: jnp.zeros_like(parameters[0]), step)
+'''
+SETTINGS = {
+    "morphology": "elbow.yaml",
+    "world": "lake",
+    "controller": {"type": "mine/own.py:make_hold"},
+    "task": {"type": "mine/own.py:rise", "duration": 0.2, "settle": 0.0, "trials": 1},
+    "evolution": {"population_size": 4, "generations": 2, "checkpoint_every": 1},
+}
+GENES = jnp.array([[0.3, -0.7], [0.0, 0.0]])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A configuration that names own code; the current folder is its folder."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "own.py").write_text(OWN)
+    (tmp_path / "elbow.yaml").write_text(ELBOW)
+    (tmp_path / "swim.yaml").write_text(json.dumps(SETTINGS))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """The fitness of such a configuration, compiled once."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "mine").mkdir()
+    (folder / "mine" / "own.py").write_text(OWN)
+    (folder / "elbow.yaml").write_text(ELBOW)
+    (folder / "swim.yaml").write_text(json.dumps(SETTINGS))
+    return make_fitness(folder / "swim.yaml", **{"task.params": {"height": 0.25}})
+
+
+# ------------------------------------------------------------------------- what they do
+
+
+def test_an_own_task_scores_what_an_own_controller_does(lab):
+    scores, measures = lab.evaluate(GENES, jax.random.key(0))
+    # In a fifth of a second the robot sinks by some millimetres below where it began.
+    fallen = np.asarray(measures["depth_error_m"])
+    assert (fallen > 1e-4).all() and (fallen < 0.05).all()
+    assert (np.asarray(scores) < -0.25 - fallen).all()
+    assert (np.asarray(scores) > -0.25 - 2 * fallen).all()
+
+
+def test_targets_stand_in_the_order_that_is_asked_for(lab):
+    reach = lab.robot.mj_model.actuator_ctrlrange[:, 1]
+    angles = reach * np.sin(np.asarray(GENES[0]))
+    for order in ([0, 1], [1, 0]):
+        parameters = lab.controller.decode(GENES.T, np.array(order))
+        state = lab.controller.init(parameters)
+        _, targets = lab.controller.step(parameters, state, 0.0, None)
+        assert np.asarray(targets)[:, 0] == pytest.approx(angles[order], rel=1e-6)
+
+
+def test_units_are_those_of_the_docstrings(folder):
+    path = folder / "mine" / "own.py"
+    assert score_unit(f"{path}:rise") == "kg"  # the last brackets of the first line
+    assert score_unit(f"{path}:bare") == score_unit(f"{path}:none") == score_unit("gone.py:x") == ""
+    for name, task in TASKS.items():
+        assert f"[{UNITS[name]}]" in task.__doc__.splitlines()[0]
+
+
+def test_a_changed_file_is_read_anew_and_an_unchanged_one_is_not(folder):
+    name = f"{folder / 'mine' / 'own.py'}:rise"
+    first = own_code.load_own(name, "task.type")
+    assert own_code.load_own(name, "task.type") is first
+    (folder / "mine" / "own.py").write_text(OWN.replace("wish.height", "2 * wish.height"))
+    assert own_code.load_own(name, "task.type") is not first
+
+
+# ------------------------------------------------------------------------- mistakes
+
+
+def check_line(message, action):
+    with pytest.raises(InputError) as caught:
+        action()
+    assert "\n" not in str(caught.value)
+    assert message in str(caught.value), str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "swim.yaml: task.type: expected a function rise in {own}; found no function in it"),
+        ("def up(track, settings): pass\nfrom math import sin",
+         "task.type: expected a function rise in {own}; found only up"),
+        ("rise = 3", "task.type: expected a function rise in {own}; found 3"),
+        ("x = 1\ny = x +\n", "{own}: line 2: expected Python that runs; found SyntaxError"),
+        ("\0", "{own}: "),
+        ("import jax\n\nfrom nowhere import nothing", "{own}: line 3: expected Python that runs; "
+         "found ModuleNotFoundError: No module named 'nowhere'"),
+        ("x = 1\nx.y\n", "{own}: line 2: expected Python that runs; found AttributeError: 'int'"),
+        ("raise SystemExit(3)", "{own}: line 1: expected Python that runs; found SystemExit: 3"),
+        ("raise ValueError('two\\nlines')", "found ValueError: two"),
+        ("assert False", "{own}: line 1: expected Python that runs; found AssertionError"),
+        ("def rise(track):\n    return 0", "{own}: expected rise to score a track; found "
+         "TypeError: rise() takes 1 positional argument but 2 were given"),
+        ("def rise(track, settings):\n    return track.height", "{own}: line 2: expected rise to "
+         "score a track; found AttributeError: 'Track' object has no attribute 'height'"),
+        ("def rise(track, settings):\n    return track.position[:, 2]", "{own}: rise: expected a "
+         "score for each lane, [3] for a position of [7, 3, 3]; found [7, 3]"),
+        ("def rise(track, settings):\n    return 1.0", "expected a score for each lane, [3] for a "
+         "position of [7, 3, 3]; found []"),
+        ("def rise(track, settings):\n    return None", "found <class 'NoneType'>"),
+        ("def rise(track, settings):\n    return settings.params['far']", "{own}: line 2: expected "
+         "rise to score a track; found KeyError: 'far'"),
+        ("def rise(track, settings):\n    if track.energy[0, 0] > 1:\n        return 0",
+         "{own}: line 2: expected rise to score a track; found TracerBoolConversionError"),
+        ("from mjx_revolve import InputError\ndef rise(track, settings):\n"
+         "    raise InputError('params.far: expected a number; found none')",
+         "{own}: params.far: expected a number; found none"),
+    ],
+)  # fmt: skip
+def test_wrong_tasks(folder, text, message):
+    own = folder / "mine" / "task.py"
+    own.write_text(text)
+    settings = {"task.type": "mine/task.py:rise"}
+    check_line(message.format(own=own), lambda: make_fitness("swim.yaml", **settings))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("def make_hold", "def make_other", "controller.type: expected a function make_hold in "
+         "{own}; found only rise, bare, make_other"),
+        ("return Controller(n, names, decode", "return (n, names, decode",
+         "{own}: make_hold: expected a Controller; found tuple"),
+        ("Controller(n,", "Controller(n + 1,", "{own}: make_hold: gene_names: expected 3 of them, "
+         "as num_genes says; found 2"),
+        ("Controller(n,", "Controller(n + 0.5,", "{own}: make_hold: num_genes: expected a whole "
+         "number >= 0; found 2.5"),
+        ("parameters + 0 * state", "parameters[0]", "{own}: make_hold: step: expected targets "
+         "[nu, lanes], here [2, 3]; found [3]"),
+        ("parameters + 0 * state", "None", "step: expected targets [nu, lanes], here [2, 3]; found "
+         "NoneType"),
+        ("return state + 1,", "return parameters,", "{own}: make_hold: step: expected a state of "
+         "the shapes that init gives, float32[3]; found float32[2, 3]"),
+        ("jnp.sin(genes)", "jnp.sin(gene)", "{own}: line 38: expected make_hold's decode, init and "
+         "step to give targets; found NameError: name 'gene' is not defined"),
+        ("n = robot", "n = robots", "{own}: line 34: expected make_hold to make a controller; "
+         "found NameError: name 'robots' is not defined"),
+        ("jnp.sin(genes)", "genes[[0, 1, 2]]", "{own}: line 38: expected make_hold's decode"),
+    ],
+)  # fmt: skip
+def test_wrong_controllers(folder, old, new, message):
+    own = folder / "mine" / "own.py"
+    assert old in OWN
+    own.write_text(OWN.replace(old, new))
+    check_line(message.format(own=own), lambda: make_fitness("swim.yaml"))
+
+
+def test_the_command_says_so_in_one_line(folder, capsys):
+    (folder / "mine" / "own.py").write_text("rise = 3\nmake_hold = 3")
+    assert run_command(evolve.main, ["swim.yaml", "--workers", "1"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: swim.yaml: controller.type: expected a function make_hold in ")
+    assert error.count("\n") == 1
+    assert not (folder / "runs").exists()
+
+
+# ------------------------------------------------------------------------- runs
+
+
+def test_a_run_keeps_the_code(folder):
+    config = load_config("swim.yaml")
+    run, kept = runs.create_run("run", config, config_file=str(folder / "swim.yaml"), settings=[])
+    run.close()
+    copy = folder / "run" / "inputs" / "own.py"
+    assert copy.read_text() == OWN
+    assert kept.task.type == f"{copy}:rise" and kept.controller.type == f"{copy}:make_hold"
+    assert settings_hash(kept) == settings_hash(config)
+    text = (folder / "run" / "config.yaml").read_text()
+    assert "type: inputs/own.py:rise" in text and "type: inputs/own.py:make_hold" in text
+    shutil.move("run", "moved")
+    again = load_config("moved/config.yaml")
+    assert again.task.type == f"{folder / 'moved' / 'inputs' / 'own.py'}:rise"
+    assert settings_hash(again) == settings_hash(config)
+    # The command that began it is told as long as the file is what it was.
+    record = read_run("moved")
+    assert record.unit == "kg" and record.task.startswith("rise ")
+    assert len(repeat_commands(record)) == 2
+    before = settings_hash(config)
+    (folder / "mine" / "own.py").write_text(OWN + "\n")
+    assert settings_hash(load_config("swim.yaml")) != before
+    assert len(repeat_commands(record)) == 1
+
+
+def test_two_files_of_one_name_are_both_kept(folder):
+    (folder / "own.py").write_text(OWN + "# another\n")
+    config = override_config(load_config("swim.yaml"), {"task.type": str(folder / "own.py:rise")})
+    run, kept = runs.create_run("run", config)
+    run.close()
+    assert kept.controller.type.endswith("inputs/own.py:make_hold")
+    assert kept.task.type.endswith("inputs/task_own.py:rise")
+    assert (folder / "run" / "inputs" / "task_own.py").read_text().endswith("# another\n")
+
+
+def test_reports_group_runs_by_what_the_code_says(folder):
+    for name, text in (("a", OWN), ("b", OWN), ("c", OWN + "\n")):
+        (folder / "mine" / "own.py").write_text(text)
+        runs.create_run(name, load_config("swim.yaml"))[0].close()
+    groups = group_runs([read_run(name) for name in "abc"])
+    assert [len(group.records) + len(group.copies) for group in groups] == [2, 1]
+    assert groups[0].task != groups[1].task
+
+
+def test_a_lost_file_is_told_and_the_rest_is_read(folder):
+    runs.create_run("run", load_config("swim.yaml"))[0].close()
+    (folder / "run" / "inputs" / "own.py").unlink()
+    record = read_run("run")
+    assert record.config is None
+    assert any(
+        "controller.type: expected a file; found none at inputs/own.py" in problem.text
+        for problem in record.problems
+    )
+
+
+@pytest.mark.slow
+def test_evolving_with_workers_and_resuming(folder):
+    """In processes of its own: workers get the code, the run folder keeps it, and goes on."""
+
+    def command(*words):
+        run = [sys.executable, "-m", "mjx_revolve.evolve", *words]
+        there = {**os.environ, "PYTHONPATH": str(Path(own_code.__file__).parents[2])}
+        return subprocess.run(run, capture_output=True, text=True, cwd=folder, env=there)
+
+    many = ["--set", "task.trials=16", "--set", "evolution.population_size=8"]  # two blocks
+    done = command("swim.yaml", *many, "--out", "run", "--workers", "2")
+    assert done.returncode == 0, done.stderr
+    assert "rise in lake" in done.stdout and " kg over 16 fresh starts" in done.stdout
+    assert "2 workers" in done.stdout
+    facts = json.loads((folder / "run" / "run.json").read_text())["champion"]
+    assert (facts["task"], facts["controller"]) == ("rise", "make_hold")
+    (folder / "mine" / "own.py").rename(folder / "mine" / "old.py")
+    done = command("--resume", "run", "--workers", "1")
+    assert done.returncode == 0 and "finished after 2 generations" in done.stdout, done.stderr
+
+
+def test_only_the_same_code_goes_on_with_a_run(folder):
+    config = load_config("swim.yaml")
+    run, kept = runs.create_run("run", config)
+    run.close()
+    evolve._check_unchanged(kept, config, "--resume run")
+    (folder / "mine" / "own.py").write_text(OWN + "\n")
+    check_line(
+        "--resume run: controller.type: expected '",
+        lambda: evolve._check_unchanged(kept, config, "--resume run"),
+    )

@@ -1,0 +1,100 @@
+"""The compiler tricks: identities to JAX, and noticed when XLA stops taking them."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_revolve.numerics import xla
+from mjx_revolve.numerics.xla import derived_by, fused_scan, on_cpu, over_chunks, share_once
+
+LANES = jnp.linspace(-1, 1, 64, dtype=jnp.float32)
+
+
+def step(x):
+    """A value that several others use, several times over: what a tree recursion is made of."""
+    for _ in range(6):
+        y = jnp.sqrt(x * x + 1) / (1 + 0.1 * x)
+        x = jnp.clip(y * y - y * x + 0.5 * x, -2, 2)
+    return x
+
+
+def rolled(x, body):
+    return jax.lax.scan(lambda s, _: (body(s), None), x, None, length=5)[0]
+
+
+def fused(x):
+    """Steps of a carry with leaves of several shapes, and rows that come in and go out."""
+
+    def turn(carry, row):
+        x, (y, count) = carry
+        x = step(x + row) + 0.1 * y[0]
+        y = jnp.stack([jnp.sin(x) * y[1], jnp.cos(x + y[0])])
+        return (x, (y, count + 1)), x * y[1] * count
+
+    rows = jnp.linspace(0, 1, 7)
+    carry = (x, (jnp.stack([x, -x]), jnp.zeros((), jnp.int32)))
+    turn, pack, unpack = fused_scan(turn, carry, rows[0])
+    packed, kept = jax.lax.scan(turn, pack(carry), rows)
+    return unpack(packed), kept
+
+
+def plain(x):
+    carry, kept = (x, (jnp.stack([x, -x]), 0)), []
+    for row in np.linspace(0, 1, 7, dtype=np.float32):
+        x, (y, count) = carry
+        x = step(x + row) + 0.1 * y[0]
+        y = jnp.stack([jnp.sin(x) * y[1], jnp.cos(x + y[0])])
+        kept.append(x * y[1] * count)
+        carry = (x, (y, count + 1))
+    return carry, jnp.stack(kept)
+
+
+@pytest.mark.parametrize("pieces", [1, 2, 5])
+def test_they_change_nothing(monkeypatch, pieces):
+    """Whole, and cut into pieces: to rounding, as the compiler may contract other products."""
+    monkeypatch.setattr(xla, "_PIECE", xla.Graph(step, (LANES,)).size / pieces)
+    tricked = jax.jit(derived_by(fused, plain))
+    agree = partial(jax.tree.map, partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5))
+    agree(tricked(LANES), plain(LANES))
+    both = jax.vmap(tricked)(jnp.stack([LANES, 2 * LANES]))
+    agree(jax.tree.map(lambda x: x[0], both), plain(LANES))
+    slope, expected = (jax.grad(lambda x, f=f: jnp.sum(f(x)[1]))(LANES) for f in (tricked, plain))
+    np.testing.assert_allclose(slope, expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.skipif(not on_cpu(), reason="the tricks are for XLA:CPU")
+def test_xla_still_takes_them(monkeypatch):
+    """A misspelt or withdrawn annotation would be ignored in silence: look at the compiled text."""
+
+    def text(fun):
+        return jax.jit(lambda x: fun(x)).lower(LANES).compile().as_text()
+
+    bare = text(lambda x: rolled(x, step))
+    shared = text(lambda x: rolled(x, share_once(step)))
+    # Shared values stay behind calls of their own that were not inlined.
+    assert shared.count(" call(") > bare.count(" call(")
+    marked = lambda x: len(re.findall(r" call\(.*xla_cpu_small_call", text(x)))  # noqa: E731
+    assert marked(lambda x: rolled(x, share_once(step))) == 0
+    assert marked(fused) == 1
+    monkeypatch.setattr(xla, "_PIECE", 2)
+    assert marked(fused) == round(xla.Graph(step, (LANES,)).size / 2) > 2
+
+
+def test_chunks_are_all_of_one_shape():
+    seen = []
+
+    def fun(x, y):
+        seen.append(x.shape)
+        return {"sum": x + y, "rows": jnp.stack([x, y])}
+
+    x = jnp.arange(10.0)
+    out = over_chunks(fun, lanes=4)(x, 2 * x)
+    np.testing.assert_array_equal(out["sum"], 3 * x)
+    np.testing.assert_array_equal(out["rows"], jnp.stack([x, 2 * x]))
+    assert set(seen) == {(4,)}

@@ -1,0 +1,236 @@
+"""Forces on parts: closed forms, and the sum that the engines' step makes of them."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import WATER, accelerate, arm_robot, body, box_robot, random_states, world
+from mjx_revolve.body.module_types import Thruster
+from mjx_revolve.body.plates import LiftDrag
+from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.episodes.rollout import Trajectory
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.forces import Forces, module_forces, part_motion, sum_modules
+from mjx_revolve.water.flow import Water, flow, water_of
+
+RHO, G = 999.1026, 9.81
+BRICK = (0.06, 0.04, 0.02)
+TURNED = [np.cos(0.35), *(np.sin(0.35) * np.array([0.6, 0.0, 0.8]))]
+
+
+def states(robot: Robot, qpos, qvel=None, ctrl=None, command=None, time=None) -> Trajectory:
+    """A trajectory of given states, `[S, nq]`."""
+    qpos = np.atleast_2d(np.asarray(qpos, float))
+    count, model = len(qpos), robot.mj_model
+    blank = lambda value, width: np.zeros((count, width)) if value is None else value  # noqa: E731
+    return Trajectory(
+        time=np.zeros(count) if time is None else time,
+        qpos=qpos,
+        qvel=blank(qvel, model.nv),
+        xpos=np.zeros((count, model.nbody, 3)),
+        ctrl=blank(ctrl, model.nu),
+        power=np.zeros(count),
+        command=command,
+    )
+
+
+def pose(x=0.0, y=0.0, z=-5.0, quat=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:
+    return np.array([x, y, z, *quat])
+
+
+# ------------------------------------------------------------------------- closed forms
+
+
+def test_buoyancy_of_what_is_under_water():
+    """ρ V g upwards, whatever the attitude; none above; half of it half way."""
+    robot = box_robot(BRICK, 0.03, world(gravity=G, buoyancy="partial"))
+    rows = [pose(), pose(quat=TURNED), pose(z=1.0), pose(z=0.0)]
+    forces = module_forces(robot, states(robot, rows))
+    full = RHO * np.prod(BRICK) * G
+    assert forces.buoyancy[:, 0, 2] == pytest.approx([full, full, 0, full / 2], rel=1e-5)
+    assert forces.buoyancy[:, 0, :2] == pytest.approx(0, abs=1e-6 * full)
+    assert not forces.drag.any() and not forces.thrust.any()
+
+
+def test_buoyancy_of_each_module():
+    """Modules under water are held up by ρ V g each, hinge and all."""
+    robot = build_robot(body("spider"), world(**WATER))
+    forces = module_forces(robot, states(robot, robot.start_qpos(3.0)))
+    expected = [RHO * module.kind.volume * G for module in robot.morphology.modules]
+    assert sum_modules(robot, forces.buoyancy)[0, :, 2] == pytest.approx(expected, rel=1e-5)
+    assert forces.buoyancy.sum(1)[0, 2] == pytest.approx(RHO * robot.morphology.volume * G)
+    assert forces.place[0] == pytest.approx(part_motion(robot, *_start(robot)).place[0])
+
+
+def _start(robot: Robot):
+    return robot.start_qpos(3.0)[None], np.zeros((1, robot.mj_model.nv))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_drag_of_a_brick(axis):
+    """½ ρ C_d A v² against its motion relative to the water."""
+    current = (0.1, -0.2, 0.05)
+    robot = box_robot(BRICK, 0.03, world(drag="faces", current=current), drag_coefficient=1.05)
+    v = np.zeros((2, 6))
+    v[:, axis] = [0.3, -0.4]
+    v[:, :3] += current
+    drag = module_forces(robot, states(robot, [pose()] * 2, v)).drag[:, 0]
+    area = np.prod(BRICK) / BRICK[axis]
+    expected = np.zeros((2, 3))
+    expected[:, axis] = 0.5 * RHO * 1.05 * area * np.array([-(0.3**2), 0.4**2])
+    assert drag == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def test_lift_of_a_plate():
+    """At 30° of attack: lift ½ ρ A v² cla α across the flow, drag ½ ρ A v² cda α against it."""
+    fin = LiftDrag(cla=2.0, cda=0.5, area=0.01, forward=(1.0, 0.0, 0.0), upward=(0.0, 0.0, 1.0))
+    robot = box_robot((0.1, 0.1, 0.01), 0.03, world(drag="faces"), lift_drag=fin)
+    attack, speed = np.radians(30.0), 0.5
+    v = np.zeros((1, 6))
+    v[0, :3] = speed * np.array([np.cos(attack), 0.0, -np.sin(attack)])
+    drag = module_forces(robot, states(robot, pose(), v)).drag[0, 0]
+    q = 0.5 * RHO * 0.01 * speed**2
+    across = np.array([np.sin(attack), 0.0, np.cos(attack)])
+    expected = q * 2.0 * attack * across - q * 0.5 * attack * v[0, :3] / speed
+    assert drag == pytest.approx(expected, rel=1e-4)
+
+
+def test_thrust_follows_the_curve():
+    """T = k x|x| along the turned axis, of the command behind the lag; none out of the water."""
+    thruster = Thruster(gain=0.8, axis=(0.0, 1.0, 0.0), time_constant=0.2)
+    robot = box_robot((0.1, 0.1, 0.1), 1.0, world(buoyancy="partial"), thruster=thruster)
+    rows, lagged = [pose(), pose(quat=TURNED), pose(z=1.0)], np.array([[0.5], [-0.7], [1.0]])
+    forces = module_forces(robot, states(robot, rows, ctrl=np.ones((3, 1)), command=lagged))
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, np.array(TURNED))
+    expected = [[0, 0.8 * 0.25, 0], -0.8 * 0.49 * turn.reshape(3, 3)[:, 1], [0, 0, 0]]
+    assert forces.thrust[:, 0] == pytest.approx(np.array(expected), abs=1e-6)
+    # Without a record of the lag, what was asked for.
+    asked = module_forces(robot, states(robot, rows, ctrl=np.full((3, 1), 0.5)))
+    assert asked.thrust[0, 0] == pytest.approx([0, 0.8 * 0.25, 0])
+
+
+def test_thrust_of_the_auv():
+    """Each thruster by its own curve, at its own module, along its own axis."""
+    robot = build_robot(body("auv"), world(**WATER))
+    command = np.array([[0.3, -0.6, 0.9, 0.4]])
+    forces = module_forces(robot, states(robot, robot.start_qpos(2.0), command=command))
+    for k, (row, part) in enumerate(zip(robot.thruster_row, robot.thruster_part, strict=True)):
+        size = part.thruster.thrust_at(command[0, k])
+        assert np.linalg.norm(forces.thrust[0, row]) == pytest.approx(abs(size), rel=1e-5)
+        axis = robot.fluid.rotation[row] @ part.thruster.axis
+        assert forces.thrust[0, row] == pytest.approx(size * axis, abs=1e-6)
+    others = np.setdiff1d(np.arange(len(robot.fluid.body)), robot.thruster_row)
+    assert not forces.thrust[0, others].any()
+
+
+# ------------------------------------------------------------------------- moving water
+
+
+def test_water_of_its_time():
+    """Waves go on with time, a current's rows with the steps: drag sees the water of the moment."""
+    sea = world(drag="faces", gravity=G, waves=[{"amplitude": 0.05, "wavelength": 2.0}])
+    robot = box_robot(BRICK, 0.03, sea)
+    time = np.array([0.2, 0.4, 0.6])
+    rows = [pose(0.3, 0.0, -0.5)] * 3
+    forces = module_forces(robot, states(robot, rows, time=time))
+    still = water_of(sea)
+    for k in range(3):
+        u = [float(x) for x in flow(sea, still._replace(time=time[k]), 0.3, 0.0, -0.5)[0]]
+        c = RHO * robot.fluid.drag_linear[0]
+        assert forces.drag[k, 0] == pytest.approx(c * np.abs(u) * u, rel=2e-3, abs=1e-6)
+    # A row of the current is the water of the step that follows; the last one stays.
+    robot = box_robot(BRICK, 0.03, world(drag="faces"))
+    gusty = Water(0.0, (np.array([0.1, 0.2, 0.3]), 0.0, 0.0))
+    forces = module_forces(robot, states(robot, rows, time=time), water=gusty)
+    c = RHO * robot.fluid.drag_linear[0, 0]
+    assert forces.drag[:, 0, 0] == pytest.approx(c * np.array([0.04, 0.09, 0.09]), rel=1e-4)
+
+
+def test_a_current_that_speeds_up_pushes():
+    """Water that accelerates holds up ρ V (g + a)."""
+    robot = box_robot(BRICK, 0.03, world(gravity=G, buoyancy="partial"))
+    water = Water(0.0, (0.0, 0.0, 0.0), (0.5, 0.0, -1.0))
+    force = module_forces(robot, states(robot, pose()), water=water).buoyancy[0, 0]
+    assert force == pytest.approx(RHO * np.prod(BRICK) * np.array([0.5, 0, G - 1]), rel=1e-5)
+
+
+# ------------------------------------------------------------------------- the step's sum
+
+_SEA = {
+    "current": (0.2, -0.1, 0.0),
+    "waves": [{"amplitude": 0.03, "wavelength": 1.5, "direction": 0.7}],
+    "shear": {"velocity": (0.1, 0.0, 0.0), "depth": 3.0},
+    "surface_tension": {"gamma": 0.0728},
+}
+
+
+def _momentum_rate(robot: Robot, qpos, qvel, qacc, step=1e-5) -> np.ndarray:
+    """d/dt of the robot's linear momentum, by central differences along its motion."""
+    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+
+    def momentum(time: float) -> np.ndarray:
+        data.qpos[:] = qpos
+        mujoco.mj_integratePos(model, data.qpos, qvel, time)
+        data.qvel[:] = qvel + time * qacc
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        return model.body_subtreemass[1] * data.subtree_linvel[1]
+
+    return (momentum(step) - momentum(-step)) / (2 * step)
+
+
+@pytest.mark.parametrize(
+    "laws",
+    [
+        {"buoyancy": "partial", "drag": "faces", **_SEA},
+        {"buoyancy": "mask", "drag": "lift_drag", "current": (0.2, 0.0, 0.1)},
+        {"buoyancy": "partial", "drag": "inertia_box", "current": (0.2, 0.0, 0.1)},
+        {"buoyancy": "off", "drag": "ellipsoid", "current": (0.2, 0.0, 0.1)},
+    ],
+    ids=lambda laws: laws["drag"],
+)
+def test_sum_is_what_the_step_does(laws):
+    """Newton, without added mass: d/dt Σ m v = Σ forces + weight, half in and half out of water."""
+    robot = arm_robot(world(gravity=G, **laws))
+    qpos, qvel = random_states(robot, 3, depth=0.05, speed=0.5)
+    qpos[2, 2] -= 1.0
+    acceleration = accelerate(robot, qpos, qvel)
+    forces = module_forces(robot, states(robot, qpos.T, qvel.T))
+    total = (forces.buoyancy + forces.drag + forces.thrust).sum(1)
+    total[:, 2] -= robot.mj_model.body_subtreemass[1] * G
+    expected = [
+        _momentum_rate(robot, q, v, a)
+        for q, v, a in zip(qpos.T, qvel.T, acceleration.T, strict=True)
+    ]
+    assert total == pytest.approx(np.array(expected), rel=1e-3, abs=2e-4)
+
+
+# ------------------------------------------------------------------------- rows and mistakes
+
+
+def test_rows():
+    """Every so many rows, from the first."""
+    robot = box_robot(BRICK, 0.03, world(gravity=G, buoyancy="partial"))
+    forces = module_forces(robot, states(robot, [pose()] * 7, time=0.1 * np.arange(7)), 3)
+    assert isinstance(forces, Forces)
+    assert forces.rows.tolist() == [0, 3, 6]
+    assert forces.time == pytest.approx([0, 0.3, 0.6])
+    assert forces.drag.shape == forces.place.shape == (3, 1, 3)
+
+
+@pytest.mark.parametrize("every", [0, -1, 1.5, True])
+def test_every_is_checked(every):
+    robot = box_robot(BRICK, 0.03, world())
+    with pytest.raises(InputError, match=r"^every: expected a whole number of at least 1; found"):
+        module_forces(robot, states(robot, pose()), every)
+
+
+def test_another_robots_trajectory():
+    robot, other = box_robot(BRICK, 0.03, world()), arm_robot(world())
+    with pytest.raises(InputError, match=r"^trajectory.qpos: expected \[1, 7\]; found \[1, 11\]$"):
+        module_forces(robot, states(other, other.qpos0))

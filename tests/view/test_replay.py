@@ -1,0 +1,670 @@
+from __future__ import annotations
+
+import io
+import math
+import os
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import av
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from laboratory import body
+from mjx_revolve import replay
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.champion import Episode
+from mjx_revolve.episodes.rollout import Trajectory
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.film import opengl
+from mjx_revolve.view.film.camera import plan_shots
+from mjx_revolve.view.film.film import draw_frames, enclosing_balls, make_film
+from mjx_revolve.view.film.scene import BACKGROUND, build_scene, corner_normals, make_sand
+from mjx_revolve.view.film.video import GifMaker, Mp4Writer
+from mjx_revolve.view.film.waterlight import (
+    bright_lines,
+    daylight,
+    make_shader,
+    open_water,
+    transmission,
+)
+from mjx_revolve.view.swim_picture import pose_scene
+from mjx_revolve.water.flow import Water
+from mjx_revolve.water.world import load_world
+
+FOVY = math.radians(40.0)
+STEP = 0.005
+SIZE = (160, 120)
+
+
+# --- an episode without a simulation ------------------------------------------------------------
+
+
+def swim(robot, seconds=1.0, velocity=(0.2, 0.1, 0.0), depth=1.0):
+    """The robot carried along at a constant velocity, flapping."""
+    time = STEP * np.arange(1, round(seconds / STEP) + 1)
+    qpos = np.tile(robot.start_qpos(depth), (len(time), 1))
+    qpos[:, :3] += time[:, None] * np.asarray(velocity)
+    qpos[:, 7:] = 0.4 * np.sin(2 * np.pi * time)[:, None]
+    nv, nu = robot.mj_model.nv, robot.mj_model.nu
+    zeros = [np.zeros((len(time), n)) for n in (nv, 3 * robot.mj_model.nbody, nu)]
+    trajectory = Trajectory(time, qpos, zeros[0], zeros[1].reshape(len(time), -1, 3), zeros[2],
+                            np.zeros(len(time)))  # fmt: skip
+    return Episode("spider: carried along", robot, trajectory)
+
+
+@pytest.fixture(scope="module")
+def episode(spider):
+    return swim(spider)
+
+
+@pytest.fixture(scope="module")
+def way():
+    """The OpenGL of this machine."""
+    try:
+        return opengl.find_opengl()
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="module")
+def frames(episode, way):
+    """A drawn film, and what it was drawn from."""
+    film = make_film(episode, SIZE, 10)
+    return film, list(draw_frames(film, way))
+
+
+# --- the camera ---------------------------------------------------------------------------------
+
+
+def plan(path, radius=0.2, surface=0.0, bed=None, aspect=4 / 3, **kw):
+    time = np.arange(len(path)) / 30
+    size = np.full(len(path), radius)
+    return plan_shots(time, np.asarray(path, float), size, aspect=aspect, fovy=FOVY,
+                      surface=surface, bed=bed, **kw)  # fmt: skip
+
+
+def assert_in_frame(shots, path, radius, aspect=4 / 3):
+    """The whole ball lies inside the four planes of every frame."""
+    up, side = math.tan(FOVY / 2), math.tan(FOVY / 2) * aspect
+    for frame, center in enumerate(path):
+        x, y, z = shots.axes(frame) @ (np.asarray(center) - shots.position[frame])
+        assert z > radius
+        assert (z * side - abs(x)) / math.hypot(1, side) > radius
+        assert (z * up - abs(y)) / math.hypot(1, up) > radius
+
+
+@pytest.mark.parametrize("aspect", [4 / 3, 16 / 9, 0.5])
+@pytest.mark.parametrize("heading", [0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+def test_robot_stays_in_frame_and_swims_to_the_right(heading, aspect):
+    time = np.arange(150)[:, None] / 30
+    ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
+    path = [0, 0, -2.0] + 0.3 * time * ahead + 0.05 * np.sin(9 * time) * [0.3, 0.2, 1.0]
+    shots = plan(path, aspect=aspect)
+    assert_in_frame(shots, path, 0.2, aspect)
+    assert (shots.axes(75)[0] @ ahead) > 0.8
+    assert not shots.above
+    assert (shots.position[:, 2] < 0.0).all()
+
+
+@pytest.mark.parametrize(
+    "velocity", [(0, 0, 0), (0, 0, -0.5), (0, 0, 0.18), (3.0, 0, 0), (0.2, -0.3, 0.15)]
+)
+def test_robot_stays_in_frame_whatever_it_does(velocity):
+    time = np.arange(150)[:, None] / 30
+    random = np.random.default_rng(0)
+    path = [5.0, -3.0, -1.0] + time * np.array(velocity) + random.normal(0, 0.02, (150, 3))
+    shots = plan(path, bed=lambda x, y: np.full(len(x), -4.0))
+    assert_in_frame(shots, path, 0.2)
+
+
+def test_camera_does_not_shake_with_the_strokes():
+    time = np.arange(300)[:, None] / 30
+    path = [0, 0, -2] + time * [0.1, 0, 0] + 0.05 * np.sin(2 * np.pi * 1.5 * time) * [0, 0, 1]
+    shots = plan(path)
+    assert np.ptp(shots.target[60:-60, 2]) < 0.002
+    assert np.diff(shots.position[:, 0]) == pytest.approx(0.1 / 30, rel=0.02)
+
+
+def test_camera_goes_round_a_dune_and_under_the_surface():
+    def bed(x, y):
+        return -1.0 + 0.8 * np.exp(-((x - 0.3) ** 2 + (y + 1.0) ** 2) / 0.1)
+
+    time = np.arange(90)[:, None] / 30
+    path = np.array([0, 0, -0.6]) + 0.1 * time * [1, 0, 0]
+    shots = plan(path, radius=0.15, bed=bed, waves=0.05)
+    assert (shots.position[:, 2] > bed(*shots.position[:, :2].T)).all()
+    assert (shots.position[:, 2] < -0.05).all()
+    assert_in_frame(shots, path, 0.15)
+
+
+def test_what_floats_is_filmed_from_the_air():
+    path = np.tile([0.0, 0.0, -0.05], (90, 1))
+    path[:20, 2] = np.linspace(-1.0, -0.05, 20)
+    shots = plan(path, waves=0.1)
+    assert shots.above
+    assert (shots.position[:, 2] > 0.1).all()
+    assert_in_frame(shots, path, 0.2)
+
+
+def test_who_stays_is_seen_from_its_side():
+    shots = plan([[0, 0, -2.0]] * 30, along=(0.0, 1.0))
+    assert shots.axes(0)[0] @ [0, 1, 0] > 0.8
+
+
+def test_one_frame_is_a_film_too():
+    assert_in_frame(plan([[1.0, 2.0, -3.0]]), [[1.0, 2.0, -3.0]], 0.2)
+
+
+def test_projection_of_a_known_point():
+    shots = plan([[0.0, 0.0, -2.0]] * 2)
+    flat, away = shots.project(0, np.array([shots.target[0], 2 * shots.position[0]
+                                            - shots.target[0]]))  # fmt: skip
+    assert flat[0] == pytest.approx([0, 0], abs=1e-9)
+    assert away[1] == pytest.approx(-away[0])
+
+
+# --- the scene ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["spider", "auv", "fish"])
+def test_scene_stands_as_the_robot_does(name):
+    robot = build_robot(body(name), load_world("lake"))
+    shapes = (robot.mj_model.ngeom, robot.mj_model.nmesh)
+    model = build_scene(robot)
+    assert (robot.mj_model.ngeom, robot.mj_model.nmesh) == shapes
+    assert model.nq == robot.mj_model.nq
+    random = np.random.default_rng(1)
+    qpos = robot.start_qpos()
+    qpos[:3] += random.normal(size=3)
+    qpos[3:7] = random.normal(size=4)
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    qpos[7:] = random.uniform(-1, 1, len(qpos) - 7)
+    drawn, weighed = mujoco.MjData(model), mujoco.MjData(robot.mj_model)
+    for data, its in ((drawn, model), (weighed, robot.mj_model)):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(its, data)
+    for body_id in range(robot.mj_model.nbody):
+        other = model.body(robot.mj_model.body(body_id).name).id
+        assert drawn.xpos[other] == pytest.approx(weighed.xpos[body_id], abs=1e-12)
+        assert drawn.xmat[other] == pytest.approx(weighed.xmat[body_id], abs=1e-12)
+    # The meshes' corners are those of the pictures, axes and arrows apart.
+    corners = []
+    for geom in range(model.ngeom):
+        if model.geom(geom).name.startswith("drawn"):
+            mesh = model.geom_dataid[geom]
+            first = model.mesh_vertadr[mesh]
+            points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+            frame = drawn.geom_xmat[geom].reshape(3, 3)
+            corners.append(points @ frame.T + drawn.geom_xpos[geom])
+    scene = pose_scene(robot, qpos)
+    assert len(corners) == sum(len(m.kind.parts) for m in robot.morphology.modules)
+    for points in corners:
+        near = np.abs(scene.corners.reshape(-1, 3)[None] - points[:3, None]).max(-1).min(1)
+        assert near.max() < 1e-5
+
+
+def test_scene_counts_from_its_origin(spider):
+    model = build_scene(spider, origin=(380.0, 20.0, -10.0), sight=5.0)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    assert data.geom_xpos[model.geom("surface").id] == pytest.approx([0, 0, 10])
+
+
+def test_a_world_without_a_bed_has_none(spider):
+    open_water_world = load_world("lake", bed="off")
+    model = build_scene(build_robot(spider.morphology, open_water_world))
+    names = [model.geom(k).name for k in range(model.ngeom)]
+    assert "sand" not in names and "bed" not in names
+
+
+def test_normals_are_sharp_on_a_cube_and_smooth_on_a_pipe():
+    import trimesh
+
+    cube = trimesh.creation.box((1, 1, 1))
+    normals = corner_normals(np.asarray(cube.triangles))
+    assert normals == pytest.approx(np.repeat(cube.face_normals[:, None], 3, 1), abs=1e-9)
+    pipe = trimesh.creation.cylinder(1.0, 2.0, sections=32)
+    corners = np.asarray(pipe.triangles)
+    side = np.abs(pipe.face_normals[:, 2]) < 0.5
+    outward = corners[side] * [1, 1, 0]
+    assert (corner_normals(corners)[side] * outward).sum(-1) == pytest.approx(1, abs=0.01)
+
+
+def test_sand_can_be_laid_side_by_side():
+    sand = make_sand(128).astype(float)
+    inside = np.abs(np.diff(sand, axis=0)).mean()
+    assert np.abs(sand[0] - sand[-1]).mean() < 2 * inside
+    assert sand.std() > 3
+
+
+# --- the water's light --------------------------------------------------------------------------
+
+
+def test_water_takes_red_first():
+    clear = np.asarray(transmission(0.0, 1.0))
+    assert clear == pytest.approx([1, 1, 1])
+    near, far = (np.asarray(transmission(x, 1.0)) for x in (1.0, 8.0))
+    assert (near > 0.75).all() and (far < 0.4).all()
+    assert far[0] < far[1] < far[2]
+    # Small robots are seen as clearly as large ones.
+    assert np.asarray(transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
+
+
+def test_light_comes_from_above():
+    assert np.asarray(daylight(0.0)) == pytest.approx([1, 1, 1])
+    assert (np.diff(np.asarray(daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
+    assert (np.diff(np.asarray(open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
+
+
+def test_bright_lines_only_move_light_about():
+    x, y = np.meshgrid(np.linspace(0, 20, 200), np.linspace(0, 20, 200))
+    lines = np.asarray(bright_lines(1.0, 9.81, 0.7, x, y))
+    assert lines.mean() == pytest.approx(1.0, abs=0.2)
+    assert lines.min() > 0 and lines.std() > 0.1
+
+
+@lru_cache
+def shader_of(world, above):
+    return make_shader(world, (32, 24), 1.0, above)
+
+
+def shade(world, above, depth, color=(200, 60, 40), height=1.0, pitch=0.0, time=0.0):
+    """A picture of one colour, all at one depth, by a camera at a height above the surface."""
+    shader = shader_of(world, above)
+    picture = np.empty((24, 32, 3), np.uint8)
+    picture[:] = color
+    axes = np.array([[1, 0, 0], [0, -math.sin(pitch), math.cos(pitch)],
+                     [0, math.cos(pitch), math.sin(pitch)]], np.float32)  # fmt: skip
+    water = Water(np.float32(0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), np.float32(time))
+    depths, place = np.full((24, 32), depth, np.float32), np.float32([0, 0, height])
+    return np.asarray(shader(picture, depths, place, axes, np.float32(FOVY), water))
+
+
+def test_what_is_far_is_lost_in_blue_haze():
+    world = load_world("lake")
+    near, far = (shade(world, False, d, height=-5.0).reshape(-1, 3).mean(0) for d in (1.0, 30.0))
+    assert near[0] > near[2]
+    assert far[2] > 2 * far[0]
+
+
+def test_looking_up_shows_the_surface_and_looking_down_none():
+    world = load_world("lake")
+    plain = tuple(round(255 * c) for c in BACKGROUND)
+    up = shade(world, False, np.inf, plain, height=-0.5, pitch=1.2)
+    down = shade(world, False, np.inf, plain, height=-0.5, pitch=-1.2)
+    assert up.mean() > 150 > 90 > down.mean()
+
+
+def test_waves_move_the_surface_in_time():
+    calm = load_world("lake")
+    rough = load_world("lake", waves=[{"amplitude": 0.05, "wavelength": 1.0}])
+    plain = tuple(round(255 * c) for c in BACKGROUND)
+    look = {"color": plain, "height": -0.3, "pitch": 0.6}
+    first, later = (shade(rough, False, np.inf, time=t, **look).astype(int) for t in (0.0, 0.4))
+    assert np.abs(first - later).max() > 20
+    assert np.abs(first - shade(calm, False, np.inf, **look).astype(int)).max() > 20
+
+
+def test_from_the_air_what_is_deep_is_dimmer():
+    world = load_world("lake")
+    look = {"height": 1.0, "pitch": -1.2}
+    dry, shallow, deep = (shade(world, True, d, **look).astype(int) for d in (0.8, 1.3, 4.0))
+    assert dry[12, 16] == pytest.approx([200, 60, 40], abs=4)
+    assert dry[..., 0].mean() > shallow[..., 0].mean() > deep[..., 0].mean() + 20
+    assert deep[..., 2].mean() > deep[..., 0].mean()
+
+
+# --- films --------------------------------------------------------------------------------------
+
+
+def test_frames_are_evenly_spaced_and_between_the_rows(episode):
+    film = make_film(episode, SIZE, 30)
+    assert len(film.time) == 30
+    assert np.diff(film.time) == pytest.approx(1 / 30)
+    assert film.qpos[15, 0] == pytest.approx(0.2 * film.time[15], abs=1e-9)
+    assert film.speed == pytest.approx(math.hypot(0.2, 0.1), rel=0.05)
+    assert film.lost is None
+
+
+def test_a_turn_over_the_sign_of_the_quaternion_is_a_small_one(spider):
+    episode = swim(spider)
+    qpos = np.array(episode.trajectory.qpos)
+    qpos[1::2, 3:7] *= -1
+    film = make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)), SIZE, 77)
+    assert np.abs(film.qpos[:, 3]) == pytest.approx(1.0)
+
+
+def test_motes_drift_with_the_current_and_its_gusts(spider):
+    robot = build_robot(spider.morphology, load_world("lake", current=(0.1, 0, 0)))
+    film = make_film(swim(robot), SIZE, 10)
+    assert film.current == pytest.approx(np.tile([0.1, 0, 0], (10, 1)))
+    steps = np.arange(200)
+    gusty = Water(0.0, (0.1 + STEP * steps, 0.0 * steps, 0.0 * steps))
+    film = make_film(replace(swim(robot), water=gusty), SIZE, 10)
+    assert film.current[:, 0] == pytest.approx(0.1 + film.time)
+
+
+def test_balls_hold_every_part(spider):
+    qpos = spider.start_qpos()[None]
+    center, radius = enclosing_balls(spider, qpos)
+    away = np.linalg.norm(pose_scene(spider, qpos[0]).corners - center[0], axis=-1)
+    assert away.max() < radius[0] < 1.3 * away.max()
+
+
+def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
+    episode = swim(spider)
+    qpos = np.array(episode.trajectory.qpos)
+    qpos[120:] = np.nan
+    film = make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)), SIZE, 30)
+    assert film.lost == pytest.approx(121 * STEP)
+    assert len(film.time) == 18
+    assert np.isfinite(film.qpos).all()
+    qpos[:] = np.nan
+    with pytest.raises(InputError, match="expected a trajectory of finite numbers"):
+        make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)))
+
+
+def test_frames_show_the_robot_in_its_colours_in_blue_water(frames):
+    film, drawn = frames
+    assert len(drawn) == len(film.time) == 10
+    for frame in drawn:
+        assert frame.shape == (120, 160, 3) and frame.dtype == np.uint8
+        red, _, blue = (frame[..., k].astype(int) for k in range(3))
+        assert (blue > red + 20).mean() > 0.5  # water
+        salmon = red > blue + 30  # the spider's feet
+        assert 20 < salmon.sum() < 2000
+        # All of them well inside the frame.
+        rows, columns = np.nonzero(salmon[18:100])
+        assert rows.min() > 3 and columns.min() > 5 and columns.max() < 155
+    assert np.abs(drawn[0].astype(int) - drawn[9]).max() > 50
+
+
+def test_light_falls_from_above_in_a_film(frames):
+    _, drawn = frames
+    assert drawn[0][20:40].mean() > drawn[0][90:105].mean() + 10
+
+
+def test_the_bed_shows_where_it_is_near(spider, way):
+    world = load_world("lake", bed={"kind": "flat", "height": -1.3})
+    robot = build_robot(spider.morphology, world)
+    film = make_film(swim(robot, 0.1, depth=1.1), SIZE, 10)
+    assert "bed" not in film.robot.mj_model.names.decode() or film.shots.position[0, 2] > -1.3
+    frame = next(iter(draw_frames(film, way)))
+    low = frame[95:110, 60:].reshape(-1, 3).mean(0)
+    assert low[0] > 80  # sand is no water
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def moving_dot(count=30, size=SIZE):
+    for k in range(count):
+        frame = np.full((size[1], size[0], 3), (20, 90, 130), np.uint8)
+        frame[50:70, 5 * k : 5 * k + 20] = (220, 60, 40)
+        yield frame
+
+
+def read_mp4(path):
+    with av.open(str(path)) as file:
+        stream = file.streams.video[0]
+        pictures = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+        return stream, float(stream.average_rate), stream.codec_context, pictures
+
+
+def test_mp4_reads_back(tmp_path):
+    path = tmp_path / "dot.mp4"
+    with Mp4Writer(path, SIZE, 25, "a dot") as writer:
+        for frame in moving_dot():
+            writer.add(frame)
+    _, rate, codec, pictures = read_mp4(path)
+    assert len(pictures) == 30 and rate == 25
+    assert codec.name == "h264" and codec.pix_fmt == "yuv420p"
+    for picture, frame in zip(pictures, moving_dot(), strict=True):
+        assert np.abs(picture.astype(int) - frame).mean() < 6
+    # The index stands before the pictures.
+    content = path.read_bytes()
+    assert content.find(b"moov") < content.find(b"mdat")
+
+
+def test_gif_reads_back_with_the_film_s_time_and_colours():
+    maker = GifMaker(SIZE, 30, 30)
+    for frame in moving_dot():
+        maker.add(frame)
+    gif = Image.open(io.BytesIO(maker.make()))
+    assert gif.size == SIZE and gif.n_frames == 15
+    total = 0
+    for k in range(gif.n_frames):
+        gif.seek(k)
+        total += gif.info["duration"]
+        assert (
+            np.abs(np.asarray(gif.convert("RGB"), int)[60, 10 * k + 10] - (220, 60, 40)).max() < 8
+        )
+    assert total == 1000
+
+
+def test_long_and_noisy_gifs_get_smaller():
+    random = np.random.default_rng(0)
+    maker = GifMaker((320, 240), 30, 6000, limit=100_000)
+    assert 6000 / maker.every <= 160
+    for _ in range(4 * maker.every):
+        maker.add(random.integers(0, 255, (240, 320, 3), np.uint8))
+    content = maker.make()
+    assert 30_000 < len(content) < 100_000
+    with Image.open(io.BytesIO(content)) as gif:
+        assert gif.n_frames == 4 and gif.width * 3 == pytest.approx(gif.height * 4, abs=4)
+
+
+# --- the command --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def command(episode, monkeypatch):
+    """Runs the command on the made-up episode."""
+    import mjx_revolve.episodes.champion
+    import mjx_revolve.viewer
+
+    def load(path, world="lake", duration=None, seed=None):
+        return episode
+
+    monkeypatch.setattr(mjx_revolve.episodes.champion, "load_episode", load)
+
+    def write(episode, path):
+        write_atomic(path, episode.title.encode())
+
+    monkeypatch.setattr(mjx_revolve.viewer, "write_viewer", write)
+    return lambda *words: run_command(replay.main, list(words))
+
+
+def test_command_writes_film_gif_and_page(command, way, tmp_path, capsys):
+    (tmp_path / "config.yaml").write_text("")
+    small = ("--size", f"{SIZE[0]}x{SIZE[1]}", "--fps", "10")
+    assert command(str(tmp_path), *small) == 0
+    _, rate, _, pictures = read_mp4(tmp_path / "swim.mp4")
+    assert len(pictures) == 10 and rate == 10 and pictures[0].shape == (120, 160, 3)
+    assert pictures[0].std() > 10
+    with Image.open(tmp_path / "swim.gif") as gif:
+        assert gif.size == SIZE and gif.n_frames == 10
+    assert (tmp_path / "viewer.html").read_text() == "spider: carried along"
+    out = capsys.readouterr().out
+    assert "swim.mp4: 1 s, 160 x 120, 10 frames/s" in out and "viewer.html: open it" in out
+    assert not list(tmp_path.glob(".*"))
+    # A page that is there stays, and keeps nobody from making a film.
+    for name in ("swim.mp4", "swim.gif"):
+        (tmp_path / name).unlink()
+    (tmp_path / "viewer.html").write_text("kept")
+    assert command(str(tmp_path), *small) == 0
+    assert "viewer.html: there already, and left as it is" in capsys.readouterr().out
+    assert (tmp_path / "viewer.html").read_text() == "kept"
+    assert (tmp_path / "swim.mp4").exists() and (tmp_path / "swim.gif").exists()
+    # So do films, unless they are named.
+    assert command(str(tmp_path), *small) == 2
+    assert "say where with --out" in capsys.readouterr().err
+    old = (tmp_path / "swim.mp4").stat().st_mtime_ns
+    assert command(str(tmp_path), *small, "--out", str(tmp_path / "swim.mp4")) == 0
+    assert (tmp_path / "swim.mp4").stat().st_mtime_ns > old
+
+
+def test_page_alone_needs_no_opengl(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(opengl, "_works", lambda way: False)
+    source = tmp_path / "spider.yaml"
+    source.touch()
+    assert command(str(source), "--html", "--out", str(tmp_path / "new")) == 0
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["viewer.html"]
+    assert command(str(source), "--out", str(tmp_path / "page.html")) == 0
+    assert (tmp_path / "page.html").exists()
+
+
+def test_no_opengl_is_one_line_that_says_what_to_install(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(opengl, "_works", lambda way: False)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    (tmp_path / "genes.yaml").touch()
+    assert command(str(tmp_path / "genes.yaml"), "--out", str(tmp_path / "x.mp4")) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: OpenGL: expected") and error.count("\n") == 1
+    if os.sys.platform.startswith("linux"):
+        assert "apt-get install libegl1 libgl1-mesa-dri" in error
+
+
+def test_the_user_s_opengl_is_the_only_one_tried(monkeypatch):
+    tried = []
+    monkeypatch.setattr(opengl, "_works", lambda way: tried.append(way) or True)
+    monkeypatch.setattr(opengl.sys, "platform", "linux")
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert opengl.find_opengl() == "osmesa" and tried == ["osmesa"]
+    monkeypatch.setenv("MUJOCO_GL", "vulkan")
+    with pytest.raises(InputError, match="MUJOCO_GL: expected one of egl, osmesa, glfw; found"):
+        opengl.find_opengl()
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(InputError, match="switched off"):
+        opengl.find_opengl()
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(opengl, "_works", lambda way: tried.append(way) or way == "glfw")
+    with pytest.raises(InputError, match="expected one of egl, osmesa to draw with"):
+        opengl.find_opengl()
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert opengl.find_opengl() == "glfw"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--size", "640"), "--size: expected WIDTHxHEIGHT"),
+        (("--size", "641x480"), "even numbers of pixels"),
+        (("--size", "0x0"), "from 64x64 to 3840x2160; found '0x0'"),
+        (("--size", "64000x480"), "--size"),
+        (("--fps", "0"), "--fps: expected a whole number from 1 to 120; found '0'"),
+        (("--fps", "29.97"), "--fps"),
+        (("--seed", "-1"), "from 0 to 4294967295; found '-1'"),
+        (("--seed", "99999999999"), "--seed: expected a whole number"),
+        (("--duration", "0"), "--duration: expected seconds > 0; found '0'"),
+        (("--duration", "nan"), "--duration"),
+        (("--duration", "long"), "--duration"),
+        (("--fast",), "unrecognized arguments"),
+        (("--html", "--out", "x.mp4"), "with --html"),
+        (("--view", "--out", "x.mp4"), "--view: expected neither"),
+    ],
+)
+def test_wrong_options(words, message, tmp_path, capsys):
+    (tmp_path / "spider.yaml").touch()
+    assert run_command(replay.main, [str(tmp_path / "spider.yaml"), *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and error.startswith("error: ")
+
+
+def genes(folder, text):
+    folder.mkdir()
+    (folder / "config.yaml").write_text("")
+    (folder / "champion").mkdir()
+    (folder / "champion" / "genes.yaml").write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda at: at / "none", "expected a run folder, a genes.yaml or a morphology; found none"),
+        (lambda at: at, "expected a run folder; found no config.yaml in it"),
+        (lambda at: genes(at / "run", "[1, 2"), "expected valid YAML"),
+        (lambda at: genes(at / "run", "genes: many"), "genes: expected a list of numbers"),
+    ],
+)
+def test_wrong_paths(make, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(opengl, "_works", lambda way: True)
+    path = make(tmp_path)
+    assert run_command(replay.main, [str(path), "--out", str(tmp_path / "x.mp4")]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_a_run_without_a_champion(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(opengl, "_works", lambda way: True)
+    (tmp_path / "config.yaml").write_text("")
+    assert run_command(replay.main, [str(tmp_path)]) == 2
+    assert "expected a champion; found none" in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written(command, way, tmp_path, capsys):
+    source = tmp_path / "spider.yaml"
+    source.touch()
+    (tmp_path / "file").touch()
+    for name, message in (
+        ("file/x.mp4", "file/x.mp4: expected the folder"),
+        ("file/x", "file/x: expected the folder"),
+        ("file", "expected a folder, or a name that ends in .mp4, .gif, .html; found another file"),
+        ("x.avi", "expected a folder, or a name that ends in .mp4, .gif, .html; found '.avi'"),
+    ):
+        assert command(str(source), "--out", str(tmp_path / name)) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+    assert command(str(source), "--html", "--out", str(tmp_path / "v0.2")) == 0
+    assert [path.name for path in (tmp_path / "v0.2").iterdir()] == ["viewer.html"]
+
+
+@pytest.mark.skipif(not os.sys.platform.startswith("linux"), reason="Linux's screens")
+def test_view_without_a_screen_is_one_line(command, tmp_path, capsys, monkeypatch):
+    source = tmp_path / "spider.yaml"
+    source.touch()
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert command(str(source), "--view") == 2
+    assert "found neither DISPLAY nor WAYLAND_DISPLAY" in capsys.readouterr().err
+    monkeypatch.setenv("DISPLAY", ":987")
+    assert command(str(source), "--view") == 2
+    assert capsys.readouterr().err.startswith("error: --view: expected a screen")
+
+
+def test_a_lost_robot_is_named(episode, command, way, tmp_path, capsys, monkeypatch):
+    import mjx_revolve.episodes.champion
+
+    qpos = jnp.asarray(episode.trajectory.qpos).at[100:].set(jnp.nan)
+    lost = replace(episode, trajectory=replace(episode.trajectory, qpos=qpos))
+    monkeypatch.setattr(mjx_revolve.episodes.champion, "load_episode", lambda *a: lost)
+    source = tmp_path / "spider.yaml"
+    source.touch()
+    out = tmp_path / "x.gif"
+    assert command(str(source), "--size", "64x64", "--fps", "4", "--out", str(out)) == 0
+    assert "not finite from 0.505 s on" in capsys.readouterr().err
+    with Image.open(out) as gif:
+        assert gif.n_frames == 2
+
+
+@pytest.mark.slow
+def test_a_run_from_end_to_end(way, tmp_path):
+    from mjx_revolve import evolve
+
+    run = tmp_path / "run"
+    config = Path(__file__).resolve().parents[2] / "configs" / "smoke.yaml"
+    assert run_command(evolve.main, [str(config), "--out", str(run)]) == 0
+    assert run_command(replay.main, [str(run), "--size", "320x240"]) == 0
+    _, _, _, pictures = read_mp4(run / "swim.mp4")
+    assert len(pictures) == 30
+    assert (run / "swim.gif").stat().st_size < 8e6 and (run / "viewer.html").stat().st_size < 5e6

@@ -1,0 +1,719 @@
+"""Reports: what is read of whole and damaged runs, the statistics, the pictures and the page."""
+
+import errno
+import json
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+
+import mjx_revolve
+from laboratory import _ELBOW as ELBOW
+from laboratory import read
+from mjx_revolve import evolve, report
+from mjx_revolve.episodes.config import load_config, make_config
+from mjx_revolve.episodes.fitness import make_fitness
+from mjx_revolve.episodes.scoring import replay_key
+from mjx_revolve.evolution import runs
+from mjx_revolve.evolution.fingerprints import model_hash, settings_hash
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics import runtime
+from mjx_revolve.view import plots
+from mjx_revolve.view.report import appendix as report_appendix
+from mjx_revolve.view.report import motion as report_motion
+from mjx_revolve.view.report import page as report_page
+from mjx_revolve.view.report import plots as report_plots
+from mjx_revolve.view.report import repeat as report_repeat
+from mjx_revolve.view.report.champion import cpg_phases, judge, path_of, replay_champion
+from mjx_revolve.view.report.data import read_metrics, read_run
+from mjx_revolve.view.report.groups import (
+    differences,
+    format_interval,
+    group_runs,
+    mean_difference,
+    mean_interval,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+SETTINGS = {
+    "morphology": "elbow.yaml",
+    "trim": "none",
+    "world": "lake",
+    "controller": {"type": "cpg", "max_frequency": 1.0},
+    "task": {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 1},
+    "evolution": {"strategy": "SNES", "population_size": 8, "generations": 6},
+}
+GENES = np.float32([0.9, -0.6, 0.5])
+
+
+def row(generation, seed=0):
+    """A generation of a search that gets better, each seed in its own way."""
+    best = float(0.1 * np.log1p(generation) + 0.01 * seed)
+    return {
+        "generation": generation, "evaluations": 8 * generation, "best": best, "mean": best / 2,
+        "std": 0.02, "median": best / 2.2, "champion": best, "step_size": 0.5 / generation,
+        "failed": 0, "restarts": 0, "speed_m_s": best / 3, "seconds": 0.5 * generation,
+        "evaluations_per_second": 16.0,
+    }  # fmt: skip
+
+
+def make_run(folder, config, fitness, seed=0, generations=6, finished=True, score=None):
+    """A run folder as evolution leaves it, without evolution."""
+    evolution = config.evolution.model_copy(update={"seed": seed})
+    config = config.model_copy(update={"evolution": evolution})
+    settings = ["controller.max_frequency=1.0", f"evolution.seed={seed}"]
+    run, config = runs.create_run(
+        folder, config, started="2026-01-02T03:04:05+00:00", seed=seed,
+        config_file=config.source, settings=settings, model_hash=model_hash(fitness),
+        **runtime.describe_process(),
+    )  # fmt: skip
+    for generation in range(1, generations + 1):
+        run.append_metrics(row(generation, seed))
+    arrays = {"elites": np.stack([GENES, 0 * GENES]), "elite_scores": np.float32([0.2, -np.inf])}
+    for generation in (generations - 1, generations):
+        run.save_checkpoint(generation, arrays, {}, 3)
+    facts = {"score": score or row(generations, seed)["best"], "score_std": 0.004,
+             "origin": "best of generation 5", "measures": {"speed_m_s": 0.02}}  # fmt: skip
+    run.save_champion(GENES, final=finished, **facts)
+    run.write("champion/morphology.yaml", fitness.robot.morphology.save)
+    if finished:
+        run.update_info(finished="2026-01-02T03:05:00+00:00", generations=generations,
+                        champion=facts)  # fmt: skip
+    run.close()
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """Three seeds of one configuration, and what their champion does."""
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "elbow.yaml").write_text(ELBOW)
+    (folder / "swim.yaml").write_text(json.dumps(SETTINGS))
+    config = load_config(folder / "swim.yaml")
+    fitness = make_fitness(config)
+    trajectory = fitness.replay(GENES, replay_key(0))
+    score, measures = judge(fitness, trajectory, replay_key(0))
+    for seed in range(3):
+        make_run(folder / f"s{seed}", config, fitness, seed, score=score)
+    record = read_run(folder / "s0")
+    assert record.problems == []
+    return {"folder": folder, "config": config, "fitness": fitness, "score": score,
+            "measures": measures, "replay": replay_champion(record, fitness)}  # fmt: skip
+
+
+@pytest.fixture
+def copy(lab, tmp_path, monkeypatch):
+    """A run of one's own to damage, current folder beside it."""
+    shutil.copytree(lab["folder"] / "s0", tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def quick(lab, monkeypatch):
+    """Reports that compile nothing: all runs have the same robot."""
+    monkeypatch.setattr("mjx_revolve.episodes.fitness.make_fitness", lambda config: lab["fitness"])
+    monkeypatch.setattr("mjx_revolve.view.report.sections._swim_jpeg", lambda replay: b"\xff\xd8")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+
+
+def run_main(*argv):
+    return run_command(report.main, [str(word) for word in argv])
+
+
+# --- statistics ---
+
+
+def test_intervals_of_known_numbers():
+    interval = mean_interval([1.0, 2.0, 3.0])
+    assert (interval.mean, interval.count) == (2.0, 3)
+    assert interval.half == pytest.approx(4.302653 / np.sqrt(3), rel=1e-6)  # t(0.975, 2) / √3
+    values = np.array([[1.0, 5.0, np.nan], [2.0, np.nan, np.nan], [3.0, 5.0, np.nan]])
+    wide = mean_interval(values)
+    assert wide.mean[:2].tolist() == [2.0, 5.0]
+    assert wide.count.tolist() == [3, 2, 0]
+    assert wide.half[1] == 0.0
+    assert np.isnan([wide.mean[2], wide.half[2], mean_interval([4.0]).half]).all()
+
+
+def test_intervals_agree_with_scipy():
+    draw = np.random.default_rng(0)
+    a, b = draw.normal(1, 2, 7), draw.normal(0, 1, 5)
+    low, high = scipy.stats.t.interval(0.95, 6, a.mean(), scipy.stats.sem(a))
+    assert mean_interval(a).half == pytest.approx((high - low) / 2)
+    welch = scipy.stats.ttest_ind(a, b, equal_var=False).confidence_interval(0.95)
+    difference = mean_difference(a, b)
+    assert difference.mean == pytest.approx(a.mean() - b.mean())
+    assert difference.half == pytest.approx((welch.high - welch.low) / 2)
+    assert mean_difference([1.0, 1.0], [2.0, 2.0]).half == 0.0
+    assert np.isnan(mean_difference([1.0], b).half)
+    assert mean_difference([], b).count == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ([], "–"),
+        ([float("nan")], "–"),
+        ([0.12345], "0.123"),
+        ([0.1, 0.1, 0.1], "0.1"),
+        ([0.15, 0.16, 0.17], "0.160 ± 0.025"),
+        ([-12.0, -15.0, -13.0], "−13.3 ± 3.8"),
+        ([1000.0, 3000.0], "2000 ± 12706"),
+        ([1e-12, 3e-12], "2e−12 ± 1e−11"),
+    ],
+)
+def test_means_are_written_to_the_digits_that_count(values, text):
+    assert format_interval(mean_interval(values)) == text
+
+
+# --- groups ---
+
+
+def test_seeds_are_grouped_and_configurations_told_apart(lab, tmp_path):
+    config, fitness, folder = lab["config"], lab["fitness"], lab["folder"]
+    longer = make_config(config.model_dump(), "/", ["evolution.generations=9"], config.source)
+    make_run(tmp_path / "long", longer, fitness, 0, 9)
+    other = make_config(config.model_dump(), "/", ["controller.max_frequency=2.0"], config.source)
+    make_run(tmp_path / "other", other, fitness, 1)
+    shutil.copytree(folder / "s1", tmp_path / "again")
+    places = [*(folder / f"s{k}" for k in range(3)), *(tmp_path / n for n in ("long", "other"))]
+    groups = group_runs([read_run(place) for place in (*places, tmp_path / "again")])
+    assert [[r.seed for r in group.records] for group in groups] == [[0, 1, 2], [0], [1]]
+    assert [group.name for group in groups] == [
+        "6 generations, max frequency 1.0", "9 generations, max frequency 1.0",
+        "6 generations, max frequency 2.0",
+    ]  # fmt: skip
+    assert differences(groups) == {
+        "controller.max_frequency": [1.0, 1.0, 2.0], "evolution.generations": [6, 9, 6]
+    }  # fmt: skip
+    (again,) = groups[0].copies
+    assert again.state == "a copy"
+    assert "the same configuration and seed as" in again.warning
+    assert len(groups[0].scores()) == 3
+    (alone,) = group_runs([read_run(folder / "s0")])
+    assert (alone.name, alone.task, alone.unit) == ("swim", "speed", "body lengths/s")
+
+
+def test_curves_go_as_far_as_all_runs_do(lab, tmp_path):
+    config = make_config(lab["config"].model_dump(), "/", ["evolution.generations=9"], "swim.yaml")
+    for seed, generations in enumerate((9, 4, 7)):
+        make_run(tmp_path / f"{seed}", config, lab["fitness"], seed, generations, finished=False)
+    lines = (tmp_path / "0" / "metrics.csv").read_text().splitlines(True)
+    (tmp_path / "0" / "metrics.csv").write_text("".join(lines[:2] + lines[3:]))  # without the 2nd
+    (group,) = group_runs([read_run(tmp_path / f"{seed}") for seed in range(3)])
+    x, values = group.curve("champion")
+    assert x.tolist() == [1, 3, 4]
+    assert np.allclose(values, [[row(g, seed)["champion"] for g in x] for seed in range(3)])
+    assert group.curve("champion", "evaluations")[0].tolist() == [8, 24, 32]
+    assert np.isnan(group.curve("no_such_column")[1]).all()
+    assert group.scores() == []
+    assert group.best().seed == 0  # the furthest, where nothing was judged
+
+
+def test_the_best_run_is_the_best_judged_one(lab, tmp_path):
+    for seed, (score, finished) in enumerate(((0.2, True), (0.3, True), (0.9, False))):
+        make_run(tmp_path / f"{seed}", lab["config"], lab["fitness"], seed, 6, finished, score)
+    (group,) = group_runs([read_run(tmp_path / f"{seed}") for seed in range(3)])
+    assert group.best().seed == 1
+    assert group.scores() == [0.2, 0.3]
+
+
+# --- reading what is left ---
+
+
+def cut(path, share=0.5):
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
+
+def made_by(run, package, version):
+    record = json.loads((run / "run.json").read_text())
+    record["versions"][package] = version
+    (run / "run.json").write_text(json.dumps(record))
+
+
+def edit(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def break_cell(run):
+    edit(run / "metrics.csv", "\n3,24,", "\n3,x,")
+
+
+DAMAGES = [
+    (lambda run: cut(run / "metrics.csv"), "damaged", "metrics.csv ends at generation 2, but the "
+     "run reached 6"),
+    (break_cell, "damaged", "metrics.csv: 1 line is damaged and left out"),
+    (break_cell, "damaged", "metrics.csv: 1 of 6 generations are not in it"),
+    (lambda run: (run / "metrics.csv").write_bytes(bytes(300)), "incomplete", "metrics.csv is "
+     "empty"),
+    (lambda run: (run / "metrics.csv").write_bytes(b"\xff\xfe\x00a,b\n1,2\n"), "damaged",
+     "metrics.csv: expected a header with a column generation; found"),
+    (lambda run: cut(run / "metrics.csv", 0.1), "damaged", "metrics.csv: expected a header"),
+    (lambda run: (run / "metrics.csv").unlink(), "incomplete", "metrics.csv is missing"),
+    (lambda run: (run / "run.json").unlink(), "incomplete", "run.json is missing"),
+    (lambda run: cut(run / "run.json"), "damaged", "run.json: expected JSON; found"),
+    (lambda run: (run / "config.yaml").unlink(), "incomplete", "config.yaml is missing"),
+    (lambda run: (run / "config.yaml").write_text("a: {"), "damaged", "config.yaml: line "),
+    (lambda run: (run / "config.yaml").write_text("[]"), "damaged", "config.yaml: expected a map"),
+    (lambda run: edit(run / "config.yaml", "duration: 1.0", "duration: -1"), "damaged",
+     "config.yaml: task.duration: expected a number > 0; found -1"),
+    (lambda run: edit(run / "config.yaml", "engine: population", "engine: population\nflux: 3"),
+     "of another version", "config.yaml: this version does not know flux; read without"),
+    (lambda run: edit(run / "config.yaml", "trials: 1", "trials: 1\n  trails: 2"),
+     "of another version", "this version does not know task.trails; read without"),
+    (lambda run: edit(run / "run.json", f'"jax": "{jax.__version__}"', '"jax": "0.0.7"'),
+     "of another version", f"made with older jax 0.0.7 (here {jax.__version__}): a replay may"),
+    (lambda run: made_by(run, "mjx_revolve", "99.1"),
+     "of another version", "made with newer mjx_revolve 99.1 (here "),
+    (lambda run: edit(run / "run.json", '"versions"', '"visions"'), "of another version",
+     "run.json names no versions"),
+    (lambda run: (run / "inputs" / "elbow.yaml").unlink(), "incomplete",
+     "inputs/elbow.yaml is missing: champion/morphology.yaml stands in for it"),
+    (lambda run: (run / "champion" / "genes.yaml").unlink(), "incomplete",
+     "the champion shown is the best individual in checkpoints/generation_000006.npz"),
+    (lambda run: (run / "champion" / "genes.yaml").write_text("genes: [1, .nan]"), "damaged",
+     "champion/genes.yaml: genes: expected finite numbers"),
+    (lambda run: (run / "champion" / "genes.yaml").write_text("genes: [1,"), "damaged",
+     "champion/genes.yaml: line 1: expected valid YAML"),
+    (lambda run: cut(run / "checkpoints" / "generation_000006.npz"), "damaged",
+     "checkpoints/generation_000006.npz: File is not a zip file"),
+    (lambda run: shutil.rmtree(run / "checkpoints"), "incomplete", "checkpoints/ has none"),
+    (lambda run: edit(run / "run.json", '"finished"', '"began"'), "not finished",
+     "stopped or still running after 6 of 6 generations"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("damage", "state", "text"), DAMAGES)
+def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
+    damage(copy)
+    record = read_run(copy)
+    assert state in record.state
+    assert text in record.warning, record.warning
+    assert str(copy) not in "; ".join(problem.text for problem in record.problems)
+    assert record.info or record.settings
+    assert record.genes is not None
+    if "metrics" in text and record.metrics:  # whatever is left makes pictures
+        (group,) = group_runs([record])
+        assert plots.figure_svg(report_plots.plot_seeds(group)).startswith(b"<?xml")
+        assert plots.figure_svg(plots.plot_fitness(record.metrics)).startswith(b"<?xml")
+
+
+def test_values_of_the_wrong_kind_do_not_stop_a_report(copy, quick, capsys):
+    info = json.loads((copy / "run.json").read_text())
+    info |= {"champion": {"score": 10**400, "measures": [1]}, "versions": {"jax": 1}, "git": 7,
+             "threads": "?", "settings": "?", "resumed": [3], "config_file": None}  # fmt: skip
+    (copy / "run.json").write_text(json.dumps(info))
+    (copy / "inputs" / "elbow.yaml").write_bytes(b"\xff\xfe")
+    assert run_main("run") == 0
+    assert "Repeat it" in Page((copy / "report.html").read_text()).words
+
+
+def test_metrics_of_another_version_may_lack_columns(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("generation,best\r\n2,0.5\r\n1,inf\r\n2,0.6\r\n")
+    table, problems = read_metrics(path)
+    assert problems == []
+    assert table["generation"].tolist() == [1, 2]
+    assert np.isnan(table["best"][0]) and table["best"][1] == 0.6  # the resumed run's line counts
+    assert plots.figure_svg(plots.plot_fitness(table)).startswith(b"<?xml")
+    bare = {"generation": table["generation"]}
+    assert plots.figure_svg(plots.plot_fitness(bare)).startswith(b"<?xml")
+
+
+def test_quartiles_are_drawn_where_there_are_some():
+    table = {"generation": np.arange(1.0, 4), "best": np.arange(3.0), "median": np.arange(3.0) / 2,
+             "lower_quartile": np.zeros(3), "upper_quartile": np.arange(3.0)}  # fmt: skip
+    top = plots.plot_fitness(table).axes[0]
+    labels = [text.get_text() for text in top.get_legend().get_texts()]
+    assert labels == ["quartiles", "median", "best"]
+
+
+@pytest.mark.parametrize("make", [lambda p: None, lambda p: p.mkdir(), lambda p: p.touch()])
+def test_what_is_no_run_is_refused(tmp_path, make):
+    make(tmp_path / "thing")
+    with pytest.raises(InputError, match=r"thing: expected a run folder; found"):
+        read_run(tmp_path / "thing")
+
+
+def test_a_folder_of_damaged_files_is_refused_with_the_reason(copy):
+    shutil.rmtree(copy / "checkpoints")
+    for path in copy.rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"\0\1")
+    with pytest.raises(InputError, match=r"run: expected a run folder; found run.json: expected J"):
+        read_run(copy)
+
+
+# --- the champion ---
+
+
+def test_the_replay_scores_as_evolution_did(lab, copy):
+    replay = lab["replay"]
+    assert replay.score == lab["score"]
+    record = read_run(copy)
+    for name in ("run.json", "champion/genes.yaml"):
+        data = (copy / name).read_text()
+        (copy / name).write_text(data.replace(str(lab["score"]), str(lab["score"] + 0.1)))
+    record = read_run(copy)
+    assert np.isnan(replay_champion(record, lab["fitness"]).score) == 0
+    assert "changed" in record.state
+    assert "the simulator has changed since, or files of the run have" in record.warning
+
+
+@pytest.mark.slow
+def test_judging_is_what_evolution_does(lab):
+    scores, measures = lab["fitness"].evaluate(GENES[None], replay_key(0))
+    assert lab["score"] == pytest.approx(float(scores[0]), rel=1e-4)
+    for name, value in measures.items():
+        assert lab["measures"][name] == pytest.approx(float(value[0]), rel=1e-3), name
+
+
+def test_genes_of_another_controller_are_refused(lab, copy):
+    (copy / "champion" / "genes.yaml").write_text("genes: [1.0, 2.0]")
+    with pytest.raises(InputError, match=r"genes: expected 3, as config.yaml has it; found 2"):
+        replay_champion(read_run(copy), lab["fitness"])
+
+
+def test_phases_of_oscillators_without_neighbours_turn_evenly(lab):
+    fitness = lab["fitness"]
+    genes = np.float32([0.9, -0.6, 0.0])
+    phases = np.unwrap(cpg_phases(fitness, genes, 100), axis=0)
+    seconds = fitness.robot.world.timestep * np.arange(1, 101)
+    assert np.allclose(phases, 2 * np.pi * np.sin(genes[:2]) * seconds[:, None], atol=1e-4)
+    trajectory = fitness.replay(genes, replay_key(0))
+    low, high = fitness.robot.mj_model.actuator_ctrlrange.T
+    expected = (low + high) / 2 + (high - low) / 2 * np.tanh(np.sin(phases))
+    assert np.allclose(trajectory.ctrl[:100], expected, atol=1e-4)
+
+
+# --- pictures ---
+
+
+def axes_of(figure):
+    """Rendered once, then its axes by what they are called."""
+    assert plots.figure_svg(figure).startswith(b"<?xml")
+    return figure.axes
+
+
+def test_joint_angles_are_those_of_the_joints(lab):
+    first, second = axes_of(report_motion.plot_joints(lab["replay"]))
+    trajectory = lab["replay"].episode.trajectory
+    assert first.get_title(loc="left") == "shoulder"
+    assert np.allclose(first.lines[1].get_ydata(), np.degrees(trajectory.qpos[:, 7]))
+    assert np.allclose(second.lines[0].get_ydata(), np.degrees(trajectory.ctrl[:, 1]))
+    assert second.get_xlabel() == "time (s)"
+
+
+def test_power_adds_up(lab):
+    replay = lab["replay"]
+    power, energy, cost = axes_of(report_motion.plot_energy(replay))
+    assert [axes.get_ylabel() for axes in (power, energy, cost)] == [
+        "power (W)", "energy so far (J)", "cost of transport (–)",
+    ]  # fmt: skip
+    seconds = replay.episode.trajectory.time[-1]
+    total = float(np.mean(replay.episode.trajectory.power)) * float(seconds)
+    assert energy.lines[0].get_ydata()[-1] == pytest.approx(total, rel=1e-4)
+    final = float(cost.get_title(loc="left").split()[0])
+    assert final == pytest.approx(replay.measures["cost_of_transport"], rel=0.01)
+
+
+def test_phases_and_thrusters(lab):
+    phases = axes_of(report_motion.plot_phases(lab["replay"]))
+    assert phases[0].images[0].get_array().shape == (2, 200)
+    assert phases[0].images[0].get_cmap().name == "twilight"  # a circle: 0 and 2π look the same
+    from types import SimpleNamespace
+
+    time = np.arange(400) * 0.01
+    command = np.sin(40 * time)[:, None]
+    model = SimpleNamespace(actuator=lambda i: SimpleNamespace(name="bow"))
+    robot = SimpleNamespace(thrusters=(0,), mj_model=model)
+    trajectory = SimpleNamespace(time=time, ctrl=command, command=0.5 * command)
+    replay = SimpleNamespace(episode=SimpleNamespace(robot=robot, trajectory=trajectory))
+    (axes,) = axes_of(report_motion.plot_thrusters(replay))
+    assert np.ptp(axes.lines[0].get_xdata()) < 2.0  # the last of many swings
+    assert np.ptp(axes.lines[1].get_ydata()) == pytest.approx(1.0, abs=0.05)
+
+
+def test_comparison_of_very_different_lengths(lab, tmp_path):
+    config = lab["config"]
+    made = []
+    for generations in (3, 40):
+        changed = make_config(config.model_dump(), "/", [f"evolution.generations={generations}"])
+        for seed in range(3):
+            folder = tmp_path / f"{generations}-{seed}"
+            make_run(folder, changed, lab["fitness"], seed, generations)
+            made.append(read_run(folder))
+    groups = group_runs(made)
+    styles = {group.name: k for k, group in enumerate(groups)}
+    left, right = axes_of(report_plots.plot_comparison(groups, styles))
+    assert left.get_xscale() == "log"
+    assert np.allclose(left.lines[0].get_ydata(), np.mean(groups[0].curve("champion")[1], axis=0))
+    assert [tick.get_text() for tick in right.get_xticklabels()] == ["A", "B"]
+    (same,) = group_runs(made[:3])
+    left, _ = axes_of(report_plots.plot_comparison([same], {same.name: 0}))
+    assert left.get_xscale() == "linear"
+
+
+def test_searches_in_which_everything_fails_make_pictures(lab, tmp_path):
+    make_run(tmp_path / "0", lab["config"], lab["fitness"], 0, 1)
+    make_run(tmp_path / "1", lab["config"], lab["fitness"], 1, 3)
+    text = (tmp_path / "1" / "metrics.csv").read_text().splitlines()
+    rows = [f"{g},{8 * g}," + ",".join(["nan"] * 4) + ",-inf,.5,8,0,nan,1,1" for g in (1, 2, 3)]
+    (tmp_path / "1" / "metrics.csv").write_text("\n".join([text[0], *rows, ""]))
+    one, other = (read_run(tmp_path / name) for name in "01")
+    assert other.problems == []
+    for records in ([one], [other], [one, other]):
+        groups = group_runs(records)
+        axes_of(report_plots.plot_comparison(groups, {group.name: 0 for group in groups}))
+        axes_of(report_plots.plot_seeds(groups[0]))
+        axes_of(plots.plot_fitness(records[-1].metrics))
+
+
+def test_long_episodes_make_small_pictures():
+    from types import SimpleNamespace
+
+    time = np.arange(100_000) * 0.005
+    path = np.random.default_rng(0).normal(size=(len(time), 3)).cumsum(0) * 1e-3
+    figure = plots.plot_trajectory(SimpleNamespace(time=time, xpos=np.stack([path, path], axis=1)))
+    assert len(plots.figure_svg(figure)) < 1e6
+
+
+def test_champions_start_at_one_place(lab):
+    replay = lab["replay"]
+    figure = report_plots.plot_champions([("one", 0, [replay, replay, replay]), ("b", 1, [replay])])
+    above, side, away = axes_of(figure)
+    assert np.allclose(above.lines[0].get_xydata()[0], 0)
+    way = path_of(replay)[1]
+    distance = np.linalg.norm(way - way[0], axis=1)
+    assert np.allclose(away.lines[0].get_ydata(), distance)
+    assert side.get_ylabel() == "z (m)"
+
+
+@pytest.mark.parametrize(("index", "text"), [(0, "A"), (25, "Z"), (26, "AA"), (52, "BA")])
+def test_letters_never_run_out(index, text):
+    assert report_plots.letter(index) == text
+    assert set(report_plots.style_of(index)) == {"color", "linestyle"}
+
+
+def test_side_views_look_across_the_way():
+    from types import SimpleNamespace
+
+    time = np.arange(100) * 0.05
+    path = np.stack([0 * time, 0.2 * time, 0 * time - 1], axis=-1)
+    figure = plots.plot_trajectory(SimpleNamespace(time=time, xpos=np.stack([path, path], axis=1)))
+    assert figure.axes[1].get_xlabel() == "y (m)"
+
+
+def test_pictures_are_the_same_bytes_twice():
+    table = {"generation": np.arange(1.0, 4), "best": np.arange(3.0)}
+    first, second = (plots.figure_svg(plots.plot_fitness(table)) for _ in range(2))
+    assert first == second
+    assert b"<text" not in first  # no fonts needed
+
+
+# --- tables and commands ---
+
+
+def test_modules_are_counted_and_weighed():
+    elbow = read(ELBOW)
+    page = report_appendix.module_table(elbow)
+    assert '<td class="left">FixedBrick</td><td>2</td><td>10.2</td><td>20.4</td>' in page
+    assert f"<td>{1e3 * elbow.mass:.4g}</td>" in page
+    assert "41 × 41 × 35.5" in page
+
+
+def test_the_commands_give_the_same_settings(lab, copy):
+    record = read_run(copy)
+    (own_words, own), (words, started) = report_repeat.repeat_commands(record)
+    assert (own_words, words) == ("from this run folder", "as it was started")
+    for command in (own, started):
+        assert command.startswith("python -m mjx_revolve.evolve ")
+        arguments = evolve._parser().parse_args(command.split()[3:])
+        config = load_config(arguments.config, evolve._seed_setting(arguments))
+        assert settings_hash(config) == settings_hash(record.config)
+    assert "--seed 0 --set controller.max_frequency=1.0" in started
+
+
+def test_a_command_that_no_longer_fits_is_not_shown(lab, copy):
+    source = copy.parent / "swim.yaml"
+    shutil.copy(lab["folder"] / "elbow.yaml", copy.parent)
+    shutil.copy(lab["folder"] / "swim.yaml", source)
+    runs.Run(copy).update_info(config_file=str(source))
+    commands = report_repeat.repeat_commands(read_run(copy))
+    assert commands[1][1].startswith("python -m mjx_revolve.evolve swim.yaml --seed 0 ")
+    edit(source, '"duration": 1.0', '"duration": 2.0')
+    assert len(report_repeat.repeat_commands(read_run(copy))) == 1
+    source.unlink()
+    assert len(report_repeat.repeat_commands(read_run(copy))) == 1
+    runs.Run(copy).update_info(xla_flags="--a --b", threads={"OPENBLAS_NUM_THREADS": "2"})
+    ((_, command),) = report_repeat.repeat_commands(read_run(copy))
+    assert command.startswith("OPENBLAS_NUM_THREADS=2 XLA_FLAGS='--a --b' python -m ")
+
+
+# --- the page ---
+
+
+class Page(HTMLParser):
+    """Checks that tags close, and that nothing comes from elsewhere."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.images, self.anchors, self.links, self.words = [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+        assert all(link.removeprefix("#") in self.anchors for link in self.links)
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag == "img":
+            assert values["src"].startswith("data:image/")
+            assert values["alt"]
+            self.images.append(values["src"])
+        if tag == "a":
+            assert values["href"].startswith("#")
+            self.links.append(values["href"])
+        if "id" in values:
+            self.anchors.append(values["id"])
+        assert tag not in ("script", "link", "iframe")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] != ["style"]:
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(self.words)
+
+
+def test_text_is_escaped():
+    inside = report_page.table(["<a>\n<b>"], [["<script>"]]) + report_page.listing('"<pre>&')
+    box = report_page.problem_box([("<run>", "", ["<img>"])], True)
+    page = Page(report_page.make_page("<t>", box, [("x", "<h>", inside), ("y", "none", "")], "<f>"))
+    for text in ("<script>", '"<pre>&', "<run>", "<img>", "<t>", "<h>", "<f>", "<a>", "<b>"):
+        assert text in page.words
+    assert "none" not in page.text
+
+
+def test_a_page_about_one_run(copy, quick, capsys):
+    assert run_main("run") == 0
+    captured = capsys.readouterr()
+    assert captured.out.startswith("report: run/report.html (")
+    assert captured.err == ""
+    text = (copy / "report.html").read_text()
+    page = Page(text)
+    assert "elbow: speed (run)" in page.words
+    for words in ("Convergence", "Champion", "Robot", "Repeat it", "FixedBrick", "config.yaml"):
+        assert words in page.words
+    assert "python -m mjx_revolve.evolve run/config.yaml --out run-again" in page.text
+    assert len(page.images) == 6  # fitness, swim, way, joints, phases, energy
+    assert "Not everything could be read" not in page.text
+    assert len(text) < 2e6
+    assert run_main("run") == 0  # its own page is replaced
+
+
+def test_a_page_about_several_runs(lab, copy, quick, capsys):
+    runs_of = [lab["folder"] / f"s{seed}" for seed in range(3)]
+    assert run_main(*runs_of, "run", "--out", "page.html") == 0
+    assert "the same configuration and seed as" in capsys.readouterr().err
+    page = Page((copy.parent / "page.html").read_text())
+    assert "4 runs of swim" in page.words
+    assert format_interval(mean_interval([lab["score"]] * 3)) in page.words
+    assert "Champions side by side" in page.words
+    assert any("95 % confidence" in words for words in page.words)
+    assert len(page.images) == 3 + 5
+
+
+@pytest.mark.slow
+def test_every_champion_may_be_shown(lab, copy, quick):
+    runs_of = [lab["folder"] / f"s{seed}" for seed in range(3)]
+    assert run_main(*runs_of, "--every-champion", "--out", "all.html") == 0
+    assert len(Page((copy.parent / "all.html").read_text()).images) == 3 + 3 * 5
+
+
+def test_a_page_about_what_is_left(copy, quick, capsys):
+    for name in ("a", "b", "c", "d"):
+        shutil.copytree(copy, name)
+    (copy.parent / "a" / "config.yaml").write_text("a: {")
+    (copy.parent / "a" / "swim.png").write_bytes(plots.figure_png(plots.new_figure(1, 1)))
+    shutil.rmtree("b/champion")
+    shutil.rmtree("b/checkpoints")
+    (copy.parent / "c" / "metrics.csv").unlink()
+    (copy.parent / "c" / "champion" / "genes.yaml").write_text("genes: [1.0]")
+    for path in (copy.parent / "d").iterdir():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    assert run_main("a", "b", "c", "d") == 0
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert len(lines) == 4
+    assert lines[0] == (
+        "warning: nothing could be read: d: expected a run folder; found nothing of a run"
+    )
+    assert all(line.startswith("warning: ") for line in lines)
+    page = Page((copy.parent / "report.html").read_text())
+    for words in ("Not everything could be read", "a", "b", "c", "Nothing could be read of"):
+        assert words in page.words
+    assert "found 1" in page.text  # c: one gene where three are expected
+    assert any(source.startswith("data:image/png") for source in page.images)  # a's own picture
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ([], "the following arguments are required: RUN (see --help)"),
+        (["run", "--outt", "x"], "unrecognized arguments: --outt x (see --help)"),
+        (["nowhere"], "nowhere: expected a run folder; found none"),
+        (["run", "nowhere"], "nowhere: expected a run folder; found none"),
+        (["run/config.yaml"], "run/config.yaml: expected a run folder; found a file"),
+        (["empty"], "empty: expected a run folder; found nothing of a run"),
+        (["run", "run/../run"], "run/../run: expected each run once; found it as run, too"),
+        (["run", "--out", "page.pdf"], "--out page.pdf: expected a name that ends in .html"),
+        (["run", "--out", "folder.html"], "--out folder.html: expected a file; found a folder"),
+        (["run", "--out", "no/page.html"], "--out no/page.html: expected the folder no; found"),
+        (["run"], "run/report.html: expected no file or an earlier report; found another file"),
+    ],
+)
+def test_wrong_commands(copy, argv, message, capsys):
+    (copy.parent / "empty").mkdir()
+    (copy.parent / "folder.html").mkdir()
+    (copy / "report.html").write_text("mine")
+    before = sorted(copy.parent.rglob("*"))
+    assert run_main(*argv) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.startswith("error: ") and err.count("\n") == 1
+    assert sorted(copy.parent.rglob("*")) == before
+    assert (copy / "report.html").read_text() == "mine"
+
+
+def test_a_full_disk_is_one_line(copy, quick, capsys, monkeypatch):
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(runs, "write_atomic", full)
+    assert run_main("run", "--out", "page.html") == 1
+    assert capsys.readouterr().err == "error: page.html: No space left on device\n"
+
+
+@pytest.mark.slow
+def test_the_real_thing(copy, capsys):
+    assert run_main("run") == 0
+    assert capsys.readouterr().err == ""
+    page = Page((copy / "report.html").read_text())
+    assert any(source.startswith("data:image/jpeg") for source in page.images)
+    assert mjx_revolve.__version__ in page.text

@@ -1,0 +1,223 @@
+"""Added mass: Lamb's coefficients, Kirchhoff's equations, and what they conserve."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import (
+    accelerate,
+    arm_robot,
+    at_rest,
+    body,
+    box_robot,
+    march,
+    random_states,
+    world,
+)
+from mjx_revolve.engine.hydrodynamics import Water, box_added_mass, lamb_coefficients
+from mjx_revolve.engine.robot import build_robot
+from references import Lagrangian
+
+RHO = 999.1026
+SIZE = (0.12, 0.08, 0.03)  # its carried water weighs from 0.2 to 1.6 times what it displaces
+
+
+# ------------------------------------------------------------------------- coefficients
+
+
+def test_sphere():
+    """Half of the displaced water along each axis, and none turns with it (Lamb 1932, § 92)."""
+    mass, inertia = lamb_coefficients(np.full(3, 0.3))
+    assert mass == pytest.approx(0.5 * 4 / 3 * np.pi * 0.3**3, rel=1e-9)
+    assert inertia == pytest.approx(0.0, abs=1e-12)
+
+
+def test_thin_disc():
+    """8/3 r³ face on, 16/45 r⁵ about a diameter (Lamb 1932, § 108); the rest vanishes."""
+    mass, inertia = lamb_coefficients(np.array([0.5, 0.5, 1e-5]))
+    assert mass[2] == pytest.approx(8 / 3 * 0.5**3, rel=1e-4)
+    assert inertia[:2] == pytest.approx(16 / 45 * 0.5**5, rel=1e-4)
+    assert mass[:2] == pytest.approx(0.0, abs=1e-5)
+    assert inertia[2] == 0.0
+
+
+def test_long_spheroid():
+    """Slender-body limit: the displaced water crossways, that of a cylinder's end over end."""
+    a, r = 100.0, 1.0
+    mass, inertia = lamb_coefficients(np.array([r, a, r]))
+    volume = 4 / 3 * np.pi * a * r * r
+    assert mass[[0, 2]] == pytest.approx(volume, rel=2e-3)
+    assert mass[1] < 1e-3 * volume
+    assert inertia[[0, 2]] == pytest.approx(volume * (a * a + r * r) / 5, rel=5e-3)
+    assert inertia[1] == 0.0
+
+
+def test_prolate_spheroid_of_fineness_two():
+    # Lamb 1932, § 115: k₁ = 0.209, k₂ = 0.702, k' = 0.240 at a/b = 2, reckoned by hand.
+    mass, inertia = lamb_coefficients(np.array([2.0, 1.0, 1.0]))
+    volume = 4 / 3 * np.pi * 2.0
+    assert mass / volume == pytest.approx([0.209, 0.702, 0.702], abs=3e-3)
+    assert inertia[1] / (volume * (4 + 1) / 5) == pytest.approx(0.240, abs=3e-3)
+
+
+@pytest.mark.parametrize("semi", [(0.1, 0.06, 0.03), (0.02, 0.5, 0.1), (0.3, 0.3, 0.1)])
+def test_ellipsoid_as_mujoco_has_it(semi):
+    """MuJoCo's virtual mass and inertia of `fluidshape="ellipsoid"`, from its own quadrature."""
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><worldbody><body><freejoint/><geom type="ellipsoid" mass="1"
+        size="{semi[0]} {semi[1]} {semi[2]}" fluidshape="ellipsoid"/></body></worldbody></mujoco>
+    """)
+    mass, inertia = lamb_coefficients(np.array(semi))
+    assert mass == pytest.approx(model.geom_fluid[0, 6:9], rel=1e-3)
+    assert inertia == pytest.approx(model.geom_fluid[0, 9:12], rel=5e-3, abs=1e-3 * inertia.max())
+
+
+def test_a_box_is_the_ellipsoid_of_its_volume_and_proportions():
+    half = np.array(SIZE) / 2
+    semi = half * (6 / np.pi) ** (1 / 3)
+    assert 4 / 3 * np.pi * semi.prod() == pytest.approx(np.prod(SIZE))
+    assert box_added_mass(half)[0] == pytest.approx(lamb_coefficients(semi)[0])
+    cube, _ = box_added_mass(np.full(3, 0.5))
+    assert cube == pytest.approx(0.5)
+
+
+# ------------------------------------------------------------------------- one body
+
+
+def deep_box(**fields):
+    tank = world(added_mass=True, **fields)
+    return box_robot(SIZE, 0.2, tank)
+
+
+def test_net_force_accelerates_body_and_water():
+    """(m + m_a) a = net weight, on each face; m_a / m is 0.4 to 2.3 here."""
+    tank = world(added_mass=True, gravity=9.81, buoyancy="partial")
+    robot = box_robot(SIZE, 0.4, tank)
+    qpos, qvel = at_rest(robot, 3, -3.0)
+    qpos[3:7] = np.array([[1, 0, 0, 0], [0.5**0.5, 0.5**0.5, 0, 0], [0.5**0.5, 0, 0.5**0.5, 0]]).T
+    carried = RHO * robot.fluid.added_mass[0][[2, 1, 0]]
+    net = (0.4 - RHO * np.prod(SIZE)) * 9.81
+    assert -accelerate(robot, qpos, qvel)[2] == pytest.approx(net / (0.4 + carried), rel=1e-12)
+
+
+def test_munk_moment():
+    """A body that moves askew is turned broadside on: M = ½ (m_b - m_a) U² sin 2α."""
+    robot = deep_box()
+    alpha = np.linspace(-np.pi / 2, np.pi / 2, 9)
+    qpos, qvel = at_rest(robot, 9, -3.0)
+    qvel[0], qvel[2] = 0.4 * np.cos(alpha), 0.4 * np.sin(alpha)
+    added, inertia = RHO * robot.fluid.added_mass[0], RHO * robot.fluid.added_inertia[0]
+    own = 0.2 / 12 * (SIZE[0] ** 2 + SIZE[2] ** 2)
+    # -ν × (A ν) about y, with x forward and z up; positive turns the nose (x) down.
+    moment = 0.5 * (added[2] - added[0]) * 0.4**2 * np.sin(2 * alpha)
+    spin = accelerate(robot, qpos, qvel)[4]
+    assert spin == pytest.approx(moment / (own + inertia[1]), abs=1e-12)
+    # It moves up (α > 0) and its nose goes down: further away from where it moves to.
+    assert added[2] > added[0]
+    assert spin[5] > 0
+
+
+def impulses(robot, qpos, qvel):
+    """Linear and angular (about the world's origin) impulse of a single box and its water."""
+    added, spin_added = RHO * robot.fluid.added_mass[0], RHO * robot.fluid.added_inertia[0]
+    mass, own = robot.mj_model.body_mass[1], robot.mj_model.body_inertia[1]
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, qpos[3:7] / np.linalg.norm(qpos[3:7]))
+    turn = turn.reshape(3, 3)
+    linear = turn @ ((mass + added) * (turn.T @ qvel[:3]))
+    # MuJoCo keeps principal inertias in an order of its own.
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, robot.mj_model.body_iquat[1])
+    axes = axes.reshape(3, 3)
+    inertia = axes @ np.diag(own) @ axes.T + np.diag(spin_added)
+    return np.concatenate([linear, np.cross(qpos[:3], linear) + turn @ inertia @ qvel[3:6]])
+
+
+def test_kirchhoff_impulse_and_energy_are_conserved():
+    """Without drag, dP/dt = 0, dL/dt = 0 and dT/dt = 0 in every state, over 20 µs."""
+    robot = deep_box()
+    qpos, qvel = random_states(robot, 20, speed=2.0)
+    qacc = accelerate(robot, qpos, qvel)
+    lagrangian = Lagrangian(robot, RHO)
+    for q, v, a in zip(qpos.T, qvel.T, qacc.T, strict=True):
+        ahead, behind = ((lagrangian.moved(q, v + s * a / 2, s), v + s * a) for s in (1e-5, -1e-5))
+        before, after = (impulses(robot, *state) for state in (behind, ahead))
+        assert (after - before) / 2e-5 == pytest.approx(0.0, abs=1e-5 * np.abs(before).max())
+        gained = lagrangian.energy(*ahead) - lagrangian.energy(*behind)
+        assert gained / 2e-5 == pytest.approx(0.0, abs=1e-5 * lagrangian.energy(q, v))
+
+
+def test_conservation_over_a_rollout():
+    """A second of tumbling: energy to rounding at any step; impulse drifts less as it halves."""
+    drift = []
+    for dt in (0.005, 0.001, 0.0005):
+        robot = deep_box(timestep=dt)
+        qpos, qvel = random_states(robot, 8, speed=0.2)
+        _, q, v, _ = march(robot, 1.0, qpos, qvel, every=round(0.1 / dt))
+        lagrangian = Lagrangian(robot, RHO)
+        start = [lagrangian.energy(*s) for s in zip(qpos.T, qvel.T, strict=True)]
+        end = [lagrangian.energy(*s) for s in zip(q[-1].T, v[-1].T, strict=True)]
+        assert np.divide(end, start) == pytest.approx(1.0, abs=1e-9)
+        first = np.array([impulses(robot, *s) for s in zip(qpos.T, qvel.T, strict=True)])
+        last = np.array([impulses(robot, *s) for s in zip(q[-1].T, v[-1].T, strict=True)])
+        drift.append(np.max(np.abs(last - first).max(1) / np.abs(first).max(1)))
+    assert drift[1] < 0.05
+    # The angular impulse takes the place half a step late, so it is first order.
+    assert drift[1] / drift[2] == pytest.approx(2.0, abs=0.4)
+
+
+@pytest.mark.parametrize("mass", [0.5, 0.16, 0.05])
+def test_a_light_plate_keeps_its_energy(mass):
+    """Three, ten and thirty times its mass carried across it, at the default step, for 2 s."""
+    robot = box_robot((0.2, 0.1, 0.01), mass, world(added_mass=True))
+    qpos, qvel = random_states(robot, 16, speed=1.0)
+    _, q, v, _ = march(robot, 2.0, qpos, qvel, every=100)
+    lagrangian = Lagrangian(robot, RHO)
+    start = [lagrangian.energy(*s) for s in zip(qpos.T, qvel.T, strict=True)]
+    for row, rate in zip(q, v, strict=True):
+        energy = [lagrangian.energy(*s) for s in zip(row.T, rate.T, strict=True)]
+        assert np.divide(energy, start) == pytest.approx(1.0, abs=1e-9)
+
+
+# ------------------------------------------------------------------------- jointed bodies
+
+
+def check_lagrange(robot, lanes, seed=0):
+    """The step's accelerations against Lagrange's equations with carried water, all 6 + n."""
+    qpos, qvel = random_states(robot, lanes, seed=seed, speed=1.5)
+    servo = qpos[7:] + 0.02  # each servo pulls with a known part of its effort
+    qacc = accelerate(robot, qpos, qvel, servo)
+    lagrangian, model = Lagrangian(robot, RHO), robot.mj_model
+    gain = model.actuator_gainprm[:, :1]
+    torque = gain * 0.02 - model.dof_damping[6:, None] * qvel[6:]
+    for q, v, a, t in zip(qpos.T, qvel.T, qacc.T, torque.T, strict=True):
+        needed = lagrangian.force(q, v, a)
+        expected = np.concatenate([np.zeros(6), t])
+        # Differences over 10 µs leave about 1e-9 of the forces at work.
+        scale = np.abs(lagrangian.inertia(q)).max() * np.abs(a).max()
+        assert needed == pytest.approx(expected, abs=1e-7 * scale)
+
+
+def test_a_jointed_body_obeys_lagrange():
+    check_lagrange(arm_robot(world(added_mass=True)), 12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["spider", "gecko"])
+def test_shipped_bodies_obey_lagrange(name):
+    check_lagrange(build_robot(body(name), world(added_mass=True)), 4)
+
+
+def test_galilean_invariance_in_a_uniform_current():
+    """A current is a moving frame: accelerations as in still water at velocities less by it."""
+    robot = arm_robot(world(added_mass=True, drag="faces", gravity=9.81, buoyancy="partial"))
+    current = np.array([0.3, -0.2, 0.1])
+    # Some are half out of the water; in one instant, a surface that moves looks like one at rest.
+    qpos, qvel = random_states(robot, 24, depth=2.0)
+    moving = qvel.copy()
+    moving[:3] += current[:, None]
+    still = accelerate(robot, qpos, qvel, water=Water(0.0, (np.float64(0),) * 3))
+    flowing = accelerate(robot, qpos, moving, water=Water(0.0, tuple(current)))
+    assert flowing == pytest.approx(still, abs=1e-10 * np.abs(still).max())

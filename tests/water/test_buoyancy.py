@@ -1,0 +1,487 @@
+"""Buoyancy: the cut box against exact geometry, and robots that fall, hover, float and bob."""
+
+from __future__ import annotations
+
+import itertools
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import at_rest, body, box_robot, march, world
+from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.morphology import trim_neutral
+from mjx_revolve.engine.hydrodynamics import Water
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.water.buoyancy import buoyancy, submersion
+from references import clip_box
+
+WATER = 999.1026  # kg/m³, the thesis's
+G = 9.81
+
+BOXES = {
+    f"{kind.name}-{part.name}": np.array(part.boxes[0].size) / 2
+    for kind in MODULES.values()
+    for part in kind.parts
+} | {
+    "cube": np.full(3, 0.5),
+    "plank": np.array([0.5, 0.1, 0.02]),
+    "sheet": np.array([0.5, 0.3, 5e-5]),
+    "needle": np.array([5e-4, 0.5, 5e-4]),
+}
+
+# Of the share, and of each component of the moment over its half edge: rounding, of a handful of
+# additions of numbers up to 2. Found: 1.2e-15 and 1.4e-7.
+ERROR = {True: 1e-14, False: 1e-6}  # float64, float32
+
+
+@lru_cache
+def _cut(half, mode):
+    return jax.jit(lambda up, depth: submersion(up, depth, half, mode))
+
+
+def cut(up, depth, half, mode="partial", x64=True):
+    """`submersion` of many states of one box: `[n, 3]`, `[n]`, `[3]` to `[n]`, `[n, 3]`."""
+    with jax.enable_x64(x64):
+        up = tuple(jnp.asarray(x) for x in np.asarray(up, float).T)
+        share, moment = _cut(tuple(half), mode)(up, jnp.asarray(depth))
+        return np.asarray(share), np.stack(moment, -1)
+
+
+def attitudes(n, seed=0):
+    """`[n, 3]` verticals, half of them anywhere, half with one or two edges level or nearly so."""
+    draw = np.random.default_rng(seed)
+    up = draw.normal(size=(n, 3))
+    for k in range(2):
+        rows = np.arange(k * n // 4, n // 2)
+        up[rows, draw.integers(0, 3, len(rows))] *= 10 ** draw.uniform(-12, 0, len(rows))
+    return up / np.linalg.norm(up, axis=1)[:, None]
+
+
+# ------------------------------------------------------------------------- the cut box
+
+
+def test_the_reference_itself_against_counting_points():
+    # 4e5 random points: the standard error of a share is below 0.0008.
+    draw = np.random.default_rng(3)
+    half = np.array([0.3, 0.7, 1.0])
+    points = draw.uniform(-1, 1, (400_000, 3)) * half
+    for up, depth in zip(attitudes(6), (-0.5, -0.1, 0.0, 0.1, 0.3, 0.6), strict=True):
+        wet = points @ up < depth
+        share, moment = clip_box(up, depth, half)
+        assert share == pytest.approx(wet.mean(), abs=0.004)
+        assert moment == pytest.approx((points * wet[:, None]).mean(0), abs=0.004)
+
+
+# Level, on edge and on corner, where the heights of edges vanish or are equal; signs too.
+SPECIAL = [
+    np.array(n) / np.linalg.norm(n) for n in itertools.product((0.0, -1.0, 1.0), repeat=3) if any(n)
+]
+
+
+def assert_exact(up, depth, half):
+    """Against tetrahedra, in both precisions."""
+    for x64 in (True, False):
+        # Both cut what the precision can say of the state: rounding it is no error of the cut's.
+        kind = np.float64 if x64 else np.float32
+        state = np.asarray(up, kind).astype(float), np.asarray(depth, kind).astype(float)
+        exact = [clip_box(u, d, half) for u, d in zip(*state, strict=True)]
+        share, moment = cut(*state, half, x64=x64)
+        assert share.dtype == moment.dtype == kind
+        assert share.min() >= 0
+        assert share.max() <= 1
+        assert np.abs(share - [s for s, _ in exact]).max() < ERROR[x64]
+        assert np.abs((moment - [m for _, m in exact]) / half).max() < ERROR[x64]
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_share_and_moment_of_a_cut_box(name):
+    half, n = BOXES[name], 300
+    up = attitudes(n)
+    depth = np.random.default_rng(1).uniform(-1.05, 1.05, n) * (np.abs(up) @ half)
+    assert_exact(up, depth, half)
+
+
+@pytest.mark.parametrize("name", ["cube", "plank", "needle", "TouchSensor-sensor"])
+def test_share_and_moment_on_face_edge_and_corner(name):
+    half = BOXES[name]
+    # Tilts by a rounding error too: no step between level and nearly level.
+    near = [n + 1e-7 * np.roll(n, 1) - 1e-9 * np.roll(n, 2) for n in SPECIAL]
+    up = np.array(SPECIAL + [n / np.linalg.norm(n) for n in near])
+    # Not level with a face to the last digit: there a reference has to choose a side.
+    for level in (-0.999, -0.5, 0.0, 0.1, 1 / 3, 0.999):
+        assert_exact(up, level * (np.abs(up) @ half), half)
+
+
+@pytest.mark.parametrize("mode", ["partial", "mask"])
+def test_far_above_and_below_the_surface_nothing_is_cut(mode):
+    half, up = BOXES["cube"], attitudes(50)
+    for depth, expected in ((-3.0, 0.0), (3.0, 1.0)):
+        share, moment = cut(up, np.full(50, depth), half, mode)
+        assert np.all(share == expected)
+        assert not moment.any()
+
+
+def test_mask_is_all_or_nothing_and_off_is_nothing():
+    up = attitudes(4)
+    depth = np.array([-1e-6, 1e-6, -0.2, 0.2])
+    share, moment = cut(up, depth, BOXES["cube"], "mask")
+    assert share.tolist() == [0, 1, 0, 1]
+    assert not moment.any()
+    share, moment = cut(up, depth, BOXES["cube"], "off")
+    assert not share.any()
+    assert not moment.any()
+
+
+def tilted(angle):
+    """A vertical that all three edges see, but for angle 0."""
+    return (0.6 * jnp.sin(angle), 0.8 * jnp.sin(angle), jnp.cos(angle))
+
+
+@pytest.mark.parametrize("name", ["cube", "TouchSensor-sensor"])
+def test_force_moment_and_gradients_are_continuous_through_the_surface(name):
+    """Halving the spacing of the samples halves the largest jump; a jump would stay."""
+    half = BOXES[name]
+
+    def everything(depth, angle):
+        share, moment = submersion(tilted(angle), depth, tuple(half), "partial")
+        return jnp.stack([share, *(m / half.max() for m in moment)])
+
+    @jax.jit
+    def table(depth, angle):
+        rows = jax.vmap(everything, (0, None))(depth, angle)
+        slope = jax.vmap(jax.jacfwd(everything, (0, 1)), (0, None))(depth, angle)
+        return rows, jnp.concatenate([slope[0] * half.max(), slope[1]], 1)
+
+    depth = np.linspace(-1.2, 1.2, 8001) * np.linalg.norm(half)
+    for tilt in (0.0, 1e-3, 0.02, 0.3, np.pi / 4):
+        with jax.enable_x64(True):
+            tables = table(depth, tilt)
+        # Tilted by 1e-3, the slopes' ramp is a few samples wide; for 0 see the next test.
+        for rows in map(np.asarray, tables if tilt > 0.01 else tables[:1]):
+            fine = np.abs(np.diff(rows, axis=0)).max(0)
+            coarse = np.abs(np.diff(rows[::2], axis=0)).max(0)
+            assert np.all(fine < 0.7 * coarse + 1e-9), tilt
+
+
+def test_only_a_level_face_changes_the_slope_at_once_and_by_its_area():
+    """The one jump of geometry itself: ∂share/∂d of a level box is its waterplane or nothing.
+
+    Any tilt spreads it over the height by which the face is tilted.
+    """
+    half = np.array([0.3, 0.2, 0.1])
+    slope = jax.jit(
+        jax.vmap(
+            jax.grad(lambda d, t: submersion(tilted(t), d, tuple(half), "partial")[0]), (0, None)
+        )
+    )
+    just = 1e-9
+    with jax.enable_x64(True):
+        around = [-0.1 - just, -0.1 + just, 0.1 - just, 0.1 + just]
+        assert np.asarray(slope(np.array(around), 0.0)) == pytest.approx([0, 5, 5, 0], abs=1e-9)
+        # Flush: neither, but between both.
+        flush = np.asarray(slope(np.array([-0.1, 0.1]), 0.0))
+        assert np.all((flush >= 0) & (flush <= 5))
+        for tilt in (1e-6, 1e-4, 1e-2):
+            # At a corner the waterplane starts as a point: it grows with the square.
+            height = np.abs(np.array(tilted(tilt)) @ (half * [1, 1, 0]))
+            reach = height + 0.1 * np.cos(tilt)
+            depth = -reach + np.array([0.0, 1e-3, 2.0]) * height
+            found = np.asarray(slope(depth, tilt))
+            assert found[0] == pytest.approx(0.0, abs=1e-9)
+            assert 0 < found[1] < 1e-4
+            assert found[2] == pytest.approx(5 / np.cos(tilt), rel=1e-6)
+
+
+def potential(state, half):
+    """W by the corners of the box: the textbook's sum, for edges far from level only."""
+    a = jnp.abs(jnp.stack(state[1:]) if isinstance(state, tuple) else state[1:]) * half
+    total = 0.0
+    for signs in itertools.product((-1, 1), repeat=3):
+        total += np.prod(signs) * jnp.maximum(0.0, state[0] + a @ np.array(signs, float)) ** 4
+    return total / (192 * a.prod())
+
+
+@pytest.mark.parametrize("name", ["cube", "ActiveHinge-frame", "TouchSensor-sensor"])
+def test_share_and_moment_are_the_slopes_of_the_mean_depth(name):
+    """Share = ∂W/∂d, moment = -∂W/∂n, and so the force and torque of the energy ρgV W."""
+    half, n = BOXES[name], 200
+    up = attitudes(8 * n, 7)
+    # The textbook's sum loses digits with each edge that nears level.
+    up = up[np.abs(up).min(1) > 0.15][:n]
+    depth = np.random.default_rng(3).uniform(-0.95, 0.95, len(up)) * (np.abs(up) @ half)
+    share, moment = cut(up, depth, half)
+    with jax.enable_x64(True):
+        slopes = jax.jit(jax.vmap(jax.grad(lambda s: potential(s, half))))
+        slopes = np.asarray(slopes(jnp.column_stack([depth, up])))
+    assert share == pytest.approx(slopes[:, 0], abs=1e-9)
+    assert moment == pytest.approx(-slopes[:, 1:], abs=1e-9 * half.max())
+
+
+LEVEL, EDGE, CORNER = (0.0, 0.0, 1.0), (0.0, -(0.5**0.5), 0.5**0.5), (3**-0.5,) * 3
+STATES = {
+    # up, depth over the height from centre to the top
+    "level": (LEVEL, 0.3),
+    "level, centre at the surface": (LEVEL, 0.0),
+    "upside down": ((0.0, 0.0, -1.0), -0.4),
+    "on edge": (EDGE, -0.2),
+    "on edge, centre at the surface": (EDGE, 0.0),
+    "edge at the surface": (EDGE, -1.0),
+    "edge just under": (EDGE, 1.0),
+    "on corner": (CORNER, 0.1),
+    "on corner, centre at the surface": (CORNER, 0.0),
+    "corner at the surface": (CORNER, -1.0),
+    "three corners at the surface": (CORNER, 1 / 3),
+    "nearly level": ((1e-9, 0.0, 1.0), 0.5),
+    "anywhere": ((0.36, -0.48, 0.8), 0.2),
+    "under": ((0.36, -0.48, 0.8), 1.5),
+    "out": ((0.36, -0.48, 0.8), -1.5),
+    "level and under": (LEVEL, 2.0),
+    "level and out": (LEVEL, -2.0),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+@pytest.mark.parametrize("half", [(0.5, 0.5, 0.5), (0.3, 0.2, 0.1)])
+def test_gradients_against_differences(name, half):
+    """Forward and backward, share and moment by depth and vertical, also where edges are equal."""
+    up, level = STATES[name]
+    state = np.array([level * (np.abs(up) @ np.array(half)), *up])
+
+    def everything(state):
+        share, moment = submersion(tuple(state[1:]), state[0], half, "partial")
+        return jnp.stack([share, *moment])
+
+    with jax.enable_x64(True):
+        run = jax.jit(everything)
+        step = 1e-6
+        rows = [(run(state + e) - run(state - e)) / (2 * step) for e in step * np.eye(4)]
+        expected = np.stack(rows, -1)
+        for mode in (jax.jacfwd, jax.jacrev):
+            # Third slopes of W jump at the edges of a cut: differences there err by the step.
+            assert np.asarray(mode(everything)(state)) == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize("x64", [True, False])
+def test_gradients_are_finite_everywhere(x64):
+    """Faces flush, far away, any of the special attitudes; float32 too."""
+    half = (0.05, 0.03, 5e-4)
+    kind = np.float64 if x64 else np.float32
+    up = np.concatenate([SPECIAL, attitudes(40)]).astype(kind)
+    reach = np.abs(up) @ np.array(half, kind)
+    with jax.enable_x64(x64):
+
+        def everything(depth, up):
+            share, moment = submersion(tuple(up), depth, half, "partial")
+            return jnp.stack([share, *moment])
+
+        slopes = jax.jit(jax.vmap(jax.jacrev(everything, (0, 1))))
+        for level in (-1e6, -1, -half[0], 0, half[0], 1, 1e6):
+            depth = (np.sign(level) * abs(level) * reach).astype(kind)
+            by_depth, by_up = slopes(depth, up)
+            assert np.all(np.isfinite(by_depth))
+            assert np.all(np.isfinite(by_up))
+            if abs(level) > 1:
+                assert not np.any(by_depth)
+                assert not np.any(by_up)
+
+
+def test_lanes_parts_and_vmap_agree():
+    """`[npart, nbody, lanes]` with a table of sizes, or one state at a time."""
+    draw = np.random.default_rng(4)
+    up = attitudes(24, 8).T.reshape(3, 2, 3, 4)
+    depth = draw.uniform(-0.1, 0.1, (2, 3, 4))
+    half = draw.uniform(0.02, 0.08, (3, 2, 3, 1))
+    with jax.enable_x64(True):
+        share, moment = jax.jit(lambda u, d: submersion(tuple(u), d, tuple(half), "partial"))(
+            up, depth
+        )
+        flat = np.broadcast_to(half, up.shape).reshape(3, -1).T
+        one = jax.vmap(lambda u, d, h: submersion(tuple(u), d, tuple(h), "partial"))
+        each, moments = one(up.reshape(3, -1).T, depth.ravel(), flat)
+    assert np.asarray(share).ravel() == pytest.approx(np.asarray(each), abs=1e-15)
+    assert np.stack(moment).reshape(3, -1) == pytest.approx(np.stack(moments), abs=1e-15)
+
+
+@pytest.mark.parametrize("name", ["cube", "TouchSensor-sensor"])
+def test_force_and_moment_come_from_one_potential(name):
+    """∂share/∂n = -∂moment/∂d and ∂moment_i/∂n_j = ∂moment_j/∂n_i: nothing to gain in a cycle."""
+    half, n = BOXES[name], 60
+    up = attitudes(n, 5)
+    depth = np.random.default_rng(2).uniform(-0.9, 0.9, n) * (np.abs(up) @ half)
+
+    def first(state):
+        share, moment = submersion((state[1], state[2], state[3]), state[0], tuple(half), "partial")
+        return jnp.stack([share, *(-m for m in moment)])
+
+    with jax.enable_x64(True):
+        second = np.asarray(jax.jit(jax.vmap(jax.jacfwd(first)))(np.column_stack([depth, up])))
+    # Rounding only, at attitudes as near to level as the generator makes them.
+    scale = np.abs(second).max((1, 2))[:, None, None]
+    assert np.all(np.abs(second - second.transpose(0, 2, 1)) < 1e-7 * scale)
+
+
+def test_level_draft_is_exact():
+    # A level box is under water by what its draft says, to rounding.
+    half = np.array([0.3, 0.2, 0.1])
+    depth = np.linspace(-0.07, 0.07, 15)
+    share, moment = cut(np.tile([0.0, 0.0, 1.0], (15, 1)), depth, half)
+    assert share == pytest.approx(0.5 + depth / 0.2, abs=1e-12)
+    assert moment[:, :2] == pytest.approx(0.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("half", [(0.0445, 0.0445, 0.0225), (0.1, 0.05, 0.02), (0.2, 0.3, 0.3)])
+@pytest.mark.parametrize("angle", [1e-3, 0.02, 0.1])
+def test_righting_moment_of_a_level_box(half, angle):
+    """The wall-sided formula, exact until an edge dips in.
+
+    y_B = BM tan φ, z_B = KB + ½ BM tan² φ.
+    """
+    half, depth = np.array(half), 0.1 * half[2]
+    draft = half[2] + depth
+    metacentric = (2 * half[1]) ** 2 / (12 * draft)
+    center = [
+        0.0,
+        -metacentric * np.tan(angle),
+        draft / 2 - half[2] + metacentric * np.tan(angle) ** 2 / 2,
+    ]
+    up = np.array([0.0, np.sin(angle), np.cos(angle)])
+    share, moment = cut(up[None], [depth * np.cos(angle)], half)
+    assert share[0] == pytest.approx(draft / (2 * half[2]), rel=1e-12)
+    torque, exact = np.cross(moment[0] / share[0], up)[0], np.cross(center, up)[0]
+    assert torque == pytest.approx(exact, rel=1e-9)
+
+
+def test_archimedes_and_the_lever_of_the_centre_of_volume():
+    up = (0.0, 0.6, 0.8)
+    force, torque = buoyancy(up, 0.5, (0.0, 0.0, -0.01), 2e-4, (0.003, 0.0, 0.01), WATER * G)
+    lift = 0.5 * WATER * G * 2e-4
+    assert np.array(force, float) == pytest.approx(lift * np.array(up))
+    arm = np.array([0.003, 0.0, 0.01]) + np.array([0.0, 0.0, -0.01]) / 0.5
+    assert np.array(torque, float) == pytest.approx(np.cross(arm, lift * np.array(up)))
+
+
+# ------------------------------------------------------------------------- falling
+
+
+def center_of_mass(robot, qpos):
+    data = mujoco.MjData(robot.mj_model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(robot.mj_model, data)
+    mujoco.mj_comPos(robot.mj_model, data)
+    return data.subtree_com[0].copy()
+
+
+@pytest.fixture(scope="module")
+def falls():
+    """One compiled spider for water and for air: the surface tells which it is in."""
+    robot = build_robot(body("spider"), world(gravity=G, buoyancy="partial"))
+    qpos, qvel = at_rest(robot, 2, -1.0)
+    air_and_water = Water(np.array([-1e4, 0.0]), (0.0, 0.0, 0.0))
+    return robot, march(robot, 2.0, qpos, qvel, water=air_and_water, every=10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lane", "expected"), [(0, 9.81), (1, 0.60648)])
+def test_the_thesis_spider_falls(falls, lane, expected):
+    """Drag and added mass off: 9.8100 m/s² in air, .60648 m/s² in water, to 1e-4."""
+    robot, (time, qpos, _, _) = falls
+    model = robot.mj_model
+    mass, volume = model.body_subtreemass[0], robot.fluid.volume.sum()
+    assert expected == pytest.approx(G if lane == 0 else G * (1 - WATER * volume / mass), abs=1e-5)
+    height = [center_of_mass(robot, row[:, lane])[2] for row in qpos]
+    start = center_of_mass(robot, at_rest(robot, 1, -1.0)[0][:, 0])[2]
+    # Semi-implicit Euler from rest: z_n = z_0 - a dt² n (n + 1) / 2, exactly.
+    n = np.round(time / 0.005)
+    fall = 2 * (start - np.array(height)) / (0.005**2 * n * (n + 1))
+    assert fall == pytest.approx(expected, abs=1e-5)
+    # The core itself: the legs are lighter than it and hang back by their servos' give.
+    core = 2 * (-1.0 - qpos[-1, 2, lane]) / (0.005**2 * n[-1] * (n[-1] + 1))
+    assert core == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_single_module_falls_in_air_and_water():
+    robot = build_robot(body("core"), world(gravity=G, buoyancy="partial"))
+    qpos, qvel = at_rest(robot, 2, -1.0)
+    _, _, qvel, _ = march(
+        robot, 1.0, qpos, qvel, water=Water(np.array([-1e4, 0.0]), (0.0, 0.0, 0.0)), x64=False
+    )
+    net = G * (1 - WATER * 5.054e-5 / 0.09)
+    # float32: a sum of 200 equal steps.
+    assert -qvel[-1, 2] == pytest.approx([G, net], rel=2e-6)
+
+
+# ------------------------------------------------------------------------- hovering and floating
+
+
+@pytest.mark.slow
+def test_a_neutral_spider_stays_put_for_ten_seconds():
+    tank = world(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
+    robot = build_robot(trim_neutral(body("spider"), tank.density), tank)
+    start, still = at_rest(robot, 1, -1.0)
+    _, qpos, _, _ = march(robot, 10.0, start, still, every=20, x64=False)
+    # The legs float and the core sinks by what the servos give, a tenth of a millimetre.
+    assert np.abs(qpos[:, :3] - start[:3]).max() < 5e-4
+    assert np.abs(qpos[:, 4:7]).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("size", "relative_density"),
+    [((0.2, 0.2, 0.1), 0.5), ((0.3, 0.2, 0.08), 0.8)],
+)
+def test_a_box_floats_at_its_draft(size, relative_density):
+    tank = world(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
+    robot = box_robot(size, relative_density * WATER * np.prod(size), tank)
+    qpos, qvel = at_rest(robot, 3)
+    level = size[2] * (0.5 - relative_density)
+    # At its draft; dropped from above the water; let go below it, tilted.
+    qpos[2] = level, level + size[2], level - size[2]
+    qpos[4, 2] = 0.1
+    _, qpos, qvel, _ = march(robot, 60.0, qpos, qvel, every=20)
+    assert np.abs(qpos[:, 2, 0] - level).max() < 1e-9
+    # Quadratic drag lets small bobs die like 1/t; their middle is the draft, and they stay upright.
+    late = qpos[300:]
+    assert late[:, 2].mean(0) == pytest.approx(level, abs=0.005 * size[2])
+    assert np.abs(late[:, 2] - level).max() < 0.08 * size[2]
+    assert np.abs(late[:, 4:6]).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("size", "relative_density", "added_mass"),
+    [((0.2, 0.2, 0.1), 0.5, False), ((0.2, 0.2, 0.1), 0.5, True), ((0.4, 0.1, 0.2), 0.7, True)],
+)
+def test_bobbing_frequency(size, relative_density, added_mass):
+    """ω² = ρ g A / (m + share × m_a): a half-wet box carries its wet share of the water."""
+    tank = world(gravity=G, buoyancy="partial", added_mass=added_mass, timestep=0.002)
+    mass = relative_density * WATER * np.prod(size)
+    robot = box_robot(size, mass, tank)
+    qpos, qvel = at_rest(robot)
+    level = size[2] * (0.5 - relative_density)
+    amplitude = 1e-3 * size[2]
+    qpos[2] = level + amplitude
+    time, qpos, _, _ = march(robot, 4.0, qpos, qvel)
+    carried = relative_density * WATER * robot.fluid.added_mass[0, 2] if added_mass else 0.0
+    omega = np.sqrt(WATER * G * size[0] * size[1] / (mass + carried))
+    # First order in the time step, second in the amplitude (the carried share varies with draft).
+    assert qpos[:, 2, 0] - level == pytest.approx(
+        amplitude * np.cos(omega * time), abs=0.02 * amplitude
+    )
+
+
+@pytest.mark.parametrize("added_mass", [False, True])
+def test_righting_frequency_of_a_submerged_box(added_mass):
+    """A neutral box, its volume above its mass, swings like a pendulum: ω² = ρVgh / (I + I_a)."""
+    size, lever = (0.06, 0.1, 0.04), 0.004
+    tank = world(gravity=G, buoyancy="partial", added_mass=added_mass, timestep=0.001)
+    mass = WATER * np.prod(size)
+    robot = box_robot(size, mass, tank, center_of_volume=(0.0, 0.0, lever))
+    qpos, qvel = at_rest(robot, 1, -2.0)
+    qpos[3:5, 0] = np.cos(5e-4), np.sin(5e-4)
+    time, qpos, _, _ = march(robot, 4.0, qpos, qvel)
+    inertia = mass * (size[1] ** 2 + size[2] ** 2) / 12
+    inertia += WATER * robot.fluid.added_inertia[0, 0] if added_mass else 0.0
+    omega = np.sqrt(mass * G * lever / inertia)
+    assert 2 * qpos[:, 4, 0] == pytest.approx(1e-3 * np.cos(omega * time), abs=2e-5)

@@ -1,0 +1,206 @@
+"""Thrusters: lag, curves and torque in closed form, in both precisions, with their gradients."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_revolve.body.catalogue import MODULES, Thruster
+from mjx_revolve.water.thrusters import (
+    basic_thrust,
+    clamp_command,
+    dead_band_thrust,
+    first_order_lag,
+    ideal_power,
+    interpolated_thrust,
+    lag_command,
+    reaction_torque,
+    thrust,
+)
+
+LANES = np.linspace(-1.5, 1.5, 61)  # commands, some beyond the range
+LINE = Thruster(
+    curve="interpolated", commands=(-1.0, -0.2, 0.1, 1.0), thrusts=(-0.7, 0.0, 0.0, 2.0)
+)
+BAND = Thruster(curve="dead_band", gain=2.0, gain_backward=0.5, dead_band=(-0.1, 0.3))
+BASIC = Thruster(gain=3.0)
+ALL = {"basic": BASIC, "dead_band": BAND, "interpolated": LINE, "catalogue's": None}
+
+
+def curve(name: str) -> Thruster:
+    return ALL[name] or MODULES["Thruster"].parts[0].thruster
+
+
+# ------------------------------------------------------------------------- lag
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.005, 0.05, 1.0])
+def test_a_step_passes_the_lag_as_an_exponential(dt):
+    """s(t) = x (1 - e^(-t/τ)), whatever the step; rounding alone, of at most 200 steps."""
+    tau, asked = 0.08, 0.7
+    state, time = 0.0, 0.0
+    for _ in range(200):
+        state, time = first_order_lag(state, asked, tau, dt), time + dt
+        assert state == pytest.approx(asked * (1 - math.exp(-time / tau)), rel=1e-12)
+
+
+def test_many_small_steps_are_one_large_step():
+    before, asked = LANES, LANES[::-1]
+    state = before
+    for _ in range(10):
+        state = first_order_lag(state, asked, 0.1, 0.005)
+    assert state == pytest.approx(first_order_lag(before, asked, 0.1, 0.05), abs=1e-14)
+
+
+def test_a_lag_rests_where_it_is_asked_to_be():
+    assert first_order_lag(0.5, 0.5, 0.1, 0.005) == pytest.approx(0.5, rel=1e-15)
+    assert first_order_lag(0.0, 0.0, 0.1, 0.005) == 0.0
+
+
+def test_each_thruster_has_its_own_lag_and_some_none():
+    tau = np.array([[0.0], [0.05], [0.5]])
+    before = jnp.ones((3, 4))
+    after = first_order_lag(before, jnp.zeros((3, 4)), tau, 0.05)
+    assert after.dtype == before.dtype
+    expected = np.array([0.0, math.exp(-1.0), math.exp(-0.1)])
+    assert np.asarray(after) == pytest.approx(np.tile(expected[:, None], 4), rel=1e-6)
+
+
+def test_lag_of_a_thruster():
+    slow, quick = Thruster(time_constant=0.1), Thruster()
+    assert lag_command(slow, 0.2, 1.0, 0.1) == pytest.approx(1 - 0.8 / math.e)
+    assert lag_command(quick, 0.2, 1.0, 0.1) == 1.0
+
+
+# ------------------------------------------------------------------------- curves
+
+
+def test_commands_are_clamped_to_the_range():
+    thruster = Thruster(range=(-0.25, 1.0))
+    assert clamp_command(thruster, LANES) == pytest.approx(np.clip(LANES, -0.25, 1.0))
+    clamped = clamp_command(thruster, jnp.asarray(LANES))
+    assert np.asarray(clamped) == pytest.approx(np.clip(LANES, -0.25, 1.0), rel=1e-6)
+
+
+def test_basic_thrust_goes_with_the_square_of_the_command():
+    found = thrust(BASIC, LANES)
+    assert found == pytest.approx(3 * np.sign(LANES) * LANES**2)
+    assert thrust(BASIC, np.array([-1.0, 0.0, 0.5])) == pytest.approx([-3.0, 0.0, 0.75])
+
+
+def test_dead_band_of_bessa():
+    """b = x|x|: k_l (b - δ_l) below δ_l, k_r (b - δ_r) above δ_r, else nothing."""
+    x = np.array([-1.0, -0.5, -math.sqrt(0.1), -0.3, 0.0, 0.5, math.sqrt(0.3), 0.6, 1.0])
+    expected = [0.5 * -0.9, 0.5 * (-0.25 + 0.1), 0, 0, 0, 0, 0, 2 * (0.36 - 0.3), 2 * 0.7]
+    assert thrust(BAND, x) == pytest.approx(np.array(expected), abs=1e-15)
+    one_sided = Thruster(curve="dead_band", gain=2.0, dead_band=(-0.1, 0.3))
+    assert thrust(one_sided, np.array([-1.0, 1.0])) == pytest.approx([-1.8, 1.4])
+
+
+def test_a_dead_band_of_no_width_is_basic():
+    band = Thruster(curve="dead_band", gain=3.0)
+    assert thrust(band, LANES) == pytest.approx(thrust(BASIC, LANES))
+
+
+def test_interpolation_is_numpys():
+    expected = np.interp(LANES, LINE.commands, LINE.thrusts)
+    assert thrust(LINE, LANES) == pytest.approx(expected, abs=1e-15)
+    assert thrust(LINE, np.array([-9.0, 9.0])) == pytest.approx([-0.7, 2.0])
+
+
+def test_interpolation_through_many_random_points_is_numpys():
+    rng = np.random.default_rng(0)
+    for count in (2, 3, 8, 40):
+        commands = np.sort(rng.uniform(-1, 1, count))
+        thrusts = rng.normal(size=count)
+        found = interpolated_thrust(LANES, commands, thrusts)
+        assert found == pytest.approx(np.interp(LANES, commands, thrusts), abs=1e-13)
+
+
+def test_curves_take_constants_per_thruster():
+    """Lanes last, thrusters before: constants `[nthruster, 1]`."""
+    gain, low, high = np.array([[1.0], [2.0]]), np.array([[-0.1], [0.0]]), np.array([[0.2], [0.3]])
+    x = np.tile(LANES, (2, 1))
+    basic, band = basic_thrust(x, gain), dead_band_thrust(x, 2 * gain, gain, low, high)
+    points = ([-gain, 0 * gain, gain], [-gain, 0 * gain, 3 * gain])
+    line = interpolated_thrust(x, *points)
+    for k in range(2):
+        g = float(gain[k, 0])
+        one = Thruster(gain=g)
+        assert basic[k] == pytest.approx(thrust(one, LANES))
+        edges = (float(low[k, 0]), float(high[k, 0]))
+        one = Thruster(curve="dead_band", gain=g, gain_backward=2 * g, dead_band=edges)
+        assert band[k] == pytest.approx(thrust(one, LANES))
+        assert line[k] == pytest.approx(np.interp(LANES, [-g, 0, g], [-g, 0, 3 * g]), abs=1e-15)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_table_of_a_thruster_is_its_curve(name):
+    """`Thruster.thrust_at`, for tables and pictures, against the law that acts in the water."""
+    thruster = curve(name)
+    clamped = clamp_command(thruster, LANES)
+    assert thrust(thruster, clamped) == pytest.approx([thruster.thrust_at(x) for x in LANES])
+    twice = thruster.scaled(2.0)
+    assert thrust(twice, clamped) == pytest.approx(2 * thrust(thruster, clamped), abs=1e-15)
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("x64", [False, True])
+def test_jax_and_numpy_agree_and_keep_the_precision(name, x64):
+    thruster, kind = curve(name), np.float64 if x64 else np.float32
+    with jax.enable_x64(x64):
+
+        def push(before, asked):
+            asked = clamp_command(thruster, asked)
+            return thrust(thruster, lag_command(thruster, before, asked, 0.005))
+
+        found = jax.jit(push)(jnp.zeros(len(LANES), kind), jnp.asarray(LANES, kind))
+        assert found.dtype == kind
+        found = np.asarray(found)
+    expected = push(0 * LANES, LANES)
+    assert found == pytest.approx(expected, abs=1e-14 if x64 else 1e-6)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_gradients_are_finite_everywhere_and_true_off_the_corners(name):
+    thruster = curve(name)
+    with jax.enable_x64(True):
+
+        def push(asked):
+            return thrust(thruster, clamp_command(thruster, asked))
+
+        edge = math.sqrt(0.3)
+        corners = jnp.array([-1.0, -0.2, -0.1, 0.0, 0.1, 0.3, edge, 1.0])
+        assert np.isfinite(jax.vmap(jax.grad(push))(corners)).all()
+        smooth = jnp.array([-1.3, -0.77, -0.15, 0.05, 0.45, 0.9, 1.2])
+        slope = jax.vmap(jax.grad(push))(smooth)
+        h = 1e-6
+        numeric = (push(smooth + h) - push(smooth - h)) / (2 * h)
+        assert np.asarray(slope) == pytest.approx(np.asarray(numeric), abs=1e-8)
+
+        def power(asked):
+            return ideal_power(push(asked), 5e-4, 1000.0)
+
+        assert np.isfinite(jax.vmap(jax.grad(power))(corners)).all()
+
+
+# ------------------------------------------------------------------------- torque and power
+
+
+def test_a_right_handed_propeller_turns_its_robot_left_handed():
+    assert reaction_torque(LANES, 0.0035) == pytest.approx(-0.0035 * LANES)
+    assert float(reaction_torque(jnp.array(2.0), -0.0035)) == pytest.approx(0.007)
+
+
+def test_ideal_power_is_thrust_times_the_speed_in_the_disc():
+    """At rest T = 2 ρ A u² (Froude), P = T u; the tiny term of the root costs 1e-12 of it."""
+    density, disc, speed = 1000.0, 5e-4, 0.6
+    push = 2 * density * disc * speed**2
+    with jax.enable_x64(True):
+        found = ideal_power(jnp.array([push, -push, 0.0]), disc, density)
+    assert np.asarray(found) == pytest.approx([push * speed, push * speed, 0.0], rel=1e-11)
+    assert float(ideal_power(jnp.array(1.0), disc, 0.0)) == 0.0

@@ -1,0 +1,587 @@
+"""Worlds: the two that ship, users' own, overrides, every wrong input, and the lake's shape."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.bed import Bed, bed_height, bed_slope, sample_bed
+from mjx_revolve.water.world import (
+    CurrentField,
+    Gust,
+    LiftDrag,
+    Shear,
+    SurfaceTension,
+    Wave,
+    World,
+    load_world,
+    make_world,
+)
+
+
+def fields(kind) -> str:
+    """Names of a dataclass's fields, as messages list them."""
+    return ", ".join(field.name for field in dataclasses.fields(kind))
+
+
+FIELDS = fields(World)
+BED_FIELDS = fields(Bed)
+LAKE = load_world("lake").bed
+
+
+# ------------------------------------------------------------------------- reading
+
+
+@pytest.mark.parametrize("name", ["empty_underwater", "lake"])
+def test_the_thesis_worlds(name):
+    water = load_world(name)
+    assert water.name == name
+    assert water.density == 999.1026
+    assert water.gravity == 9.81
+    assert water.surface_height == 0.0
+    assert water.current == (0.0, 0.0, 0.0)
+    assert (water.buoyancy, water.drag, water.added_mass) == ("partial", "faces", True)
+    assert (water.shear, water.current_field, water.gust, water.waves) == (None, None, None, ())
+    assert (water.water_depth, water.surface_tension) == (None, None)
+    if name == "lake":
+        assert (water.bed.kind, water.bed.height, water.bed.highest) == ("lake", -112.8, 36.7)
+    else:
+        assert (water.bed.kind, water.bed.height, water.bed.extent) == ("flat", -100.0, 2000.0)
+
+
+def test_a_world_of_ones_own(tmp_path):
+    path = tmp_path / "mars.yaml"
+    path.write_text("""
+density: 1.025e3
+gravity: [0, 0, -3.71]
+current: [0.1, 0, -.05]
+drag: off
+buoyancy: mask
+added_mass: no
+bed: {kind: lake, height: -4, highest: 1.5, extent: 40}
+lift_drag: {cla: 4.7}
+shear: {velocity: [.2, 0, 0], depth: 3, profile: power}
+gust: {std: 5e-2, time: 4}
+waves:
+  - {amplitude: .05, wavelength: 2, direction: 1.57}
+  - {amplitude: .01, period: 0.9, phase: -1}
+water_depth: 4
+surface_tension: yes
+timestep: 2e-3
+""")
+    water = load_world(path)
+    assert water == World(
+        name="mars",
+        density=1025.0,
+        gravity=3.71,
+        current=(0.1, 0.0, -0.05),
+        drag="off",
+        buoyancy="mask",
+        added_mass=False,
+        bed=Bed(kind="lake", height=-4, highest=1.5, extent=40),
+        lift_drag=LiftDrag(cla=4.7),
+        shear=Shear((0.2, 0.0, 0.0), depth=3, profile="power"),
+        gust=Gust((0.05, 0.05, 0.0), time=4),
+        waves=(Wave(0.05, 2, direction=1.57), Wave(0.01, period=0.9, phase=-1)),
+        water_depth=4,
+        surface_tension=SurfaceTension(gamma=0.0728, contact_angle=0.0),
+        timestep=0.002,
+    )
+    assert load_world(str(path)) == water
+    assert hash(load_world(path)) == hash(water)
+    # A mapping keeps what it does not name; lists are replaced; each can be switched off.
+    assert load_world(path, shear={"depth": 2}).shear == dataclasses.replace(water.shear, depth=2)
+    assert load_world(path, gust={"time": 2}).gust == Gust((0.05, 0.05, 0.0), time=2)
+    assert load_world(path, waves=[{"amplitude": 0.1, "wavelength": 5}]).waves == (Wave(0.1, 5),)
+    still = load_world(path, shear=None, gust="off", waves=False, surface_tension=None)
+    assert (still.shear, still.gust, still.waves, still.surface_tension) == (None, None, (), None)
+
+
+@pytest.mark.parametrize(
+    ("override", "field", "expected"),
+    [
+        ({"density": 1025}, "density", 1025),
+        ({"density": np.float32(1000)}, "density", 1000.0),
+        ({"gravity": 1.62}, "gravity", 1.62),
+        ({"gravity": (0, 0, -9.81)}, "gravity", 9.81),
+        ({"gravity": np.array([0.0, 0.0, -9.81])}, "gravity", 9.81),
+        ({"gravity": [0, 0, 0]}, "gravity", 0.0),
+        ({"surface_height": -2.5}, "surface_height", -2.5),
+        ({"current": (0.1, 0, 0)}, "current", (0.1, 0.0, 0.0)),
+        ({"current": np.array([0.1, 0.2, 0.3])}, "current", (0.1, 0.2, 0.3)),
+        ({"buoyancy": "mask"}, "buoyancy", "mask"),
+        ({"buoyancy": False}, "buoyancy", "off"),
+        ({"drag": "ellipsoid"}, "drag", "ellipsoid"),
+        ({"drag": False}, "drag", "off"),
+        ({"added_mass": False}, "added_mass", False),
+        ({"bed": None}, "bed", None),
+        ({"bed": "off"}, "bed", None),
+        ({"bed": -3}, "bed", Bed(kind="flat", height=-3.0)),
+        ({"bed": np.float64(-3)}, "bed", Bed(kind="flat", height=-3.0)),
+        ({"bed": {"kind": "flat", "height": -3}}, "bed", Bed(kind="flat", height=-3)),
+        ({"bed": Bed(kind="flat")}, "bed", Bed(kind="flat")),
+        # A mapping keeps what it does not name: the lake stays a lake.
+        ({"bed": {"friction": 0.2}}, "bed", dataclasses.replace(LAKE, friction=0.2)),
+        ({"lift_drag": {"cda": 0.1}}, "lift_drag", LiftDrag(cda=0.1)),
+        ({"shear": {"velocity": np.ones(3)}}, "shear", Shear((1.0, 1.0, 1.0))),
+        ({"shear": Shear((1, 0, 0))}, "shear", Shear((1.0, 0.0, 0.0))),
+        ({"shear": "off"}, "shear", None),
+        ({"gust": {"std": np.float32(0.5)}}, "gust", Gust((0.5, 0.5, 0.0))),
+        ({"gust": {"std": [0.1, 0, 0.2]}}, "gust", Gust((0.1, 0.0, 0.2))),
+        ({"gust": None}, "gust", None),
+        ({"waves": {"amplitude": 0, "period": 2}}, "waves", (Wave(0, period=2),)),
+        ({"waves": [Wave(0.1, 3), Wave(0.1, 4)]}, "waves", (Wave(0.1, 3), Wave(0.1, 4))),
+        ({"waves": []}, "waves", ()),
+        ({"water_depth": np.float32(8)}, "water_depth", 8.0),
+        ({"surface_tension": True}, "surface_tension", SurfaceTension()),
+        ({"surface_tension": {"gamma": 0.03}}, "surface_tension", SurfaceTension(0.03)),
+        ({"surface_tension": False}, "surface_tension", None),
+        ({"current_field": None}, "current_field", None),
+        ({"timestep": 0.002}, "timestep", 0.002),
+    ],
+)
+def test_overrides(override, field, expected):
+    water = load_world("lake", **override)
+    assert getattr(water, field) == expected
+    rest = {f.name for f in dataclasses.fields(World)} - {field}
+    assert all(getattr(water, name) == getattr(load_world("lake"), name) for name in rest)
+
+
+def test_make_world_without_a_file():
+    assert make_world() == World()
+    assert make_world(bed=-2, current=[0, 0.1, 0]) == World(
+        bed=Bed(kind="flat", height=-2.0), current=(0.0, 0.1, 0.0)
+    )
+
+
+# ------------------------------------------------------------------------- wrong inputs
+
+
+WRONG = [
+    ({"density": "heavy"}, "density: expected a number; found 'heavy'"),
+    ({"density": True}, "density: expected a number; found True"),
+    ({"density": None}, "density: expected a number; found None"),
+    ({"density": [999]}, "density: expected a number; found [999]"),
+    ({"density": -1}, "density: expected at least 0; found -1"),
+    ({"density": math.nan}, "density: expected a finite number; found nan"),
+    ({"density": 10**400}, "density: expected a finite number; found 'a huge integer'"),
+    ({"viscosity": -1e-3}, "viscosity: expected at least 0; found -0.001"),
+    ({"densty": 1000}, f"densty: expected one of {FIELDS}; found 'densty'"),
+    ({"surface_height": math.inf}, "surface_height: expected a finite number; found inf"),
+    ({"timestep": 0}, "timestep: expected at least 1e-05; found 0"),
+    ({"timestep": 1}, "timestep: expected at most 0.1; found 1"),
+    ({"gravity": -9.81}, "gravity: expected at least 0; found -9.81"),
+    ({"gravity": "down"}, "gravity: expected a number; found 'down'"),
+    ({"gravity": (0, -9.81)}, "gravity: expected a number or 3 numbers; found [0, -9.81]"),
+    ({"gravity": ("a", 0, -1)}, "gravity: expected a number or 3 numbers; found ['a', 0, -1]"),
+    (
+        {"gravity": (1, 0, -9.8)},
+        "gravity: expected (0, 0, -g), the surface is level; found (1, 0, -9.8)",
+    ),
+    (
+        {"gravity": (0, 0, 9.8)},
+        "gravity: expected (0, 0, -g), the surface is level; found (0, 0, 9.8)",
+    ),
+    ({"gravity": (0, 0, math.nan)}, "gravity: expected a finite number; found nan"),
+    ({"current": (1, 2)}, "current: expected 3 numbers; found (1, 2)"),
+    ({"current": (1, 2, 3, 4)}, "current: expected 3 numbers; found (1, 2, 3, 4)"),
+    ({"current": 0.1}, "current: expected 3 numbers; found 0.1"),
+    ({"current": "fast"}, "current: expected 3 numbers; found 'fast'"),
+    ({"current": (0, "x", 0)}, "current.y: expected a number; found 'x'"),
+    ({"current": (0, 0, math.inf)}, "current.z: expected a finite number; found inf"),
+    ({"buoyancy": "half"}, "buoyancy: expected one of 'partial', 'mask', 'off'; found 'half'"),
+    (
+        {"drag": "boxes"},
+        "drag: expected one of 'faces', 'lift_drag', 'inertia_box', 'ellipsoid', 'off'; "
+        "found 'boxes'",
+    ),
+    ({"added_mass": "yes"}, "added_mass: expected true or false; found 'yes'"),
+    ({"added_mass": 1}, "added_mass: expected true or false; found 1"),
+    (
+        {"bed": "sand"},
+        "bed: expected 'off', a height in metres or a mapping with kind; found 'sand'",
+    ),
+    ({"bed": True}, "bed: expected 'off', a height in metres or a mapping with kind; found True"),
+    ({"bed": math.nan}, "bed: expected a finite number; found nan"),
+    ({"bed": {"kind": "hill"}}, "bed.kind: expected 'flat' or 'lake'; found 'hill'"),
+    ({"bed": {"depth": 1}}, f"bed: expected one of {BED_FIELDS}; found 'depth'"),
+    ({"bed": {"height": "low"}}, "bed.height: expected a number; found 'low'"),
+    ({"bed": {"friction": math.nan}}, "bed.friction: expected a finite number; found nan"),
+    (
+        {"bed": {"stiffness": -1}},
+        "bed: expected extent > 0, stiffness > 0 and friction >= 0; found 998.0, -1, 0.6",
+    ),
+    ({"bed": {"height": 40}}, "bed.highest: expected more than bed.height (40); found 36.7"),
+    ({"lift_drag": 3}, "lift_drag: expected a mapping; found 3"),
+    (
+        {"lift_drag": {"cl": 1}},
+        f"lift_drag: expected one of {fields(LiftDrag)}; found 'cl'",
+    ),
+    ({"lift_drag": {"cla": "x"}}, "lift_drag.cla: expected a number; found 'x'"),
+    ({"lift_drag": {"a0": math.nan}}, "lift_drag.a0: expected a finite number; found nan"),
+    ({"shear": 0.1}, "shear: expected a mapping; found 0.1"),
+    ({"shear": {"depth": 3}}, "shear: expected velocity; found none"),
+    ({"shear": {"speed": 3}}, f"shear: expected one of {fields(Shear)}; found 'speed'"),
+    ({"shear": {"velocity": 1}}, "shear.velocity: expected 3 numbers; found 1"),
+    (
+        {"shear": {"velocity": [1, "a", 0]}},
+        "shear.velocity.y: expected a number; found 'a'",
+    ),
+    (
+        {"shear": {"velocity": [1, 0, 0], "depth": 0}},
+        "shear.depth: expected at least 0.001; found 0",
+    ),
+    (
+        {"shear": {"velocity": [1, 0, 0], "exponent": "1/7"}},
+        "shear.exponent: expected a number; found '1/7'",
+    ),
+    (
+        {"shear": {"velocity": [1, 0, 0], "profile": "log"}},
+        "shear.profile: expected one of 'linear', 'power', 'exponential'; found 'log'",
+    ),
+    ({"gust": {"time": 3}}, "gust: expected std; found none"),
+    ({"gust": 0.1}, "gust: expected a mapping; found 0.1"),
+    ({"gust": {"std": -1}}, "gust.std: expected at least 0; found -1"),
+    ({"gust": {"std": True}}, "gust.std: expected a number or 3 numbers; found True"),
+    ({"gust": {"std": "strong"}}, "gust.std: expected a number or 3 numbers; found 'strong'"),
+    ({"gust": {"std": [1, 2]}}, "gust.std: expected a number or 3 numbers; found [1, 2]"),
+    ({"gust": {"std": [1, -2, 0]}}, "gust.std.y: expected at least 0; found -2.0"),
+    ({"gust": {"std": math.nan}}, "gust.std: expected a finite number; found nan"),
+    ({"gust": {"std": 1, "time": 0}}, "gust.time: expected at least 0.001; found 0"),
+    ({"waves": 3}, "waves: expected a list of mappings; found 3"),
+    ({"waves": "big"}, "waves: expected a list of mappings; found 'big'"),
+    ({"waves": [0.1]}, "waves.0: expected a mapping; found 0.1"),
+    ({"waves": [{"wavelength": 1}]}, "waves.0: expected amplitude; found none"),
+    (
+        {"waves": {"amplitude": 0.1}},
+        "waves.0: expected either wavelength or period; found none",
+    ),
+    (
+        {"waves": {"amplitude": 0.1, "wavelength": 3, "period": 1}},
+        "waves.0: expected either wavelength or period; found both",
+    ),
+    (
+        {"waves": {"amplitude": 0.1, "length": 3}},
+        f"waves.0: expected one of {fields(Wave)}; found 'length'",
+    ),
+    (
+        {"waves": [{"amplitude": 0, "wavelength": 9}, {"amplitude": "a", "wavelength": 9}]},
+        "waves.1.amplitude: expected a number; found 'a'",
+    ),
+    (
+        {"waves": {"amplitude": -0.1, "wavelength": 3}},
+        "waves.0.amplitude: expected at least 0; found -0.1",
+    ),
+    (
+        {"waves": {"amplitude": 0, "wavelength": 0.001}},
+        "waves.0.wavelength: expected at least 0.01; found 0.001",
+    ),
+    (
+        {"waves": {"amplitude": 0, "period": 0.05}},
+        "waves.0.period: expected that of a wave of at least 0.01 m; found 0.05 s, a wave of "
+        "0.0039 m",
+    ),
+    (
+        {"waves": {"amplitude": 0, "wavelength": 3, "direction": 45}},
+        "waves.0.direction: expected an angle between -2 pi and 2 pi [rad]; found 45",
+    ),
+    (
+        {"waves": {"amplitude": 0, "wavelength": 3, "phase": -90}},
+        "waves.0.phase: expected an angle between -2 pi and 2 pi [rad]; found -90",
+    ),
+    (
+        {"waves": {"amplitude": 0.1, "wavelength": 3}, "gravity": 0},
+        "waves.0: expected gravity above 0; found 0",
+    ),
+    # Miche: 2 a / L at most 0.142, a = 0.071 m at 1 m.
+    (
+        {"waves": {"amplitude": 0.0711, "wavelength": 1}},
+        "waves.0.amplitude: expected at most 0.071, or a wave 1 m long breaks; found 0.0711",
+    ),
+    # In water that is shallow for it, at most 0.142 tanh(2 pi h / L).
+    (
+        {"waves": {"amplitude": 0.05, "wavelength": 10}, "water_depth": 0.1},
+        "waves.0.amplitude: expected at most 0.0446, or a wave 10 m long breaks; found 0.05",
+    ),
+    ({"water_depth": 0}, "water_depth: expected at least 0.01; found 0"),
+    ({"water_depth": "deep"}, "water_depth: expected a number; found 'deep'"),
+    ({"surface_tension": 0.07}, "surface_tension: expected a mapping; found 0.07"),
+    (
+        {"surface_tension": {"gamma": 0}},
+        "surface_tension.gamma: expected at least 1e-06; found 0",
+    ),
+    (
+        {"surface_tension": {"contact_angle": 90}},
+        "surface_tension.contact_angle: expected at most 3.14159; found 90",
+    ),
+    ({"current_field": 3}, "current_field: expected the path of a file; found 3"),
+    (
+        {"current_field": "none.npz"},
+        "current_field: none.npz: expected a file; found none",
+    ),
+    ({"current_field": "field.txt"}, "current_field: field.txt: expected a file .npz or .csv"),
+]
+
+
+@pytest.mark.parametrize(("override", "message"), WRONG, ids=[str(w[0])[:40] for w in WRONG])
+def test_wrong_overrides(override, message):
+    with pytest.raises(InputError) as caught:
+        load_world("lake", **override)
+    assert str(caught.value) == f"world lake: {message}"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected a mapping of world fields; found None"),
+        ("[1, 2]", "expected a mapping of world fields; found [1, 2]"),
+        ("1: 2", "expected names of world fields; found 1"),
+        ("densty: 3", f"densty: expected one of {FIELDS}; found 'densty'"),
+        ("density: [1]", "density: expected a number; found [1]"),
+        ("bed: {1: 2}", f"bed: expected one of {BED_FIELDS}; found 1"),
+        ("name: 3", "name: expected a text; found 3"),
+        ("density: 1\ndensity: 2", "line 2: expected each key once; found 'density' twice"),
+    ],
+)
+def test_wrong_files(tmp_path, text, message):
+    path = tmp_path / "pond.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_world(path)
+    assert str(caught.value) == f"{path}: {message}"
+
+
+def test_unknown_worlds(tmp_path):
+    with pytest.raises(InputError) as caught:
+        load_world("ocean")
+    assert str(caught.value) == (
+        "world: expected one of empty_underwater, lake or a YAML file; found 'ocean'"
+    )
+    with pytest.raises(InputError, match=r"none\.yaml: expected a file; found none$"):
+        load_world(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match=r"^world: expected a name or a path; found 5$"):
+        load_world(5)
+
+
+# ------------------------------------------------------------------------- velocities on a grid
+
+
+X, Y, Z = np.array([0.0, 1.0, 3.0]), np.array([-1.0, 2.0]), np.array([-4.0, -1.0])
+VELOCITY = np.random.default_rng(0).normal(size=(3, 2, 2, 3)).round(6)
+ARRAYS = {"x": X, "y": Y, "z": Z, "velocity": VELOCITY}
+
+
+def table(order=slice(None)) -> list[str]:
+    """The grid as lines of a CSV file, without their heading."""
+    rows = [
+        ",".join(map(repr, map(float, (X[i], Y[j], Z[k], *VELOCITY[i, j, k]))))
+        for i, j, k in np.ndindex(3, 2, 2)
+    ]
+    return list(np.array(rows)[order])
+
+
+def test_a_field_is_the_same_from_either_kind_of_file(tmp_path):
+    (tmp_path / "deep").mkdir()
+    np.savez(tmp_path / "deep" / "flow.npz", **ARRAYS)
+    with (tmp_path / "small.NPZ").open("wb") as file:
+        np.savez_compressed(file, **ARRAYS)
+    shuffled = table(np.random.default_rng(1).permutation(12))
+    (tmp_path / "flow.csv").write_text("\n".join(["x,y,z,u,v,w", *shuffled]) + "\n\n")
+    # A column more, spaces, another order, and a spreadsheet's invisible mark at the start.
+    loose = [f" {row}, 7 " for row in table()]
+    (tmp_path / "loose.csv").write_text("\ufeffx, y ,z,u,v,w,salt\n" + "\n".join(loose))
+    worlds = []
+    for name in ("deep/flow.npz", "small.NPZ", "flow.csv", "loose.csv"):
+        path = tmp_path / "sea.yaml"
+        path.write_text(f"name: sea\ncurrent_field: {name}\n")
+        worlds.append(load_world(path))
+        worlds.append(make_world(name="sea", current_field=tmp_path / name))
+    for sea in worlds:
+        for name, array in ARRAYS.items():
+            assert np.array_equal(getattr(sea.current_field, name), array)
+        assert (sea, hash(sea), repr(sea)) == (worlds[0], hash(worlds[0]), repr(worlds[0]))
+    assert load_world(tmp_path / "sea.yaml", current_field=None).current_field is None
+    # Other numbers are another world, to caches and to resumed runs.
+    other = CurrentField(X, Y, Z, VELOCITY + 1e-9)
+    assert make_world(current_field=other) != worlds[0]
+    assert repr(other) != repr(worlds[0].current_field)
+    with pytest.raises(ValueError, match="read-only"):
+        other.velocity[0] = 0
+
+
+def test_relative_paths_start_where_they_are_written(tmp_path, monkeypatch):
+    folder = tmp_path / "worlds"
+    folder.mkdir()
+    np.savez(tmp_path / "flow.npz", **ARRAYS)
+    path = folder / "sea.yaml"
+    path.write_text("current_field: flow.npz")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as caught:
+        load_world(path)
+    assert str(caught.value) == (
+        f"{path}: current_field: {folder / 'flow.npz'}: expected a file; found none"
+    )
+    assert load_world("lake", current_field="flow.npz").current_field.x[2] == 3.0
+    path.write_text("current_field: ../flow.npz")
+    (folder / "link.npz").symlink_to(tmp_path / "flow.npz")
+    for name in ("../flow.npz", "link.npz"):
+        path.write_text(f"current_field: {name}")
+        with pytest.raises(InputError) as caught:
+            load_world(path)
+        assert str(caught.value) == (
+            f"{path}: current_field: {name}: expected a path inside {folder}; "
+            "found one that leads out"
+        )
+    path.write_text(f"current_field: {tmp_path / 'flow.npz'}")
+    assert load_world(path).current_field is not None
+    path.write_text('current_field: "a\\0b.npz"')
+    with pytest.raises(InputError, match=r"expected a file name; found a null byte$"):
+        load_world(path)
+
+
+GRID = "expected one row for each of 3 x 2 x 2 points of a full grid"
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ([], "line 1: expected columns x, y, z, u, v, w; found no x"),
+        (["x,y,z,u,v"], "line 1: expected columns x, y, z, u, v, w; found no w"),
+        (["x,y,z,u,v,w,x"], "line 1: expected columns x, y, z, u, v, w; found x twice"),
+        (["x,y,z,u,v,w"], "line 2: expected rows of numbers; found none"),
+        (["x,y,z,u,v,w", "", "1,2,3,4,5"], "line 3: expected 6 numbers; found 5"),
+        (["x,y,z,u,v,w", "1,2,3,4,5,6,7"], "line 2: expected 6 numbers; found 7"),
+        (["x,y,z,u,v,w", "1,2,3,4,5,fast"], "line 2: expected a number; found 'fast'"),
+        (["x,y,z,u,v,w", "1,2,3,,5,6"], "line 2: expected a number; found ''"),
+        (["x,y,z,u,v,w", "1,2,3,4,5,nan"], "line 2: expected a finite number; found 'nan'"),
+        (["x,y,z,u,v,w", *table()[1:]], f"{GRID}; found 11 rows"),
+        (["x,y,z,u,v,w", *table(), table()[5]], f"{GRID}; found (1, -1, -1) twice"),
+        (["x,y,z,u,v,w", *table()[1:], table()[5]], f"{GRID}; found (1, -1, -1) twice"),
+    ],
+)
+def test_wrong_tables(tmp_path, lines, message):
+    path = tmp_path / "flow.csv"
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError) as caught:
+        load_world("lake", current_field=path)
+    assert str(caught.value) == f"world lake: current_field: {path}: {message}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x": None}, "expected arrays x, y, z, velocity; found no x"),
+        ({"velocity": None}, "expected arrays x, y, z, velocity; found no velocity"),
+        ({"z": np.float64(2)}, "z: expected a row of numbers [m]; found shape []"),
+        ({"y": np.zeros((2, 1))}, "y: expected a row of numbers [m]; found shape [2, 1]"),
+        ({"y": np.zeros(0)}, "y: expected a row of numbers [m]; found shape [0]"),
+        ({"z": [-1.0, -4.0]}, "z: expected rising numbers [m]; found -4 after -1"),
+        ({"z": [-1.0, -1.0]}, "z: expected rising numbers [m]; found -1 after -1"),
+        ({"z": [-1.0, np.inf]}, "z: expected finite numbers; found NaN or infinity"),
+        ({"x": [0.0, np.nan, 1.0]}, "x: expected finite numbers; found NaN or infinity"),
+        ({"x": ["a", "b", "c"]}, "x: expected real numbers; found <U1"),
+        ({"velocity": VELOCITY + 0j}, "velocity: expected real numbers; found complex128"),
+        (
+            {"velocity": VELOCITY[..., :2]},
+            "velocity: expected shape [3, 2, 2, 3], as x, y and z have it; found [3, 2, 2, 2]",
+        ),
+        (
+            {"velocity": np.where(VELOCITY > 1, np.nan, VELOCITY)},
+            "velocity: expected finite numbers; found NaN or infinity",
+        ),
+        (
+            {"x": np.array([None, 1, 2])},
+            "expected arrays of numbers; found: Object arrays cannot be loaded when "
+            "allow_pickle=False",
+        ),
+    ],
+)
+def test_wrong_arrays(tmp_path, changes, message):
+    path = tmp_path / "flow.npz"
+    np.savez(path, **{k: v for k, v in (ARRAYS | changes).items() if v is not None})
+    with pytest.raises(InputError) as caught:
+        load_world("lake", current_field=path)
+    assert str(caught.value) == f"world lake: current_field: {path}: {message}"
+
+
+def test_files_that_are_no_fields(tmp_path):
+    whole = tmp_path / "whole.npz"
+    np.savez_compressed(whole, **ARRAYS)
+    content = whole.read_bytes()
+    middle = content.index(b"velocity") + 60
+    wrong = {
+        "empty.npz": b"",
+        "text.npz": b"x,y,z,u,v,w",
+        "cut.npz": content[:-100],
+        "spoilt.npz": content[:middle] + bytes(40) + content[middle + 40 :],
+        "latin.csv": b"x,y,z,u,v,w\n\xff",
+    }
+    np.save(tmp_path / "array.npy", X)
+    wrong["array.npz"] = (tmp_path / "array.npy").read_bytes()
+    (tmp_path / "folder.npz").mkdir()
+    for name, data in wrong.items():
+        (tmp_path / name).write_bytes(data)
+    for name in (*wrong, "folder.npz"):
+        with pytest.raises(InputError, match=rf"{name}: expected .*; found:? [^\n]+$"):
+            load_world("lake", current_field=tmp_path / name)
+
+
+# ------------------------------------------------------------------------- the bed
+
+
+def test_lake_extremes_are_exact():
+    """-112.8 m at the bottom and +36.7 m on the shore, over 998 m x 998 m, never beyond."""
+    line = np.linspace(-499, 499, 999)
+    x, y = np.meshgrid(line, line)
+    height = np.asarray(bed_height(LAKE, x, y))
+    assert LAKE.extent == 998.0
+    # To rounding of float32, 8 µm at 112 m; dunes stay between the two.
+    assert height.min() == height[499, 499] == pytest.approx(-112.8, abs=1e-5)
+    assert height.max() == height[0, 0] == height[-1, -1] == pytest.approx(36.7, abs=1e-5)
+    # A shore all round: nobody swims off the map.
+    rim = np.concatenate([height[0], height[-1], height[:, 0], height[:, -1]])
+    assert rim.min() > 20.0
+
+
+def test_lake_is_always_the_same_and_has_shore_slope_and_basin():
+    first, second = sample_bed(LAKE), sample_bed(load_world("lake").bed)
+    assert np.array_equal(first, second)
+    assert first.shape == (201, 201)
+    assert 0.05 < np.mean(first < -110) < 0.3  # basin
+    assert 0.2 < np.mean(first > 0) < 0.6  # shore
+    assert np.sum((first > -100) & (first < -10)) > 5000  # slope
+    assert np.diff(np.sign(np.diff(first[60], 2))).any()  # dunes
+
+
+def test_lake_heights_of_other_extents():
+    bed = Bed(kind="lake", height=-3.0, highest=1.0, extent=20.0)
+    heights = sample_bed(bed, 51)
+    assert heights.max() == pytest.approx(1.0)
+    assert heights[25, 25] == pytest.approx(-3.0)
+
+
+def test_slope_against_finite_differences():
+    """Central differences in float64 over 2 cm: the same numbers; over 1 mm: to what dunes bend."""
+    import jax
+
+    x, y = np.random.default_rng(0).uniform(-480, 480, (2, 500))
+    with jax.enable_x64(True):
+        slope = [np.asarray(s) for s in bed_slope(LAKE, x, y)]
+        d = 5e-4
+        fine = [
+            np.asarray(bed_height(LAKE, x + d, y) - bed_height(LAKE, x - d, y)) / (2 * d),
+            np.asarray(bed_height(LAKE, x, y + d) - bed_height(LAKE, x, y - d)) / (2 * d),
+        ]
+    assert slope[0] == pytest.approx(fine[0], abs=1e-4)
+    assert slope[1] == pytest.approx(fine[1], abs=1e-4)
+    assert np.hypot(*slope).max() < 1.0
+
+
+def test_a_flat_bed():
+    x = np.zeros(3, np.float32)
+    assert np.all(np.asarray(bed_height(Bed(height=-7.0), x, x)) == -7.0)
+    assert not any(np.any(np.asarray(s)) for s in bed_slope(Bed(), x, x))
