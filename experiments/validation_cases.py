@@ -21,7 +21,9 @@ from mjx_revolve.body.module_types import Box, ModuleType, Part, Thruster
 from mjx_revolve.body.morphology import Module, Morphology, load_morphology
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.engine.step import acceleration
-from mjx_revolve.episodes.rollout import flow_at, make_engine, roll_out, simulate
+from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.episodes.rollout import flow_at, roll_out
+from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.numerics.xla import on_cpu
 from mjx_revolve.water.buoyancy import submersion
 from mjx_revolve.water.drag import (

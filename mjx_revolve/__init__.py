@@ -24,12 +24,12 @@ _WHERE = {
     "make_world": "water.world",
     "build_robot": "engine.robot",
     "export_mjcf": "engine.robot",
-    "make_cpg": "control.controllers",
-    "make_sine": "control.controllers",
-    "bind_genes": "control.controllers",
-    "simulate": "episodes.rollout",
+    "make_cpg": "control.cpg",
+    "make_sine": "control.sine",
+    "bind_genes": "control.controller",
+    "simulate": "episodes.simulate",
     "make_fitness": "episodes.fitness",
-    "make_mixed_fitness": "episodes.mixed_fitness",
+    "make_mixed_fitness": "episodes.fitness",
 }
 
 __all__ = ["__version__", *sorted(_WHERE)]
@@ -41,15 +41,15 @@ if TYPE_CHECKING:
     from mjx_revolve.body.morphology import load_morphology as load_morphology
     from mjx_revolve.body.morphology import save_morphology as save_morphology
     from mjx_revolve.body.morphology import trim_neutral as trim_neutral
-    from mjx_revolve.control.controllers import bind_genes as bind_genes
-    from mjx_revolve.control.controllers import make_cpg as make_cpg
-    from mjx_revolve.control.controllers import make_sine as make_sine
+    from mjx_revolve.control.controller import bind_genes as bind_genes
+    from mjx_revolve.control.cpg import make_cpg as make_cpg
+    from mjx_revolve.control.sine import make_sine as make_sine
     from mjx_revolve.engine.robot import build_robot as build_robot
     from mjx_revolve.engine.robot import export_mjcf as export_mjcf
     from mjx_revolve.episodes.config import load_config as load_config
     from mjx_revolve.episodes.fitness import make_fitness as make_fitness
-    from mjx_revolve.episodes.mixed_fitness import make_mixed_fitness as make_mixed_fitness
-    from mjx_revolve.episodes.rollout import simulate as simulate
+    from mjx_revolve.episodes.fitness import make_mixed_fitness as make_mixed_fitness
+    from mjx_revolve.episodes.simulate import simulate as simulate
     from mjx_revolve.inputs.errors import InputError as InputError
     from mjx_revolve.water.world import load_world as load_world
     from mjx_revolve.water.world import make_world as make_world

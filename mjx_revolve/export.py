@@ -29,7 +29,7 @@ from mjx_revolve.numerics import runtime
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
     from mjx_revolve.episodes.champion import Episode
-    from mjx_revolve.episodes.rollout import Trajectory
+    from mjx_revolve.episodes.simulate import Trajectory
 
 # Formats: what their files are called in a folder, and what they may end in.
 _FILES = {"mjcf": "robot.xml", "urdf": "robot.urdf", "sdf": "robot.sdf", "mcap": "rollout.mcap"}

@@ -13,7 +13,7 @@ from laboratory import body
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.champion import Episode
-from mjx_revolve.episodes.rollout import Trajectory
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.water.world import load_world
 
 # Names that neither ROS nor Gazebo takes, two that are one when they are made plain, every kind of

@@ -17,9 +17,11 @@ import numpy as np
 
 from mjx_revolve.body.module_types import Box, ModuleType, Part
 from mjx_revolve.body.morphology import Module, Morphology, load_morphology
+from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.levels import make_levels
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.engine.step import acceleration
-from mjx_revolve.episodes.rollout import flow_at, make_engine, roll_out
+from mjx_revolve.engine.step import acceleration, level_plant
+from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.numerics.xla import on_cpu, share_once
 from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.world import World, load_world
@@ -115,8 +117,12 @@ USUAL = _USUAL if on_cpu() else None  # as users compile
 
 @lru_cache(maxsize=64)
 def _accelerator(robot: Robot, still: bool):
+    levels = make_levels(robot)
+    plant, own = level_plant(levels), np.array([*robot.servos, *robot.thrusters], int)
+
     def run(qpos, qvel, ctrl, water):
-        return acceleration(robot, qpos, qvel, ctrl, water_of(robot.world) if still else water)
+        water = water_of(robot.world) if still else water
+        return acceleration(levels, qpos, qvel, plant.arrange(ctrl[own]), water)
 
     return jax.jit(share_once(run), compiler_options=QUICK)
 
@@ -139,7 +145,7 @@ def _marcher(robot: Robot, records: int, every: int, engine: str, still: bool):
             simulator,
             lambda state, time, row, sense: (state, targets),
             flow_at(robot.world, water_of(robot.world) if still else water),
-            lambda state, ctrl, energy: (*simulator.observe(state), energy),
+            lambda state, ctrl, energy, water: (*simulator.observe(state), energy),
             simulator.init(qpos, qvel),
             (),
             None,
@@ -187,8 +193,9 @@ def march(
         kind = jnp.float64 if x64 else jnp.float32
         lanes = np.shape(qpos)[-1]
         ctrl = np.zeros((robot.mj_model.nu, lanes)) if ctrl is None else ctrl
-        order = make_engine(robot, engine).order
-        arrays = [jnp.asarray(x, kind) for x in (qpos, qvel, np.asarray(ctrl)[order])]
+        own = np.asarray(ctrl)[[*robot.servos, *robot.thrusters]]
+        asked = make_engine(robot, engine).plant.arrange(jnp.asarray(own, kind))
+        arrays = [*(jnp.asarray(x, kind) for x in (qpos, qvel)), asked]
         run = _marcher(robot, records, every, engine, water is None)
         kept = [np.asarray(x, np.float64) for x in run(*arrays, water)]
     return (dt * every * np.arange(1, records + 1), *kept)

@@ -22,7 +22,6 @@ from experiments.falling_spider import (
     row_ticks,
 )
 from laboratory import QUICK
-from mjx_revolve.episodes import rollout
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
@@ -61,7 +60,7 @@ def test_the_closed_forms_height_and_time_are_inverse():
 @pytest.mark.parametrize(("run", "expected"), [("air", 9.81), ("mask", 0.60648)])
 def test_the_spider_falls_as_fast_as_it_must(monkeypatch, run, expected):
     # The compiler's optimisations cost more than they save here.
-    monkeypatch.setattr(rollout, "compiler_options", lambda: QUICK)
+    monkeypatch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
     assert acceleration(fall(RUNS[run][0], 1.5)) == pytest.approx(expected, abs=1e-4)
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.tree import Level, Points
+from mjx_revolve.engine.level import Level, Points
 from mjx_revolve.numerics.inertia import Motion, SpatialInertia, sum_parts
 from mjx_revolve.numerics.spatial import (
     SYM,
@@ -121,8 +121,7 @@ def bed_on_level(
     Returns:
         Torque [N·m] and force [N] about each body's origin, body frame, and their damping.
     """
-    n, lanes = len(level.body), jnp.shape(motion.height)[-1]
-    k = max(np.shape(x)[0] if np.ndim(x) == 3 else 1 for x in points.position)
+    k, n, lanes = points.count, level.count, jnp.shape(motion.height)[-1]
     wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
     assert world.bed is not None  # there are points only above a bed
     rows = (motion.x_axis, motion.y_axis, motion.up)

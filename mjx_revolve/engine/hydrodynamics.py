@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.fluid_table import FluidTable
-from mjx_revolve.engine.tree import Level, Parts
+from mjx_revolve.engine.level import Level, Mounts, Parts
 from mjx_revolve.numerics.inertia import (
     Motion,
     SpatialInertia,
@@ -42,40 +41,11 @@ from mjx_revolve.numerics.spatial import (
     vscale,
     vsub,
 )
-from mjx_revolve.water.added_mass import box_added_mass, entrained_water, lamb_coefficients
-from mjx_revolve.water.buoyancy import buoyancy, displaced, submersion, surface_tension
-from mjx_revolve.water.drag import (
-    ELLIPSOID_COEFFICIENTS,
-    ellipsoid,
-    ellipsoid_constants,
-    face_drag_coefficients,
-    inertia_box,
-    quadratic_drag,
-)
-from mjx_revolve.water.flow import Water, flow, is_uniform, surface, water_of, wave_convection
-from mjx_revolve.water.lift_drag import LiftDrag, lift_drag, lift_drag_damping, lift_drag_wrench
+from mjx_revolve.water.buoyancy import displaced, submersion, surface_tension
+from mjx_revolve.water.drag import ellipsoid, inertia_box, quadratic_drag
+from mjx_revolve.water.flow import Water, flow, is_uniform, surface, wave_convection
+from mjx_revolve.water.lift_drag import lift_drag_damping, lift_drag_wrench
 from mjx_revolve.water.world import World
-
-__all__ = [
-    "ELLIPSOID_COEFFICIENTS",
-    "FluidTable",
-    "LiftDrag",
-    "Outer",
-    "Water",
-    "box_added_mass",
-    "buoyancy",
-    "ellipsoid",
-    "ellipsoid_constants",
-    "entrained_water",
-    "face_drag_coefficients",
-    "inertia_box",
-    "lamb_coefficients",
-    "lift_drag",
-    "quadratic_drag",
-    "submersion",
-    "water_of",
-    "water_on_level",
-]
 
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -165,10 +135,10 @@ def _push(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Ve
 
     All but the drag of faces against turning: `_twist`.
     """
-    if parts.drag == "faces":
+    if parts.laws.drag == "faces":
         push = [quadratic_drag(x, c, share) for x, c in zip(v, parts.drag_linear, strict=True)]
         return tuple(f for f, _ in push), _ZERO, tuple(d for _, d in push)
-    if parts.drag == "lift_drag":
+    if parts.laws.drag == "lift_drag":
         assert parts.plate is not None
         at = vadd(v, cross(w, parts.plate_center))
         plate = (parts.plate_forward, parts.plate_upward, parts.plate_area, world.density)
@@ -178,7 +148,7 @@ def _push(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Ve
         # Half of the slope: the step then takes the force in the middle of its velocities.
         half = mul(0.5, slope)
         return vscale(share, force), vscale(share, torque), (half, half, half)
-    if parts.drag == "ellipsoid":
+    if parts.laws.drag == "ellipsoid":
         force, torque = ellipsoid(v, w, parts.ellipsoid, not world.added_mass)
         return vscale(share, force), vscale(share, torque), None
     return _ZERO, _ZERO, None
@@ -239,18 +209,25 @@ def _pressure(
     return tuple(map(gather, torque)), tuple(map(gather, force))
 
 
-def _water_on_parts(
-    world: World, parts: Parts, n: int, motion: Motion, gravity: Vec, water: Water
-) -> tuple[Vec, Vec, SpatialInertia | None, SpatialInertia | None, Scalar]:
-    """Torque, force, carried water, damping and submerged share of one group of parts."""
-    k, lanes = len(parts.rows), jnp.shape(motion.height)[-1]
-    wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
-    gather = lambda x: sum_parts(wide(x) if _is_array(x) else x, k)  # noqa: E731
-    stream = _stream(world, water, motion, parts.position)
-    velocity = vadd(motion.velocity, cross(motion.spin, parts.position))
-    relative = velocity if stream.velocity is None else vsub(velocity, stream.velocity)
-    v = matTvec(parts.rotation, relative)
-    w = matTvec(parts.rotation, motion.spin)
+class _Wet(NamedTuple):
+    """How far parts are under water, `[npart, nbody, lanes]`.
+
+    Attributes:
+        share: of each part that is submerged [-].
+        moment: of the submerged share, as from `submersion`, part's axes.
+        up: the surface's normal, part's axes.
+        depth: of the part's centre below the surface [m].
+    """
+
+    share: Scalar
+    moment: Vec
+    up: Vec
+    depth: Scalar
+
+
+def _submerge(
+    world: World, parts: Parts, motion: Motion, water: Water, wide: Callable[[Scalar], Scalar]
+) -> _Wet:
     height, slope = water.surface_height, None
     if world.waves:
         x, y, _ = _world_place(motion, parts.center_position)
@@ -262,32 +239,72 @@ def _water_on_parts(
         steep = jax.lax.rsqrt(1 + slope[0] * slope[0] + slope[1] * slope[1])
         below = below * steep
         normal = _to_body(motion, (-slope[0] * steep, -slope[1] * steep, steep))
-    up = matTvec(parts.rotation, normal)
-    depth = wide(below)
+    up, depth = matTvec(parts.rotation, normal), wide(below)
     # Without buoyancy the water still drags what is below its surface.
-    mode = "mask" if parts.buoyancy == "off" else parts.buoyancy
+    mode = "mask" if parts.laws.buoyancy == "off" else parts.laws.buoyancy
     share, moment = submersion(up, depth, parts.half_size, mode)
-    force, torque, damping = _push(world, parts, v, w, share)
-    if parts.buoyancy != "off" and world.surface_tension is not None:
-        pull, turn = surface_tension(
-            tuple(map(wide, up)),
-            depth,
-            parts.half_size,
-            world.surface_tension.gamma,
-            world.density * world.gravity,
-            world.surface_tension.contact_angle,
-            parts.exposed,
-        )
-        force, torque = vadd(force, pull), vadd(torque, turn)
+    return _Wet(share, moment, up, depth)
+
+
+def _pull(
+    world: World, parts: Parts, wet: _Wet, wide: Callable[[Scalar], Scalar]
+) -> tuple[Vec, Vec]:
+    """Force and torque of the surface's tension, part's axes, at the box's centre."""
+    tension = world.surface_tension
+    if tension is None or parts.laws.buoyancy == "off":
+        return _ZERO, _ZERO
+    return surface_tension(
+        tuple(map(wide, wet.up)),
+        wet.depth,
+        parts.half_size,
+        tension.gamma,
+        world.density * world.gravity,
+        tension.contact_angle,
+        parts.exposed,
+    )
+
+
+def _thrust(mounts: Mounts, share: Scalar, thrusts: jax.Array) -> tuple[Vec, Vec]:
+    """Torque and force of the thrusters on each part, about the body's origin, body frame."""
+    which = mounts.which
+    if isinstance(which, jax.Array):  # robots differ from lane to lane
+        push = total(*[jnp.where(which == k, thrusts[k], 0) for k in range(thrusts.shape[0])])
+    else:
+        none = jnp.zeros_like(thrusts[0])
+        rows = [[thrusts[k] if k >= 0 else none for k in row] for row in which[..., 0]]
+        push = jnp.stack([jnp.stack(row) for row in rows])
+    # Out of the water a propeller finds nothing to push.
+    force = vscale(mul(push, share), mounts.axis)
+    return vsub(cross(mounts.position, force), vscale(mounts.torque_ratio, force)), force
+
+
+def _sizes(parts: Parts, n: int, motion: Motion) -> Callable[[Scalar], Scalar]:
+    """What makes a number of the parts as wide as all of them."""
+    lanes = jnp.shape(motion.height)[-1]
+    return lambda x: jnp.broadcast_to(x, (parts.count, n, lanes))
+
+
+def _water_on_parts(
+    world: World, parts: Parts, n: int, motion: Motion, gravity: Vec, water: Water, thrusts: Any
+) -> tuple[Vec, Vec, SpatialInertia | None, SpatialInertia | None, Scalar]:
+    """Torque, force, carried water, damping and submerged share of one group of parts."""
+    k, wide = parts.count, _sizes(parts, n, motion)
+    gather = lambda x: sum_parts(wide(x) if _is_array(x) else x, k)  # noqa: E731
+    stream = _stream(world, water, motion, parts.position)
+    v, w = _relative(parts, motion, stream)
+    wet = _submerge(world, parts, motion, water, wide)
+    force, torque, damping = _push(world, parts, v, w, wet.share)
+    pull, turn = _pull(world, parts, wet, wide)
+    force, torque = vadd(force, pull), vadd(torque, turn)
     force = matvec(parts.rotation, force)
     torque = vadd(matvec(parts.rotation, torque), cross(parts.position, force))
+    if parts.mounts is not None:
+        driven = _thrust(parts.mounts, wet.share, thrusts)
+        torque, force = vadd(torque, driven[0]), vadd(force, driven[1])
     force, torque = tuple(map(gather, force)), tuple(map(gather, torque))
-    if parts.buoyancy != "off":
-        # The pressure's gradient holds up what is still, and pushes along with moving water.
-        gradient = gravity
-        if stream.acceleration is not None:
-            gradient = vadd(gradient, stream.acceleration)
-        righting, lift = _pressure(world, parts, share, moment, gradient, gather)
+    if parts.laws.buoyancy != "off":
+        gradient = _gradient(gravity, stream)
+        righting, lift = _pressure(world, parts, wet.share, wet.moment, gradient, gather)
         torque, force = vadd(torque, righting), vadd(force, lift)
     resisting = None
     if damping is not None:
@@ -295,7 +312,7 @@ def _water_on_parts(
         linear = rotate_sym(parts.rotation, (x, 0.0, 0.0, y, 0.0, z))
         one = shift_inertia(linear, (0.0,) * 6, parts.position)
         # No plate knows drag against turning; without one, a free plate spins up for ever.
-        twist, turning = _twist(parts, w, share, gather)
+        twist, turning = _twist(parts, w, wet.share, gather)
         torque = vadd(torque, twist)
         resisting = SpatialInertia(
             vadd(tuple(map(gather, one.angular)), turning),
@@ -303,14 +320,87 @@ def _water_on_parts(
             tuple(map(gather, one.linear)),
         )
     carried = None
-    if any(_present(x) for x in (*parts.carried_linear, *parts.carried_angular)):
-        weigh = lambda x: sum_parts(mul(x, share), k) if _present(x) else 0.0  # noqa: E731
-        carried = SpatialInertia(
-            tuple(map(weigh, parts.carried_angular)),
-            tuple(tuple(map(weigh, row)) for row in parts.carried_cross),
-            tuple(map(weigh, parts.carried_linear)),
+    if parts.carried is not None and any(map(_present, jax.tree.leaves(parts.carried))):
+        weigh = lambda x: sum_parts(mul(x, wet.share), k) if _present(x) else 0.0  # noqa: E731
+        carried = jax.tree.map(weigh, parts.carried)
+    return torque, force, carried, resisting, wet.share
+
+
+def _relative(parts: Parts, motion: Motion, stream: _Stream) -> tuple[Vec, Vec]:
+    """Velocity of the parts' centres relative to the water, and spin, part's axes."""
+    velocity = vadd(motion.velocity, cross(motion.spin, parts.position))
+    relative = velocity if stream.velocity is None else vsub(velocity, stream.velocity)
+    return matTvec(parts.rotation, relative), matTvec(parts.rotation, motion.spin)
+
+
+def _gradient(gravity: Vec, stream: _Stream) -> Vec:
+    """Of the pressure: it holds up what is still, and pushes along with moving water [m/s²]."""
+    return gravity if stream.acceleration is None else vadd(gravity, stream.acceleration)
+
+
+class PartForces(NamedTuple):
+    """Forces on parts one by one, body frame, three of `[npart, nbody, lanes]` each [N].
+
+    Attributes:
+        buoyancy: of the water's pressure: Archimedes', what accelerating water adds to it, and the
+            pull of the surface where the world has one.
+        drag: of the water that flows past, the lift of fins included.
+        thrust: of the thrusters.
+    """
+
+    buoyancy: Vec
+    drag: Vec
+    thrust: Vec
+
+
+def forces_on_parts(
+    world: World, level: Level, motion: Motion, gravity: Vec, water: Water, thrusts: Any
+) -> list[PartForces]:
+    """The terms of `water_on_level`, part by part and kind by kind, before they are added up.
+
+    Args:
+        world: which laws act.
+        level: the bodies.
+        motion: where they are and how they move, relative to the uniform current.
+        gravity: as in `water_on_level`.
+        water: surface, current, time.
+        thrusts: of the robot's thrusters, `[nthruster, lanes]` [N].
+
+    Returns:
+        For each group of the level's parts. MuJoCo's inertia-box law, which knows only whole
+        bodies, is shared out among a body's parts by their submerged volume.
+    """
+    found, shares = [], []
+    for parts in level.parts:
+        wide = _sizes(parts, level.count, motion)
+        each = lambda vector, wide=wide: tuple(wide(x) for x in vector)  # noqa: E731
+        stream = _stream(world, water, motion, parts.position)
+        v, w = _relative(parts, motion, stream)
+        wet = _submerge(world, parts, motion, water, wide)
+        shares.append(wet.share)
+        lift = matvec(parts.rotation, _pull(world, parts, wet, wide)[0])
+        if parts.laws.buoyancy != "off":
+            gradient = _gradient(gravity, stream)
+            held = _pressure(world, parts, wet.share, wet.moment, gradient, wide)[1]
+            lift = vadd(lift, held)
+        drag = matvec(parts.rotation, _push(world, parts, v, w, wet.share)[0])
+        push: Vec = _ZERO
+        if parts.mounts is not None:
+            push = _thrust(parts.mounts, wet.share, thrusts)[1]
+        found.append(PartForces(each(lift), each(drag), each(push)))
+    if world.drag == "inertia_box":
+        force = _inertia_box(world, level, motion, water, _share_of_body(level, shares))[1]
+        total_wet = total(
+            *[
+                sum_parts(mul(parts.volume, share), parts.count)
+                for parts, share in zip(level.parts, shares, strict=True)
+            ]
         )
-    return torque, force, carried, resisting, share
+        for k, (parts, share) in enumerate(zip(level.parts, shares, strict=True)):
+            part = mul(parts.volume, share) / jnp.maximum(total_wet, 1e-30)
+            own = tuple(mul(part, x) for x in force)
+            found[k] = found[k]._replace(drag=vadd(found[k].drag, own))
+    return found
 
 
 def _plus(a: SpatialInertia | None, b: SpatialInertia | None) -> SpatialInertia | None:
@@ -321,10 +411,10 @@ def _plus(a: SpatialInertia | None, b: SpatialInertia | None) -> SpatialInertia 
 
 def _share_of_body(level: Level, shares: Sequence[Scalar]) -> Scalar:
     """Submerged share of each body, its parts weighted by volume."""
-    n = len(level.body)
+    n = level.count
     wet, whole = 0.0, 1e-30
     for parts, share in zip(level.parts, shares, strict=True):
-        k, volume = len(parts.rows), parts.volume
+        k, volume = parts.count, parts.volume
         if not isinstance(volume, jax.Array):
             volume = np.broadcast_to(np.asarray(volume), (k, n, 1))
         wet = add(wet, sum_parts(mul(volume, share), k))
@@ -336,43 +426,21 @@ def _inertia_box(
     world: World, level: Level, motion: Motion, water: Water, share: Scalar
 ) -> tuple[Vec, Vec]:
     """Torque and force of MuJoCo's inertia-box law on each body."""
-    stream = _stream(world, water, motion, level.box_position)
-    at = vadd(motion.velocity, cross(motion.spin, level.box_position))
+    box = level.box
+    assert box is not None
+    stream = _stream(world, water, motion, box.position)
+    at = vadd(motion.velocity, cross(motion.spin, box.position))
     at = at if stream.velocity is None else vsub(at, stream.velocity)
     force, torque = inertia_box(
-        matTvec(level.box_rotation, at),
-        matTvec(level.box_rotation, motion.spin),
-        level.box_size,
+        matTvec(box.rotation, at),
+        matTvec(box.rotation, motion.spin),
+        box.size,
         world.density,
         world.viscosity,
     )
-    force = vscale(share, matvec(level.box_rotation, force))
-    torque = vscale(share, matvec(level.box_rotation, torque))
-    return vadd(torque, cross(level.box_position, force)), force
-
-
-def _thrust(level: Level, shares: Sequence[Scalar], thrusts: Sequence[Scalar]) -> tuple[Vec, Vec]:
-    """Torque and force of the thrusters on each body."""
-    n = len(level.body)
-    torques: list[list[Any]] = [[0.0] * n for _ in range(3)]
-    forces: list[list[Any]] = [[0.0] * n for _ in range(3)]
-    for p in level.propellers:
-        # Out of the water a propeller finds nothing to push.
-        wet = shares[p.group][p.slot, p.body]
-        force = vscale(mul(thrusts[p.index], wet), p.axis)
-        torque = vsub(cross(p.position, force), vscale(p.thruster.torque_ratio, force))
-        for i in range(3):
-            forces[i][p.body] = add(forces[i][p.body], force[i])
-            torques[i][p.body] = add(torques[i][p.body], torque[i])
-
-    def rows(values: list[Any]) -> Scalar:
-        arrays = [x for x in values if _is_array(x)]
-        if not arrays:
-            return 0.0
-        zero = jnp.zeros_like(arrays[0])
-        return jnp.stack([x if _is_array(x) else zero for x in values])
-
-    return tuple(rows(x) for x in torques), tuple(rows(x) for x in forces)
+    force = vscale(share, matvec(box.rotation, force))
+    torque = vscale(share, matvec(box.rotation, torque))
+    return vadd(torque, cross(box.position, force)), force
 
 
 def water_on_level(
@@ -382,7 +450,7 @@ def water_on_level(
     swirling: tuple[Vec, Vec],
     gravity: Vec,
     water: Water,
-    thrusts: Sequence[Scalar] = (),
+    thrusts: Any = (),
 ) -> Outer:
     """What the water does to the bodies of a level.
 
@@ -401,24 +469,20 @@ def water_on_level(
             a step takes them in its middle.
         gravity: upwards, body frames, with the uniform current's acceleration [m/s²].
         water: surface, current, time.
-        thrusts: of the robot's thrusters, `[lanes]` each [N].
+        thrusts: of the thrusters, `[nthruster, lanes]` [N].
 
     Returns:
         Forces, torques and inertias.
     """
-    n = len(level.body)
     torque, force = _ZERO, _ZERO
     carried, damping, shares = None, None, []
     for parts in level.parts:
         on_torque, on_force, more_carried, more_damping, share = _water_on_parts(
-            world, parts, n, motion, gravity, water
+            world, parts, level.count, motion, gravity, water, thrusts
         )
         torque, force = vadd(torque, on_torque), vadd(force, on_force)
         carried, damping = _plus(carried, more_carried), _plus(damping, more_damping)
         shares.append(share)
-    if level.propellers:
-        on_torque, on_force = _thrust(level, shares, thrusts)
-        torque, force = vadd(torque, on_torque), vadd(force, on_force)
     if world.drag == "inertia_box":
         on_torque, on_force = _inertia_box(
             world, level, motion, water, _share_of_body(level, shares)

@@ -8,24 +8,28 @@ The bed is the population step's penalty law or, where the world says so, MJX's 
 
 from __future__ import annotations
 
-from typing import Any
+import itertools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_revolve.engine.levels import Levels, make_levels
+from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
 from mjx_revolve.engine.servos import end_stop, servo
 from mjx_revolve.engine.step import (
     Engine,
-    Sense,
+    Root,
     outer_forces,
-    run_thrusters,
+    push_of,
     turn_quat,
     with_water,
 )
-from mjx_revolve.engine.tree import make_tree
+from mjx_revolve.engine.step import init as start
+from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.numerics.inertia import Motion, SpatialInertia, cross_force, gyroscope
 from mjx_revolve.numerics.spatial import full, quat_to_rows
 from mjx_revolve.water.flow import Water
@@ -40,6 +44,59 @@ _OFF = mujoco.mjtDisableBit
 _STEPS, _SEARCH = 20, 8
 
 
+class _Plan(NamedTuple):
+    """What the stages of a step know of the robot.
+
+    Attributes:
+        robot: the robot.
+        levels: the population step's constants.
+        columns: `[level]` of qvel that are its hinges.
+        below: `[nv]` degrees of freedom that hang below each.
+        solves: whether MJX solves the contact with the bed.
+    """
+
+    robot: Robot
+    levels: Levels
+    columns: tuple[np.ndarray, ...]
+    below: tuple[np.ndarray, ...]
+    solves: bool
+
+    @property
+    def dt(self) -> float:
+        """Of the step [s]."""
+        return self.levels.world.timestep
+
+
+class _Matrices(NamedTuple):
+    """M q̈ = f, as the stages build it up.
+
+    Attributes:
+        mass: `[nv, nv]`, all that is implicit included.
+        force: `[nv]`.
+    """
+
+    mass: jax.Array
+    force: jax.Array
+
+
+class _Flow(NamedTuple):
+    """How an individual moves, seen from the uniform current.
+
+    Attributes:
+        qpos: `[nq]`.
+        qvel: `[nv]`.
+        ahead: `[nv]` half a step ahead, for momenta that turn.
+        acceleration: `[3]` of the current [m/s²].
+        drift: spatial acceleration of each level's bodies when no joint accelerates, `[nbody, 6]`.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    ahead: jax.Array
+    acceleration: jax.Array
+    drift: list[jax.Array]
+
+
 def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
     """MJX's step of a robot, for a population on the last axis.
 
@@ -48,19 +105,27 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         contact: whether the robot can touch the bed.
 
     Returns:
-        The engine; see `dynamics.Engine`.
+        The engine; see `step.Engine`.
 
     Raises:
         InputError: the model holds a joint that the water's tables cannot follow.
     """
     m, world = robot.mj_model, robot.world
     solves = contact and world.bed is not None and world.bed.contact == "mjx"
-    tree = make_tree(robot, contact and not solves)
-    dt = world.timestep
+    levels = make_levels(robot, contact and not solves)
     check_timestep(robot, "mjx")
-    propellers = sorted(
-        (p for level in tree.levels for p in level.propellers), key=lambda p: p.index
+    edges = np.cumsum([0] + [level.count for level in levels.below])
+    plan = _Plan(
+        robot,
+        levels,
+        tuple(6 + levels.hinge_order[a:b] for a, b in itertools.pairwise(edges)),
+        # 32 bits: JAX keeps one typed copy of an array that it meets, in either mode.
+        tuple(
+            np.array([k for k in range(m.nv) if _descends(m, k, j)], np.int32) for j in range(m.nv)
+        ),
+        solves,
     )
+    plant, thrusters = plant_of(robot), levels.thrusters
     models: dict[Any, Any] = {}
 
     def model_of(dtype: Any) -> Any:
@@ -71,155 +136,13 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
             models[dtype] = model.replace(opt=_options(model.opt, solves))
         return models[dtype]
 
-    def forward_parts(model: Any, qpos: Any, qvel: Any, seen: Any) -> Any:
-        """All that follows from place and velocity; contacts see the velocity over the ground."""
-        data = mjx.make_data(model).replace(qpos=qpos, qvel=seen)
-        data = forward.fwd_position(model, data).replace(qvel=qvel)
-        return forward.fwd_velocity(model, data)
-
-    def jacobians(model: Any, data: Any, level: Any) -> tuple[Any, Any]:
-        """`[nbody, 6, nv]` of the level's bodies, in their own frames, and `[nbody, 3, 3]` axes."""
-        rows, axes = [], []
-        for body, frame in zip(level.body, level.frame, strict=True):
-            linear, angular = support.jac(model, data, data.xpos[body], jnp.int32(body))
-            turn = data.xmat[body] @ jnp.asarray(frame, qdtype(data))
-            rows.append(jnp.concatenate([turn.T @ angular.T, turn.T @ linear.T]))
-            axes.append(turn)
-        return jnp.stack(rows), jnp.stack(axes)
-
-    def qdtype(data: Any) -> Any:
-        return data.qpos.dtype
-
-    def moved(qpos: Any, qvel: Any, time: Any) -> Any:
-        quat = turn_quat(tuple(qpos[3:7]), tuple(time * qvel[3:6]), 1.0)
-        return jnp.concatenate(
-            [qpos[:3] + time * qvel[:3], jnp.stack(quat), qpos[7:] + time * qvel[6:]]
+    def drive(command: Any, ctrl: jax.Array) -> tuple[Any, Any, Any]:
+        if not thrusters.count:
+            return command, (), 0.0
+        command, thrusts, pumped = run_thrusters(
+            thrusters, command, ctrl[plant.num_hinges :], world.density
         )
-
-    def velocities(model: Any, qpos: Any, qvel: Any) -> list[Any]:
-        data = mjx.kinematics(model, mjx.make_data(model).replace(qpos=qpos))
-        data = mjx.com_pos(model, data)
-        return [jnp.einsum("bij,j->bi", jacobians(model, data, x)[0], qvel) for x in tree.levels]
-
-    def one(qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, water: Water) -> Any:
-        model, zero = model_of(qpos.dtype), jnp.zeros((), qpos.dtype)
-        current, acceleration = (
-            jnp.stack([zero + x for x in xs]) for xs in (water.current, water.acceleration)
-        )
-        seen = qvel
-        qvel = qvel.at[:3].add(-current)  # as seen from the current
-        # Momenta that turn are taken half a step ahead (see `dynamics._acceleration`).
-        ahead = qvel
-        if pace is not None:
-            turn = _rows(qpos)
-            ahead = qvel + 0.5 * dt * pace.at[:3].set(turn @ pace[:3])
-        # With carried water the bodies' own momenta turn with it, below; else MuJoCo's terms hold.
-        moving = jnp.zeros_like(qvel) if tree.carries else qvel
-        data = forward_parts(model, qpos, moving, seen)
-        mass = support.full_m(model, data)
-        friction = jnp.asarray(m.dof_damping, qpos.dtype)
-        force = data.qfrc_passive - data.qfrc_bias - friction * (qvel if tree.carries else 0.0)
-        # The current's acceleration is felt as weight is.
-        force = force - mass[:, :3] @ acceleration
-        # Spatial acceleration of each body when no joint accelerates: d/dt of J at constant q̇.
-        drift = lambda t: velocities(model, moved(qpos, ahead, t), ahead)  # noqa: E731
-        _, still = jax.jvp(drift, (zero,), (zero + 1,))
-        for level, drift_rate in zip(tree.levels, still, strict=True):
-            jacobian, axes = jacobians(model, data, level)
-            rate = jnp.einsum("bij,j->bi", jacobian, qvel)
-            rate_ahead = jnp.einsum("bij,j->bi", jacobian, ahead)
-            column = lambda x: tuple(x[:, i, None] for i in range(3))  # noqa: E731
-            place = data.xpos[jnp.asarray(level.body)]
-            motion = Motion(
-                spin=column(rate[:, :3]),
-                velocity=column(rate[:, 3:]),
-                up=column(axes[:, 2]),
-                height=place[:, 2, None],
-                x_axis=column(axes[:, 0]),
-                y_axis=column(axes[:, 1]),
-                place=(place[:, 0, None], place[:, 1, None]),
-            )
-            swirling = (column(rate_ahead[:, :3]), column(rate_ahead[:, 3:]))
-            upwards = acceleration + jnp.array([0.0, 0.0, world.gravity], qpos.dtype)
-            gravity = column(jnp.einsum("bji,j->bi", axes, upwards))
-            outer = outer_forces(level, motion, swirling, gravity, water, thrusts, world)
-            n = len(level.body)
-            wrench = jnp.concatenate([_stack(outer.torque, n), _stack(outer.force, n)], -1)
-            matrices = []
-            if outer.carried is not None:
-                matrices.append(_dense(outer.carried, n))
-            if outer.damping is not None:
-                matrices.append(dt * _dense(outer.damping, n))
-            if tree.carries:
-                rigid, _, momentum = with_water(level, outer, swirling)
-                turning = cross_force(motion.spin, motion.velocity, *momentum)
-                wrench = wrench - jnp.concatenate([_stack(x, n) for x in turning], -1)
-                # The mass matrix holds the rigid inertia; only its J̇ q̇ is missing.
-                wrench = wrench - jnp.einsum("bij,bj->bi", _dense(rigid, n), drift_rate)
-                gyro = gyroscope(*momentum)
-                rows = [
-                    jnp.concatenate([_matrix(a, n), _matrix(b, n)], -1)
-                    for a, b in ((gyro.angular, gyro.across), (gyro.back, gyro.linear))
-                ]
-                matrices.append(0.5 * dt * jnp.concatenate(rows, -2))
-            for spatial in matrices:
-                wrench = wrench - jnp.einsum("bij,bj->bi", spatial, drift_rate)
-                mass = mass + jnp.einsum("bik,bij,bjl->kl", jacobian, spatial, jacobian)
-            force = force + jnp.einsum("bij,bi->j", jacobian, wrench)
-        mass = mass + jnp.diag(jnp.asarray(m.dof_damping * dt, qpos.dtype))
-        power, stop = zero, len(tree.qpos_index)
-        # Tips to root, as in the articulated-body algorithm: a servo must know what it moves.
-        for level, drift_rate in zip(reversed(tree.levels[1:]), reversed(still[1:]), strict=True):
-            start = stop - len(level.body)
-            q, v = tree.qpos_index[start:stop], tree.qvel_index[start:stop]
-            angle, speed = qpos[q][:, None], qvel[v][:, None]
-            torque, inertia = end_stop(level, angle, speed, dt)
-            force = force.at[v].add(torque[:, 0])
-            mass = mass.at[v, v].add(inertia[:, 0])
-            moved_inertia, load = [], []
-            jacobian_of, _ = jacobians(model, data, level)
-            for j, jacobian, drifting in zip(v, jacobian_of, drift_rate, strict=True):
-                # 32 bits: JAX keeps one typed copy of an array that it meets, in either mode.
-                below = np.array([k for k in range(m.nv) if _descends(m, k, j)], np.int32)
-                row, load_j = mass[j], force[j]
-                if len(below):
-                    inner = mass[np.ix_(below, below)]
-                    back = jnp.linalg.solve(inner.T, row[below])
-                    row, load_j = row - back @ mass[below], load_j - back @ force[below]
-                moved_inertia.append(row[j])
-                # There the hinge's body is held without acceleration, J̇ q̇ included.
-                held = jnp.linalg.solve(jacobian[:, :6], drifting)
-                load.append(load_j + row[:6] @ held)
-            asked = ctrl[tree.ctrl_index[start:stop]][:, None]
-            motor, motor_inertia = servo(
-                level,
-                angle,
-                speed,
-                asked,
-                dt,
-                jnp.stack(moved_inertia)[:, None],
-                jnp.stack(load)[:, None],
-            )
-            force = force.at[v].add(motor[:, 0])
-            mass = mass.at[v, v].add(motor_inertia[:, 0])
-            power = power + jnp.sum(jnp.abs(motor * speed))
-            stop = start
-        kind = "gen" if tree.carries else "pos"
-        rates = jax.scipy.linalg.solve(mass, force, assume_a=kind)
-        if solves:
-            smooth = rates.at[:3].add(acceleration)
-            push = _contact_force(model, data, mass, smooth)
-            rates = rates + jax.scipy.linalg.solve(mass, push, assume_a=kind)
-        new = qvel + dt * rates
-        turn = _rows(qpos)
-        before = turn.T @ qvel[:3]
-        pace = rates.at[:3].set(turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3]))
-        if tree.carries:
-            quat = turn_quat(tuple(qpos[3:7]), tuple(new[3:6]), dt)
-            turned = jnp.stack([jnp.stack(r) for r in quat_to_rows(quat)])
-            new = new.at[:3].set(turned @ (before + dt * pace[:3]))
-        new = new.at[:3].add(current + dt * acceleration)
-        return moved(qpos, new, jnp.asarray(dt, qpos.dtype)), new, pace, power
+        return command, thrusts, jnp.sum(pumped, 0)
 
     def step(state: Any, ctrl: jax.Array, water: Water) -> tuple[Any, jax.Array]:
         qpos, qvel, pace, command = state
@@ -228,45 +151,241 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         plain = lambda x: isinstance(x, int | float)  # noqa: E731
         fixed = jax.tree.map(lambda x: x if plain(x) else None, water)
         given = jax.tree.map(lambda x: None if plain(x) else x, water)
-        asked = tuple(ctrl[k] for k in tree.ctrl_index[len(tree.qpos_index) :])
-        command, thrusts, pumped = run_thrusters(propellers, command, asked, world, dt)
+        command, thrusts, pumped = drive(command, ctrl)
 
         def single(qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, given: Any) -> Any:
             merged = jax.tree.map(
                 lambda a, b: b if a is None else a, fixed, given, is_leaf=lambda x: x is None
             )
-            return one(qpos, qvel, pace, ctrl, thrusts, merged)
+            return _step(plan, model_of(qpos.dtype), qpos, qvel, pace, ctrl, thrusts, merged)
 
         given = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes,)), given)
         qpos, qvel, pace, power = jax.vmap(single, in_axes=-1, out_axes=-1)(
-            qpos, qvel, pace, ctrl, [jnp.broadcast_to(x, (lanes,)) for x in thrusts], given
+            qpos, qvel, pace, ctrl, thrusts, given
         )
-        pace = pace if tree.carries else None
-        return (qpos, qvel, pace, command), power + pumped
+        return (qpos, qvel, pace if levels.carries else None, command), power + pumped
 
     def init(qpos: jax.Array, qvel: jax.Array) -> Any:
         length = jnp.sqrt(jnp.sum(qpos[3:7] ** 2, 0))
-        command = tuple(jnp.zeros_like(qpos[0]) for _ in propellers)
-        pace = jnp.zeros_like(qvel) if tree.carries else None
+        command = jnp.zeros((thrusters.count, *qpos.shape[1:]), qpos.dtype)
+        pace = jnp.zeros_like(qvel) if levels.carries else None
         return qpos.at[3:7].divide(length), qvel, pace, command
 
-    def sense(state: Any) -> Sense:
+    def root(state: Any) -> Root:
         qpos, qvel, *_ = state
-        up = quat_to_rows(tuple(qpos[3:7]))[2]
-        return Sense(qpos[2] - world.surface_height, qvel[2], up, tuple(qvel[3:6]))
+        return Root(tuple(qpos[:3]), tuple(qpos[3:7]), tuple(qvel[:3]), tuple(qvel[3:6]))
 
-    def command(state: Any) -> jax.Array:
-        return jnp.stack(state[3]) if propellers else jnp.zeros((0, *state[0].shape[1:]))
+    def push(state: Any, ctrl: jax.Array, water: Water) -> Any:
+        qpos, qvel, _, command = state
+        return push_of(levels, start(levels, qpos, qvel), water, drive(command, ctrl)[1])
 
     return Engine(
-        init,
-        step,
-        lambda state: state[:2],
-        lambda state: tuple(state[0][:3]),
-        sense,
-        command,
-        np.arange(m.nu),
+        init=init,
+        step=step,
+        observe=lambda state: state[:2],
+        root=root,
+        command=lambda state: state[3],
+        push=push,
+        plant=plant,
+        fuses=False,
     )
+
+
+# ------------------------------------------------------------------ the stages of a step
+
+
+def _step(
+    plan: _Plan, model: Any, qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, water: Water
+) -> tuple[Any, Any, Any, Any]:
+    """One step of one individual: (qpos, qvel, pace) after it, and the servos' power."""
+    zero = jnp.zeros((), qpos.dtype)
+    current, acceleration = (
+        jnp.stack([zero + x for x in xs]) for xs in (water.current, water.acceleration)
+    )
+    data, flow = _start(plan, model, qpos, qvel, pace, current, acceleration)
+    matrices = _rigid(plan, model, data, flow)
+    for level in range(len(plan.levels.all)):
+        matrices = _add_water(plan, model, data, flow, matrices, level, water, thrusts)
+    damping = jnp.asarray(plan.robot.mj_model.dof_damping * plan.dt, qpos.dtype)
+    matrices = matrices._replace(mass=matrices.mass + jnp.diag(damping))
+    power = zero
+    # Tips to root, as in the articulated-body algorithm: a servo must know what it moves.
+    for level in reversed(range(1, len(plan.levels.all))):
+        matrices, spent = _add_servos(plan, model, data, flow, matrices, level, ctrl)
+        power = power + spent
+    kind = "gen" if plan.levels.carries else "pos"
+    rates = jax.scipy.linalg.solve(matrices.mass, matrices.force, assume_a=kind)
+    if plan.solves:
+        smooth = rates.at[:3].add(acceleration)
+        push = _contact_force(model, data, matrices.mass, smooth)
+        rates = rates + jax.scipy.linalg.solve(matrices.mass, push, assume_a=kind)
+    return *_advance(plan, flow, rates, current), power
+
+
+def _start(
+    plan: _Plan, model: Any, qpos: Any, qvel: Any, pace: Any, current: Any, acceleration: Any
+) -> tuple[Any, _Flow]:
+    """All that follows from place and velocity; contacts see the velocity over the ground."""
+    seen, qvel = qvel, qvel.at[:3].add(-current)
+    # Momenta that turn are taken half a step ahead (see `step.accelerate`).
+    ahead = qvel
+    if pace is not None:
+        ahead = qvel + 0.5 * plan.dt * pace.at[:3].set(_rows(qpos) @ pace[:3])
+    # With carried water the bodies' own momenta turn with it, below; else MuJoCo's terms hold.
+    moving = jnp.zeros_like(qvel) if plan.levels.carries else qvel
+    data = mjx.make_data(model).replace(qpos=qpos, qvel=seen)
+    data = forward.fwd_position(model, data).replace(qvel=moving)
+    data = forward.fwd_velocity(model, data)
+
+    def velocities(time: Any) -> list[Any]:
+        moved = mjx.make_data(model).replace(qpos=_moved(qpos, ahead, time))
+        moved = mjx.com_pos(model, mjx.kinematics(model, moved))
+        levels = range(len(plan.levels.all))
+        return [
+            jnp.einsum("bij,j->bi", _jacobians(plan, model, moved, k)[0], ahead) for k in levels
+        ]
+
+    # d/dt of J at constant q̇.
+    zero = jnp.zeros((), qpos.dtype)
+    _, drift = jax.jvp(velocities, (zero,), (zero + 1,))
+    return data, _Flow(qpos, qvel, ahead, acceleration, drift)
+
+
+def _jacobians(plan: _Plan, model: Any, data: Any, level: int) -> tuple[Any, Any]:
+    """`[nbody, 6, nv]` of a level's bodies, in their own frames, and `[nbody, 3, 3]` axes."""
+    rows, axes = [], []
+    for body, frame in zip(plan.levels.bodies[level], plan.levels.frames[level], strict=True):
+        linear, angular = support.jac(model, data, data.xpos[body], jnp.int32(body))
+        turn = data.xmat[body] @ jnp.asarray(frame, data.qpos.dtype)
+        rows.append(jnp.concatenate([turn.T @ angular.T, turn.T @ linear.T]))
+        axes.append(turn)
+    return jnp.stack(rows), jnp.stack(axes)
+
+
+def _rigid(plan: _Plan, model: Any, data: Any, flow: _Flow) -> _Matrices:
+    """MuJoCo's own mass matrix and forces, the hinges' friction among them."""
+    mass = support.full_m(model, data)
+    friction = jnp.asarray(plan.robot.mj_model.dof_damping, flow.qpos.dtype)
+    resisted = flow.qvel if plan.levels.carries else 0.0
+    force = data.qfrc_passive - data.qfrc_bias - friction * resisted
+    # The current's acceleration is felt as weight is.
+    return _Matrices(mass, force - mass[:, :3] @ flow.acceleration)
+
+
+def _add_water(
+    plan: _Plan,
+    model: Any,
+    data: Any,
+    flow: _Flow,
+    matrices: _Matrices,
+    level: int,
+    water: Water,
+    thrusts: Any,
+) -> _Matrices:
+    """Water, thrusters and bed on the bodies of a level, by the population step's functions."""
+    levels, dt, world = plan.levels, plan.dt, plan.levels.world
+    constants, drift = levels.all[level], flow.drift[level]
+    jacobian, axes = _jacobians(plan, model, data, level)
+    rate, rate_ahead = (jnp.einsum("bij,j->bi", jacobian, v) for v in (flow.qvel, flow.ahead))
+    column = lambda x: tuple(x[:, i, None] for i in range(3))  # noqa: E731
+    place = data.xpos[jnp.asarray(levels.bodies[level])]
+    motion = Motion(
+        spin=column(rate[:, :3]),
+        velocity=column(rate[:, 3:]),
+        up=column(axes[:, 2]),
+        height=place[:, 2, None],
+        x_axis=column(axes[:, 0]),
+        y_axis=column(axes[:, 1]),
+        place=(place[:, 0, None], place[:, 1, None]),
+    )
+    swirling = (column(rate_ahead[:, :3]), column(rate_ahead[:, 3:]))
+    upwards = flow.acceleration + jnp.array([0.0, 0.0, world.gravity], flow.qpos.dtype)
+    gravity = column(jnp.einsum("bji,j->bi", axes, upwards))
+    pushes = thrusts[:, None] if levels.thrusters.count else ()
+    outer = outer_forces(constants, motion, swirling, gravity, water, pushes, world)
+    n = constants.count
+    wrench = jnp.concatenate([_stack(outer.torque, n), _stack(outer.force, n)], -1)
+    implicit = []
+    if outer.carried is not None:
+        implicit.append(_dense(outer.carried, n))
+    if outer.damping is not None:
+        implicit.append(dt * _dense(outer.damping, n))
+    if levels.carries:
+        rigid, _, momentum = with_water(constants, outer, swirling)
+        turning = cross_force(motion.spin, motion.velocity, *momentum)
+        wrench = wrench - jnp.concatenate([_stack(x, n) for x in turning], -1)
+        # The mass matrix holds the rigid inertia; only its J̇ q̇ is missing.
+        wrench = wrench - jnp.einsum("bij,bj->bi", _dense(rigid, n), drift)
+        gyro = gyroscope(*momentum)
+        rows = [
+            jnp.concatenate([_matrix(a, n), _matrix(b, n)], -1)
+            for a, b in ((gyro.angular, gyro.across), (gyro.back, gyro.linear))
+        ]
+        implicit.append(0.5 * dt * jnp.concatenate(rows, -2))
+    mass = matrices.mass
+    for spatial in implicit:
+        wrench = wrench - jnp.einsum("bij,bj->bi", spatial, drift)
+        mass = mass + jnp.einsum("bik,bij,bjl->kl", jacobian, spatial, jacobian)
+    return _Matrices(mass, matrices.force + jnp.einsum("bij,bi->j", jacobian, wrench))
+
+
+def _add_servos(
+    plan: _Plan, model: Any, data: Any, flow: _Flow, matrices: _Matrices, level: int, ctrl: Any
+) -> tuple[_Matrices, Any]:
+    """End stops and servos of a level's hinges, and the servos' power."""
+    v, hinges = plan.columns[level - 1], plan.levels.all[level].hinges
+    assert hinges is not None
+    angle, speed = flow.qpos[v + 1][:, None], flow.qvel[v][:, None]
+    torque, inertia = end_stop(hinges, angle, speed, plan.dt)
+    force = matrices.force.at[v].add(torque[:, 0])
+    mass = matrices.mass.at[v, v].add(inertia[:, 0])
+    moved_inertia, load = [], []
+    jacobian_of, _ = _jacobians(plan, model, data, level)
+    for j, jacobian, drifting in zip(v, jacobian_of, flow.drift[level], strict=True):
+        below, row, load_j = plan.below[j], mass[j], force[j]
+        if len(below):
+            inner = mass[np.ix_(below, below)]
+            back = jnp.linalg.solve(inner.T, row[below])
+            row, load_j = row - back @ mass[below], load_j - back @ force[below]
+        moved_inertia.append(row[j])
+        # There the hinge's body is held without acceleration, J̇ q̇ included.
+        held = jnp.linalg.solve(jacobian[:, :6], drifting)
+        load.append(load_j + row[:6] @ held)
+    motor, motor_inertia = servo(
+        hinges,
+        angle,
+        speed,
+        ctrl[v - 6][:, None],
+        plan.dt,
+        jnp.stack(moved_inertia)[:, None],
+        jnp.stack(load)[:, None],
+    )
+    found = _Matrices(mass.at[v, v].add(motor_inertia[:, 0]), force.at[v].add(motor[:, 0]))
+    return found, jnp.sum(jnp.abs(motor * speed))
+
+
+def _advance(plan: _Plan, flow: _Flow, rates: Any, current: Any) -> tuple[Any, Any, Any]:
+    """The end of a step: semi-implicit Euler, as `step.advance` has it."""
+    dt, new, turn = plan.dt, flow.qvel + plan.dt * rates, _rows(flow.qpos)
+    ahead, before = flow.ahead, turn.T @ flow.qvel[:3]
+    pace = rates.at[:3].set(turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3]))
+    if plan.levels.carries:
+        quat = turn_quat(tuple(flow.qpos[3:7]), tuple(new[3:6]), dt)
+        turned = jnp.stack([jnp.stack(r) for r in quat_to_rows(quat)])
+        new = new.at[:3].set(turned @ (before + dt * pace[:3]))
+    new = new.at[:3].add(current + dt * flow.acceleration)
+    return _moved(flow.qpos, new, jnp.asarray(dt, flow.qpos.dtype)), new, pace
+
+
+def _moved(qpos: Any, qvel: Any, time: Any) -> Any:
+    """`[nq]` after a time at a velocity."""
+    quat = turn_quat(tuple(qpos[3:7]), tuple(time * qvel[3:6]), 1.0)
+    return jnp.concatenate(
+        [qpos[:3] + time * qvel[:3], jnp.stack(quat), qpos[7:] + time * qvel[6:]]
+    )
+
+
+# ------------------------------------------------------------------ helpers of the stages
 
 
 def _options(options: Any, solves: bool) -> Any:

@@ -81,6 +81,15 @@ class Robot:
         return import_mjx().put_model(self.mj_model)
 
     @property
+    def part_geoms(self) -> tuple[str, ...]:
+        """`[npart]` names of the parts' main geoms, which may carry MuJoCo's ellipsoid."""
+        return tuple(
+            f"{module.name}/{part.name}"
+            for module in self.morphology.modules
+            for part in module.kind.parts
+        )
+
+    @property
     def num_hinges(self) -> int:
         """Number of actuated hinges."""
         return len(self.servos)
@@ -146,7 +155,6 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
     _add_bed(spec, morphology, world)
     rows, points = _add_modules(spec, morphology, world)
     try:
-        _limit_stiffness(spec, spec.compile())
         model = spec.compile()
     except ValueError as error:
         reason = str(error).splitlines()[0]
@@ -154,6 +162,7 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
             f"{morphology.path or morphology.name}: expected a body that MuJoCo can simulate; "
             f"found: {reason}"
         ) from None
+    _limit_stiffness(spec, model)
     body = {model.body(i).name: i for i in range(model.nbody)}
     parts = [row["part"] for row in rows]
     pushing = tuple(k for k, part in enumerate(parts) if part.thruster is not None)
@@ -391,7 +400,10 @@ def _limit_stiffness(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
         inertia = model.body_inertia[body] @ along**2 + model.body_mass[body] * (arm @ arm)
         most = 1.5 * (inertia / dt**2 + model.dof_damping[model.jnt_dofadr[joint]] / dt)
         stiffness = min(actuator.gainprm[0], most)
-        actuator.gainprm[0], actuator.biasprm[1] = stiffness, -stiffness
+        if stiffness < actuator.gainprm[0]:  # in the compiled model too: no need for another
+            actuator.gainprm[0], actuator.biasprm[1] = stiffness, -stiffness
+            model.actuator_gainprm[actuator.id, 0] = stiffness
+            model.actuator_biasprm[actuator.id, 1] = -stiffness
 
 
 def _add_geoms(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.tree import Level
+from mjx_revolve.engine.level import Hinges
 from mjx_revolve.numerics.spatial import Scalar, mul, sub
 
 # Ratio of the end stops' damper to their spring [s]. A choice: a leg arrives over-damped.
@@ -18,7 +18,7 @@ _MARGIN = 2.0
 
 
 def servo(
-    level: Level,
+    hinges: Hinges,
     angle: Scalar,
     speed: Scalar,
     target: Scalar,
@@ -41,7 +41,7 @@ def servo(
     a hinge past its top speed; elsewhere the push is constant.
 
     Args:
-        level: whose hinges.
+        hinges: their numbers.
         angle: q `[nbody, lanes]` [rad].
         speed: q̇ `[nbody, lanes]` [rad/s].
         target: `[nbody, lanes]` [rad].
@@ -52,19 +52,19 @@ def servo(
     Returns:
         Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
     """
-    target = jnp.clip(target, _cast(level.target[0], target), _cast(level.target[1], target))
-    torque = sub(mul(level.gain, target), mul(level.stiffness, angle))
-    torque = sub(torque, mul(level.servo_damping, speed))
-    low, high = (_cast(x, torque) for x in level.effort)
+    target = jnp.clip(target, _cast(hinges.target[0], target), _cast(hinges.target[1], target))
+    torque = sub(mul(hinges.gain, target), mul(hinges.stiffness, angle))
+    torque = sub(torque, mul(hinges.servo_damping, speed))
+    low, high = (_cast(x, torque) for x in hinges.effort)
     torque = jnp.clip(torque, low, high)
-    if level.motor is None:
+    if hinges.motor is None:
         return torque, jnp.zeros_like(torque)
-    friction, slope, top = (_cast(x, torque) for x in level.motor)
+    friction, slope, top = (_cast(x, torque) for x in hinges.motor)
     forward = jnp.sign(torque)
     rate, push = forward * speed, jnp.abs(torque)
     line = lambda x: friction + slope * (top - x)  # noqa: E731
     # The motor turns its base, too, the other way.
-    per_base = dt / _cast(level.base_inertia, torque)
+    per_base = dt / _cast(hinges.base_inertia, torque)
     gain = dt * (push + jnp.maximum(forward * load, 0)) / inertia + per_base * push
     beyond = line(rate) < push
     # A push that friction outweighs needs no limit, and has no chord at the top speed itself.
@@ -78,7 +78,7 @@ def _cast(x: Scalar, like: jax.Array) -> Scalar:
     return x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)
 
 
-def end_stop(level: Level, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:
+def end_stop(hinges: Hinges, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:
     """Torque of the joint's end stops, and what an implicit step adds to the joint's inertia.
 
     A spring with a damper, both of which act on angle and speed at the end of the step: linearly
@@ -86,7 +86,7 @@ def end_stop(level: Level, angle: Scalar, speed: Scalar, dt: float) -> tuple[Sca
     for). The damper lets go within `STOP_TIME`: hinges arrive and stay, they do not bounce.
 
     Args:
-        level: whose hinges.
+        hinges: their numbers.
         angle: q `[nbody, lanes]` [rad].
         speed: q̇ `[nbody, lanes]` [rad/s].
         dt: for which it is implicit [s]; 0 for none.
@@ -94,10 +94,10 @@ def end_stop(level: Level, angle: Scalar, speed: Scalar, dt: float) -> tuple[Sca
     Returns:
         Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
     """
-    low, high = (_cast(x, angle) for x in level.range)
+    low, high = (_cast(x, angle) for x in hinges.range)
     ahead = angle + dt * speed
     over = jnp.maximum(ahead - high, 0) - jnp.maximum(low - ahead, 0)
-    stop = _cast(level.stop, angle)
+    stop = _cast(hinges.stop, angle)
     # The damper never holds a hinge that swings back.
     outward = jnp.where(over * speed > 0, speed, 0)
     torque = -stop * (over + STOP_TIME * outward)

@@ -1,17 +1,20 @@
-"""One step of a whole population: an articulated body in water, the population on the last axis.
+"""One step of a whole population: articulated bodies in water, the population on the last axis.
 
-Featherstone's articulated-body algorithm (2008, Rigid Body Dynamics Algorithms, § 7.3) over levels
-of bodies, in components (`spatial`), with the water's forces (`hydrodynamics`) and the carried
-water's mass inside each body's 6×6 inertia. Integration is MuJoCo's semi-implicit Euler with
-implicit joint damping, so that trajectories can be compared step by step.
+Featherstone's articulated-body algorithm (2008, Rigid Body Dynamics Algorithms, § 7.3) in
+components (`spatial`), with the water's forces (`hydrodynamics`) and the carried water's mass
+inside each body's 6×6 inertia. Integration is MuJoCo's semi-implicit Euler with implicit joint
+damping, so that trajectories can be compared step by step.
+
+Everything here is written once, for one robot and for many different ones: how trees are traversed
+is an argument, `bodies`, either `Levels` or `Rows`.
 
 Spatial quantities are (angular, linear), in each body's own frame, about its own origin.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,11 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.contact import bed_on_level
-from mjx_revolve.engine.hydrodynamics import Outer, water_on_level
+from mjx_revolve.engine.hydrodynamics import Outer, forces_on_parts, water_on_level
+from mjx_revolve.engine.level import Hinges, Level
+from mjx_revolve.engine.levels import Levels, make_levels
+from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep
+from mjx_revolve.engine.rows import Rows
 from mjx_revolve.engine.servos import end_stop, servo
-from mjx_revolve.engine.tree import Level, Propeller, Tree, make_tree
-from mjx_revolve.numerics.articulated import lift_off, plus, solve_root, to_parent, upper
+from mjx_revolve.engine.thrusters import run_thrusters
+from mjx_revolve.numerics.articulated import lift_off, solve_root, to_parent, upper
 from mjx_revolve.numerics.inertia import (
     Block,
     Motion,
@@ -43,7 +50,6 @@ from mjx_revolve.numerics.spatial import (
     add,
     cross,
     dot,
-    fold,
     full,
     matTvec,
     matvec,
@@ -60,8 +66,10 @@ from mjx_revolve.numerics.spatial import (
     vsub,
 )
 from mjx_revolve.water.flow import Water, needs_place
-from mjx_revolve.water.thrusters import clamp_command, ideal_power, lag_command, thrust
 from mjx_revolve.water.world import World
+
+# How a tree is traversed: that of one robot, or those of many.
+Bodies = Levels | Rows
 
 
 class State(NamedTuple):
@@ -72,36 +80,37 @@ class State(NamedTuple):
         quat: of the root, world from body (w, x, y, z), four of `[lanes]`.
         velocity: of the root's origin, world frame [m/s], three of `[lanes]`.
         spin: angular velocity of the root, body frame [rad/s], three of `[lanes]`.
-        angle: of the hinges, one `[nbody, lanes]` for each level below the root [rad].
+        angle: of the hinges, as `bodies.spread` has them: `[nbody, lanes]` for each level below
+            the root, or `[rows, 1, lanes]` [rad].
         speed: of the hinges, likewise [rad/s].
         pace: accelerations of the step before, (linear, angular, hinges); the root's as rates of
             its body-frame velocities; empty where nothing needs them.
-        command: of the thrusters, behind their lag, one `[lanes]` each [-].
+        command: of the thrusters, behind their lag, `[nthruster, lanes]` [-]; empty without.
     """
 
     position: Vec
     quat: tuple[Scalar, Scalar, Scalar, Scalar]
     velocity: Vec
     spin: Vec
-    angle: tuple[jax.Array, ...]
-    speed: tuple[jax.Array, ...]
+    angle: Any
+    speed: Any
     pace: Any = ()
-    command: tuple[jax.Array, ...] = ()
+    command: Any = ()
 
 
-class Sense(NamedTuple):
-    """What a controller may know of a robot's state, `[lanes]` each.
+class Root(NamedTuple):
+    """Where the core is and how it moves, component by component, `[lanes]` each.
 
     Attributes:
-        height: z of the core's centre above the still surface, negative under water [m].
-        climb: its vertical velocity [m/s].
-        up: the world's vertical, core frame, three of `[lanes]` [-].
-        spin: angular velocity, core frame, three of `[lanes]` [rad/s].
+        position: of its origin, world frame [m].
+        quat: world from body (w, x, y, z).
+        velocity: of its origin, world frame [m/s].
+        spin: angular velocity, body frame [rad/s].
     """
 
-    height: jax.Array
-    climb: jax.Array
-    up: Vec
+    position: Vec
+    quat: tuple[Scalar, Scalar, Scalar, Scalar]
+    velocity: Vec
     spin: Vec
 
 
@@ -110,65 +119,28 @@ class Engine(NamedTuple):
 
     Attributes:
         init: (qpos `[nq, lanes]`, qvel `[nv, lanes]`) → state.
-        step: (state, ctrl `[nu, lanes]` in `order`, water) → (state, power `[lanes]` that the
-            servos deliver or take up, summed without sign [W]).
+        step: (state, ctrl `[n, lanes]` in the plant's order, water) → (state, power `[lanes]` that
+            the servos deliver or take up, summed without sign [W]).
         observe: state → (qpos `[nq, lanes]`, qvel `[nv, lanes]`).
-        root: state → root position, world frame [m], three of `[lanes]`; cheaper than observe.
-        sense: state → what a controller may know of it.
+        root: state → where the core is and how it moves; cheaper than observe.
         command: state → the thrusters' commands behind their lag, `[nthruster, lanes]` [-].
-        order: `[nu]` actuator of each row of `step`'s ctrl.
+        push: (state, ctrl, water) → (force of the bed, force of the water) on the whole robot,
+            world frame, three of `[lanes]` each [N]; weight and carried water's inertia apart.
+        plant: the actuators in the order of `step`'s ctrl.
+        fuses: whether a step is element-wise, so that it may be compiled as one function.
     """
 
     init: Callable[[jax.Array, jax.Array], Any]
     step: Callable[[Any, jax.Array, Water], tuple[Any, jax.Array]]
     observe: Callable[[Any], tuple[jax.Array, jax.Array]]
-    root: Callable[[Any], Vec]
-    sense: Callable[[Any], Sense]
+    root: Callable[[Any], Root]
     command: Callable[[Any], jax.Array]
-    order: np.ndarray
+    push: Callable[[Any, jax.Array, Water], tuple[Vec, Vec]]
+    plant: Plant
+    fuses: bool
 
 
-# ------------------------------------------------------------------ between the levels
-
-
-def _take(x: Scalar, k: int) -> Scalar:
-    return x[k : k + 1] if hasattr(x, "shape") and x.shape[0] > 1 else x
-
-
-def _down(level: Level, x: Any) -> Any:
-    """A quantity of the level above, for each body of this one."""
-    if isinstance(x, tuple):
-        return tuple(_down(level, y) for y in x)
-    if x is None or not hasattr(x, "shape") or x.shape[0] == 1:
-        return x
-    if level.parent == tuple(range(x.shape[0])):
-        return x
-    return jnp.concatenate([x[k : k + 1] for k in level.parent])
-
-
-def _up(level: Level, above: int, x: Any) -> Any:
-    """The sum over each parent's children, for each body of the level above."""
-    if isinstance(x, tuple):
-        return tuple(_up(level, above, y) for y in x)
-    if level.parent == tuple(range(above)):
-        return x
-    n = len(level.parent)
-    if not isinstance(x, jax.Array):  # a constant stays one, so that it still folds away
-        rows = np.broadcast_to(x, (n, 1))
-        children = np.equal.outer(range(above), level.parent)
-        return fold(children @ rows)
-    if x.shape[0] == 1 and n > 1:
-        x = jnp.broadcast_to(x, (n, *x.shape[1:]))
-    if above == 1:
-        return total(*[x[k : k + 1] for k in range(n)])
-    sums = []
-    for parent in range(above):
-        children = [x[k : k + 1] for k in range(n) if level.parent[k] == parent]
-        sums.append(total(*children) if children else jnp.zeros_like(x[:1]))
-    return jnp.concatenate(sums)
-
-
-# ------------------------------------------------------------------ articulated bodies
+# ------------------------------------------------------------------ bodies by themselves
 
 
 def outer_forces(
@@ -177,7 +149,7 @@ def outer_forces(
     swirling: tuple[Vec, Vec],
     gravity: Vec,
     water: Water,
-    thrusts: Sequence[Scalar],
+    thrusts: Any,
     world: World,
 ) -> Outer:
     """What water, thrusters and bed do to the bodies of a level, their weight apart.
@@ -188,7 +160,7 @@ def outer_forces(
         swirling: as in `hydrodynamics.water_on_level`.
         gravity: as there.
         water: surface, current, time.
-        thrusts: of the robot's thrusters, `[lanes]` each [N].
+        thrusts: of the thrusters, `[nthruster, lanes]` [N].
         world: which laws act.
 
     Returns:
@@ -235,14 +207,14 @@ def own_inertia(
     motion: Motion,
     swirling: tuple[Vec, Vec],
     water: Water,
-    thrusts: Sequence[Scalar],
+    thrusts: Any,
     gravity: Vec,
     dt: float,
 ) -> tuple[Block, tuple[Vec, Vec]]:
     """Each body's inertia with its carried water, and the bias force that needs no acceleration.
 
     Where water is carried, the whole momentum h turns by K(h) ν in the middle of the step (see
-    `_acceleration`), which makes the inertia's matrix unsymmetric.
+    `accelerate`), which makes the inertia's matrix unsymmetric.
     """
     outer = outer_forces(level, motion, swirling, gravity, water, thrusts, world)
     weight = tuple(neg(g) for g in gravity)
@@ -258,12 +230,12 @@ def own_inertia(
     return block, (vsub(bias[0], torque), vsub(bias[1], force))
 
 
-def turn_hinges(level: Level, angle: Scalar) -> Mat:
+def turn_hinges(hinges: Hinges, angle: Scalar) -> Mat:
     """Rotation of each body's frame, parent from child."""
     sine, cosine = sincos(angle)
-    c, s = level.offset
+    c, s = hinges.offset
     cosine, sine = sub(mul(c, cosine), mul(s, sine)), add(mul(s, cosine), mul(c, sine))
-    r = level.rotation
+    r = hinges.rotation
     return tuple(
         (
             add(mul(r[i][0], cosine), mul(r[i][1], sine)),
@@ -274,62 +246,129 @@ def turn_hinges(level: Level, angle: Scalar) -> Mat:
     )
 
 
-def _velocities(
-    tree: Tree, turns: Sequence[Mat], spin: Vec, velocity: Vec, speed: tuple[Scalar, ...]
-) -> list[tuple[Vec, Vec]]:
-    """Angular and linear velocity of each level's bodies, body frame, at its origin."""
-    rates = [(spin, velocity)]
-    for level, turn, rate in zip(tree.levels[1:], turns[1:], speed, strict=True):
-        above_spin, above_velocity = (_down(level, x) for x in rates[-1])
-        spin = matTvec(turn, above_spin)
-        spin = (spin[0], spin[1], add(spin[2], rate))
-        velocity = matTvec(turn, vadd(above_velocity, cross(above_spin, level.position)))
-        rates.append((spin, velocity))
-    return rates
+class _Moving(NamedTuple):
+    """What goes down the tree.
+
+    Attributes:
+        motion: of the bodies.
+        ahead: their (angular, linear) velocity half a step ahead, for momenta that turn; None
+            where nothing needs it.
+    """
+
+    motion: Motion
+    ahead: Any
+
+    @property
+    def swirling(self) -> tuple[Vec, Vec]:
+        """The velocities with which momenta turn."""
+        return self.ahead or (self.motion.spin, self.motion.velocity)
 
 
-def _motions(
-    tree: Tree, turns: Sequence[Mat], state: State, rates: Sequence[Any], located: bool
-) -> list[Motion]:
-    """Where the bodies of each level are and how they move."""
-    row = lambda xs: tuple(x[None] for x in xs)  # noqa: E731
-    spin, velocity = rates[0]
-    root = Motion(
+def _child_rate(turn: Mat, position: Vec, rate: tuple[Vec, Vec], speed: Scalar) -> Any:
+    """Angular and linear velocity of a child from those of its parent."""
+    spin, velocity = rate
+    below = matTvec(turn, spin)
+    return (below[0], below[1], add(below[2], speed)), matTvec(
+        turn, vadd(velocity, cross(spin, position))
+    )
+
+
+def _coriolis(rate: tuple[Vec, Vec], speed: Scalar) -> tuple[Vec, Vec]:
+    """Velocity times joint velocity (Featherstone's c_J): ν × (z q̇)."""
+    spin, velocity = rate
+    return (
+        (mul(spin[1], speed), neg(mul(spin[0], speed)), 0.0),
+        (mul(velocity[1], speed), neg(mul(velocity[0], speed)), 0.0),
+    )
+
+
+def _row(xs: Any) -> Any:
+    """The root as a level of one body."""
+    return tuple(x[None] for x in xs)
+
+
+def _move(bodies: Bodies, state: State, located: bool, dt: float) -> tuple[_Moving, Any, Any, Any]:
+    """Where all bodies are and how they move.
+
+    Args:
+        bodies: the robots.
+        state: their velocities relative to the uniform current.
+        located: whether anything asks where they are horizontally.
+        dt: of the step [s].
+
+    Returns:
+        The root's motion, then of the bodies below it: motions, rotations (parent from child), and
+        the hinges' speeds half a step ahead.
+    """
+    turn = tuple(_row(r) for r in quat_to_rows(state.quat))
+    spin, velocity = _row(state.spin), matTvec(turn, _row(state.velocity))
+    motion = Motion(
         spin=spin,
         velocity=velocity,
-        up=turns[0][2],
+        up=turn[2],
         height=state.position[2][None],
-        x_axis=turns[0][0] if located else None,
-        y_axis=turns[0][1] if located else None,
-        place=row(state.position[:2]) if located else None,
+        x_axis=turn[0] if located else None,
+        y_axis=turn[1] if located else None,
+        place=_row(state.position[:2]) if located else None,
     )
-    motions = [root]
-    for level, turn, (spin, velocity) in zip(tree.levels[1:], turns[1:], rates[1:], strict=True):
-        parent = motions[-1]
-        up, height = _down(level, parent.up), _down(level, parent.height)
+    midway, ahead = state.speed, None
+    if state.pace and dt:
+        half = lambda v, a: add(v, mul(0.5 * dt, a))  # noqa: E731
+        linear, angular, hinges = state.pace
+        midway = jax.tree.map(half, state.speed, hinges)
+        ahead = tuple(
+            tuple(map(half, v, _row(a))) for v, a in ((spin, angular), (velocity, linear))
+        )
+    turns = bodies.map(lambda level, angle: turn_hinges(level.hinges, angle), state.angle)
+
+    def move(level: Level, parent: _Moving, turn: Mat, speed: Scalar, midway: Scalar) -> Any:
+        assert level.hinges is not None
+        position, above = level.hinges.position, parent.motion
+        spin, velocity = _child_rate(turn, position, (above.spin, above.velocity), speed)
         x_axis, y_axis, place = None, None, None
         if located:
-            x_axis, y_axis, place = (
-                _down(level, x) for x in (parent.x_axis, parent.y_axis, parent.place)
-            )
+            x_axis, y_axis = matTvec(turn, above.x_axis), matTvec(turn, above.y_axis)
             place = (
-                add(place[0], dot(x_axis, level.position)),
-                add(place[1], dot(y_axis, level.position)),
+                add(above.place[0], dot(above.x_axis, position)),
+                add(above.place[1], dot(above.y_axis, position)),
             )
-            x_axis, y_axis = matTvec(turn, x_axis), matTvec(turn, y_axis)
-        height = add(height, dot(up, level.position))
-        motions.append(Motion(spin, velocity, matTvec(turn, up), height, x_axis, y_axis, place))
-    return motions
+        height = add(above.height, dot(above.up, position))
+        ahead = parent.ahead and _child_rate(turn, position, parent.ahead, midway)
+        motion = Motion(spin, velocity, matTvec(turn, above.up), height, x_axis, y_axis, place)
+        found = _Moving(motion, ahead)
+        return found, found
+
+    root = _Moving(motion, ahead)
+    return root, bodies.down(move, root, turns, state.speed, midway), turns, midway
 
 
-def _acceleration(
-    tree: Tree,
-    state: State,
-    targets: tuple[Scalar, ...],
-    water: Water,
-    thrusts: Sequence[Scalar],
-    dt: float,
-) -> tuple[Vec, Vec, tuple[Scalar, ...], Scalar]:
+def _is_located(bodies: Bodies, water: Water) -> bool:
+    return is_pulled(water) or needs_place(bodies.world) or bodies.touches
+
+
+def _flatten(block: Block, bias: tuple[Vec, Vec], symmetric: bool) -> tuple[Any, ...]:
+    """A block and its bias as the numbers that are their own."""
+    if symmetric:
+        return upper(block.angular), block.across, upper(block.linear), bias
+    return tuple(block), bias
+
+
+def _unflatten(value: tuple[Any, ...], symmetric: bool) -> tuple[Block, tuple[Vec, Vec]]:
+    if symmetric:
+        angular, across, linear, bias = value
+        return Block(full(angular), across, transpose(across), full(linear)), bias
+    block, bias = value
+    return Block(*block), bias
+
+
+_NO_MATRIX = ((0.0,) * 3,) * 3
+_NO_BLOCK = Block(_NO_MATRIX, _NO_MATRIX, _NO_MATRIX, _NO_MATRIX)
+_NO_BIAS = ((0.0,) * 3, (0.0,) * 3)
+
+
+def accelerate(
+    bodies: Bodies, state: State, targets: Any, water: Water, thrusts: Any, dt: float
+) -> tuple[Vec, Vec, Any, Scalar]:
     """Accelerations, by the articulated-body algorithm.
 
     Where water is carried, the momentum h of each body with its water turns as K(h) ν, and the step
@@ -339,131 +378,172 @@ def _acceleration(
     extrapolated to the middle from the step before, for second order.
 
     Args:
-        tree: the robot.
+        bodies: the robots.
         state: the population, its velocities relative to the uniform current.
-        targets: of the servos, one `[nbody, lanes]` for each level below the root [rad].
+        targets: of the servos, as `bodies.split` has them [rad].
         water: surface and current.
-        thrusts: of the thrusters, one `[lanes]` each [N].
+        thrusts: of the thrusters, `[nthruster, lanes]` [N].
         dt: for which turning, damping, drag and end stops are implicit [s]; 0 for none.
 
     Returns:
         Root: linear and angular, body frame, as rates of the body-frame components [m/s², rad/s²];
         hinges [rad/s²]; servo power, summed over the hinges without sign [W], `[lanes]`.
     """
-    world = tree.robot.world
-    symmetric = not (tree.carries and dt)
-    row = lambda xs: tuple(x[None] for x in xs)  # noqa: E731
-    turn_root = tuple(row(r) for r in quat_to_rows(state.quat))
-    turns: list[Any] = [turn_root]
-    turns += [
-        turn_hinges(level, angle) for level, angle in zip(tree.levels[1:], state.angle, strict=True)
-    ]
-    pulled = is_pulled(water)
-    located = pulled or needs_place(world) or any(level.points is not None for level in tree.levels)
-    velocity, spin = matTvec(turn_root, row(state.velocity)), row(state.spin)
-    rates = _velocities(tree, turns, spin, velocity, state.speed)
-    motions = _motions(tree, turns, state, rates, located)
-    swirling, speeds = rates, state.speed
-    if state.pace and dt:
-        half = lambda v, a: add(v, mul(0.5 * dt, a))  # noqa: E731
-        linear, angular, hinges = state.pace
-        speeds = tuple(half(v, a) for v, a in zip(state.speed, hinges, strict=True))
-        swirling = _velocities(
-            tree,
-            turns,
-            tuple(half(v, a) for v, a in zip(spin, row(angular), strict=True)),
-            tuple(half(v, a) for v, a in zip(velocity, row(linear), strict=True)),
-            speeds,
-        )
-    # Velocity times joint velocity (Featherstone's c_J): ν × (z q̇).
-    coriolis: list[Any] = [None]  # the root has no joint
-    for (spin, velocity), speed in zip(swirling[1:], speeds, strict=True):
-        coriolis.append(
-            (
-                (mul(spin[1], speed), neg(mul(spin[0], speed)), 0.0),
-                (mul(velocity[1], speed), neg(mul(velocity[0], speed)), 0.0),
-            )
-        )
-    owns = []
-    for level, motion, rate in zip(tree.levels, motions, swirling, strict=True):
-        gravity = felt_gravity(world, water, motion)
-        owns.append(
-            own_inertia(world, tree.carries, level, motion, rate, water, thrusts, gravity, dt)
-        )
+    symmetric = not (bodies.carries and dt)
+    root, moved, turns, midway = _move(bodies, state, _is_located(bodies, water), dt)
 
-    # Tips to root: articulated inertias.
-    blocks = [block for block, _ in owns]
-    biases = [bias for _, bias in owns]
-    power: Scalar = 0.0
-    joint: list[Any] = [None] * len(tree.levels)
-    for d in range(len(tree.levels) - 1, 0, -1):
-        level, angle, speed = tree.levels[d], state.angle[d - 1], state.speed[d - 1]
-        stop, stop_inertia = end_stop(level, angle, speed, dt)
-        load = sub(stop, mul(level.damping, speed))
-        inertia = add(level.armature, add(mul(dt, level.damping), stop_inertia))
+    def own_of(level: Level, moving: _Moving) -> Any:
+        gravity = felt_gravity(bodies.world, water, moving.motion)
+        block, bias = own_inertia(
+            bodies.world, bodies.carries, level, moving.motion, moving.swirling, water, thrusts,
+            gravity, dt,
+        )  # fmt: skip
+        return _flatten(block, bias, symmetric)
+
+    def hold(level: Level, angle: Scalar, speed: Scalar) -> tuple[Scalar, Scalar]:
+        """Torque on a hinge by itself, and what is implicit of it, with the armature."""
+        hinges = level.hinges
+        assert hinges is not None
+        stop, stop_inertia = end_stop(hinges, angle, speed, dt)
+        inertia = add(hinges.armature, add(mul(dt, hinges.damping), stop_inertia))
+        return sub(stop, mul(hinges.damping, speed)), inertia
+
+    def lift(level: Level, gathered: Any, *x: Any) -> tuple[Any, Any, Scalar]:
+        """Tips to root: articulated inertias."""
+        moving, turn, (load, inertia), angle, speed, midway, target = x
+        hinges, own = level.hinges, own_of(level, moving)
+        assert hinges is not None
+        block, bias = _unflatten(
+            own if gathered is None else jax.tree.map(add, own, gathered), symmetric
+        )
         motor, motor_inertia = servo(
-            level,
+            hinges,
             angle,
             speed,
-            targets[d - 1],
+            target,
             dt,
-            add(blocks[d].angular[2][2], inertia),
-            sub(load, biases[d][0][2]),
+            add(block.angular[2][2], inertia),
+            sub(load, bias[0][2]),
         )
-        delivered = jnp.abs(motor * speed)
-        power = add(power, total(*[delivered[k] for k in range(delivered.shape[0])]))
-        left, bias, joint[d] = lift_off(
-            blocks[d],
-            biases[d],
+        left, bias, released = lift_off(
+            block,
+            bias,
             add(inertia, motor_inertia),
             add(motor, load),
-            coriolis[d],
+            _coriolis(moving.swirling, midway),
             symmetric,
         )
-        above = len(tree.levels[d - 1].body)
-        moved, bias = to_parent(turns[d], level.position, left, bias, symmetric)
-        blocks[d - 1] = _join(blocks[d - 1], _up_block(level, above, moved, symmetric), symmetric)
-        bias = _up(level, above, bias)
-        biases[d - 1] = tuple(vadd(a, b) for a, b in zip(biases[d - 1], bias, strict=True))
+        block, bias = to_parent(turn, hinges.position, left, bias, symmetric)
+        return _flatten(block, bias, symmetric), released, jnp.abs(motor * speed)
 
-    # Root to tips: accelerations.
-    angular, linear = solve_root(blocks[0], biases[0], symmetric)
-    accelerations, hinges = [(angular, linear)], []
-    for d in range(1, len(tree.levels)):
-        level, turn = tree.levels[d], turns[d]
-        row_a, row_l, inverse, rest = joint[d]
-        up_angular, up_linear = (_down(level, x) for x in accelerations[-1])
-        a = vadd(matTvec(turn, up_angular), coriolis[d][0])
-        b = vadd(matTvec(turn, vadd(up_linear, cross(up_angular, level.position))), coriolis[d][1])
-        hinge = mul(inverse, sub(sub(rest, dot(row_a, a)), dot(row_l, b)))
-        hinges.append(hinge)
-        accelerations.append(((a[0], a[1], add(a[2], hinge)), b))
-    lane = lambda x: jnp.broadcast_to(x, (1, state.position[0].shape[0]))[0]  # noqa: E731
+    held = bodies.map(hold, state.angle, state.speed)
+    gathered, released, power = bodies.up(
+        lift,
+        (_flatten(_NO_BLOCK, _NO_BIAS, symmetric), 0.0),
+        moved, turns, held, state.angle, state.speed, midway, targets,
+    )  # fmt: skip
+    whole = own_of(bodies.root, root)
+    if gathered is not None:
+        whole = jax.tree.map(add, whole, gathered)
+    angular, linear = solve_root(*_unflatten(whole, symmetric), symmetric)
+
+    def release(level: Level, parent: Any, *x: Any) -> tuple[Any, Scalar]:
+        """Root to tips: accelerations."""
+        moving, turn, midway, released = x
+        assert level.hinges is not None
+        up_angular, up_linear = parent
+        coriolis = _coriolis(moving.swirling, midway)
+        a = vadd(matTvec(turn, up_angular), coriolis[0])
+        position = level.hinges.position
+        b = vadd(matTvec(turn, vadd(up_linear, cross(up_angular, position))), coriolis[1])
+        hinge = sub(sub(released.rest, dot(released.row_a, a)), dot(released.row_l, b))
+        hinge = mul(released.inverse, hinge)
+        return ((a[0], a[1], add(a[2], hinge)), b), hinge
+
+    hinges = bodies.down(release, (angular, linear), moved, turns, midway, released)
+    lanes, dtype = state.position[0].shape, state.position[0].dtype
+    lane = lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), (1, *lanes))[0]  # noqa: E731
     return (
-        tuple(lane(x) for x in linear),
-        tuple(lane(x) for x in angular),
-        tuple(hinges),
-        power if hasattr(power, "shape") else jnp.zeros_like(state.position[0]),
+        tuple(map(lane, linear)),
+        tuple(map(lane, angular)),
+        hinges,
+        jnp.broadcast_to(jnp.asarray(power, dtype), lanes),
     )
 
 
-def _up_block(level: Level, above: int, block: Block, symmetric: bool) -> Block:
-    if not symmetric:
-        return Block(*_up(level, above, tuple(block)))
-    angular, linear = (full(_up(level, above, upper(x))) for x in (block.angular, block.linear))
-    across = _up(level, above, block.across)
-    return Block(angular, across, transpose(across), linear)
+def push_of(bodies: Bodies, state: State, water: Water, thrusts: Any) -> tuple[Vec, Vec]:
+    """Force of the bed and of the water on whole robots, world frame, `[lanes]` each [N].
+
+    Weight is no force of the water's, and the inertia of what it carries along is no force at all.
+
+    Args:
+        bodies: the robots.
+        state: the population.
+        water: surface and current.
+        thrusts: of the thrusters, `[nthruster, lanes]` [N].
+
+    Returns:
+        (force of the bed, force of the water), three components each.
+    """
+    relative = state._replace(velocity=vsub(state.velocity, water.current))
+    root, moved, *_ = _move(bodies, relative, True, 0.0)
+    world = bodies.world
+
+    def pushes(level: Level, gathered: Any, moving: _Moving) -> tuple[Any, Any, Any]:
+        motion = moving.motion
+        gravity = felt_gravity(world, water, motion)
+        outer = water_on_level(world, level, motion, moving.swirling, gravity, water, thrusts)
+        bed: Vec = (0.0, 0.0, 0.0)
+        if level.points is not None:
+            bed = bed_on_level(world, level, motion, level.points, water)[1]
+        axes = (motion.x_axis, motion.y_axis, motion.up)
+        wide = lambda x: add(x, jnp.zeros_like(motion.height))  # noqa: E731
+        turned = tuple(
+            tuple(wide(dot(axis, force)) for axis in axes) for force in (bed, outer.force)
+        )
+        return (), (), turned
+
+    nothing = ((0.0,) * 3, (0.0,) * 3)
+    _, _, below = bodies.up(pushes, ((), nothing), moved)
+    own = jax.tree.map(lambda x: x[0], pushes(bodies.root, None, root)[2])
+    bed, wet = jax.tree.map(add, own, below)
+    return bed, wet
 
 
-def _join(a: Block, b: Block, symmetric: bool) -> Block:
-    """The sum of two, of symmetric ones from their upper halves alone."""
-    if not symmetric:
-        return add_block(a, 1.0, b)
-    angular, linear = (
-        full(vadd(upper(x), upper(y))) for x, y in ((a.angular, b.angular), (a.linear, b.linear))
-    )
-    across = plus(a.across, b.across)
-    return Block(angular, across, transpose(across), linear)
+def part_forces(
+    levels: Levels, state: State, water: Water, thrusts: Any
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Forces of the water on a robot's parts one by one, by the terms that the step adds up.
+
+    Args:
+        levels: the robot.
+        state: of the population.
+        water: surface and current.
+        thrusts: of the thrusters, `[nthruster, lanes]` [N].
+
+    Returns:
+        Buoyancy, drag and thrust, world frame, `[lanes, npart, 3]` each [N]; parts in the order of
+        the fluid table.
+    """
+    relative = state._replace(velocity=vsub(state.velocity, water.current))
+    root, moved, *_ = _move(levels, relative, True, 0.0)
+    lanes, count = state.position[0].shape[0], len(levels.robot.fluid.volume)
+    found = [jnp.zeros((lanes, count, 3), state.position[0].dtype) for _ in range(3)]
+    for level, moving, groups in zip(levels.all, (root, *moved), levels.part_rows, strict=True):
+        motion = moving.motion
+        gravity = felt_gravity(levels.world, water, motion)
+        terms = forces_on_parts(levels.world, level, motion, gravity, water, thrusts)
+        axes = (motion.x_axis, motion.y_axis, motion.up)
+        for rows, forces in zip(groups, terms, strict=True):
+            for k, force in enumerate(forces):
+                turned = jnp.stack([dot(axis, force) * jnp.ones(lanes) for axis in axes], -1)
+                for slot, body in zip(*np.nonzero(rows >= 0), strict=True):
+                    found[k] = found[k].at[:, rows[slot, body]].set(turned[slot, body])
+    buoyancy, drag, thrust = found
+    return buoyancy, drag, thrust
+
+
+# ------------------------------------------------------------------ the step
 
 
 def turn_quat(quat: tuple[Scalar, ...], spin: Vec, dt: float) -> tuple[Scalar, ...]:
@@ -505,7 +585,8 @@ def advance(state: State, water: Water, pace: Any, dt: float, carries: bool) -> 
     """
     linear, angular, hinges = pace
     spin = tuple(w + dt * a for w, a in zip(state.spin, angular, strict=True))
-    speed = tuple(w + dt * a for w, a in zip(state.speed, hinges, strict=True))
+    forward = lambda x, rate: x + dt * rate  # noqa: E731
+    speed = jax.tree.map(forward, state.speed, hinges)
     turn, quat = quat_to_rows(state.quat), turn_quat(state.quat, spin, dt)
     relative = vsub(state.velocity, water.current)
     seen = matTvec(turn, relative)
@@ -524,7 +605,7 @@ def advance(state: State, water: Water, pace: Any, dt: float, carries: bool) -> 
         quat=quat,
         velocity=velocity,
         spin=spin,
-        angle=tuple(q + dt * w for q, w in zip(state.angle, speed, strict=True)),
+        angle=jax.tree.map(forward, state.angle, speed),
         speed=speed,
         pace=pace if carries else (),
         command=state.command,
@@ -552,129 +633,150 @@ def felt_gravity(world: World, water: Water, motion: Motion) -> Vec:
 # ------------------------------------------------------------------ the engine
 
 
+def init(bodies: Bodies, qpos: jax.Array, qvel: jax.Array) -> State:
+    """The state of a population.
+
+    Args:
+        bodies: the robots.
+        qpos: `[nq, lanes]`.
+        qvel: `[nv, lanes]`.
+
+    Returns:
+        The state; thrusters at rest.
+    """
+    # MuJoCo accepts quaternions of any length and normalises them before use.
+    length = jnp.sqrt(jnp.sum(qpos[3:7] ** 2, 0))
+    velocity, spin = tuple(qvel[:3]), tuple(qvel[3:6])
+    speed = bodies.spread(qvel[6:])
+    pace = jax.tree.map(jnp.zeros_like, (velocity, spin, speed)) if bodies.carries else ()
+    count = bodies.thrusters.count
+    return State(
+        position=tuple(qpos[:3]),
+        quat=tuple(qpos[3:7] / length),
+        velocity=velocity,
+        spin=spin,
+        angle=bodies.spread(qpos[7:]),
+        speed=speed,
+        pace=pace,
+        command=jnp.zeros((count, *qpos.shape[1:]), qpos.dtype) if count else (),
+    )
+
+
+def observe(bodies: Bodies, state: State) -> tuple[jax.Array, jax.Array]:
+    """Qpos `[nq, lanes]` and qvel `[nv, lanes]` in MuJoCo's order."""
+    like = state.position[0]
+    qpos = jnp.stack([*state.position, *state.quat])
+    qvel = jnp.stack([*state.velocity, *state.spin])
+    return (
+        jnp.concatenate([qpos, bodies.gather(state.angle, like)]),
+        jnp.concatenate([qvel, bodies.gather(state.speed, like)]),
+    )
+
+
+def _drive(bodies: Bodies, state: State, ctrl: jax.Array) -> tuple[Any, Any, Any, Scalar]:
+    """Targets of the servos, then the thrusters' commands, thrusts and power."""
+    count = bodies.thrusters.count
+    hinges = ctrl.shape[0] - count
+    targets = bodies.split(ctrl[:hinges])
+    if not count:
+        return targets, (), (), 0.0
+    command, thrusts, pumped = run_thrusters(
+        bodies.thrusters, state.command, ctrl[hinges:], bodies.world.density
+    )
+    return targets, command, thrusts, total(*[pumped[k] for k in range(count)])
+
+
+def step(bodies: Bodies, state: State, ctrl: jax.Array, water: Water) -> tuple[State, jax.Array]:
+    """One step.
+
+    Args:
+        bodies: the robots.
+        state: the population.
+        ctrl: `[n, lanes]` targets [rad] and commands [-] in the plant's order.
+        water: surface and current.
+
+    Returns:
+        The state after it, and the power of servos and ideal propellers, `[lanes]` [W].
+    """
+    dt = bodies.world.timestep
+    targets, command, thrusts, pumped = _drive(bodies, state, ctrl)
+    # The whole step is seen from the uniform current: there, no current is left.
+    relative = state._replace(velocity=vsub(state.velocity, water.current))
+    *pace, power = accelerate(bodies, relative, targets, water, thrusts, dt)
+    new = advance(state, water, tuple(pace), dt, bodies.carries)
+    return new._replace(command=command), add(power, pumped)
+
+
+def root_of(state: State) -> Root:
+    """Where the core is and how it moves."""
+    return Root(state.position, state.quat, state.velocity, state.spin)
+
+
+def make_step_engine(bodies: Bodies, plant: Plant) -> Engine:
+    """The population step as an engine; its functions are pure, and run under jit, vmap and grad.
+
+    Args:
+        bodies: the robots.
+        plant: their actuators.
+
+    Returns:
+        The engine.
+    """
+
+    def command(state: State) -> jax.Array:
+        lanes = state.position[0]
+        return state.command if bodies.thrusters.count else jnp.zeros((0, *lanes.shape))
+
+    def push(state: State, ctrl: jax.Array, water: Water) -> tuple[Vec, Vec]:
+        return push_of(bodies, state, water, _drive(bodies, state, ctrl)[2])
+
+    return Engine(
+        init=partial(init, bodies),
+        step=partial(step, bodies),
+        observe=partial(observe, bodies),
+        root=root_of,
+        command=command,
+        push=push,
+        plant=plant,
+        fuses=True,
+    )
+
+
 def make_population_engine(robot: Robot, contact: bool = True) -> Engine:
-    """The population step of a robot.
+    """The population step of one robot.
 
     Args:
         robot: from `build_robot`.
         contact: whether the robot can touch the bed; leaving it out makes a step much cheaper.
 
     Returns:
-        The engine; its functions are pure, and run under jit, vmap and grad.
+        The engine.
 
     Raises:
         InputError: the model holds something that the population step cannot do.
     """
-    tree = make_tree(robot, contact)
-    model, world, dt = robot.mj_model, robot.world, robot.world.timestep
+    levels = make_levels(robot, contact)
     check_timestep(robot)
-    sizes = [len(level.body) for level in tree.levels[1:]]
-    edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-    spans = list(itertools.pairwise(edges))
-    propellers = sorted((p for level in tree.levels for p in level.propellers), key=_index)
-
-    def init(qpos: jax.Array, qvel: jax.Array) -> State:
-        angle, speed = qpos[tree.qpos_index], qvel[tree.qvel_index]
-        # MuJoCo accepts quaternions of any length and normalises them before use.
-        length = jnp.sqrt(jnp.sum(qpos[3:7] ** 2, 0))
-        velocity, spin = tuple(qvel[:3]), tuple(qvel[3:6])
-        speeds = tuple(speed[a:b] for a, b in spans)
-        pace = jax.tree.map(jnp.zeros_like, (velocity, spin, speeds)) if tree.carries else ()
-        return State(
-            position=tuple(qpos[:3]),
-            quat=tuple(qpos[3:7] / length),
-            velocity=velocity,
-            spin=spin,
-            angle=tuple(angle[a:b] for a, b in spans),
-            speed=speeds,
-            pace=pace,
-            command=tuple(jnp.zeros_like(qpos[0]) for _ in propellers),
-        )
-
-    def observe(state: State) -> tuple[jax.Array, jax.Array]:
-        qpos = jnp.stack([*state.position, *state.quat])
-        qvel = jnp.stack([*state.velocity, *state.spin])
-        if spans:
-            back = np.argsort(tree.qpos_index)
-            qpos = jnp.concatenate([qpos, jnp.concatenate(state.angle)[back]])
-            qvel = jnp.concatenate([qvel, jnp.concatenate(state.speed)[back]])
-        return qpos, qvel
-
-    def step(state: State, ctrl: jax.Array, water: Water) -> tuple[State, jax.Array]:
-        targets = tuple(ctrl[a:b] for a, b in spans)
-        command, thrusts, pumped = run_thrusters(
-            propellers, state.command, tuple(ctrl[edges[-1] :]), world, dt
-        )
-        # The whole step is seen from the uniform current: there, no current is left.
-        relative = state._replace(velocity=vsub(state.velocity, water.current))
-        linear, angular, hinges, power = _acceleration(tree, relative, targets, water, thrusts, dt)
-        new = advance(state, water, (linear, angular, hinges), dt, tree.carries)
-        return new._replace(command=command), add(power, pumped)
-
-    def sense(state: State) -> Sense:
-        return Sense(
-            state.position[2] - world.surface_height,
-            state.velocity[2],
-            quat_to_rows(state.quat)[2],
-            state.spin,
-        )
-
-    def command(state: State) -> jax.Array:
-        return jnp.stack(state.command) if propellers else jnp.zeros((0, *state.spin[0].shape))
-
-    assert model.nq == 7 + len(tree.qpos_index)
-    return Engine(
-        init, step, observe, lambda state: state.position, sense, command, tree.ctrl_index
-    )
+    return make_step_engine(levels, level_plant(levels))
 
 
-def _index(propeller: Propeller) -> int:
-    return propeller.index
-
-
-def run_thrusters(
-    propellers: Sequence[Propeller],
-    lagged: tuple[Scalar, ...],
-    ctrl: tuple[Scalar, ...],
-    world: World,
-    dt: float,
-) -> tuple[tuple[Scalar, ...], list[Scalar], Scalar]:
-    """The thrusters' part of a step.
-
-    As in MuJoCo's filtered actuators, a command passes its lag at the end of the step, and thrust
-    follows the command that had passed at its beginning; without a lag it follows at once.
-
-    Args:
-        propellers: the robot's thrusters.
-        lagged: their commands behind the lag, `[lanes]` each [-].
-        ctrl: what is asked for, likewise.
-        world: whose water they push.
-        dt: of the step [s].
-
-    Returns:
-        The lagged commands after the step, the thrusts, `[lanes]` each [N], and the power that
-        an ideal propeller needs for them, summed [W] (`thrusters.ideal_power`).
-    """
-    after, thrusts, power = [], [], 0.0
-    for propeller, before, asked in zip(propellers, lagged, ctrl, strict=True):
-        thruster = propeller.thruster
-        asked = clamp_command(thruster, asked)
-        after.append(lag_command(thruster, before, asked, dt))
-        thrusts.append(thrust(thruster, before if thruster.time_constant > 0 else asked))
-        power = add(power, ideal_power(thrusts[-1], propeller.disc, world.density))
-    return tuple(after), thrusts, power
+def level_plant(levels: Levels) -> Plant:
+    """The plant of one robot in the order of its levels."""
+    robot = levels.robot
+    hinges = [robot.servos[k] for k in levels.hinge_order]
+    return plant_of(robot, [*hinges, *robot.thrusters])
 
 
 def acceleration(
-    robot: Robot, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, water: Water
+    bodies: Bodies, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, water: Water
 ) -> jax.Array:
     """Acceleration of a population in MuJoCo's coordinates, as `mj_forward` defines it.
 
     Args:
-        robot: from `build_robot`.
+        bodies: the robots.
         qpos: `[nq, lanes]`.
         qvel: `[nv, lanes]`.
-        ctrl: `[nu, lanes]` servo targets [rad] and thrusters' commands [-], in MuJoCo's order; a
+        ctrl: `[n, lanes]` servo targets [rad] and thrusters' commands [-], in the plant's order; a
             thruster with a lag is still.
         water: surface and current.
 
@@ -682,21 +784,13 @@ def acceleration(
         `[nv, lanes]` qacc: root linear, world frame [m/s²], root angular, body frame [rad/s²],
         hinges [rad/s²].
     """
-    tree, engine = make_tree(robot), make_population_engine(robot)
-    ctrl = ctrl[tree.ctrl_index]
-    edges = np.cumsum([len(level.body) for level in tree.levels[1:]])
-    targets = tuple(jnp.split(ctrl[: len(tree.qpos_index)], edges[:-1])) if len(edges) else ()
-    propellers = sorted((p for level in tree.levels for p in level.propellers), key=_index)
-    state = engine.init(qpos, qvel)._replace(pace=())
-    asked = tuple(ctrl[len(tree.qpos_index) :])
+    state = init(bodies, qpos, qvel)._replace(pace=())
     # As in mj_forward, a thruster behind a lag has not heard of its command yet.
-    _, thrusts, _ = run_thrusters(propellers, state.command, asked, robot.world, 0.0)
+    targets, _, thrusts, _ = _drive(bodies, state, ctrl)
     relative = state._replace(velocity=vsub(state.velocity, water.current))
-    linear, angular, hinges, _ = _acceleration(tree, relative, targets, water, thrusts, 0.0)
+    linear, angular, hinges, _ = accelerate(bodies, relative, targets, water, thrusts, 0.0)
     turn = quat_to_rows(state.quat)
     seen = matTvec(turn, relative.velocity)
     linear = matvec(turn, vadd(linear, cross(state.spin, seen)))
     root = jnp.stack([*vadd(linear, water.acceleration), *angular])
-    if not hinges:
-        return root
-    return jnp.concatenate([root, jnp.concatenate(hinges)[np.argsort(tree.qvel_index)]])
+    return jnp.concatenate([root, bodies.gather(hinges, state.position[0])])

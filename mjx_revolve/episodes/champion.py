@@ -17,8 +17,9 @@ from mjx_revolve.body.morphology import load_morphology, trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.episodes.fitness import Fitness, make_fitness
-from mjx_revolve.episodes.rollout import Trajectory, gusty_water, simulate
 from mjx_revolve.episodes.scoring import replay_key
+from mjx_revolve.episodes.simulate import Trajectory, simulate
+from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.errors import InputError, load_yaml
 from mjx_revolve.water.flow import Water, gust_path

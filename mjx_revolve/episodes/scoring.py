@@ -9,20 +9,26 @@ its trials. Each is scored where it was run, chunk by chunk, so that no track ou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from mjx_revolve.engine.plant import Figure
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.tasks import Track, measure
+from mjx_revolve.episodes.tasks import Task, Track, measure
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
 # Score of a rollout that blew up. Finite, because optimisers' averages and sorts are not made for
 # infinities, and below anything that a task gives.
 WORST = -1e3
+
+# Nothing made of these modules swims or sinks this fast: servos, drag and weight allow a tenth of
+# it. An individual that gets further than this allows has blown up [m/s].
+_FASTEST = 3.0
 
 # Fresh episodes on which a champion is judged, and the stream of random numbers that draws them,
 # which no generation uses.
@@ -82,84 +88,103 @@ def first_counted(task: TaskConfig, timestep: float) -> int:
 
 
 def judge_tracks(
-    task: TaskConfig,
-    score_track: Callable[[Track, TaskConfig], jax.Array],
+    task: Task,
+    settings: TaskConfig,
     world: World,
-    position: jax.Array,
-    energy: jax.Array,
+    recorded: Mapping[str, jax.Array],
     start_height: jax.Array,
-    length: Any,
-    weight: Any,
+    figure: Figure,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """What a task says of tracks, blown up or not; arguments as of `score_episodes`.
+    """What a task says of tracks, blown up or not.
 
     Args:
         task: what they are about.
-        score_track: from `tasks.find_task`.
+        settings: of the task.
         world: the world.
-        position: `[S, 3, lanes]` of the core, world frame [m].
-        energy: `[S, lanes]` since the row before [J].
+        recorded: `position` and `energy`, and what else the task has recorded: fields of a `Track`,
+            sampled as `sample_rows` has it, the settling time not cut off.
         start_height: `[lanes]` z of the core at the start [m].
-        length: body length, a number or `[lanes]` [m].
-        weight: in air, likewise [N].
+        figure: of the bodies, `[lanes]` or one.
 
     Returns:
         `[lanes]` scores, and `[lanes]` measures (see `tasks.measure`).
     """
-    first = first_counted(task, world.timestep)
-    kept = position[first:]
-    clearance = jnp.full_like(kept[:, 0], jnp.inf)
+    first = first_counted(settings, world.timestep)
+    kept = {name: x[first:] for name, x in recorded.items()}
+    place = kept["position"]
+    clearance = jnp.full_like(place[:, 0], jnp.inf)
     if world.bed is not None:
-        clearance = kept[:, 2] - bed_height(world.bed, kept[:, 0], kept[:, 1])
+        clearance = place[:, 2] - bed_height(world.bed, place[:, 0], place[:, 1])
     track = Track(
-        position=kept,
         clearance=clearance,
-        energy=energy[first:],
-        interval=sample_rows(task, world.timestep)[0] * world.timestep,
+        interval=sample_rows(settings, world.timestep)[0] * world.timestep,
         start_height=start_height,
-        length=length,
-        weight=weight,
+        length=figure.length,
+        weight=figure.weight,
         surface_height=world.surface_height,
+        **kept,
     )
     measures = measure(track)
-    return score_track(track, task) - task.energy_weight * measures["energy_j"], measures
+    return task.score(track, settings) - settings.energy_weight * measures["energy_j"], measures
 
 
 def score_episodes(
-    task: TaskConfig,
-    score_track: Callable[[Track, TaskConfig], jax.Array],
+    task: Task,
+    settings: TaskConfig,
     world: World,
-    position: jax.Array,
-    energy: jax.Array,
+    recorded: Mapping[str, jax.Array],
     start: jax.Array,
-    length: Any,
-    weight: Any,
-    farthest: float,
+    figure: Figure,
 ) -> Scores:
     """Scores and measures of episodes from their tracks.
 
     Args:
         task: what they are about.
-        score_track: from `tasks.find_task`.
+        settings: of the task.
         world: the world.
-        position: `[S, 3, lanes]` of the core [m], S and the time between rows as `sample_rows` has
-            them.
-        energy: `[S, lanes]` since the row before [J].
-        start: `[3, lanes]` [m].
-        length: body length, a number or `[lanes]` [m].
-        weight: in air, likewise [N].
-        farthest: whoever gets further than this has blown up [m].
+        recorded: as of `judge_tracks`.
+        start: `[3, lanes]` of the core [m].
+        figure: of the bodies, `[lanes]` or one.
 
     Returns:
         The scores.
     """
-    score, measures = judge_tracks(
-        task, score_track, world, position, energy, start[2], length, weight
-    )
-    away = jnp.max(jnp.abs(position - start), (0, 1))
+    score, measures = judge_tracks(task, settings, world, recorded, start[2], figure)
+    away = jnp.max(jnp.abs(recorded["position"] - start), (0, 1))
     # Written so that NaN counts as too far.
-    sane = jnp.isfinite(score) & (away < farthest)
+    sane = jnp.isfinite(score) & (away < farthest(settings, world, figure))
     return Scores(jnp.where(sane, score, WORST), sane, measures)
+
+
+def farthest(settings: TaskConfig, world: World, figure: Figure) -> Any:
+    """How far from its start an episode may lead; who gets further has blown up.
+
+    Args:
+        settings: of the task.
+        world: the world.
+        figure: of the bodies, `[lanes]` or one.
+
+    Returns:
+        The distance [m].
+    """
+    current = np.linalg.norm(world.current) + 4 * settings.current_std
+    fall = 0.5 * world.gravity * settings.duration**2
+    swum = (_FASTEST + current) * settings.duration + 4 * settings.start_position
+    return swum + figure.sinks * fall + figure.length
+
+
+def may_touch_bed(task: Task, settings: TaskConfig, world: World, figure: Figure) -> bool:
+    """Whether the bed is within reach of an episode; if not, the step needs no contact.
+
+    Reach is what a robot at `_FASTEST` covers, plus its fall where the water does not carry it. An
+    individual that outruns it counts as blown up, so nothing can pass through an absent bed unseen.
+    """
+    if world.bed is None:
+        return False
+    reach = float(farthest(settings, world, figure))
+    line = np.linspace(-reach, reach, 101)
+    highest = float(np.max(bed_height(world.bed, *np.meshgrid(line, line))))
+    return task.on_bed or world.surface_height - settings.depth - reach < highest
 
 
 def average_trials(scores: Scores, trials: int) -> tuple[jax.Array, dict[str, jax.Array]]:

@@ -1,7 +1,7 @@
-"""Tasks: from the track of an episode to measures and a score. Knows nothing of simulators.
+"""Tasks: where episodes start, what is recorded of them, and what they are worth.
 
-A task is a plain function of a `Track` and the task's settings (`config.TaskConfig`). A task of
-one's own stands in a file of one's own: see `find_task`.
+A `Task` owns all of that; nothing else asks for its name. A task of one's own stands in a file of
+one's own, as a `Task` or as a plain function that scores: see `find_task`.
 """
 
 from __future__ import annotations
@@ -10,26 +10,32 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.engine.plant import Figure
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.own_code import call_own, load_own, parse_own, short_name
 from mjx_revolve.numerics.spatial import safe_norm
+from mjx_revolve.water.bed import bed_height
+from mjx_revolve.water.world import World
 
-# Units of the tasks' scores.
-UNITS = {
-    "directed_swim": "body lengths/s",
-    "speed": "body lengths/s",
-    "crawl": "body lengths/s",
-    "reach_target": "body lengths",
-    "hold_depth": "body lengths",
-}
+# What a task may have recorded beside the core's position and the energy: see `Track`.
+RECORDS = ("core", "joints", "contacts", "forces")
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "position", "clearance", "energy", "start_height", "length", "weight", "surface_height",
+        "quat", "velocity", "spin", "angle", "speed", "bed_force", "water_force",
+    ],
+    meta_fields=["interval"],
+)  # fmt: skip
 @dataclass(frozen=True)
 class Track:
     """An episode of many individuals, sampled at equal intervals after the settling time.
@@ -43,6 +49,17 @@ class Track:
         length: body length, the robot's largest extent at rest [m].
         weight: of the robot in air [N].
         surface_height: [m].
+        quat: `[S, 4, lanes]` of the core, world from body (w, x, y, z); None unless "core" is
+            recorded.
+        velocity: `[S, 3, lanes]` of the core, world frame [m/s], likewise.
+        spin: `[S, 3, lanes]` angular velocity of the core, body frame [rad/s], likewise.
+        angle: `[S, nhinge, lanes]` of the hinges, the robot's order [rad]; None unless "joints" are
+            recorded.
+        speed: `[S, nhinge, lanes]` of the hinges [rad/s], likewise.
+        bed_force: `[S, 3, lanes]` of the bed on the robot, world frame [N]; None unless "contacts"
+            are recorded.
+        water_force: `[S, 3, lanes]` of the water on the robot, buoyancy included, the inertia of
+            carried water not, world frame [N]; None unless "forces" are recorded.
     """
 
     position: jax.Array
@@ -53,11 +70,71 @@ class Track:
     length: float
     weight: float
     surface_height: jax.Array | float
+    quat: jax.Array | None = None
+    velocity: jax.Array | None = None
+    spin: jax.Array | None = None
+    angle: jax.Array | None = None
+    speed: jax.Array | None = None
+    bed_force: jax.Array | None = None
+    water_force: jax.Array | None = None
 
     @property
     def duration(self) -> float:
         """Counted time [s]."""
         return self.interval * (self.position.shape[0] - 1)
+
+
+def start_at_depth(settings: Any, world: World, figure: Figure, place: jax.Array) -> jax.Array:
+    """The core at the task's depth below the still surface.
+
+    Args:
+        settings: of the task.
+        world: the world.
+        figure: of the robots, `[lanes]` or one.
+        place: `[3, lanes]` drawn around 0 [m].
+
+    Returns:
+        `[3, lanes]` where the cores start, world frame [m].
+    """
+    return place.at[2].add(world.surface_height - settings.depth)
+
+
+def start_on_bed(settings: Any, world: World, figure: Figure, place: jax.Array) -> jax.Array:
+    """The lowest corner of any module 5 mm above the bed, whatever the tilt; as `start_at_depth`.
+
+    A tilt of three standard deviations is taken for the largest.
+    """
+    assert world.bed is not None
+    tilt = min(3 * settings.start_tilt, np.pi / 2)
+    below = figure.lowest * np.cos(tilt) + figure.radius * np.sin(tilt)
+    return place.at[2].set(bed_height(world.bed, place[0], place[1]) + below + 0.005)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What robots are asked to do.
+
+    Attributes:
+        score: (track, settings) → `[lanes]` scores, higher is better.
+        unit: of the scores.
+        records: what the track holds beside the core's position and the energy, of `RECORDS`.
+        start: where episodes begin, like `start_at_depth`.
+        on_bed: whether episodes begin on the bed, so that there must be one.
+        needs: settings without which the task has no meaning.
+    """
+
+    score: Callable[[Track, Any], jax.Array]
+    unit: str = ""
+    records: tuple[str, ...] = ()
+    start: Callable[[Any, World, Figure, jax.Array], jax.Array] = start_at_depth
+    on_bed: bool = False
+    needs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Checks what a user may have got wrong."""
+        for name in self.records:
+            if name not in RECORDS:
+                raise InputError(f"records: expected any of {', '.join(RECORDS)}; found {name!r}")
 
 
 def _keeping(error: jax.Array, tolerance: float) -> jax.Array:
@@ -114,75 +191,104 @@ def crawl(track: Track, settings: Any) -> jax.Array:
     return counted / (track.duration * track.length)
 
 
-TASKS: Mapping[str, Callable[[Track, Any], jax.Array]] = {
-    "directed_swim": directed_swim,
-    "speed": speed,
-    "reach_target": reach_target,
-    "hold_depth": hold_depth,
-    "crawl": crawl,
+_SPEED = "body lengths/s"
+TASKS: Mapping[str, Task] = {
+    "directed_swim": Task(directed_swim, _SPEED),
+    "speed": Task(speed, _SPEED),
+    "reach_target": Task(reach_target, "body lengths", needs=("target",)),
+    "hold_depth": Task(hold_depth, "body lengths"),
+    "crawl": Task(crawl, _SPEED, start=start_on_bed, on_bed=True),
 }
 
 
-def find_task(settings: Any, source: str = "config") -> Callable[[Track, Any], jax.Array]:
-    """The function that scores a task.
+def find_task(settings: Any, source: str = "config") -> Task:
+    """The task that a configuration names.
 
     Args:
-        settings: a `config.TaskConfig`. Its `type` is a name in `TASKS`, or FILE.py:FUNCTION for a
-            function of the user's own: it takes a `Track` and these settings, and returns `[lanes]`
-            scores, higher is better, by JAX, so that it can be compiled.
+        settings: a `config.TaskConfig`. Its `type` is a name in `TASKS`, or FILE.py:NAME for one of
+            the user's own: a `Task`, or a function that takes a `Track` and these settings and
+            returns `[lanes]` scores, higher is better, by JAX, so that it can be compiled. A
+            function says its unit in brackets in the first line of its docstring, as ours do:
+            `Mean height above the bed [body lengths].`
         source: what messages call the configuration.
 
     Returns:
-        (track, settings) → `[lanes]` scores.
+        The task.
 
     Raises:
-        InputError: the file or the function is missing, or it does not score a track; one line
-            says where.
+        InputError: the file or the name is missing, or it does not score a track; one line says
+            where.
     """
     if settings.type in TASKS:
         return TASKS[settings.type]
     name = settings.type
-    function = load_own(name, f"{source}: task.type")
-    rows, lanes = 7, 3  # unlike numbers, so that an axis taken for another shows
-
-    def score(
-        position: jax.Array, clearance: jax.Array, energy: jax.Array, start: jax.Array
-    ) -> Any:
-        return function(Track(position, clearance, energy, 0.1, start, 0.5, 1.0, 0.0), settings)
-
-    shapes = [(rows, 3, lanes), (rows, lanes), (rows, lanes), (lanes,)]
-    given = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    what = f"{short_name(name)} to score a track"
-    found = call_own(name, what, jax.eval_shape, score, *given)
-    if not isinstance(found, jax.ShapeDtypeStruct) or found.shape != (lanes,):
+    task = _load_task(name, f"{source}: task.type")
+    found = call_own(
+        name,
+        f"{short_name(name)} to score a track",
+        jax.eval_shape,
+        lambda track: task.score(track, settings),
+        _example_track(task.records),
+    )
+    if not isinstance(found, jax.ShapeDtypeStruct) or found.shape != (_LANES,):
         own = parse_own(name)
         assert own is not None
         shown = list(found.shape) if isinstance(found, jax.ShapeDtypeStruct) else type(found)
         raise InputError(
-            f"{own.path}: {own.function}: expected a score for each lane, [{lanes}] for a position "
-            f"of [{rows}, 3, {lanes}]; found {shown}"
+            f"{own.path}: {own.function}: expected a score for each lane, [{_LANES}] for a "
+            f"position of [{_ROWS}, 3, {_LANES}]; found {shown}"
         )
-    return function
+    return task
+
+
+def _load_task(name: str, label: str) -> Task:
+    found = load_own(name, label, Task)
+    if isinstance(found, Task):
+        return found
+    units = re.findall(r"\[([^\[\]]+)\]", (inspect.getdoc(found) or "").partition("\n")[0])
+    return Task(found, units[-1] if units else "")
+
+
+# Unlike numbers, so that an axis taken for another shows.
+_ROWS, _LANES, _HINGES = 7, 3, 5
+
+
+def _example_track(records: tuple[str, ...]) -> Any:
+    """The shapes of a track."""
+
+    def given(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+    of = {"core": ("quat", "velocity", "spin"), "joints": ("angle", "speed")}
+    of |= {"contacts": ("bed_force",), "forces": ("water_force",)}
+    wide = {"quat": 4, "angle": _HINGES, "speed": _HINGES}
+    more = {field: given(_ROWS, wide.get(field, 3), _LANES) for r in records for field in of[r]}
+    return Track(
+        position=given(_ROWS, 3, _LANES),
+        clearance=given(_ROWS, _LANES),
+        energy=given(_ROWS, _LANES),
+        interval=0.1,
+        start_height=given(_LANES),
+        length=0.5,
+        weight=1.0,
+        surface_height=0.0,
+        **more,
+    )
 
 
 def score_unit(name: str) -> str:
     """Unit of a task's scores.
 
     Args:
-        name: `type` of a task. Own functions say it in brackets in the first line of their
-            docstring, as ours do: `Mean height above the bed [body lengths].`
+        name: `type` of a task.
 
     Returns:
         The unit; "" where it is not known.
     """
-    if name in UNITS:
-        return UNITS[name]
     try:
-        text = inspect.getdoc(load_own(name, "task.type")) or ""
+        return TASKS[name].unit if name in TASKS else _load_task(name, "task.type").unit
     except InputError:
         return ""
-    units = re.findall(r"\[([^\[\]]+)\]", text.partition("\n")[0])
-    return units[-1] if units else ""
 
 
 def measure(track: Track) -> dict[str, jax.Array]:

@@ -14,13 +14,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.servos import servo
-from mjx_revolve.engine.tree import make_tree
-from mjx_revolve.episodes.rollout import Trajectory
+from mjx_revolve.engine.torques import motor_torques
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.formats.links import BASE, ODOM, WORLD, Link, make_links
 from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
@@ -93,24 +91,8 @@ def joint_torques(robot: Robot, trajectory: Trajectory, rows: np.ndarray) -> np.
     Returns:
         `[S, nhinge]` in the order of the links' joints [N·m].
     """
-    model = robot.mj_model
-    tree = make_tree(robot, contact=False)
-    qpos, qvel, ctrl = (
-        np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
-    )
-    drive = {int(model.actuator_trnid[k, 0]): k for k in robot.servos}
-    torque = np.zeros((len(rows), model.nbody - 2))
-    for level in tree.levels[1:]:
-        joint = [int(model.body_jntadr[body]) for body in level.body]
-        angle = jnp.asarray(qpos[:, model.jnt_qposadr[joint]].T)
-        speed = jnp.asarray(qvel[:, model.jnt_dofadr[joint]].T)
-        target = jnp.asarray(ctrl[:, [drive[j] for j in joint]].T)
-        # A step of no length: the torque now, not what an implicit step makes of it.
-        push, _ = servo(level, angle, speed, target, 0.0, 1.0, 0.0)
-        # Beyond the top speed that torque brakes; a motor has no more than its effort.
-        push = np.clip(np.asarray(push), *(np.asarray(x) for x in level.effort))
-        torque[:, [body - 2 for body in level.body]] = push.T
-    return torque
+    some = (np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl))
+    return motor_torques(robot, *some)
 
 
 def pick_rows(robot: Robot, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:

@@ -74,15 +74,16 @@ def content_name(name: str) -> str:
     return f"{own.function} {hashlib.sha256(content).hexdigest()[:16]}"
 
 
-def load_own(name: str, label: str) -> Callable[..., Any]:
+def load_own(name: str, label: str, kind: type | tuple[type, ...] = ()) -> Any:
     """The function that FILE.py:FUNCTION names; its file is run once per process and content.
 
     Args:
         name: `FILE.py:FUNCTION`.
         label: the place that named it, for messages: `lake.yaml: task.type`.
+        kind: what may stand there instead of a function.
 
     Returns:
-        The function.
+        The function, or a value of that kind.
 
     Raises:
         InputError: there is no such file or function, or the file raises when it is run.
@@ -102,7 +103,7 @@ def load_own(name: str, label: str) -> Callable[..., Any]:
             f"{'only ' + ', '.join(made) if made else 'no function in it'}"
         )
     function = getattr(module, own.function)
-    if not callable(function):
+    if not callable(function) and not isinstance(function, kind):
         raise InputError(
             f"{label}: expected a function {own.function} in {own.path}; found {function!r:.60}"
         )

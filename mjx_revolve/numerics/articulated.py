@@ -76,8 +76,8 @@ def _minus(a: Mat, b: Mat) -> Mat:
     return tuple(vsub(x, y) for x, y in zip(a, b, strict=True))
 
 
-class Joint(NamedTuple):
-    """What the tips-to-root sweep leaves for the way back."""
+class Released(NamedTuple):
+    """What setting a hinge free leaves for the way back."""
 
     row_a: Vec
     row_l: Vec
@@ -92,7 +92,7 @@ def lift_off(
     torque: Scalar,
     coriolis: tuple[Vec, Vec],
     symmetric: bool,
-) -> tuple[Block, tuple[Vec, Vec], Joint]:
+) -> tuple[Block, tuple[Vec, Vec], Released]:
     """Articulated inertia and bias of a hinge's body, the hinge (its z axis) set free.
 
     Args:
@@ -128,7 +128,7 @@ def lift_off(
         vadd(vadd(bias[0], carried[0]), vscale(pushed, column_a)),
         vadd(vadd(bias[1], carried[1]), vscale(pushed, column_l)),
     )
-    return left, bias, Joint(row_a, row_l, inverse, rest)
+    return left, bias, Released(row_a, row_l, inverse, rest)
 
 
 def solve_root(block: Block, bias: tuple[Vec, Vec], symmetric: bool) -> tuple[Vec, Vec]:

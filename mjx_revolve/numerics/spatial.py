@@ -29,6 +29,12 @@ def _constant(a: Scalar) -> bool:
     return isinstance(a, int | float | np.ndarray | np.generic)
 
 
+def clean(x: np.ndarray) -> np.ndarray:
+    """Rounds 1e-17 to 0 and 0.9999999 to 1, so that products with them fold away."""
+    near = np.round(x)
+    return np.where(np.abs(x - near) < 1e-12, near, x)
+
+
 def fold(a: np.ndarray) -> float | np.ndarray:
     """A constant that is the same everywhere as one float, which products can fold away."""
     a = np.asarray(a, np.float64)

@@ -38,7 +38,7 @@ from mjx_revolve.water.bed import bed_height, bed_slope
 
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
-    from mjx_revolve.episodes.rollout import Trajectory
+    from mjx_revolve.episodes.simulate import Trajectory
 
 _PAGE = (1600, 900)  # pixels
 _DPI = 100

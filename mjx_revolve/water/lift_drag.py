@@ -24,9 +24,10 @@ sign in a jump where α wraps at ±90°, unless `cla_stall` brings it to zero th
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -36,14 +37,52 @@ from mjx_revolve.numerics.spatial import Scalar, Vec, cross, dot, mul, neg, safe
 __all__ = ["LiftDrag", "lift_drag", "lift_drag_damping", "lift_drag_wrench"]
 
 
-def _numbers(p: LiftDrag, dtype: Any) -> Any:
-    """The coefficients in the dtype of what they meet; they may be arrays, a plate each."""
-    names = [f.name for f in dataclasses.fields(p)][:8]
-    return {name: np.asarray(getattr(p, name), dtype) for name in names}
+# The coefficients of a plate.
+_NAMES = ("a0", "cla", "cda", "alpha_stall", "cla_stall", "cda_stall", "cma", "cma_stall")
+
+
+class PlateTable(NamedTuple):
+    """Plates side by side: the fields of `LiftDrag` that the law reads, an array or number each."""
+
+    a0: Any
+    cla: Any
+    cda: Any
+    alpha_stall: Any
+    cla_stall: Any
+    cda_stall: Any
+    cma: Any
+    cma_stall: Any
+    radial_symmetry: Any
+    density: Any
+
+    @classmethod
+    def of(cls, plates: Sequence[LiftDrag], density: float) -> PlateTable:
+        """`[n]` each.
+
+        Args:
+            plates: n of them.
+            density: of the water, for those that give none [kg/m³].
+        """
+        return cls(
+            **{name: np.array([float(getattr(p, name)) for p in plates]) for name in _NAMES},
+            radial_symmetry=np.array([p.radial_symmetry for p in plates], bool),
+            density=np.array([density if p.density is None else p.density for p in plates]),
+        )
+
+
+def _numbers(p: LiftDrag | PlateTable, dtype: Any) -> Any:
+    """The coefficients in the dtype of what they meet."""
+    cast = lambda x: x if isinstance(x, jax.Array) else np.asarray(x, dtype)  # noqa: E731
+    return {name: cast(getattr(p, name)) for name in _NAMES}
+
+
+def _may_be(x: Any) -> bool:
+    """Whether a number is not plainly zero everywhere; what is traced counts."""
+    return isinstance(x, jax.Array) or bool(np.any(x))
 
 
 def lift_drag_wrench(
-    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag
+    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateTable
 ) -> tuple[Vec, Vec]:
     """Force and pitching moment of plates.
 
@@ -66,8 +105,8 @@ def lift_drag_wrench(
         Force [N] and moment [N·m] about the centre of pressure, in the frame of v.
     """
     density = density if p.density is None else p.density
-    radial = np.asarray(p.radial_symmetry, bool)
-    if radial.any():
+    if _may_be(p.radial_symmetry):
+        radial = jnp.asarray(p.radial_symmetry, bool)
         # Upward is against the flow across the forward direction.
         along = dot(v, forward)
         across = tuple(sub(x, mul(along, f)) for x, f in zip(v, forward, strict=True))
@@ -109,18 +148,20 @@ def lift_drag_wrench(
         pressure * speed_in_plane * (c_lift * up - c_drag * along)
         for up, along in zip(lift_direction, plane, strict=True)
     )
-    if not (np.any(k["cma"]) or np.any(k["cma_stall"])):
+    if not (_may_be(k["cma"]) or _may_be(k["cma_stall"])):
         return force, (0.0, 0.0, 0.0)
     return force, vscale(pressure * speed_in_plane * speed_in_plane * c_moment, n)
 
 
-def lift_drag(v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag) -> Vec:
+def lift_drag(
+    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateTable
+) -> Vec:
     """The force of `lift_drag_wrench` alone [N]."""
     return lift_drag_wrench(v, forward, upward, area, density, p)[0]
 
 
 def lift_drag_damping(
-    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag
+    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateTable
 ) -> Scalar:
     """How fast the force may fall with velocity, at most: what makes a step implicit.
 
@@ -141,8 +182,9 @@ def lift_drag_damping(
     """
     density = density if p.density is None else p.density
     speed = safe_norm(v)
-    k = {name: np.abs(x) for name, x in _numbers(p, speed.dtype).items()}
-    steepest = np.maximum(k["cla"], k["cla_stall"])
+    xp = jnp if isinstance(p.cla, jax.Array) else np
+    k = {name: xp.abs(x) for name, x in _numbers(p, speed.dtype).items()}
+    steepest = xp.maximum(k["cla"], k["cla_stall"])
     most = k["cda"] * k["alpha_stall"] + k["cda_stall"] * (np.pi / 2 - k["alpha_stall"])
-    slope = steepest + np.maximum(np.maximum(k["cda"], k["cda_stall"]), 2 * most)
+    slope = steepest + xp.maximum(xp.maximum(k["cda"], k["cda_stall"]), 2 * most)
     return mul(mul(density, area), slope.astype(speed.dtype) * speed)

@@ -34,7 +34,8 @@ def _numpy_of(x: Any) -> Any:
 
 def _like(constant: Any, x: Any) -> Any:
     """A constant, or an array of them, that does not widen x."""
-    return np.asarray(constant, x.dtype) if hasattr(x, "dtype") else constant
+    traced = isinstance(constant, jax.Array)
+    return np.asarray(constant, x.dtype) if hasattr(x, "dtype") and not traced else constant
 
 
 # ------------------------------------------------------------------------- the laws
@@ -135,24 +136,25 @@ def reaction_torque(thrust: Any, torque_ratio: Any) -> Any:
     return -_like(torque_ratio, thrust) * thrust
 
 
-def ideal_power(thrust: Scalar, disc: float, density: float) -> Scalar:
+def ideal_power(thrust: Scalar, disc: Any, density: float) -> Scalar:
     """Power that an ideal propeller at rest in the water needs: |T|^(3/2) / √(2 ρ A).
 
     Source: momentum theory (Froude 1889); real ones need about twice as much.
 
     Args:
         thrust: T [N].
-        disc: A, area of the propeller's disc [m²].
+        disc: A, area of the propeller's disc, a number or an array [m²]; 0 for no propeller.
         density: of the water [kg/m³].
 
     Returns:
         Power [W].
     """
-    if density <= 0 or disc <= 0:
-        return jnp.zeros_like(thrust)
+    xp = _numpy_of(disc)
+    pushes = 2 * density * disc
+    inverse = xp.where(pushes > 0, 1 / xp.sqrt(xp.where(pushes > 0, pushes, 1.0)), 0.0)
     size = jnp.abs(thrust)
     # The tiny term keeps the slope finite at rest.
-    return size * jnp.sqrt(size + 1e-12) / np.sqrt(2 * density * disc)
+    return size * jnp.sqrt(size + 1e-12) * _like(inverse, size)
 
 
 # ------------------------------------------------------------------------- of one thruster

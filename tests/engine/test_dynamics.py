@@ -24,11 +24,11 @@ from laboratory import (
     world,
 )
 from mjx_revolve.body.morphology import load_morphology
-from mjx_revolve.engine.hydrodynamics import Water
+from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes.rollout import make_engine
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed
+from mjx_revolve.water.flow import Water
 from references import clip_box
 
 NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mjx_revolve.engine.menagerie import fit_shape, pack_bodies
 
 from experiments.random_bodies import random_body
 from laboratory import QUICK, ROOT, WATER, accelerate, body, march, random_states, world
 from mjx_revolve import load_config, make_fitness
 from mjx_revolve.engine import menagerie, mixed_step
-from mjx_revolve.engine.menagerie import fit_shape, pack_bodies
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes.mixed_fitness import make_mixed_fitness
+from mjx_revolve.episodes.fitness import make_mixed_fitness
 from mjx_revolve.episodes.rollout import roll_out
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of

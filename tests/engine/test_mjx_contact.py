@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from laboratory import ROOT, WATER, at_rest, body, box_robot, elbow_robot, march, world
-from mjx_revolve.engine.hydrodynamics import Water
+from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.fitness import make_fitness
-from mjx_revolve.episodes.rollout import make_engine, simulate
+from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height
+from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import load_world
 from references import Lagrangian
 

@@ -25,12 +25,12 @@ from laboratory import (
     world,
 )
 from mjx_revolve.body.morphology import trim_neutral
-from mjx_revolve.engine.hydrodynamics import Water, box_added_mass
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes import rollout
-from mjx_revolve.episodes.rollout import gusty_water, simulate
+from mjx_revolve.episodes.simulate import simulate
+from mjx_revolve.episodes.starts import gusty_water
+from mjx_revolve.water.added_mass import box_added_mass
 from mjx_revolve.water.bed import Bed
-from mjx_revolve.water.flow import gust_path
+from mjx_revolve.water.flow import Water, gust_path
 from references import Lagrangian
 
 RHO, G = 999.1026, 9.81
@@ -41,7 +41,7 @@ CUBE = (0.1, 0.1, 0.1)  # carries the same water along every axis, so no Munk mo
 def quick_compiles():
     """Leaves out the compiler's optimisations: they cost more than these short runs save."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
         yield
 
 

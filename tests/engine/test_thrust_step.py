@@ -23,8 +23,7 @@ from laboratory import (
 )
 from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes import rollout
-from mjx_revolve.episodes.rollout import simulate
+from mjx_revolve.episodes.simulate import simulate
 
 RHO, G = 999.1026, 9.81
 CUBE = (0.1, 0.1, 0.1)
@@ -35,7 +34,7 @@ NEUTRAL = RHO * 1e-3
 def quick_compiles():
     """Leaves out the compiler's optimisations: they cost more than these short runs save."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
         yield
 
 

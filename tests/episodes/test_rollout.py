@@ -10,15 +10,15 @@ import mujoco
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from mjx_revolve.control.controllers import bind_genes, make_cpg, make_sine
 
 from laboratory import QUICK, USUAL, WATER, body, elbow_robot, march, read, world
 from mjx_revolve.body.morphology import trim_neutral
-from mjx_revolve.control.controllers import bind_genes, make_cpg, make_sine
-from mjx_revolve.engine.hydrodynamics import Water
+from mjx_revolve.engine.kinematics import body_positions
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes import rollout
-from mjx_revolve.episodes.rollout import Trajectory, body_positions, simulate
+from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.flow import Water
 
 STEPS, DT = 40, 0.005
 SPAN = STEPS * DT
@@ -28,7 +28,7 @@ SPAN = STEPS * DT
 def quick_compiles():
     """Leaves out the compiler's optimisations: they cost more than these short runs save."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
         yield
 
 

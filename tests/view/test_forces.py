@@ -10,7 +10,7 @@ from laboratory import WATER, accelerate, arm_robot, body, box_robot, random_sta
 from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.body.plates import LiftDrag
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.episodes.rollout import Trajectory
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.forces import Forces, module_forces, part_motion, sum_modules
 from mjx_revolve.water.flow import Water, flow, water_of

@@ -18,7 +18,7 @@ from laboratory import body
 from mjx_revolve import replay
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
-from mjx_revolve.episodes.rollout import Trajectory
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic

@@ -15,9 +15,8 @@ from browser import Browser, find_browser
 from laboratory import QUICK, ROOT, WATER, body, box_robot, world
 from mjx_revolve import viewer
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes import rollout
 from mjx_revolve.episodes.champion import Episode
-from mjx_revolve.episodes.rollout import Trajectory
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.forces import module_forces, sum_modules
@@ -393,7 +392,7 @@ def test_other_worlds_draw(browser, tmp_path):
 
 @pytest.fixture
 def quick_compiles(monkeypatch):
-    monkeypatch.setattr(rollout, "compiler_options", lambda: QUICK)
+    monkeypatch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
 
 
 CORE = str(ROOT / "morphologies" / "core.yaml")

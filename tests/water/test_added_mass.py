@@ -16,8 +16,9 @@ from laboratory import (
     random_states,
     world,
 )
-from mjx_revolve.engine.hydrodynamics import Water, box_added_mass, lamb_coefficients
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.water.added_mass import box_added_mass, lamb_coefficients
+from mjx_revolve.water.flow import Water
 from references import Lagrangian
 
 RHO = 999.1026

@@ -14,9 +14,9 @@ import pytest
 from laboratory import at_rest, body, box_robot, march, world
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import trim_neutral
-from mjx_revolve.engine.hydrodynamics import Water
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.water.buoyancy import buoyancy, submersion
+from mjx_revolve.water.flow import Water
 from references import clip_box
 
 WATER = 999.1026  # kg/m³, the thesis's

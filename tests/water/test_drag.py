@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from laboratory import accelerate, arm_robot, at_rest, box_robot, march, random_states, world
-from mjx_revolve.engine.hydrodynamics import (
+from mjx_revolve.water.drag import (
     ELLIPSOID_COEFFICIENTS,
     ellipsoid,
     ellipsoid_constants,
     face_drag_coefficients,
     inertia_box,
-    lift_drag,
     quadratic_drag,
 )
+from mjx_revolve.water.lift_drag import lift_drag
 from mjx_revolve.water.world import LiftDrag
 
 RHO = 999.1026

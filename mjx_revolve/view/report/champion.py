@@ -13,8 +13,8 @@ import numpy as np
 
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.fitness import Fitness
-from mjx_revolve.episodes.rollout import Trajectory
 from mjx_revolve.episodes.scoring import first_counted, judge_tracks, replay_key
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.report.data import RunRecord, number
 

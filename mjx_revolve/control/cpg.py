@@ -1,0 +1,105 @@
+"""Revolve's differential CPG: coupled oscillators, one for each hinge."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.control.controller import Controller, Gene, as_plant, make_controller
+from mjx_revolve.control.sense import Sense
+from mjx_revolve.engine.plant import Plant
+from mjx_revolve.engine.robot import Robot
+
+
+def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float = 1.0) -> Controller:
+    """Revolve's differential CPG: one oscillator pair per hinge, neighbours coupled.
+
+    ẋ_i = w_i y_i + Σ_j c_ij x_j,  ẏ_i = -w_i x_i,  c_ij = -c_ji for hinges that share a rigid link
+    (Lan et al. 2021, Learning locomotion skills in evolvable robots, Neurocomputing 452). The
+    system matrix is antisymmetric, so Σ x² + y² is constant. Target of hinge i: amplitude × half
+    range × tanh(x_i), from the middle of its range. It starts at x = 0, y = 1: with all weights
+    zero nothing ever moves. Integrated by the classical Runge-Kutta method at the physics' step.
+    Thrusters have no neighbours: each runs at a constant command, half range × sin(gene).
+
+    Genes: one w per hinge, then one c per pair of neighbours, then one command per thruster;
+    w = 2π f_max sin(gene), c = π f_max sin(gene).
+
+    Args:
+        body: whose hinges are driven: a plant or a robot.
+        max_frequency: of an uncoupled oscillator [Hz].
+        amplitude: share of the hinges' range used [-].
+
+    Returns:
+        The controller.
+    """
+    made_for = as_plant(body)
+    n, pairs, dt = made_for.num_hinges, made_for.num_pairs, made_for.timestep
+    genes = [Gene("w", "hinge", k) for k in range(n)]
+    genes += [Gene("c", "pair", k) for k in range(pairs)]
+    genes += [Gene("thrust", "thruster", k) for k in range(made_for.num_thrusters)]
+
+    def decode(genes: jax.Array, plant: Plant) -> Any:
+        folded, rows = jnp.sin(genes), plant.num_hinge_rows
+        coupling = _couple(np.pi * max_frequency * folded[n : n + pairs], plant)
+        # Of each row: its oscillator's w, or its thruster's command.
+        values = plant.arrange(jnp.concatenate([folded[:n], folded[n + pairs :]]))
+        middle, reach = plant.middle(genes), plant.reach(genes)
+        w = 2 * np.pi * max_frequency * values[:rows]
+        constant = middle[rows:] + reach[rows:] * values[rows:]
+        return w, coupling, amplitude * reach[:rows], middle[:rows], constant
+
+    def slope(w: jax.Array, c: Any, x: jax.Array, y: jax.Array) -> tuple[Any, Any]:
+        coupled = w * y
+        for j, column in c.items():  # written out: no reductions inside the compiled loop
+            coupled = coupled + column * x[j : j + 1]
+        return coupled, -w * x
+
+    def init(parameters: Any) -> Any:
+        w = parameters[0]
+        return jnp.zeros_like(w), jnp.ones_like(w)
+
+    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+        w, c, reach, center, constant = parameters
+        x, y = state
+        a1, b1 = slope(w, c, x, y)
+        a2, b2 = slope(w, c, x + dt / 2 * a1, y + dt / 2 * b1)
+        a3, b3 = slope(w, c, x + dt / 2 * a2, y + dt / 2 * b2)
+        a4, b4 = slope(w, c, x + dt * a3, y + dt * b3)
+        x = x + dt / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        y = y + dt / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
+        targets = center + reach * jnp.tanh(x)
+        if not constant.shape[0]:
+            return (x, y), targets
+        return (x, y), jnp.concatenate([targets, constant])
+
+    return make_controller(made_for, genes, decode, init, step)
+
+
+def _couple(weights: jax.Array, plant: Plant) -> dict[int, jax.Array]:
+    """The antisymmetric coupling of neighbours, column by column.
+
+    Args:
+        weights: `[num_pairs, lanes]`, how the later hinge of a pair acts on the earlier one.
+        plant: whose pairs.
+
+    Returns:
+        For each hinge row that may act on others, `[hinge rows, lanes]` how it does.
+    """
+    rows, lanes = plant.num_hinge_rows, weights.shape[1:]
+    if not plant.num_pairs:
+        return {}
+    wide = lambda x: jnp.broadcast_to(jnp.asarray(x), weights.shape)  # noqa: E731
+    i, j = wide(plant.first), wide(plant.second)
+    lane = jnp.arange(lanes[0]) if lanes else 0
+    matrix = jnp.zeros((rows, rows, *lanes), weights.dtype)
+    # What is past the end stands for no pair.
+    matrix = matrix.at[i, j, lane].add(weights, mode="drop")
+    matrix = matrix.at[j, i, lane].add(-weights, mode="drop")
+    if isinstance(plant.first, jax.Array):
+        acting = list(range(rows))
+    else:
+        acting = sorted({*plant.first.ravel().tolist(), *plant.second.ravel().tolist()})
+    return {j: matrix[:, j] for j in acting}

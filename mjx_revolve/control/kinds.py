@@ -1,0 +1,105 @@
+"""The controllers by name, and users' own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjx_revolve.control.controller import Controller
+from mjx_revolve.control.cpg import make_cpg
+from mjx_revolve.control.feedback import make_feedback
+from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.sine import make_sine
+from mjx_revolve.engine.plant import Plant
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.own_code import call_own, load_own, parse_own, short_name
+
+# By the name that a configuration gives; each takes (plant, settings).
+CONTROLLERS: dict[str, Callable[[Plant, Any], Controller]] = {
+    "cpg": lambda plant, settings: make_cpg(plant, settings.max_frequency, settings.amplitude),
+    "sine": lambda plant, settings: make_sine(
+        plant, settings.max_frequency, settings.amplitude, settings.harmonics
+    ),
+    "feedback": lambda plant, settings: make_feedback(plant, settings.depth, settings.gain),
+}
+
+
+def find_controller(
+    plant: Plant, settings: Any, source: str = "config", example: Plant | None = None
+) -> Controller:
+    """The controller that a configuration names, made for a plant.
+
+    Args:
+        plant: whose hinges and thrusters are driven.
+        settings: a `config.ControllerConfig`. Its `type` is a name in `CONTROLLERS`, or
+            FILE.py:FUNCTION for a function of the user's own, which takes the plant and these
+            settings and returns a `Controller`.
+        source: what messages call the configuration.
+        example: a plant with its tables, to try a user's own on; by default `plant`.
+
+    Returns:
+        The controller.
+
+    Raises:
+        InputError: the file or the function is missing, or what it makes is no controller of this
+            plant; one line says where.
+    """
+    if settings.type in CONTROLLERS:
+        return CONTROLLERS[settings.type](plant, settings)
+    name = settings.type
+    function = load_own(name, f"{source}: controller.type")
+    controller = call_own(
+        name, f"{short_name(name)} to make a controller", function, plant, settings
+    )
+    _check_own(name, controller, plant if example is None else example)
+    return controller
+
+
+def _check_own(name: str, controller: Any, plant: Plant) -> None:
+    """Refuses what is no controller of a plant, before anything is compiled."""
+    own = parse_own(name)
+    place = f"{own.path}: {own.function}" if own else name
+    if not isinstance(controller, Controller):
+        raise InputError(f"{place}: expected a Controller; found {type(controller).__name__}")
+    count = controller.num_genes
+    if not isinstance(count, int) or count < 0:
+        raise InputError(f"{place}: num_genes: expected a whole number >= 0; found {count!r}")
+    if len(controller.gene_names) != count:
+        raise InputError(
+            f"{place}: gene_names: expected {count} of them, as num_genes says; found "
+            f"{len(controller.gene_names)}"
+        )
+    lanes, rows = 3, plant.num_rows
+    one: Any = jax.ShapeDtypeStruct((lanes,), jnp.float32)
+
+    def run(genes: jax.Array, time: jax.Array, sense: Sense) -> Any:
+        parameters = controller.decode(genes, plant)
+        state = controller.init(parameters)
+        return state, *controller.step(parameters, state, time, sense)
+
+    before, after, targets = call_own(
+        name,
+        f"{short_name(name)}'s decode, init and step to give targets",
+        jax.eval_shape,
+        run,
+        jax.ShapeDtypeStruct((count, lanes), jnp.float32),
+        jax.ShapeDtypeStruct((), jnp.float32),
+        Sense(one, one, (one, one, one), (one, one, one)),
+    )
+    if getattr(targets, "shape", None) != (rows, lanes):
+        raise InputError(
+            f"{place}: step: expected targets [n, lanes], here [{rows}, {lanes}]; found "
+            f"{list(targets.shape) if hasattr(targets, 'shape') else type(targets).__name__}"
+        )
+    if _shapes(before) != _shapes(after):
+        raise InputError(
+            f"{place}: step: expected a state of the shapes that init gives, {_shapes(before)}; "
+            f"found {_shapes(after)}"
+        )
+
+
+def _shapes(state: Any) -> str:
+    return str(jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", state)).replace("'", "")

@@ -1,0 +1,248 @@
+"""The constants of a step: bodies that move together, as pytrees of numbers.
+
+A `Level` holds some bodies with their hinges, their parts and their contact points. In the step of
+one robot it is a level of its tree, and its numbers are Python floats or NumPy arrays that fold
+away while the step is traced; in the step of many different robots it is a row of theirs, one body
+of each, and its numbers are arrays with the population on the last axis.
+
+Each moving body's frame is turned so that its hinge is its z axis, which makes the joint's motion
+subspace constant (Featherstone 2008, Rigid Body Dynamics Algorithms, § 4.4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+
+from mjx_revolve.numerics.inertia import SpatialInertia
+from mjx_revolve.numerics.spatial import Mat, Scalar, Sym, Vec
+
+
+class Laws(NamedTuple):
+    """What tells groups of parts apart.
+
+    Attributes:
+        buoyancy: name of the buoyancy law.
+        drag: name of the drag law.
+        pushes: whether they are thrusters.
+    """
+
+    buoyancy: str
+    drag: str
+    pushes: bool = False
+
+
+class Hinges(NamedTuple):
+    """Of the hinges that carry the bodies of a level, `[nbody, lanes]` or a number each.
+
+    Attributes:
+        rotation: parent from child where the hinge stands at the angle `-offset`; the same for all
+            hinges that point the same way, so that it mostly folds away.
+        offset: cosine and sine of the angle that is added to the joint angle [-].
+        position: of the joint in the parent's frame [m].
+        armature: [kg·m²].
+        damping: passive [N·m·s/rad].
+        gain: of the servo, per target angle [N·m/rad].
+        stiffness: of the servo, per joint angle [N·m/rad].
+        servo_damping: of the servo, per joint speed [N·m·s/rad].
+        effort: torque limits of the servo, low and high [N·m].
+        target: limits of the servo's target, low and high [rad].
+        range: limits of the joint, low and high [rad].
+        stop: stiffness of the end stops [N·m/rad].
+        motor: the line between speed and torque near the top speed, or None where no servo has
+            one: torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s].
+        base_inertia: of all that is on the parent's side of the hinge, about its axis, at rest
+            [kg·m²].
+    """
+
+    rotation: Mat
+    offset: tuple[Scalar, Scalar]
+    position: Vec
+    armature: Scalar
+    damping: Scalar
+    gain: Scalar
+    stiffness: Scalar
+    servo_damping: Scalar
+    effort: tuple[Scalar, Scalar]
+    target: tuple[Scalar, Scalar]
+    range: tuple[Scalar, Scalar]
+    stop: Scalar
+    motor: tuple[Scalar, Scalar, Scalar] | None
+    base_inertia: Scalar
+
+
+class InertiaBox(NamedTuple):
+    """Of MuJoCo's inertia-box law, `[nbody, lanes]` or a number each.
+
+    Attributes:
+        rotation: body from inertial frame.
+        position: centre of mass, body frame [m].
+        size: edges of the box of equal inertia [m].
+    """
+
+    rotation: Mat
+    position: Vec
+    size: Vec
+
+
+class Mounts(NamedTuple):
+    """Where thrusters push, `[npart, nbody, lanes]` or a number each.
+
+    Attributes:
+        which: of the robot's thrusters, -1 for none; whole numbers.
+        axis: of the thrust, unit vector in the body's frame.
+        position: where it pushes, body frame [m].
+        torque_ratio: reaction torque per thrust [m].
+    """
+
+    which: Any
+    axis: Vec
+    position: Vec
+    torque_ratio: Scalar
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "position", "rotation", "half_size", "center_position", "volume", "exposed",
+        "drag_linear", "drag_angular", "carried", "plate", "plate_area", "plate_forward",
+        "plate_upward", "plate_center", "ellipsoid", "mounts",
+    ],
+    meta_fields=["laws", "count"],
+)  # fmt: skip
+@dataclass(frozen=True)
+class Parts:
+    """Those parts of the bodies of a level that obey the same laws.
+
+    `[npart, nbody, lanes]` or a number each, in the bodies' frames; None where no law asks for it.
+    Bodies with fewer parts are padded with parts that do nothing. A part that stands square on its
+    body is described along the body's axes, so that its rotation folds away.
+
+    Attributes:
+        laws: which they obey.
+        count: npart, how many a body has.
+        position: centre of the box [m].
+        rotation: body from the axes that describe the part.
+        half_size: half edges of the box [m].
+        center_position: centre of the displaced volume [m].
+        volume: displaced [m³].
+        exposed: share of each pair of faces that the water reaches [-].
+        drag_linear: ρ ½ C_d A of each pair of faces [kg/m].
+        drag_angular: the same against turning [kg·m²].
+        carried: inertia of the water that they carry along, wholly wet, about the body's origin.
+        plate: coefficients of `lift_drag`, a `PlateTable`.
+        plate_area: [m²].
+        plate_forward: unit vector of zero angle of attack, part's axes.
+        plate_upward: unit vector of the upper surface, part's axes.
+        plate_center: centre of pressure, part's axes [m].
+        ellipsoid: constants of MuJoCo's ellipsoid law.
+        mounts: where thrusters push.
+    """
+
+    laws: Laws
+    count: int
+    position: Vec
+    rotation: Mat
+    half_size: Vec
+    center_position: Vec
+    volume: Scalar
+    exposed: Any = None
+    drag_linear: Any = None
+    drag_angular: Any = None
+    carried: SpatialInertia | None = None
+    plate: Any = None
+    plate_area: Any = None
+    plate_forward: Any = None
+    plate_upward: Any = None
+    plate_center: Any = None
+    ellipsoid: Any = None
+    mounts: Mounts | None = None
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["position", "mass"], meta_fields=["count"])
+@dataclass(frozen=True)
+class Points:
+    """What may touch the bed, `[npoint, nbody, lanes]` or a number each.
+
+    Attributes:
+        count: npoint, how many a body has.
+        position: body frame [m].
+        mass: each point's share of its body's mass [kg]; 0 for padding.
+    """
+
+    count: int
+    position: Vec
+    mass: Scalar
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["hinges", "mass", "moment", "inertia", "box", "parts", "points"],
+    meta_fields=["count"],
+)
+@dataclass(frozen=True)
+class Level:
+    """Bodies that move together, `[nbody, lanes]` or a number each.
+
+    Attributes:
+        count: nbody, how many they are.
+        hinges: that carry them; None for the root.
+        mass: [kg].
+        moment: mass times centre of mass, body frame [kg·m].
+        inertia: about the body's origin [kg·m²].
+        box: for MuJoCo's inertia-box law, else None.
+        parts: what the water acts on, in groups that obey the same laws.
+        points: what may touch the bed, or None.
+    """
+
+    count: int
+    hinges: Hinges | None
+    mass: Scalar
+    moment: Vec
+    inertia: Sym
+    box: InertiaBox | None
+    parts: tuple[Parts, ...]
+    points: Points | None
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "low", "high", "kept", "delayed", "backward", "forward", "dead_low", "dead_high", "line",
+        "disc",
+    ],
+    meta_fields=["count"],
+)  # fmt: skip
+@dataclass(frozen=True)
+class Thrusters:
+    """The thrusters of a robot, `[nthruster, lanes]` each.
+
+    Attributes:
+        count: nthruster.
+        low: least command [-].
+        high: greatest command [-].
+        kept: share of a command behind its lag that is still there after a step [-].
+        delayed: whether there is a lag.
+        backward: thrust per command squared, astern [N].
+        forward: likewise, ahead [N].
+        dead_low: lower end of the dead band [-].
+        dead_high: its upper end [-].
+        line: (commands, thrusts, whether the curve is such a broken line), points on the first
+            axis; None where no thruster has one.
+        disc: area of the propeller's disc [m²].
+    """
+
+    count: int
+    low: Any
+    high: Any
+    kept: Any
+    delayed: Any
+    backward: Any
+    forward: Any
+    dead_low: Any
+    dead_high: Any
+    line: Any
+    disc: Any

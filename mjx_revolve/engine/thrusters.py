@@ -1,0 +1,131 @@
+"""The thrusters of robots in a step: commands → lag → thrust → power, all of a robot at once.
+
+The laws are those of `water.thrusters`; here they run over tables, so that thrusters of any curve
+stand side by side, in one robot or in many.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.body.module_types import Thruster
+from mjx_revolve.engine.level import Thrusters
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.water.thrusters import dead_band_thrust, ideal_power, interpolated_thrust
+
+# What stands where a robot has fewer thrusters than others.
+_NONE = Thruster(gain=0.0)
+
+
+def read_thrusters(robot: Robot) -> Thrusters:
+    """The thrusters of a robot, `[nthruster, 1]`."""
+    listed = [part.thruster for part in robot.thruster_part if part.thruster is not None]
+    discs = propeller_discs(robot)
+    return stack_thrusters([listed], [discs], len(listed), robot.world.timestep)
+
+
+def propeller_discs(robot: Robot) -> list[float]:
+    """Area of each propeller's disc: the circle in its box, seen along its axis [m²]."""
+    discs = []
+    for row, part in zip(robot.thruster_row, robot.thruster_part, strict=True):
+        assert part.thruster is not None
+        size = 2 * robot.fluid.half_size[row]
+        across = np.prod(size) / size
+        discs.append(float(np.pi / 4 * np.abs(np.asarray(part.thruster.axis)) @ across))
+    return discs
+
+
+def stack_thrusters(
+    listed: list[list[Thruster]], discs: list[list[float]], count: int, dt: float
+) -> Thrusters:
+    """Thrusters of several robots side by side.
+
+    Args:
+        listed: of each robot.
+        discs: areas of their propellers' discs [m²].
+        count: how many a robot may have; the others do nothing.
+        dt: of a step [s].
+
+    Returns:
+        Tables `[count, robots]`.
+    """
+    padded = [[*some, *[_NONE] * (count - len(some))] for some in listed]
+    disc = [[*some, *[0.0] * (count - len(some))] for some in discs]
+
+    def column(look: Any, dtype: Any = np.float64) -> np.ndarray:
+        return np.array([[look(t) for t in some] for some in padded], dtype).T.reshape(
+            count, len(padded)
+        )
+
+    backward = lambda t: t.gain if t.gain_backward is None else t.gain_backward  # noqa: E731
+    kept = lambda t: np.exp(-dt / t.time_constant) if t.time_constant > 0 else 0.0  # noqa: E731
+    lines = [t for some in padded for t in some if t.curve == "interpolated"]
+    line = None
+    if lines:
+        most = max(len(t.commands) for t in lines)
+        line = (
+            tuple(column(lambda t, k=k: _point(t, k)[0]) for k in range(most)),
+            tuple(column(lambda t, k=k: _point(t, k)[1]) for k in range(most)),
+            column(lambda t: t.curve == "interpolated", bool),
+        )
+    return Thrusters(
+        count=count,
+        low=column(lambda t: t.range[0]),
+        high=column(lambda t: t.range[1]),
+        kept=column(kept),
+        delayed=column(lambda t: t.time_constant > 0, bool),
+        backward=column(backward),
+        forward=column(lambda t: t.gain),
+        dead_low=column(lambda t: t.dead_band[0]),
+        dead_high=column(lambda t: t.dead_band[1]),
+        line=line,
+        disc=np.array(disc, float).T.reshape(count, len(padded)),
+    )
+
+
+def _point(thruster: Thruster, k: int) -> tuple[float, float]:
+    """A point of a broken line; beyond its last one, level."""
+    if thruster.curve != "interpolated":
+        return float(k), 0.0
+    last = len(thruster.commands) - 1
+    return thruster.commands[min(k, last)] + max(k - last, 0), thruster.thrusts[min(k, last)]
+
+
+def run_thrusters(
+    thrusters: Thrusters, lagged: jax.Array, ctrl: jax.Array, density: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The thrusters' part of a step.
+
+    As in MuJoCo's filtered actuators, a command passes its lag at the end of the step, and thrust
+    follows the command that had passed at its beginning; without a lag it follows at once.
+
+    Args:
+        thrusters: of the robots.
+        lagged: their commands behind the lag, `[nthruster, lanes]` [-].
+        ctrl: what is asked for, likewise.
+        density: of the water [kg/m³].
+
+    Returns:
+        The lagged commands after the step, the thrusts, `[nthruster, lanes]` [N], and the power
+        that ideal propellers need for them, likewise [W] (`water.thrusters.ideal_power`).
+    """
+    cast = lambda x: x if isinstance(x, jax.Array) else np.asarray(x, ctrl.dtype)  # noqa: E731
+    asked = jnp.clip(ctrl, cast(thrusters.low), cast(thrusters.high))
+    kept = cast(thrusters.kept)
+    # Not x + kept (s - x): at rest at x, rounding must leave s alone.
+    after = lagged * kept + asked * (1 - kept)
+    acting = jnp.where(thrusters.delayed, lagged, asked)
+    push = dead_band_thrust(
+        acting,
+        *map(cast, (thrusters.backward, thrusters.forward)),
+        *map(cast, (thrusters.dead_low, thrusters.dead_high)),
+    )
+    if thrusters.line is not None:
+        commands, thrusts, is_line = thrusters.line
+        line = interpolated_thrust(acting, list(map(cast, commands)), list(map(cast, thrusts)))
+        push = jnp.where(is_line, line, push)
+    return after, push, ideal_power(push, cast(thrusters.disc), density)

@@ -1,0 +1,227 @@
+"""Scores of a population over a batch of bodies, one or many: the one fitness behind all faces.
+
+`Setup` holds what all episodes of a configuration have in common. Bodies are an argument: None for
+the one body that the setup was made for, or the tables of many. An individual's episodes run in
+lanes of a chunk of fixed shape, so its score does not depend on who swims beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjx_revolve.control.controller import Controller
+from mjx_revolve.engine.batch import Bodies, Capacity
+from mjx_revolve.engine.plant import Figure
+from mjx_revolve.engine.rows import Rows
+from mjx_revolve.engine.step import Engine, make_step_engine
+from mjx_revolve.episodes.config import Config, TaskConfig
+from mjx_revolve.episodes.rollout import flow_at, roll_out
+from mjx_revolve.episodes.scoring import (
+    Scores,
+    average_trials,
+    list_episodes,
+    sample_rows,
+    score_episodes,
+)
+from mjx_revolve.episodes.starts import Starts, check_key, draw_starts, gusty_water, start_pose
+from mjx_revolve.episodes.tasks import Task
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.xla import compiler_options, derived_by, over_chunks
+from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.water.world import World
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What all episodes of a configuration have in common.
+
+    Attributes:
+        config: what it was made from.
+        world: the world.
+        task: what episodes are about.
+        controller: genes to commands; for the largest of many bodies.
+        engine: what steps the one body; None for many.
+        figure: of the one body; None for many.
+        capacity: room for many bodies; None for one.
+    """
+
+    config: Config
+    world: World
+    task: Task
+    controller: Controller
+    engine: Engine | None = None
+    figure: Figure | None = None
+    capacity: Capacity | None = None
+
+    @property
+    def settings(self) -> TaskConfig:
+        """Of the task."""
+        return self.config.task
+
+    @property
+    def record_every(self) -> int:
+        """Timesteps between the rows of the track that tasks see."""
+        return sample_rows(self.settings, self.world.timestep)[0]
+
+    @property
+    def num_records(self) -> int:
+        """How many rows the track of an episode has, before the settling time is cut off."""
+        return sample_rows(self.settings, self.world.timestep)[1]
+
+    def starts(self, key: jax.Array) -> Starts:
+        """What a key's episodes start from."""
+        steps = self.num_records * self.record_every
+        return draw_starts(self.settings, self.world, key, steps)
+
+    def engine_of(self, bodies: Bodies | None) -> Engine:
+        """What steps the bodies."""
+        if bodies is None:
+            assert self.engine is not None
+            return self.engine
+        assert self.capacity is not None
+        return make_step_engine(Rows(self.world, self.capacity, bodies), bodies.plant)
+
+    def figure_of(self, bodies: Bodies | None) -> Figure:
+        """The bodies' size."""
+        if bodies is not None:
+            return bodies.figure
+        assert self.figure is not None
+        return self.figure
+
+    def evaluate(
+        self, bodies: Bodies | None, population: Any, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Scores a population and says how it moved.
+
+        Args:
+            bodies: the tables of a body for each individual, or None for the one body.
+            population: `[P, num_genes]`.
+            key: draws the episodes' starts and water, the same for every individual.
+
+        Returns:
+            `[P]` scores and `[P]` measures (see `tasks.measure`), means over the episodes.
+
+        Raises:
+            InputError: the population has another shape, there are no genes to evolve, or the key
+                is none.
+        """
+        shape, count = jnp.shape(population), self.controller.num_genes
+        if len(shape) != 2 or shape[1] != count or shape[0] < 1:
+            raise InputError(f"population: expected [P, {count}]; found {list(shape)}")
+        check_key(key)
+        traced = any(isinstance(x, jax.core.Tracer) for x in (population, key))
+        run = self._evaluate if traced else self._jitted
+        return run(bodies, jnp.asarray(population), key)
+
+    @cached_property
+    def _jitted(self) -> Any:
+        # Compiler options belong to the outermost jit, so under somebody else's we go without.
+        return jax.jit(self._evaluate, compiler_options=compiler_options())
+
+    def _evaluate(self, bodies: Bodies | None, population: Any, key: jax.Array) -> Any:
+        trials = self.settings.trials
+        starts = jax.tree.map(lambda x: x.astype(population.dtype), self.starts(key))
+        run = partial(self._episode, bodies, population, starts)
+        return average_trials(over_chunks(run)(*list_episodes(len(population), trials)), trials)
+
+    def _episode(
+        self,
+        bodies: Bodies | None,
+        population: jax.Array,
+        starts: Starts,
+        individual: jax.Array,
+        trial: jax.Array,
+    ) -> Scores:
+        """Scores of one chunk of episodes.
+
+        A chunk picks what is its own from what all chunks share, so that nothing is kept for each
+        episode of a population but its scores.
+
+        Args:
+            bodies: of all individuals, or None.
+            population: `[P, num_genes]`.
+            starts: of all trials.
+            individual: `[lanes]` whose episode each is.
+            trial: `[lanes]` which of that individual's.
+
+        Returns:
+            The scores.
+        """
+        world, controller, settings = self.world, self.controller, self.settings
+        bodies = jax.tree.map(lambda x: jnp.asarray(x)[..., individual], bodies)
+        starts = jax.tree.map(lambda x: x[..., trial], starts)
+        root = start_pose(self.task, settings, world, self.figure_of(bodies), starts)
+        parameters = controller.decode(population[individual].T, self.engine_of(bodies).plant)
+        rows = None
+        if starts.gusts is not None:
+            rows = gusty_water(world, starts.gusts, starts.water)
+            shape = (starts.gusts.shape[0] - 1, root.shape[-1])
+            rows = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), rows)
+
+        def run(derived: bool, bodies: Any, root: Any, parameters: Any, water: Any, rows: Any):
+            engine = self.engine_of(bodies)
+            still = water_of(world) if water is None else water
+            hinges = jnp.zeros((engine.plant.num_hinges, root.shape[-1]), root.dtype)
+            qvel = jnp.concatenate([jnp.zeros_like(root[:6]), hinges])
+            _, kept = roll_out(
+                engine,
+                lambda state, time, row, sense: controller.step(parameters, state, time, sense),
+                lambda time, row: flow_at(world, still if row is None else row)(time, None),
+                make_recorder(engine, self.task),
+                engine.init(jnp.concatenate([root, hinges]), qvel),
+                controller.init(parameters),
+                rows,
+                records=self.num_records,
+                every=self.record_every,
+                timestep=world.timestep,
+                derived=derived,
+            )
+            return kept
+
+        # MJX's step is differentiated as it is.
+        fuses = self.engine is None or self.engine.fuses
+        episode = (
+            derived_by(partial(run, False), partial(run, True)) if fuses else partial(run, True)
+        )
+        recorded = episode(bodies, root, parameters, starts.water, rows)
+        figure = self.figure_of(bodies)
+        return score_episodes(self.task, settings, world, recorded, root[:3], figure)
+
+
+def make_recorder(
+    engine: Engine, task: Task
+) -> Callable[[Any, jax.Array, jax.Array, Water], dict[str, jax.Array]]:
+    """What `rollout.roll_out` records for a task: fields of a `tasks.Track`."""
+
+    def record(state: Any, ctrl: jax.Array, energy: jax.Array, water: Water) -> Any:
+        root = engine.root(state)
+        found = {"position": jnp.stack(root.position), "energy": energy}
+        if "core" in task.records:
+            found["quat"] = jnp.stack(root.quat)
+            found["velocity"], found["spin"] = jnp.stack(root.velocity), jnp.stack(root.spin)
+        if "joints" in task.records:
+            qpos, qvel = engine.observe(state)
+            found["angle"], found["speed"] = qpos[7:], qvel[6:]
+        if {"contacts", "forces"} & set(task.records):
+            bed, wet = engine.push(state, ctrl, water)
+            if "contacts" in task.records:
+                found["bed_force"] = jnp.stack(bed)
+            if "forces" in task.records:
+                found["water_force"] = jnp.stack(wet)
+        return found
+
+    return record
+
+
+def pick_water(world: World, starts: Starts, trial: int) -> Water | None:
+    """The water of one episode, as `simulate` takes it; None: just the world's."""
+    water = jax.tree.map(lambda x: x[trial], starts.water)
+    if starts.gusts is None:
+        return water
+    return gusty_water(world, starts.gusts[..., trial], water)

@@ -1,0 +1,231 @@
+"""One robot, simulated: `simulate` and the trajectory that it returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.control.controller import BoundController, Controller
+from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.kinematics import body_positions
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.episodes.rollout import flow_at, roll_out
+from mjx_revolve.episodes.starts import gusty_water
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.xla import compiler_options
+from mjx_revolve.water.flow import Water, gust_path, water_of
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["time", "qpos", "qvel", "xpos", "ctrl", "power", "command"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class Trajectory:
+    """What a robot did, one row after each step.
+
+    Attributes:
+        time: `[T]` [s]; the first row is one timestep after the start.
+        qpos: `[T, nq]` root position, world frame [m], root quaternion (w, x, y, z), hinges [rad].
+        qvel: `[T, nv]` root velocity, world frame [m/s], root angular velocity, body frame [rad/s],
+            hinges [rad/s].
+        xpos: `[T, nbody, 3]` origins of MuJoCo's bodies (0 is the world, 1 the core), world frame
+            [m].
+        ctrl: `[T, nu]` joint targets [rad] and commands of the thrusters [-], MuJoCo's order.
+        power: `[T]` mechanical power at the servos, summed without sign, and what ideal propellers
+            need for the thrust [W].
+        command: `[T, nthruster]` commands of the thrusters behind their lag [-].
+    """
+
+    time: jax.Array
+    qpos: jax.Array
+    qvel: jax.Array
+    xpos: jax.Array
+    ctrl: jax.Array
+    power: jax.Array
+    command: jax.Array | None = None
+
+
+@lru_cache(maxsize=64)
+def _compiled(
+    robot: Robot, engine: str, steps: int, controller: Controller | None, still: bool
+) -> Any:
+    """The jitted rollout of one robot; cached, so that a second call compiles nothing.
+
+    `still` leaves the water's surface and current to the world, as constants that fold away.
+    """
+    simulator = make_engine(robot, engine)
+    dt = robot.world.timestep
+    # MuJoCo's actuators in the robot's own order, and where each stands among the engine's rows.
+    own = np.array([*robot.servos, *robot.thrusters], int)
+    back = np.argsort(own[simulator.plant.source[:, 0]])
+
+    def run(
+        qpos: Any, qvel: Any, drive_input: Any, water: Water | None, derived: bool = False
+    ) -> Trajectory:
+        parameters, drive_state, targets = None, (), None
+        if controller is None:
+            targets = jax.vmap(simulator.plant.arrange)(drive_input[:, own, None])
+            drive = lambda s, time, row, sense: (s, row[0])  # noqa: E731
+        else:
+            parameters = controller.decode(drive_input[:, None], simulator.plant)
+            drive_state = controller.init(parameters)
+            drive = lambda s, time, row, sense: controller.step(  # noqa: E731
+                parameters, s, time, sense
+            )
+        moving = None if still else water
+        if moving is None:
+            flow = flow_at(robot.world, water_of(robot.world))
+        else:
+            moving = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[:, None], moving)
+            flow = lambda time, row: flow_at(robot.world, row[1])(time, None)  # noqa: E731
+        keep = lambda state, ctrl, energy, water: (state, ctrl, energy)  # noqa: E731
+        _, (states, ctrl, energy) = roll_out(
+            simulator,
+            drive,
+            flow,
+            keep,
+            simulator.init(qpos[:, None], qvel[:, None]),
+            drive_state,
+            (targets, moving),
+            records=steps,
+            every=1,
+            timestep=dt,
+            derived=derived,
+        )
+        qs, vs = jax.vmap(simulator.observe)(states)
+        return Trajectory(
+            time=dt * jnp.arange(1, steps + 1, dtype=qs.dtype),
+            qpos=qs[..., 0],
+            qvel=vs[..., 0],
+            xpos=body_positions(robot, qs[..., 0]),
+            ctrl=ctrl[..., 0][:, back],
+            power=energy[..., 0] / dt,
+            command=jax.vmap(simulator.command)(states)[..., 0],
+        )
+
+    jitted = jax.jit(run, compiler_options=compiler_options())
+    return jitted, partial(run, derived=True)
+
+
+def simulate(
+    robot: Robot,
+    ctrl: Any = None,
+    duration: float | None = None,
+    *,
+    qpos: Any = None,
+    qvel: Any = None,
+    key: jax.Array | None = None,
+    water: Water | None = None,
+    engine: str = "population",
+) -> Trajectory:
+    """Simulates one robot.
+
+    Args:
+        robot: from `build_robot`.
+        ctrl: joint targets [rad]: None (all 0), `[nu]` (held), `[T, nu]` (a row for each step), a
+            `BoundController` (see `controllers.bind_genes`), or a function of time [s] that
+            returns `[nu]` and that JAX can trace. Thrusters take commands within their range.
+        duration: [s]; by default as long as `ctrl` has rows, else 5.
+        qpos: `[nq]` start; by default the rest pose 1 m below the surface. Root position, world
+            frame [m], quaternion (w, x, y, z), hinges [rad].
+        qvel: `[nv]` start, by default at rest; root velocity, world frame [m/s], root angular
+            velocity, body frame [rad/s], hinges [rad/s].
+        key: if given, the default start pose is turned at random about the vertical; it also draws
+            the world's gusts (`jax.random.key(0)` by default).
+        water: surface and current, by default the world's; each a number or `[T]`, a row for each
+            step. It replaces the world's gusts.
+        engine: "population" or "mjx".
+
+    Returns:
+        The trajectory, one row after each step. Differentiable in qpos, qvel, ctrl and water.
+
+    Raises:
+        InputError: a shape or a number is wrong.
+    """
+    model, dt = robot.mj_model, robot.world.timestep
+    controller: Controller | None = None
+    rows: Any = None
+    if isinstance(ctrl, BoundController):
+        controller, drive_input = ctrl.controller, _array("genes", ctrl.genes, (-1,))
+        if drive_input.shape[0] != controller.num_genes:
+            raise InputError(
+                f"genes: expected {controller.num_genes} numbers; found {drive_input.shape[0]}"
+            )
+    elif ctrl is not None and not callable(ctrl):
+        rows = _array("ctrl", ctrl, None)
+        if rows.ndim not in (1, 2) or rows.shape[-1] != model.nu:
+            raise InputError(
+                f"ctrl: expected [{model.nu}] or [T, {model.nu}]; found {list(rows.shape)}"
+            )
+    steps = _steps(rows, duration, dt)
+    if controller is None:
+        if ctrl is None:
+            rows = jnp.zeros(model.nu)
+        elif callable(ctrl):
+            rows = jax.vmap(lambda t: jnp.asarray(ctrl(t)))(dt * jnp.arange(steps))
+        if rows.shape[-1] != model.nu:
+            raise InputError(f"ctrl: expected {model.nu} targets; found {rows.shape[-1]}")
+        drive_input = jnp.broadcast_to(rows, (steps, model.nu))
+    if qpos is None:
+        qpos = robot.start_qpos()
+        if key is not None:
+            half = jax.random.uniform(key, (), minval=-np.pi, maxval=np.pi) / 2
+            turned = jnp.stack([jnp.cos(half), 0 * half, 0 * half, jnp.sin(half)])
+            qpos = jnp.asarray(qpos).at[3:7].set(turned)
+    qpos = _array("qpos", qpos, (model.nq,))
+    qvel = jnp.zeros(model.nv) if qvel is None else _array("qvel", qvel, (model.nv,))
+    if water is None and robot.world.gust is not None:
+        gust_key = jax.random.fold_in(jax.random.key(0) if key is None else key, 1)
+        path = gust_path(robot.world.gust, gust_key, steps, dt, 1)[..., 0]
+        water = gusty_water(robot.world, path)
+    if water is not None:
+        water = jax.tree.map(lambda x: _array("water", x, None), water)
+        for leaf in jax.tree.leaves(water):
+            if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
+                raise InputError(f"water: expected numbers or [{steps}]; found {list(leaf.shape)}")
+    jitted, plain = _compiled(robot, engine, steps, controller, water is None)
+    traced = any(
+        isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((qpos, qvel, drive_input, water))
+    )
+    return (plain if traced else jitted)(qpos, qvel, drive_input, water)
+
+
+def _steps(rows: Any, duration: float | None, dt: float) -> int:
+    if duration is not None and (
+        isinstance(duration, bool)
+        or not isinstance(duration, int | float | np.number)
+        or not np.isfinite(duration)
+        or duration <= 0
+    ):
+        raise InputError(f"duration: expected seconds > 0; found {duration!r}")
+    if rows is not None and rows.ndim == 2:
+        steps = rows.shape[0]
+        if duration is not None and abs(duration - steps * dt) > dt:
+            raise InputError(
+                f"duration: expected {steps * dt:g} s, as ctrl has {steps} rows of {dt:g} s; "
+                f"found {duration:g}"
+            )
+        return steps
+    return max(1, round((5.0 if duration is None else duration) / dt))
+
+
+def _array(place: str, value: Any, shape: tuple[int, ...] | None) -> jax.Array:
+    try:
+        array = jnp.asarray(value, dtype=jnp.result_type(float))
+    except (TypeError, ValueError):
+        raise InputError(f"{place}: expected numbers; found {value!r}") from None
+    if shape is not None and (
+        array.ndim != len(shape)
+        or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True))
+    ):
+        raise InputError(f"{place}: expected shape {list(shape)}; found {list(array.shape)}")
+    if not isinstance(array, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(array))):
+        raise InputError(f"{place}: expected finite numbers; found NaN or infinity")
+    return array

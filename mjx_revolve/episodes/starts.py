@@ -1,0 +1,134 @@
+"""What differs from episode to episode: where robots start, and the water around them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_revolve.engine.plant import Figure
+from mjx_revolve.episodes.config import TaskConfig
+from mjx_revolve.episodes.tasks import Task
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.flow import Water, gust_path, water_of
+from mjx_revolve.water.world import World
+
+# How long a sea is before it begins again, as episodes see it [s].
+_SEA = 1000.0
+
+
+class Starts(NamedTuple):
+    """Of a key's episodes.
+
+    Attributes:
+        place: `[3, trials]` drawn around 0 [m]; the task says where that leads a body.
+        quat: `[4, trials]` of the core, world from body (w, x, y, z).
+        water: `[trials]` where it varies, else None.
+        gusts: `[steps + 1, 3, trials]` velocity around the episode's current [m/s], or None where
+            the world has no gusts.
+    """
+
+    place: jax.Array
+    quat: jax.Array
+    water: Water | None
+    gusts: jax.Array | None
+
+
+def check_key(key: Any) -> None:
+    """Refuses what `jax.random` would not draw from, such as a bare seed.
+
+    Args:
+        key: from `jax.random.key`, or one of the older arrays of uint32.
+
+    Raises:
+        InputError: it is something else.
+    """
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not (jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32):
+        raise InputError(f"key: expected jax.random.key(SEED); found {key!r}")
+
+
+def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> Starts:
+    """Draws the starts of a key's episodes, the same for all bodies.
+
+    Args:
+        task: how starts vary.
+        world: the world.
+        key: draws them.
+        steps: how long episodes are.
+
+    Returns:
+        The starts.
+    """
+    trials = task.trials
+    place_key, tilt_key, yaw_key, current_key = jax.random.split(key, 4)
+    place = task.start_position * jax.random.normal(place_key, (3, trials))
+    tilt = task.start_tilt * jax.random.normal(tilt_key, (2, trials))
+    yaw = task.start_yaw * jax.random.normal(yaw_key, (trials,))
+    quat = _euler_quat(tilt[0], tilt[1], yaw)
+    gusts = None
+    if world.gust is not None:
+        gust_key = jax.random.fold_in(key, 1)
+        gusts = gust_path(world.gust, gust_key, steps, world.timestep, trials)
+    if task.current_std == 0 and not world.waves:
+        return Starts(place, quat, None, gusts)
+    extra = task.current_std * jax.random.normal(current_key, (2, trials))
+    x, y, z = world.current
+    full = jnp.full((trials,), 0.0, place.dtype)
+    water = Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
+    if world.waves:
+        # Episodes begin at any moment of the sea.
+        time_key = jax.random.fold_in(key, 2)
+        water = water._replace(time=jax.random.uniform(time_key, (trials,), maxval=_SEA))
+    water = jax.tree.map(lambda x: jnp.broadcast_to(x, (trials,)), water)
+    return Starts(place, quat, water, gusts)
+
+
+def start_pose(
+    task: Task, settings: TaskConfig, world: World, figure: Figure, starts: Starts
+) -> jax.Array:
+    """Where the cores of bodies start.
+
+    Args:
+        task: which knows.
+        settings: of the task.
+        world: the world.
+        figure: of the bodies, `[lanes]` or one.
+        starts: of their episodes, `[lanes]`.
+
+    Returns:
+        `[7, lanes]` position, world frame [m], and quaternion (w, x, y, z).
+    """
+    place = task.start(settings, world, figure, starts.place)
+    return jnp.concatenate([place, starts.quat])
+
+
+def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Water:
+    """The water along a path of gusts.
+
+    Args:
+        world: whose gusts they are.
+        path: `[steps + 1, 3, ...]` from `water.gust_path` [m/s], around the world's current.
+        water: what else differs from the world; its current is that around which the gusts blow.
+
+    Returns:
+        Water whose current and acceleration are `[steps, ...]`.
+    """
+    base = water_of(world) if water is None else water
+    current = tuple(c + path[:-1, i] for i, c in enumerate(base.current))
+    change = jnp.diff(path, axis=0) / world.timestep
+    return base._replace(current=current, acceleration=tuple(change[:, i] for i in range(3)))
+
+
+def _euler_quat(roll: Any, pitch: Any, yaw: Any) -> jax.Array:
+    """`[4, n]` quaternion (w, x, y, z) of roll, then pitch, then yaw [rad]."""
+    (cr, sr), (cp, sp), (cy, sy) = ((jnp.cos(x / 2), jnp.sin(x / 2)) for x in (roll, pitch, yaw))
+    return jnp.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
