@@ -8,13 +8,12 @@ import pkgutil
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import mjx_revolve
+from laboratory import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 MODULES = [m.name for m in pkgutil.iter_modules(mjx_revolve.__path__) if m.name[0] != "_"]
 
 

@@ -1,7 +1,6 @@
 """The experiments: their closed forms, what they read from the thesis's data, their options."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,12 +20,11 @@ from experiments.falling_spider import (
     read_tables,
     row_ticks,
 )
-from laboratory import QUICK
+from laboratory import QUICK, ROOT
 from mjx_revolve.episodes import rollout
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[1]
 THESIS = ROOT.parent / "shared" / "thesis"
 SHARE = 0.93818  # ρ V / m of the spider
 

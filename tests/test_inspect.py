@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import yaml
 
+from laboratory import ROOT
 from mjx_revolve import inspect
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def _leg() -> dict:
