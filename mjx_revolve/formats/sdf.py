@@ -10,14 +10,14 @@ Sources: gz-sim, `src/systems/` `buoyancy`, `hydrodynamics`, `lift_drag`, `thrus
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from mjx_revolve.body.module_types import Part
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.formats.inertias import moments, part_spread, propeller
 from mjx_revolve.formats.links import (
     BASE,
     Link,
@@ -36,13 +36,9 @@ from mjx_revolve.water.thrusters import thrust
 
 # Gazebo's usual step [s]: its water is explicit.
 _STEP = 0.001
-# A link must weigh something; what has no mass of its own gets this [kg].
-_LEAST = 1e-6
-# Radius of a ballast, as `robot.py` has it [m].
-_BALLAST = 1e-3
-# Share of a thruster's mass that is its propeller, and thrust coefficient K_T of a propeller at
-# standstill (Carlton, Marine Propellers and Propulsion, chapter 6); both only make it spin.
-_ROTOR, _THRUST_COEFFICIENT = 0.05, 0.3
+# Thrust coefficient K_T of a propeller at standstill (Carlton, Marine Propellers and Propulsion,
+# chapter 6); it only makes it spin.
+_THRUST_COEFFICIENT = 0.3
 # Of a bed, as `robot.py` has it.
 _SAND = (0.76, 0.70, 0.50)
 
@@ -103,62 +99,6 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
     return to_document(node("sdf", world, version="1.11"), note)
 
 
-# ------------------------------------------------------------------------- inertias
-
-
-def _spread(mass: float, center: Any, square: np.ndarray) -> np.ndarray:
-    """`[4, 4]` pseudo-inertia of a body; those of bodies in one frame add up.
-
-    Source: Wensing, Kim and Slotine 2018, Linear matrix inequalities for physically consistent
-    inertial parameter identification.
-
-    Args:
-        mass: [kg].
-        center: `[3]` of mass [m].
-        square: `[3, 3]` mean of x xᵀ over the mass, x from the centre [m²].
-    """
-    place = np.append(center, 1.0)
-    spread = np.outer(place, place)
-    spread[:3, :3] += square
-    return mass * spread
-
-
-def _spread_of(part: Part) -> np.ndarray:
-    """Pseudo-inertia of a part without its propeller, as the MuJoCo model has it.
-
-    The mass is spread evenly over the main box; a ballast is a small ball.
-    """
-    box = _spread(part.mass, np.zeros(3), np.diag(np.square(part.boxes[0].size)) / 12)
-    ball = _spread(part.ballast_mass, part.ballast_position, _BALLAST**2 / 5 * np.eye(3))
-    return box + ball - (0 if part.thruster is None else _propeller(part)[0])
-
-
-def _propeller(part: Part) -> tuple[np.ndarray, float]:
-    """Pseudo-inertia of a thruster's propeller, a thin disc, part frame; its diameter [m]."""
-    assert part.thruster is not None
-    axis = np.asarray(part.thruster.axis)
-    across = np.abs(axis) < 0.99 * np.abs(axis).max()
-    diameter = 0.9 * float(np.asarray(part.boxes[0].size)[across].min())
-    square = diameter**2 / 16 * (np.eye(3) - np.outer(axis, axis))
-    return _spread(max(_ROTOR * part.mass, _LEAST), part.thruster.position, square), diameter
-
-
-def _inertial(spread: np.ndarray, *more: Element) -> Element:
-    mass = spread[3, 3]
-    if mass <= 0:
-        mass, spread = _LEAST, _spread(_LEAST, np.zeros(3), 5e-5 * np.eye(3))
-    center = spread[:3, 3] / mass
-    square = spread[:3, :3] - mass * np.outer(center, center)
-    inertia = np.trace(square) * np.eye(3) - square
-    return node(
-        "inertial",
-        _pose(center, np.eye(3)),
-        node("mass", max(mass, _LEAST)),
-        node("inertia", *nodes(**inertia_entries(inertia))),
-        *more,
-    )
-
-
 # ------------------------------------------------------------------------- elements
 
 
@@ -170,6 +110,14 @@ def _plugin(file: str, kind: str, *content: Element, **fields: Value) -> Element
     """A gz-sim system; its fields in the order given."""
     name = f"gz::sim::systems::{kind}"
     return node("plugin", *content, *nodes(**fields), filename=f"gz-sim-{file}-system", name=name)
+
+
+def _inertial(
+    mass: float, center: np.ndarray, inertia: np.ndarray, more: Iterable[Element] = ()
+) -> Element:
+    entries = nodes(**inertia_entries(inertia))
+    pose = _pose(center, np.eye(3))
+    return node("inertial", pose, node("mass", mass), node("inertia", *entries), *more)
 
 
 def _material(rgb: tuple[float, float, float]) -> Element:
@@ -240,7 +188,7 @@ def _link(robot: Robot, links: tuple[Link, ...], link: Link, meshes: str) -> Ite
         yield node(
             "link",
             _pose(position + rotation @ part.position, rotation @ part.rotation),
-            _inertial(_spread_of(part.part), *_carried(robot, part)),
+            _inertial(*moments(part_spread(part.part)), _carried(robot, part)),
             node("visual", mesh, _material(part.rgb), name="visual"),
             *_collision(robot, part),
             name=part.name,
@@ -278,12 +226,9 @@ def _collision(robot: Robot, part: PlacedPart) -> Iterator[Element]:
 def _rotor(part: PlacedPart, name: str) -> Iterator[Element]:
     """A propeller that turns about the thrust's axis, for Gazebo's thruster to push at."""
     assert part.part.thruster is not None
-    spread, _ = _propeller(part.part)
-    center = spread[:3, 3] / spread[3, 3]
-    shift = np.eye(4)
-    shift[:3, 3] = -center
+    mass, center, inertia = moments(propeller(part.part)[0])
     pose = _pose(center, np.eye(3), relative_to=part.name)
-    yield node("link", pose, _inertial(shift @ spread @ shift.T), name=name)
+    yield node("link", pose, _inertial(mass, np.zeros(3), inertia), name=name)
     axis = node("axis", node("xyz", part.part.thruster.axis))
     ends = nodes(parent=part.name, child=name)
     yield node("joint", *ends, axis, name=f"{name}_joint", type="revolute")
@@ -378,7 +323,7 @@ def _thruster(robot: Robot, part: PlacedPart) -> Element:
         "Thruster",
         joint_name=f"{part.name}_propeller_joint",
         fluid_density=robot.world.density,
-        propeller_diameter=_propeller(part.part)[1],
+        propeller_diameter=propeller(part.part)[1],
         thrust_coefficient=-coefficient if thruster.torque_ratio < 0 else coefficient,
         velocity_control=True,
         max_thrust_cmd=float(high),
