@@ -2,8 +2,8 @@
 
     python docs/reference.py build/docs
 
-`index.html` is the README; every `docs/*.md` becomes a page; each module has one below
-`mjx_revolve/`, in the reading order of the README's table. Made by pdoc.
+`index.html` is the README; every `docs/*.md` becomes a page; each room of the package and each
+module has one below `mjx_revolve/`, in reading order. Made by pdoc.
 """
 
 from __future__ import annotations
@@ -25,6 +25,11 @@ DOCS = ROOT / "docs"
 PACKAGE = "mjx_revolve"
 # The order in which a user meets the pages; those not named here follow.
 FIRST = ("tutorial", "viewer", "replay", "report", "interchange", "physics", "parallel")
+# The package's rooms in reading order: each imports only from itself and from those before it.
+ROOMS = (
+    "inputs", "numerics", "body", "water", "engine", "control", "episodes", "evolution", "formats",
+    "view",
+)  # fmt: skip
 
 _DOT = r'((?:</span><span class="o">)?\.(?:</span><span class="n">)?)'
 # What Python says of values and types, and what is meant.
@@ -45,25 +50,27 @@ def list_pages() -> list[Path]:
     return sorted(DOCS.glob("*.md"), key=lambda path: (place.get(path.stem, 99), path.stem))
 
 
-def list_modules() -> dict[str, list[str]]:
-    """All public modules by the idea that the README's table gives their row, in its order."""
+def list_rooms() -> dict[str, list[str]]:
+    """The full names of all public modules by room, in reading order; the commands come last."""
     package = importlib.import_module(PACKAGE)
-    names = [m.name for m in pkgutil.iter_modules(package.__path__) if not m.name.startswith("_")]
-    groups: dict[str, list[str]] = {}
-    placed: set[str] = set()
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    for files, idea in re.findall(r"^\| (`.*?\.py`.*?) \| (.*?) \|$", text, re.MULTILINE):
-        wanted = re.findall(r"`(\w+\*?)\.py`", files)
-        found = [
-            name
-            for want in wanted
-            for name in names
-            if (name == want or (want.endswith("*") and name.startswith(want[:-1])))
-        ]
-        groups[idea] = [name for name in dict.fromkeys(found) if name not in placed]
-        placed.update(found)
-    groups["others"] = [name for name in names if name not in placed]
-    return {idea: found for idea, found in groups.items() if found}
+    rooms: dict[str, list[str]] = {room: [] for room in ROOMS}
+    commands = []
+    for found in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."):
+        _, room, *rest = found.name.split(".")
+        if any(part.startswith("_") for part in (room, *rest)):
+            continue
+        if rest:
+            rooms.setdefault(room, []).append(found.name)
+        elif not found.ispkg:
+            commands.append(found.name)
+    return rooms | {"": commands}
+
+
+def idea_of(room: str) -> str:
+    """The first line of a room's docstring; "" is the front door."""
+    if not room:
+        return "What users type: arguments in, messages out."
+    return (importlib.import_module(f"{PACKAGE}.{room}").__doc__ or "").partition("\n")[0]
 
 
 def link_text(text: str, modules: list[str]) -> str:
@@ -73,13 +80,13 @@ def link_text(text: str, modules: list[str]) -> str:
         name = match[1]
         if (DOCS / f"{name}.md").is_file() and match[0].startswith("`docs/"):
             return f"[{match[0]}]({name}.html)"
-        if name in modules and match[0].startswith("`mjx_revolve/"):
+        if f"{PACKAGE}.{name.replace('/', '.')}" in modules and match[0].endswith(".py`"):
             return f"[{match[0]}]({PACKAGE}/{name}.html)"
         return match[0]
 
     parts = re.split(r"(^```.*?^```$)", text, flags=re.MULTILINE | re.DOTALL)
     for k in range(0, len(parts), 2):  # not inside blocks
-        parts[k] = re.sub(r"`(?:docs|mjx_revolve)/(\w+)\.(?:md|py)`", link, parts[k])
+        parts[k] = re.sub(r"`(?:docs|mjx_revolve)/([\w/]+)\.(?:md|py)`", link, parts[k])
         parts[k] = re.sub(r"\]\(docs/([\w.]+)\)", r"](\1)", parts[k])
         parts[k] = re.sub(r"\]\((\w+)\.md(#[\w-]+)?\)", r"](\1.html\2)", parts[k])
     return "".join(parts)
@@ -120,8 +127,8 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     import pdoc.doc
     import pdoc.render
 
-    groups = list_modules()
-    modules = [name for found in groups.values() for name in found]
+    rooms = list_rooms()
+    modules = [name for found in rooms.values() for name in found]
     package = importlib.import_module(PACKAGE)
     for name in package.__all__:  # they are imported when they are first used
         getattr(package, name)
@@ -131,7 +138,7 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
         name: pdoc.doc.Module(make_page(name, link_text(path.read_text(encoding="utf-8"), modules)))
         for name, (_, path) in pages.items()
     }
-    for name in [PACKAGE, *(f"{PACKAGE}.{name}" for name in modules)]:
+    for name in [PACKAGE, *(f"{PACKAGE}.{room}" for room in rooms if room), *modules]:
         module = importlib.import_module(name)
         mend_tuples(module)
         documents[name] = pdoc.doc.Module(module)
@@ -141,7 +148,9 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
         template_directory=DOCS / "pages",
     )
     pdoc.render.env.globals["prose"] = [(name, title) for name, (title, _) in pages.items()]
-    pdoc.render.env.globals["groups"] = list(groups.items())
+    pdoc.render.env.globals["rooms"] = [
+        (room, idea_of(room), found) for room, found in rooms.items()
+    ]
     written = []
     with warnings.catch_warnings(record=True) as complaints:
         warnings.simplefilter("always", UserWarning)

@@ -150,20 +150,19 @@ def make_bare(job: dict[str, Any]) -> Case:
             engine,
             lambda state, time, row, sense: (state, ctrl),
             flow_at(robot.world, water_of(world)),
-            lambda state, ctrl, energy: (),
+            lambda state, ctrl, energy, water: (),
             engine.init(qpos, qvel),
             (),
             None,
             records=steps // 20,
             every=20,
             timestep=world.timestep,
-            mode="fused",
         )
         return jnp.stack(state.position)
 
     run = jax.jit(over_chunks(chunk), compiler_options=compiler_options())
     qpos = jnp.tile(jnp.asarray(robot.start_qpos(DEPTH), jnp.float32)[:, None], (1, count))
-    low, high = robot.mj_model.actuator_ctrlrange[engine.order].T[:, :, None]
+    low, high = engine.plant.low, engine.plant.high
     share = jax.random.uniform(jax.random.key(0), (robot.num_hinges, count))
     ctrl = jnp.asarray(low + (high - low) * share, jnp.float32)
     return lambda: jax.block_until_ready(run(qpos, ctrl)), count * steps
@@ -174,7 +173,6 @@ def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
     import numpy as np
 
     from mjx_revolve import build_robot, load_morphology, load_world
-    from mjx_revolve.episodes.fitness import reach_below
     from mjx_revolve.water.bed import bed_height
 
     fields = dict(PHYSICS[job["physics"]])

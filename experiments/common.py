@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from mjx_revolve.inputs.commands import Parser
@@ -55,24 +54,3 @@ def shown(path: Path) -> str:
     """A path as a user would type it."""
     path = path.resolve()
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
-
-
-def align(rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """Rows of text as an aligned table.
-
-    Args:
-        rows: of equal length; the first holds the headings, the second their units.
-        left: how many columns, from the first, are aligned to the left.
-
-    Returns:
-        The table, lines joined.
-    """
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [
-            cell.ljust(width) if k < left else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)

@@ -19,7 +19,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.common import ROOT, align, make_folder, make_parser, shown
+from experiments.common import ROOT, make_folder, make_parser, shown
+from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.plots import figure_png
@@ -511,7 +512,7 @@ def main(argv: list[str] | None = None) -> int:
             for kind, heights in data.items()
         }
     print(f"The spider, dropped {DROP} m above the water\n")
-    print(align(table(falls, still, readings)))
+    print("\n".join(align(table(falls, still, readings))))
     print()
     if data is None:
         print("The thesis's data are not here: its columns stay empty, and it is not in the plot.")

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common import ROOT, align, make_folder, make_parser, shown
+from experiments.common import ROOT, make_folder, make_parser, shown
+from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command, whole
 
 SEED = 0
@@ -253,7 +254,7 @@ def main(argv: list[str] | None = None) -> int:
         rows.append((o.name, f"{o.score:.3f}", f"{o.fresh:.3f}", f"{o.evaluations}", f"{rate:.0f}"))
     task = CONFIG["task"]
     print(f"Spider, neutral, lake: {task['type']}, {task['duration']:g} s\n")
-    print(align(rows))
+    print("\n".join(align(rows)))
     print(
         f"\nKeeping still scores {abs(still):.3f}. Fresh starts: the mean over {FRESH}. Speeds "
         "include compiling the optimiser's own functions, not the fitness."

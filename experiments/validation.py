@@ -13,7 +13,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.common import align, make_folder, make_parser, shown
+from experiments.common import make_folder, make_parser, shown
+from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.view.plots import figure_png
 
@@ -69,7 +70,7 @@ def main(argv: list[str] | None = None) -> int:
             numbers = (row.expected, row.found, abs(row.found - row.expected), row.tolerance)
             cells = tuple(f"{np.float64(x):.4g}" for x in numbers)
             table.append((name, row.what, *cells, row.unit, "ok" if row.passed else "FAILS"))
-    print(align(table, left=2))
+    print("\n".join(align(table, left=(0, 1))))
     with (folder / "validation.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([row for row in table if any(row)])
     written = "validation.csv"

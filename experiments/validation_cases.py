@@ -19,9 +19,10 @@ from scipy.spatial import ConvexHull
 from experiments.common import ROOT
 from mjx_revolve.body.module_types import Box, ModuleType, Part, Thruster
 from mjx_revolve.body.morphology import Module, Morphology, load_morphology
-from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.engine.step import acceleration
 from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.engine.step import robot_acceleration
 from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.numerics.xla import on_cpu
@@ -136,7 +137,7 @@ def march(
             engine,
             lambda state, time, row, sense: (state, ctrl),
             flow_at(robot.world, water_of(robot.world)),
-            lambda state, ctrl, energy: engine.observe(state),
+            lambda state, ctrl, energy, water: engine.observe(state),
             engine.init(qpos, qvel),
             (),
             None,
@@ -147,7 +148,8 @@ def march(
 
     with jax.enable_x64(True):
         ctrl = np.zeros((robot.mj_model.nu, qpos.shape[1])) if ctrl is None else ctrl
-        arrays = [jnp.asarray(x, jnp.float64) for x in (qpos, qvel, np.asarray(ctrl)[engine.order])]
+        asked = engine.plant.arrange(jnp.asarray(ctrl, jnp.float64)[actuators_of(robot)])
+        arrays = [*(jnp.asarray(x, jnp.float64) for x in (qpos, qvel)), asked]
         qs, vs = jax.jit(run, compiler_options=QUICK)(*arrays)
         return dt * every * np.arange(1, records + 1), np.asarray(qs), np.asarray(vs)
 
@@ -156,7 +158,7 @@ def accelerate(robot: Robot, qpos: Any, qvel: Any) -> np.ndarray:
     """`[nv, lanes]` acceleration."""
     with jax.enable_x64(True):
         ctrl = jnp.zeros((robot.mj_model.nu, qpos.shape[1]))
-        found = acceleration(
+        found = robot_acceleration(
             robot, jnp.asarray(qpos), jnp.asarray(qvel), ctrl, water_of(robot.world)
         )
         return np.asarray(found)

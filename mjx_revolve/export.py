@@ -11,9 +11,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from mjx_revolve.inputs.commands import (
     Parser,
@@ -26,82 +24,13 @@ from mjx_revolve.inputs.commands import (
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 
-if TYPE_CHECKING:
-    from mjx_revolve.engine.robot import Robot
-    from mjx_revolve.episodes.champion import Episode
-    from mjx_revolve.episodes.simulate import Trajectory
-
-# Formats: what their files are called in a folder, and what they may end in.
-_FILES = {"mjcf": "robot.xml", "urdf": "robot.urdf", "sdf": "robot.sdf", "mcap": "rollout.mcap"}
-_ENDINGS = {"mjcf": (".xml",), "urdf": (".urdf",), "sdf": (".sdf", ".world"), "mcap": (".mcap",)}
-
-# Where meshes go, beside the files that name them.
-_MESHES = "meshes"
-
-
-def export(
-    robot: Robot,
-    files: dict[str, Path],
-    trajectory: Trajectory | None = None,
-    meshes: str | None = None,
-) -> list[tuple[Path, str]]:
-    """Writes a robot, and what it did, for other programs.
-
-    Each file appears whole or not at all; files that are there are replaced.
-
-    Args:
-        robot: from `build_robot`.
-        files: by format ("mjcf", "urdf", "sdf", "mcap"), where each goes. URDF and SDF have their
-            meshes in a folder `meshes` beside them.
-        trajectory: what it did; MJCF and SDF start where it starts, and "mcap" cannot do without.
-        meshes: what URDF and SDF call that folder; by default `meshes/`, as seen from the file.
-
-    Returns:
-        The files, and what each is, in words.
-
-    Raises:
-        InputError: there is no trajectory for a bag, nothing of it is finite, or the package that
-            writes bags is missing.
-        OSError: a file cannot be written.
-    """
-    import numpy as np
-
-    from mjx_revolve.formats.links import make_links, make_meshes
-    from mjx_revolve.formats.mjcf import make_mjcf
-    from mjx_revolve.formats.sdf import make_sdf
-    from mjx_revolve.formats.urdf import make_urdf
-    from mjx_revolve.inputs.files import write_atomic
-
-    done: list[tuple[Path, str]] = []
-    start = None if trajectory is None else np.asarray(trajectory.qpos)[0]
-    if start is not None and not np.isfinite(start).all():
-        start = None
-    prefix = f"{_MESHES}/" if meshes is None else meshes
-    makers: dict[str, tuple[Callable[[], str], str]] = {
-        "mjcf": (lambda: make_mjcf(robot, start), "MJCF; opens in stock MuJoCo"),
-        "urdf": (lambda: make_urdf(robot, prefix), "URDF; meshes beside it"),
-        "sdf": (lambda: make_sdf(robot, prefix, start), "SDF world for Gazebo; meshes beside it"),
-    }
-    for name, (make, words) in makers.items():
-        if name in files:
-            write_atomic(files[name], make().encode())
-            done.append((files[name], words))
-    shapes = make_meshes(robot.morphology)
-    for folder in {files[name].parent / _MESHES for name in ("urdf", "sdf") if name in files}:
-        for name, mesh in shapes.items():
-            content: Any = mesh.export(file_type="stl")
-            write_atomic(folder / f"{name}.stl", content)
-        done.append((folder, f"{len(shapes)} meshes (STL, m)"))
-    if "mcap" in files:
-        from mjx_revolve.formats.ros_bag import pick_rows, write_bag
-
-        if trajectory is None:
-            raise InputError("mcap: expected a trajectory; found none")
-        write_bag(robot, trajectory, files["mcap"])
-        rows, stamps = pick_rows(robot, trajectory)
-        words = f"ROS 2 bag: {stamps[-1] / 1e9:.4g} s, {len(rows)} poses"
-        done.append((files["mcap"], f"{words} of {len(make_links(robot))} links"))
-    return done
+# By option: what its file is called in a folder, what it may end in, and what it is.
+_FORMATS = {
+    "mjcf": ("robot.xml", (".xml",), "for stock MuJoCo"),
+    "urdf": ("robot.urdf", (".urdf",), "for ROS"),
+    "sdf": ("robot.sdf", (".sdf", ".world"), "a world for Gazebo, with the water"),
+    "mcap": ("rollout.mcap", (".mcap",), "the rollout, as a ROS 2 bag"),
+}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -111,10 +40,8 @@ def _parser() -> argparse.ArgumentParser:
         "into a folder, or those that are given a file.",
     )
     add_episode_arguments(parser)
-    parser.add_argument("--mjcf", metavar="FILE.xml", help="for stock MuJoCo")
-    parser.add_argument("--urdf", metavar="FILE.urdf", help="for ROS")
-    parser.add_argument("--sdf", metavar="FILE.sdf", help="a world for Gazebo, with the water")
-    parser.add_argument("--mcap", metavar="FILE.mcap", help="the rollout, as a ROS 2 bag")
+    for name, (_, endings, words) in _FORMATS.items():
+        parser.add_argument(f"--{name}", metavar=f"FILE{endings[0]}", help=words)
     parser.add_argument(
         "--out",
         type=read_path,
@@ -131,14 +58,18 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _all_files(folder: Path) -> dict[str, Path]:
+    """The files of all formats in a folder."""
+    return {name: folder / file for name, (file, _, _) in _FORMATS.items()}
+
+
 def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
     """The files that were asked for by name."""
     files = {}
-    for name, endings in _ENDINGS.items():
-        given = getattr(arguments, name)
-        if given is None:
+    for name, (_, endings, _) in _FORMATS.items():
+        if getattr(arguments, name) is None:
             continue
-        path = Path(given)
+        path = files[name] = Path(getattr(arguments, name))
         if path.suffix.lower() not in endings:
             raise InputError(
                 f"--{name} {path}: expected a name that ends in {' or '.join(endings)}; found "
@@ -147,7 +78,6 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
         if path.is_dir():
             raise InputError(f"--{name} {path}: expected a file; found a folder")
         check_place(path, f"--{name} {path}")
-        files[name] = path
     if arguments.out is None:
         return files
     if files:
@@ -156,18 +86,7 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: expected a folder; found a file")
     check_place(folder / "any", f"--out {folder}")
-    return {name: folder / file for name, file in _FILES.items()}
-
-
-def _usual_files(episode: Episode) -> dict[str, Path]:
-    """Where files go that were given no name: never over what is there."""
-    if episode.folder is not None:
-        folder = Path(os.path.normpath(episode.folder / "export"))
-    else:
-        folder = Path(f"{Path(episode.robot.morphology.name).name}_export")
-    if folder.exists():
-        raise InputError(f"{folder}: expected no such folder yet; name it with --out to replace it")
-    return {name: folder / file for name, file in _FILES.items()}
+    return _all_files(folder)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -189,12 +108,21 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare_process()
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episodes.champion import load_episode
+    from mjx_revolve.formats.export import export_robot
     from mjx_revolve.formats.ros_bag import check_rosbags
 
     if arguments.mcap is not None:
         check_rosbags()
     episode = load_episode(arguments.path, arguments.world, arguments.duration, arguments.seed)
-    files = files or _usual_files(episode)
+    if not files:  # never over what is there
+        folder = Path(f"{Path(episode.robot.morphology.name).name}_export")
+        if episode.folder is not None:
+            folder = Path(os.path.normpath(episode.folder / "export"))
+        if folder.exists():
+            raise InputError(
+                f"{folder}: expected no such folder yet; name it with --out to replace it"
+            )
+        files = _all_files(folder)
     lacking = None
     if arguments.mcap is None and "mcap" in files:
         try:
@@ -202,7 +130,7 @@ def main(argv: list[str] | None = None) -> int:
         except InputError as error:  # the other formats do not need it
             lacking = error
             del files["mcap"]
-    for path, words in export(episode.robot, files, episode.trajectory, arguments.meshes):
+    for path, words in export_robot(episode.robot, files, episode.trajectory, arguments.meshes):
         print(f"{path}: {words}")
     if lacking is not None:
         print(f"no bag: {lacking}", file=sys.stderr)

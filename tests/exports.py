@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from functools import lru_cache
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from laboratory import body
-from mjx_revolve.body.morphology import load_morphology
+from laboratory import body, read
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.simulate import Trajectory
@@ -50,11 +47,7 @@ NAMES = ("spider", "auv", "fish", "centipede", "odd")
 @lru_cache
 def odd_episode() -> Episode:
     """The odd one for 0.6 s, its arms waving; stepped by MuJoCo, which has nothing to compile."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "odd.yaml"
-        path.write_text(ODD)
-        morphology = load_morphology(path)
-    robot = build_robot(morphology, load_world("lake"))
+    robot = build_robot(read(ODD), load_world("lake"))
     data = mujoco.MjData(robot.mj_model)
     data.qpos[:] = robot.start_qpos()
     data.qvel[:6] = [0.3, -0.2, 0.5, 1.0, 2.0, -0.5]

@@ -18,9 +18,9 @@ import numpy as np
 from mjx_revolve.body.module_types import Box, ModuleType, Part
 from mjx_revolve.body.morphology import Module, Morphology, load_morphology
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.levels import make_levels
+from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.engine.step import acceleration, level_plant
+from mjx_revolve.engine.step import robot_acceleration
 from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.numerics.xla import on_cpu, share_once
 from mjx_revolve.water.flow import water_of
@@ -117,12 +117,9 @@ USUAL = _USUAL if on_cpu() else None  # as users compile
 
 @lru_cache(maxsize=64)
 def _accelerator(robot: Robot, still: bool):
-    levels = make_levels(robot)
-    plant, own = level_plant(levels), np.array([*robot.servos, *robot.thrusters], int)
-
     def run(qpos, qvel, ctrl, water):
         water = water_of(robot.world) if still else water
-        return acceleration(levels, qpos, qvel, plant.arrange(ctrl[own]), water)
+        return robot_acceleration(robot, qpos, qvel, ctrl, water)
 
     return jax.jit(share_once(run), compiler_options=QUICK)
 
@@ -193,7 +190,7 @@ def march(
         kind = jnp.float64 if x64 else jnp.float32
         lanes = np.shape(qpos)[-1]
         ctrl = np.zeros((robot.mj_model.nu, lanes)) if ctrl is None else ctrl
-        own = np.asarray(ctrl)[[*robot.servos, *robot.thrusters]]
+        own = np.asarray(ctrl)[actuators_of(robot)]
         asked = make_engine(robot, engine).plant.arrange(jnp.asarray(own, kind))
         arrays = [*(jnp.asarray(x, kind) for x in (qpos, qvel)), asked]
         run = _marcher(robot, records, every, engine, water is None)

@@ -8,19 +8,19 @@ import pkgutil
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import mjx_revolve
+from laboratory import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
-MODULES = [m.name for m in pkgutil.iter_modules(mjx_revolve.__path__) if m.name[0] != "_"]
+FOUND = [m.name for m in pkgutil.walk_packages(mjx_revolve.__path__, "mjx_revolve.")]
+MODULES = [name for name in FOUND if "._" not in name]
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_every_public_name_has_a_docstring(name):
-    module = importlib.import_module(f"mjx_revolve.{name}")
+    module = importlib.import_module(name)
     assert (module.__doc__ or "").strip()
     for key, value in vars(module).items():
         ours = getattr(value, "__module__", None) == module.__name__
@@ -47,8 +47,9 @@ def site(tmp_path_factory):
 @pytest.mark.slow
 def test_every_module_and_every_promised_name_has_its_place(site):
     for name in MODULES:
-        text = (site / "mjx_revolve" / f"{name}.html").read_text()
-        assert f'href="../mjx_revolve/{name}.html"' in text  # in its own table of contents
+        place = f"{name.replace('.', '/')}.html"
+        text = (site / place).read_text()
+        assert f'href="{"../" * name.count(".")}{place}"' in text  # in its own table of contents
     front = (site / "mjx_revolve.html").read_text()
     for name in mjx_revolve.__all__:
         assert f'<section id="{name}">' in front, name
@@ -56,6 +57,25 @@ def test_every_module_and_every_promised_name_has_its_place(site):
         if inspect.isfunction(value):
             home = (site / f"{value.__module__.replace('.', '/')}.html").read_text()
             assert f'<section id="{name}">' in home
+
+
+@pytest.mark.slow
+def test_rooms_are_listed_in_the_order_in_which_they_are_imported(site):
+    """Each room in the table of contents, with its idea; none imports from those behind it."""
+    front = (site / "index.html").read_text()
+    listed = re.findall(
+        r'<p class="idea">\s*<a href="mjx_revolve/(\w+)\.html">.*?</a>\s*(\S)', front
+    )
+    rooms = [room for room, _ in listed]
+    assert {*rooms} == {name.split(".")[1] for name in MODULES if name.count(".") > 1}
+    for name in MODULES:
+        room = name.split(".")[1]
+        if room not in rooms:  # a command
+            continue
+        behind = rooms[rooms.index(room) + 1 :]
+        code = inspect.getsource(importlib.import_module(name))
+        for other in re.findall(r"^\s*(?:from|import) mjx_revolve\.(\w+)", code, re.MULTILINE):
+            assert other not in behind, f"{name} imports from {other}"
 
 
 @pytest.mark.slow

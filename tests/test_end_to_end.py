@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
+from laboratory import ROOT
+
 # What the clock writes; everything else is reproducible.
 CLOCK = {"seconds", "evaluations_per_second"}
 

@@ -15,7 +15,6 @@ import struct
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +22,7 @@ import numpy as np
 import pytest
 
 import toys
-from laboratory import XLA_FLAGS
+from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.config import EvolutionConfig
 from mjx_revolve.evolution import loop, progress, runs
@@ -38,7 +37,6 @@ from mjx_revolve.evolution.strategies import (
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[1]
 # In metrics.csv, all but these is reproducible.
 CLOCK = ("seconds", "evaluations_per_second")
 

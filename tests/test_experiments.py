@@ -1,7 +1,8 @@
 """The experiments: their closed forms, what they read from the thesis's data, their options."""
 
+import contextlib
+import io
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from experiments.falling_spider import (
     TICK,
     acceleration,
     closed_form,
-    fall,
     fit,
     load_thesis,
     mean_acceleration,
@@ -21,11 +21,10 @@ from experiments.falling_spider import (
     read_tables,
     row_ticks,
 )
-from laboratory import QUICK
+from laboratory import QUICK, ROOT
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[1]
 THESIS = ROOT.parent / "shared" / "thesis"
 SHARE = 0.93818  # ρ V / m of the spider
 
@@ -56,12 +55,23 @@ def test_the_closed_forms_height_and_time_are_inverse():
     assert speeds[0] == pytest.approx(speeds[1], rel=1e-5)
 
 
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    """The experiment's folder, what it printed, and its falls; compiled cheaply."""
+    folder, falls, fall = tmp_path_factory.mktemp("falls"), [], falling_spider.fall
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
+        patch.setattr(falling_spider, "fall", lambda *run: falls.append(fall(*run)) or falls[-1])
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            assert falling_spider.main(["--out", str(folder)]) == 0
+    return folder, printed.getvalue(), dict(zip(RUNS, falls, strict=True))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("run", "expected"), [("air", 9.81), ("mask", 0.60648)])
-def test_the_spider_falls_as_fast_as_it_must(monkeypatch, run, expected):
-    # The compiler's optimisations cost more than they save here.
-    monkeypatch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
-    assert acceleration(fall(RUNS[run][0], 1.5)) == pytest.approx(expected, abs=1e-4)
+def test_the_spider_falls_as_fast_as_it_must(experiment, run, expected):
+    _, _, falls = experiment
+    assert acceleration(falls[run]) == pytest.approx(expected, abs=1e-4)
 
 
 def test_a_parabola_gives_its_own_acceleration_back():
@@ -118,13 +128,12 @@ def test_heights_that_are_none_are_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_falling_spider_writes_its_table_and_its_plot(tmp_path, capsys):
-    assert falling_spider.main(["--out", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
+def test_falling_spider_writes_its_table_and_its_plot(experiment):
+    folder, printed, _ = experiment
     for line in ("no buoyancy (air)", "thesis's buoyancy, no drag", "default water"):
         assert line in printed
-    assert (tmp_path / "falls.png").read_bytes().startswith(b"\x89PNG")
-    rows = (tmp_path / "falls.csv").read_text().splitlines()
+    assert (folder / "falls.png").read_bytes().startswith(b"\x89PNG")
+    rows = (folder / "falls.csv").read_text().splitlines()
     assert rows[0] == "time_s,air_m,mask_m,partial_m,default_m"
     # Drag ends the fall in the default water at the speed of the closed form.
     last, before = (float(row.split(",")[-1]) for row in (rows[-1], rows[-201]))
@@ -243,7 +252,10 @@ def test_each_library_maximises(name):
 
 
 @pytest.mark.slow
-def test_the_three_optimisers_share_one_fitness():
+def test_the_three_optimisers_share_one_fitness(monkeypatch):
+    # Half the hinges, half the time to compile.
+    fish = str(ROOT / "morphologies" / "fish.yaml")
+    monkeypatch.setitem(optimisers.CONFIG, "morphology", fish)
     outcomes, still = optimisers.optimise(300)
     assert still == pytest.approx(0.0, abs=0.02)
     assert len({outcome.evaluations for outcome in outcomes}) == 1

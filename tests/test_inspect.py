@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
+from laboratory import ROOT
 from mjx_revolve import inspect
 from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.body.table import module_table, summary, thruster_table
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def _leg() -> dict:
@@ -74,7 +74,7 @@ def test_the_spider_weighs_what_the_thesis_says(spider, capsys):
 
 
 def test_the_table_is_aligned_with_units_in_its_header(spider):
-    lines = inspect.module_table(load_morphology(spider))
+    lines = module_table(load_morphology(spider))
     assert len(lines) == 2 + 17
     assert lines[0].split() == [
         "#", "name", "type", "parent", "slot", "turn", "x", "y", "z", "mass", "volume"
@@ -115,7 +115,7 @@ def _density(arguments: tuple[str, str]) -> float:
 
 def test_a_neutral_robot_is_called_neutral(spider):
     body = load_morphology(spider)
-    assert any("(neutral)" in line for line in inspect.summary(body, body.mass / body.volume))
+    assert any("(neutral)" in line for line in summary(body, body.mass / body.volume, 9.81))
 
 
 def test_descriptors_are_listed(spider, capsys):
@@ -130,7 +130,7 @@ def test_thrusters_are_listed_with_what_they_do(capsys):
     out = capsys.readouterr().out
     assert (_value(out, "thrusters"), _value(out, "fins"), _value(out, "hinges")) == (4, 0, 0)
     assert "(neutral)" in out
-    lines = inspect.thruster_table(load_morphology(ROOT / "morphologies" / "auv.yaml"))
+    lines = thruster_table(load_morphology(ROOT / "morphologies" / "auv.yaml"))
     assert len(lines) == 2 + 4 and all(line in out for line in lines)
     assert [line.split()[1:] for line in lines[2:]] == [
         ["bow", "0.00000", "0.05950", "0.00000", "0", "0", "1", "-0.5", "0.5", "0.1", "0.0035"],
@@ -144,7 +144,7 @@ def test_thrusters_are_listed_with_what_they_do(capsys):
 def test_centres_of_mass_and_volume_are_shown(spider, capsys):
     assert run(spider) == 0
     out = capsys.readouterr().out
-    assert "centre of mass at rest" in out and inspect.thruster_table(load_morphology(spider)) == []
+    assert "centre of mass at rest" in out and thruster_table(load_morphology(spider)) == []
     assert run(ROOT / "morphologies" / "fish.yaml") == 0
     out = capsys.readouterr().out
     (mass,), (volume,) = (
@@ -275,11 +275,16 @@ def test_drawing_leaves_matplotlib_alone():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--density", "heavy"), "--density: expected a number > 0 [kg/m3]; found 'heavy'"),
-        (("--density", "0"), "--density: expected a number > 0 [kg/m3]; found 0.0"),
-        (("--density", "nan"), "--density: expected a number > 0 [kg/m3]; found nan"),
-        (("--gravity", "-9.81"), "--gravity: expected a number > 0 [m/s2]; found -9.81"),
-        (("--gravity", "inf"), "--gravity: expected a number > 0 [m/s2]; found inf"),
+        (("--density", "heavy"),
+         "--density: expected a number > 0 [kg/m3]; found 'heavy' (see --help)"),
+        (("--density", "0"),
+         "--density: expected a number > 0 [kg/m3]; found '0' (see --help)"),
+        (("--density", "nan"),
+         "--density: expected a number > 0 [kg/m3]; found 'nan' (see --help)"),
+        (("--gravity", "-9.81"),
+         "--gravity: expected a number > 0 [m/s2]; found '-9.81' (see --help)"),
+        (("--gravity", "inf"),
+         "--gravity: expected a number > 0 [m/s2]; found 'inf' (see --help)"),
         (("--picture", "{tmp}/none/a.png"),
          "{tmp}/none/a.png: expected the folder {tmp}/none to exist; found none"),
         (("--picture", "{tmp}/a.jpg"), "{tmp}/a.jpg: expected a name that ends in .png; found "

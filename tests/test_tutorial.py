@@ -17,17 +17,16 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 import yaml
 
+from laboratory import ROOT
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.view.report.data import read_run
 
-ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "docs" / "tutorial.md").read_text()
 QUICKLY = "--xla_cpu_use_fusion_emitters=false"
 BLOCK = re.compile(r"(?:^`([^`\n]+)`:\n\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

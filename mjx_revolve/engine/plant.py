@@ -145,6 +145,11 @@ class Plant:
         return jnp.broadcast_to(x, (self.num_rows, *like.shape[1:])).astype(like.dtype)
 
 
+def actuators_of(robot: Robot) -> np.ndarray:
+    """`[nu]` MuJoCo's actuators in the robot's own order: hinges, then thrusters."""
+    return np.array([*robot.servos, *robot.thrusters], int)
+
+
 def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
     """The plant of a robot.
 
@@ -156,7 +161,7 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
     Returns:
         Its table, `[n, 1]`.
     """
-    m, own = robot.mj_model, [*robot.servos, *robot.thrusters]
+    m, own = robot.mj_model, actuators_of(robot).tolist()
     rows = np.asarray(own if order is None else order, int)
     source = np.array([own.index(k) for k in rows], np.int32)
     row = {int(k): i for i, k in enumerate(source)}

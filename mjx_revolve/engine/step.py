@@ -25,7 +25,7 @@ from mjx_revolve.engine.contact import bed_on_level
 from mjx_revolve.engine.hydrodynamics import Outer, forces_on_parts, water_on_level
 from mjx_revolve.engine.level import Hinges, Level
 from mjx_revolve.engine.levels import Levels, make_levels
-from mjx_revolve.engine.plant import Plant, plant_of
+from mjx_revolve.engine.plant import Plant, actuators_of, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep
 from mjx_revolve.engine.rows import Rows
 from mjx_revolve.engine.servos import end_stop, servo
@@ -765,6 +765,15 @@ def level_plant(levels: Levels) -> Plant:
     robot = levels.robot
     hinges = [robot.servos[k] for k in levels.hinge_order]
     return plant_of(robot, [*hinges, *robot.thrusters])
+
+
+def robot_acceleration(
+    robot: Robot, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, water: Water
+) -> jax.Array:
+    """The same for one robot, its `[nu, lanes]` ctrl in MuJoCo's order."""
+    levels = make_levels(robot)
+    asked = level_plant(levels).arrange(ctrl[actuators_of(robot)])
+    return acceleration(levels, qpos, qvel, asked, water)
 
 
 def acceleration(

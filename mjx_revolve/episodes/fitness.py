@@ -26,7 +26,7 @@ from mjx_revolve.control.controller import Controller, bind_genes, gene_places
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.batch import Bodies, Capacity, fit_capacity, pack_bodies
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.plant import Plant, figure_of, plant_of
+from mjx_revolve.engine.plant import Plant, actuators_of, figure_of, plant_of
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.step import Engine
 from mjx_revolve.episodes.config import Config, load_config, make_config
@@ -153,8 +153,7 @@ class Fitness:
             state = self.engine.init(qpos, qvel)
             if command.shape[0] and hasattr(state, "command"):
                 state = state._replace(command=command)
-            own = jnp.asarray([*self.robot.servos, *self.robot.thrusters], int)
-            asked = self.engine.plant.arrange(ctrl[own]) if len(own) else ctrl
+            asked = self.engine.plant.arrange(ctrl[actuators_of(self.robot)])
             kept = make_recorder(self.engine, self.task)(state, asked, energy[:, 0], water)
             recorded = {
                 name: jnp.moveaxis(x, -1, 0)[..., None]

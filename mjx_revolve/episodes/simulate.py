@@ -13,6 +13,7 @@ import numpy as np
 from mjx_revolve.control.controller import BoundController, Controller
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_positions
+from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.episodes.starts import gusty_water
@@ -63,7 +64,7 @@ def _compiled(
     simulator = make_engine(robot, engine)
     dt = robot.world.timestep
     # MuJoCo's actuators in the robot's own order, and where each stands among the engine's rows.
-    own = np.array([*robot.servos, *robot.thrusters], int)
+    own = actuators_of(robot)
     back = np.argsort(own[simulator.plant.source[:, 0]])
 
     def run(

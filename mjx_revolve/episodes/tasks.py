@@ -100,14 +100,19 @@ def start_at_depth(settings: Any, world: World, figure: Figure, place: jax.Array
 
 
 def start_on_bed(settings: Any, world: World, figure: Figure, place: jax.Array) -> jax.Array:
-    """The lowest corner of any module 5 mm above the bed, whatever the tilt; as `start_at_depth`.
+    """The lowest corner of any module 5 mm above the bed, whatever the tilt; as `start_at_depth`."""
+    assert world.bed is not None
+    below = reach_below(settings, figure)
+    return place.at[2].set(bed_height(world.bed, place[0], place[1]) + below + 0.005)
+
+
+def reach_below(settings: Any, figure: Figure) -> Any:
+    """How far the rest pose reaches below the core's centre, in any attitude drawn [m].
 
     A tilt of three standard deviations is taken for the largest.
     """
-    assert world.bed is not None
     tilt = min(3 * settings.start_tilt, np.pi / 2)
-    below = figure.lowest * np.cos(tilt) + figure.radius * np.sin(tilt)
-    return place.at[2].set(bed_height(world.bed, place[0], place[1]) + below + 0.005)
+    return figure.lowest * np.cos(tilt) + figure.radius * np.sin(tilt)
 
 
 @dataclass(frozen=True)

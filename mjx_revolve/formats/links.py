@@ -1,16 +1,14 @@
-"""A robot as other programs see it: links, joints and shapes, with names that they all accept.
+"""A robot as other programs see it: links, joints and parts, with names that they all accept.
 
-What is welded together is one link. URDF, ROS topics and SDF take their frames from here, so that a
-transform in a bag fits the link of the same name in a URDF. MuJoCo bodies are links one to one.
+The words are URDF's. What is welded together is one link. URDF, ROS topics and SDF take their
+frames from here, so that a transform in a bag fits the link of the same name in a URDF. MuJoCo
+bodies are links one to one.
 """
 
 from __future__ import annotations
 
 import re
-import textwrap
-from collections.abc import Iterable
 from dataclasses import dataclass
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -21,6 +19,8 @@ from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.body.solids import part_mesh
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.water.bed import Bed, bed_height
+from mjx_revolve.water.world import World
 
 # The names of ROS (REP 105) for what does not move, for where a robot's odometry starts, and for
 # the robot's main part.
@@ -28,6 +28,9 @@ WORLD, ODOM, BASE = "world", "odom", "base_link"
 
 # Colour of a module whose YAML gives none: that of its geoms in the model.
 _GREY = (0.5, 0.5, 0.5)
+
+# A bed this far below the surface, or nearer, comes along [m]: a robot starts 1 m deep.
+_NEAR = 5.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,9 @@ class Joint:
         speed: largest speed of the motor [rad/s].
         damping: viscous friction [N·m·s/rad].
         stiffness: of the position servo [N·m/rad].
+        qpos: index of its angle.
+        qvel: index of its speed.
+        ctrl: index of its servo's target.
     """
 
     name: str
@@ -51,16 +57,26 @@ class Joint:
     speed: float
     damping: float
     stiffness: float
+    qpos: int
+    qvel: int
+    ctrl: int
+
+    @property
+    def limit(self) -> dict[str, float]:
+        """Angles [rad], torque [N·m] and speed [rad/s] as URDF and SDF call them."""
+        low, high = self.range
+        return {"lower": low, "upper": high, "effort": self.effort, "velocity": self.speed}
 
 
 @dataclass(frozen=True)
-class Shape:
+class PlacedPart:
     """A part of a module, placed on its link.
 
     Attributes:
         name: unique in the robot: those of module and part.
         row: of the fluid table.
         part: what it is.
+        geoms: names of its boxes in the MuJoCo model.
         mesh: name of its mesh, without suffix; equal parts share one.
         rgb: colour from 0 to 1.
         position: `[3]` of the part's frame, link frame [m].
@@ -70,6 +86,7 @@ class Shape:
     name: str
     row: int
     part: Part
+    geoms: tuple[str, ...]
     mesh: str
     rgb: tuple[float, float, float]
     position: np.ndarray
@@ -90,7 +107,7 @@ class Link:
         mass: [kg].
         center_of_mass: `[3]` link frame [m].
         inertia: `[3, 3]` about the centre of mass, link's axes [kg·m²].
-        shapes: what it is made of.
+        parts: what it is made of.
     """
 
     name: str
@@ -102,7 +119,7 @@ class Link:
     mass: float
     center_of_mass: np.ndarray
     inertia: np.ndarray
-    shapes: tuple[Shape, ...]
+    parts: tuple[PlacedPart, ...]
 
 
 def make_links(robot: Robot) -> tuple[Link, ...]:
@@ -115,31 +132,25 @@ def make_links(robot: Robot) -> tuple[Link, ...]:
         The links, in the order of MuJoCo's bodies.
     """
     model = robot.mj_model
-    servo = {int(model.actuator_trnid[k, 0]): k for k in robot.servos}
-    names = _unique(
-        [BASE] + [f"{plain(model.body(b).name)}_link" for b in range(2, model.nbody)],
-        taken={WORLD, ODOM},
-    )
-    joints = _unique([plain(model.body(b).name) for b in range(1, model.nbody)], taken={*names})
-    shapes = _make_shapes(robot, taken={*names, *joints})
+    modules = [model.body(body).name for body in range(1, model.nbody)]
+    names = _unique([BASE] + [f"{plain(name)}_link" for name in modules[1:]], taken={WORLD, ODOM})
+    joints = _unique([plain(name) for name in modules], taken={*names})
+    parts = _place_parts(robot, taken={*names, *joints})
     links = []
-    for body in range(1, model.nbody):
-        joint = int(model.body_jntadr[body])
+    for body, (name, joint) in enumerate(zip(names, joints, strict=True), 1):
         axes = matrix(model.body_iquat[body])
         links.append(
             Link(
-                name=names[body - 1],
+                name=name,
                 body=body,
                 parent=int(model.body_parentid[body]) - 1,
-                joint=_make_joint(robot, joint, servo[joint], joints[body - 1])
-                if body > 1
-                else None,
+                joint=_make_joint(robot, body, joint) if body > 1 else None,
                 position=model.body_pos[body].copy(),
                 rotation=matrix(model.body_quat[body]),
                 mass=float(model.body_mass[body]),
                 center_of_mass=model.body_ipos[body].copy(),
                 inertia=axes @ np.diag(model.body_inertia[body]) @ axes.T,
-                shapes=tuple(s for s in shapes if robot.fluid.body[s.row] == body),
+                parts=tuple(part for part in parts if robot.fluid.body[part.row] == body),
             )
         )
     return tuple(links)
@@ -152,14 +163,10 @@ def make_meshes(morphology: Morphology) -> dict[str, trimesh.Trimesh]:
         morphology: the robot's modules.
 
     Returns:
-        By the names that `Shape.mesh` has.
+        By the names that `PlacedPart.mesh` has.
     """
-    names, parts = _mesh_names(morphology), _parts(morphology)
-    found: dict[str, trimesh.Trimesh] = {}
-    for name, (module, part) in zip(names, parts, strict=True):
-        if name not in found:
-            found[name] = part_mesh(module.kind, part)
-    return found
+    drawn = dict(zip(_mesh_names(morphology), _parts(morphology), strict=True))
+    return {name: part_mesh(module.kind, part) for name, (module, part) in drawn.items()}
 
 
 def rest_pose(links: tuple[Link, ...], index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -208,58 +215,49 @@ def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
     return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
 
 
-def numbers(values: Iterable[float] | float) -> str:
-    """Numbers as XML has them: twelve digits, rounding errors around 0 left out."""
-    rounded = np.round(np.atleast_1d(np.asarray(values, np.float64)), 15) + 0.0
-    return " ".join(f"{x:.12g}" for x in rounded)
+def inertia_entries(inertia: np.ndarray) -> dict[str, float]:
+    """The entries of a `[3, 3]` inertia by the names that URDF and SDF have for them."""
+    return {f"i{'xyz'[i]}{'xyz'[j]}": inertia[i, j] for i in range(3) for j in range(i, 3)}
 
 
-def exact(values: Iterable[float] | float) -> str:
-    """Numbers as XML has them, however small: twelve digits."""
-    return " ".join(f"{x + 0.0:.12g}" for x in np.atleast_1d(np.asarray(values, np.float64)))
-
-
-def to_text(root: ElementTree.Element, comment: str) -> str:
-    """An XML document, indented.
+def near_bed(robot: Robot) -> Bed | None:
+    """The bed of a robot's world, where it is near enough to matter.
 
     Args:
-        root: of the document.
-        comment: that stands above it; a line each.
+        robot: that starts at the origin.
 
     Returns:
-        The text.
+        The bed, or None.
     """
-    ElementTree.indent(root)
-    body = ElementTree.tostring(root, encoding="unicode")
-    return f'<?xml version="1.0"?>\n{to_comment(comment)}\n{body}\n'
+    bed = robot.world.bed
+    if bed is None:
+        return None
+    deep = robot.world.surface_height - float(bed_height(bed, np.float64(0), np.float64(0)))
+    return bed if deep <= _NEAR else None
 
 
-def to_comment(text: str) -> str:
-    """An XML comment; two hyphens, which none may hold, are spread."""
-    text = text.strip("\n")
-    while "--" in text:
-        text = text.replace("--", "- -")
-    return f"<!--\n{text}\n-->"
+def missing_flow(world: World) -> list[tuple[object, str]]:
+    """What other simulators' water lacks: whether the world has it, and what it is."""
+    names = ("shear", "current_field", "gust", "waves", "surface_tension")
+    return [(getattr(world, name), f"the world's {name.replace('_', ' ')}") for name in names]
 
 
-def to_list(lines: Iterable[str]) -> str:
-    """Lines of a comment, each wrapped behind a dash."""
-    return "\n".join(
-        textwrap.fill(line, 98, initial_indent="  - ", subsequent_indent="    ") for line in lines
-    )
-
-
-def _make_joint(robot: Robot, joint: int, servo: int, name: str) -> Joint:
-    model = robot.mj_model
+def _make_joint(robot: Robot, body: int, name: str) -> Joint:
+    model, joint = robot.mj_model, int(robot.mj_model.body_jntadr[body])
     low, high = map(float, model.jnt_range[joint])
+    [servo] = [k for k in robot.servos if model.actuator_trnid[k, 0] == joint]
+    dof = int(model.jnt_dofadr[joint])
     return Joint(
         name=name,
         axis=model.jnt_axis[joint].copy(),
         range=(low, high),
         effort=float(model.actuator_forcerange[servo, 1]),
         speed=float(model.jnt_user[joint, 0]),
-        damping=float(model.dof_damping[model.jnt_dofadr[joint]]),
+        damping=float(model.dof_damping[dof]),
         stiffness=float(model.actuator_gainprm[servo, 0]),
+        qpos=int(model.jnt_qposadr[joint]),
+        qvel=dof,
+        ctrl=servo,
     )
 
 
@@ -268,22 +266,25 @@ def _parts(morphology: Morphology) -> list[tuple[Module, Part]]:
     return [(module, part) for module in morphology.modules for part in module.kind.parts]
 
 
-def _make_shapes(robot: Robot, taken: set[str]) -> list[Shape]:
+def _place_parts(robot: Robot, taken: set[str]) -> list[PlacedPart]:
     table, parts = robot.fluid, _parts(robot.morphology)
     names = _unique([plain(f"{m.name}_{p.name}") for m, p in parts], taken)
+    rows = zip(names, _mesh_names(robot.morphology), parts, strict=True)
     return [
-        Shape(
+        PlacedPart(
             name=name,
             row=row,
             part=part,
+            geoms=tuple(
+                f"{module.name}/{part.name}" + (f"/{k}" if k else "")
+                for k in range(len(part.boxes))
+            ),
             mesh=mesh,
             rgb=module.rgb if module.rgb is not None else _GREY,
             position=table.position[row],
             rotation=table.rotation[row],
         )
-        for row, (name, mesh, (module, part)) in enumerate(
-            zip(names, _mesh_names(robot.morphology), parts, strict=True)
-        )
+        for row, (name, mesh, (module, part)) in enumerate(rows)
     ]
 
 

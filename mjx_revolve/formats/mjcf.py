@@ -10,11 +10,8 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.formats.links import make_links, make_meshes, to_comment, to_list
-from mjx_revolve.water.bed import Bed, bed_height
-
-# A bed this far below the surface, or nearer, comes along [m]: a robot starts 1 m deep.
-_NEAR = 5.0
+from mjx_revolve.formats.links import Link, make_links, make_meshes, missing_flow, near_bed
+from mjx_revolve.formats.xml_text import to_comment, to_list
 
 # Groups that MuJoCo's viewer shows at first are 0 to 2.
 _SEEN, _HIDDEN = 2, 3
@@ -35,22 +32,6 @@ _NOTE = """
 """
 
 
-def near_bed(robot: Robot) -> Bed | None:
-    """The bed of a robot's world, where it is near enough to matter.
-
-    Args:
-        robot: that starts at the origin.
-
-    Returns:
-        The bed, or None.
-    """
-    bed = robot.world.bed
-    if bed is None:
-        return None
-    deep = robot.world.surface_height - float(bed_height(bed, np.float64(0), np.float64(0)))
-    return bed if deep <= _NEAR else None
-
-
 def make_mjcf(robot: Robot, start: np.ndarray | None = None) -> str:
     """The robot as MJCF of its own.
 
@@ -63,11 +44,18 @@ def make_mjcf(robot: Robot, start: np.ndarray | None = None) -> str:
     """
     spec = robot.mj_spec.copy()
     start = robot.start_qpos() if start is None else np.asarray(start, np.float64)
-    _keep_bed(robot, spec)
-    _show_meshes(robot, spec)
+    links = make_links(robot)
+    _keep_bed(robot, spec, links)
+    _show_meshes(robot, spec, links)
+    _light(robot, spec)
     # What the viewer looks at: the robot, not the bed.
     spec.stat.center, spec.stat.extent = start[:3], 1.5 * robot.morphology.length
-    water = _fill_water(robot, spec)
+    _lift(robot, spec)
+    for link in links[1:]:
+        _limit_speed(spec.joint(robot.mj_model.body(link.body).name), link)
+    if robot.world.drag != "off":
+        spec.option.density, spec.option.viscosity = robot.world.density, robot.world.viscosity
+        spec.option.wind = robot.world.current
     spec.add_key(name="start", qpos=start, ctrl=np.zeros(robot.mj_model.nu))
     spec.compile()
     note = _NOTE.format(
@@ -76,13 +64,13 @@ def make_mjcf(robot: Robot, start: np.ndarray | None = None) -> str:
         surface=robot.world.surface_height,
         seen=_SEEN,
         hidden=_HIDDEN,
-        water=to_list(water),
+        water=to_list(_water(robot)),
         missing=to_list(_missing(robot)),
     )
     return to_comment(note) + "\n" + spec.to_xml()
 
 
-def _keep_bed(robot: Robot, spec: mujoco.MjSpec) -> None:
+def _keep_bed(robot: Robot, spec: mujoco.MjSpec, links: tuple[Link, ...]) -> None:
     """Drops a bed out of reach; lets MuJoCo's solver keep the robot off one that is near."""
     bed = robot.world.bed
     if bed is None:
@@ -95,24 +83,12 @@ def _keep_bed(robot: Robot, spec: mujoco.MjSpec) -> None:
         return
     # Its priority makes the bed's friction count, not the larger of the two.
     geom.conaffinity, geom.priority, geom.friction = 1, 1, [bed.friction, 0.005, 0.0001]
-    for link in make_links(robot):
-        for shape in link.shapes:
-            for geom in _geoms_of(robot, spec, shape.row):
-                geom.contype = int(shape.part.contact)
+    for part in (part for link in links for part in link.parts):
+        for name in part.geoms:
+            spec.geom(name).contype = int(part.part.contact)
 
 
-def _geoms_of(robot: Robot, spec: mujoco.MjSpec, row: int) -> list[mujoco.MjsGeom]:
-    """The boxes of a part, as `robot.py` names them."""
-    names = [
-        (f"{module.name}/{part.name}", len(part.boxes))
-        for module in robot.morphology.modules
-        for part in module.kind.parts
-    ]
-    name, count = names[row]
-    return [spec.geom(f"{name}/{k}" if k else name) for k in range(count)]
-
-
-def _show_meshes(robot: Robot, spec: mujoco.MjSpec) -> None:
+def _show_meshes(robot: Robot, spec: mujoco.MjSpec, links: tuple[Link, ...]) -> None:
     """Adds the meshes, in the modules' colours, and hides the boxes behind them."""
     for name, mesh in make_meshes(robot.morphology).items():
         # Its inertia is never used; that of a surface exists for the thinnest of walls.
@@ -122,25 +98,29 @@ def _show_meshes(robot: Robot, spec: mujoco.MjSpec) -> None:
             userface=np.asarray(mesh.faces, np.int32).ravel(),
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
-    for link in make_links(robot):
+    for link in links:
         body = spec.body(robot.mj_model.body(link.body).name)
-        for shape in link.shapes:
-            for geom in _geoms_of(robot, spec, shape.row):
-                geom.group = _HIDDEN
+        for part in link.parts:
+            for name in part.geoms:
+                spec.geom(name).group = _HIDDEN
             quat = np.zeros(4)
-            mujoco.mju_mat2Quat(quat, np.ascontiguousarray(shape.rotation).ravel())
+            mujoco.mju_mat2Quat(quat, np.ascontiguousarray(part.rotation).ravel())
             body.add_geom(
-                name=f"{shape.name}/mesh",
+                name=f"{part.name}/mesh",
                 type=mujoco.mjtGeom.mjGEOM_MESH,
-                meshname=shape.mesh,
-                pos=shape.position,
+                meshname=part.mesh,
+                pos=part.position,
                 quat=quat,
                 mass=0.0,
-                rgba=[*shape.rgb, 1.0],
+                rgba=[*part.rgb, 1.0],
                 contype=0,
                 conaffinity=0,
                 group=_SEEN,
             )
+
+
+def _light(robot: Robot, spec: mujoco.MjSpec) -> None:
+    """The colours of water and sun, and a camera that follows from the right, behind and above."""
     spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
     spec.visual.headlight.diffuse = [0.3, 0.3, 0.3]
     spec.add_texture(
@@ -159,7 +139,6 @@ def _show_meshes(robot: Robot, spec: mujoco.MjSpec) -> None:
         diffuse=[0.5, 0.5, 0.5],
         castshadow=False,
     )
-    # From the right, behind and above.
     back = np.array([0.9, -1.3, 0.8])
     right = np.cross([0, 0, 1], back)
     spec.body(robot.mj_model.body(1).name).add_camera(
@@ -170,43 +149,15 @@ def _show_meshes(robot: Robot, spec: mujoco.MjSpec) -> None:
     )
 
 
-def _fill_water(robot: Robot, spec: mujoco.MjSpec) -> list[str]:
-    """Sets MuJoCo's fluid and lift; returns what stands for what, a line each."""
-    world = robot.world
-    lines = []
-    if _add_lift(robot, spec):
-        lines.append(
-            "the bodies whose names end in /lift weigh nothing (10 micrograms) and sit at the "
-            "centres of buoyancy; their gravcomp lifts with the weight of the displaced water"
-        )
-    if robot.num_hinges:
-        _limit_speed(robot, spec)
-        lines.append(
-            "the hinges' second damping coefficient holds them to the servos' top speed, at which "
-            "it takes all of their effort"
-        )
-    if world.drag == "off":
-        return [*lines, "there is no drag"]
-    spec.option.density, spec.option.viscosity = world.density, world.viscosity
-    spec.option.wind = world.current
-    if "ellipsoid" in robot.fluid.drag:
-        lines.append("drag and lift are MuJoCo's ellipsoid law, as it evolved with")
-    elif set(robot.fluid.drag) == {"inertia_box"}:
-        lines.append("drag is MuJoCo's inertia-box law, as it evolved with")
-    else:
-        lines.append(
-            "drag is MuJoCo's inertia-box law: one box for all modules that are welded together, "
-            "in place of the modules' own faces"
-        )
-    return lines
+def _floats(robot: Robot) -> np.ndarray:
+    """`[npart]` whether water lifts a part."""
+    laws = np.array(robot.fluid.buoyancy)
+    return (laws != "off") & (robot.fluid.volume > 0) & (robot.world.gravity != 0)
 
 
-def _add_lift(robot: Robot, spec: mujoco.MjSpec) -> bool:
+def _lift(robot: Robot, spec: mujoco.MjSpec) -> None:
     """Adds bodies at the centres of buoyancy, since MuJoCo lifts at centres of mass only."""
-    world, table, model = robot.world, robot.fluid, robot.mj_model
-    floats = np.array([law != "off" for law in table.buoyancy]) & (table.volume > 0)
-    if world.gravity == 0:
-        return False
+    world, table, model, floats = robot.world, robot.fluid, robot.mj_model, _floats(robot)
     center = table.position + np.einsum("pij,pj->pi", table.rotation, table.center_of_volume)
     for body in np.unique(table.body[floats]):
         rows = floats & (table.body == body)
@@ -220,45 +171,62 @@ def _add_lift(robot: Robot, spec: mujoco.MjSpec) -> bool:
             inertia=np.zeros(3),  # MuJoCo drags what has inertia as a box
             gravcomp=world.density * volume.sum() / _FEATHER,
         )
-    return bool(floats.any())
 
 
-def _limit_speed(robot: Robot, spec: mujoco.MjSpec) -> None:
+def _limit_speed(joint: mujoco.MjsJoint, link: Link) -> None:
     """Damping d q̇ + b |q̇| q̇ that meets the servo's effort at its top speed."""
-    for link in make_links(robot)[1:]:
-        joint = link.joint
-        assert joint is not None
-        top = joint.speed
-        square = max(joint.effort - joint.damping * top, 0.0) / top**2
-        name = robot.mj_model.body(link.body).name
-        spec.joint(name).damping = [joint.damping, square, 0.0]
+    assert link.joint is not None
+    top, damping = link.joint.speed, link.joint.damping
+    joint.damping = [damping, max(link.joint.effort - damping * top, 0.0) / top**2, 0.0]
 
 
-def _missing(robot: Robot) -> list[str]:
-    """What MuJoCo lacks of this robot and its world, a line each."""
-    world, table = robot.world, robot.fluid
-    lines = []
-    if table.carried_mass.any():
-        share = world.density * table.carried_mass.mean(-1).sum() / robot.morphology.mass
-        lines.append(
-            "the inertia of the water that moves with the modules (added mass and what fills "
-            f"them), here {share:.2g} times their mass"
-        )
-    lines.append("a surface: half out of the water it is held up as if it were below")
-    if "lift_drag" in table.drag:
-        lines.append("fins: their lift and stall are left out")
-    if "off" in table.drag and world.drag != "off":
-        lines.append("modules without drag next to others with it")
-    if robot.num_thrusters:
-        lines.append(
-            "the thrusters' curves: thrust is the gain times the command, the same at both ends of "
-            "its range; it stays when the thruster leaves the water"
-        )
-    lines += [
-        f"the world's {name.replace('_', ' ')}"
-        for name in ("shear", "current_field", "gust", "waves", "surface_tension")
-        if getattr(world, name)
+def _water(robot: Robot) -> list[tuple[object, str]]:
+    """What may stand for what in MuJoCo's water: whether it does, and in words."""
+    laws, off = {*robot.fluid.drag}, robot.world.drag == "off"
+    own = laws == {"inertia_box"}
+    return [
+        (
+            _floats(robot).any(),
+            "the bodies whose names end in /lift weigh nothing (10 micrograms) and sit at the "
+            "centres of buoyancy; their gravcomp lifts with the weight of the displaced water",
+        ),
+        (
+            robot.num_hinges,
+            "the hinges' second damping coefficient holds them to the servos' top speed, at which "
+            "it takes all of their effort",
+        ),
+        (off, "there is no drag"),
+        ("ellipsoid" in laws, "drag and lift are MuJoCo's ellipsoid law, as it evolved with"),
+        (own, "drag is MuJoCo's inertia-box law, as it evolved with"),
+        (
+            not (off or own or "ellipsoid" in laws),
+            "drag is MuJoCo's inertia-box law: one box for all modules that are welded together, "
+            "in place of the modules' own faces",
+        ),
     ]
-    if world.bed is not None and near_bed(robot) is None:
-        lines.append("the bed, which is out of reach")
-    return lines
+
+
+def _missing(robot: Robot) -> list[tuple[object, str]]:
+    """What MuJoCo may lack: whether this robot or its world has it, and what it is."""
+    world, table = robot.world, robot.fluid
+    share = world.density * table.carried_mass.mean(-1).sum() / robot.morphology.mass
+    return [
+        (
+            table.carried_mass.any(),
+            "the inertia of the water that moves with the modules (added mass and what fills "
+            f"them), here {share:.2g} times their mass",
+        ),
+        (True, "a surface: half out of the water it is held up as if it were below"),
+        ("lift_drag" in table.drag, "fins: their lift and stall are left out"),
+        (
+            "off" in table.drag and world.drag != "off",
+            "modules without drag next to others with it",
+        ),
+        (
+            robot.num_thrusters,
+            "the thrusters' curves: thrust is the gain times the command, the same at both ends of "
+            "its range; it stays when the thruster leaves the water",
+        ),
+        *missing_flow(world),
+        (world.bed is not None and near_bed(robot) is None, "the bed, which is out of reach"),
+    ]

@@ -12,14 +12,16 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.torques import motor_torques
 from mjx_revolve.episodes.simulate import Trajectory
-from mjx_revolve.formats.links import BASE, ODOM, WORLD, Link, make_links
+from mjx_revolve.formats.links import BASE, ODOM, WORLD, Link, make_links, matrix
 from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
@@ -80,21 +82,6 @@ def write_bag(robot: Robot, trajectory: Trajectory, path: Path) -> None:
     write_atomic(path, write)
 
 
-def joint_torques(robot: Robot, trajectory: Trajectory, rows: np.ndarray) -> np.ndarray:
-    """Torque of the motors, by the servos' own law, without the joints' friction.
-
-    Args:
-        robot: that made the trajectory.
-        trajectory: what it did.
-        rows: `[S]` of it.
-
-    Returns:
-        `[S, nhinge]` in the order of the links' joints [N·m].
-    """
-    some = (np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl))
-    return motor_torques(robot, *some)
-
-
 def pick_rows(robot: Robot, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Which rows of a trajectory become messages.
 
@@ -131,7 +118,8 @@ def _write(robot: Robot, trajectory: Trajectory, folder: Path) -> None:
     bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     channels: dict[str, Any] = {}
     with bag as writer:
-        for topic, kind, stamp, message in _messages(robot, trajectory, _Messages(store)):
+        for topic, stamp, message in _messages(robot, trajectory, _Messages(store)):
+            kind = message.__msgtype__
             if topic not in channels:
                 quality = [_quality(latched=topic in _LATCHED)]
                 channels[topic] = writer.add_connection(
@@ -142,24 +130,17 @@ def _write(robot: Robot, trajectory: Trajectory, folder: Path) -> None:
 
 def _quality(latched: bool) -> Any:
     """ROS 2's quality of service: reliable; latched topics reach those who listen later."""
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
+    from rosbags import interfaces as ros
 
-    forever = QosTime(9223372036, 854775807)
-    return Qos(
-        history=QosHistory.KEEP_LAST,
+    forever = ros.QosTime(9223372036, 854775807)
+    return ros.Qos(
+        history=ros.QosHistory.KEEP_LAST,
         depth=1 if latched else 10,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        reliability=ros.QosReliability.RELIABLE,
+        durability=getattr(ros.QosDurability, "TRANSIENT_LOCAL" if latched else "VOLATILE"),
         deadline=forever,
         lifespan=forever,
-        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness=ros.QosLiveliness.AUTOMATIC,
         liveliness_lease_duration=forever,
         avoid_ros_namespace_conventions=False,
     )
@@ -167,115 +148,83 @@ def _quality(latched: bool) -> Any:
 
 def _messages(
     robot: Robot, trajectory: Trajectory, make: _Messages
-) -> Iterator[tuple[str, str, int, Any]]:
-    """Topic, type, time [ns] and message, in the order of time."""
-    links, model = make_links(robot), robot.mj_model
+) -> Iterator[tuple[str, int, Any]]:
+    """Topic, time [ns] and message, in the order of time."""
+    links = make_links(robot)
+    joints = [link.joint for link in links if link.joint is not None]
+    names, none = [joint.name for joint in joints], np.zeros(0)
     rows, stamps = pick_rows(robot, trajectory)
-    qpos = np.asarray(trajectory.qpos, np.float64)[rows]
-    qvel = np.asarray(trajectory.qvel, np.float64)[rows]
-    ctrl = np.asarray(trajectory.ctrl, np.float64)[rows]
-    torques = joint_torques(robot, trajectory, rows)
-    joints = [int(model.body_jntadr[link.body]) for link in links[1:]]
-    drive = {int(model.actuator_trnid[k, 0]): k for k in robot.servos}
-    # Encoding wants each row in one piece.
-    angles, speeds, targets = map(
-        np.ascontiguousarray,
-        (
-            qpos[:, model.jnt_qposadr[joints]],
-            qvel[:, model.jnt_dofadr[joints]],
-            ctrl[:, [drive[j] for j in joints]],
-        ),
+    qpos, qvel, ctrl = (
+        np.asarray(x, np.float64)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
     )
-    names, none = [link.joint.name for link in links if link.joint is not None], np.zeros(0)
-    moving, joint_state = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/JointState"
+    # Encoding wants each row in one piece.
+    angles = np.ascontiguousarray(qpos[:, [joint.qpos for joint in joints]])
+    speeds = np.ascontiguousarray(qvel[:, [joint.qvel for joint in joints]])
+    targets = np.ascontiguousarray(ctrl[:, [joint.ctrl for joint in joints]])
+    # The torque of the motors, without the joints' friction.
+    torques = motor_torques(robot, qpos, qvel, ctrl)
+    commands = ctrl[:, list(robot.thrusters)]
+    if trajectory.command is not None:
+        commands = np.asarray(trajectory.command, np.float64)[rows]
+    pushing = [robot.mj_model.actuator(k).name for k in robot.thrusters]
 
-    first, text = int(stamps[0]), "std_msgs/msg/String"
-    yield "/robot_description", text, first, make(text, data=make_urdf(robot, meshes=None))
-    fixed = make.transform(first, WORLD, ODOM, np.zeros(3), np.array([1.0, 0, 0, 0]))
-    yield "/tf_static", moving, first, make(moving, transforms=[fixed])
+    first, still = int(stamps[0]), np.array([1.0, 0.0, 0.0, 0.0])
+    yield "/robot_description", first, make.ros.String(make_urdf(robot, meshes=None))
+    fixed = make.transform(first, WORLD, ODOM, np.zeros(3), still)
+    yield "/tf_static", first, make.ros.TFMessage([fixed])
     for k, stamp in enumerate(map(int, stamps)):
         base = qpos[k, 3:7] / np.linalg.norm(qpos[k, 3:7])
         frames = [make.transform(stamp, ODOM, BASE, qpos[k, :3], base)]
         for link, angle in zip(links[1:], angles[k], strict=True):
+            pose = _turned(robot.mj_model.body_quat[link.body], link, angle)
             parent = links[link.parent].name
-            pose = _turned(model.body_quat[link.body], link, angle)
             frames.append(make.transform(stamp, parent, link.name, link.position, pose))
-        yield "/tf", moving, stamp, make(moving, transforms=frames)
-        odometry = make.odometry(stamp, qpos[k, :3], base, qvel[k, :6])
-        yield "/odom", "nav_msgs/msg/Odometry", stamp, odometry
+        yield "/tf", stamp, make.ros.TFMessage(frames)
+        yield "/odom", stamp, make.odometry(stamp, qpos[k, :3], base, qvel[k, :6])
         if names:
-            head = make.header(stamp, "")
-            states = make.joints(head, names, angles[k], speeds[k], torques[k])
-            yield "/joint_states", joint_state, stamp, states
-            aims = make.joints(head, names, targets[k], none, none)
-            yield "/joint_targets", joint_state, stamp, aims
-        if robot.num_thrusters:
-            commands = make.commands(robot, trajectory, int(rows[k]))
-            yield "/thruster_commands", "std_msgs/msg/Float64MultiArray", stamp, commands
+            head, state = make.header(stamp, ""), make.ros.JointState
+            yield "/joint_states", stamp, state(head, names, angles[k], speeds[k], torques[k])
+            yield "/joint_targets", stamp, state(head, names, targets[k], none, none)
+        if pushing:
+            yield "/thruster_commands", stamp, make.commands(pushing, commands[k])
 
 
 def _turned(rest: np.ndarray, link: Link, angle: float) -> np.ndarray:
     """Quaternion (w, x, y, z) of a link in its parent's frame, its hinge turned."""
     assert link.joint is not None
-    w, (x, y, z) = np.cos(angle / 2), np.sin(angle / 2) * link.joint.axis
-    a, b, c, d = rest
-    return np.array(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ]
-    )
+    turn, pose = np.zeros(4), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, link.joint.axis, angle)
+    mujoco.mju_mulQuat(pose, rest, turn)
+    return pose
 
 
 class _Messages:
-    """Makes messages of ROS 2's types."""
+    """Makes messages of ROS 2's types.
+
+    Attributes:
+        ros: the types by their short names; their fields are in the order of ROS's definitions.
+    """
 
     def __init__(self, store: Any) -> None:
-        self._types = store.types
-
-    def __call__(self, kind: str, **fields: Any) -> Any:
-        return self._types[kind](**fields)
-
-    def stamp(self, time: int) -> Any:
-        """A time [ns]."""
-        return self("builtin_interfaces/msg/Time", sec=time // 10**9, nanosec=time % 10**9)
+        self.ros = SimpleNamespace(
+            **{name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+        )
 
     def header(self, time: int, frame: str) -> Any:
         """Time [ns] and frame."""
-        return self("std_msgs/msg/Header", stamp=self.stamp(time), frame_id=frame)
-
-    def vector(self, xyz: Any, kind: str = "geometry_msgs/msg/Vector3") -> Any:
-        """Three numbers."""
-        x, y, z = map(float, xyz)
-        return self(kind, x=x, y=y, z=z)
+        return self.ros.Header(self.ros.Time(*divmod(time, 10**9)), frame)
 
     def quaternion(self, wxyz: np.ndarray) -> Any:
         """ROS has (x, y, z, w)."""
-        w, x, y, z = map(float, wxyz)
-        return self("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-    def joints(self, header: Any, names: list[str], *values: np.ndarray) -> Any:
-        """Angles, speeds and torques of joints."""
-        fields = dict(zip(("position", "velocity", "effort"), values, strict=True))
-        return self("sensor_msgs/msg/JointState", header=header, name=names, **fields)
+        return self.ros.Quaternion(*np.roll(wxyz, -1).tolist())
 
     def transform(
         self, time: int, parent: str, child: str, position: np.ndarray, quat: np.ndarray
     ) -> Any:
         """Pose of the child in the parent's frame."""
-        pose = self(
-            "geometry_msgs/msg/Transform",
-            translation=self.vector(position),
-            rotation=self.quaternion(quat),
-        )
-        return self(
-            "geometry_msgs/msg/TransformStamped",
-            header=self.header(time, parent),
-            child_frame_id=child,
-            transform=pose,
-        )
+        place = self.ros.Vector3(*position.tolist())
+        pose = self.ros.Transform(place, self.quaternion(quat))
+        return self.ros.TransformStamped(self.header(time, parent), child, pose)
 
     def odometry(
         self, time: int, position: np.ndarray, quat: np.ndarray, velocity: np.ndarray
@@ -289,42 +238,20 @@ class _Messages:
             velocity: `[6]` MuJoCo's: linear in the world's frame [m/s], angular in the body's
                 [rad/s].
         """
-        w, axis = quat[0], quat[1:]
-        linear = velocity[:3]
-        # The inverse rotation: v - 2 w (a × v) + 2 a × (a × v).
-        side = np.cross(axis, linear)
-        linear = linear - 2 * w * side + 2 * np.cross(axis, side)
-        pose = self(
-            "geometry_msgs/msg/Pose",
-            position=self.vector(position, "geometry_msgs/msg/Point"),
-            orientation=self.quaternion(quat),
-        )
-        twist = self(
-            "geometry_msgs/msg/Twist",
-            linear=self.vector(linear),
-            angular=self.vector(velocity[3:]),
-        )
-        none = np.zeros(36)
-        return self(
-            "nav_msgs/msg/Odometry",
-            header=self.header(time, ODOM),
-            child_frame_id=BASE,
-            pose=self("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=none),
-            twist=self("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
+        ros, none = self.ros, np.zeros(36)
+        linear = velocity[:3] @ matrix(quat)
+        pose = ros.Pose(ros.Point(*position.tolist()), self.quaternion(quat))
+        twist = ros.Twist(ros.Vector3(*linear.tolist()), ros.Vector3(*velocity[3:].tolist()))
+        return ros.Odometry(
+            self.header(time, ODOM),
+            BASE,
+            ros.PoseWithCovariance(pose, none),
+            ros.TwistWithCovariance(twist, none),
         )
 
-    def commands(self, robot: Robot, trajectory: Trajectory, row: int) -> Any:
+    def commands(self, names: list[str], values: np.ndarray) -> Any:
         """Commands of the thrusters; the layout's label names them."""
-        if trajectory.command is None:
-            values = np.asarray(trajectory.ctrl)[row, list(robot.thrusters)]
-        else:
-            values = np.asarray(trajectory.command)[row]
-        names = [robot.mj_model.actuator(k).name for k in robot.thrusters]
         count = len(names)
-        dimension = self(
-            "std_msgs/msg/MultiArrayDimension", label=",".join(names), size=count, stride=count
-        )
-        layout = self("std_msgs/msg/MultiArrayLayout", dim=[dimension], data_offset=0)
-        return self(
-            "std_msgs/msg/Float64MultiArray", layout=layout, data=np.asarray(values, np.float64)
-        )
+        dimension = self.ros.MultiArrayDimension(",".join(names), count, count)
+        layout = self.ros.MultiArrayLayout([dimension], 0)
+        return self.ros.Float64MultiArray(layout, np.ascontiguousarray(values))

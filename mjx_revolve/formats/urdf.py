@@ -6,22 +6,20 @@ angles are 0 at rest. The water has no place in URDF; `sdf.py` takes it to Gazeb
 
 from __future__ import annotations
 
-from typing import Any
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.formats.links import (
     Link,
-    Shape,
-    exact,
+    PlacedPart,
+    inertia_entries,
     make_links,
-    numbers,
     plain,
     roll_pitch_yaw,
-    to_text,
 )
+from mjx_revolve.formats.xml_text import node, to_document
 
 _NOTE = """
   {title}: {links} links, {joints} hinges, {mass:.6g} kg. SI units; angles are 0 at rest.
@@ -43,85 +41,79 @@ def make_urdf(robot: Robot, meshes: str | None = "meshes/") -> str:
         The XML text.
     """
     links = make_links(robot)
-    root = Element("robot", name=plain(robot.morphology.name))
-    # Without these MuJoCo's importer drops folders of meshes, what is only seen, and the base.
-    compiler = {"strippath": "false", "discardvisual": "false", "fusestatic": "false"}
-    SubElement(SubElement(root, "mujoco"), "compiler", compiler)
-    for rgb in sorted({shape.rgb for link in links for shape in link.shapes}):
-        material = SubElement(root, "material", name=_material(rgb))
-        SubElement(material, "color", rgba=numbers([*rgb, 1.0]))
-    for link in links:
-        _add_link(root, link, meshes)
-    for link in links[1:]:
-        _add_joint(root, link, links[link.parent])
+    colors = sorted({part.rgb for link in links for part in link.parts})
+    root = node(
+        "robot",
+        # Without these MuJoCo's importer drops folders of meshes, what is only seen, and the base.
+        node("mujoco", node("compiler", strippath=False, discardvisual=False, fusestatic=False)),
+        *(node("material", node("color", rgba=[*rgb, 1]), name=_material(rgb)) for rgb in colors),
+        *(_link(link, meshes) for link in links),
+        *(_joint(link, links[link.parent]) for link in links[1:]),
+        name=plain(robot.morphology.name),
+    )
     note = _NOTE.format(
         title=robot.morphology.name,
         links=len(links),
         joints=len(links) - 1,
         mass=sum(link.mass for link in links),
     )
-    return to_text(root, note)
+    return to_document(root, note)
 
 
 def _material(rgb: tuple[float, float, float]) -> str:
     return "rgb_" + "_".join(f"{x:.6g}" for x in rgb)
 
 
-def _origin(parent: Element, position: Any, rotation: np.ndarray) -> None:
-    xyz, rpy = numbers(position), numbers(roll_pitch_yaw(rotation))
-    SubElement(parent, "origin", xyz=xyz, rpy=rpy)
+def _origin(position: np.ndarray, rotation: np.ndarray) -> Element:
+    return node("origin", xyz=position, rpy=roll_pitch_yaw(rotation))
 
 
-def _add_link(root: Element, link: Link, meshes: str | None) -> None:
-    element = SubElement(root, "link", name=link.name)
-    inertial = SubElement(element, "inertial")
-    _origin(inertial, link.center_of_mass, np.eye(3))
-    SubElement(inertial, "mass", value=exact(link.mass))
-    entries = {
-        "i" + "xyz"[i] + "xyz"[j]: exact(link.inertia[i, j]) for i in range(3) for j in range(i, 3)
-    }
-    SubElement(inertial, "inertia", entries)
-    for shape in link.shapes:
+def _link(link: Link, meshes: str | None) -> Element:
+    inertial = node(
+        "inertial",
+        _origin(link.center_of_mass, np.eye(3)),
+        node("mass", value=link.mass),
+        node("inertia", **inertia_entries(link.inertia)),
+    )
+    seen, solid = [], []
+    for part in link.parts:
+        material = node("material", name=_material(part.rgb))
         if meshes is None:
-            _add_boxes(element, "visual", shape)
+            seen += _boxes("visual", part, part.name, material)
         else:
-            visual = SubElement(element, "visual", name=shape.name)
-            _origin(visual, shape.position, shape.rotation)
-            geometry = SubElement(visual, "geometry")
-            SubElement(geometry, "mesh", filename=f"{meshes}{shape.mesh}.stl")
-            SubElement(visual, "material", name=_material(shape.rgb))
-    for shape in link.shapes:
-        if shape.part.contact:
-            _add_boxes(element, "collision", shape)
+            mesh = node("geometry", node("mesh", filename=f"{meshes}{part.mesh}.stl"))
+            origin = _origin(part.position, part.rotation)
+            seen.append(node("visual", origin, mesh, material, name=part.name))
+        if part.part.contact:
+            solid += _boxes("collision", part, f"{part.name}_collision")
+    return node("link", inertial, *seen, *solid, name=link.name)
 
 
-def _add_boxes(element: Element, kind: str, shape: Shape) -> None:
-    for k, box in enumerate(shape.part.boxes):
-        name = shape.name if kind == "visual" else f"{shape.name}_{kind}"
-        name = f"{name}_{k}" if k else name
-        child = SubElement(element, kind, name=name)
-        position = shape.position + shape.rotation @ np.asarray(box.position)
-        _origin(child, position, shape.rotation)
-        SubElement(SubElement(child, "geometry"), "box", size=numbers(box.size))
-        if kind == "visual":
-            SubElement(child, "material", name=_material(shape.rgb))
+def _boxes(kind: str, part: PlacedPart, name: str, *more: Element) -> list[Element]:
+    """An element for each box of a part."""
+    return [
+        node(
+            kind,
+            _origin(part.position + part.rotation @ np.asarray(box.position), part.rotation),
+            node("geometry", node("box", size=box.size)),
+            *more,
+            name=f"{name}_{k}" if k else name,
+        )
+        for k, box in enumerate(part.part.boxes)
+    ]
 
 
-def _add_joint(root: Element, link: Link, parent: Link) -> None:
+def _joint(link: Link, parent: Link) -> Element:
     joint = link.joint
     assert joint is not None
-    element = SubElement(root, "joint", name=joint.name, type="revolute")
-    _origin(element, link.position, link.rotation)
-    SubElement(element, "parent", link=parent.name)
-    SubElement(element, "child", link=link.name)
-    SubElement(element, "axis", xyz=numbers(joint.axis))
-    low, high = joint.range
-    SubElement(
-        element,
-        "limit",
-        lower=exact(low),
-        upper=exact(high),
-        effort=exact(joint.effort),
-        velocity=exact(joint.speed),
+    return node(
+        "joint",
+        _origin(link.position, link.rotation),
+        node("parent", link=parent.name),
+        node("child", link=link.name),
+        node("axis", xyz=joint.axis),
+        node("limit", **joint.limit),
+        node("dynamics", damping=joint.damping, friction=0),
+        name=joint.name,
+        type="revolute",
     )
-    SubElement(element, "dynamics", damping=exact(joint.damping), friction="0")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
+from laboratory import ROOT
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
 from mjx_revolve.body.morphology import (
     MAX_MODULES,
@@ -22,7 +23,6 @@ from mjx_revolve.body.morphology import (
 )
 from mjx_revolve.inputs.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[2]
 OURS = sorted((ROOT / "morphologies").glob("*.yaml"))
 WILD_FOLDER = ROOT.parent / "shared" / "revolve_robots"
 WILD_NAMES = ["babyA", "gecko", "robot_5", "snake", "spider", "spider17"]

@@ -1,14 +1,14 @@
 """The configuration: every wrong input with its message, paths, overrides, and the way back."""
 
 import re
-from pathlib import Path
 
 import pytest
 
+from laboratory import ROOT
 from mjx_revolve.episodes.config import dump_config, load_config, make_config, override_config
 from mjx_revolve.inputs.errors import InputError
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS = ROOT / "configs"
 GOOD = """
 morphology: robot.yaml
 world: lake

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -10,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK
+from laboratory import QUICK, ROOT
 from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes import fitness as fitness_module
 from mjx_revolve.episodes.fitness import WORST
 from mjx_revolve.episodes.tasks import TASKS, Track, measure
 
-ROOT = Path(__file__).resolve().parents[2]
 KEY = jax.random.key(7)
 # The smallest robot with joints: compiles fast.
 ROBOT = """

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import toys
-from laboratory import XLA_FLAGS
+from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import hosts, leader, runs, wire
@@ -33,7 +33,6 @@ from mjx_revolve.evolution.worker import program_versions
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[2]
 CLOCK = ("seconds", "evaluations_per_second")
 SECRET = "correct horse"
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="lists processes by /proc")

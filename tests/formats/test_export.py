@@ -11,8 +11,8 @@ import pytest
 
 from exports import ODD, odd_episode
 from mjx_revolve.episodes import champion as episodes
-from mjx_revolve.evolution import runs
 from mjx_revolve.export import main
+from mjx_revolve.formats import export as exporter
 from mjx_revolve.inputs.commands import run_command
 
 
@@ -133,6 +133,6 @@ def test_command_names_what_the_disk_refuses(quick, capsys, monkeypatch):
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr(runs, "write_atomic", full)
+    monkeypatch.setattr(exporter, "write_atomic", full)
     code, _, err = run(capsys, "odd.yaml", "--mjcf", "a.xml")
     assert (code, err) == (1, "error: a.xml: No space left on device\n")

@@ -13,7 +13,7 @@ from exports import NAMES, angles_of, forward, lake_robot, odd_episode
 from laboratory import body
 from mjx_revolve.body.meshes import mesh_volume
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.export import export
+from mjx_revolve.formats.export import export_robot
 from mjx_revolve.formats.links import make_links, make_meshes, matrix, rest_pose, roll_pitch_yaw
 from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.formats.urdf import make_urdf
@@ -36,16 +36,16 @@ def test_links_stand_where_their_hinges_do(robot):
         anchor = module.kind.hinge.anchor if index else np.zeros(3)
         np.testing.assert_allclose(position, module.position + module.rotation @ anchor, atol=1e-12)
         np.testing.assert_allclose(rotation, module.rotation, atol=1e-12)
-        for shape in link.shapes:
-            assert shape.rgb == (
-                robot.morphology.modules[robot.fluid.module[shape.row]].rgb or (0.5, 0.5, 0.5)
+        for part in link.parts:
+            assert part.rgb == (
+                robot.morphology.modules[robot.fluid.module[part.row]].rgb or (0.5, 0.5, 0.5)
             )
     assert sum(link.mass for link in links) == pytest.approx(robot.morphology.mass)
 
 
 def test_names_are_plain_and_told_apart():
     links = make_links(odd_episode().robot)
-    names = [link.name for link in links] + [s.name for link in links for s in link.shapes]
+    names = [link.name for link in links] + [part.name for link in links for part in link.parts]
     names += [link.joint.name for link in links[1:]]
     assert len({*names}) == len(names)
     assert [link.name for link in links] == ["base_link", "arm_1_link", "arm_1_link_2"]
@@ -56,8 +56,8 @@ def test_names_are_plain_and_told_apart():
 def test_meshes_have_the_parts_volume(robot):
     meshes = make_meshes(robot.morphology)
     for link in make_links(robot):
-        for shape in link.shapes:
-            assert mesh_volume(meshes[shape.mesh]) == pytest.approx(shape.part.volume, rel=1e-6)
+        for part in link.parts:
+            assert mesh_volume(meshes[part.mesh]) == pytest.approx(part.part.volume, rel=1e-6)
 
 
 @pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-7])
@@ -146,14 +146,14 @@ def test_mjcf_starts_below_the_surface_and_looks_like_the_robot():
 def test_mjcf_and_sdf_start_where_the_rollout_does(tmp_path):
     episode = odd_episode()
     files = {"mjcf": tmp_path / "a.xml", "sdf": tmp_path / "a.sdf"}
-    export(episode.robot, files, episode.trajectory)
+    export_robot(episode.robot, files, episode.trajectory)
     start = np.asarray(episode.trajectory.qpos)[0]
     key = mujoco.MjModel.from_xml_path(str(files["mjcf"])).key("start")
     np.testing.assert_allclose(key.qpos, start, atol=1e-6)
     pose = ElementTree.parse(files["sdf"]).findtext("world/model/pose").split()
     np.testing.assert_allclose(np.array(pose[:3], float), start[:3])
     with pytest.raises(InputError, match="mcap: expected a trajectory; found none"):
-        export(episode.robot, {"mcap": tmp_path / "a.mcap"})
+        export_robot(episode.robot, {"mcap": tmp_path / "a.mcap"})
 
 
 def test_mjcf_has_the_current_and_a_near_bed():
@@ -220,7 +220,7 @@ def test_urdf_is_the_same_robot_to_mujoco(robot):
 def test_urdf_is_the_same_robot_to_yourdfpy(robot, tmp_path):
     yourdfpy = pytest.importorskip("yourdfpy", reason="the package yourdfpy reads URDF")
     path = tmp_path / "robot.urdf"
-    export(robot, {"urdf": path})
+    export_robot(robot, {"urdf": path})
     urdf = yourdfpy.URDF.load(str(path))
     assert urdf.validate()
     angles, links = angles_of(robot, 2), make_links(robot)
@@ -230,7 +230,7 @@ def test_urdf_is_the_same_robot_to_yourdfpy(robot, tmp_path):
         pose = urdf.get_transform(link.name, "base_link")
         np.testing.assert_allclose(pose[:3, 3], position[index], atol=1e-9)
         np.testing.assert_allclose(pose[:3, :3], rotation[index], atol=1e-9)
-        assert len(urdf.link_map[link.name].visuals) == len(link.shapes)
+        assert len(urdf.link_map[link.name].visuals) == len(link.parts)
     for link in links[1:]:
         joint = urdf.joint_map[link.joint.name]
         hinge = next(m for m in robot.morphology.modules if m.kind.hinge).kind.hinge
@@ -246,7 +246,9 @@ def test_urdf_is_the_same_robot_to_yourdfpy(robot, tmp_path):
 
 
 def test_urdf_names_meshes_as_asked(tmp_path):
-    export(odd_episode().robot, {"urdf": tmp_path / "a.urdf"}, meshes="package://mine/meshes/")
+    export_robot(
+        odd_episode().robot, {"urdf": tmp_path / "a.urdf"}, meshes="package://mine/meshes/"
+    )
     root = ElementTree.parse(tmp_path / "a.urdf").getroot()
     files = {mesh.get("filename") for mesh in root.iter("mesh")}
     assert "package://mine/meshes/core_core.stl" in files

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from exports import odd_episode
+from mjx_revolve.engine.torques import motor_torques
 from mjx_revolve.formats.links import make_links, matrix
-from mjx_revolve.formats.ros_bag import joint_torques, pick_rows, write_bag
+from mjx_revolve.formats.ros_bag import pick_rows, write_bag
 from mjx_revolve.inputs.errors import InputError
 
 
@@ -124,7 +125,8 @@ def test_bag_odometry_is_in_its_frames(bag, episode):
 def test_bag_joint_states_are_the_trajectorys(bag, episode):
     robot, trajectory = episode.robot, episode.trajectory
     rows, _ = pick_rows(robot, trajectory)
-    torque = joint_torques(robot, trajectory, rows)
+    some = (np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl))
+    torque = motor_torques(robot, *some)
     for k, (_, message) in enumerate(bag.topics["/joint_states"]):
         assert list(message.name) == ["arm_1", "arm_1_2"]
         np.testing.assert_allclose(message.position, np.asarray(trajectory.qpos)[rows[k], 7:])
@@ -144,12 +146,12 @@ def test_torque_is_the_servos(episode):
     robot = episode.robot
     joint = make_links(robot)[1].joint
     angle, far = 0.01, 0.5
-    rows = SimpleNamespace(
-        qpos=np.array([[0, 0, 0, 1, 0, 0, 0, angle, 0.0]] * 2),
-        qvel=np.zeros((2, 8)),
-        ctrl=np.array([[0.02, 0.0, 0.0], [far, 0.0, -far]]),  # a thruster is in the middle
+    rows = (
+        np.array([[0, 0, 0, 1, 0, 0, 0, angle, 0.0]] * 2),
+        np.zeros((2, 8)),
+        np.array([[0.02, 0.0, 0.0], [far, 0.0, -far]]),  # a thruster is in the middle
     )
-    torque = joint_torques(robot, rows, np.arange(2))
+    torque = motor_torques(robot, *rows)
     assert torque[0, 0] == pytest.approx(joint.stiffness * 0.01, rel=1e-4)
     np.testing.assert_allclose(torque[1], [joint.effort, -joint.effort], rtol=1e-5)
 

@@ -10,7 +10,7 @@ import pytest
 from exports import NAMES, angles_of, forward, lake_robot
 from laboratory import body
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.export import export
+from mjx_revolve.formats.export import export_robot
 from mjx_revolve.formats.links import make_links, matrix, rest_pose
 from mjx_revolve.formats.sdf import make_sdf
 from mjx_revolve.water.world import load_world
@@ -60,11 +60,11 @@ def test_sdf_stands_as_the_robot_does(robot):
         position, rotation = rest_pose(links, index)
         np.testing.assert_allclose(rest[link.name][0], position, atol=1e-9)
         np.testing.assert_allclose(rest[link.name][1], rotation, atol=1e-9)
-        for shape in link.shapes:
-            module = robot.morphology.modules[robot.fluid.module[shape.row]]
+        for part in link.parts:
+            module = robot.morphology.modules[robot.fluid.module[part.row]]
             np.testing.assert_allclose(
-                rest[shape.name][0],
-                module.position + module.rotation @ shape.part.position,
+                rest[part.name][0],
+                module.position + module.rotation @ part.part.position,
                 atol=1e-9,
             )
 
@@ -112,8 +112,8 @@ def test_sdf_has_the_water_of_each_part(robot):
     drags = {p.findtext("link_name"): p for p in plugins if "Hydrodynamics" in p.get("name")}
     fins = {p.findtext("link_name"): p for p in plugins if "LiftDrag" in p.get("name")}
     for link in make_links(robot):
-        for shape in link.shapes:
-            k, element = shape.row, model.find(f"link[@name='{shape.name}']")
+        for part in link.parts:
+            k, element = part.row, model.find(f"link[@name='{part.name}']")
             size = np.array(element.findtext("collision/geometry/box/size").split(), float)
             assert size.prod() == pytest.approx(table.volume[k])
             np.testing.assert_allclose(
@@ -124,14 +124,12 @@ def test_sdf_has_the_water_of_each_part(robot):
             carried = [*table.carried_mass[k], *table.carried_inertia[k]]
             np.testing.assert_allclose(values, density * np.array(carried), rtol=1e-9)
             if table.drag[k] == "lift_drag":
-                assert float(fins[shape.name].findtext("area")) == pytest.approx(
-                    table.plate_area[k]
-                )
-                assert float(fins[shape.name].findtext("air_density")) == density
+                assert float(fins[part.name].findtext("area")) == pytest.approx(table.plate_area[k])
+                assert float(fins[part.name].findtext("air_density")) == density
                 continue
             # After Fossen: what brakes is negative.
             found = [
-                float(drags[shape.name].findtext(tag))
+                float(drags[part.name].findtext(tag))
                 for tag in ("xUabsU", "yVabsV", "zWabsW", "kPabsP", "mQabsQ", "nRabsR")
             ]
             expected = [*table.drag_linear[k], *table.drag_angular[k]]
@@ -197,7 +195,7 @@ def test_sdf_and_urdf_are_the_same_robot_to_drake(tmp_path):
     for name in NAMES:
         robot = lake_robot(name)
         paths = {key: tmp_path / name / f"robot.{key}" for key in ("urdf", "sdf")}
-        export(robot, paths)
+        export_robot(robot, paths)
         angles, links = angles_of(robot, 3), make_links(robot)
         position, rotation = forward(robot, angles)
         for path in paths.values():

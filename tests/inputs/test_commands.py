@@ -4,10 +4,10 @@ import argparse
 import errno
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from laboratory import ROOT
 from mjx_revolve.inputs.commands import (
     Parser,
     check_place,
@@ -17,8 +17,6 @@ from mjx_revolve.inputs.commands import (
     whole,
 )
 from mjx_revolve.inputs.errors import InputError
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import math
 import os
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import av
 import jax.numpy as jnp
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from laboratory import body
+from laboratory import ROOT, body
 from mjx_revolve import replay
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
@@ -662,7 +661,7 @@ def test_a_run_from_end_to_end(way, tmp_path):
     from mjx_revolve import evolve
 
     run = tmp_path / "run"
-    config = Path(__file__).resolve().parents[2] / "configs" / "smoke.yaml"
+    config = ROOT / "configs" / "smoke.yaml"
     assert run_command(evolve.main, [str(config), "--out", str(run)]) == 0
     assert run_command(replay.main, [str(run), "--size", "320x240"]) == 0
     _, _, _, pictures = read_mp4(run / "swim.mp4")

@@ -4,7 +4,6 @@ import errno
 import json
 import shutil
 from html.parser import HTMLParser
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -39,7 +38,6 @@ from mjx_revolve.view.report.groups import (
     mean_interval,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = {
     "morphology": "elbow.yaml",
     "trim": "none",

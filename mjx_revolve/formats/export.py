@@ -1,0 +1,78 @@
+"""A robot, and what it did, into files for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.episodes.simulate import Trajectory
+from mjx_revolve.formats.links import make_links, make_meshes
+from mjx_revolve.formats.mjcf import make_mjcf
+from mjx_revolve.formats.ros_bag import pick_rows, write_bag
+from mjx_revolve.formats.sdf import make_sdf
+from mjx_revolve.formats.urdf import make_urdf
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import write_atomic
+
+# Where meshes go, beside the files that name them.
+_MESHES = "meshes"
+
+
+def export_robot(
+    robot: Robot,
+    files: dict[str, Path],
+    trajectory: Trajectory | None = None,
+    meshes: str | None = None,
+) -> list[tuple[Path, str]]:
+    """Writes a robot, and what it did, for other programs.
+
+    Each file appears whole or not at all; files that are there are replaced.
+
+    Args:
+        robot: from `build_robot`.
+        files: by format ("mjcf", "urdf", "sdf", "mcap"), where each goes. URDF and SDF have their
+            meshes in a folder `meshes` beside them.
+        trajectory: what it did; MJCF and SDF start where it starts, and "mcap" cannot do without.
+        meshes: what URDF and SDF call that folder; by default `meshes/`, as seen from the file.
+
+    Returns:
+        The files, and what each is, in words.
+
+    Raises:
+        InputError: there is no trajectory for a bag, nothing of it is finite, or the package that
+            writes bags is missing.
+        OSError: a file cannot be written.
+    """
+    done: list[tuple[Path, str]] = []
+    start = None if trajectory is None else np.asarray(trajectory.qpos)[0]
+    if start is not None and not np.isfinite(start).all():
+        start = None
+    prefix = f"{_MESHES}/" if meshes is None else meshes
+    makers: dict[str, tuple[Callable[[], str], str]] = {
+        "mjcf": (lambda: make_mjcf(robot, start), "MJCF; opens in stock MuJoCo"),
+        "urdf": (lambda: make_urdf(robot, prefix), "URDF; meshes beside it"),
+        "sdf": (lambda: make_sdf(robot, prefix, start), "SDF world for Gazebo; meshes beside it"),
+    }
+    for name, (make, words) in makers.items():
+        if name in files:
+            write_atomic(files[name], make().encode())
+            done.append((files[name], words))
+    folders = {files[name].parent / _MESHES for name in ("urdf", "sdf") if name in files}
+    shapes = make_meshes(robot.morphology) if folders else {}
+    for folder in folders:
+        for name, mesh in shapes.items():
+            content: Any = mesh.export(file_type="stl")
+            write_atomic(folder / f"{name}.stl", content)
+        done.append((folder, f"{len(shapes)} meshes (STL, m)"))
+    if "mcap" in files:
+        if trajectory is None:
+            raise InputError("mcap: expected a trajectory; found none")
+        write_bag(robot, trajectory, files["mcap"])
+        rows, stamps = pick_rows(robot, trajectory)
+        words = f"ROS 2 bag: {stamps[-1] / 1e9:.4g} s, {len(rows)} poses"
+        done.append((files["mcap"], f"{words} of {len(make_links(robot))} links"))
+    return done
