@@ -173,6 +173,8 @@ def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
     import numpy as np
 
     from mjx_revolve import build_robot, load_morphology, load_world
+    from mjx_revolve.engine.plant import figure_of
+    from mjx_revolve.episodes.tasks import reach_below
     from mjx_revolve.water.bed import bed_height
 
     fields = dict(PHYSICS[job["physics"]])
@@ -186,7 +188,7 @@ def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
         body = robot.morphology
         model.opt.gravity[2] *= 1 - world.density * body.volume / body.mass
         start = float(bed_height(world.bed, np.zeros(1), np.zeros(1))[0])
-        model.qpos0[2] = start + reach_below(robot, _config(job).task)
+        model.qpos0[2] = start + reach_below(_config(job).task, figure_of(robot))
     return model
 
 

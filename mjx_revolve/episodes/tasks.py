@@ -100,7 +100,7 @@ def start_at_depth(settings: Any, world: World, figure: Figure, place: jax.Array
 
 
 def start_on_bed(settings: Any, world: World, figure: Figure, place: jax.Array) -> jax.Array:
-    """The lowest corner of any module 5 mm above the bed, whatever the tilt; as `start_at_depth`."""
+    """The lowest corner 5 mm above the bed, whatever the tilt; arguments of `start_at_depth`."""
     assert world.bed is not None
     below = reach_below(settings, figure)
     return place.at[2].set(bed_height(world.bed, place[0], place[1]) + below + 0.005)
