@@ -35,7 +35,7 @@ __all__ = [
 MAX_MODULES = 1000
 
 # Names that the MuJoCo model keeps for itself.
-_RESERVED = ("world", "root")
+RESERVED = ("world", "root")
 
 _MODULE_KEYS = ("id", "type", "slot", "orientation", "params", "children")
 
@@ -225,7 +225,7 @@ def read_module(
         raise InputError(f"{place}: expected a module (a mapping with a type); found {found}")
     _check_known(item, _MODULE_KEYS, place)
     kind = _read_type(item.get("type"), place, modules, parent < 0)
-    orientation = _read_orientation(item.get("orientation"), f"{place}.orientation")
+    orientation = read_orientation(item.get("orientation"), f"{place}.orientation")
     if parent < 0 and orientation != 0.0:
         raise InputError(
             f"{place}.orientation: expected 0 (the core is attached to nothing); "
@@ -315,12 +315,24 @@ def _read_id(value: Any, place: str) -> str:
         raise InputError(f"{place}: expected a name or a number; found {show(value)}") from None
 
 
-def _read_orientation(value: Any, place: str) -> float:
+def read_orientation(value: Any, place: str) -> float:
+    """A module's turn.
+
+    Args:
+        value: what the user gave; None is 0.
+        place: where, for the message.
+
+    Returns:
+        The angle [deg].
+
+    Raises:
+        InputError: it is no quarter turn.
+    """
     if value is None:  # Revolve itself writes `orientation: null`
         return 0.0
-    angle = read_number(value)
-    known = (0, 90, 180, 270, -90, -180, -270)
-    if isinstance(angle, bool) or not isinstance(angle, int | float) or angle not in known:
+    angle, known = read_number(value), (0, 90, 180, 270, -90, -180, -270)
+    number = isinstance(angle, int | float | np.integer) and not isinstance(angle, bool)
+    if not number or angle not in known:
         raise InputError(f"{place}: expected 0, 90, 180, 270 or -90 [deg]; found {show(value)}")
     return float(angle)
 
@@ -353,7 +365,7 @@ def _read_params(
 def _with_unique_names(modules: list[Module]) -> tuple[Module, ...]:
     """Tells apart the modules that share a name, or have one that MuJoCo needs."""
     names = [m.name for m in modules]
-    taken, seen = {*names}, {*_RESERVED}
+    taken, seen = {*names}, {*RESERVED}
     for i, name in enumerate(names):
         count = 2
         while name in seen:
