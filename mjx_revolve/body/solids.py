@@ -213,7 +213,9 @@ def _servo(kind: ModuleType, part: Part) -> list[_Body] | None:
         return None
     middle = 0.5 * (back - half_x), 0.0  # of the body behind the plate
     half_body = 0.5 * (back + half_x)
-    sheet = _prism(0, back, front, _outline(*half[1:], 0.15 * min(half[1:]), tuple(center[1:])))
+    sheet = _prism(
+        0, back, front, _outline(half[1], half[2], 0.15 * min(half[1:]), tuple(center[1:]))
+    )
 
     def build(share: float) -> list[_Body]:
         duct = share * half_body, share * half_y, share * min(half_body, half_y)
