@@ -25,11 +25,11 @@ from mjx_revolve.body.module_types import ModuleType, show
 from mjx_revolve.body.morphology import (
     MAX_MODULES,
     RESERVED,
-    check_overlaps,
     read_module,
     read_orientation,
+    read_slot,
 )
-from mjx_revolve.body.placement import Module, attach
+from mjx_revolve.body.placement import Module, attach, check_overlaps
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.inputs.errors import InputError
 
@@ -84,7 +84,7 @@ def add_module(
             module is wrong, it overlaps with another one, or there would be too many.
     """
     above, at = _find_slot(body, parent, slot)
-    item = _item(name, type, orientation, params)
+    item = {"id": name, "type": type, "orientation": orientation, "params": params}
     place = f"{_place(body, above)}.children.{at}"
     new = replace(read_module(item, place, modules, body.modules, above, at), parent=-1)
     return _insert(body, above, at, [new], allow_overlap)
@@ -175,7 +175,7 @@ def replace_module(
     """
     index = _find(body, module)
     old, place = body.modules[index], _place(body, index)
-    item = _item(old.name, type, old.orientation, params)
+    item = {"id": old.name, "type": type, "orientation": old.orientation, "params": params}
     new = read_module(item, place, modules, body.modules, old.parent, old.slot)
     tree: Sequence[Module] = body.modules
     homeless = [i for i, m in enumerate(tree) if m.parent == index and m.slot not in new.kind.slots]
@@ -290,24 +290,12 @@ def _place(body: Morphology, index: int) -> str:
     return f"{body.path or body.name}: {body.modules[index].name}"
 
 
-def _item(
-    name: str | None, type: str, orientation: float, params: Mapping[str, Any] | None
-) -> dict[str, Any]:
-    """A module as a morphology file has it."""
-    given = params if params is None else dict(params)
-    return {"id": name, "type": type, "orientation": orientation, "params": given}
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
 def _find(body: Morphology, module: str | int, core: bool = True) -> int:
     """Index of a module; `core` whether it may be the core."""
     names = {m.name: i for i, m in enumerate(body.modules)}
-    named = names.get(module, -1) if isinstance(module, str) else -1
-    index = int(module) if _is_whole(module) else named
-    if not 0 <= index < len(names):
+    index = names.get(module, -1) if isinstance(module, str) else module
+    whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
+    if not whole or not 0 <= index < len(names):
         raise InputError(
             f"{body.path or body.name}: expected the name of a module or an index from 0 to "
             f"{len(names) - 1}; found {show(module)}"
@@ -316,23 +304,20 @@ def _find(body: Morphology, module: str | int, core: bool = True) -> int:
         raise InputError(
             f"{_place(body, 0)}: expected a module that is attached to another one; found the core"
         )
-    return index
+    return int(index)
 
 
 def _find_slot(body: Morphology, parent: str | int, slot: int) -> tuple[int, int]:
     """Index of the module and number of its slot, which is free."""
     index = _find(body, parent)
-    place, kind = _place(body, index), body.modules[index].kind
-    if not _is_whole(slot) or slot not in kind.slots:
-        slots = ", ".join(map(str, sorted(kind.slots)))
-        wanted = f"one of the slots {slots}" if slots else "no child, since there are no slots"
-        raise InputError(f"{place}: expected {wanted} of type {kind.name}; found {show(slot)}")
+    at = read_slot(slot, body.modules[index].kind, _place(body, index))
     for module in body.modules:
-        if (module.parent, module.slot) == (index, slot):
+        if (module.parent, module.slot) == (index, at):
             raise InputError(
-                f"{place}: expected a free slot; found slot {slot} taken by {module.name!r}"
+                f"{_place(body, index)}: expected a free slot; found slot {at} taken by "
+                f"{module.name!r}"
             )
-    return index, int(slot)
+    return index, at
 
 
 def _end(modules: Sequence[Module], index: int) -> int:

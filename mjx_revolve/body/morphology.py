@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.module_types import ModuleType, check_number, show
 from mjx_revolve.body.params import apply_overrides, check_overrides, read_number
-from mjx_revolve.body.placement import Module, attach, find_overlaps, frozen
+from mjx_revolve.body.placement import Module, attach, check_overlaps, frozen
 from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
 from mjx_revolve.inputs.errors import InputError, load_yaml
 
@@ -142,35 +142,6 @@ def _make(
     )
 
 
-def check_overlaps(
-    modules: Sequence[Module], allow: bool, place: str, moved: Iterable[int] | None = None
-) -> tuple[tuple[str, str], ...]:
-    """Refuses modules that overlap at rest.
-
-    Args:
-        modules: of one robot.
-        allow: refuse none.
-        place: where, for the message.
-        moved: indices of the modules to compare with all; by default all.
-
-    Returns:
-        Names of the pairs that overlap, in the modules' order.
-
-    Raises:
-        InputError: some overlap and `allow` is not set.
-    """
-    found = find_overlaps(modules, moved)
-    pairs = tuple((modules[i].name, modules[j].name) for i, j in found)
-    if pairs and not allow:
-        named = ", ".join(f"{a} and {b}" for a, b in pairs[:5])
-        more = f" and {len(pairs) - 5} more" if len(pairs) > 5 else ""
-        raise InputError(
-            f"{place}: expected modules that do not overlap at rest; found overlapping: "
-            f"{named}{more} (allow_overlap loads them all the same)"
-        )
-    return pairs
-
-
 def _check_known(item: dict[Any, Any], known: tuple[str, ...], place: str) -> None:
     for key in item:
         if key not in known:
@@ -279,25 +250,39 @@ def _read_children(item: dict[str, Any], place: str, module: Module) -> dict[int
         raise InputError(
             f"{place}: expected a mapping from slots to modules; found {show(children)}"
         )
-    slots = module.kind.slots
-    if children and not slots:
-        raise InputError(
-            f"{place}: expected none, since type {module.type} has no slots; "
-            f"found {show(list(children))}"
-        )
     found: dict[int, Any] = {}
     for key, child in children.items():
-        number = int(key) if isinstance(key, str) and re.fullmatch(r"[0-9]{1,9}", key) else key
-        if not isinstance(number, int) or isinstance(number, bool) or number not in slots:
-            hint = " (slot 0 is where it is attached)" if number == 0 and 0 not in slots else ""
-            raise InputError(
-                f"{place}: expected one of the slots {', '.join(map(str, sorted(slots)))} of type "
-                f"{module.type}{hint}; found {show(key)}"
-            )
+        number = read_slot(key, module.kind, place)
         if number in found:
             raise InputError(f"{place}: expected each slot once; found slot {number} twice")
         found[number] = child
     return found
+
+
+def read_slot(value: Any, kind: ModuleType, place: str) -> int:
+    """The number of one of a type's slots.
+
+    Args:
+        value: what the user gave: a number, or one written as text.
+        kind: the type of module.
+        place: where, for the message.
+
+    Returns:
+        The number.
+
+    Raises:
+        InputError: the type has no such slot.
+    """
+    text = isinstance(value, str) and re.fullmatch(r"[0-9]{1,9}", value)
+    number = int(value) if text or isinstance(value, np.integer) else value
+    if isinstance(number, int) and not isinstance(number, bool) and number in kind.slots:
+        return number
+    wanted = f"one of the slots {', '.join(map(str, sorted(kind.slots)))} of type {kind.name}"
+    if not kind.slots:
+        wanted = f"none, since type {kind.name} has no slots"
+    elif number == 0 and 0 not in kind.slots:
+        wanted += " (slot 0 is where it is attached)"
+    raise InputError(f"{place}: expected {wanted}; found {show(value)}")
 
 
 def _read_id(value: Any, place: str) -> str:

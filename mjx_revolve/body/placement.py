@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_revolve.body.boxes import boxes_overlap, quarter_turn
 from mjx_revolve.body.module_types import ModuleType, Slot, Vector
+from mjx_revolve.inputs.errors import InputError
 
 # Boxes are shrunk by this much at each face [m] before they are tested for overlap, thin ones by
 # half their half-edge at most. A choice: a brick's box stands 1.5 mm proud of its attachment faces,
@@ -53,9 +55,9 @@ class Module:
         """Same values, bit for bit."""
         if not isinstance(other, Module):
             return NotImplemented
-        plain = ("name", "type", "parent", "slot", "orientation", "rgb", "kind")
+        plain = attrgetter("name", "type", "parent", "slot", "orientation", "rgb", "kind")
         return (
-            all(getattr(self, key) == getattr(other, key) for key in plain)
+            plain(self) == plain(other)
             and np.array_equal(self.position, other.position)
             and np.array_equal(self.rotation, other.rotation)
             and same(self.params, other.params)
@@ -260,3 +262,32 @@ def find_overlaps(
     )
     pairs = np.sort(np.column_stack([a[apart], b[apart]])[hit], axis=1)
     return tuple(sorted({(int(i), int(j)) for i, j in pairs}))
+
+
+def check_overlaps(
+    modules: Sequence[Module], allow: bool, place: str, moved: Iterable[int] | None = None
+) -> tuple[tuple[str, str], ...]:
+    """Refuses modules that overlap at rest.
+
+    Args:
+        modules: of one robot.
+        allow: refuse none.
+        place: where, for the message.
+        moved: indices of the modules to compare with all; by default all.
+
+    Returns:
+        Names of the pairs that overlap, in the modules' order.
+
+    Raises:
+        InputError: some overlap and `allow` is not set.
+    """
+    found = find_overlaps(modules, moved)
+    pairs = tuple((modules[i].name, modules[j].name) for i, j in found)
+    if pairs and not allow:
+        named = ", ".join(f"{a} and {b}" for a, b in pairs[:5])
+        more = f" and {len(pairs) - 5} more" if len(pairs) > 5 else ""
+        raise InputError(
+            f"{place}: expected modules that do not overlap at rest; found overlapping: "
+            f"{named}{more} (allow_overlap loads them all the same)"
+        )
+    return pairs
