@@ -2,6 +2,16 @@
 
 ``python -m experiments.module_volumes``
 
+For a closed mesh whose faces all look outwards, the volume is the sum of the signed volumes of the
+tetrahedra between each face and the origin (C. Zhang, T. Chen, "Efficient feature extraction for
+2D/3D objects in mesh representation", ICIP 2001, equation 5)::
+
+    V_i = 1/6 (-x3 y2 z1 + x2 y3 z1 + x3 y1 z2 - x1 y3 z2 - x2 y1 z3 + x1 y2 z3)
+
+which is det[v1 v2 v3] / 6. The thesis prints the last term as ``x1 y2 z2``; that is a misprint:
+with it the sum depends on where the mesh lies. The package itself asks trimesh, which the first
+table checks.
+
 The meshes of `mjx_revolve.body.solids` are drawn to enclose the tabulated volumes, so the first
 table is a check of the whole way (shape, closed surface, signed tetrahedra) and not an independent
 measurement of RoboGen's printed parts, whose files are not ours to ship.
@@ -26,18 +36,21 @@ TABLE = {
 }
 
 
-def printed_volume(mesh: Mesh, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> float:
-    """Volume by the formula as the thesis prints it, with x1 y2 z2 for x1 y2 z3 [m³].
+def signed_volume(
+    mesh: Mesh, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), printed: bool = False
+) -> float:
+    """Volume of a mesh by the formula of the thesis [m³].
 
     Args:
         mesh: as for `mjx_revolve.body.meshes.mesh_volume`.
-        shift: moves the mesh first [m]; a volume would not change.
+        shift: moves the mesh first [m]; a volume does not change.
+        printed: as the thesis prints the formula, with x1 y2 z2 for x1 y2 z3.
     """
     vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
     corners = (np.asarray(vertices, float) + shift)[np.asarray(faces)]
     (x1, y1, z1), (x2, y2, z2), (x3, y3, z3) = corners.transpose(1, 2, 0)
-    terms = -x3 * y2 * z1 + x2 * y3 * z1 + x3 * y1 * z2 - x1 * y3 * z2 - x2 * y1 * z3 + x1 * y2 * z2
-    return float(terms.sum() / 6.0)
+    terms = -x3 * y2 * z1 + x2 * y3 * z1 + x3 * y1 * z2 - x1 * y3 * z2 - x2 * y1 * z3
+    return float((terms + x1 * y2 * (z2 if printed else z3)).sum() / 6.0)
 
 
 def rows() -> list[dict[str, float | str]]:
@@ -50,7 +63,7 @@ def rows() -> list[dict[str, float | str]]:
             volume, mass = TABLE[kind.name, part.name]
             mesh = part_mesh(kind, part)
             check_mesh(mesh, f"{kind.name} {part.name}")
-            computed = mesh_volume(mesh)
+            computed = signed_volume(mesh)
             found.append(
                 {
                     "part": f"{kind.name} {part.name}",
@@ -61,9 +74,10 @@ def rows() -> list[dict[str, float | str]]:
                     "mass": mass,
                     "density": mass / computed,
                     "center": mesh_center_of_volume(mesh),
-                    "printed": printed_volume(mesh),
-                    "printed_moved": printed_volume(mesh, (0.1, 0.1, 0.1)),
-                    "moved": mesh_volume((mesh.vertices + 0.1, mesh.faces)),
+                    "trimesh": mesh_volume(mesh),
+                    "moved": signed_volume(mesh, (0.1, 0.1, 0.1)),
+                    "printed": signed_volume(mesh, printed=True),
+                    "printed_moved": signed_volume(mesh, (0.1, 0.1, 0.1), printed=True),
                 }
             )
     return found
@@ -74,19 +88,20 @@ def main() -> int:
     table = rows()
     print("Module volumes (thesis, Table 1) from our meshes\n")
     print(
-        f"{'part':<20}{'tabulated':>11}{'computed':>11}{'diff.':>9}{'boxes':>11}{'mass':>9}"
+        f"{'part':<20}{'tabulated':>11}{'computed':>11}{'diff.':>9}{'trimesh':>11}{'boxes':>11}"
+        f"{'mass':>9}"
         f"{'density':>9}   centre of volume"
     )
     print(
-        f"{'':<20}{'[m3]':>11}{'[m3]':>11}{'[%]':>9}{'[m3]':>11}{'[kg]':>9}{'[kg/m3]':>9}"
+        f"{'':<20}{'[m3]':>11}{'[m3]':>11}{'[%]':>9}{'[m3]':>11}{'[m3]':>11}{'[kg]':>9}{'[kg/m3]':>9}"
         "   x, y, z [mm]"
     )
     for row in table:
         center = ", ".join(f"{round(1e3 * value, 2) + 0.0:.2f}" for value in row["center"])
         print(
             f"{row['part']:<20}{row['tabulated']:>11.3e}{row['computed']:>11.3e}"
-            f"{round(row['difference'], 4) + 0.0:>9.4f}{row['box']:>11.3e}{row['mass']:>9.4f}"
-            f"{row['density']:>9.1f}   {center}"
+            f"{round(row['difference'], 4) + 0.0:>9.4f}{row['trimesh']:>11.3e}{row['box']:>11.3e}"
+            f"{row['mass']:>9.4f}{row['density']:>9.1f}   {center}"
         )
     print(
         "\nThe centres are those of our shapes in the part's frame; the physics uses the "

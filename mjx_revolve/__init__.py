@@ -18,8 +18,17 @@ _WHERE = {
     "MODULES": "body.catalogue",
     "THESIS_MODULES": "body.catalogue",
     "load_morphology": "body.morphology",
+    "make_morphology": "body.morphology",
     "save_morphology": "body.morphology",
     "trim_neutral": "body.morphology",
+    "add_module": "body.edits",
+    "exchange_subtrees": "body.edits",
+    "free_slots": "body.edits",
+    "graft_subtree": "body.edits",
+    "remove_module": "body.edits",
+    "replace_module": "body.edits",
+    "swap_subtrees": "body.edits",
+    "turn_module": "body.edits",
     "load_world": "water.world",
     "make_world": "water.world",
     "build_robot": "engine.robot",
@@ -38,7 +47,16 @@ if TYPE_CHECKING:
     from mjx_revolve.body.catalogue import MODULES as MODULES
     from mjx_revolve.body.catalogue import THESIS_MODULES as THESIS_MODULES
     from mjx_revolve.body.catalogue import load_modules as load_modules
+    from mjx_revolve.body.edits import add_module as add_module
+    from mjx_revolve.body.edits import exchange_subtrees as exchange_subtrees
+    from mjx_revolve.body.edits import free_slots as free_slots
+    from mjx_revolve.body.edits import graft_subtree as graft_subtree
+    from mjx_revolve.body.edits import remove_module as remove_module
+    from mjx_revolve.body.edits import replace_module as replace_module
+    from mjx_revolve.body.edits import swap_subtrees as swap_subtrees
+    from mjx_revolve.body.edits import turn_module as turn_module
     from mjx_revolve.body.morphology import load_morphology as load_morphology
+    from mjx_revolve.body.morphology import make_morphology as make_morphology
     from mjx_revolve.body.morphology import save_morphology as save_morphology
     from mjx_revolve.body.morphology import trim_neutral as trim_neutral
     from mjx_revolve.control.controller import bind_genes as bind_genes

@@ -49,15 +49,15 @@ def boxes_overlap(
     rotations: np.ndarray,
     halves: np.ndarray,
 ) -> np.ndarray:
-    """Separating axis theorem for one box against `n` others.
+    """Separating axis theorem for `n` pairs of boxes, or for one box against `n` others.
 
     Two boxes are apart when their shadows are apart on one of 15 axes: three normals of each and
     the nine cross products of their edges (Gottschalk, Lin and Manocha, OBBTree, SIGGRAPH 1996).
 
     Args:
-        center: `[3]` of the one [m].
-        rotation: `[3, 3]` its axes as columns.
-        half: `[3]` its half edges [m].
+        center: `[n, 3]` or `[3]` of the ones [m].
+        rotation: `[n, 3, 3]` or `[3, 3]` their axes as columns.
+        half: `[n, 3]` or `[3]` their half edges [m].
         centers: `[n, 3]` of the others [m].
         rotations: `[n, 3, 3]` of the others.
         halves: `[n, 3]` of the others [m].
@@ -65,13 +65,14 @@ def boxes_overlap(
     Returns:
         `[n]` whether they overlap by more than 1 nm.
     """
-    mine = np.broadcast_to(rotation.T, (len(centers), 3, 3))
-    theirs = rotations.transpose(0, 2, 1)
+    theirs = np.swapaxes(rotations, 1, 2)
+    mine = np.broadcast_to(np.swapaxes(rotation, -1, -2), theirs.shape)
     crossed = np.cross(mine[:, :, None], theirs[:, None, :]).reshape(-1, 9, 3)
     axes = np.concatenate([mine, theirs, crossed], axis=1)  # [n, 15, 3]
     length = np.linalg.norm(axes, axis=2)
-    shadow_a = np.abs(np.einsum("nkx,nxi->nki", axes, np.swapaxes(mine, 1, 2))) @ half
-    shadow_b = np.einsum("nki,ni->nk", np.abs(np.einsum("nkx,nxi->nki", axes, rotations)), halves)
+    halfs = np.broadcast_to(half, halves.shape)
+    shadow_a = np.einsum("nki,ni->nk", np.abs(np.einsum("nkx,nix->nki", axes, mine)), halfs)
+    shadow_b = np.einsum("nki,ni->nk", np.abs(np.einsum("nkx,nix->nki", axes, theirs)), halves)
     gap = np.abs(np.einsum("nkx,nx->nk", axes, centers - center)) - shadow_a - shadow_b
     # Parallel edges have no cross product and separate nothing.
     return np.all((gap < -1e-9 * length) | (length < 1e-9), axis=1)

@@ -1,197 +1,45 @@
-"""The tree of modules: read, checked, laid out at rest, described and written.
+"""Bodies read: from Revolve's YAML, or from a mapping like it, checked and laid out at rest.
 
 A morphology file is Revolve's YAML: `id`, `body` (a tree of modules, each with `id`, `type`,
-`orientation`, `params` and `children` by slot) and `brain`. The core's frame is the robot's: at the
-origin, unturned. All positions are in that frame, at rest (hinges at 0), in metres.
+`orientation`, `params` and `children` by slot) and `brain`.
 """
 
 from __future__ import annotations
 
+import copy
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.descriptors import describe
-from mjx_revolve.body.module_types import ModuleType, Part, Vector, check_number, show
+from mjx_revolve.body.module_types import ModuleType, check_number, show
 from mjx_revolve.body.params import apply_overrides, check_overrides, read_number
-from mjx_revolve.body.placement import Module, attach, find_bounds, find_overlaps, frozen, same
-from mjx_revolve.inputs.errors import InputError, SafeLoader, load_yaml
+from mjx_revolve.body.placement import Module, attach, check_overlaps, frozen
+from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
+from mjx_revolve.inputs.errors import InputError, load_yaml
 
-__all__ = ["Module", "Morphology", "load_morphology", "save_morphology", "trim_neutral"]
+__all__ = [
+    "Module",
+    "Morphology",
+    "load_morphology",
+    "make_morphology",
+    "save_morphology",
+    "trim_neutral",
+]
 
 # Evolved robots have about 30 modules. The limit is a choice: it keeps a mistake from taking hours.
 MAX_MODULES = 1000
 
 # Names that the MuJoCo model keeps for itself.
-_RESERVED = ("world", "root")
+RESERVED = ("world", "root")
 
 _MODULE_KEYS = ("id", "type", "slot", "orientation", "params", "children")
-_COLORS = ("red", "green", "blue")
 
-
-# ------------------------------------------------------------------------- values
-
-
-@dataclass(frozen=True, eq=False)
-class Morphology:
-    """A robot's body as a tree of modules, depth first in the file's order.
-
-    Two morphologies are equal when name, modules and brain are.
-
-    Attributes:
-        name: the file's `id`, or its stem.
-        modules: the core first; a parent comes before its children.
-        brain: the file's `brain` as it is, for whoever understands it; None where there is none.
-        path: the file that it was read from.
-        overlaps: names of the pairs of modules that overlap at rest (empty unless allowed).
-    """
-
-    name: str
-    modules: tuple[Module, ...]
-    brain: Any = None
-    path: str | None = None
-    overlaps: tuple[tuple[str, str], ...] = ()
-
-    def __eq__(self, other: object) -> bool:
-        """Same name, modules and brain; the path does not count."""
-        if not isinstance(other, Morphology):
-            return NotImplemented
-        return (
-            self.name == other.name
-            and self.modules == other.modules
-            and same(self.brain, other.brain)
-        )
-
-    @property
-    def num_modules(self) -> int:
-        """Number of modules; a hinge is one."""
-        return len(self.modules)
-
-    @property
-    def mass(self) -> float:
-        """Mass [kg]."""
-        return sum(module.kind.mass for module in self.modules)
-
-    @property
-    def volume(self) -> float:
-        """Displaced volume, electronics and ballast included [m³]."""
-        return sum(module.kind.volume for module in self.modules)
-
-    @property
-    def center_of_mass(self) -> np.ndarray:
-        """`[3]` centre of mass at rest, core frame [m]."""
-        return self._center(lambda part: (part.total_mass, part.center_of_mass))
-
-    @property
-    def center_of_volume(self) -> np.ndarray:
-        """`[3]` centre of the displaced volume at rest, core frame [m].
-
-        Where it lies above the centre of mass, the robot rights itself under water.
-        """
-        return self._center(lambda part: (part.total_volume, part.displaced_center))
-
-    def _center(self, look: Callable[[Part], tuple[float, Vector]]) -> np.ndarray:
-        """Weighted mean of a point of each part; `look` gives weight and point, part frame."""
-        center, whole = np.zeros(3), 0.0
-        for module in self.modules:
-            for part in module.kind.parts:
-                weight, point = look(part)
-                place = module.rotation @ np.add(part.position, point)
-                center += weight * (module.position + place)
-                whole += weight
-        return center / whole if whole > 0.0 else center
-
-    @property
-    def box_volume(self) -> float:
-        """Sum of all collision boxes' volumes [m³]; shared space counts for each box."""
-        return sum(module.kind.box_volume for module in self.modules)
-
-    @property
-    def hinges(self) -> tuple[int, ...]:
-        """Indices of the modules with a hinge, in order: the order of `ctrl`."""
-        return tuple(i for i, m in enumerate(self.modules) if m.kind.hinge is not None)
-
-    @property
-    def num_hinges(self) -> int:
-        """Number of hinges."""
-        return len(self.hinges)
-
-    @property
-    def thrusters(self) -> tuple[tuple[int, int], ...]:
-        """Module and part of each thruster, in order: the order of `ctrl` after the hinges'."""
-        return tuple(
-            (i, k)
-            for i, module in enumerate(self.modules)
-            for k, part in enumerate(module.kind.parts)
-            if part.thruster is not None
-        )
-
-    @property
-    def num_thrusters(self) -> int:
-        """Number of thrusters."""
-        return len(self.thrusters)
-
-    @property
-    def num_fins(self) -> int:
-        """Number of modules with a fin."""
-        return sum(module.kind.is_fin for module in self.modules)
-
-    def hinge_neighbours(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of hinges that share a rigid body.
-
-        Modules that are welded together are one body; a hinge joins the body that it is attached to
-        and the body that it moves.
-
-        Returns:
-            pairs (i, j), i < j, of positions in `hinges`, in order.
-        """
-        number = {index: k for k, index in enumerate(self.hinges)}
-        carries: list[int] = []  # the hinge that moves a module's children, -1 for the core's body
-        joined: dict[int, list[int]] = {}
-        for index, module in enumerate(self.modules):
-            body = carries[module.parent] if module.parent >= 0 else -1
-            if index in number:
-                joined.setdefault(body, []).append(number[index])
-                body = number[index]
-                joined.setdefault(body, []).append(body)
-            carries.append(body)
-        pairs = {(min(i, j), max(i, j)) for group in joined.values() for i in group for j in group}
-        return tuple(sorted((i, j) for i, j in pairs if i < j))
-
-    @cached_property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """`[3]` lowest and `[3]` highest corner of all boxes at rest, core frame [m]."""
-        return find_bounds(self.modules)
-
-    @property
-    def extent(self) -> np.ndarray:
-        """`[3]` edges of the bounding box at rest along the core's x, y, z [m]."""
-        low, high = self.bounds
-        return high - low
-
-    @property
-    def length(self) -> float:
-        """Body length: the largest extent at rest [m]."""
-        return float(self.extent.max())
-
-    @cached_property
-    def descriptors(self) -> dict[str, float]:
-        """Measures of the body; see `descriptors.describe`."""
-        return describe(self.modules)
-
-    def save(self, path: str | Path) -> None:
-        """Writes the morphology; see `save_morphology`."""
-        save_morphology(self, path)
-
-
-# ------------------------------------------------------------------------- reading
+_ORIGIN = frozen(np.zeros(3)), frozen(np.eye(3))
 
 
 def load_morphology(
@@ -199,7 +47,35 @@ def load_morphology(
     modules: Mapping[str, ModuleType] = MODULES,
     allow_overlap: bool = False,
 ) -> Morphology:
-    """Reads a robot's body from Revolve's YAML.
+    """Reads a robot's body from Revolve's YAML, as `make_morphology` does from a mapping.
+
+    Args:
+        path: the file; without an `id` in it, the robot is named after it.
+        modules: the types of modules by name and alias.
+        allow_overlap: load a robot whose modules overlap at rest; `overlaps` then names them.
+
+    Returns:
+        The morphology.
+
+    Raises:
+        InputError: the file cannot be read, or something in it is wrong; the message says where,
+            what was expected and what was found.
+    """
+    path = Path(path)
+    data = load_yaml(path)
+    if data is None:
+        raise InputError(f"{path}: expected a mapping with id, body and brain; found an empty file")
+    return replace(_make(data, modules, allow_overlap, path.stem, str(path)), path=str(path))
+
+
+def make_morphology(
+    mapping: Mapping[str, Any],
+    modules: Mapping[str, ModuleType] = MODULES,
+    allow_overlap: bool = False,
+    name: str = "robot",
+    source: str = "morphology",
+) -> Morphology:
+    """Makes a robot's body from a mapping like a morphology file.
 
     Read as found in the wild: slots may be numbers or text; a module's `slot` key means nothing;
     `orientation` (0), `params` and `id` may be missing (a module without id is named after its type
@@ -228,41 +104,42 @@ def load_morphology(
       left-handed propeller; `thrust` [N] at its highest command, which scales its curve.
 
     Args:
-        path: the file.
+        mapping: `id`, `body` and `brain`, or a body's tree of modules alone; it is copied.
         modules: the types of modules by name and alias.
-        allow_overlap: load a robot whose modules overlap at rest; `overlaps` then names them.
+        allow_overlap: make a robot whose modules overlap at rest; `overlaps` then names them.
+        name: of the robot, where the mapping has no `id`.
+        source: what to call the mapping in messages.
 
     Returns:
         The morphology.
 
     Raises:
-        InputError: the file cannot be read, or something in it is wrong; the message says where,
-            what was expected and what was found.
+        InputError: something in the mapping is wrong; the message says where, what was expected and
+            what was found.
     """
-    path = Path(path)
-    data = load_yaml(path)
+    if isinstance(mapping, dict) and "type" in mapping and "body" not in mapping:
+        mapping = {"body": mapping}
+    return _make(mapping, modules, allow_overlap, name, source)
+
+
+def _make(
+    data: Any, modules: Mapping[str, ModuleType], allow_overlap: bool, name: str, source: str
+) -> Morphology:
+    """The body of a whole mapping; `name` where it has no `id`."""
     if not isinstance(data, dict):
-        found = "an empty file" if data is None else show(data)
-        raise InputError(f"{path}: expected a mapping with id, body and brain; found {found}")
-    _check_known(data, ("id", "body", "brain"), str(path))
-    if "body" not in data:
-        raise InputError(f"{path}: expected the key body; found {show(list(data))}")
-    tree = _read_tree(data["body"], modules, path)
-    morphology = Morphology(
-        name=_read_id(data.get("id"), f"{path}: id") or path.stem,
-        modules=tree,
-        brain=data.get("brain"),
-        path=str(path),
-    )
-    pairs = find_overlaps(tree)
-    if pairs and not allow_overlap:
-        named = ", ".join(f"{a} and {b}" for a, b in pairs[:5])
-        more = f" and {len(pairs) - 5} more" if len(pairs) > 5 else ""
         raise InputError(
-            f"{path}: body: expected modules that do not overlap at rest; found overlapping: "
-            f"{named}{more} (allow_overlap loads them all the same)"
+            f"{source}: expected a mapping with id, body and brain; found {show(data)}"
         )
-    return replace(morphology, overlaps=pairs)
+    _check_known(data, ("id", "body", "brain"), source)
+    if "body" not in data:
+        raise InputError(f"{source}: expected the key body; found {show(list(data))}")
+    tree = _read_tree(data["body"], modules, source)
+    return Morphology(
+        name=_read_id(data.get("id"), f"{source}: id") or name,
+        modules=tree,
+        brain=copy.deepcopy(data.get("brain")),
+        overlaps=check_overlaps(tree, allow_overlap, f"{source}: body"),
+    )
 
 
 def _check_known(item: dict[Any, Any], known: tuple[str, ...], place: str) -> None:
@@ -271,81 +148,96 @@ def _check_known(item: dict[Any, Any], known: tuple[str, ...], place: str) -> No
             raise InputError(f"{place}: expected only {', '.join(known)}; found {show(key)}")
 
 
-def _read_tree(body: Any, modules: Mapping[str, ModuleType], path: Path) -> tuple[Module, ...]:
+def _read_tree(body: Any, modules: Mapping[str, ModuleType], source: str) -> tuple[Module, ...]:
     """All modules, depth first, with unique names."""
     found: list[Module] = []
     stack: list[tuple[Any, str, int, int]] = [(body, "body", -1, -1)]
     while stack:
         item, where, parent, slot = stack.pop()
-        place = f"{path}: {where}"
+        place = f"{source}: {where}"
         if len(found) == MAX_MODULES:
-            raise InputError(f"{path}: body: expected at most {MAX_MODULES} modules; found more")
-        above = found[parent] if parent >= 0 else None
-        module = _read_module(item, place, modules, above)
+            raise InputError(f"{source}: body: expected at most {MAX_MODULES} modules; found more")
         index = len(found)
-        found.append(replace(module, parent=parent, slot=slot))
-        children = _read_children(item, place, module)
+        module = read_module(item, place, modules, found, parent, slot)
+        found.append(module)
         stack.extend(
             (child, f"{where}.children.{number}", index, number)
-            for number, child in reversed(children.items())
+            for number, child in reversed(_read_children(item, place, module).items())
         )
-        if above is not None:
-            pose = attach(above, above.kind.slots[slot], module)
-            found[index] = replace(found[index], position=pose[0], rotation=pose[1])
     return _with_unique_names(found)
 
 
-def _read_module(
-    item: Any, place: str, modules: Mapping[str, ModuleType], parent: Module | None
+def read_module(
+    item: Any,
+    place: str,
+    modules: Mapping[str, ModuleType],
+    tree: Sequence[Module],
+    parent: int,
+    slot: int,
 ) -> Module:
-    """One module without its children, at the origin."""
+    """Reads one module without its children and puts it in its place.
+
+    Args:
+        item: the mapping with its type.
+        place: where, for messages.
+        modules: the types of modules by name and alias.
+        tree: the robot's modules so far.
+        parent: index of its parent in them; -1 for the core.
+        slot: the parent's slot, which it has; -1 for the core.
+
+    Returns:
+        The module; where it has no name, it is named after its type and its place in the order.
+
+    Raises:
+        InputError: something in it is wrong.
+    """
     if not isinstance(item, dict):
         found = "nothing" if item is None else show(item)
         raise InputError(f"{place}: expected a module (a mapping with a type); found {found}")
     _check_known(item, _MODULE_KEYS, place)
-    kind = _read_type(item, place, modules, parent)
-    orientation = _read_orientation(item.get("orientation"), f"{place}.orientation")
-    if parent is None and orientation != 0.0:
+    kind = _read_type(item.get("type"), place, modules, parent < 0)
+    orientation = read_orientation(item.get("orientation"), f"{place}.orientation")
+    if parent < 0 and orientation != 0.0:
         raise InputError(
             f"{place}.orientation: expected 0 (the core is attached to nothing); "
             f"found {orientation:g}"
         )
     rgb, params = _read_params(item.get("params"), f"{place}.params")
     try:
-        changed = apply_overrides(kind, params)
+        changed = apply_overrides(kind, params) if params else kind
     except InputError as error:
         raise InputError(f"{place}.params: {error}") from None
+    position, rotation = _ORIGIN
+    if parent >= 0:
+        above = tree[parent]
+        position, rotation = attach(above, above.kind.slots[slot], changed, orientation)
     return Module(
-        name=_read_id(item.get("id"), f"{place}.id"),
+        name=_read_id(item.get("id"), f"{place}.id") or f"{kind.name}{len(tree)}",
         type=kind.name,
-        parent=-1,
-        slot=-1,
+        parent=parent,
+        slot=slot,
         orientation=orientation,
         rgb=rgb,
-        position=frozen(np.zeros(3)),
-        rotation=frozen(np.eye(3)),
+        position=position,
+        rotation=rotation,
         kind=changed,
         params=params,
     )
 
 
 def _read_type(
-    item: dict[str, Any], place: str, modules: Mapping[str, ModuleType], parent: Module | None
+    name: Any, place: str, modules: Mapping[str, ModuleType], is_root: bool
 ) -> ModuleType:
     """The type of a module, checked against where it stands."""
-    names = sorted(n for n, k in modules.items() if (k.mount is None) == (parent is None))
-    expected = f"expected one of {', '.join(names)}"
-    if item.get("type") is None:
-        raise InputError(f"{place}.type: {expected}; found none")
-    name = item["type"]
-    if not isinstance(name, str) or name not in modules:
-        raise InputError(f"{place}.type: {expected}; found {show(name)}")
-    kind = modules[name]
-    if parent is None and kind.mount is not None:
-        raise InputError(f"{place}.type: {expected} (the root is a core); found {name!r}")
-    if parent is not None and kind.mount is None:
-        raise InputError(f"{place}.type: {expected} (a core is always the root); found {name!r}")
-    return kind
+    kind = modules.get(name) if isinstance(name, str) else None
+    if kind is not None and (kind.mount is None) == is_root:
+        return kind
+    names = sorted(n for n, k in modules.items() if (k.mount is None) == is_root)
+    hint = " (the root is a core)" if is_root else " (a core is always the root)"
+    raise InputError(
+        f"{place}.type: expected one of {', '.join(names)}{'' if kind is None else hint}; "
+        f"found {'none' if name is None else show(name)}"
+    )
 
 
 def _read_children(item: dict[str, Any], place: str, module: Module) -> dict[int, Any]:
@@ -358,25 +250,39 @@ def _read_children(item: dict[str, Any], place: str, module: Module) -> dict[int
         raise InputError(
             f"{place}: expected a mapping from slots to modules; found {show(children)}"
         )
-    slots = module.kind.slots
-    if children and not slots:
-        raise InputError(
-            f"{place}: expected none, since type {module.type} has no slots; "
-            f"found {show(list(children))}"
-        )
     found: dict[int, Any] = {}
     for key, child in children.items():
-        number = int(key) if isinstance(key, str) and re.fullmatch(r"[0-9]{1,9}", key) else key
-        if not isinstance(number, int) or isinstance(number, bool) or number not in slots:
-            hint = " (slot 0 is where it is attached)" if number == 0 and 0 not in slots else ""
-            raise InputError(
-                f"{place}: expected one of the slots {', '.join(map(str, sorted(slots)))} of type "
-                f"{module.type}{hint}; found {show(key)}"
-            )
+        number = read_slot(key, module.kind, place)
         if number in found:
             raise InputError(f"{place}: expected each slot once; found slot {number} twice")
         found[number] = child
     return found
+
+
+def read_slot(value: Any, kind: ModuleType, place: str) -> int:
+    """The number of one of a type's slots.
+
+    Args:
+        value: what the user gave: a number, or one written as text.
+        kind: the type of module.
+        place: where, for the message.
+
+    Returns:
+        The number.
+
+    Raises:
+        InputError: the type has no such slot.
+    """
+    text = isinstance(value, str) and re.fullmatch(r"[0-9]{1,9}", value)
+    number = int(value) if text or isinstance(value, np.integer) else value
+    if isinstance(number, int) and not isinstance(number, bool) and number in kind.slots:
+        return number
+    wanted = f"one of the slots {', '.join(map(str, sorted(kind.slots)))} of type {kind.name}"
+    if not kind.slots:
+        wanted = f"none, since type {kind.name} has no slots"
+    elif number == 0 and 0 not in kind.slots:
+        wanted += " (slot 0 is where it is attached)"
+    raise InputError(f"{place}: expected {wanted}; found {show(value)}")
 
 
 def _read_id(value: Any, place: str) -> str:
@@ -394,12 +300,24 @@ def _read_id(value: Any, place: str) -> str:
         raise InputError(f"{place}: expected a name or a number; found {show(value)}") from None
 
 
-def _read_orientation(value: Any, place: str) -> float:
+def read_orientation(value: Any, place: str) -> float:
+    """A module's turn.
+
+    Args:
+        value: what the user gave; None is 0.
+        place: where, for the message.
+
+    Returns:
+        The angle [deg].
+
+    Raises:
+        InputError: it is no quarter turn.
+    """
     if value is None:  # Revolve itself writes `orientation: null`
         return 0.0
-    angle = read_number(value)
-    known = (0, 90, 180, 270, -90, -180, -270)
-    if isinstance(angle, bool) or not isinstance(angle, int | float) or angle not in known:
+    angle, known = read_number(value), (0, 90, 180, 270, -90, -180, -270)
+    number = isinstance(angle, int | float | np.integer) and not isinstance(angle, bool)
+    if not number or angle not in known:
         raise InputError(f"{place}: expected 0, 90, 180, 270 or -90 [deg]; found {show(value)}")
     return float(angle)
 
@@ -412,17 +330,17 @@ def _read_params(
         return None, {}
     if not isinstance(params, dict):
         raise InputError(f"{place}: expected a mapping; found {show(params)}")
-    rest = {key: value for key, value in params.items() if key not in _COLORS}
-    rest = check_overrides(rest, place)
-    given = [key for key in _COLORS if key in params]
+    rest = {key: copy.deepcopy(params[key]) for key in params if key not in COLORS}
+    rest = check_overrides(rest, place) if rest else rest
+    given = [key for key in COLORS if key in params]
     if not given:
         return None, rest
     if len(given) < 3:
         raise InputError(
             f"{place}: expected red, green and blue, or none; found {', '.join(given)} only"
         )
-    levels = [read_number(params[key]) for key in _COLORS]
-    for key, level in zip(_COLORS, levels, strict=True):
+    levels = [read_number(params[key]) for key in COLORS]
+    for key, level in zip(COLORS, levels, strict=True):
         number = isinstance(level, int | float) and not isinstance(level, bool)
         if not number or not 0.0 <= level <= 1.0:
             raise InputError(f"{place}.{key}: expected a number from 0 to 1; found {show(level)}")
@@ -430,9 +348,9 @@ def _read_params(
 
 
 def _with_unique_names(modules: list[Module]) -> tuple[Module, ...]:
-    """Names the nameless and tells apart those that share a name."""
-    names = [m.name or f"{m.type}{i}" for i, m in enumerate(modules)]
-    taken, seen = {*names}, {*_RESERVED}
+    """Tells apart the modules that share a name, or have one that MuJoCo needs."""
+    names = [m.name for m in modules]
+    taken, seen = {*names}, {*RESERVED}
     for i, name in enumerate(names):
         count = 2
         while name in seen:
@@ -443,10 +361,10 @@ def _with_unique_names(modules: list[Module]) -> tuple[Module, ...]:
         taken.add(name)
         seen.add(name)
         names[i] = name
-    return tuple(replace(m, name=name) for m, name in zip(modules, names, strict=True))
-
-
-# ------------------------------------------------------------------------- trimming
+    return tuple(
+        m if m.name == name else replace(m, name=name)
+        for m, name in zip(modules, names, strict=True)
+    )
 
 
 def trim_neutral(morphology: Morphology, density: float) -> Morphology:
@@ -477,53 +395,3 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
     added = {"electronics_volume": max(total, 0.0)}
     core = replace(core, kind=apply_overrides(core.kind, added), params={**core.params, **added})
     return replace(morphology, modules=(core, *morphology.modules[1:]))
-
-
-# ------------------------------------------------------------------------- writing
-
-
-class _Dumper(yaml.SafeDumper):
-    """Puts text in quotes that our own reader would take for a number (`1e-3`)."""
-
-    yaml_implicit_resolvers = SafeLoader.yaml_implicit_resolvers
-
-    def ignore_aliases(self, data: Any) -> bool:
-        """Writes shared values out."""
-        return True
-
-
-def save_morphology(morphology: Morphology, path: str | Path) -> None:
-    """Writes a robot's body as YAML that `load_morphology` reads back to an equal morphology.
-
-    Types are written by name: a robot with a user's own types needs those again to be read.
-
-    Args:
-        morphology: the robot.
-        path: the file.
-
-    Raises:
-        InputError: the file cannot be written, or `params` or `brain` hold what YAML cannot.
-    """
-    items: list[dict[str, Any]] = []
-    for module in morphology.modules:
-        item: dict[str, Any] = {"id": module.name, "type": module.type}
-        turn = module.orientation
-        item["orientation"] = int(turn) if turn.is_integer() else turn
-        colors = zip(_COLORS, module.rgb, strict=True) if module.rgb is not None else ()
-        params = {**dict(colors), **module.params}
-        if params:
-            item["params"] = params
-        items.append(item)
-        if module.parent >= 0:
-            items[module.parent].setdefault("children", {})[module.slot] = item
-    data: dict[str, Any] = {"id": morphology.name, "body": items[0]}
-    if morphology.brain is not None:
-        data["brain"] = morphology.brain
-    try:
-        text = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
-        Path(path).write_text(text, encoding="utf-8")
-    except (ValueError, RecursionError, yaml.YAMLError) as error:
-        found = str(error).splitlines()[0]
-        raise InputError(f"{path}: expected values that YAML can hold; found: {found}") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a file to write; found: {error.strerror}") from None

@@ -1,23 +1,29 @@
-"""Modules at rest: where each one lies, and which ones overlap."""
+"""Modules at rest: where each one and its boxes lie, and which ones overlap."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import lru_cache
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_revolve.body.boxes import boxes_overlap, quarter_turn
-from mjx_revolve.body.module_types import ModuleType, Slot
+from mjx_revolve.body.module_types import ModuleType, Slot, Vector
+from mjx_revolve.inputs.errors import InputError
 
 # Boxes are shrunk by this much at each face [m] before they are tested for overlap, thin ones by
 # half their half-edge at most. A choice: a brick's box stands 1.5 mm proud of its attachment faces,
 # so that two bricks on neighbouring faces of a third share 3 mm by design.
 OVERLAP_TOLERANCE = 0.002
 
+# Types whose geometry is remembered: the catalogue's, and those that modules' own `params` make.
+_MOST_SHAPES = 4096
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Module:
     """One module of a robot, at rest.
 
@@ -49,13 +55,18 @@ class Module:
         """Same values, bit for bit."""
         if not isinstance(other, Module):
             return NotImplemented
-        plain = ("name", "type", "parent", "slot", "orientation", "rgb", "kind")
+        plain = attrgetter("name", "type", "parent", "slot", "orientation", "rgb", "kind")
         return (
-            all(getattr(self, key) == getattr(other, key) for key in plain)
+            plain(self) == plain(other)
             and np.array_equal(self.position, other.position)
             and np.array_equal(self.rotation, other.rotation)
             and same(self.params, other.params)
         )
+
+    def __repr__(self) -> str:
+        """One line."""
+        place = "" if self.parent < 0 else f", slot {self.slot} of module {self.parent}"
+        return f"Module({self.name!r}: {self.type}{place}, {self.kind.mass:.4g} kg)"
 
     def boxes(self, main: bool = False) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Its boxes at rest.
@@ -83,7 +94,18 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def attach(parent: Module, slot: Slot, child: Module) -> tuple[np.ndarray, np.ndarray]:
+@lru_cache(maxsize=4096)
+def _turn(up: Vector, direction: Vector, outward: Vector, quarter: int) -> np.ndarray:
+    """`[3, 3]` parent's frame from child's frame, for a slot, a mount and quarter turns."""
+    toward, above, away, z = map(np.array, (direction, up, outward, (0.0, 0.0, 1.0)))
+    target = np.column_stack([toward, np.cross(above, toward), above])
+    source = np.column_stack([away, np.cross(z, away), z])
+    return frozen(quarter_turn(toward, quarter) @ target @ source.T)
+
+
+def attach(
+    parent: Module, slot: Slot, kind: ModuleType, orientation: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Pose of a child at rest.
 
     The child's outward axis comes to lie along the slot's direction and its z along the slot's up;
@@ -92,46 +114,115 @@ def attach(parent: Module, slot: Slot, child: Module) -> tuple[np.ndarray, np.nd
     Args:
         parent: the module that carries it, placed.
         slot: one of the parent's slots.
-        child: a module with a mount; its own pose is not read.
+        kind: the child's type, which has a mount.
+        orientation: the child's [deg].
 
     Returns:
         `[3]` position and `[3, 3]` rotation, core frame.
     """
-    mount = child.kind.mount
+    mount = kind.mount
     assert mount is not None  # a core is never a child
-    up, direction = np.array(slot.up), np.array(slot.direction)
-    outward, z = np.array(mount.outward), np.array([0.0, 0.0, 1.0])
-    target = np.column_stack([direction, np.cross(up, direction), up])
-    source = np.column_stack([outward, np.cross(z, outward), z])
-    quarter = round(child.orientation / 90) % 4
-    turned = quarter_turn(direction, quarter) @ target @ source.T
-    rotation = parent.rotation @ turned
-    position = (
-        parent.position
-        + parent.rotation @ np.array(slot.position)
-        - rotation @ np.array(mount.position)
-    )
+    quarter = round(orientation / 90) % 4
+    rotation = parent.rotation @ _turn(slot.up, slot.direction, mount.outward, quarter)
+    position = parent.position + parent.rotation @ slot.position - rotation @ mount.position
     return frozen(position), frozen(rotation)
 
 
-def find_bounds(modules: Sequence[Module]) -> tuple[np.ndarray, np.ndarray]:
-    """Bounding box of all boxes at rest.
+# ------------------------------------------------------------------------- all parts together
+
+
+class Layout(NamedTuple):
+    """All parts of a body at rest, and all of their boxes, part after part.
+
+    Attributes:
+        module: `[npart]` index of each part's module.
+        position: `[npart, 3]` origin of the part's frame, core frame [m].
+        rotation: `[npart, 3, 3]` core frame from part frame.
+        low: `[npart, 3]` lowest corner of the part's boxes, part frame [m].
+        high: `[npart, 3]` highest corner.
+        main: `[npart]` index of the part's first box, the main one, centred on the part's frame.
+        box_part: `[nbox]` index of each box's part.
+        box_position: `[nbox, 3]` its centre, part frame [m].
+        box_half: `[nbox, 3]` its half edges, part frame [m].
+    """
+
+    module: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    main: np.ndarray
+    box_part: np.ndarray
+    box_position: np.ndarray
+    box_half: np.ndarray
+
+    def box_centers(self) -> np.ndarray:
+        """`[nbox, 3]` centres of the boxes, core frame [m]."""
+        k = self.box_part
+        return self.position[k] + np.einsum("bij,bj->bi", self.rotation[k], self.box_position)
+
+    def box_reaches(self) -> np.ndarray:
+        """`[nbox, 3]` how far each box reaches from its centre along the core's axes [m]."""
+        return np.einsum("bij,bj->bi", np.abs(self.rotation[self.box_part]), self.box_half)
+
+
+_shapes: dict[int, tuple[ModuleType, tuple[np.ndarray, ...]]] = {}
+
+
+def _shape(kind: ModuleType) -> tuple[np.ndarray, ...]:
+    """What a layout needs of a type: the same for all of its modules, so found once."""
+    # Types hold dictionaries and have no hash. The type is kept with its shape, so that no other
+    # comes to have its id.
+    if id(kind) not in _shapes:
+        if len(_shapes) >= _MOST_SHAPES:
+            _shapes.clear()
+        boxes = [(k, box) for k, part in enumerate(kind.parts) for box in part.boxes]
+        owner = np.array([k for k, _ in boxes])
+        shape = (
+            np.array([part.position for part in kind.parts], float),
+            np.array([part.bounds[0] for part in kind.parts], float),
+            np.array([part.bounds[1] for part in kind.parts], float),
+            np.searchsorted(owner, np.arange(len(kind.parts))),
+            owner,
+            np.array([box.position for _, box in boxes], float),
+            np.array([box.size for _, box in boxes], float) / 2,
+        )
+        _shapes[id(kind)] = kind, shape
+    return _shapes[id(kind)][1]
+
+
+def lay_out(modules: Sequence[Module]) -> Layout:
+    """Where all parts and boxes of a body lie at rest.
 
     Args:
         modules: a robot's modules.
 
     Returns:
-        `[3]` lowest and `[3]` highest corner, core frame [m].
+        The layout.
     """
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for module in modules:
-        for center, half in module.boxes():
-            reach = np.abs(module.rotation) @ half
-            low, high = np.minimum(low, center - reach), np.maximum(high, center + reach)
-    return low, high
+    shapes = [_shape(m.kind) for m in modules]
+    place, low, high, main, owner, center, half = map(np.concatenate, zip(*shapes, strict=True))
+    parts, boxes = [len(s[0]) for s in shapes], [len(s[4]) for s in shapes]
+    module = np.repeat(np.arange(len(modules)), parts)
+    before = np.cumsum([0, *parts[:-1]]), np.cumsum([0, *boxes[:-1]])
+    rotation = np.array([m.rotation for m in modules])[module]
+    origin = np.array([m.position for m in modules])[module]
+    return Layout(
+        module=module,
+        position=origin + np.einsum("pij,pj->pi", rotation, place),
+        rotation=rotation,
+        low=low,
+        high=high,
+        main=main + np.repeat(before[1], parts),
+        box_part=owner + np.repeat(before[0], boxes),
+        box_position=center,
+        box_half=half,
+    )
 
 
-def find_overlaps(modules: Sequence[Module]) -> tuple[tuple[str, str], ...]:
+def find_overlaps(
+    modules: Sequence[Module], moved: Iterable[int] | None = None
+) -> tuple[tuple[int, int], ...]:
     """Modules that overlap at rest.
 
     The main boxes of all parts are compared, shrunk by `OVERLAP_TOLERANCE`; parts of one module and
@@ -139,27 +230,64 @@ def find_overlaps(modules: Sequence[Module]) -> tuple[tuple[str, str], ...]:
 
     Args:
         modules: a robot's modules.
+        moved: indices of those to compare with all; by default all.
 
     Returns:
-        names of the pairs, in the modules' order.
+        pairs of indices, in order.
     """
-    owner, centers, halves = [], [], []
-    for index, module in enumerate(modules):
-        for center, half in module.boxes(main=True):
-            owner.append(index)
-            centers.append(center)
-            halves.append(half - np.minimum(OVERLAP_TOLERANCE, half / 2))
-    which = np.array(owner)
-    parent = np.array([m.parent for m in modules])[which]
-    center, half = np.array(centers), np.array(halves)
-    turn = np.array([modules[i].rotation for i in owner])
-    radius = np.linalg.norm(half, axis=1)
-    pairs: set[tuple[int, int]] = set()
-    for a in range(len(which)):
-        b = np.arange(a + 1, len(which))
-        apart = (which[b] != which[a]) & (parent[b] != which[a]) & (which[b] != parent[a])
-        near = np.linalg.norm(center[b] - center[a], axis=1) < radius[b] + radius[a]
-        b = b[apart & near]
-        hit = boxes_overlap(center[a], turn[a], half[a], center[b], turn[b], half[b])
-        pairs |= {(int(which[a]), int(which[j])) for j in b[hit]}
-    return tuple((modules[i].name, modules[j].name) for i, j in sorted(pairs))
+    all_parts = lay_out(modules)
+    center, turn = all_parts.position, all_parts.rotation
+    half = all_parts.box_half[all_parts.main]
+    half = half - np.minimum(OVERLAP_TOLERANCE, half / 2)
+    reach = np.einsum("pij,pj->pi", np.abs(turn), half)
+    rows = np.arange(len(center))
+    if moved is not None:
+        rows = rows[np.isin(all_parts.module, list(moved))]
+    # Few boxes are so near that the core's axes do not tell them apart.
+    near = np.ones((len(rows), len(center)), bool)
+    for axis in range(3):
+        low, high = (center + sign * reach for sign in (-1, 1))
+        near &= low[rows, None, axis] < high[None, :, axis]
+        near &= low[None, :, axis] < high[rows, None, axis]
+    first, second = np.nonzero(near)
+    first = rows[first]
+    a, b = all_parts.module[first], all_parts.module[second]
+    parent = np.array([m.parent for m in modules])
+    apart = (a != b) & (parent[a] != b) & (parent[b] != a)
+    first, second = first[apart], second[apart]
+    if not len(first):
+        return ()
+    hit = boxes_overlap(
+        center[first], turn[first], half[first], center[second], turn[second], half[second]
+    )
+    pairs = np.sort(np.column_stack([a[apart], b[apart]])[hit], axis=1)
+    return tuple(sorted({(int(i), int(j)) for i, j in pairs}))
+
+
+def check_overlaps(
+    modules: Sequence[Module], allow: bool, place: str, moved: Iterable[int] | None = None
+) -> tuple[tuple[str, str], ...]:
+    """Refuses modules that overlap at rest.
+
+    Args:
+        modules: of one robot.
+        allow: refuse none.
+        place: where, for the message.
+        moved: indices of the modules to compare with all; by default all.
+
+    Returns:
+        Names of the pairs that overlap, in the modules' order.
+
+    Raises:
+        InputError: some overlap and `allow` is not set.
+    """
+    found = find_overlaps(modules, moved)
+    pairs = tuple((modules[i].name, modules[j].name) for i, j in found)
+    if pairs and not allow:
+        named = ", ".join(f"{a} and {b}" for a, b in pairs[:5])
+        more = f" and {len(pairs) - 5} more" if len(pairs) > 5 else ""
+        raise InputError(
+            f"{place}: expected modules that do not overlap at rest; found overlapping: "
+            f"{named}{more} (allow_overlap loads them all the same)"
+        )
+    return pairs

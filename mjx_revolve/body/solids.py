@@ -6,10 +6,9 @@ drawn from the catalogue alone: the outer dimensions are those of a part's boxes
 dimension (a wall, a window, the height of the pads) is solved so that the mesh encloses the part's
 tabulated volume. A user's module type is drawn the same way.
 
-A surface is put together from flat faces and from bands between two closed loops of points. A loop
-is four quadrants, counter-clockwise about the direction in which its face looks; the quadrants let
-a rectangle (one point each) and a rounded opening (an arc each) be joined without any search. Every
-mesh is closed, wound one way and needs no boolean engine.
+A shape is a list of bodies that touch and share no volume, such as the six walls of a hollow box,
+so that no boolean engine is needed. A body is swept through outlines of equally many points, the
+corners of a rectangle counting several times: every wall, with or without a window, is one sweep.
 
 The meshes are pictures: the centre of volume that the physics uses is the catalogue's.
 """
@@ -17,7 +16,6 @@ The meshes are pictures: the centre of volume that the physics uses is the catal
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import cast
 
 import numpy as np
@@ -26,103 +24,96 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from mjx_revolve.body.catalogue import Box, ModuleType, Part
-from mjx_revolve.body.meshes import mesh_volume
 
 # Segments of a quarter circle: enough to look round at the size of a module.
 _ARC = 6
-# Corners nearer than this [m] are one corner; the thinnest wall of the catalogue is 1 mm.
-_MERGE = 1e-9
+# Corners that agree to this many digits [m] are one corner; the thinnest wall of the catalogue is
+# 1 mm.
+_DIGITS = 9
 # A window takes this share of the room inside the walls.
 _WINDOW = 0.62
 # A solid of at least this share of a box is drawn as the box; one of less than the least share as a
 # shell of that share, since no surface encloses nothing.
 _SOLID, _LEAST = 0.999, 1e-3
 
-_Loop = list[np.ndarray]  # four quadrants, [n, 2] in a face's plane or [n, 3] in space
-_Triangles = list[np.ndarray]  # [3, 3] each
+_Body = np.ndarray  # [m, 3, 3] triangles of a closed surface that look outwards
 _Corners = tuple[np.ndarray, np.ndarray]  # lowest and highest corner of a box, [3] each
-_Build = Callable[[float], _Triangles]
+_Build = Callable[[float], list[_Body]]
 
 
-def _rounded(half_u: float, half_v: float, radius: float = 0.0) -> _Loop:
-    """Rectangle with rounded corners about the origin of a plane, counter-clockwise."""
+def _outline(
+    half_u: float, half_v: float, radius: float = 0.0, center: Sequence[float] = (0.0, 0.0)
+) -> np.ndarray:
+    """`[n, 2]` rectangle with rounded corners, counter-clockwise; n is the same for all."""
     radius = min(radius, half_u, half_v)
-    loop = []
-    for k, sign in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
-        center = np.multiply(sign, (half_u - radius, half_v - radius))
-        angle = np.linspace(0.5 * np.pi * k, 0.5 * np.pi * (k + 1), _ARC + 1)
-        arc = center + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        loop.append(arc if radius > 0.0 else center[None])
-    return loop
+    angle = 0.5 * np.pi * (np.arange(4)[:, None] + np.linspace(0.0, 1.0, _ARC + 1))
+    arc = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    signs = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])[:, None]
+    return (arc + signs * (half_u - radius, half_v - radius) + center).reshape(-1, 2)
 
 
-def _place(loop: _Loop, axis: int, height: float, center: ArrayLike = (0.0, 0.0)) -> _Loop:
-    """Puts a plane loop on a face that looks along +`axis`.
+def _volume(bodies: Sequence[_Body]) -> float:
+    """Volume of all bodies [m³]."""
+    mass = trimesh.triangles.mass_properties(np.concatenate(bodies), skip_inertia=True)
+    return float(mass.volume)
+
+
+def _sweep(axis: int, *outlines: tuple[np.ndarray, float], closed: bool = False) -> _Body:
+    """Body through outlines.
 
     Args:
-        loop: four quadrants `[n, 2]` [m].
-        axis: 0, 1 or 2 for x, y, z.
-        height: the face's coordinate along `axis` [m].
-        center: where the loop's origin lies along the two next axes, in cyclic order [m].
+        axis: that the outlines lie across: 0, 1 or 2 for x, y, z; theirs are the two next, in
+            cyclic order.
+        outlines: `[n, 2]` each [m], with its coordinate along the axis [m].
+        closed: join the last with the first, as around a hole; else both are filled.
     """
     order = np.argsort([axis, (axis + 1) % 3, (axis + 2) % 3])
-    return [
-        np.column_stack([np.full(len(one), height), one + np.asarray(center)])[:, order]
-        for one in loop
+    loops = np.array([np.insert(line, 0, height, axis=1)[:, order] for line, height in outlines])
+    start, stop = (loops, np.roll(loops, -1, axis=0)) if closed else (loops[:-1], loops[1:])
+    after = np.roll(start, -1, axis=1), np.roll(stop, -1, axis=1)
+    sides = [
+        np.stack([start, after[0], stop], axis=2),
+        np.stack([after[0], after[1], stop], axis=2),
     ]
+    triangles = [side.reshape(-1, 3, 3) for side in sides]
+    for loop, turn in () if closed else ((loops[0], -1), (loops[-1], 1)):
+        fan = np.stack([np.broadcast_to(loop[0], loop[2:].shape), loop[1:-1], loop[2:]], axis=1)
+        triangles.append(fan if turn > 0 else fan[:, ::-1])
+    body = np.concatenate(triangles)
+    return body if _volume([body]) > 0.0 else body[:, ::-1]
 
 
-def _band(outer: _Loop, inner: _Loop) -> _Triangles:
-    """Triangles between two loops; they look along the loops' direction if `inner` is within."""
-    triangles = []
-    for k in range(4):
-        a, b = outer[k], inner[k]
-        for i in range(len(a) - 1):
-            triangles.append(np.stack([a[i], a[i + 1], b[min(i, len(b) - 1)]]))
-        for j in range(len(b) - 1):
-            triangles.append(np.stack([a[min(j + 1, len(a) - 1)], b[j + 1], b[j]]))
-        a_next, b_next = outer[(k + 1) % 4][0], inner[(k + 1) % 4][0]
-        triangles += [np.stack([a[-1], a_next, b[-1]]), np.stack([a_next, b_next, b[-1]])]
-    return triangles
+def _prism(
+    axis: int, low: float, high: float, outline: np.ndarray, hole: np.ndarray | None = None
+) -> _Body:
+    """Body of one outline along an axis from one coordinate to another, bored by a hole."""
+    if hole is None:
+        return _sweep(axis, (outline, low), (outline, high))
+    rims = (outline, low), (outline, high), (hole, high), (hole, low)
+    return _sweep(axis, *rims, closed=True)
 
 
-def _chain(*loops: _Loop) -> _Triangles:
-    """Bands from each loop to the next."""
-    return [one for a, b in pairwise(loops) for one in _band(a, b)]
+def _box(size: ArrayLike) -> _Body:
+    """Solid box about the origin."""
+    x, y, z = 0.5 * np.asarray(size)
+    return _prism(2, -z, z, _outline(x, y))
 
 
-def _face(points: Sequence[Sequence[float]] | _Loop, look: ArrayLike) -> _Triangles:
-    """Convex flat face `[n, 3]` (or a loop) as a fan of triangles that look along `look`."""
-    rim = np.concatenate([np.reshape(one, (-1, 3)) for one in points])
-    fan = [np.stack([rim[0], rim[i], rim[i + 1]]) for i in range(1, len(rim) - 1)]
-    # The area of the whole face tells the winding even where a triangle of the fan has none.
-    area = np.sum([np.cross(one[1] - one[0], one[2] - one[0]) for one in fan], axis=0)
-    return fan if np.dot(area, look) > 0 else [one[::-1] for one in fan]
-
-
-def _mirror(triangles: _Triangles, axis: int) -> _Triangles:
-    """The triangles reflected in the plane through the origin across `axis`."""
-    flip = np.where(np.arange(3) == axis, -1.0, 1.0)
-    return [one[::-1] * flip for one in triangles]
-
-
-def _surface(triangles: _Triangles) -> trimesh.Trimesh:
-    """One mesh of the triangles, with one vertex per corner point."""
-    corners = np.concatenate(triangles)
-    grid = np.round(corners / _MERGE).astype(np.int64)
-    _, first, index = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+def _surface(body: _Body) -> trimesh.Trimesh:
+    """One mesh of a body, with one vertex per corner point."""
+    corners = body.reshape(-1, 3)
+    first, index = trimesh.grouping.unique_rows(corners, digits=_DIGITS)
     faces = index.reshape(-1, 3)
-    # Where arcs of neighbouring quadrants meet, the band between them has no width.
+    # Where corners count several times, the sweep between them has no width.
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     return trimesh.Trimesh(corners[first], faces, process=False)
 
 
-def _solve(build: _Build, low: float, high: float, volume: float) -> _Triangles | None:
+def _solve(build: _Build, low: float, high: float, volume: float) -> list[_Body] | None:
     """`build(s)` with `low <= s <= high` that encloses `volume` [m³]; None if there is none."""
 
     def excess(s: float) -> float:
-        triangles = np.concatenate(build(s))
-        return mesh_volume((triangles, np.arange(len(triangles)).reshape(-1, 3))) / volume - 1.0
+        return _volume(build(s)) / volume - 1.0
 
     if low >= high or excess(low) * excess(high) > 0.0:
         return None
@@ -131,7 +122,7 @@ def _solve(build: _Build, low: float, high: float, volume: float) -> _Triangles 
 
 def _shell(
     size: ArrayLike, wall: float, windows: dict[tuple[int, int], tuple[float, float, float]]
-) -> _Triangles:
+) -> list[_Body]:
     """Hollow box about the origin with rounded windows in some of its faces.
 
     Args:
@@ -142,35 +133,22 @@ def _shell(
     """
     outer = 0.5 * np.asarray(size)
     inner = outer - wall
-    triangles = []
+    walls = []
     for axis in range(3):
-        u, v, look = (axis + 1) % 3, (axis + 2) % 3, np.eye(3)[axis]
-        rim = _place(_rounded(outer[u], outer[v]), axis, outer[axis])
-        floor = _place(_rounded(inner[u], inner[v]), axis, inner[axis])
+        # Where two walls meet, the edge belongs to that of the later axis.
+        u, v = (outer[k] if k < axis else inner[k] for k in ((axis + 1) % 3, (axis + 2) % 3))
         for sign in (1, -1):
-            if (axis, sign) in windows:
-                hole = _rounded(*windows[axis, sign])
-                side = _chain(
-                    rim, _place(hole, axis, outer[axis]), _place(hole, axis, inner[axis]), floor
-                )
-            else:
-                side = _face(rim, look) + _face(floor, -look)
-            triangles += side if sign > 0 else _mirror(side, axis)
-    return triangles
+            hole = _outline(*windows[axis, sign]) if (axis, sign) in windows else None
+            heights = sign * inner[axis], sign * outer[axis]
+            walls.append(_prism(axis, *heights, _outline(u, v), hole))
+    return walls
 
 
-def _box(size: ArrayLike) -> _Triangles:
-    """Solid box about the origin."""
-    half = 0.5 * np.asarray(size)
-    low, high = (_place(_rounded(half[0], half[1]), 2, sign * half[2]) for sign in (-1, 1))
-    return _face(low, (0, 0, -1)) + _chain(low, high) + _face(high, (0, 0, 1))
-
-
-def _core(kind: ModuleType, part: Part) -> _Triangles | None:
+def _core(kind: ModuleType, part: Part) -> list[_Body] | None:
     """Box with a wide window in each side wall, a round one in the lid and a closed floor."""
     half = 0.5 * np.asarray(part.boxes[0].size)
 
-    def build(wall: float) -> _Triangles:
+    def build(wall: float) -> list[_Body]:
         x, y, z = half - wall
         slit = 0.45 * z
         windows = {(2, 1): (0.55 * min(x, y),) * 3}
@@ -182,11 +160,11 @@ def _core(kind: ModuleType, part: Part) -> _Triangles | None:
     return _solve(build, 1e-3 * half.min(), 0.95 * half.min(), part.volume)
 
 
-def _brick(kind: ModuleType, part: Part) -> _Triangles | None:
+def _brick(kind: ModuleType, part: Part) -> list[_Body] | None:
     """Box with a round window in each of its six faces."""
     half = 0.5 * np.asarray(part.boxes[0].size)
 
-    def build(wall: float) -> _Triangles:
+    def build(wall: float) -> list[_Body]:
         room = _WINDOW * (half - wall)
         windows = {}
         for axis in range(3):
@@ -197,7 +175,7 @@ def _brick(kind: ModuleType, part: Part) -> _Triangles | None:
     return _solve(build, 1e-3 * half.min(), 0.95 * half.min(), part.volume)
 
 
-def _frame(kind: ModuleType, part: Part) -> _Triangles | None:
+def _frame(kind: ModuleType, part: Part) -> list[_Body] | None:
     """U bracket: a base plate at -x and two arms along x, bored for the hinge's axis (y)."""
     half_x, half_y, half_z = 0.5 * np.asarray(part.boxes[0].size)
     if kind.hinge is None:
@@ -210,39 +188,19 @@ def _frame(kind: ModuleType, part: Part) -> _Triangles | None:
     if room < 1.2 * bore or widest <= 0.0:
         return None
 
-    def build(wall: float) -> _Triangles:
+    def build(wall: float) -> list[_Body]:
         base, inside = wall - half_x, half_y - wall
-
-        def arm(start: float, y: float) -> _Loop:
-            half = 0.5 * (half_x - start)
-            loop = _rounded(half_z, half, half_z)[:2] + _rounded(half_z, half)[2:]
-            return _place(loop, 1, y, (0.0, 0.5 * (half_x + start)))
-
-        outer, inner = arm(-half_x, half_y), arm(base, inside)
-        hole = _rounded(bore, bore, bore)
-        side = _chain(outer, *(_place(hole, 1, y, (0.0, axis_x)) for y in (half_y, inside)), inner)
-        ends = np.concatenate(outer[:2]), np.concatenate(inner[:2])
-        for a, b in zip(pairwise(ends[0]), pairwise(ends[1]), strict=True):
-            if not np.allclose(*a, rtol=0.0, atol=_MERGE):
-                side += _face([*a, *b[::-1]], (a[0] + a[1]) / 2 - (bend, half_y, 0.0))
-        for z in (half_z, -half_z):
-            strip = [(-half_x, half_y, z), (base, inside, z), (bend, inside, z), (bend, half_y, z)]
-            side += _face(strip, (0, 0, z))
-        triangles = side + _mirror(side, 1)
-        for x, y, look in ((-half_x, half_y, -1), (base, inside, 1)):
-            plate = [(x, y, half_z), (x, -y, half_z), (x, -y, -half_z), (x, y, -half_z)]
-            triangles += _face(plate, (look, 0, 0))
-        for z in (half_z, -half_z):
-            strip = [
-                (-half_x, half_y, z), (base, inside, z), (base, -inside, z), (-half_x, -half_y, z)
-            ]  # fmt: skip
-            triangles += _face(strip, (0, 0, z))
-        return triangles
+        half, middle = 0.5 * (half_x - base), (0.0, 0.5 * (half_x + base))
+        round_, square = (_outline(half_z, half, radius, middle) for radius in (half_z, 0.0))
+        arm = np.concatenate([round_[: len(round_) // 2], square[len(square) // 2 :]])
+        hole = _outline(bore, bore, bore, (0.0, axis_x))
+        arms = [_prism(1, *ends, arm, hole) for ends in ((inside, half_y), (-half_y, -inside))]
+        return [_prism(0, -half_x, base, _outline(half_y, half_z)), *arms]
 
     return _solve(build, 1e-3 * half_y, 0.999 * widest, part.volume)
 
 
-def _servo(kind: ModuleType, part: Part) -> _Triangles | None:
+def _servo(kind: ModuleType, part: Part) -> list[_Body] | None:
     """Servo with a cable duct along z, and in front of it, at +x, the plate it is screwed to."""
     if len(part.boxes) != 2:
         return None
@@ -251,65 +209,47 @@ def _servo(kind: ModuleType, part: Part) -> _Triangles | None:
     center, half = np.asarray(plate.position), 0.5 * np.asarray(plate.size)
     back, front = center[0] - half[0], center[0] + half[0]
     covers = half[1] - abs(center[1]) > half_y and half[2] - abs(center[2]) > half_z
-    if not covers or not -half_x < back < half_x <= front + _MERGE:
+    if not covers or not -half_x < back < half_x <= front + 10.0**-_DIGITS:
         return None
-    middle = 0.5 * (back - half_x)  # of the body behind the plate
+    middle = 0.5 * (back - half_x), 0.0  # of the body behind the plate
+    half_body = 0.5 * (back + half_x)
+    sheet = _prism(
+        0, back, front, _outline(half[1], half[2], 0.15 * min(half[1:]), tuple(center[1:]))
+    )
 
-    def build(share: float) -> _Triangles:
-        body = [_place(_rounded(half_y, half_z), 0, x) for x in (-half_x, back)]
-        outline = _rounded(half[1], half[2], 0.15 * min(half[1:]))
-        sheet = [_place(outline, 0, x, center[1:]) for x in (back, front)]
-        triangles = _face(body[0], (-1, 0, 0)) + _chain(body[1], *sheet)
-        triangles += _face(sheet[1], (1, 0, 0))
-        for y in (half_y, -half_y):
-            side = [(-half_x, y, half_z), (-half_x, y, -half_z), (back, y, -half_z)]
-            triangles += _face([*side, (back, y, half_z)], (0, y, 0))
-        half_body = 0.5 * (back + half_x)
-        duct = _rounded(share * half_body, share * half_y, share * min(half_body, half_y))
-        rim = _rounded(half_body, half_y)
-        return triangles + _chain(
-            *(
-                _place(loop, 2, z, (middle, 0.0))
-                for loop, z in ((rim, half_z), (duct, half_z), (duct, -half_z), (rim, -half_z))
-            )
-        )
+    def build(share: float) -> list[_Body]:
+        duct = share * half_body, share * half_y, share * min(half_body, half_y)
+        outline, hole = _outline(half_body, half_y, 0.0, middle), _outline(*duct, middle)
+        return [_prism(2, -half_z, half_z, outline, hole), sheet]
 
     return _solve(build, 1e-3, 0.9, part.volume)
 
 
-def _sensor(kind: ModuleType, part: Part) -> _Triangles | None:
+def _sensor(kind: ModuleType, part: Part) -> list[_Body] | None:
     """Slab with two rounded pads on its +x face.
 
     The tabulated volume of the touch sensor (2.735e-6 m³) exceeds its collision box (1.970e-6 m³):
     the pads hold the rest and stand out of the box.
     """
     half_x, half_y, half_z = 0.5 * np.asarray(part.boxes[0].size)
-    corners = [(y, z) for y in (half_y, -half_y) for z in (half_z, -half_z)]
     base = np.array([0.36 * half_y, 0.78 * half_z])
 
-    def build(height: float) -> _Triangles:
-        back = [(-half_x, *corners[k]) for k in (0, 1, 3, 2)]
-        triangles = _face(back, (-1, 0, 0))
-        for y in (half_y, -half_y):
-            side = [(x, y, z) for x, z in ((-half_x, half_z), (-half_x, -half_z))]
-            triangles += _face([*side, (half_x, y, -half_z), (half_x, y, half_z)], (0, y, 0))
-        for z in (half_z, -half_z):
-            # The front is two halves with a pad each, so their common edge ends in this face.
-            side = [(-half_x, half_y, z), (-half_x, -half_y, z), (half_x, -half_y, z)]
-            triangles += _face([*side, (half_x, 0.0, z), (half_x, half_y, z)], (0, 0, z))
-        middle = (0.5 * half_y, 0.0)
-        pad = [_place(_rounded(0.5 * half_y, half_z), 0, half_x, middle)]
+    def pad(height: float, middle: float) -> _Body:
+        outlines = []
         for angle in np.linspace(0.0, 1.2, 6):
             y, z = base * np.cos(angle) ** 0.7
-            loop = _rounded(y, z, base.min())
-            pad.append(_place(loop, 0, half_x + height * np.sin(angle) / np.sin(1.2), middle))
-        front = _chain(*pad) + _face(pad[-1], (1, 0, 0))
-        return triangles + front + _mirror(front, 1)
+            outline = _outline(y, z, base.min(), (middle, 0.0))
+            outlines.append((outline, half_x + height * np.sin(angle) / np.sin(1.2)))
+        return _sweep(0, *outlines)
+
+    def build(height: float) -> list[_Body]:
+        pads = [pad(height, sign * 0.5 * half_y) for sign in (1, -1)]
+        return [_box(part.boxes[0].size), *pads]
 
     return _solve(build, 1e-6 * half_y, 2.0 * half_y, part.volume)
 
 
-def _duct(kind: ModuleType, part: Part) -> _Triangles | None:
+def _duct(kind: ModuleType, part: Part) -> list[_Body] | None:
     """Tube along the thrust, and in it a motor with three blades at the end that pushes ahead."""
     if part.thruster is None:
         return None
@@ -318,57 +258,44 @@ def _duct(kind: ModuleType, part: Part) -> _Triangles | None:
     half = 0.5 * np.asarray(part.boxes[0].size)
     length, radius = half[axis], min(half[(axis + 1) % 3], half[(axis + 2) % 3])
 
-    def circle(size: float, height: float) -> _Loop:
-        return _place(_rounded(size, size, size), axis, height)
+    def circle(size: float) -> np.ndarray:
+        return _outline(size, size, size)
 
     hub, nose, most = 0.4 * radius, 0.12 * radius, 0.9 * length
     ends = [(nose, -most), (hub, -0.7 * most), (hub, 0.7 * most), (nose, most)]
-    motor = [circle(size, height) for size, height in ends]
-    look = np.eye(3)[axis]
-    inside = _face(motor[0], -look) + _chain(*motor) + _face(motor[-1], look)
+    motor = _sweep(axis, *((circle(size), height) for size, height in ends))
 
     # Blades are pitched by 35 degrees and end short of motor and tube: nothing counts twice.
     wide, c, s = 0.55 * radius, np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
     pitch = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     root = 1.01 * hub
 
-    def blade(tip: float, turn: float) -> _Triangles:
+    def blade(tip: float, turn: float) -> _Body:
         """Thin plate from the motor to the tip."""
         cos, sin = np.cos(turn), np.sin(turn)
         about = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        at = np.array([0.5 * (tip + root), 0.0, 0.0])
-        height = np.array([0.0, 0.0, ahead * 0.5 * most])
+        plate = _box((tip - root, wide, 0.05 * radius)) @ pitch.T + (0.5 * (tip + root), 0.0, 0.0)
         # Built about z, then z becomes the axis: a turn that keeps the order of the axes.
         order = [(k - axis - 1) % 3 for k in range(3)]
-        plate = _box((tip - root, wide, 0.05 * radius))
-        return [((one @ pitch.T + at) @ about.T + height)[:, order] for one in plate]
+        return (plate @ about.T + (0.0, 0.0, ahead * 0.5 * most))[..., order]
 
-    def build(wall: float) -> _Triangles:
+    def build(wall: float) -> list[_Body]:
         inner = radius - wall
-        rims = [
-            circle(size, height)
-            for size, height in (
-                (inner, -length), (radius, -length), (radius, length), (inner, length)
-            )
-        ]  # fmt: skip
-        triangles = _chain(*rims, rims[0]) + inside
-        for k in range(3):
-            tip = np.sqrt((0.97 * inner) ** 2 - (0.5 * wide * c) ** 2)
-            triangles += blade(tip, k * 2.0 * np.pi / 3.0)
-        return triangles
+        tip = np.sqrt((0.97 * inner) ** 2 - (0.5 * wide * c) ** 2)
+        blades = [blade(tip, k * 2.0 * np.pi / 3.0) for k in range(3)]
+        return [_prism(axis, -length, length, circle(radius), circle(inner)), motor, *blades]
 
     return _solve(build, 1e-3 * radius, 0.5 * radius, part.volume)
 
 
-def _plate(kind: ModuleType, part: Part) -> _Triangles | None:
+def _plate(kind: ModuleType, part: Part) -> list[_Body] | None:
     """Flat plate with rounded corners."""
     half = 0.5 * np.asarray(part.boxes[0].size)
     axis = int(half.argmin())
-    u, v, look = half[(axis + 1) % 3], half[(axis + 2) % 3], np.eye(3)[axis]
+    u, v = half[(axis + 1) % 3], half[(axis + 2) % 3]
 
-    def build(radius: float) -> _Triangles:
-        low, high = (_place(_rounded(u, v, radius), axis, sign * half[axis]) for sign in (-1, 1))
-        return _face(low, -look) + _chain(low, high) + _face(high, look)
+    def build(radius: float) -> list[_Body]:
+        return [_prism(axis, -half[axis], half[axis], _outline(u, v, radius))]
 
     return _solve(build, 1e-6 * min(u, v), min(u, v), part.volume)
 
@@ -414,7 +341,7 @@ def _pieces(boxes: Sequence[Box]) -> list[_Corners]:
     return done
 
 
-def _generic(part: Part) -> list[_Triangles]:
+def _generic(part: Part) -> list[_Body]:
     """The part's boxes, each hollowed to the same share, with a window in every face.
 
     The windows let the water in: a sealed shell would displace its whole box. They close as the
@@ -424,11 +351,11 @@ def _generic(part: Part) -> list[_Triangles]:
     pieces = _pieces(part.boxes)
     share = part.volume / sum(float(np.prod(high - low)) for low, high in pieces)
     share = max(share, _LEAST)
-    shells = []
+    bodies: list[_Body] = []
     for low, high in pieces:
-        half = 0.5 * (high - low)
+        half, middle = 0.5 * (high - low), 0.5 * (low + high)
 
-        def build(s: float, half: np.ndarray = half) -> _Triangles:
+        def build(s: float, half: np.ndarray = half) -> list[_Body]:
             wall = s * half.min()
             room = _WINDOW * (1.0 - s) * (half - wall)
             windows = {}
@@ -441,11 +368,10 @@ def _generic(part: Part) -> list[_Triangles]:
         if share < _SOLID:
             shell = _solve(build, 1e-5, 1.0 - 1e-5, share * float(np.prod(2.0 * half)))
         if shell is None:
-            scale = share ** (1.0 / 3.0)
-            shells.append([scale * (one + 0.5 * (low + high)) for one in _box(2.0 * half)])
+            bodies.append(share ** (1.0 / 3.0) * (_box(2.0 * half) + middle))
         else:
-            shells.append([one + 0.5 * (low + high) for one in shell])
-    return shells
+            bodies += [wall + middle for wall in shell]
+    return bodies
 
 
 def part_mesh(kind: ModuleType, part: Part) -> trimesh.Trimesh:
@@ -465,11 +391,7 @@ def part_mesh(kind: ModuleType, part: Part) -> trimesh.Trimesh:
         A closed mesh in the part's frame (origin at the centre of its main box) [m].
     """
     shape = _SHAPES.get((kind.name, part.name))
-    triangles = shape(kind, part) if shape and part.volume > 0.0 else None
-    if triangles is not None:
-        return _surface(triangles)
-    # Pieces that touch stay bodies of their own: no edge has more than two faces.
-    pieces = [_surface(piece) for piece in _generic(part)]
-    return (
-        pieces[0] if len(pieces) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(pieces))
-    )
+    bodies = shape(kind, part) if shape and part.volume > 0.0 else None
+    # Bodies that touch share no vertex: no edge has more than two faces.
+    meshes = [_surface(body) for body in (_generic(part) if bodies is None else bodies)]
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))

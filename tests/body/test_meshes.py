@@ -92,6 +92,8 @@ def test_volume_and_centre_agree_with_trimesh(mesh):
     mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, (1, 2, 3)))
     mesh.apply_translation((0.3, -0.2, 0.9))
     assert mesh_volume(mesh) == pytest.approx(mesh.volume, rel=1e-10)
+    experiment = pytest.importorskip("experiments.module_volumes")
+    assert mesh_volume(mesh) == pytest.approx(experiment.signed_volume(mesh), rel=1e-10)
     np.testing.assert_allclose(mesh_center_of_volume(mesh), mesh.center_mass, atol=1e-10)
 
 
@@ -121,11 +123,13 @@ def test_an_inside_out_mesh_has_negative_volume():
 def test_the_thesis_formula_as_printed_is_no_volume():
     experiment = pytest.importorskip("experiments.module_volumes")
     mesh = (TETRAHEDRON, TETRAHEDRON_FACES)
-    assert mesh_volume(mesh) == pytest.approx(1 / 6)
-    assert experiment.printed_volume(mesh) != pytest.approx(1 / 6, rel=0.1)
+    assert experiment.signed_volume(mesh) == pytest.approx(1 / 6)
+    assert experiment.signed_volume(mesh, printed=True) != pytest.approx(1 / 6, rel=0.1)
     # What is worse: it depends on where the mesh lies.
-    here = experiment.printed_volume(box())
-    there = experiment.printed_volume(box(), (1.0, 2.0, 3.0))
+    shift = (1.0, 2.0, 3.0)
+    assert experiment.signed_volume(box(), shift) == pytest.approx(24.0)
+    here = experiment.signed_volume(box(), printed=True)
+    there = experiment.signed_volume(box(), shift, printed=True)
     assert abs(there - here) > 1.0
     assert abs(here - 24.0) > 1.0
 
@@ -494,6 +498,7 @@ def test_the_experiment_recomputes_the_table(capsys):
     densities = {row["part"]: row["density"] for row in rows}
     for row in rows:
         assert abs(row["difference"]) < 0.5
+        assert row["trimesh"] == pytest.approx(row["computed"], rel=1e-9)
         assert row["moved"] == pytest.approx(row["computed"], rel=1e-9)
         assert abs(row["printed_moved"] / row["computed"] - 1) > 0.5
     assert sorted(densities.values()) == pytest.approx(

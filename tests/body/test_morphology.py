@@ -18,6 +18,7 @@ from mjx_revolve.body.morphology import (
     MAX_MODULES,
     Morphology,
     load_morphology,
+    make_morphology,
     save_morphology,
     trim_neutral,
 )
@@ -926,6 +927,140 @@ def test_wrong_files_are_refused(tmp_path, text, message):
     assert message in found
     assert found.startswith(f"{tmp_path / 'robot.yaml'}: ")
     assert "\n" not in found
+
+
+# ------------------------------------------------------------------------- bodies in memory
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
+def test_a_mapping_makes_the_body_of_its_file(path):
+    robot = load_morphology(path)
+    assert make_morphology(yaml.safe_load(path.read_text())) == robot
+    again = make_morphology(robot.to_mapping())
+    assert again == robot and again.path is None
+    assert make_morphology(robot.to_mapping()["body"], name=robot.name) == robot
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_random_trees_round_trip_in_memory(seed):
+    tree = random_tree(random.Random(seed), 30)
+    robot = make_morphology(tree, allow_overlap=True)
+    assert robot.name == "robot"
+    again = make_morphology(robot.to_mapping(), allow_overlap=True)
+    assert again == robot and again.overlaps == robot.overlaps
+
+
+def test_a_body_shares_nothing_with_its_mapping():
+    tree = {"type": "Core", "params": {"note": ["a"], "ballast_position": [0, 0, 0]}}
+    mapping = {"body": tree, "brain": {"type": ["b"]}}
+    robot = make_morphology(mapping)
+    tree["params"]["note"].append("c")
+    mapping["brain"]["type"].append("c")
+    robot.to_mapping()["body"]["params"]["note"].append("c")
+    robot.to_mapping()["brain"]["type"].append("c")
+    assert robot.modules[0].params["note"] == ["a"] and robot.brain == {"type": ["b"]}
+
+
+@pytest.mark.parametrize(
+    "mapping, message",
+    [
+        (None, "morphology: expected a mapping with id, body and brain; found None"),
+        ([], "morphology: expected a mapping with id, body and brain; found []"),
+        ({"id": "x"}, "morphology: expected the key body; found ['id']"),
+        ({"type": "Bric"}, "morphology: body.type: expected one of Core, CoreComponent; found"),
+        ({"type": "Core", "childen": {}}, "morphology: body: expected only id, type, slot, orie"),
+        (
+            {"body": {"type": "Core", "children": {1: {"type": "Fin", "orientation": 45}}}},
+            "morphology: body.children.1.orientation: expected 0, 90, 180, 270 or -90 [deg]; f",
+        ),
+        (yaml.safe_load(RING), "morphology: body: expected modules that do not overlap at rest"),
+    ],
+)
+def test_wrong_mappings_are_refused(mapping, message):
+    with pytest.raises(InputError) as error:
+        make_morphology(mapping)
+    assert str(error.value).startswith(message)
+    with pytest.raises(InputError, match=r"^mine: "):
+        make_morphology(mapping, source="mine")
+
+
+def test_a_tree_without_its_file_around_it_is_no_file(tmp_path):
+    with pytest.raises(InputError, match="expected only id, body, brain; found 'type'"):
+        read(tmp_path, "type: Core")
+
+
+# ------------------------------------------------------------------------- all parts at rest
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
+def test_the_layout_is_that_of_the_modules(path):
+    robot = load_morphology(path)
+    here = robot.layout
+    parts = [(i, part) for i, m in enumerate(robot.modules) for part in m.kind.parts]
+    boxes = [box for module in robot.modules for box in module.boxes()]
+    assert list(here.module) == [i for i, _ in parts]
+    assert here.box_centers() == pytest.approx(np.array([center for center, _ in boxes]))
+    assert here.box_half == pytest.approx(np.array([half for _, half in boxes]))
+    assert list(here.box_part[here.main]) == list(range(len(parts)))
+    corners = []
+    for i, part in parts:
+        module = robot.modules[i]
+        for corner in np.ndindex(2, 2, 2):
+            local = np.add(part.position, np.where(corner, part.bounds[1], part.bounds[0]))
+            corners.append(module.position + module.rotation @ local)
+    corners = np.array(corners)
+    assert robot.corners == pytest.approx(corners)
+    assert robot.lowest == pytest.approx(-corners[:, 2].min())
+    assert robot.horizontal_radius == pytest.approx(np.hypot(*corners[:, :2].T).max())
+    assert robot.radius == pytest.approx(np.linalg.norm(corners, axis=1).max())
+    assert robot.bounds[0] == pytest.approx(corners.min(axis=0))
+    assert robot.exposed.shape == (len(parts), 3)
+    assert (robot.exposed >= 0).all() and (robot.exposed <= 1).all()
+
+
+def test_exposed_shares_of_a_chain_counted_by_hand(tmp_path):
+    text = (
+        "body: {type: Core, children: {2: {type: FixedBrick, children: {1: {type: FixedBrick}}}}}"
+    )
+    core, first, last = read(tmp_path, text).exposed
+    # The brick hides as much of the core's front as it is smaller than it.
+    size = np.array(MODULES["Core"].parts[0].boxes[0].size)
+    brick = np.array(MODULES["FixedBrick"].parts[0].boxes[0].size)
+    ticks = (np.arange(24) + 0.5) / 24 - 0.5
+    hidden = np.prod([(np.abs(ticks * size[k]) <= brick[k] / 2).mean() for k in (1, 2)])
+    assert core == pytest.approx([1 - hidden / 2, 1, 1])
+    assert (first.min(), last.min()) == (0.0, 0.5)  # joined on both sides, on one
+
+
+def test_slanted_modules_cover_what_lies_behind_them(tmp_path):
+    brick = MODULES["FixedBrick"]
+    c, s = math.cos(0.3), math.sin(0.3)
+    slot = replace(brick.slots[1], direction=(s, c, 0.0))
+    slanted = replace(brick, name="Slanted", aliases=(), slots={1: slot})
+    text = "body: {type: Core, children: {2: {type: Slanted, children: {1: {type: FixedBrick}}}}}"
+    robot = read(tmp_path, text, modules=MODULES | {"Slanted": slanted})
+    below = robot.modules[1]
+    # The same by asking point after point of the face.
+    ticks = (np.arange(24) + 0.5) / 24 - 0.5
+    size = np.array(brick.parts[0].boxes[0].size)
+    upper = robot.modules[2]
+    covered = np.zeros((24, 24), bool)
+    for depth in (-2e-3, -1e-3, 0.0, 1e-3, 2e-3):
+        for i, j in np.ndindex(24, 24):
+            local = np.array([ticks[i] * size[0], size[1] / 2 + depth, ticks[j] * size[2]])
+            place = upper.rotation.T @ (below.position + below.rotation @ local - upper.position)
+            covered[i, j] |= bool((np.abs(place) <= size / 2 + 1e-6).all())
+    assert 0 < covered.mean() < 1
+    # The other face, on the core, is hidden.
+    assert np.isclose(robot.exposed[1], (1 - covered.mean()) / 2, atol=1e-12).any()
+
+
+def test_bodies_and_modules_print_one_line():
+    robot = ours("spider")
+    assert repr(robot) == "Morphology('spider': 17 modules, 8 hinges, 0.2572 kg)"
+    assert repr(robot.modules[1]) == (
+        "Module('back_hip': ActiveHinge, slot 0 of module 0, 0.0107 kg)"
+    )
 
 
 def test_what_yaml_cannot_hold_is_refused(tmp_path):

@@ -1,0 +1,273 @@
+"""The tree of modules at rest: what a body is, what follows from it, and how it is written.
+
+The core's frame is the robot's: at the origin, unturned. All positions are in that frame, at rest
+(hinges at 0), in metres.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from mjx_revolve.body.descriptors import describe
+from mjx_revolve.body.exposure import exposed_shares
+from mjx_revolve.body.module_types import Part, Vector
+from mjx_revolve.body.placement import Layout, Module, frozen, lay_out, same
+from mjx_revolve.inputs.errors import InputError, SafeLoader
+
+COLORS = ("red", "green", "blue")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Morphology:
+    """A robot's body as a tree of modules, depth first in the file's order.
+
+    Two morphologies are equal when name, modules and brain are.
+
+    Attributes:
+        name: the file's `id`, or its stem.
+        modules: the core first; a parent comes before its children.
+        brain: the file's `brain` as it is, for whoever understands it; None where there is none.
+        path: the file that it was read from.
+        overlaps: names of the pairs of modules that overlap at rest (empty unless allowed).
+    """
+
+    name: str
+    modules: tuple[Module, ...]
+    brain: Any = None
+    path: str | None = None
+    overlaps: tuple[tuple[str, str], ...] = ()
+
+    def __eq__(self, other: object) -> bool:
+        """Same name, modules and brain; the path does not count."""
+        if not isinstance(other, Morphology):
+            return NotImplemented
+        return (
+            self.name == other.name
+            and self.modules == other.modules
+            and same(self.brain, other.brain)
+        )
+
+    def __repr__(self) -> str:
+        """One line."""
+        return (
+            f"Morphology({self.name!r}: {self.num_modules} modules, {self.num_hinges} hinges, "
+            f"{self.mass:.4g} kg)"
+        )
+
+    @property
+    def num_modules(self) -> int:
+        """Number of modules; a hinge is one."""
+        return len(self.modules)
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
+        return sum(module.kind.mass for module in self.modules)
+
+    @property
+    def volume(self) -> float:
+        """Displaced volume, electronics and ballast included [m³]."""
+        return sum(module.kind.volume for module in self.modules)
+
+    @property
+    def center_of_mass(self) -> np.ndarray:
+        """`[3]` centre of mass at rest, core frame [m]."""
+        return self._center(lambda part: (part.total_mass, part.center_of_mass))
+
+    @property
+    def center_of_volume(self) -> np.ndarray:
+        """`[3]` centre of the displaced volume at rest, core frame [m].
+
+        Where it lies above the centre of mass, the robot rights itself under water.
+        """
+        return self._center(lambda part: (part.total_volume, part.displaced_center))
+
+    def _center(self, look: Callable[[Part], tuple[float, Vector]]) -> np.ndarray:
+        """Weighted mean of a point of each part; `look` gives weight and point, part frame."""
+        looks = [look(part) for module in self.modules for part in module.kind.parts]
+        weight, point = (np.array(column) for column in zip(*looks, strict=True))
+        here = self.layout
+        center = weight @ (here.position + np.einsum("pij,pj->pi", here.rotation, point))
+        return center / weight.sum() if weight.any() else center
+
+    @property
+    def box_volume(self) -> float:
+        """Sum of all collision boxes' volumes [m³]; shared space counts for each box."""
+        return sum(module.kind.box_volume for module in self.modules)
+
+    @property
+    def hinges(self) -> tuple[int, ...]:
+        """Indices of the modules with a hinge, in order: the order of `ctrl`."""
+        return tuple(i for i, m in enumerate(self.modules) if m.kind.hinge is not None)
+
+    @property
+    def num_hinges(self) -> int:
+        """Number of hinges."""
+        return len(self.hinges)
+
+    @property
+    def thrusters(self) -> tuple[tuple[int, int], ...]:
+        """Module and part of each thruster, in order: the order of `ctrl` after the hinges'."""
+        return tuple(
+            (i, k)
+            for i, module in enumerate(self.modules)
+            for k, part in enumerate(module.kind.parts)
+            if part.thruster is not None
+        )
+
+    @property
+    def num_thrusters(self) -> int:
+        """Number of thrusters."""
+        return len(self.thrusters)
+
+    @property
+    def num_fins(self) -> int:
+        """Number of modules with a fin."""
+        return sum(module.kind.is_fin for module in self.modules)
+
+    def hinge_neighbours(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of hinges that share a rigid body.
+
+        Modules that are welded together are one body; a hinge joins the body that it is attached to
+        and the body that it moves.
+
+        Returns:
+            pairs (i, j), i < j, of positions in `hinges`, in order.
+        """
+        number = {index: k for k, index in enumerate(self.hinges)}
+        carries: list[int] = []  # the hinge that moves a module's children, -1 for the core's body
+        joined: dict[int, list[int]] = {}
+        for index, module in enumerate(self.modules):
+            body = carries[module.parent] if module.parent >= 0 else -1
+            if index in number:
+                joined.setdefault(body, []).append(number[index])
+                body = number[index]
+                joined.setdefault(body, []).append(body)
+            carries.append(body)
+        pairs = {(min(i, j), max(i, j)) for group in joined.values() for i in group for j in group}
+        return tuple(sorted((i, j) for i, j in pairs if i < j))
+
+    @cached_property
+    def layout(self) -> Layout:
+        """All parts and boxes at rest as arrays."""
+        return lay_out(self.modules)
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """`[8 npart, 3]` corners of the boxes around each part at rest, core frame [m]."""
+        here, which = self.layout, np.array(list(np.ndindex(2, 2, 2)), bool)
+        local = np.where(which, here.high[:, None], here.low[:, None])
+        place = here.position[:, None] + np.einsum("pij,pcj->pci", here.rotation, local)
+        return frozen(place.reshape(-1, 3))
+
+    @property
+    def lowest(self) -> float:
+        """How far the corners reach below the core's centre at rest [m]."""
+        return float(-self.corners[:, 2].min())
+
+    @property
+    def horizontal_radius(self) -> float:
+        """Distance of the farthest corner from the core's vertical axis at rest [m]."""
+        return float(np.linalg.norm(self.corners[:, :2], axis=1).max())
+
+    @property
+    def radius(self) -> float:
+        """Of the sphere about the core's centre that holds all corners at rest [m]."""
+        return float(np.linalg.norm(self.corners, axis=1).max())
+
+    @cached_property
+    def exposed(self) -> np.ndarray:
+        """`[npart, 3]` share of each part's faces that the water reaches; `exposed_shares`."""
+        return frozen(exposed_shares(self))
+
+    @cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """`[3]` lowest and `[3]` highest corner of all boxes at rest, core frame [m]."""
+        center, reach = self.layout.box_centers(), self.layout.box_reaches()
+        return frozen((center - reach).min(axis=0)), frozen((center + reach).max(axis=0))
+
+    @property
+    def extent(self) -> np.ndarray:
+        """`[3]` edges of the bounding box at rest along the core's x, y, z [m]."""
+        low, high = self.bounds
+        return high - low
+
+    @property
+    def length(self) -> float:
+        """Body length: the largest extent at rest [m]."""
+        return float(self.extent.max())
+
+    @cached_property
+    def descriptors(self) -> dict[str, float]:
+        """Measures of the body; see `descriptors.describe`."""
+        return describe(self)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The body as a morphology file has it: `make_morphology` makes an equal one of it.
+
+        Types are named: a robot with a user's own types needs those again to be read.
+
+        Returns:
+            A new mapping with `id`, `body` and, where there is one, `brain`.
+        """
+        items: list[dict[str, Any]] = []
+        for module in self.modules:
+            item: dict[str, Any] = {"id": module.name, "type": module.type}
+            turn = module.orientation
+            item["orientation"] = int(turn) if turn.is_integer() else turn
+            colors = zip(COLORS, module.rgb, strict=True) if module.rgb is not None else ()
+            params = {**dict(colors), **copy.deepcopy(dict(module.params))}
+            if params:
+                item["params"] = params
+            items.append(item)
+            if module.parent >= 0:
+                items[module.parent].setdefault("children", {})[module.slot] = item
+        data: dict[str, Any] = {"id": self.name, "body": items[0]}
+        if self.brain is not None:
+            data["brain"] = copy.deepcopy(self.brain)
+        return data
+
+    def save(self, path: str | Path) -> None:
+        """Writes the morphology; see `save_morphology`."""
+        save_morphology(self, path)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Puts text in quotes that our own reader would take for a number (`1e-3`)."""
+
+    yaml_implicit_resolvers = SafeLoader.yaml_implicit_resolvers
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Writes shared values out."""
+        return True
+
+
+def save_morphology(morphology: Morphology, path: str | Path) -> None:
+    """Writes a robot's body as YAML that `load_morphology` reads back to an equal morphology.
+
+    Types are written by name: a robot with a user's own types needs those again to be read.
+
+    Args:
+        morphology: the robot.
+        path: the file.
+
+    Raises:
+        InputError: the file cannot be written, or `params` or `brain` hold what YAML cannot.
+    """
+    try:
+        data = morphology.to_mapping()
+        text = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+        Path(path).write_text(text, encoding="utf-8")
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        found = str(error).splitlines()[0]
+        raise InputError(f"{path}: expected values that YAML can hold; found: {found}") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a file to write; found: {error.strerror}") from None
