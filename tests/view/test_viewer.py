@@ -13,16 +13,19 @@ import pytest
 
 from browser import Browser, find_browser
 from laboratory import QUICK, ROOT, WATER, body, box_robot, world
-from mjx_revolve import viewer
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes import rollout
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.rollout import Trajectory
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view import page_data as page_data_module
+from mjx_revolve.view.course import speed_over
 from mjx_revolve.view.forces import module_forces, sum_modules
+from mjx_revolve.view.page_data import page_data
 from mjx_revolve.view.swim_picture import pose_scene
-from mjx_revolve.viewer import main, make_page, page_data, write_viewer
+from mjx_revolve.view.viewer import make_page, write_viewer
+from mjx_revolve.viewer import main
 from mjx_revolve.water.flow import Water, surface, water_of
 from mjx_revolve.water.world import load_world
 
@@ -130,14 +133,14 @@ def test_speed_leaves_the_stroke_out():
     time = 0.02 * np.arange(500)
     path = np.zeros((500, 3))
     path[:, 1] = 0.2 * time + 0.05 * np.sin(2 * np.pi * time / 0.5)
-    assert viewer._speed(path, 0.02, 0.5) == pytest.approx(np.full(500, 0.2), rel=1e-3)
-    assert viewer._speed(path[:1], 0.02, 0.5).tolist() == [0]
+    assert speed_over(time, path, 0.5) == pytest.approx(np.full(500, 0.2), rel=1e-3)
+    assert speed_over(time[:1], path[:1], 0.5).tolist() == [0]
 
 
 @pytest.mark.parametrize("rows, every", [(2000, 4), (50, 4), (1, 1), (30000, 10)])
 def test_stride(rows, every):
     """Fifty rows a second, fewer of what lasts."""
-    assert viewer._stride(DT * np.arange(1, rows + 1)) == every
+    assert page_data_module._stride(DT * np.arange(1, rows + 1)) == every
 
 
 def small_episode(tank, **fields) -> Episode:
@@ -196,8 +199,11 @@ def test_stops_where_numbers_end():
     episode = small_episode(world())
     qvel = np.array(episode.trajectory.qvel)
     qvel[60:, 1] = np.nan
-    data = page_data(replace(episode, trajectory=replace(episode.trajectory, qvel=qvel)))
-    assert data["count"] == 15
+    lost = replace(episode, trajectory=replace(episode.trajectory, qvel=qvel))
+    assert page_data(lost)["count"] == 15
+    # So do gusts, which have a row for each of the trajectory.
+    gusty = replace(lost, water=Water(0.0, (0.0, np.full(100, 0.5), 0.0)))
+    assert unpack(page_data(gusty)["drift"], -1, 3)[-1] == pytest.approx([0, 0.14, 0], rel=1e-4)
     qvel[0] = np.inf
     with pytest.raises(InputError, match="expected finite numbers in its first row; found none"):
         page_data(replace(episode, trajectory=replace(episode.trajectory, qvel=qvel)))

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.spatial import sincos
-from mjx_revolve.view.film.scene import BACKGROUND, SUN
+from mjx_revolve.view.film.camera import FOVY
+from mjx_revolve.view.film.stage import BACKGROUND, SUN
 from mjx_revolve.water.flow import Water, surface
 from mjx_revolve.water.world import World
 
@@ -98,8 +99,8 @@ def make_shader(
     Returns:
         A function of colours `[height, width, 3]` uint8, depths along the view `[height, width]`
         (infinite where nothing is) [m], the camera's position `[3]` [m], its axes `[3, 3]` (rows
-        right, up, along the view), its `fovy` [rad] and the water (surface, current, time); it
-        returns colours `[height, width, 3]` uint8.
+        right, up, along the view) and the water (surface, current, time); it returns colours
+        `[height, width, 3]` uint8.
     """
     width, height = size
     u = (np.arange(width, dtype=np.float32) + 0.5) * 2 / height - width / height
@@ -107,15 +108,11 @@ def make_shader(
     # A little darker towards the corners, as lenses are.
     corners = 1 - 0.05 * ((u / u.max())[None, :] ** 2 + (v**2)[:, None])[..., None]
 
+    opening = math.tan(FOVY / 2)
+
     def shade(
-        color: jax.Array,
-        depth: jax.Array,
-        position: jax.Array,
-        axes: jax.Array,
-        fovy: jax.Array,
-        water: Water,
+        color: jax.Array, depth: jax.Array, position: jax.Array, axes: jax.Array, water: Water
     ) -> jax.Array:
-        opening = jnp.tan(fovy / 2)
         along = axes[2] + opening * (u[None, :, None] * axes[0] + v[:, None, None] * axes[1])
         length = jnp.linalg.norm(along, axis=-1)
         place = (float(origin[0]), float(origin[1]))
