@@ -98,10 +98,7 @@ def _lines(depth: np.ndarray, part: np.ndarray, normal: np.ndarray) -> np.ndarra
     """Where the outline of a part or a sharp edge lies: `[rows, columns]` bool."""
     line = np.zeros(depth.shape, bool)
     with np.errstate(invalid="ignore"):
-        for axis in (0, 1):
-            one, two = (slice(None, -1), slice(1, None))
-            a = (one, slice(None)) if axis == 0 else (slice(None), one)
-            b = (two, slice(None)) if axis == 0 else (slice(None), two)
+        for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
             jump = np.abs(depth[a] - depth[b]) > _STEP
             turn = (normal[a] * normal[b]).sum(axis=-1) < _TURN
             line[a] |= jump | (turn & (part[a] >= 0) & (part[b] >= 0)) | (part[a] != part[b])

@@ -29,11 +29,11 @@ from mjx_revolve.view.film.film import make_film
 from mjx_revolve.view.film.stage import BACKGROUND, build_stage, make_sand, smooth_mesh
 from mjx_revolve.view.film.video import gif_stride, make_gif, write_mp4
 from mjx_revolve.view.film.waterlight import (
-    bright_lines,
-    daylight,
+    _bright_lines,
+    _daylight,
+    _open_water,
+    _transmission,
     make_shader,
-    open_water,
-    transmission,
 )
 from mjx_revolve.view.swim_picture import pose_scene
 from mjx_revolve.water.flow import Water
@@ -249,24 +249,24 @@ def test_sand_can_be_laid_side_by_side():
 
 
 def test_water_takes_red_first():
-    clear = np.asarray(transmission(0.0, 1.0))
+    clear = np.asarray(_transmission(0.0, 1.0))
     assert clear == pytest.approx([1, 1, 1])
-    near, far = (np.asarray(transmission(x, 1.0)) for x in (1.0, 8.0))
+    near, far = (np.asarray(_transmission(x, 1.0)) for x in (1.0, 8.0))
     assert (near > 0.75).all() and (far < 0.4).all()
     assert far[0] < far[1] < far[2]
     # Small robots are seen as clearly as large ones.
-    assert np.asarray(transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
+    assert np.asarray(_transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
 
 
 def test_light_comes_from_above():
-    assert np.asarray(daylight(0.0)) == pytest.approx([1, 1, 1])
-    assert (np.diff(np.asarray(daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
-    assert (np.diff(np.asarray(open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
+    assert np.asarray(_daylight(0.0)) == pytest.approx([1, 1, 1])
+    assert (np.diff(np.asarray(_daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
+    assert (np.diff(np.asarray(_open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
 
 
 def test_bright_lines_only_move_light_about():
     x, y = np.meshgrid(np.linspace(0, 20, 200), np.linspace(0, 20, 200))
-    lines = np.asarray(bright_lines(1.0, 9.81, 0.7, x, y))
+    lines = np.asarray(_bright_lines(1.0, 9.81, 0.7, x, y))
     assert lines.mean() == pytest.approx(1.0, abs=0.2)
     assert lines.min() > 0 and lines.std() > 0.1
 

@@ -283,6 +283,7 @@ def test_page_opens_and_plays(browser, page):
     """No error, nothing asked for over the network, and time goes on; the space bar stops it."""
     browser.open(page, "#plain")
     assert read(browser, "error") is None
+    assert float(read(browser, "time")) >= DT - 1e-9
     browser.wait("document.documentElement.dataset.time > 0.3")
     first = float(read(browser, "time"))
     browser.wait(f"document.documentElement.dataset.time > {first + 0.1}")
@@ -340,6 +341,26 @@ def test_switches_change_the_picture(browser, page):
     assert re.fullmatch(r"[0-9.e-]+ N", scale)
     assert browser.evaluate("document.getElementById('thrust').disabled") is True
     assert browser.errors == []
+
+
+@pytest.mark.slow
+@needs_browser
+def test_panels_do_not_overlap(browser, page):
+    browser.open(page, "#plain&paused")
+    boxes = (
+        "[...document.querySelectorAll('.glass')].map((e) => e.getBoundingClientRect())"
+        ".filter((b) => b.width > 0).map((b) => [b.left, b.top, b.right, b.bottom])"
+    )
+    try:
+        for size in ((480, 300), (600, 400), (390, 700), (800, 480), (1100, 680)):
+            browser.resize(*size)
+            panels = np.array(browser.evaluate(boxes))
+            low = np.maximum(panels[:, None, :2], panels[:, :2])
+            high = np.minimum(panels[:, None, 2:], panels[:, 2:])
+            assert ((low < high).all(-1) == np.eye(len(panels), dtype=bool)).all(), size
+            assert panels.min() >= 0 and (panels[:, 2:] <= size).all()
+    finally:
+        browser.resize(*SIZE)
 
 
 @pytest.mark.slow

@@ -104,17 +104,9 @@ def _add_dots(
     size: np.ndarray,
     color: tuple[float, float, float],
 ) -> None:
-    """Lays soft dots over a picture, in place, where nothing stands before them.
+    """Lays soft dots of radii `size` [m] at points `[n, 3]` [m] over a picture, in place.
 
-    Args:
-        picture: `[height, width, 3]` uint8.
-        depth: `[height, width]` along the view [m].
-        film: whose camera looks at them.
-        frame: number of the frame.
-        points: `[n, 3]` world frame [m].
-        alpha: `[n]` how opaque, 0 to 1.
-        size: `[n]` radius [m].
-        color: of the dots.
+    Not where something stands before them, by the depths of the picture [m].
     """
     height, width = depth.shape
     flat, away = film.shots.project(frame, points)

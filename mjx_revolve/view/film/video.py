@@ -30,7 +30,9 @@ _GIF_WIDTH, _LEAST_WIDTH = 420, 80
 _MAIN = 150
 
 
-def write_film(film: Film, opengl: str, mp4: Path | None = None, gif: Path | None = None) -> None:
+def write_film(
+    film: Film, opengl: str, mp4: str | Path | None = None, gif: str | Path | None = None
+) -> None:
     """Draws a film once and writes it as MP4, as GIF, or as both.
 
     Files appear whole or not at all. On a terminal a bar shows how far it is.
@@ -58,12 +60,12 @@ def write_film(film: Film, opengl: str, mp4: Path | None = None, gif: Path | Non
 
     if mp4 is not None:
         title = film.episode.title
-        write_atomic(mp4, lambda path: write_mp4(path, draw(), film.size, film.fps, title))
+        write_atomic(Path(mp4), lambda path: write_mp4(path, draw(), film.size, film.fps, title))
     else:
         for _ in draw():
             pass
     if gif is not None:
-        write_atomic(gif, make_gif(small, every / film.fps))
+        write_atomic(Path(gif), make_gif(small, every / film.fps))
 
 
 def write_mp4(
