@@ -11,7 +11,6 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mjx_revolve.inputs.commands import (
     Parser,
@@ -23,14 +22,12 @@ from mjx_revolve.inputs.commands import (
     whole,
 )
 from mjx_revolve.inputs.errors import InputError
-
-if TYPE_CHECKING:
-    from mjx_revolve.episodes.champion import Episode
-    from mjx_revolve.view.film.film import Film
+from mjx_revolve.view.film.opengl import check_screen, find_opengl
 
 _KINDS = (".mp4", ".gif", ".html")
 _SMALLEST, _LARGEST = (64, 64), (3840, 2160)  # pixels
 _MOST_FPS = 120
+_VIEW_FPS = 60  # in MuJoCo's viewer
 
 
 def _parser() -> Parser:
@@ -143,8 +140,6 @@ def main(argv: list[str] | None = None) -> int:
         InputError: an argument or a file is wrong, or there is no OpenGL to draw with.
         OSError: a file cannot be written.
     """
-    from mjx_revolve.view.film.opengl import check_screen, find_opengl
-
     arguments = _parser().parse_args(argv)
     path, out, view = Path(arguments.path), arguments.out, arguments.view
     kinds = (".html",) if arguments.html else _KINDS
@@ -167,18 +162,23 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.episodes.champion import load_episode
 
     episode = load_episode(path, arguments.world, arguments.duration, arguments.seed)
-    if view:
-        from mjx_revolve.view.film.draw import show_film
-
-        show_film(_make_film(episode, arguments.size, 60))
-        return 0
     if paths is None:
-        paths = _usual_paths(Path(), str(episode.robot.morphology.name), kinds)
-    if films:
+        paths = {} if view else _usual_paths(Path(), str(episode.robot.morphology.name), kinds)
+    if view or films:
+        from mjx_revolve.view.film.draw import show_film
+        from mjx_revolve.view.film.film import make_film
         from mjx_revolve.view.film.video import write_film
 
-        film = _make_film(episode, arguments.size, arguments.fps)
-        write_film(film, opengl, paths.get(".mp4"), paths.get(".gif"))
+        film = make_film(episode, arguments.size, _VIEW_FPS if view else arguments.fps)
+        if film.lost is not None:
+            print(
+                f"note: the trajectory is not finite from {film.lost:.4g} s on; shown up to there",
+                file=sys.stderr,
+            )
+        if view:
+            show_film(film)
+        else:
+            write_film(film, opengl, paths.get(".mp4"), paths.get(".gif"))
         length = f"{len(film.time) / film.fps:.3g} s"
         _say(paths, ".mp4", f"{length}, {film.size[0]} x {film.size[1]}, {film.fps} frames/s")
         _say(paths, ".gif", length)
@@ -188,19 +188,6 @@ def main(argv: list[str] | None = None) -> int:
         write_viewer(episode, paths[".html"])
         _say(paths, ".html", "open it in a browser")
     return 0
-
-
-def _make_film(episode: Episode, size: tuple[int, int], fps: int) -> Film:
-    """Makes a film and says what of it is lost."""
-    from mjx_revolve.view.film.film import make_film
-
-    film = make_film(episode, size, fps)
-    if film.lost is not None:
-        print(
-            f"note: the trajectory is not finite from {film.lost:.4g} s on; shown up to there",
-            file=sys.stderr,
-        )
-    return film
 
 
 def _say(paths: dict[str, Path], kind: str, words: str) -> None:

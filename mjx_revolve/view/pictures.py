@@ -173,16 +173,14 @@ def _compose(morphology: Morphology) -> Figure:
         left = width - 0.35 - (room[0] + wide[k]) / 2
         bottom = 1.55 + tall[1] + 0.6 * spare if k == 0 else 0.65 + 0.4 * spare
         axes = figure.add_axes((left / width, bottom / height, wide[k] / width, tall[k] / height))
-        axes.set_xlim(low[across] - pad, high[across] + pad)
-        axes.set_ylim(low[up] - pad, high[up] + pad)
+        axes.set(xlim=(low[across] - pad, high[across] + pad), ylim=(low[up] - pad, high[up] + pad))
         axes.set_title(title, fontsize=9, color=_INK)
-        axes.set_xlabel("xyz"[across] + " [m]", color=_INK)
-        axes.set_ylabel("xyz"[up] + " [m]", color=_INK)
+        axes.set_xlabel(f"{'xyz'[across]} [m]", color=_INK)
+        axes.set_ylabel(f"{'xyz'[up]} [m]", color=_INK)
         axes.grid(True, color=_FAINT, lw=0.5)
         axes.set_axisbelow(True)
         axes.tick_params(labelsize=8, colors=_INK, length=3)
-        for spine in axes.spines.values():
-            spine.set_color(_INK)
+        axes.spines[:].set_color(_INK)
         for axis, span in ((axes.xaxis, wide[k] / 0.6), (axes.yaxis, tall[k] / 0.35)):
             count = int(np.clip(span, 1, 6))
             axis.set_major_locator(MaxNLocator(nbins=count, steps=[1, 2, 5, 10]))

@@ -107,7 +107,6 @@ def make_shader(
     v = 1 - (np.arange(height, dtype=np.float32) + 0.5) * 2 / height
     # A little darker towards the corners, as lenses are.
     corners = 1 - 0.05 * ((u / u.max())[None, :] ** 2 + (v**2)[:, None])[..., None]
-
     opening = math.tan(FOVY / 2)
 
     def shade(
