@@ -235,7 +235,7 @@ def test_thrusters_and_fins_have_shapes_of_their_volume_within_their_box(name):
 def test_an_arrow_is_closed_and_points_along_its_axis():
     import trimesh
 
-    from mjx_revolve.view.pictures import _spindle
+    from mjx_revolve.view.pieces import _spindle
 
     corners = _spindle((0, 0, 2), [(0.0, 0.0), (0.0, 1.0), (3.0, 1.0), (3.0, 2.0), (5.0, 0.0)])
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
@@ -246,17 +246,17 @@ def test_an_arrow_is_closed_and_points_along_its_axis():
 
 
 def test_what_is_nearer_hides_what_is_farther():
-    from mjx_revolve.view.pictures import _depth_buffer
+    from mjx_revolve.view.raster import depth_buffer
 
     square = np.array([[(0, 0), (4, 0), (4, 4)], [(0, 0), (4, 4), (0, 4)]], float)
     low = np.concatenate([square, np.zeros((2, 3, 1))], axis=2)
     high = np.concatenate([0.5 * square + 1, np.ones((2, 3, 1))], axis=2)
     for corners, near in ((np.concatenate([low, high]), 2), (np.concatenate([high, low]), 0)):
-        depth, index = _depth_buffer(corners, np.zeros(2), 0.1, (40, 40))
+        depth, index = depth_buffer(corners, np.zeros(2), 0.1, (40, 40))
         assert (depth[10:30, 10:30] == 1.0).all()
         assert (depth == 1.0).sum() == 400 and (depth == 0.0).sum() == 1200
         assert np.isin(index[10:30, 10:30], (near, near + 1)).all()
-    depth, _ = _depth_buffer(low[:, ::-1], np.zeros(2), 0.1, (40, 40))
+    depth, _ = depth_buffer(low[:, ::-1], np.zeros(2), 0.1, (40, 40))
     assert not np.isfinite(depth).any()  # faces that look away are not drawn
 
 

@@ -22,22 +22,22 @@ from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
 from mjx_revolve.view.film import opengl
-from mjx_revolve.view.film.camera import plan_shots
-from mjx_revolve.view.film.film import draw_frames, enclosing_balls, make_film
-from mjx_revolve.view.film.scene import BACKGROUND, build_scene, corner_normals, make_sand
-from mjx_revolve.view.film.video import GifMaker, Mp4Writer
+from mjx_revolve.view.film.camera import FOVY, plan_shots
+from mjx_revolve.view.film.draw import draw_frames
+from mjx_revolve.view.film.film import make_film
+from mjx_revolve.view.film.stage import BACKGROUND, build_stage, make_sand, smooth_mesh
+from mjx_revolve.view.film.video import gif_stride, make_gif, write_mp4
 from mjx_revolve.view.film.waterlight import (
-    bright_lines,
-    daylight,
+    _bright_lines,
+    _daylight,
+    _open_water,
+    _transmission,
     make_shader,
-    open_water,
-    transmission,
 )
 from mjx_revolve.view.swim_picture import pose_scene
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import load_world
 
-FOVY = math.radians(40.0)
 STEP = 0.005
 SIZE = (160, 120)
 
@@ -85,7 +85,7 @@ def frames(episode, way):
 def plan(path, radius=0.2, surface=0.0, bed=None, aspect=4 / 3, **kw):
     time = np.arange(len(path)) / 30
     size = np.full(len(path), radius)
-    return plan_shots(time, np.asarray(path, float), size, aspect=aspect, fovy=FOVY,
+    return plan_shots(time, np.asarray(path, float), size, aspect=aspect,
                       surface=surface, bed=bed, **kw)  # fmt: skip
 
 
@@ -169,14 +169,14 @@ def test_projection_of_a_known_point():
     assert away[1] == pytest.approx(-away[0])
 
 
-# --- the scene ----------------------------------------------------------------------------------
+# --- the stage ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["spider", "auv", "fish"])
-def test_scene_stands_as_the_robot_does(name):
+def test_stage_stands_as_the_robot_does(name):
     robot = build_robot(body(name), load_world("lake"))
     shapes = (robot.mj_model.ngeom, robot.mj_model.nmesh)
-    model = build_scene(robot)
+    model = build_stage(robot)
     assert (robot.mj_model.ngeom, robot.mj_model.nmesh) == shapes
     assert model.nq == robot.mj_model.nq
     random = np.random.default_rng(1)
@@ -209,8 +209,8 @@ def test_scene_stands_as_the_robot_does(name):
         assert near.max() < 1e-5
 
 
-def test_scene_counts_from_its_origin(spider):
-    model = build_scene(spider, origin=(380.0, 20.0, -10.0), sight=5.0)
+def test_stage_counts_from_its_origin(spider):
+    model = build_stage(spider, origin=(380.0, 20.0, -10.0), sight=5.0)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     assert data.geom_xpos[model.geom("surface").id] == pytest.approx([0, 0, 10])
@@ -218,7 +218,7 @@ def test_scene_counts_from_its_origin(spider):
 
 def test_a_world_without_a_bed_has_none(spider):
     open_water_world = load_world("lake", bed="off")
-    model = build_scene(build_robot(spider.morphology, open_water_world))
+    model = build_stage(build_robot(spider.morphology, open_water_world))
     names = [model.geom(k).name for k in range(model.ngeom)]
     assert "sand" not in names and "bed" not in names
 
@@ -226,14 +226,15 @@ def test_a_world_without_a_bed_has_none(spider):
 def test_normals_are_sharp_on_a_cube_and_smooth_on_a_pipe():
     import trimesh
 
-    cube = trimesh.creation.box((1, 1, 1))
-    normals = corner_normals(np.asarray(cube.triangles))
-    assert normals == pytest.approx(np.repeat(cube.face_normals[:, None], 3, 1), abs=1e-9)
-    pipe = trimesh.creation.cylinder(1.0, 2.0, sections=32)
-    corners = np.asarray(pipe.triangles)
+    cube = smooth_mesh(np.asarray(trimesh.creation.box((1, 1, 1)).triangles))
+    expected = np.repeat(cube.face_normals[:, None], 3, 1)
+    assert cube.vertex_normals[cube.faces] == pytest.approx(expected, abs=1e-9)
+    assert len(cube.faces) == 12 and cube.area == pytest.approx(6)
+    pipe = smooth_mesh(np.asarray(trimesh.creation.cylinder(1.0, 2.0, sections=32).triangles))
     side = np.abs(pipe.face_normals[:, 2]) < 0.5
-    outward = corners[side] * [1, 1, 0]
-    assert (corner_normals(corners)[side] * outward).sum(-1) == pytest.approx(1, abs=0.01)
+    assert side.sum() == 64
+    outward = pipe.triangles[side] * [1, 1, 0]
+    assert (pipe.vertex_normals[pipe.faces][side] * outward).sum(-1) == pytest.approx(1, abs=0.01)
 
 
 def test_sand_can_be_laid_side_by_side():
@@ -247,24 +248,24 @@ def test_sand_can_be_laid_side_by_side():
 
 
 def test_water_takes_red_first():
-    clear = np.asarray(transmission(0.0, 1.0))
+    clear = np.asarray(_transmission(0.0, 1.0))
     assert clear == pytest.approx([1, 1, 1])
-    near, far = (np.asarray(transmission(x, 1.0)) for x in (1.0, 8.0))
+    near, far = (np.asarray(_transmission(x, 1.0)) for x in (1.0, 8.0))
     assert (near > 0.75).all() and (far < 0.4).all()
     assert far[0] < far[1] < far[2]
     # Small robots are seen as clearly as large ones.
-    assert np.asarray(transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
+    assert np.asarray(_transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
 
 
 def test_light_comes_from_above():
-    assert np.asarray(daylight(0.0)) == pytest.approx([1, 1, 1])
-    assert (np.diff(np.asarray(daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
-    assert (np.diff(np.asarray(open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
+    assert np.asarray(_daylight(0.0)) == pytest.approx([1, 1, 1])
+    assert (np.diff(np.asarray(_daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
+    assert (np.diff(np.asarray(_open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
 
 
 def test_bright_lines_only_move_light_about():
     x, y = np.meshgrid(np.linspace(0, 20, 200), np.linspace(0, 20, 200))
-    lines = np.asarray(bright_lines(1.0, 9.81, 0.7, x, y))
+    lines = np.asarray(_bright_lines(1.0, 9.81, 0.7, x, y))
     assert lines.mean() == pytest.approx(1.0, abs=0.2)
     assert lines.min() > 0 and lines.std() > 0.1
 
@@ -283,7 +284,7 @@ def shade(world, above, depth, color=(200, 60, 40), height=1.0, pitch=0.0, time=
                      [0, math.cos(pitch), math.sin(pitch)]], np.float32)  # fmt: skip
     water = Water(np.float32(0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), np.float32(time))
     depths, place = np.full((24, 32), depth, np.float32), np.float32([0, 0, height])
-    return np.asarray(shader(picture, depths, place, axes, np.float32(FOVY), water))
+    return np.asarray(shader(picture, depths, place, axes, water))
 
 
 def test_what_is_far_is_lost_in_blue_haze():
@@ -343,18 +344,18 @@ def test_a_turn_over_the_sign_of_the_quaternion_is_a_small_one(spider):
 def test_motes_drift_with_the_current_and_its_gusts(spider):
     robot = build_robot(spider.morphology, load_world("lake", current=(0.1, 0, 0)))
     film = make_film(swim(robot), SIZE, 10)
-    assert film.current == pytest.approx(np.tile([0.1, 0, 0], (10, 1)))
+    assert np.stack(film.water.current) == pytest.approx(np.tile([[0.1], [0], [0]], 10))
     steps = np.arange(200)
     gusty = Water(0.0, (0.1 + STEP * steps, 0.0 * steps, 0.0 * steps))
     film = make_film(replace(swim(robot), water=gusty), SIZE, 10)
-    assert film.current[:, 0] == pytest.approx(0.1 + film.time)
+    assert film.water.current[0] == pytest.approx(0.1 + film.time)
 
 
 def test_balls_hold_every_part(spider):
-    qpos = spider.start_qpos()[None]
-    center, radius = enclosing_balls(spider, qpos)
-    away = np.linalg.norm(pose_scene(spider, qpos[0]).corners - center[0], axis=-1)
-    assert away.max() < radius[0] < 1.3 * away.max()
+    film = make_film(swim(spider), SIZE, 10)
+    for k in (0, 7):
+        away = np.linalg.norm(pose_scene(spider, film.qpos[k]).corners - film.center[k], axis=-1)
+        assert away.max() < film.radius[k] < 1.3 * away.max()
 
 
 def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
@@ -366,7 +367,9 @@ def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
     assert len(film.time) == 18
     assert np.isfinite(film.qpos).all()
     qpos[:] = np.nan
-    with pytest.raises(InputError, match="expected a trajectory of finite numbers"):
+    with pytest.raises(
+        InputError, match="qpos: expected finite numbers in its first row; found none"
+    ):
         make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)))
 
 
@@ -419,9 +422,7 @@ def read_mp4(path):
 
 def test_mp4_reads_back(tmp_path):
     path = tmp_path / "dot.mp4"
-    with Mp4Writer(path, SIZE, 25, "a dot") as writer:
-        for frame in moving_dot():
-            writer.add(frame)
+    write_mp4(path, moving_dot(), SIZE, 25, "a dot")
     _, rate, codec, pictures = read_mp4(path)
     assert len(pictures) == 30 and rate == 25
     assert codec.name == "h264" and codec.pix_fmt == "yuv420p"
@@ -433,10 +434,9 @@ def test_mp4_reads_back(tmp_path):
 
 
 def test_gif_reads_back_with_the_film_s_time_and_colours():
-    maker = GifMaker(SIZE, 30, 30)
-    for frame in moving_dot():
-        maker.add(frame)
-    gif = Image.open(io.BytesIO(maker.make()))
+    every = gif_stride(30, 30)
+    shown = [Image.fromarray(frame) for frame in moving_dot()][::every]
+    gif = Image.open(io.BytesIO(make_gif(shown, every / 30)))
     assert gif.size == SIZE and gif.n_frames == 15
     total = 0
     for k in range(gif.n_frames):
@@ -450,11 +450,10 @@ def test_gif_reads_back_with_the_film_s_time_and_colours():
 
 def test_long_and_noisy_gifs_get_smaller():
     random = np.random.default_rng(0)
-    maker = GifMaker((320, 240), 30, 6000, limit=100_000)
-    assert 6000 / maker.every <= 160
-    for _ in range(4 * maker.every):
-        maker.add(random.integers(0, 255, (240, 320, 3), np.uint8))
-    content = maker.make()
+    every = gif_stride(30, 6000)
+    assert 6000 / every <= 160
+    shown = [Image.fromarray(random.integers(0, 255, (240, 320, 3), np.uint8)) for _ in range(4)]
+    content = make_gif(shown, every / 30, limit=100_000)
     assert 30_000 < len(content) < 100_000
     with Image.open(io.BytesIO(content)) as gif:
         assert gif.n_frames == 4 and gif.width * 3 == pytest.approx(gif.height * 4, abs=4)
@@ -467,7 +466,7 @@ def test_long_and_noisy_gifs_get_smaller():
 def command(episode, monkeypatch):
     """Runs the command on the made-up episode."""
     import mjx_revolve.episodes.champion
-    import mjx_revolve.viewer
+    import mjx_revolve.view.viewer
 
     def load(path, world="lake", duration=None, seed=None):
         return episode
@@ -477,7 +476,7 @@ def command(episode, monkeypatch):
     def write(episode, path):
         write_atomic(path, episode.title.encode())
 
-    monkeypatch.setattr(mjx_revolve.viewer, "write_viewer", write)
+    monkeypatch.setattr(mjx_revolve.view.viewer, "write_viewer", write)
     return lambda *words: run_command(replay.main, list(words))
 
 

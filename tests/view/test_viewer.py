@@ -13,15 +13,18 @@ import pytest
 
 from browser import Browser, find_browser
 from laboratory import QUICK, ROOT, WATER, body, box_robot, world
-from mjx_revolve import viewer
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view import page_data as page_data_module
+from mjx_revolve.view.course import speed_over
 from mjx_revolve.view.forces import module_forces, sum_modules
+from mjx_revolve.view.page_data import page_data
 from mjx_revolve.view.swim_picture import pose_scene
-from mjx_revolve.viewer import main, make_page, page_data, write_viewer
+from mjx_revolve.view.viewer import make_page, write_viewer
+from mjx_revolve.viewer import main
 from mjx_revolve.water.flow import Water, surface, water_of
 from mjx_revolve.water.world import load_world
 
@@ -129,14 +132,14 @@ def test_speed_leaves_the_stroke_out():
     time = 0.02 * np.arange(500)
     path = np.zeros((500, 3))
     path[:, 1] = 0.2 * time + 0.05 * np.sin(2 * np.pi * time / 0.5)
-    assert viewer._speed(path, 0.02, 0.5) == pytest.approx(np.full(500, 0.2), rel=1e-3)
-    assert viewer._speed(path[:1], 0.02, 0.5).tolist() == [0]
+    assert speed_over(time, path, 0.5) == pytest.approx(np.full(500, 0.2), rel=1e-3)
+    assert speed_over(time[:1], path[:1], 0.5).tolist() == [0]
 
 
 @pytest.mark.parametrize("rows, every", [(2000, 4), (50, 4), (1, 1), (30000, 10)])
 def test_stride(rows, every):
     """Fifty rows a second, fewer of what lasts."""
-    assert viewer._stride(DT * np.arange(1, rows + 1)) == every
+    assert page_data_module._stride(DT * np.arange(1, rows + 1)) == every
 
 
 def small_episode(tank, **fields) -> Episode:
@@ -195,8 +198,11 @@ def test_stops_where_numbers_end():
     episode = small_episode(world())
     qvel = np.array(episode.trajectory.qvel)
     qvel[60:, 1] = np.nan
-    data = page_data(replace(episode, trajectory=replace(episode.trajectory, qvel=qvel)))
-    assert data["count"] == 15
+    lost = replace(episode, trajectory=replace(episode.trajectory, qvel=qvel))
+    assert page_data(lost)["count"] == 15
+    # So do gusts, which have a row for each of the trajectory.
+    gusty = replace(lost, water=Water(0.0, (0.0, np.full(100, 0.5), 0.0)))
+    assert unpack(page_data(gusty)["drift"], -1, 3)[-1] == pytest.approx([0, 0.14, 0], rel=1e-4)
     qvel[0] = np.inf
     with pytest.raises(InputError, match="expected finite numbers in its first row; found none"):
         page_data(replace(episode, trajectory=replace(episode.trajectory, qvel=qvel)))
@@ -276,6 +282,7 @@ def test_page_opens_and_plays(browser, page):
     """No error, nothing asked for over the network, and time goes on; the space bar stops it."""
     browser.open(page, "#plain")
     assert read(browser, "error") is None
+    assert float(read(browser, "time")) >= DT - 1e-9
     browser.wait("document.documentElement.dataset.time > 0.3")
     first = float(read(browser, "time"))
     browser.wait(f"document.documentElement.dataset.time > {first + 0.1}")
@@ -333,6 +340,26 @@ def test_switches_change_the_picture(browser, page):
     assert re.fullmatch(r"[0-9.e-]+ N", scale)
     assert browser.evaluate("document.getElementById('thrust').disabled") is True
     assert browser.errors == []
+
+
+@pytest.mark.slow
+@needs_browser
+def test_panels_do_not_overlap(browser, page):
+    browser.open(page, "#plain&paused")
+    boxes = (
+        "[...document.querySelectorAll('.glass')].map((e) => e.getBoundingClientRect())"
+        ".filter((b) => b.width > 0).map((b) => [b.left, b.top, b.right, b.bottom])"
+    )
+    try:
+        for size in ((480, 300), (600, 400), (390, 700), (800, 480), (1100, 680)):
+            browser.resize(*size)
+            panels = np.array(browser.evaluate(boxes))
+            low = np.maximum(panels[:, None, :2], panels[:, :2])
+            high = np.minimum(panels[:, None, 2:], panels[:, 2:])
+            assert ((low < high).all(-1) == np.eye(len(panels), dtype=bool)).all(), size
+            assert panels.min() >= 0 and (panels[:, 2:] <= size).all()
+    finally:
+        browser.resize(*SIZE)
 
 
 @pytest.mark.slow

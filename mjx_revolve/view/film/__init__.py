@@ -1,1 +1,1 @@
-"""The film of a robot's episode: scene, camera, light, captions, video."""
+"""The film of a robot's episode: frames, camera, stage, light, what is laid over, video."""

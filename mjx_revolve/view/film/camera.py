@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+# Angle of view, upright [rad].
+FOVY = math.radians(40.0)
 # The camera's path is smoothed over this long, less where the robot would leave the frame [s].
 _CALM = (1.0, 0.6, 0.35, 0.2, 0.1, 0.05)
 # How far the robot may get from where the camera looks, in its own radii.
@@ -48,14 +50,12 @@ class Shots:
         target: `[F, 3]` what it looks at, world frame [m].
         above: whether it stands in the air.
         distance: usual distance from the robot [m].
-        fovy: angle of view, upright [rad].
     """
 
     position: np.ndarray
     target: np.ndarray
     above: bool
     distance: float
-    fovy: float
 
     def axes(self, frame: int) -> np.ndarray:
         """`[3, 3]` of a frame; its rows point right, up and along the view, world frame."""
@@ -76,10 +76,9 @@ class Shots:
             `[n, 2]` right and up of the frame's middle, 1 at its upper edge, and `[n]` distance
             along the view [m]. What lies behind the camera has a distance below 0.
         """
-        seen = (points - self.position[frame]) @ self.axes(frame).T
-        depth = seen[:, 2]
-        safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-        return seen[:, :2] / (safe[:, None] * math.tan(self.fovy / 2)), depth
+        right, up, depth = self.axes(frame) @ (points - self.position[frame]).T
+        safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9) * math.tan(FOVY / 2)
+        return np.stack([right / safe, up / safe], axis=-1), depth
 
 
 def plan_shots(
@@ -88,7 +87,6 @@ def plan_shots(
     radius: np.ndarray,
     *,
     aspect: float,
-    fovy: float,
     surface: float,
     waves: float = 0.0,
     bed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
@@ -101,7 +99,6 @@ def plan_shots(
         center: `[F, 3]` middle of the robot, world frame [m].
         radius: `[F]` of a ball around it that holds the robot [m].
         aspect: width of the frame over its height.
-        fovy: angle of view, upright [rad].
         surface: z of the still surface [m].
         waves: the most that waves rise above it [m].
         bed: height of the bed at x and y `[n]` [m], or None.
@@ -112,15 +109,12 @@ def plan_shots(
     """
     largest = float(radius.max())
     step = float(time[1] - time[0]) if len(time) > 1 else 1.0
-    target = center
-    for calm in _CALM:
-        target = _smooth(center, calm / step)
-        if np.linalg.norm(target - center, axis=1).max() <= _STRAY * largest:
+    for calm in (*_CALM, 0.0):
+        target = _smooth(center, calm / step) if calm else center
+        stray = float(np.linalg.norm(target - center, axis=1).max())
+        if stray <= _STRAY * largest:
             break
-    else:
-        target = center
-    stray = float(np.linalg.norm(target - center, axis=1).max())
-    half = math.atan(min(1.0, aspect) * math.tan(fovy / 2))
+    half = math.atan(min(1.0, aspect) * math.tan(FOVY / 2))
     distance = (largest + stray) / (_FILL * math.sin(half))
 
     ahead = _heading(center, largest, along)
@@ -129,51 +123,35 @@ def plan_shots(
     depth = surface - center[:, 2]
     above = bool(np.median(depth) < _AFLOAT * largest)
     margin = _AIR * distance
-    elevation = _HIGH
-    if not above and not _is_near(bed, center, _NEAR * distance):
-        elevation = _LEVEL
-    low, high = np.full(len(time), -np.inf), np.full(len(time), np.inf)
-    if above:
-        low[:] = surface + waves + margin
-    else:
-        high[:] = surface - waves - 0.5 * margin
-    reach = np.full(len(time), distance)
+    # Whether the bed is close below for half of the time.
+    near = bed is not None and np.median(center[:, 2] - bed(*center[:, :2].T)) < _NEAR * distance
+    elevation = _HIGH if above or near else _LEVEL
+    low: Any = surface + waves + margin if above else -np.inf
+    high = np.inf if above else surface - waves - 0.5 * margin
     foot = target[:, :2] + distance * math.cos(elevation) * stand
     if bed is not None:
         # Also halfway, or a dune could stand between camera and robot.
         for share in (1.0, 0.5):
             at = target[:, :2] + share * (foot - target[:, :2])
-            rise = np.asarray(bed(at[:, 0], at[:, 1]), float) + 0.6 * margin - target[:, 2]
+            rise = bed(*at.T) + 0.6 * margin - target[:, 2]
             low = np.maximum(low, target[:, 2] + rise / share)
     # In a gap too narrow for both, rather through the surface than through the bed.
     height = np.maximum(np.minimum(target[:, 2] + distance * math.sin(elevation), high), low)
     height = _smooth(height[:, None], _CALM[2] / step)[:, 0]
     height = np.maximum(np.minimum(height, high), low)
     rise = height - target[:, 2]
-    reach = np.maximum(reach, np.abs(rise) / math.sin(_STEEP))
+    reach = np.maximum(distance, np.abs(rise) / math.sin(_STEEP))
     level = np.sqrt(np.maximum(reach**2 - rise**2, 0.0))
     position = np.concatenate([target[:, :2] + level[:, None] * stand, height[:, None]], axis=1)
-    target = target + np.array([0.0, 0.0, _HEADROOM * 2 * distance * math.tan(fovy / 2)])
-    return Shots(position, target, above, distance, fovy)
-
-
-def _is_near(bed: Any, center: np.ndarray, reach: float) -> bool:
-    """Whether the bed is that close below for half of the time."""
-    if bed is None:
-        return False
-    below = center[:, 2] - np.asarray(bed(center[:, 0], center[:, 1]), float)
-    return bool(np.median(below) < reach)
+    target = target + np.array([0.0, 0.0, _HEADROOM * 2 * distance * math.tan(FOVY / 2)])
+    return Shots(position, target, above, distance)
 
 
 def _smooth(path: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian mean over rows that leaves straight lines as they are, ends included."""
     count = len(path)
     reach = min(int(4 * sigma) + 1, count - 1)
-    if reach < 1:
-        return np.array(path)
-    before = 2 * path[0] - path[reach:0:-1]
-    after = 2 * path[-1] - path[-2 : -reach - 2 : -1]
-    padded = np.concatenate([before, path, after])
+    padded = np.pad(path, [(reach, reach), (0, 0)], mode="reflect", reflect_type="odd")
     return gaussian_filter1d(padded, sigma, axis=0, mode="nearest")[reach : reach + count]
 
 

@@ -1,4 +1,4 @@
-"""Finds an OpenGL that works, with a screen or without.
+"""Finds an OpenGL that works, with a screen or without, and whether there is a screen.
 
 MuJoCo chooses OpenGL when it is imported, by the environment variable MUJOCO_GL, and then has no
 second try. Here each way of making a context is tried in a process of its own, where a driver that
@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
 
 from mjx_revolve.inputs.errors import InputError
 
@@ -48,8 +49,7 @@ def find_opengl() -> str:
         if wish not in ways:
             raise InputError(f"MUJOCO_GL: expected one of {', '.join(ways)}; found {wish!r}")
         ways = (wish,)
-    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if system == "linux" and not screen and not wish:
+    if system == "linux" and not _has_display() and not wish:
         ways = tuple(way for way in ways if way != "glfw")
     for way in ways:
         if _works(way):
@@ -60,6 +60,32 @@ def find_opengl() -> str:
         f"OpenGL: expected one of {', '.join(ways)} to draw with{asked}; found none that works "
         f"(install one{hint})"
     )
+
+
+def check_screen() -> None:
+    """Refuses `--view` where nobody could see it.
+
+    Raises:
+        InputError: there is no screen.
+    """
+    hint = "(without --view a film is written, which needs none)"
+    if sys.platform.startswith("linux") and not _has_display():
+        raise InputError(
+            f"--view: expected a screen; found neither DISPLAY nor WAYLAND_DISPLAY set {hint}"
+        )
+    # MuJoCo's viewer would end the process with a complaint of its own.
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if not glfw.init():
+            raise InputError(
+                f"--view: expected a screen; found none that lets us open a window {hint}"
+            )
+
+
+def _has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _works(way: str) -> bool:

@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import av
 import numpy as np
 from PIL import Image
+from tqdm import tqdm
+
+from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.film.draw import draw_frames
+from mjx_revolve.view.film.film import Film
 
 # Quality of x264 (18: nothing to be seen, 23: its default) and how long it may ponder.
 _QUALITY, _PRESET = 19, "veryfast"
@@ -26,111 +30,101 @@ _GIF_WIDTH, _LEAST_WIDTH = 420, 80
 _MAIN = 150
 
 
-class Mp4Writer:
-    """Writes frames as they come; a context manager, for the file's end must be written.
+def write_film(
+    film: Film, opengl: str, mp4: str | Path | None = None, gif: str | Path | None = None
+) -> None:
+    """Draws a film once and writes it as MP4, as GIF, or as both.
+
+    Files appear whole or not at all. On a terminal a bar shows how far it is.
+
+    Args:
+        film: from `film.make_film`.
+        opengl: from `opengl.find_opengl`.
+        mp4: where to write the MP4 (H.264), or None.
+        gif: where to write the GIF, or None.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    count = len(film.time)
+    every = gif_stride(film.fps, count)
+    small: list[Image.Image] = []
+
+    def draw() -> Iterator[np.ndarray]:
+        frames = draw_frames(film, opengl)
+        bar = tqdm(frames, "drawing", count, leave=False, disable=None, unit="frame")
+        for number, frame in enumerate(bar):
+            if gif is not None and number % every == 0:
+                small.append(_shrink(Image.fromarray(frame), _GIF_WIDTH))
+            yield frame
+
+    if mp4 is not None:
+        title = film.episode.title
+        write_atomic(Path(mp4), lambda path: write_mp4(path, draw(), film.size, film.fps, title))
+    else:
+        for _ in draw():
+            pass
+    if gif is not None:
+        write_atomic(Path(gif), make_gif(small, every / film.fps))
+
+
+def write_mp4(
+    path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], fps: int, title: str = ""
+) -> None:
+    """Writes frames as they come.
 
     Args:
         path: of the file.
+        frames: `[height, width, 3]` uint8 each.
         size: width and height, both even [pixels].
         fps: frames per second.
         title: for the file's metadata.
     """
-
-    def __init__(self, path: Path, size: tuple[int, int], fps: int, title: str = "") -> None:
-        # The index goes to the front, so that a browser can play while it loads.
-        self._file = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
-        if title:
-            self._file.metadata["title"] = title
+    # The index goes to the front, so that a browser can play while it loads.
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as file:
+        file.metadata["title"] = title
         options = {"crf": str(_QUALITY), "preset": _PRESET}
-        stream: Any = self._file.add_stream("libx264", rate=fps, options=options)
+        stream: Any = file.add_stream("libx264", rate=fps, options=options)
         stream.width, stream.height = size
         # The one that every browser plays.
         stream.pix_fmt = "yuv420p"
         stream.time_base = Fraction(1, fps)
-        self._stream = stream
-        self._count = 0
-
-    def add(self, frame: np.ndarray) -> None:
-        """Appends a frame.
-
-        Args:
-            frame: `[height, width, 3]` uint8.
-        """
-        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-        picture.pts = self._count
-        self._count += 1
-        for packet in self._stream.encode(picture):
-            self._file.mux(packet)
-
-    def close(self) -> None:
-        """Writes what is left, and the index."""
-        for packet in self._stream.encode():
-            self._file.mux(packet)
-        self._file.close()
-
-    def __enter__(self) -> Mp4Writer:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is None:
-            self.close()
-        else:
-            self._file.close()
+        for number, frame in enumerate(frames):
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            picture.pts = number
+            file.mux(stream.encode(picture))
+        file.mux(stream.encode())
 
 
-class GifMaker:
-    """Collects frames, small, and makes a GIF of them.
+def gif_stride(fps: int, count: int) -> int:
+    """Frames of a film of `count` frames from one that a GIF shows to the next."""
+    return max(1, round(fps / 15), -(-count // _MOST_FRAMES))
+
+
+def make_gif(frames: Sequence[Image.Image], pause: float, limit: int = _MOST_BYTES) -> bytes:
+    """Encodes a GIF, as large as it may be.
 
     Args:
-        size: width and height of the frames [pixels].
-        fps: frames per second.
-        count: how many frames will come.
+        frames: to show.
+        pause: from one to the next [s].
         limit: on the file's size [bytes].
+
+    Returns:
+        The file's bytes.
     """
-
-    def __init__(
-        self, size: tuple[int, int], fps: int, count: int, limit: int = _MOST_BYTES
-    ) -> None:
-        self._width = min(_GIF_WIDTH, size[0])
-        self._limit = limit
-        self.every = max(1, round(fps / 15), -(-count // _MOST_FRAMES))
-        self._pause = self.every / fps
-        self._frames: list[Image.Image] = []
-        self._seen = 0
-
-    def add(self, frame: np.ndarray) -> None:
-        """Keeps a frame, if its turn has come.
-
-        Args:
-            frame: `[height, width, 3]` uint8.
-        """
-        if self._seen % self.every == 0:
-            self._frames.append(_shrink(Image.fromarray(frame), self._width))
-        self._seen += 1
-
-    def make(self) -> bytes:
-        """Encodes the GIF, as large as it may be.
-
-        Returns:
-            The file's bytes.
-        """
-        width = self._width
-        while True:
-            content = _encode_gif([_shrink(frame, width) for frame in self._frames], self._pause)
-            if len(content) <= self._limit or width <= _LEAST_WIDTH:
-                return content
-            # Bytes grow with the picture's area.
-            share = min(0.9, math.sqrt(0.9 * self._limit / len(content)))
-            width = max(_LEAST_WIDTH, int(share * width))
+    width = min(_GIF_WIDTH, frames[0].width)
+    while True:
+        content = _encode_gif([_shrink(frame, width) for frame in frames], pause)
+        if len(content) <= limit or width <= _LEAST_WIDTH:
+            return content
+        # Bytes grow with the picture's area.
+        share = min(0.9, math.sqrt(0.9 * limit / len(content)))
+        width = max(_LEAST_WIDTH, int(share * width))
 
 
 def _shrink(frame: Image.Image, width: int) -> Image.Image:
-    if frame.width == width:
+    """A picture that is no wider than this."""
+    if frame.width <= width:
         return frame
     height = max(1, round(frame.height * width / frame.width))
     return frame.resize((width, height), Image.Resampling.LANCZOS)
@@ -141,17 +135,17 @@ def _encode_gif(frames: Sequence[Image.Image], pause: float) -> bytes:
     # A contact sheet of some frames stands for all.
     some = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 8).astype(int))]
     palette = _make_palette(Image.fromarray(np.concatenate([np.asarray(frame) for frame in some])))
-    flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     # GIF counts in hundredths of a second: each frame begins at its own, and the whole keeps time.
-    ends = np.round(100 * pause * np.arange(1, len(flat) + 1))
+    ends = np.round(100 * pause * np.arange(1, len(frames) + 1))
     times = (10 * np.diff(ends, prepend=0.0)).astype(int).tolist()
     file = io.BytesIO()
-    flat[0].save(
+    first.save(
         file,
         format="GIF",
         save_all=True,
-        append_images=flat[1:],
-        duration=times if len(times) > 1 else times[0],
+        append_images=rest,
+        duration=times if rest else times[0],
         loop=0,
         optimize=False,
     )

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.spatial import sincos
-from mjx_revolve.view.film.scene import BACKGROUND, SUN
+from mjx_revolve.view.film.camera import FOVY
+from mjx_revolve.view.film.stage import BACKGROUND, SUN
 from mjx_revolve.water.flow import Water, surface
 from mjx_revolve.water.world import World
 
@@ -76,7 +77,7 @@ class _View(NamedTuple):
     @property
     def own_light(self) -> Any:
         """Daylight where the camera is."""
-        return daylight(self.depth(self.position[2]))
+        return _daylight(self.depth(self.position[2]))
 
 
 def make_shader(
@@ -98,24 +99,19 @@ def make_shader(
     Returns:
         A function of colours `[height, width, 3]` uint8, depths along the view `[height, width]`
         (infinite where nothing is) [m], the camera's position `[3]` [m], its axes `[3, 3]` (rows
-        right, up, along the view), its `fovy` [rad] and the water (surface, current, time); it
-        returns colours `[height, width, 3]` uint8.
+        right, up, along the view) and the water (surface, current, time); it returns colours
+        `[height, width, 3]` uint8.
     """
     width, height = size
     u = (np.arange(width, dtype=np.float32) + 0.5) * 2 / height - width / height
     v = 1 - (np.arange(height, dtype=np.float32) + 0.5) * 2 / height
     # A little darker towards the corners, as lenses are.
     corners = 1 - 0.05 * ((u / u.max())[None, :] ** 2 + (v**2)[:, None])[..., None]
+    opening = math.tan(FOVY / 2)
 
     def shade(
-        color: jax.Array,
-        depth: jax.Array,
-        position: jax.Array,
-        axes: jax.Array,
-        fovy: jax.Array,
-        water: Water,
+        color: jax.Array, depth: jax.Array, position: jax.Array, axes: jax.Array, water: Water
     ) -> jax.Array:
-        opening = jnp.tan(fovy / 2)
         along = axes[2] + opening * (u[None, :, None] * axes[0] + v[:, None, None] * axes[1])
         length = jnp.linalg.norm(along, axis=-1)
         place = (float(origin[0]), float(origin[1]))
@@ -160,15 +156,8 @@ def _to_screen(light: Any) -> Any:
     return jnp.sqrt(jnp.clip(light + 0.5 * over, 0.0, 1.0))
 
 
-def open_water(up: Any) -> Any:
-    """Colour of water without end.
-
-    Args:
-        up: sine of the angle at which one looks up, any shape.
-
-    Returns:
-        Light, red, green and blue, along a last axis.
-    """
+def _open_water(up: Any) -> Any:
+    """Light of water without end, `[..., 3]`, by the sine of the angle at which one looks up."""
     up = jnp.asarray(up)[..., None]
     rising = 1 - jnp.exp(-1.6 * jnp.maximum(up, 0.0))
     falling = 1 - jnp.exp(2.4 * jnp.minimum(up, 0.0))
@@ -176,72 +165,45 @@ def open_water(up: Any) -> Any:
     return ahead + (top - ahead) * rising + (low - ahead) * falling
 
 
-def daylight(depth: Any) -> Any:
-    """Share of the light that reaches a depth.
-
-    Args:
-        depth: below the surface [m], any shape.
-
-    Returns:
-        Red, green and blue along a last axis; 1 at the surface.
-    """
+def _daylight(depth: Any) -> Any:
+    """Share of the light that reaches a depth below the surface [m], `[..., 3]`; 1 above it."""
     left = jnp.exp(-_FADING * jnp.maximum(jnp.asarray(depth), 0.0)[..., None])
     return _LEAST + (1 - _LEAST) * left
 
 
-def transmission(path: Any, distance: float) -> Any:
-    """Share of light that passes through water.
+def _transmission(path: Any, distance: float) -> Any:
+    """Share of light, `[..., 3]`, that passes through water of a length [m].
 
     Less of it is lost close to the camera than Beer and Lambert would have it, so that the robot
-    keeps its colours while what lies behind it sinks into the haze.
-
-    Args:
-        path: length in the water [m], any shape.
-        distance: of the camera from the robot [m].
-
-    Returns:
-        Red, green and blue along a last axis.
+    keeps its colours while what lies behind it sinks into the haze. `distance` is that of the
+    camera from the robot [m].
     """
     path = jnp.asarray(path) / distance
     beyond = jnp.maximum(path - 0.75, 0.0)
     return jnp.exp(-_LOSS * (0.27 * path + beyond)[..., None])
 
 
-def _ripples(distance: float, gravity: float, time: Any, x: Any, y: Any) -> tuple[Any, Any]:
+def _ripples(distance: float, gravity: float, time: Any, x: Any, y: Any) -> tuple[Any, ...]:
     """Slopes of the ripples, and the second derivatives xx, xy, yy of their height."""
-    slope_x: Any = 0.0
-    slope_y: Any = 0.0
-    xx: Any = 0.0
-    xy: Any = 0.0
-    yy: Any = 0.0
+    total: list[Any] = [0.0] * 5
     for share, angle, steep, phase in _RIPPLES:
         k = 2 * math.pi / (share * distance)
         # They run as waves do, but no faster than the eye can follow around a small robot.
         omega = math.sqrt(max(gravity, 1.0) * k) / max(1.0, math.sqrt(1.5 / distance))
         c, s = math.cos(angle), math.sin(angle)
         sine, cosine = sincos(jnp.asarray(k * (c * x + s * y) - omega * time + phase))
-        slope_x, slope_y = slope_x - steep * c * sine, slope_y - steep * s * sine
-        bent = -steep * k * distance * cosine
-        xx, xy, yy = xx + c * c * bent, xy + c * s * bent, yy + s * s * bent
-    return (slope_x, slope_y), (xx, xy, yy)
+        rise, bent = -steep * sine, -steep * k * distance * cosine
+        own = (c * rise, s * rise, c * c * bent, c * s * bent, s * s * bent)
+        total = [a + b for a, b in zip(total, own, strict=True)]
+    return tuple(total[:2]), tuple(total[2:])
 
 
-def bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> Any:
-    """Brightness of sunlight that ripples have gathered into lines.
+def _bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> Any:
+    """Brightness, about 1 on average, of sunlight that ripples have gathered into lines.
 
     Rays that a surface of height h bends land at x + f ∇h, so light is denser by 1 / |det(1 + f
     ∇∇h)|; f is chosen for looks. The determinant is taken where the ray lands, not where it
-    entered: the lines are bent a little otherwise than true ones.
-
-    Args:
-        distance: of the camera from the robot, which sets the size [m].
-        gravity: [m/s²].
-        time: [s].
-        x: where the ray came through the surface [m], any shape.
-        y: the same.
-
-    Returns:
-        About 1 on average, same shape.
+    entered at x, y [m]: the lines are bent a little otherwise than true ones.
     """
     _, (xx, xy, yy) = _ripples(distance, gravity, time, x, y)
     density = (1 + _FOCUS * xx) * (1 + _FOCUS * yy) - (_FOCUS * xy) ** 2
@@ -308,20 +270,20 @@ def _sunlit(view: _View, far: Any) -> Any:
     x, y, z = view.along(jnp.minimum(far, 1e3))
     depth = view.depth(z)
     through = _under_sun(view, x, y, depth)
-    lines = bright_lines(view.distance, view.world.gravity, view.water.time, *through)
+    lines = _bright_lines(view.distance, view.world.gravity, view.water.time, *through)
     share = _LINES * _step(_facing_up(view, far), 0.0, 0.8)
     share = share * jnp.exp(-far / (5 * view.distance)) * _step(depth, 0.0, 0.15 * view.distance)
-    return daylight(depth) * (1 + share * (lines - 1))[..., None]
+    return _daylight(depth) * (1 + share * (lines - 1))[..., None]
 
 
 def _in_water(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
     """What a camera in the water sees, and how clearly it sees the edges of things."""
-    ahead = open_water(view.ray[..., 2]) * view.own_light
+    ahead = _open_water(view.ray[..., 2]) * view.own_light
     s, slope = _meet_surface(view, _HORIZON * view.distance)
     backdrop = jax.lax.cond(
         jnp.isfinite(s).any(), lambda: _ceiling(view, s, slope, ahead), lambda: ahead
     )
-    through = transmission(jnp.minimum(far, s), view.distance)
+    through = _transmission(jnp.minimum(far, s), view.distance)
     things = scene * _sunlit(view, far) * through + ahead * (1 - through)
     picture = jnp.where((far < s)[..., None], things, backdrop)
     return picture + _shafts(view, jnp.minimum(far, s)) * view.own_light, 1.0
@@ -336,10 +298,10 @@ def _ceiling(view: _View, s: Any, slope: Any, ahead: Any) -> Any:
     outside = 1 - _INDEX**2 * (1 - cosine**2)
     window = _step(outside, -0.25, 0.6)[..., None]
     mirrored = view.ray[..., 2] - 2 * cosine * normal[..., 2]
-    lining = open_water(0.8 * mirrored + 0.45) * view.own_light
+    lining = _open_water(0.8 * mirrored + 0.45) * view.own_light
     sky = 1.25 * _to_light(_WINDOW)
     seen = lining + (sky - lining) * window
-    through = transmission(0.7 * near, view.distance)
+    through = _transmission(0.7 * near, view.distance)
     return jnp.where(jnp.isfinite(s)[..., None], seen * through + ahead * (1 - through), ahead)
 
 
@@ -386,7 +348,7 @@ def _from_air(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
     mirror = _sky(mirrored[..., 2]) + (2.5 * glint**240 + 0.25 * glint**24)[..., None]
     # Through the surface: things, lit and dimmed by the water over and before them.
     path = jnp.maximum(far - near, 0.0)
-    through = transmission(0.4 * distance + path, distance) ** 1.5
+    through = _transmission(0.4 * distance + path, distance) ** 1.5
     below = scene * _sunlit(view, far) * through + _to_light(_BODY) * (1 - through)
     below = jnp.where(jnp.isfinite(far)[..., None], below, _to_light(_BODY))
     wet = below * (1 - share) + mirror * share

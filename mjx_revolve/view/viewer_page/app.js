@@ -12,7 +12,7 @@ function fail(message) {
 // The largest of 1, 2, 5 times a power of ten up to x.
 function roundNumber(x) {
   const power = 10 ** Math.floor(Math.log10(x)), digit = x / power;
-  return (digit >= 5 ? 5 : digit >= 2 ? 2 : 1) * power;
+  return Number(((digit >= 5 ? 5 : digit >= 2 ? 2 : 1) * power).toPrecision(1)); // 0.2, not 0.2000…1
 }
 
 function digits(x) {
@@ -49,7 +49,7 @@ function start() {
   const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera(38, 1, 0.02 * size, 3000);
   camera.up.set(0, 0, 1);
   const robot = makeRobot(data.robot, step), background = makeBackground(), surface = makeSurface(size);
-  const grid = makeGrid(data.grid.height, size, data.grid.step, world.bed === null);
+  const gridStep = roundNumber(0.6 * size), grid = makeGrid(data.floor, size, gridStep, world.bed === null);
   const dust = makeDust(size), shadow = makeShadow(size);
   const core = new Track(data.core, 3, step), center = new Track(data.center, 3, step);
   const drift = new Track(data.drift, 3, step), speed = new Track(data.speed, 1, step);
@@ -168,6 +168,8 @@ function start() {
       button.title = `no ${name} in this episode`;
     }
   }
+  byId("grid").title = `level lines, ${gridStep} m apart (G)`;
+  byId("grid").querySelector("small").textContent = `${gridStep} m`;
   for (const button of document.querySelectorAll("[data-view]")) {
     button.addEventListener("click", () => look(views[button.dataset.view]));
   }
@@ -404,7 +406,8 @@ function start() {
 
   function tickFrame(now) {
     requestAnimationFrame(tickFrame);
-    const passed = Math.min((now - lastTick) / 1000, 0.25);
+    // The first tick may lie before the script's own time, and a hidden page has none for long.
+    const passed = Math.min(Math.max((now - lastTick) / 1000, 0), 0.25);
     lastTick = now;
     if (state.playing) {
       state.time += passed * state.rate;

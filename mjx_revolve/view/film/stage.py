@@ -1,28 +1,28 @@
 """The robot as it is drawn: modules' meshes, the bed, light and haze, in a MuJoCo model of its own.
 
 The model has the bodies and joints of `robot.mj_model`, so the same qpos poses it, but meshes in
-place of the boxes that the physics weighs. It is for looking at, in MuJoCo's viewer or through
-`painter`; its geoms touch nothing.
+place of the boxes that the physics weighs. It is for looking at (`draw`); its geoms touch nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import mujoco
 import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.view.pictures import Piece, make_pieces
-from mjx_revolve.water.bed import bed_height
+from mjx_revolve.view.course import bed_rings
+from mjx_revolve.view.film.camera import FOVY
+from mjx_revolve.view.pieces import make_pieces, mount_piece
 
 # What is hidden of the model by default in MuJoCo's viewer is drawn in none of these groups.
 MODULES, SURFACE, _WEIGHTS = 0, 1, 4
-# Of the camera, upright [deg].
-FOVY = 40.0
 # Towards the light, world frame: high, from one side.
 SUN = np.array([-0.42, -0.28, 0.86]) / np.linalg.norm([-0.42, -0.28, 0.86])
 # What is drawn offscreen where nothing is: a colour of water, for the edges of things mix with it.
@@ -31,19 +31,18 @@ BACKGROUND = (36 / 255, 110 / 255, 146 / 255)
 _WATER = (0.09, 0.40, 0.55)
 
 # Edges of a part are sharp where its faces turn by more than this.
-_CREASE = math.cos(math.radians(35.0))
+_CREASE = math.radians(35.0)
 # The bed is drawn on rings around the middle of the way; its texture repeats after a tile.
-_RINGS, _SECTORS = 64, 96
+_RINGS = 64
 _TILE, _TEXELS = 1.6, 1024  # m, and texels along it
 
 
-def build_scene(
+def build_stage(
     robot: Robot,
     size: tuple[int, int] = (640, 480),
-    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    origin: ArrayLike = (0.0, 0.0, 0.0),
     way: float = 1.0,
     sight: float = 10.0,
-    shade: float = 1.0,
     plain: bool = False,
 ) -> mujoco.MjModel:
     """Builds what is drawn of a robot and the world around it.
@@ -55,7 +54,6 @@ def build_scene(
             Far from its origin OpenGL has too few digits for small robots.
         way: how far from there the robot gets [m].
         sight: how far one sees through the water [m].
-        shade: radius around the light's target within which things cast shadows [m].
         plain: whether the background has one colour, for a film that paints the water itself.
 
     Returns:
@@ -68,131 +66,94 @@ def build_scene(
             spec.delete(geom)
         else:  # they carry the masses, without which MuJoCo has no body
             geom.group = _WEIGHTS
-            geom.contype = geom.conaffinity = 0
     for field in list(spec.hfields):
         spec.delete(field)
-    _add_pieces(spec, robot)
     place = np.asarray(origin, float)
-    if robot.world.bed is not None:
-        _add_bed(spec, robot, place, way, sight)
-    _add_surface(spec, robot, place, way + 4.0 * sight)
-    _add_light(spec, size, way, sight, shade, plain)
+    _add_pieces(spec, robot)
+    _add_bed(spec, robot, place, way, sight)
+    # The still surface is for MuJoCo's viewer; films draw their own, which moves.
+    spec.add_material(name="surface", specular=0.9, shininess=0.9, rgba=[0.55, 0.85, 0.95, 0.22])
+    spec.worldbody.add_geom(
+        name="surface",
+        type=mujoco.mjtGeom.mjGEOM_BOX,  # a plane is invisible from below
+        size=[way + 4.0 * sight, way + 4.0 * sight, 5e-4],
+        pos=[0.0, 0.0, robot.world.surface_height - place[2]],
+        material="surface",
+        group=SURFACE,
+    )
+    _add_light(spec, size, way, sight, plain)
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
     return spec.compile()
 
 
 def _add_pieces(spec: mujoco.MjSpec, robot: Robot) -> None:
     """Meshes of all parts, each fixed to the body that carries its part's box."""
-    modules, fluid = robot.morphology.modules, robot.fluid
-    row = np.cumsum([0] + [len(module.kind.parts) for module in modules])
     spec.add_material(name="module", specular=0.35, shininess=0.35, rgba=[1, 1, 1, 1])
     bodies = {body.name: body for body in spec.bodies}
     names: dict[int, str] = {}  # modules of a kind share their parts' triangles
-    for number, piece in enumerate(_parts(robot)):
+    parts = (piece for piece in make_pieces(robot.morphology) if not piece.mark)
+    for number, piece in enumerate(parts):
         if id(piece.corners) not in names:
-            names[id(piece.corners)] = f"piece {number}"
-            _add_mesh(spec, f"piece {number}", piece)
-        k = row[piece.module] + piece.part
-        part = modules[piece.module].kind.parts[piece.part]
-        # The table has the centre of the part's main box; meshes are in their module's frame.
-        center = np.asarray(part.position) + np.asarray(part.boxes[0].position)
-        rotation = fluid.rotation[k]
+            names[id(piece.corners)] = name = f"piece {number}"
+            mesh = smooth_mesh(piece.corners)
+            _add_mesh(spec, name, mesh.vertices, mesh.faces, usernormal=mesh.vertex_normals.ravel())
+        body, position, rotation = mount_piece(robot, piece)
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation).ravel())
-        bodies[robot.mj_model.body(fluid.body[k]).name].add_geom(
+        bodies[robot.mj_model.body(body).name].add_geom(
             name=f"drawn {number}",
             type=mujoco.mjtGeom.mjGEOM_MESH,
             meshname=names[id(piece.corners)],
-            pos=fluid.position[k] - rotation @ center,
+            pos=position,
             quat=quat,
             material="module",
             rgba=[*piece.color, 1.0],
             group=MODULES,
             mass=0.0,
-            contype=0,
-            conaffinity=0,
         )
 
 
-def _parts(robot: Robot) -> list[Piece]:
-    """The pieces that are there to touch: no axes of hinges, no arrows of thrusters."""
-    pieces = make_pieces(robot.morphology)
-    modules = [piece.module for piece in pieces]
-    # Of each module its parts come first.
-    rank = [number - modules.index(module) for number, module in enumerate(modules)]
-    kinds = [module.kind for module in robot.morphology.modules]
-    return [p for p, k in zip(pieces, rank, strict=True) if k < len(kinds[p.module].parts)]
+def _add_mesh(
+    spec: mujoco.MjSpec, name: str, vertices: np.ndarray, faces: np.ndarray, **more: Any
+) -> None:
+    """Triangles `[m, 3]` between points `[n, 3]` [m]."""
+    # Thin or open parts have no volume to speak of; nothing asks for their inertia.
+    shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    points, faces = np.asarray(vertices).ravel(), np.asarray(faces).ravel()
+    spec.add_mesh(name=name, uservert=points, userface=faces, inertia=shell, **more)
 
 
-def _add_mesh(spec: mujoco.MjSpec, name: str, piece: Piece) -> None:
-    """A piece's triangles, smooth but for its edges."""
-    corners = piece.corners
-    count = len(corners)
-    spec.add_mesh(
-        name=name,
-        uservert=corners.ravel(),
-        userface=np.arange(3 * count),
-        usernormal=corner_normals(corners).ravel(),
-        userfacenormal=np.arange(3 * count),
-        # Thin or open parts have no volume to speak of; nothing asks for their inertia.
-        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-    )
-
-
-def corner_normals(corners: np.ndarray) -> np.ndarray:
-    """Normals for shading: the mean of the faces at a corner, but not across an edge.
+def smooth_mesh(corners: np.ndarray) -> trimesh.Trimesh:
+    """A mesh for shading: smooth but for its edges, along which it is cut open.
 
     Args:
         corners: `[m, 3, 3]` triangles [m].
 
     Returns:
-        `[m, 3, 3]` a unit normal for each corner of each triangle.
+        The mesh; `vertex_normals` are those to shade with.
     """
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(area, axis=1, keepdims=True)
-    face = area / np.maximum(length, 1e-30)
-    points = corners.reshape(-1, 3)
-    # Corners within a hundredth of a millimetre are one.
-    _, point = np.unique(np.round(points / 1e-5).astype(np.int64), axis=0, return_inverse=True)
-    point = point.ravel()
-    order = np.argsort(point, kind="stable")
-    owner = order // 3
-    starts = np.flatnonzero(np.diff(point[order], prepend=-1))
-    normals = np.repeat(face, 3, axis=0)
-    for begin, end in zip(starts, [*starts[1:], len(order)], strict=True):
-        around = owner[begin:end]
-        alike = face[around] @ face[around].T > _CREASE
-        mean = alike @ area[around]
-        size = np.linalg.norm(mean, axis=1, keepdims=True)
-        normals[order[begin:end]] = np.where(size > 1e-30, mean / np.maximum(size, 1e-30),
-                                             face[around])  # fmt: skip
-    return normals.reshape(-1, 3, 3)
+    mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners))
+    return trimesh.graph.smooth_shade(mesh, angle=_CREASE, facet_minarea=None)
 
 
 def _add_bed(
     spec: mujoco.MjSpec, robot: Robot, origin: np.ndarray, way: float, sight: float
 ) -> None:
     """The bed, if it is in sight, on rings that widen from the middle of the way."""
-    bed = robot.world.bed
-    assert bed is not None
-    near = max(way, 1.0)
-    radius = np.concatenate([
-        np.linspace(0.0, near, _RINGS // 2, endpoint=False),
-        np.geomspace(near, near + 4.0 * sight, _RINGS // 2),
-    ])  # fmt: skip
-    angle = 2 * np.pi * np.arange(_SECTORS) / _SECTORS
-    xy = np.stack([radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)], axis=-1)
-    world = (xy + origin[:2]).astype(np.float32)
-    height = np.asarray(bed_height(bed, world[..., 0], world[..., 1]), float) - origin[2]
-    if height.max() < -way - 4.0 * sight:
+    if robot.world.bed is None:
         return
-    points = np.concatenate([xy, height[..., None]], axis=-1).reshape(-1, 3)
-    ring, sector = np.meshgrid(np.arange(_RINGS - 1), np.arange(_SECTORS), indexing="ij")
-    beyond = (sector + 1) % _SECTORS
-    a, b = ring * _SECTORS + sector, ring * _SECTORS + beyond
-    c, d = a + _SECTORS, b + _SECTORS
-    faces = np.stack([np.stack([a, c, d], -1), np.stack([a, d, b], -1)], axis=2).reshape(-1, 3)
+    near, far = max(way, 1.0), max(way, 1.0) + 4.0 * sight
+    inner = np.linspace(0.0, near, _RINGS // 2, endpoint=False)
+    radius = np.concatenate([inner, np.geomspace(near, far, _RINGS // 2)])
+    rings = bed_rings(robot.world.bed, origin[:2], radius)
+    if rings[..., 2].max() - origin[2] < -way - 4.0 * sight:
+        return
+    a = np.arange(rings[..., 0].size).reshape(rings.shape[:2])
+    a, b, c, d = a[:-1], np.roll(a, -1, axis=1)[:-1], a[1:], np.roll(a, -1, axis=1)[1:]
     # The innermost ring is a point.
-    faces = faces[(ring > 0).ravel().repeat(2) | (np.arange(len(faces)) % 2 == 0)]
+    outward, inward = np.stack([a, c, d], -1), np.stack([a, d, b], -1)[1:]
+    faces = np.concatenate([outward.reshape(-1, 3), inward.reshape(-1, 3)])
     texture = spec.add_texture(
         name="sand",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -203,23 +164,19 @@ def _add_bed(
     texture.data = make_sand(_TEXELS).tobytes()
     material = spec.add_material(name="sand", specular=0.0, shininess=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "sand"
-    spec.add_mesh(
-        name="sand",
-        uservert=points.ravel(),
-        userface=faces.ravel(),
-        usertexcoord=((xy + origin[:2] % _TILE) / _TILE).ravel(),
+    points = rings.reshape(-1, 3)
+    # Whole tiles less: near 0 single precision has more digits.
+    texels = (points[:, :2] - _TILE * np.floor(origin[:2] / _TILE)) / _TILE
+    _add_mesh(
+        spec,
+        "sand",
+        points - origin,
+        faces,
+        usertexcoord=texels.ravel(),
         userfacetexcoord=faces.ravel(),
-        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
     )
-    spec.worldbody.add_geom(
-        name="sand",
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname="sand",
-        material="sand",
-        group=MODULES,
-        contype=0,
-        conaffinity=0,
-    )
+    kind = mujoco.mjtGeom.mjGEOM_MESH
+    spec.worldbody.add_geom(name="sand", type=kind, meshname="sand", material="sand", group=MODULES)
 
 
 @lru_cache(maxsize=2)
@@ -253,23 +210,8 @@ def make_sand(texels: int) -> np.ndarray:
     return np.round(255 * np.clip(color, 0.0, 1.0)).astype(np.uint8)
 
 
-def _add_surface(spec: mujoco.MjSpec, robot: Robot, origin: np.ndarray, reach: float) -> None:
-    """The still surface for MuJoCo's viewer; films draw their own, which moves."""
-    spec.add_material(name="surface", specular=0.9, shininess=0.9, rgba=[0.55, 0.85, 0.95, 0.22])
-    spec.worldbody.add_geom(
-        name="surface",
-        type=mujoco.mjtGeom.mjGEOM_BOX,  # a plane is invisible from below
-        size=[reach, reach, 5e-4],
-        pos=[0.0, 0.0, robot.world.surface_height - origin[2]],
-        material="surface",
-        group=SURFACE,
-        contype=0,
-        conaffinity=0,
-    )
-
-
 def _add_light(
-    spec: mujoco.MjSpec, size: tuple[int, int], way: float, sight: float, shade: float, plain: bool
+    spec: mujoco.MjSpec, size: tuple[int, int], way: float, sight: float, plain: bool
 ) -> None:
     """Light from above, haze, and how finely things are drawn."""
     spec.worldbody.add_light(
@@ -297,12 +239,13 @@ def _add_light(
     headlight, fine = visual.headlight, visual.quality
     headlight.ambient, headlight.diffuse = [0.42] * 3, [0.16] * 3
     headlight.specular = [0.08] * 3
-    getattr(visual, "global").fovy = FOVY
+    getattr(visual, "global").fovy = math.degrees(FOVY)
     getattr(visual, "global").offwidth, getattr(visual, "global").offheight = size
     fine.shadowsize, fine.offsamples = 2048, 4
     # Nothing is drawn in the last part of what lies before the far plane, but for the sky.
     visual.map.znear, visual.map.zfar = 0.02, 20.0 * (way + sight)
     visual.map.fogstart, visual.map.fogend = 0.15 * sight, 1.5 * sight
-    visual.map.shadowclip = shade
+    # Within this radius of the light's target things cast shadows.
+    visual.map.shadowclip = sight / 6.0
     visual.rgba.fog = [*_WATER, 1.0]
     visual.rgba.haze = [*_WATER, 1.0]

@@ -1,0 +1,162 @@
+"""A robot as triangles: what pictures, films and pages draw of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import trimesh
+
+from mjx_revolve.body.morphology import Morphology
+from mjx_revolve.body.solids import part_mesh
+
+if TYPE_CHECKING:
+    from mjx_revolve.engine.robot import Robot
+
+# Parts that move with a hinge are drawn darker than the frame, or the hinge could not be made out.
+_MOVING = 0.72
+_AXIS = (1.0, 0.47, 0.1)  # hinge axes are drawn as thin rods of this colour
+_ROD = (0.0011, 0.025)  # their radius and half length [m]
+_THRUST = (0.13, 0.66, 0.30)  # thrusts are drawn as arrows of this colour, along a command ahead
+_ARROW = (0.0011, 0.034, 0.0036, 0.010)  # shaft's radius and length, head's radius and length [m]
+_GREY = (0.62, 0.64, 0.68)  # modules without a colour of their own
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is drawn: `m` triangles in the world frame.
+
+    Attributes:
+        corners: `[m, 3, 3]` [m].
+        color: `[m, 3]` red, green, blue from 0 to 1.
+        part: `[m]` number of the piece that the triangle belongs to.
+    """
+
+    corners: np.ndarray
+    color: np.ndarray
+    part: np.ndarray
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One part of a module, the rod that shows a hinge's axis, or the arrow of a thrust.
+
+    Attributes:
+        module: number of the module in its morphology.
+        part: the part of the module that carries it.
+        corners: `[m, 3, 3]` triangles, module frame at hinge angle 0 [m]; one array for all that
+            look alike.
+        color: `[3]` red, green, blue from 0 to 1.
+        mark: whether it is a rod or an arrow, and nothing to touch.
+    """
+
+    module: int
+    part: int
+    corners: np.ndarray
+    color: np.ndarray
+    mark: bool = False
+
+
+def make_pieces(morphology: Morphology) -> list[Piece]:
+    """All parts of a morphology in their file's colours, hinges' axes and thrusts.
+
+    Args:
+        morphology: the robot's modules.
+
+    Returns:
+        The pieces, in the order of the modules and their parts.
+    """
+    meshes: dict[Hashable, list[np.ndarray]] = {}
+    pieces = []
+    for number, module in enumerate(morphology.modules):
+        kind = module.kind
+        drawn = tuple((p.name, p.boxes, p.volume, p.position, p.thruster) for p in kind.parts)
+        key = (kind.name, kind.hinge, drawn)
+        if key not in meshes:
+            meshes[key] = [
+                part_mesh(kind, part).triangles + np.asarray(part.position) for part in kind.parts
+            ]
+        rgb = np.clip(np.asarray(_GREY if module.rgb is None else module.rgb, float), 0.0, 1.0)
+        for k, triangles in enumerate(meshes[key]):
+            shade = rgb * (_MOVING if kind.hinge is not None and k > 0 else 1.0)
+            pieces.append(Piece(number, k, triangles, shade))
+        if kind.hinge is not None:
+            radius, half = _ROD
+            profile = [(-half, 0.0), (-half, radius), (half, radius), (half, 0.0)]
+            rod = _spindle(kind.hinge.axis, profile) + np.asarray(kind.hinge.anchor)
+            pieces.append(Piece(number, 0, rod, np.array(_AXIS), mark=True))
+        for k, part in enumerate(kind.parts):
+            if part.thruster is not None:
+                radius, shaft, wide, head = _ARROW
+                profile = [(0.0, 0.0), (0.0, radius), (shaft, radius), (shaft, wide)]
+                arrow = _spindle(part.thruster.axis, [*profile, (shaft + head, 0.0)])
+                arrow = arrow + np.asarray(part.position) + np.asarray(part.thruster.position)
+                pieces.append(Piece(number, k, arrow, np.array(_THRUST), mark=True))
+    return pieces
+
+
+def mount_piece(robot: Robot, piece: Piece) -> tuple[int, np.ndarray, np.ndarray]:
+    """Where a piece sits on a robot.
+
+    Args:
+        robot: from `build_robot`.
+        piece: of its morphology.
+
+    Returns:
+        The MuJoCo body that carries it, and position `[3]` [m] and rotation `[3, 3]` of the piece's
+        module frame, body frame.
+    """
+    fluid = robot.fluid
+    k = int(np.flatnonzero(fluid.module == piece.module)[piece.part])
+    part = robot.morphology.modules[piece.module].kind.parts[piece.part]
+    # The table has the centre of the part's main box.
+    center = np.asarray(part.position) + np.asarray(part.boxes[0].position)
+    return int(fluid.body[k]), fluid.position[k] - fluid.rotation[k] @ center, fluid.rotation[k]
+
+
+def place_pieces(
+    pieces: Sequence[Piece], place: Callable[[Piece], tuple[np.ndarray, np.ndarray]]
+) -> Scene:
+    """Puts pieces together.
+
+    Args:
+        pieces: from `make_pieces`.
+        place: position `[3]` [m] and rotation `[3, 3]` of a piece's module frame in the world.
+
+    Returns:
+        The scene.
+    """
+    corners, color, part = [], [], []
+    for number, piece in enumerate(pieces):
+        position, rotation = place(piece)
+        corners.append(piece.corners @ rotation.T + position)
+        color.append(np.broadcast_to(piece.color, (len(piece.corners), 3)))
+        part.append(np.full(len(piece.corners), number))
+    return Scene(np.concatenate(corners), np.concatenate(color), np.concatenate(part))
+
+
+def rest_scene(morphology: Morphology) -> Scene:
+    """All parts of the morphology at rest.
+
+    Args:
+        morphology: the robot's modules.
+
+    Returns:
+        The scene, the core's frame at the world's origin.
+    """
+    frames = [(np.asarray(m.position), np.asarray(m.rotation)) for m in morphology.modules]
+    return place_pieces(make_pieces(morphology), lambda piece: frames[piece.module])
+
+
+def _spindle(axis: Sequence[float], profile: Sequence[tuple[float, float]]) -> np.ndarray:
+    """Six-sided solid of revolution `[m, 3, 3]` about a direction through the origin [m].
+
+    Args:
+        axis: the direction.
+        profile: places along it and radii [m], from a point on the axis to another.
+    """
+    turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis)
+    line = [(radius, place) for place, radius in profile]
+    return np.asarray(trimesh.creation.revolve(line, sections=6, transform=turn).triangles)

@@ -1,0 +1,105 @@
+"""One HTML file that replays an episode in any browser.
+
+The file holds everything: the robot's meshes, its poses and the forces on its modules along the
+episode (`page_data`), three.js, and the page's own scripts in `viewer_page/`. It needs no server
+and asks for nothing over the network.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import write_atomic
+
+if TYPE_CHECKING:
+    from mjx_revolve.episodes.champion import Episode
+
+_PAGE = Path(__file__).parent / "viewer_page"
+
+
+def write_viewer(episode: Episode, path: str | Path) -> None:
+    """Writes the replay of an episode as one HTML file.
+
+    The file appears whole or not at all.
+
+    Args:
+        episode: what to show; rows after the first that is not finite are left out.
+        path: of the file, which ends in `.html`; its folder is made if need be.
+
+    Raises:
+        InputError: `path` has another ending, or the episode has no finite row.
+        OSError: the file cannot be written.
+    """
+    write_atomic(check_page_path(path), make_page(episode).encode())
+
+
+def check_page_path(path: str | Path) -> Path:
+    """The path of a page to write.
+
+    Args:
+        path: as a user gave it.
+
+    Returns:
+        The same.
+
+    Raises:
+        InputError: it does not end in `.html`, or is a folder.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: expected a file name that ends in .html; found {path.name!r}")
+    if path.is_dir():
+        raise InputError(f"{path}: expected a file to write; found a folder")
+    return path
+
+
+def make_page(episode: Episode) -> str:
+    """The replay of an episode as the text of an HTML file.
+
+    Args:
+        episode: what to show.
+
+    Returns:
+        The page.
+
+    Raises:
+        InputError: the episode has no finite row.
+    """
+    import jinja2
+
+    from mjx_revolve.view.page_data import page_data
+
+    pages = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_PAGE), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    pages.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    return pages.get_template("page.html").render(
+        title=episode.title,
+        subtitle=_subtitle(episode),
+        data=page_data(episode),
+        file=lambda name: (_PAGE / name).read_text(encoding="utf-8"),
+    )
+
+
+def _subtitle(episode: Episode) -> str:
+    """Score, body and water in a line."""
+    body, world = episode.robot.morphology, episode.robot.world
+    words = []
+    if episode.score is not None:
+        words.append(f"{episode.score:.3g} {episode.score_unit} over fresh starts")
+    counts = {
+        "module": body.num_modules, "hinge": body.num_hinges, "thruster": body.num_thrusters,
+    }  # fmt: skip
+    words += [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
+    words.append(world.name.replace("_", " "))
+    if any(world.current):
+        words.append(f"current {math.hypot(*world.current):.2g} m/s")
+    moving = {"gusts": world.gust, "shear": world.shear, "a field of currents": world.current_field}
+    words += [name for name, value in moving.items() if value is not None]
+    if world.waves:
+        height = 2 * math.hypot(*(wave.amplitude for wave in world.waves))
+        words.append(f"waves of {height:.2g} m")
+    return " \u00b7 ".join(words)
