@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from mjx_revolve.view.plots import COLORS, draw_curve, dress, legend_above, new_figure
 from mjx_revolve.view.report.champion import Replay, path_of
-from mjx_revolve.view.swim_picture import stroke_period
+from mjx_revolve.view.motion import stroke_period
 
 _INK, _GREY, _PALE = "#222222", "#6b7680", "#b9c6cf"
 _BLUE, _ORANGE, _GREEN = COLORS[:3]
