@@ -56,15 +56,20 @@ class Places:
             for point in np.linspace(start, end, count):
                 self.take(point - 3, point + 3)
 
-    def put(self, text: Text, spots: Iterable[Sequence[float]]) -> None:
-        """Moves a text to the first of the spots that is free; removes it where none is."""
+    def put(self, text: Text, spots: Iterable[Sequence[float]]) -> bool:
+        """Moves a text to the first of the spots that is free; removes it where none is.
+
+        Returns:
+            Whether it is there.
+        """
         for spot in spots:
             text.set_position((spot[0], spot[1]))
             low, high = self.extent(text)
             if self.free(low, high, 6):
                 self.take(low, high)
-                return
+                return True
         text.remove()
+        return False
 
 
 def write(axes: Axes, spot: Sequence[float], words: str, **style: Any) -> Text:

@@ -181,13 +181,15 @@ def _label_poses(
     ends = (motion.poses[0], motion.poses[-1])
     for row, scene in zip(motion.poses, scenes, strict=True):
         x, y = at = panel.pixels(motion.path[row])
-        words = f"{motion.time[row]:.1f}".removesuffix(".0") + " s"
-        if deep and row in ends:
-            words += f"\ndepth {motion.depth[row]:.2f} m"
+        when = f"{motion.time[row]:.1f}".removesuffix(".0") + " s"
         reach = int(np.abs(panel.pixels(scene.corners.reshape(-1, 3)) - at).max()) + 60
         spots = [(x + side, y + sign * up) for up in range(20, reach, 4) for sign in (1, -1)
-                 for side in (0, 25, -25, 50, -50)]  # fmt: skip
-        places.put(write(places.axes, at, words, fontsize=14, fontweight="bold"), spots)
+                 for side in (0, 25, -25, 50, -50, 100, -100, 150, -150)]  # fmt: skip
+        depth = f"\ndepth {motion.depth[row]:.2f} m" if deep and row in ends else ""
+        for words in dict.fromkeys((when + depth, when)):
+            label = write(places.axes, at, words, fontsize=14, fontweight="bold")
+            if places.put(label, spots):
+                break
 
 
 def _draw_stroke(figure: Figure, motion: Motion, pieces: Sequence[Piece], view: np.ndarray) -> None:
