@@ -141,11 +141,6 @@ class Motion:
         return self._column("ctrl")[:, list(self.robot.servos)]
 
     @property
-    def tracking_errors(self) -> np.ndarray:
-        """`[nhinge]` root mean square of angles less targets [rad]."""
-        return np.sqrt(np.mean((self.angles - self.targets) ** 2, axis=0))
-
-    @property
     def turns(self) -> np.ndarray:
         """`[nhinge]` mean frequency of each oscillator; negative where it turns backwards [Hz]."""
         turned = np.unwrap(np.asarray(self.phases), axis=0)
@@ -177,16 +172,23 @@ class Motion:
 
     @cached_property
     def cost(self) -> np.ndarray:
-        """`[T]` cost of transport so far: energy over weight times net distance, both counted.
+        """`[T]` cost of transport so far: energy over weight times net distance, both counted [-].
 
         NaN before that, and while the robot is closer than a tenth of its way to where it began.
         """
         away = np.linalg.norm(self.path - self.path[self.first], axis=1)
-        # A millimetre bounds it where the robot stays, as in `tasks.measure`.
-        spent = self.energy - self.energy[self.first]
-        cost = spent / (self.weight * np.maximum(away, 1e-3))
         far = away > _NEAR * max(float(away[self.first :].max()), 1e-3)
-        return np.where(far & (np.arange(self.count) > self.first), cost, np.nan)
+        counted = np.arange(self.count) > self.first
+        return np.where(far & counted, self._cost(self.energy, away), np.nan)
+
+    @property
+    def final_cost(self) -> float:
+        """Cost of transport while it is counted [-]."""
+        return float(self._cost(self.energy[-1], self.distance))
+
+    def _cost(self, energy: Any, away: Any) -> Any:
+        # A millimetre bounds it where the robot stays, as in `tasks.measure`.
+        return (energy - self.energy[self.first]) / (self.weight * np.maximum(away, 1e-3))
 
     # --- what to draw ---
 
@@ -253,6 +255,11 @@ def count_finite(values: Any) -> int:
     """How many rows `[T, n]` there are before the first that is not finite."""
     finite = np.isfinite(values).all(axis=1)
     return len(finite) if finite.all() else int(finite.argmin())
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    """Root mean square `[n]` of values `[T, n]`."""
+    return np.sqrt(np.mean(values**2, axis=0))
 
 
 def nearest_rows(time: np.ndarray, moments: np.ndarray) -> list[int]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -24,11 +23,9 @@ from mjx_revolve.view.motion import Motion, analyse_motion
 from mjx_revolve.view.pictures import (
     Piece,
     Scene,
-    check_picture_path,
     make_pieces,
     make_view,
     place_pieces,
-    write_figure,
 )
 from mjx_revolve.view.water_panel import (
     Panel,
@@ -179,15 +176,17 @@ def _label_poses(
 ) -> None:
     """When each pose was, and how deep the core is in the first and the last, if `deep`."""
     ends = (motion.poses[0], motion.poses[-1])
+    # Further away, it could be a neighbour's.
+    sides = (0, 25, -25, 50, -50) + (100, -100, 150, -150) * (len(scenes) == 1)
     for row, scene in zip(motion.poses, scenes, strict=True):
         x, y = at = panel.pixels(motion.path[row])
         when = f"{motion.time[row]:.1f}".removesuffix(".0") + " s"
         reach = int(np.abs(panel.pixels(scene.corners.reshape(-1, 3)) - at).max()) + 60
         spots = [(x + side, y + sign * up) for up in range(20, reach, 4) for sign in (1, -1)
-                 for side in (0, 25, -25, 50, -50, 100, -100, 150, -150)]  # fmt: skip
+                 for side in sides]  # fmt: skip
         depth = f"\ndepth {motion.depth[row]:.2f} m" if deep and row in ends else ""
         for words in dict.fromkeys((when + depth, when)):
-            label = write(places.axes, at, words, fontsize=14, fontweight="bold")
+            label = write(places.axes, (x, y), words, fontsize=14, fontweight="bold")
             if places.put(label, spots):
                 break
 
@@ -287,21 +286,3 @@ def plot_swim(robot: Robot, trajectory: Trajectory, counted_from: float = 0.0) -
         InputError: the trajectory is another robot's, or has no finite row.
     """
     return draw_motion(analyse_motion(robot, trajectory, counted_from))
-
-
-def draw_swim(robot: Robot, trajectory: Trajectory, path: str | Path) -> None:
-    """Draws the way a robot swam into a PNG of 1600 x 900 pixels; see `plot_swim`.
-
-    The file appears whole or not at all.
-
-    Args:
-        robot: the robot.
-        trajectory: what it did.
-        path: where to write the PNG.
-
-    Raises:
-        InputError: `path` does not end in `.png`, its folder does not exist, or it cannot be
-            written; the trajectory is another robot's, or has no finite row.
-    """
-    path = check_picture_path(path)
-    write_figure(plot_swim(robot, trajectory), path)

@@ -18,6 +18,7 @@ from mjx_revolve.view.motion import (
     last_strokes,
     last_swings,
     mean_rate,
+    rms,
     smooth_path,
     speed_over,
     stroke_period,
@@ -57,7 +58,7 @@ def test_how_fast_how_far_and_where_to(elbow, sine):
 
 def test_strokes_and_joints(sine):
     assert sine.period == pytest.approx(PERIOD, rel=0.02)
-    assert sine.tracking_errors == pytest.approx([0.1, 0.2])
+    assert rms(sine.angles - sine.targets) == pytest.approx([0.1, 0.2])
     assert sine.turns == pytest.approx([1 / PERIOD, -1 / PERIOD])
     rows = sine.stroke(4)
     assert np.diff(TIME[rows]) == pytest.approx(PERIOD / 4, abs=0.02)

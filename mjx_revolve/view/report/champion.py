@@ -1,4 +1,4 @@
-"""What a run's champion does: one episode, its score, its forces of work, its oscillators."""
+"""What a run's champion does: one episode, its score and measures, its oscillators."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.rollout import Trajectory
-from mjx_revolve.episodes.scoring import first_counted, judge_tracks, replay_key
+from mjx_revolve.episodes.scoring import judge_tracks, replay_key
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.report.data import RunRecord, number
+from mjx_revolve.view.motion import Motion, analyse_motion, count_finite, counted_time
+from mjx_revolve.view.report.record import RunRecord, number
 
 # A replay further than this from the recorded mean is another swim: standard deviations over the
 # fresh starts, and a share of the score itself where those hardly differ.
@@ -28,38 +28,14 @@ class Replay:
     """A champion's episode.
 
     Attributes:
-        episode: the episode; its trajectory ends before the first row that is not finite.
+        motion: what it did, up to the first row that is not finite.
         score: of this episode; NaN where it blew up.
         measures: of this episode, as in `metrics.csv`.
-        counted_from: when counting starts: at the first record behind the settling time [s].
-        phases: `[T, nhinge]` phase of each oscillator of a CPG [rad], 0 when its target passes the
-            middle upwards; None for other controllers.
     """
 
-    episode: Episode
+    motion: Motion
     score: float
     measures: dict[str, float]
-    counted_from: float
-    phases: np.ndarray | None = None
-
-    @property
-    def weight(self) -> float:
-        """Of the robot in air [N]."""
-        robot = self.episode.robot
-        return robot.morphology.mass * max(robot.world.gravity, 1e-9)
-
-
-def path_of(replay: Replay) -> tuple[np.ndarray, np.ndarray]:
-    """The way of the core.
-
-    Args:
-        replay: the episode.
-
-    Returns:
-        `[T]` times [s] and `[T, 3]` places, world frame [m].
-    """
-    trajectory = replay.episode.trajectory
-    return np.asarray(trajectory.time, float), np.asarray(trajectory.xpos, float)[:, 1]
 
 
 def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
@@ -82,32 +58,18 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
             f"champion/genes.yaml: genes: expected {fitness.num_genes}, as config.yaml has it; "
             f"found {len(record.genes)}"
         )
-    task = fitness.config.task
     key = replay_key(record.config.evolution.seed)
-    whole: Trajectory = jax.tree.map(np.asarray, fitness.replay(record.genes, key))
-    score, measures = judge(fitness, whole, key)
-    finite = np.isfinite(np.asarray(whole.qpos)).all(axis=1)
-    count = len(finite) if finite.all() else int(finite.argmin())
+    trajectory: Trajectory = jax.tree.map(np.asarray, fitness.replay(record.genes, key))
+    score, measures = judge(fitness, trajectory, key)
+    count = count_finite(trajectory.qpos)
     if count < 2:
         raise InputError("the champion's replay is not finite from its first step on")
-    if count < len(finite):
-        record.note("changed", f"the replay blows up after {float(whole.time[count]):.3g} s")
-    trajectory = jax.tree.map(lambda x: x[:count], whole)
-    phases = cpg_phases(fitness, record.genes, count) if has_phases(fitness) else None
-    episode = Episode(
-        title=f"{fitness.robot.morphology.name}: {task.name.replace('_', ' ')}",
-        robot=fitness.robot,
-        trajectory=trajectory,
-        score=number(record.champion.get("score")),
-        score_unit=record.unit,
-        genes=record.genes,
-        fitness=fitness,
-        folder=record.folder,
-    )
+    if count < len(trajectory.qpos):
+        record.note("changed", f"the replay blows up after {float(trajectory.time[count]):.3g} s")
     _compare(record, score)
-    interval = fitness.record_every * fitness.robot.world.timestep
-    start = interval * (1 + first_counted(fitness.config.task, fitness.robot.world.timestep))
-    return Replay(episode, score, measures, start, phases)
+    phases = cpg_phases(fitness, record.genes, count) if has_phases(fitness) else None
+    begin = counted_time(fitness.config.task, fitness.robot.world.timestep)
+    return Replay(analyse_motion(fitness.robot, trajectory, begin, phases), score, measures)
 
 
 def has_phases(fitness: Fitness) -> bool:
@@ -154,20 +116,12 @@ def judge(
 @lru_cache(maxsize=8)
 def _judge(fitness: Fitness) -> Any:
     """The task and the measures of one lane, compiled once for all runs of a configuration."""
-    task, world, robot = fitness.config.task, fitness.robot.world, fitness.robot
+    body, world = fitness.robot.morphology, fitness.robot.world
+    weight = body.mass * max(world.gravity, 1e-9)
 
-    def run(position: jax.Array, energy: jax.Array, start_height: jax.Array) -> Any:
-        body = robot.morphology
-        return judge_tracks(
-            task,
-            fitness.task,
-            world,
-            position[..., None],
-            energy[:, None],
-            start_height,
-            body.length,
-            body.mass * max(world.gravity, 1e-9),
-        )
+    def run(track: jax.Array, energy: jax.Array, start_height: jax.Array) -> Any:
+        lanes = track[..., None], energy[:, None], start_height
+        return judge_tracks(fitness.config.task, fitness.task, world, *lanes, body.length, weight)
 
     return jax.jit(run)
 

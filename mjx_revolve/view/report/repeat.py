@@ -6,10 +6,12 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.own_code import content_name
-from mjx_revolve.view.report.data import RunRecord
+from mjx_revolve.view.report.record import RunRecord
 
 # Set to 1 by the command itself where nobody sets them.
 _THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -117,3 +119,25 @@ def environment(record: RunRecord) -> list[tuple[str, str]]:
         after = [str(entry.get("generation")) for entry in resumed if isinstance(entry, dict)]
         rows.append(("resumed after generation", ", ".join(after)))
     return rows
+
+
+def sources(record: RunRecord) -> list[tuple[str, str]]:
+    """Configuration, robot and genes of a run as text, so that the page alone is enough.
+
+    Args:
+        record: the run.
+
+    Returns:
+        What each is, and the text.
+    """
+    found = []
+    if record.settings and (record.folder / "config.yaml").is_file():
+        found.append(record.folder / "config.yaml")
+    if record.config is not None and Path(record.config.morphology).is_file():
+        found.append(Path(record.config.morphology))
+    texts = [(path.name, path.read_text(errors="replace")) for path in found]
+    if record.genes is not None:
+        data = {"genes": [float(gene) for gene in record.genes]}
+        genes = yaml.safe_dump(data, default_flow_style=None, width=90)
+        texts.append(("The champion's genes", genes))
+    return texts
