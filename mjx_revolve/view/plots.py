@@ -46,15 +46,7 @@ _PIECES, _POINTS = 300, 4000
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure.
-
-    Args:
-        width: [inches].
-        height: [inches].
-
-    Returns:
-        The figure, with a canvas that needs no screen.
-    """
+    """An empty figure of so many inches, with a canvas that needs no screen."""
     figure = Figure(figsize=(width, height), dpi=120, facecolor="white")
     figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.06)  # [inches]
     FigureCanvasAgg(figure)
@@ -62,11 +54,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def dress(axes: Axes) -> None:
-    """Gives axes the look of all our figures.
-
-    Args:
-        axes: which.
-    """
+    """Gives axes the look of all our figures."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(_GREY)
     axes.tick_params(colors="#333333", labelsize=9)
@@ -100,16 +88,9 @@ def limit_to_most(axes: Axes, low: Sequence[np.ndarray], high: Sequence[np.ndarr
 
 
 def draw_curve(axes: Axes, x: np.ndarray, y: np.ndarray, **style: Any) -> None:
-    """Draws a curve over time, long ones through every so many of their points.
-
-    Args:
-        axes: where.
-        x: `[T]`.
-        y: `[T]`.
-        **style: of the line.
-    """
-    stride = -(-len(x) // _POINTS)
-    axes.plot(x[::stride] if stride else x, y[::stride] if stride else y, **style)
+    """Draws a curve `y` over `x`, `[T]` each, long ones through every so many of their points."""
+    stride = max(-(-len(x) // _POINTS), 1)
+    axes.plot(x[::stride], y[::stride], **style)
 
 
 def legend_above(axes: Axes, side: float = 1.0) -> None:
@@ -127,28 +108,14 @@ def legend_above(axes: Axes, side: float = 1.0) -> None:
 
 
 def figure_png(figure: Figure) -> bytes:
-    """Renders a figure.
-
-    Args:
-        figure: the figure.
-
-    Returns:
-        The bytes of a PNG.
-    """
+    """The bytes of a figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
 
 
 def figure_svg(figure: Figure) -> bytes:
-    """Renders a figure as lines that stay sharp in print.
-
-    Args:
-        figure: the figure.
-
-    Returns:
-        The bytes of an SVG that needs no fonts; the same figure gives the same bytes.
-    """
+    """The bytes of a figure as an SVG that needs no fonts; the same figure, the same bytes."""
     buffer = io.BytesIO()
     with rc_context({"svg.fonttype": "path", "svg.hashsalt": "mjx_revolve"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})

@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -43,47 +42,41 @@ def _names(motion: Motion, actuators: Sequence[int]) -> list[str]:
     return [motion.robot.mj_model.actuator(i).name for i in actuators]
 
 
-def _small(figure: Figure, count: int, columns: int) -> list[Axes]:
-    """Small axes that share what they measure, numbers at the outer ones only."""
-    rows = math.ceil(count / columns)
-    all_axes: list[Axes] = []
-    for k in range(count):
-        first = all_axes[0] if all_axes else None
-        axes = figure.add_subplot(rows, columns, k + 1, sharex=first, sharey=first)
-        dress(axes)
-        axes.tick_params(labelbottom=k + columns >= count, labelleft=k % columns == 0)
-        axes.set_xlabel("time (s)" if k + columns >= count else "", fontsize=9)
-        all_axes.append(axes)
-    return all_axes
-
-
 def _draw_pairs(
     motion: Motion,
     rows: slice,
     names: Sequence[str],
     curves: tuple[np.ndarray, np.ndarray],
     labels: tuple[str, str],
+    what: str,
+    words: str,
     row_height: float,
 ) -> Figure:
     """What is wanted (dashed) and what comes of it, `[T, n]` each, in axes of their own."""
     columns = 1 if len(names) == 1 else 2 if len(names) <= 12 else 3 if len(names) <= 30 else 4
-    height = 0.75 + row_height * math.ceil(len(names) / columns)
-    figure = new_figure(WIDE, max(height, 2.4))
+    lines = math.ceil(len(names) / columns)
+    figure = new_figure(WIDE, max(0.75 + row_height * lines, 2.4))
+    grid = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+    for axes in grid.flat[len(names) :]:
+        axes.remove()
     time = motion.time[rows]
-    wanted, reached = (curve[rows] for curve in curves)
-    for k, axes in enumerate(_small(figure, len(names), columns)):
-        axes.plot(time, wanted[:, k], color=_ORANGE, linewidth=1.0, label=labels[0],
-                  linestyle=(0, (3, 1)))  # fmt: skip
-        axes.plot(time, reached[:, k], color=_BLUE, linewidth=1.3, label=labels[1])
+    for k, axes in enumerate(figure.axes):
+        dress(axes)
+        for curve, color, width, dash, label in zip(
+            curves, (_ORANGE, _BLUE), (1.0, 1.3), ((0, (3, 1)), "-"), labels, strict=True
+        ):
+            axes.plot(time, curve[rows, k], color=color, linewidth=width, linestyle=dash,
+                      label=label)  # fmt: skip
         axes.set_title(names[k], loc="left", fontsize=8.5, color=_INK, pad=3)
         axes.set_xlim(time[0], time[-1])
-    return figure
-
-
-def _top_legend(figure: Figure, words: str) -> None:
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", fontsize=8.5, ncols=len(labels),
+        if k + columns >= len(names):  # nothing below it
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel("time (s)", fontsize=9)
+    handles, _ = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", fontsize=8.5, ncols=2,
                   frameon=False, title=words, title_fontsize=8.5, alignment="right")  # fmt: skip
+    figure.supylabel(what, fontsize=9.5, color=_INK)
+    return figure
 
 
 def plot_joints(motion: Motion) -> Figure:
@@ -98,13 +91,13 @@ def plot_joints(motion: Motion) -> Figure:
     rows, words = _strokes(motion)
     curves = np.degrees(motion.targets), np.degrees(motion.angles)
     names = _names(motion, motion.robot.servos)
-    figure = _draw_pairs(motion, rows, names, curves, ("target", "angle"), 1.15)
+    figure = _draw_pairs(
+        motion, rows, names, curves, ("target", "angle"), "joint angle (°)", words, 1.15
+    )
     errors = np.degrees(rms(motion.angles[rows] - motion.targets[rows]))
     for axes, error in zip(figure.axes, errors, strict=True):
         axes.set_title(f"rms error {error:.2g}°", loc="right", fontsize=8, color=_GREY, pad=3)
         axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 2, 3, 5, 10]))
-    figure.supylabel("joint angle (°)", fontsize=9.5, color=_INK)
-    _top_legend(figure, words)
     return figure
 
 
@@ -123,10 +116,8 @@ def plot_thrusters(motion: Motion) -> Figure:
     )
     curves, labels = (motion.commands, motion.lagged), ("command", "behind its lag")
     names = _names(motion, motion.robot.thrusters)
-    figure = _draw_pairs(motion, slice(first, None), names, curves, labels, 1.3)
-    figure.supylabel("command (–)", fontsize=9.5, color=_INK)
-    _top_legend(figure, words)
-    return figure
+    rows = slice(first, None)
+    return _draw_pairs(motion, rows, names, curves, labels, "command (–)", words, 1.3)
 
 
 def plot_phases(motion: Motion) -> Figure:
@@ -142,8 +133,7 @@ def plot_phases(motion: Motion) -> Figure:
     rows, words = _strokes(motion)
     names = _names(motion, motion.robot.servos)
     figure = new_figure(WIDE, 1.5 + 0.24 * len(names))
-    grid = figure.add_gridspec(1, 2, width_ratios=(3.2, 1.0))
-    left, right = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+    left, right = figure.subplots(1, 2, width_ratios=(3.2, 1.0))
     shown = motion.time[rows]
     image = left.imshow(
         np.mod(motion.phases[rows].T, 2 * np.pi), aspect="auto", cmap="twilight",
@@ -185,7 +175,7 @@ def plot_energy(motion: Motion) -> Figure:
     """
     time, power, energy = motion.time, motion.power, motion.energy
     figure = new_figure(WIDE, 3.1)
-    left, middle, right = (figure.add_subplot(1, 3, k + 1) for k in range(3))
+    left, middle, right = figure.subplots(1, 3)
     draw_curve(left, time, power, color=_PALE, linewidth=0.7, label="momentary")
     draw_curve(left, time, mean_rate(time, energy), color=_ORANGE, linewidth=1.7, label="over 1 s")
     left.set_ylabel("power (W)")

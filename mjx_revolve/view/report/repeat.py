@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from mjx_revolve.episodes.config import Config, load_config
+from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.own_code import content_name
 from mjx_revolve.view.report.record import RunRecord
 
 # Set to 1 by the command itself where nobody sets them.
@@ -62,7 +61,7 @@ def _started(record: RunRecord) -> list[str] | None:
         return None
     try:
         config = load_config(file, settings)
-        if _content(config) != _content(record.config):
+        if not _is_same(config, record.config):
             return None
     except (InputError, OSError):
         return None
@@ -76,15 +75,20 @@ def _started(record: RunRecord) -> list[str] | None:
     return words
 
 
-def _content(config: Config) -> dict[str, Any]:
-    """All settings; files by what they hold, because a run has copies of its own."""
-    data = config.model_dump()
-    data["morphology"] = Path(config.morphology).read_bytes()
-    for section in ("controller", "task"):
-        data[section]["type"] = content_name(data[section]["type"])
-    if isinstance(data["world"], str):
-        data["world"] = {"name": data["world"]}
-    return data
+def _is_same(config: Config, other: Config) -> bool:
+    """Whether all settings are; files by what they hold, because a run has copies of its own."""
+    return (
+        settings_hash(config) == settings_hash(other)
+        and config.evolution == other.evolution
+        and _held(config) == _held(other)
+    )
+
+
+def _held(config: Config) -> list[bytes | str | None]:
+    """What is in the files that a configuration names, or the names of what is no file."""
+    world = config.world if isinstance(config.world, str) else config.world.name
+    names = (config.morphology, config.modules, world)
+    return [Path(n).read_bytes() if n is not None and Path(n).is_file() else n for n in names]
 
 
 def environment(record: RunRecord) -> list[tuple[str, str]]:

@@ -27,29 +27,14 @@ _BAND_FROM = 3
 
 
 def style_of(index: int) -> dict[str, Any]:
-    """Colour and dash of a group: colours first, then other dashes.
-
-    Args:
-        index: which group.
-
-    Returns:
-        Keyword arguments for a line.
-    """
+    """Colour and dash of a group's lines, by its number: colours first, then other dashes."""
     dash = _DASHES[(index // len(COLORS)) % len(_DASHES)]
     return {"color": COLORS[index % len(COLORS)], "linestyle": dash}
 
 
 def letter(index: int) -> str:
-    """A, B ... Z, AA, AB ...: what tables and pictures call a group.
-
-    Args:
-        index: which group.
-
-    Returns:
-        The letters.
-    """
-    head = letter(index // 26 - 1) if index >= 26 else ""
-    return head + chr(ord("A") + index % 26)
+    """What tables and pictures call a group, by its number: A, B ... Z, AA, AB ..."""
+    return (letter(index // 26 - 1) if index >= 26 else "") + chr(ord("A") + index % 26)
 
 
 def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
@@ -77,10 +62,8 @@ def plot_seeds(group: Group) -> Figure:
     figure = new_figure(WIDE, 3.9)
     middle = "median" if all("median" in r.metrics for r in group.shown) else "mean"
     panels = (("champion", "best so far"), (middle, f"population's {middle}"))
-    first: Axes | None = None
-    for k, (column, words) in enumerate(panels):
-        axes = figure.add_subplot(1, 2, k + 1, sharex=first)
-        first = first or axes
+    both = figure.subplots(1, 2, sharex=True)
+    for axes, (column, words) in zip(both, panels, strict=True):
         x, values = group.curve(column)
         for record in group.shown:
             if column in record.metrics:
@@ -99,8 +82,7 @@ def plot_seeds(group: Group) -> Figure:
         dress(axes)
         curves = [r.metrics[column] for r in group.shown if column in r.metrics]
         limit_to_most(axes, curves, curves)
-    if first is not None:
-        _legend_below(figure, first, 4)
+    _legend_below(figure, both[0], 4)
     return figure
 
 
@@ -120,8 +102,7 @@ def plot_comparison(groups: Sequence[Group], styles: Mapping[str, int]) -> Figur
     known = all("evaluations" in r.metrics for group in shown for r in group.shown)
     over = "evaluations" if len(sizes) > 1 and known else "generation"
     figure = new_figure(WIDE, 4.4)
-    grid = figure.add_gridspec(1, 2, width_ratios=(2.3, 1.0))
-    left, right = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+    left, right = figure.subplots(1, 2, width_ratios=(2.3, 1.0))
     ends: list[float] = []
     core: list[np.ndarray] = []
     for group in shown:
@@ -195,7 +176,7 @@ def plot_champions(groups: Sequence[tuple[str, int, Sequence[Motion]]]) -> Figur
         the start over time, mean over the seeds with its 95 % confidence band.
     """
     figure = new_figure(WIDE, 3.7)
-    above, side, away = (figure.add_subplot(1, 3, k + 1) for k in range(3))
+    above, side, away = figure.subplots(1, 3)
     spans = [np.ptp(motion.path[:, :2], axis=0) for *_, members in groups for motion in members]
     ahead = int(np.argmax(np.max(spans, axis=0)))  # the side on which they get ahead
     for name, index, members in groups:
