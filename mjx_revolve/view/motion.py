@@ -362,15 +362,9 @@ def speed_over(time: np.ndarray, path: np.ndarray, span: float | None = None) ->
 
 
 def last_strokes(time: np.ndarray, period: float | None, strokes: float) -> int:
-    """The row from which on so many strokes are left.
+    """The row of times `[T]` [s] from which on so many strokes are left.
 
-    Args:
-        time: `[T]` [s].
-        period: of a stroke [s], or None.
-        strokes: how many.
-
-    Returns:
-        The row; 0 without a period, and where there are hardly more strokes than that in all.
+    0 without a period [s], and where there are hardly more strokes than that in all.
     """
     if period is None or time[-1] <= 1.5 * strokes * period:
         return 0
@@ -378,15 +372,9 @@ def last_strokes(time: np.ndarray, period: float | None, strokes: float) -> int:
 
 
 def last_swings(time: np.ndarray, commands: np.ndarray, swings: float) -> int:
-    """The row from which on so many swings of the liveliest command are left.
+    """The row of times `[T]` [s] from which on so many swings, up and down, are left.
 
-    Args:
-        time: `[T]` [s].
-        commands: `[T, n]`.
-        swings: how many, up and down again.
-
-    Returns:
-        The row; 0 where there are at most twice as many in all.
+    Of the liveliest of commands `[T, n]`; 0 where there are at most twice as many in all.
     """
     away = commands - commands.mean(axis=0)
     all_swings = (np.diff(np.sign(away), axis=0) != 0).sum(axis=0).max() / 2

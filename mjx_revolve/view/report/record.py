@@ -133,14 +133,7 @@ class RunRecord:
 
 
 def number(value: Any) -> float | None:
-    """A finite number, or None.
-
-    Args:
-        value: anything.
-
-    Returns:
-        The number as a float.
-    """
+    """A finite number as a float; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

@@ -86,20 +86,13 @@ def _is_same(config: Config, other: Config) -> bool:
 
 def _held(config: Config) -> list[bytes | str | None]:
     """What is in the files that a configuration names, or the names of what is no file."""
-    world = config.world if isinstance(config.world, str) else config.world.name
+    world = config.world if isinstance(config.world, str) else config.world["name"]
     names = (config.morphology, config.modules, world)
     return [Path(n).read_bytes() if n is not None and Path(n).is_file() else n for n in names]
 
 
 def environment(record: RunRecord) -> list[tuple[str, str]]:
-    """What the bits of a run depend on beside its settings.
-
-    Args:
-        record: the run.
-
-    Returns:
-        Names and values, as far as `run.json` knows them.
-    """
+    """What a run's bits depend on beside its settings, as far as `run.json` says: name, value."""
     info = record.info
     rows: list[tuple[str, str]] = []
     versions = info.get("versions")
@@ -128,11 +121,7 @@ def environment(record: RunRecord) -> list[tuple[str, str]]:
 def sources(record: RunRecord) -> list[tuple[str, str]]:
     """Configuration, robot and genes of a run as text, so that the page alone is enough.
 
-    Args:
-        record: the run.
-
-    Returns:
-        What each is, and the text.
+    Each with what it is called.
     """
     found = []
     if record.settings and (record.folder / "config.yaml").is_file():

@@ -63,14 +63,7 @@ def _column(name: str) -> str:
 
 
 def headline(groups: Sequence[Group]) -> list[tuple[str, str]]:
-    """The numbers that matter most, each before what it is.
-
-    Args:
-        groups: all groups.
-
-    Returns:
-        Pairs of words; none of several configurations, which have a table.
-    """
+    """The numbers that matter most, each before what it is; several groups have a table instead."""
     if len(groups) != 1:
         return []
     (group,) = groups
@@ -153,14 +146,7 @@ def different_settings(groups: Sequence[Group]) -> list[list[Any]]:
 
 
 def runs_table(groups: Sequence[Group]) -> tuple[list[str], list[list[Any]]]:
-    """One line for each run.
-
-    Args:
-        groups: all groups.
-
-    Returns:
-        The header, and the rows, each one's first cell being its group's number.
-    """
+    """Header and rows, one for each run; its first cell is the number of its group."""
     records = [(k, r) for k, group in enumerate(groups) for r in (*group.records, *group.copies)]
     known = _known_measures([record for _, record in records])
     units = {record.unit for _, record in records}
@@ -225,12 +211,8 @@ def count_modules(morphology: Morphology) -> tuple[list[list[Any]], list[Any]]:
 def list_modules(morphology: Morphology) -> list[list[Any]]:
     """Rows of a robot's modules.
 
-    Args:
-        morphology: the robot.
-
-    Returns:
-        Number, name, type, what it hangs on, slot and turn there [deg], place at rest in the core's
-        frame [m], mass [g], displaced volume [cm³].
+    Number, name, type, what it hangs on, slot and turn there [deg], place at rest in the core's
+    frame [m], mass [g], displaced volume [cm³].
     """
     return [
         [k, m.name, m.type, *((m.parent, m.slot, f"{m.orientation:g}") if m.parent >= 0 else "–––"),
