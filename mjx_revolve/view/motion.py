@@ -1,14 +1,13 @@
 """What a robot did, analysed once as plain values: pictures, films, pages and reports only draw.
 
-`Motion` is an episode with all that is told of it, each worked out when it is first asked for; the
-functions below it take arrays and know no robot.
+`Motion` is an episode with all that is told of it; the functions below take arrays and know no
+robot.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,168 +38,59 @@ class Motion:
 
     Attributes:
         robot: who.
-        trajectory: what it did, as long as it was.
-        count: T, its rows that are finite.
-        counted_from: when its task began to count, see `counted_time` [s].
-        phases: `[T, nhinge]` of a CPG's oscillators, hinges in the order of the servos [rad]: 0
-            when the joint's target passes the middle of its range upwards, π/2 at its largest;
-            None for other controllers.
+        length: of its body [m].
+        weight: in air [N].
+        time: `[T]` [s].
+        qpos: `[T, nq]` as in a trajectory.
+        path: `[T, 3]` of the core, world frame [m].
+        steady: `[T, 3]` the path without the to and fro of the strokes [m].
+        along: `[2]` unit vector of the way in the horizontal plane; x where the robot stayed.
+        depth: `[T]` of the core below the still surface [m].
+        period: of the strokes [s]; None where the hinges do not repeat themselves.
+        poses: rows along the way that can be told apart, see `choose_poses`.
+        angles: `[T, nhinge]` of the joints in the order of the servos [rad].
+        targets: `[T, nhinge]` that the controller sets them [rad].
+        phases: `[T, nhinge]` of a CPG's oscillators in the same order [rad]: 0 when the joint's
+            target passes the middle of its range upwards, π/2 at its largest; None for others.
+        commands: `[T, nthruster]` of the thrusters [-].
+        lagged: `[T, nthruster]` what is left of the commands behind the thrusters' lag [-].
+        power: `[T]` at the servos, summed without sign, and what ideal propellers need [W].
+        energy: `[T]` so far [J].
+        counted_from: when the task began to count, see `counted_time` [s].
+        first: the row from which the following are counted.
+        seconds: how long [s].
+        distance: net [m].
+        speed: net [m/s]; 0 in a single row.
+        cost: of transport, energy over weight times net distance [-].
+        costs: `[T]` the same so far; NaN before it counts, and while the robot is closer than a
+            tenth of its way to where it began.
     """
 
     robot: Robot
-    trajectory: Trajectory
-    count: int
-    counted_from: float = 0.0
-    phases: np.ndarray | None = None
-
-    def _column(self, name: str) -> np.ndarray:
-        return np.asarray(getattr(self.trajectory, name), float)[: self.count]
-
-    @cached_property
-    def time(self) -> np.ndarray:
-        """`[T]` [s]."""
-        return self._column("time")
-
-    @cached_property
-    def qpos(self) -> np.ndarray:
-        """`[T, nq]` as in a trajectory."""
-        return self._column("qpos")
-
-    @property
-    def length(self) -> float:
-        """Of the body [m]."""
-        return self.robot.morphology.length
-
-    @property
-    def weight(self) -> float:
-        """Of the robot in air [N]."""
-        return self.robot.morphology.mass * max(self.robot.world.gravity, 1e-9)
-
-    # --- the way ---
-
-    @property
-    def path(self) -> np.ndarray:
-        """`[T, 3]` of the core, world frame [m]."""
-        return self.qpos[:, :3]
-
-    @cached_property
-    def steady(self) -> np.ndarray:
-        """`[T, 3]` the path without the to and fro of the strokes [m]."""
-        return smooth_path(self.time, self.path, self.period)
-
-    @cached_property
-    def along(self) -> np.ndarray:
-        """`[2]` unit vector of the way in the horizontal plane; x where the robot stayed."""
-        net = self.path[-1, :2] - self.path[0, :2]
-        size = float(np.linalg.norm(net))
-        return net / size if size > _STAYED * self.length else np.array([1.0, 0.0])
-
-    @property
-    def depth(self) -> np.ndarray:
-        """`[T]` of the core below the still surface [m]."""
-        return float(self.robot.world.surface_height) - self.path[:, 2]
-
-    @cached_property
-    def first(self) -> int:
-        """The row from which distance, speed and cost are counted."""
-        row = int(np.searchsorted(self.time, self.counted_from - 1e-6))
-        return max(min(row, self.count - 2), 0)
-
-    @property
-    def seconds(self) -> float:
-        """How long it is counted [s]."""
-        return float(self.time[-1] - self.time[self.first])
-
-    @property
-    def distance(self) -> float:
-        """Net distance while it is counted [m]."""
-        return float(np.linalg.norm(self.path[-1] - self.path[self.first]))
-
-    @property
-    def speed(self) -> float:
-        """Net speed while it is counted [m/s]; 0 in a single row."""
-        return self.distance / self.seconds if self.seconds > 0.0 else 0.0
-
-    # --- strokes ---
-
-    @cached_property
-    def period(self) -> float | None:
-        """Of the strokes [s]; None where the hinges do not repeat themselves."""
-        return stroke_period(self.time, self.qpos[:, 7:])
-
-    @cached_property
-    def angles(self) -> np.ndarray:
-        """`[T, nhinge]` of the joints in the order of the servos [rad]."""
-        model = self.robot.mj_model
-        joints = [int(model.actuator_trnid[i, 0]) for i in self.robot.servos]
-        return self.qpos[:, [int(model.jnt_qposadr[joint]) for joint in joints]]
-
-    @cached_property
-    def targets(self) -> np.ndarray:
-        """`[T, nhinge]` that the controller sets the joints [rad]."""
-        return self._column("ctrl")[:, list(self.robot.servos)]
-
-    @property
-    def turns(self) -> np.ndarray:
-        """`[nhinge]` mean frequency of each oscillator; negative where it turns backwards [Hz]."""
-        turned = np.unwrap(np.asarray(self.phases), axis=0)
-        span = max(float(self.time[-1] - self.time[0]), 1e-9)
-        return (turned[-1] - turned[0]) / (2 * np.pi * span)
-
-    @cached_property
-    def commands(self) -> np.ndarray:
-        """`[T, nthruster]` of the thrusters [-]."""
-        return self._column("ctrl")[:, list(self.robot.thrusters)]
-
-    @cached_property
-    def lagged(self) -> np.ndarray:
-        """`[T, nthruster]` what is left of the commands behind the thrusters' lag [-]."""
-        return self._column("command")
-
-    # --- energy ---
-
-    @cached_property
-    def power(self) -> np.ndarray:
-        """`[T]` at the servos, summed without sign, and what ideal propellers need [W]."""
-        return self._column("power")
-
-    @cached_property
-    def energy(self) -> np.ndarray:
-        """`[T]` so far [J]."""
-        step = float(np.median(np.diff(self.time))) if self.count > 1 else float(self.time[0])
-        return np.cumsum(self.power) * step
-
-    @cached_property
-    def cost(self) -> np.ndarray:
-        """`[T]` cost of transport so far: energy over weight times net distance, both counted [-].
-
-        NaN before that, and while the robot is closer than a tenth of its way to where it began.
-        """
-        away = np.linalg.norm(self.path - self.path[self.first], axis=1)
-        far = away > _NEAR * max(float(away[self.first :].max()), 1e-3)
-        counted = np.arange(self.count) > self.first
-        return np.where(far & counted, self._cost(self.energy, away), np.nan)
-
-    @property
-    def final_cost(self) -> float:
-        """Cost of transport while it is counted [-]."""
-        return float(self._cost(self.energy[-1], self.distance))
-
-    def _cost(self, energy: Any, away: Any) -> Any:
-        # A millimetre bounds it where the robot stays, as in `tasks.measure`.
-        return (energy - self.energy[self.first]) / (self.weight * np.maximum(away, 1e-3))
-
-    # --- what to draw ---
-
-    @cached_property
-    def poses(self) -> list[int]:
-        """Rows along the way that can be told apart, see `choose_poses`."""
-        return choose_poses(self.time, self.path, self.length)
-
-    def stroke(self, count: int) -> list[int]:
-        """Rows at `count` equal times in the last stroke, or in the last second."""
-        span = min(self.period or _SECOND, float(self.time[-1] - self.time[0]))
-        return nearest_rows(self.time, self.time[-1] - span + span * np.arange(count) / count)
+    length: float
+    weight: float
+    time: np.ndarray
+    qpos: np.ndarray
+    path: np.ndarray
+    steady: np.ndarray
+    along: np.ndarray
+    depth: np.ndarray
+    period: float | None
+    poses: list[int]
+    angles: np.ndarray
+    targets: np.ndarray
+    phases: np.ndarray | None
+    commands: np.ndarray
+    lagged: np.ndarray
+    power: np.ndarray
+    energy: np.ndarray
+    counted_from: float
+    first: int
+    seconds: float
+    distance: float
+    speed: float
+    cost: float
+    costs: np.ndarray
 
 
 def analyse_motion(
@@ -213,8 +103,7 @@ def analyse_motion(
 
     Args:
         robot: who swam.
-        trajectory: what it did: `time` `[T]` [s], `qpos` `[T, nq]`, and whatever else is asked of
-            the motion. Rows after the first that is not finite are left out.
+        trajectory: what it did. Rows after the first that is not finite are left out.
         counted_from: see `Motion`.
         phases: `[T, nhinge]`, see `Motion`.
 
@@ -224,15 +113,55 @@ def analyse_motion(
     Raises:
         InputError: the trajectory is another robot's, or has no finite row.
     """
-    qpos = np.asarray(trajectory.qpos)
-    expected = [np.size(trajectory.time), robot.mj_model.nq]
-    if list(qpos.shape) != expected:
-        raise InputError(f"trajectory.qpos: expected {expected} [T, nq]; found {list(qpos.shape)}")
-    count = count_finite(qpos)
+    shape, expected = np.shape(trajectory.qpos), (np.size(trajectory.time), robot.mj_model.nq)
+    if shape != expected:
+        raise InputError(f"trajectory.qpos: expected {[*expected]} [T, nq]; found {[*shape]}")
+    count = count_finite(trajectory.qpos)
     if count == 0:
         raise InputError("trajectory.qpos: expected finite numbers in its first row; found none")
+    columns = (trajectory.time, trajectory.qpos, trajectory.ctrl, trajectory.power)
+    time, qpos, ctrl, power = (np.asarray(column, float)[:count] for column in columns)
+    length = robot.morphology.length
+    weight = robot.morphology.mass * max(robot.world.gravity, 1e-9)
+    path, period = qpos[:, :3], stroke_period(time, qpos[:, 7:])
+    net = path[-1, :2] - path[0, :2]
+    moved = float(np.linalg.norm(net)) > _STAYED * length
+    joints = robot.mj_model.actuator_trnid[list(robot.servos), 0]
+    lagged = np.zeros((count, 0)) if trajectory.command is None else trajectory.command
+    energy = np.cumsum(power) * (float(np.median(np.diff(time))) if count > 1 else 0.0)
+
+    first = max(min(int(np.searchsorted(time, counted_from - 1e-6)), count - 2), 0)
+    away = np.linalg.norm(path - path[first], axis=1)
+    seconds, distance = float(time[-1] - time[first]), float(away[-1])
+    # A millimetre bounds the cost where the robot stays, as in `tasks.measure`.
+    costs = (energy - energy[first]) / (weight * np.maximum(away, 1e-3))
+    far = away > _NEAR * max(float(away[first:].max()), 1e-3)
     return Motion(
-        robot, trajectory, count, counted_from, None if phases is None else phases[:count]
+        robot=robot,
+        length=length,
+        weight=weight,
+        time=time,
+        qpos=qpos,
+        path=path,
+        steady=smooth_path(time, path, period),
+        along=net / np.linalg.norm(net) if moved else np.array([1.0, 0.0]),
+        depth=float(robot.world.surface_height) - path[:, 2],
+        period=period,
+        poses=choose_poses(time, path, length),
+        angles=qpos[:, robot.mj_model.jnt_qposadr[joints]],
+        targets=ctrl[:, list(robot.servos)],
+        phases=None if phases is None else phases[:count],
+        commands=ctrl[:, list(robot.thrusters)],
+        lagged=np.asarray(lagged, float)[:count],
+        power=power,
+        energy=energy,
+        counted_from=counted_from,
+        first=first,
+        seconds=seconds,
+        distance=distance,
+        speed=distance / seconds if seconds > 0.0 else 0.0,
+        cost=float(costs[-1]),
+        costs=np.where(far & (np.arange(count) > first), costs, np.nan),
     )
 
 
@@ -285,6 +214,18 @@ def choose_poses(time: np.ndarray, path: np.ndarray, length: float) -> list[int]
         if apart.min() >= (_APART if count > 2 else _PAIR):
             return rows
     return [len(time) - 1]
+
+
+def stroke_rows(time: np.ndarray, period: float | None, count: int) -> list[int]:
+    """Rows of times `[T]` [s] at `count` equal times in the last stroke, or in the last second."""
+    span = min(period or _SECOND, float(time[-1] - time[0]))
+    return nearest_rows(time, time[-1] - span + span * np.arange(count) / count)
+
+
+def mean_frequency(time: np.ndarray, phases: np.ndarray) -> np.ndarray:
+    """Turns per second `[n]` of phases `[T, n]` [rad]; negative where one turns backwards [Hz]."""
+    turned = np.unwrap(phases, axis=0)
+    return (turned[-1] - turned[0]) / (2 * np.pi * max(float(time[-1] - time[0]), 1e-9))
 
 
 def stroke_period(time: np.ndarray, angles: np.ndarray) -> float | None:

@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mjx_revolve.view.labels import INK, SOFT, Places, draw_scale_bars, write
-from mjx_revolve.view.motion import Motion, analyse_motion
+from mjx_revolve.view.motion import Motion, analyse_motion, stroke_rows
 from mjx_revolve.view.pictures import (
     Piece,
     Scene,
@@ -193,7 +193,7 @@ def _label_poses(
 
 def _draw_stroke(figure: Figure, motion: Motion, pieces: Sequence[Piece], view: np.ndarray) -> None:
     """The strip: snapshots of one stroke, or of the last second."""
-    rows = motion.stroke(_SNAPSHOTS)
+    rows = stroke_rows(motion.time, motion.period, _SNAPSHOTS)
     places = motion.path[rows]
     scenes = [pose_scene(motion.robot, motion.qpos[row], pieces) for row in rows]
     size = ((_PAGE[0] - 2 * _LEFT - (_SNAPSHOTS - 1) * _GAP) // _SNAPSHOTS, _STRIP)
@@ -258,7 +258,7 @@ def draw_motion(motion: Motion) -> Figure:
     heading = math.degrees(math.atan2(motion.along[1], motion.along[0]))
     view = make_view(heading - 90.0 + _TOWARDS, _ELEVATION)
     pieces = make_pieces(motion.robot.morphology)
-    strip = motion.robot.num_hinges > 0 and motion.count > 1
+    strip = motion.robot.num_hinges > 0 and len(motion.time) > 1
     if strip:
         _draw_stroke(figure, motion, pieces, view)
     scenes = [pose_scene(motion.robot, motion.qpos[row], pieces) for row in motion.poses]
@@ -275,8 +275,7 @@ def plot_swim(robot: Robot, trajectory: Trajectory, counted_from: float = 0.0) -
 
     Args:
         robot: the robot.
-        trajectory: what it did: `time` `[T]` [s] and `qpos` `[T, nq]`. Rows after the first that
-            is not finite are left out.
+        trajectory: what it did. Rows after the first that is not finite are left out.
         counted_from: when its task begins to count, see `motion.counted_time` [s].
 
     Returns:

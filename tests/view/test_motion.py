@@ -17,16 +17,24 @@ from mjx_revolve.view.motion import (
     counted_time,
     last_strokes,
     last_swings,
+    mean_frequency,
     mean_rate,
     rms,
     smooth_path,
     speed_over,
     stroke_period,
+    stroke_rows,
 )
 
 PERIOD, SPEED, SECONDS = 0.8, 0.05, 6.0
 TIME = np.arange(0.02, SECONDS + 1e-9, 0.02)
 HEADING = 0.6
+
+
+def episode(robot, time, qpos, **columns):
+    """A trajectory of a robot that is not told anything and needs no power."""
+    still = {"ctrl": np.zeros((len(time), robot.mj_model.nu)), "power": 0 * time, "command": None}
+    return SimpleNamespace(time=time, qpos=qpos, **still | columns)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +47,7 @@ def sine(elbow):
     qpos[:, 7:] = beat[:, None]
     ctrl = qpos[:, 7:] + np.array([0.1, -0.2])
     phases = np.outer(2 * np.pi * TIME / PERIOD, [1, -1])
-    trajectory = SimpleNamespace(time=TIME, qpos=qpos, ctrl=ctrl, power=np.full(len(TIME), 2.0))
+    trajectory = episode(elbow, TIME, qpos, ctrl=ctrl, power=np.full(len(TIME), 2.0))
     return analyse_motion(elbow, trajectory, counted_from=2.0, phases=phases)
 
 
@@ -59,8 +67,8 @@ def test_how_fast_how_far_and_where_to(elbow, sine):
 def test_strokes_and_joints(sine):
     assert sine.period == pytest.approx(PERIOD, rel=0.02)
     assert rms(sine.angles - sine.targets) == pytest.approx([0.1, 0.2])
-    assert sine.turns == pytest.approx([1 / PERIOD, -1 / PERIOD])
-    rows = sine.stroke(4)
+    assert mean_frequency(sine.time, sine.phases) == pytest.approx([1 / PERIOD, -1 / PERIOD])
+    rows = stroke_rows(sine.time, sine.period, 4)
     assert np.diff(TIME[rows]) == pytest.approx(PERIOD / 4, abs=0.02)
     assert TIME[rows[0]] == pytest.approx(SECONDS - PERIOD, abs=0.02)
     assert sine.angles[rows, 0] == pytest.approx(sine.qpos[rows, 7])
@@ -70,28 +78,28 @@ def test_energy_and_its_cost(sine):
     assert sine.energy[-1] == pytest.approx(2.0 * SECONDS)
     assert mean_rate(sine.time, sine.energy) == pytest.approx(2.0)
     # Power over weight times speed, from where it counts; unknown before, and at its start.
-    assert sine.cost[-1] == pytest.approx(2.0 / (sine.weight * SPEED))
-    assert np.isnan(sine.cost[: sine.first + 1]).all()
-    assert np.isfinite(sine.cost[TIME > 2.5]).all()
+    assert sine.cost == sine.costs[-1] == pytest.approx(2.0 / (sine.weight * SPEED))
+    assert np.isnan(sine.costs[: sine.first + 1]).all()
+    assert np.isfinite(sine.costs[TIME > 2.5]).all()
 
 
 def test_rows_after_the_first_that_is_not_finite_are_left_out(elbow, sine):
     qpos = sine.qpos.copy()
     qpos[150] = np.nan
     assert count_finite(qpos) == 150
-    short = analyse_motion(elbow, SimpleNamespace(time=TIME, qpos=qpos))
-    assert (short.count, len(short.time), len(short.path)) == (150, 150, 150)
+    short = analyse_motion(elbow, episode(elbow, TIME, qpos))
+    assert {len(short.time), len(short.path), len(short.power), len(short.targets)} == {150}
     with pytest.raises(InputError, match="expected finite numbers in its first row; found none"):
-        analyse_motion(elbow, SimpleNamespace(time=TIME, qpos=np.nan * qpos))
+        analyse_motion(elbow, episode(elbow, TIME, np.nan * qpos))
 
 
 def test_who_stays_has_no_heading_and_no_speed(elbow):
     still = np.tile(elbow.mj_model.qpos0, (len(TIME), 1))
-    motion = analyse_motion(elbow, SimpleNamespace(time=TIME, qpos=still))
+    motion = analyse_motion(elbow, episode(elbow, TIME, still))
     assert motion.along.tolist() == [1.0, 0.0]
     assert (motion.speed, motion.period) == (0.0, None)
     assert motion.poses == [len(TIME) - 1]
-    one = analyse_motion(elbow, SimpleNamespace(time=TIME[:1], qpos=still[:1]))
+    one = analyse_motion(elbow, episode(elbow, TIME[:1], still[:1]))
     assert (one.speed, one.poses, one.first) == (0.0, [0], 0)
 
 

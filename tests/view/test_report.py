@@ -24,7 +24,6 @@ from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 from mjx_revolve.view import plots
-from mjx_revolve.view.motion import analyse_motion
 from mjx_revolve.view.report import champion_pictures, run_pictures, tables
 from mjx_revolve.view.report import page as report_page
 from mjx_revolve.view.report import repeat as report_repeat
@@ -101,7 +100,8 @@ def lab(tmp_path_factory):
     record = read_run(folder / "s0")
     assert record.problems == []
     return {"folder": folder, "config": config, "fitness": fitness, "score": score,
-            "measures": measures, "replay": replay_champion(record, fitness)}  # fmt: skip
+            "measures": measures, "trajectory": trajectory,
+            "replay": replay_champion(record, fitness)}  # fmt: skip
 
 
 @pytest.fixture
@@ -404,7 +404,7 @@ def axes_of(figure):
 
 def test_joint_angles_are_those_of_the_joints(lab):
     first, second = axes_of(champion_pictures.plot_joints(lab["replay"].motion))
-    trajectory = lab["replay"].motion.trajectory
+    trajectory = lab["trajectory"]
     assert first.get_title(loc="left") == "shoulder"
     assert np.allclose(first.lines[1].get_ydata(), np.degrees(trajectory.qpos[:, 7]))
     assert np.allclose(second.lines[0].get_ydata(), np.degrees(trajectory.ctrl[:, 1]))
@@ -417,7 +417,7 @@ def test_power_adds_up(lab):
     assert [axes.get_ylabel() for axes in (power, energy, cost)] == [
         "power (W)", "energy so far (J)", "cost of transport (–)",
     ]  # fmt: skip
-    trajectory = replay.motion.trajectory
+    trajectory = lab["trajectory"]
     total = float(np.mean(trajectory.power)) * float(trajectory.time[-1])
     assert energy.lines[0].get_ydata()[-1] == pytest.approx(total, rel=1e-4)
     final = float(cost.get_title(loc="left").split()[0])
@@ -432,11 +432,10 @@ def test_phases_and_thrusters(lab):
 
     time = np.arange(400) * 0.01
     command = np.sin(40 * time)[:, None]
-    model = SimpleNamespace(nq=7, actuator=lambda i: SimpleNamespace(name="bow"))
+    model = SimpleNamespace(actuator=lambda i: SimpleNamespace(name="bow"))
     robot = SimpleNamespace(thrusters=(0,), mj_model=model)
-    trajectory = SimpleNamespace(time=time, qpos=np.zeros((400, 7)), ctrl=command,
-                                 command=0.5 * command)  # fmt: skip
-    (axes,) = axes_of(champion_pictures.plot_thrusters(analyse_motion(robot, trajectory)))
+    motion = SimpleNamespace(robot=robot, time=time, commands=command, lagged=0.5 * command)
+    (axes,) = axes_of(champion_pictures.plot_thrusters(motion))
     assert np.ptp(axes.lines[0].get_xdata()) < 2.0  # the last of many swings
     assert np.ptp(axes.lines[1].get_ydata()) == pytest.approx(1.0, abs=0.05)
 
@@ -490,7 +489,7 @@ def test_champions_start_at_one_place(lab):
     figure = run_pictures.plot_champions([("one", 0, [motion] * 3), ("b", 1, [motion])])
     above, side, away = axes_of(figure)
     assert np.allclose(above.lines[0].get_xydata()[0], 0)
-    way = np.asarray(motion.trajectory.xpos)[:, 1]
+    way = np.asarray(lab["trajectory"].xpos)[:, 1]
     distance = np.linalg.norm(way - way[0], axis=1)
     assert np.allclose(away.lines[0].get_ydata(), distance)
     assert side.get_ylabel() == "z (m)"

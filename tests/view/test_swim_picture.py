@@ -30,7 +30,12 @@ def swim(robot, heading=0.0, depth=1.0, speed=SPEED):
     qpos[:, 2] = -depth
     beat = np.sin(2 * np.pi * TIME / PERIOD)
     qpos[:, 7:] = 0.5 * beat[:, None]
-    return SimpleNamespace(time=TIME, qpos=qpos)
+    return trajectory(robot, TIME, qpos)
+
+
+def trajectory(robot, time, qpos):
+    ctrl = np.zeros((len(time), robot.mj_model.nu))
+    return SimpleNamespace(time=time, qpos=qpos, ctrl=ctrl, power=0 * time, command=None)
 
 
 def draw(robot, trajectory):
@@ -144,12 +149,12 @@ def test_a_robot_that_stays_is_drawn_once(small):
 def test_rows_after_the_first_that_is_not_finite_are_left_out(small):
     broken = swim(small)
     broken.qpos[150:] = np.nan
-    short = SimpleNamespace(time=TIME[:150], qpos=broken.qpos[:150])
+    short = trajectory(small, TIME[:150], broken.qpos[:150])
     assert words(plot_swim(small, broken)) == words(plot_swim(small, short))
 
 
 def test_a_single_row_is_a_portrait(elbow):
-    said = words(plot_swim(elbow, SimpleNamespace(time=TIME[:1], qpos=swim(elbow).qpos[:1])))
+    said = words(plot_swim(elbow, trajectory(elbow, TIME[:1], swim(elbow).qpos[:1])))
     assert "elbow" in said  # a name without a speed
 
 

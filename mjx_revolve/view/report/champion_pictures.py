@@ -12,7 +12,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from mjx_revolve.view.motion import Motion, last_strokes, last_swings, mean_rate, rms
+from mjx_revolve.view.motion import (
+    Motion,
+    last_strokes,
+    last_swings,
+    mean_frequency,
+    mean_rate,
+    rms,
+)
 from mjx_revolve.view.plots import (
     COLORS,
     WIDE,
@@ -151,7 +158,9 @@ def plot_phases(motion: Motion) -> Figure:
     bar.set_label("phase (rad)", fontsize=9)
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8.5, colors="#333333")
-    right.barh(range(len(names)), motion.turns, color=_BLUE, height=0.6)
+    right.barh(
+        range(len(names)), mean_frequency(motion.time, motion.phases), color=_BLUE, height=0.6
+    )
     right.set_ylim(len(names) - 0.5, -0.5)
     right.set_yticks(range(len(names)), [""] * len(names))
     right.set_xlabel("mean frequency (Hz)")
@@ -186,11 +195,11 @@ def plot_energy(motion: Motion) -> Figure:
     middle.set_ylabel("energy so far (J)")
     middle.set_ylim(bottom=0)
     head(middle, f"{energy[-1]:.3g} J in {time[-1]:.3g} s")
-    draw_curve(right, time, motion.cost, color=_GREEN, linewidth=1.5)
+    draw_curve(right, time, motion.costs, color=_GREEN, linewidth=1.5)
     right.set_ylabel("cost of transport (–)")
-    right.set_ylim(0, 2.2 * max(motion.final_cost, 1e-6))
+    right.set_ylim(0, 2.2 * max(motion.cost, 1e-6))
     right.axvline(motion.counted_from, color=_PALE, linewidth=1.0, linestyle=(0, (3, 2)))
-    head(right, f"{motion.final_cost:.3g} at the end")
+    head(right, f"{motion.cost:.3g} at the end")
     for axes in (left, middle, right):
         axes.set_xlabel("time (s)")
         axes.set_xlim(0, time[-1])
