@@ -97,26 +97,6 @@ def nearer_signs(quaternion: np.ndarray) -> np.ndarray:
     return quaternion * signs[..., None]
 
 
-def speed_over(time: np.ndarray, path: np.ndarray, span: float | None = None) -> np.ndarray:
-    """Speed along a path over a stroke around each row.
-
-    Args:
-        time: `[S]` equal steps [s].
-        path: `[S, 3]` [m].
-        span: of a stroke [s]; None: one second.
-
-    Returns:
-        `[S]` [m/s]; at both ends as over the last whole stroke, or the to and fro would show.
-    """
-    last = len(path) - 1
-    step = float(time[-1] - time[0]) / max(last, 1)
-    whole = min(max(1, round((span or 1.0) / max(step, 1e-9))), last)
-    if whole == 0:
-        return np.zeros(1)
-    first = np.clip(np.arange(last + 1) - whole // 2, 0, last - whole)
-    return np.linalg.norm(path[first + whole] - path[first], axis=1) / (whole * step)
-
-
 def water_drift(robot: Robot, water: Water, place: np.ndarray, step: float) -> np.ndarray:
     """How far the water around a robot has gone, its waves apart.
 

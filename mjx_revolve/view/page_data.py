@@ -10,10 +10,10 @@ import numpy as np
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
-from mjx_revolve.view.course import bed_rings, finite_part, pose_robot, speed_over, water_drift
+from mjx_revolve.view.course import bed_rings, finite_part, pose_robot, water_drift
 from mjx_revolve.view.forces import module_forces, sum_modules, water_at
+from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
 from mjx_revolve.view.pieces import make_pieces, mount_piece
-from mjx_revolve.view.swim_picture import smooth_path, stroke_period
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World
 

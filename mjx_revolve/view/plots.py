@@ -7,7 +7,7 @@ anywhere: in a thread, in a test, on a machine without a screen.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from mjx_revolve.view.motion import speed_over
 
 # Okabe and Ito's palette (2008), which all readers can tell apart, and its neighbours.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#3b3b3b")
@@ -32,6 +34,7 @@ LABELS = {
     "cost_of_transport": "cost of transport (–)",
     "depth_error_m": "depth error (m)",
 }
+WIDE = 9.0  # of most figures [inches]
 _FIGURES = {
     "generation", "evaluations", "best", "mean", "std", "median", "lower_quartile",
     "upper_quartile", "champion", "step_size", "failed", "restarts", "seconds",
@@ -43,15 +46,7 @@ _PIECES, _POINTS = 300, 4000
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure.
-
-    Args:
-        width: [inches].
-        height: [inches].
-
-    Returns:
-        The figure, with a canvas that needs no screen.
-    """
+    """An empty figure of so many inches, with a canvas that needs no screen."""
     figure = Figure(figsize=(width, height), dpi=120, facecolor="white")
     figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.06)  # [inches]
     FigureCanvasAgg(figure)
@@ -59,11 +54,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def dress(axes: Axes) -> None:
-    """Gives axes the look of all our figures.
-
-    Args:
-        axes: which.
-    """
+    """Gives axes the look of all our figures."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(_GREY)
     axes.tick_params(colors="#333333", labelsize=9)
@@ -71,17 +62,35 @@ def dress(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def draw_curve(axes: Axes, x: np.ndarray, y: np.ndarray, **style: Any) -> None:
-    """Draws a curve over time, long ones through every so many of their points.
+def head(axes: Axes, text: str) -> None:
+    """Writes a line above axes, at their left."""
+    axes.set_title(text, loc="left", fontsize=10, color="#222222")
+
+
+def limit_to_most(axes: Axes, low: Sequence[np.ndarray], high: Sequence[np.ndarray]) -> None:
+    """Keeps a few terrible generations from squeezing all the others into a line.
 
     Args:
-        axes: where.
-        x: `[T]`.
-        y: `[T]`.
-        **style: of the line.
+        axes: whose vertical limits are set; nothing happens without finite values.
+        low: curves of which the worst few may lie below the frame.
+        high: curves of which all lie within.
     """
-    stride = -(-len(x) // _POINTS)
-    axes.plot(x[::stride] if stride else x, y[::stride] if stride else y, **style)
+    lows, highs = (np.concatenate([*curves, np.zeros(0)]) for curves in (low, high))
+    lows, highs = lows[np.isfinite(lows)], highs[np.isfinite(highs)]
+    if not lows.size or not highs.size:
+        return
+    bottom, top = float(np.percentile(lows, 5)), float(highs.max())
+    # Only if they would take most of it.
+    if top - lows.min() < 2.0 * (top - bottom):
+        bottom = float(lows.min())
+    margin = 0.06 * (top - bottom) or 0.1 * max(abs(top), 1e-3)
+    axes.set_ylim(bottom - margin, top + margin)
+
+
+def draw_curve(axes: Axes, x: np.ndarray, y: np.ndarray, **style: Any) -> None:
+    """Draws a curve `y` over `x`, `[T]` each, long ones through every so many of their points."""
+    stride = max(-(-len(x) // _POINTS), 1)
+    axes.plot(x[::stride], y[::stride], **style)
 
 
 def legend_above(axes: Axes, side: float = 1.0) -> None:
@@ -99,28 +108,14 @@ def legend_above(axes: Axes, side: float = 1.0) -> None:
 
 
 def figure_png(figure: Figure) -> bytes:
-    """Renders a figure.
-
-    Args:
-        figure: the figure.
-
-    Returns:
-        The bytes of a PNG.
-    """
+    """The bytes of a figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
 
 
 def figure_svg(figure: Figure) -> bytes:
-    """Renders a figure as lines that stay sharp in print.
-
-    Args:
-        figure: the figure.
-
-    Returns:
-        The bytes of an SVG that needs no fonts; the same figure gives the same bytes.
-    """
+    """The bytes of a figure as an SVG that needs no fonts; the same figure, the same bytes."""
     buffer = io.BytesIO()
     with rc_context({"svg.fonttype": "path", "svg.hashsalt": "mjx_revolve"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
@@ -156,7 +151,8 @@ def plot_fitness(
         top.step(generation, metrics["champion"], where="post", color=_DEEP, linewidth=1.4,
                  linestyle=(0, (5, 2)), label="best so far")  # fmt: skip
     top.set_ylabel(label)
-    _limit_to_the_many(top, metrics, band)
+    highs = [metrics[name] for name in ("best", "champion") if name in metrics]
+    limit_to_most(top, [band], highs or [band])
     legend_above(top, 0.0)
     if title:
         top.set_title(title, loc="left", fontsize=11, color="#222222", pad=24)
@@ -222,39 +218,37 @@ def _draw_step_size(axes: Axes, generation: np.ndarray, size: np.ndarray, dot: s
     axes.set_ylabel("step size\n(gene units)", fontsize=9)
 
 
-def _limit_to_the_many(axes: Axes, metrics: Mapping[str, np.ndarray], low: np.ndarray) -> None:
-    """Keeps one terrible generation from squeezing all the others into a line."""
-    high = np.concatenate([metrics[name] for name in ("best", "champion") if name in metrics]
-                          or [low])  # fmt: skip
-    low, high = low[np.isfinite(low)], high[np.isfinite(high)]
-    if not low.size or not high.size:
-        return
-    bottom, top = float(np.percentile(low, 5)), float(high.max())
-    # The worst few may lie below the frame only if they would take most of it.
-    if top - low.min() < 2.0 * (top - bottom):
-        bottom = float(low.min())
-    margin = 0.06 * (top - bottom) or 0.1 * max(abs(top), 1e-3)
-    axes.set_ylim(bottom - margin, top + margin)
-
-
-def plot_trajectory(
-    trajectory: Any, surface_height: float = 0.0, title: str = "", body: int = 1
-) -> Figure:
-    """Draws the way a robot swam, from above and from the side.
+def plot_trajectory(trajectory: Any, surface_height: float = 0.0, title: str = "") -> Figure:
+    """Draws the way a robot swam, see `plot_way`.
 
     Args:
         trajectory: has `time` `[T]` [s] and `xpos` `[T, nbody, 3]`, world frame [m].
         surface_height: of the water [m].
         title: a line above the picture.
-        body: the body to follow; 1 is the robot's root.
+
+    Returns:
+        The figure.
+    """
+    time, path = np.asarray(trajectory.time, float), np.asarray(trajectory.xpos, float)[:, 1]
+    return plot_way(time, path, surface_height, title)
+
+
+def plot_way(
+    seconds: np.ndarray, path: np.ndarray, surface_height: float = 0.0, title: str = ""
+) -> Figure:
+    """Draws the way a robot swam, from above and from the side.
+
+    Args:
+        seconds: `[T]` [s].
+        path: `[T, 3]` of the core, world frame [m].
+        surface_height: of the water [m].
+        title: a line above the picture.
 
     Returns:
         The figure: paths from above and from the side, coloured by time, and depth and speed over
         time.
     """
-    seconds = np.asarray(trajectory.time, float)
-    path = np.asarray(trajectory.xpos, float)[:, body]
-    figure = new_figure(9.0, 6.6)
+    figure = new_figure(WIDE, 6.6)
     outer = figure.add_gridspec(2, 1, height_ratios=(1.7, 1.0))
     paths = outer[0].subgridspec(1, 2)
     curves = outer[1].subgridspec(1, 2)
@@ -287,11 +281,9 @@ def plot_trajectory(
     _widen(depth, surface_height - path[:, 2], least=0.1)
     depth.invert_yaxis()
     if len(seconds) > 2:
-        velocity = np.gradient(path, seconds, axis=0)
-        draw_curve(speed, seconds, np.linalg.norm(velocity, axis=1), color="#b9c6cf",
-                   linewidth=0.8, label="momentary")  # fmt: skip
-        window, smooth = _smooth_velocity(path, seconds)
-        draw_curve(speed, window, np.linalg.norm(smooth, axis=1), color=_ORANGE, linewidth=1.8,
+        momentary = np.linalg.norm(np.gradient(path, seconds, axis=0), axis=1)
+        draw_curve(speed, seconds, momentary, color="#b9c6cf", linewidth=0.8, label="momentary")
+        draw_curve(speed, seconds, speed_over(seconds, path), color=_ORANGE, linewidth=1.8,
                    label="over 1 s")  # fmt: skip
         legend_above(speed)
     speed.set(xlabel="time (s)", ylabel="speed (m/s)")
@@ -347,11 +339,3 @@ def _widen(axes: Axes, values: np.ndarray, least: float) -> None:
     low, high = float(np.min(values)), float(np.max(values))
     half = max((high - low) * 0.56, least / 2)
     axes.set_ylim((low + high) / 2 - half, (low + high) / 2 + half)
-
-
-def _smooth_velocity(path: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement over one second (or all there is), at the middle of that second."""
-    step = float(np.median(np.diff(seconds)))
-    lag = int(np.clip(round(1.0 / step), 1, len(path) - 1))
-    velocity = (path[lag:] - path[:-lag]) / (seconds[lag:] - seconds[:-lag])[:, None]
-    return (seconds[lag:] + seconds[:-lag]) / 2, velocity

@@ -23,12 +23,10 @@ from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 from mjx_revolve.view import plots
-from mjx_revolve.view.report import appendix as report_appendix
-from mjx_revolve.view.report import motion as report_motion
+from mjx_revolve.view.report import champion_pictures, run_pictures, tables
 from mjx_revolve.view.report import page as report_page
-from mjx_revolve.view.report import plots as report_plots
 from mjx_revolve.view.report import repeat as report_repeat
-from mjx_revolve.view.report.champion import cpg_phases, judge, path_of, replay_champion
+from mjx_revolve.view.report.champion import cpg_phases, replay_champion
 from mjx_revolve.view.report.data import read_metrics, read_run
 from mjx_revolve.view.report.groups import (
     differences,
@@ -94,13 +92,14 @@ def lab(tmp_path_factory):
     config = load_config(folder / "swim.yaml")
     fitness = make_fitness(config)
     trajectory = fitness.replay(GENES, replay_key(0))
-    score, measures = judge(fitness, trajectory, replay_key(0))
+    score, measures = fitness.judge(trajectory, replay_key(0))
     for seed in range(3):
         make_run(folder / f"s{seed}", config, fitness, seed, score=score)
     record = read_run(folder / "s0")
     assert record.problems == []
     return {"folder": folder, "config": config, "fitness": fitness, "score": score,
-            "measures": measures, "replay": replay_champion(record, fitness)}  # fmt: skip
+            "measures": measures, "trajectory": trajectory,
+            "replay": replay_champion(record, fitness)}  # fmt: skip
 
 
 @pytest.fixture
@@ -115,8 +114,8 @@ def copy(lab, tmp_path, monkeypatch):
 @pytest.fixture
 def quick(lab, monkeypatch):
     """Reports that compile nothing: all runs have the same robot."""
-    monkeypatch.setattr("mjx_revolve.episodes.fitness.make_fitness", lambda config: lab["fitness"])
-    monkeypatch.setattr("mjx_revolve.view.report.sections._swim_jpeg", lambda replay: b"\xff\xd8")
+    monkeypatch.setattr("mjx_revolve.view.report.page.make_fitness", lambda config: lab["fitness"])
+    monkeypatch.setattr("mjx_revolve.view.report.page._swim_jpeg", lambda replay: b"\xff\xd8")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
 
 
@@ -300,7 +299,7 @@ def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
     assert record.genes is not None
     if "metrics" in text and record.metrics:  # whatever is left makes pictures
         (group,) = group_runs([record])
-        assert plots.figure_svg(report_plots.plot_seeds(group)).startswith(b"<?xml")
+        assert plots.figure_svg(run_pictures.plot_seeds(group)).startswith(b"<?xml")
         assert plots.figure_svg(plots.plot_fitness(record.metrics)).startswith(b"<?xml")
 
 
@@ -402,8 +401,8 @@ def axes_of(figure):
 
 
 def test_joint_angles_are_those_of_the_joints(lab):
-    first, second = axes_of(report_motion.plot_joints(lab["replay"]))
-    trajectory = lab["replay"].episode.trajectory
+    first, second = axes_of(champion_pictures.plot_joints(lab["replay"].motion))
+    trajectory = lab["trajectory"]
     assert first.get_title(loc="left") == "shoulder"
     assert np.allclose(first.lines[1].get_ydata(), np.degrees(trajectory.qpos[:, 7]))
     assert np.allclose(second.lines[0].get_ydata(), np.degrees(trajectory.ctrl[:, 1]))
@@ -412,19 +411,19 @@ def test_joint_angles_are_those_of_the_joints(lab):
 
 def test_power_adds_up(lab):
     replay = lab["replay"]
-    power, energy, cost = axes_of(report_motion.plot_energy(replay))
+    power, energy, cost = axes_of(champion_pictures.plot_energy(replay.motion))
     assert [axes.get_ylabel() for axes in (power, energy, cost)] == [
         "power (W)", "energy so far (J)", "cost of transport (–)",
     ]  # fmt: skip
-    seconds = replay.episode.trajectory.time[-1]
-    total = float(np.mean(replay.episode.trajectory.power)) * float(seconds)
+    trajectory = lab["trajectory"]
+    total = float(np.mean(trajectory.power)) * float(trajectory.time[-1])
     assert energy.lines[0].get_ydata()[-1] == pytest.approx(total, rel=1e-4)
     final = float(cost.get_title(loc="left").split()[0])
     assert final == pytest.approx(replay.measures["cost_of_transport"], rel=0.01)
 
 
 def test_phases_and_thrusters(lab):
-    phases = axes_of(report_motion.plot_phases(lab["replay"]))
+    phases = axes_of(champion_pictures.plot_phases(lab["replay"].motion))
     assert phases[0].images[0].get_array().shape == (2, 200)
     assert phases[0].images[0].get_cmap().name == "twilight"  # a circle: 0 and 2π look the same
     from types import SimpleNamespace
@@ -433,9 +432,8 @@ def test_phases_and_thrusters(lab):
     command = np.sin(40 * time)[:, None]
     model = SimpleNamespace(actuator=lambda i: SimpleNamespace(name="bow"))
     robot = SimpleNamespace(thrusters=(0,), mj_model=model)
-    trajectory = SimpleNamespace(time=time, ctrl=command, command=0.5 * command)
-    replay = SimpleNamespace(episode=SimpleNamespace(robot=robot, trajectory=trajectory))
-    (axes,) = axes_of(report_motion.plot_thrusters(replay))
+    motion = SimpleNamespace(robot=robot, time=time, commands=command, lagged=0.5 * command)
+    (axes,) = axes_of(champion_pictures.plot_thrusters(motion))
     assert np.ptp(axes.lines[0].get_xdata()) < 2.0  # the last of many swings
     assert np.ptp(axes.lines[1].get_ydata()) == pytest.approx(1.0, abs=0.05)
 
@@ -451,12 +449,12 @@ def test_comparison_of_very_different_lengths(lab, tmp_path):
             made.append(read_run(folder))
     groups = group_runs(made)
     styles = {group.name: k for k, group in enumerate(groups)}
-    left, right = axes_of(report_plots.plot_comparison(groups, styles))
+    left, right = axes_of(run_pictures.plot_comparison(groups, styles))
     assert left.get_xscale() == "log"
     assert np.allclose(left.lines[0].get_ydata(), np.mean(groups[0].curve("champion")[1], axis=0))
     assert [tick.get_text() for tick in right.get_xticklabels()] == ["A", "B"]
     (same,) = group_runs(made[:3])
-    left, _ = axes_of(report_plots.plot_comparison([same], {same.name: 0}))
+    left, _ = axes_of(run_pictures.plot_comparison([same], {same.name: 0}))
     assert left.get_xscale() == "linear"
 
 
@@ -470,8 +468,8 @@ def test_searches_in_which_everything_fails_make_pictures(lab, tmp_path):
     assert other.problems == []
     for records in ([one], [other], [one, other]):
         groups = group_runs(records)
-        axes_of(report_plots.plot_comparison(groups, {group.name: 0 for group in groups}))
-        axes_of(report_plots.plot_seeds(groups[0]))
+        axes_of(run_pictures.plot_comparison(groups, {group.name: 0 for group in groups}))
+        axes_of(run_pictures.plot_seeds(groups[0]))
         axes_of(plots.plot_fitness(records[-1].metrics))
 
 
@@ -485,11 +483,11 @@ def test_long_episodes_make_small_pictures():
 
 
 def test_champions_start_at_one_place(lab):
-    replay = lab["replay"]
-    figure = report_plots.plot_champions([("one", 0, [replay, replay, replay]), ("b", 1, [replay])])
+    motion = lab["replay"].motion
+    figure = run_pictures.plot_champions([("one", 0, [motion] * 3), ("b", 1, [motion])])
     above, side, away = axes_of(figure)
     assert np.allclose(above.lines[0].get_xydata()[0], 0)
-    way = path_of(replay)[1]
+    way = np.asarray(lab["trajectory"].xpos)[:, 1]
     distance = np.linalg.norm(way - way[0], axis=1)
     assert np.allclose(away.lines[0].get_ydata(), distance)
     assert side.get_ylabel() == "z (m)"
@@ -497,8 +495,8 @@ def test_champions_start_at_one_place(lab):
 
 @pytest.mark.parametrize(("index", "text"), [(0, "A"), (25, "Z"), (26, "AA"), (52, "BA")])
 def test_letters_never_run_out(index, text):
-    assert report_plots.letter(index) == text
-    assert set(report_plots.style_of(index)) == {"color", "linestyle"}
+    assert run_pictures.letter(index) == text
+    assert set(run_pictures.style_of(index)) == {"color", "linestyle"}
 
 
 def test_side_views_look_across_the_way():
@@ -522,10 +520,15 @@ def test_pictures_are_the_same_bytes_twice():
 
 def test_modules_are_counted_and_weighed():
     elbow = read(ELBOW)
-    page = report_appendix.module_table(elbow)
+    rows, foot = tables.count_modules(elbow)
+    modules = tables.list_modules(elbow)
+    robot = {"heading": "elbow", "rows": rows, "foot": foot, "modules": modules}
+    page = report_page.sections.robots([robot])
     assert '<td class="left">FixedBrick</td><td>2</td><td>10.2</td><td>20.4</td>' in page
     assert f"<td>{1e3 * elbow.mass:.4g}</td>" in page
     assert "41 × 41 × 35.5" in page
+    assert [row[1] for row in modules] == [module.name for module in elbow.modules]
+    assert all(f'<td class="left">{module.name}</td>' in page for module in elbow.modules)
 
 
 def test_the_commands_give_the_same_settings(lab, copy):
@@ -600,10 +603,27 @@ class Page(HTMLParser):
 
 
 def test_text_is_escaped():
-    inside = report_page.table(["<a>\n<b>"], [["<script>"]]) + report_page.listing('"<pre>&')
-    box = report_page.problem_box([("<run>", "", ["<img>"])], True)
-    page = Page(report_page.make_page("<t>", box, [("x", "<h>", inside), ("y", "none", "")], "<f>"))
-    for text in ("<script>", '"<pre>&', "<run>", "<img>", "<t>", "<h>", "<f>", "<a>", "<b>"):
+    from types import SimpleNamespace
+
+    sections = report_page.sections
+    inside = sections.table(["<a>\n<b>"], [["<script>"]]) + sections.listing('"<pre>&')
+    problem = SimpleNamespace(text="<img>")
+    run = SimpleNamespace(label="<run>", state="damaged", problems=[problem])
+    box = sections.problems([run], ["<lost>"], True)
+    content = [("x", "<h>", inside), ("y", "none", " ")]
+    page = Page(report_page.make_page("<t>", "<w>", box, content))
+    for text in (
+        "<script>",
+        '"<pre>&',
+        "<run>",
+        "<img>",
+        "<t>",
+        "<h>",
+        "<w>",
+        "<a>",
+        "<b>",
+        "<lost>",
+    ):
         assert text in page.words
     assert "none" not in page.text
 
@@ -703,7 +723,7 @@ def test_a_full_disk_is_one_line(copy, quick, capsys, monkeypatch):
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr(runs, "write_atomic", full)
+    monkeypatch.setattr(report, "write_atomic", full)
     assert run_main("run", "--out", "page.html") == 1
     assert capsys.readouterr().err == "error: page.html: No space left on device\n"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,14 +15,8 @@ import pytest
 from laboratory import WATER, body, world
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.swim_picture import (
-    choose_poses,
-    draw_swim,
-    plot_swim,
-    pose_scene,
-    smooth_path,
-    stroke_period,
-)
+from mjx_revolve.view.plots import figure_png
+from mjx_revolve.view.swim_picture import plot_swim, pose_scene
 
 PERIOD, SPEED, SECONDS = 0.8, 0.05, 6.0
 TIME = np.arange(0.02, SECONDS + 1e-9, 0.02)
@@ -35,13 +30,17 @@ def swim(robot, heading=0.0, depth=1.0, speed=SPEED):
     qpos[:, 2] = -depth
     beat = np.sin(2 * np.pi * TIME / PERIOD)
     qpos[:, 7:] = 0.5 * beat[:, None]
-    return SimpleNamespace(time=TIME, qpos=qpos)
+    return trajectory(robot, TIME, qpos)
 
 
-def draw(robot, trajectory, path):
-    """`[900, 1600, 3]` what `draw_swim` wrote, from 0 to 1."""
-    draw_swim(robot, trajectory, path)
-    return matplotlib.image.imread(path)[..., :3]
+def trajectory(robot, time, qpos):
+    ctrl = np.zeros((len(time), robot.mj_model.nu))
+    return SimpleNamespace(time=time, qpos=qpos, ctrl=ctrl, power=0 * time, command=None)
+
+
+def draw(robot, trajectory):
+    """`[900, 1600, 3]` the page, from 0 to 1."""
+    return matplotlib.image.imread(io.BytesIO(figure_png(plot_swim(robot, trajectory))))[..., :3]
 
 
 def words(figure):
@@ -62,59 +61,6 @@ def small():
 
 
 # ------------------------------------------------------------------ what is shown
-
-
-def test_poses_are_spread_over_the_way():
-    path = np.zeros((len(TIME), 3))
-    path[:, 0] = SPEED * TIME
-    # 0.3 m are ten lengths of 3 cm: six poses at equal times, the two ends among them.
-    rows = choose_poses(TIME, path, 0.03)
-    assert rows[0] == 0
-    assert rows[-1] == len(TIME) - 1
-    assert len(rows) == 6
-    assert np.ptp(np.diff(rows)) <= 1
-    # Of 0.3 m, at least 0.55 lengths of 0.2 m between neighbours: three, 0.15 m apart.
-    assert len(choose_poses(TIME, path, 0.2)) == 3
-    # Two alone may be closer, and who stays is shown once, at the end.
-    assert len(choose_poses(TIME, path, 0.7)) == 2
-    assert choose_poses(TIME, path, 2.0) == [len(TIME) - 1]
-
-
-def test_poses_that_come_back_are_told_apart():
-    """Out and back: at no two times shown is the robot in one place."""
-    path = np.zeros((len(TIME), 3))
-    path[:, 0] = np.interp(TIME, [0, SECONDS / 2, SECONDS], [0, 0.5, 0.2])
-    rows = choose_poses(TIME, path, 0.2)
-    x = path[rows, 0]
-    assert np.diff(np.sort(x)).min() >= 0.35 * 0.2
-
-
-@pytest.mark.parametrize("period", [0.4, 0.8, 1.1])
-def test_period_of_a_stroke(period):
-    phase = 2 * np.pi * TIME[:, None] / period
-    angles = np.column_stack([np.sin(phase), 0.3 * np.sin(2 * phase + 1), 0 * phase])
-    assert stroke_period(TIME, 0.5 * angles) == pytest.approx(period, rel=0.02)
-
-
-def test_no_period_where_nothing_repeats():
-    draw = np.random.default_rng(0)
-    assert stroke_period(TIME, np.zeros((len(TIME), 2))) is None
-    assert stroke_period(TIME, np.zeros((len(TIME), 0))) is None
-    assert stroke_period(TIME, 0.3 * draw.normal(size=(len(TIME), 2))) is None
-    assert stroke_period(TIME, 0.1 * TIME[:, None]) is None  # a drift
-    assert stroke_period(TIME[:10], np.sin(20 * TIME[:10, None])) is None  # too short to say
-
-
-def test_smooth_path_takes_out_the_strokes_alone():
-    path = np.zeros((len(TIME), 3))
-    path[:, 0] = SPEED * TIME
-    swaying = path.copy()
-    swaying[:, 1] = 0.01 * np.sin(2 * np.pi * TIME / PERIOD)
-    assert smooth_path(TIME, path, PERIOD) == pytest.approx(path, abs=1e-12)
-    inner = slice(20, -20)  # half a stroke from the ends
-    assert np.abs(smooth_path(TIME, swaying, PERIOD)[inner, 1]).max() < 5e-4
-    # The ends stay where they are.
-    assert smooth_path(TIME, swaying, PERIOD)[[0, -1]] == pytest.approx(swaying[[0, -1]])
 
 
 def test_parts_stand_where_mujoco_has_them(elbow):
@@ -144,32 +90,40 @@ def test_the_page_says_how_fast_and_how_far(elbow, figure):
     assert f"elbow: {SPEED / elbow.morphology.length:.2g} body lengths/s (0.05 m/s)" in said
     assert f"{net:.2g} m ({net / elbow.morphology.length:.2g} body lengths) in 5.98 s" in said
     assert "One stroke of 0.80 s, seen by a camera that follows the core" in said
-    assert "depth" in said  # 1 m down: a scale, and no surface
+    assert "depth 1.00 m" in said  # and no surface
     assert "water surface" not in said
+
+
+@pytest.mark.slow
+def test_getting_under_way_does_not_count(small):
+    """Twice as fast after two seconds: the page says how fast from then on, as the scores do."""
+    late = swim(small)
+    late.qpos[:, 0] += SPEED * np.maximum(TIME - 2.0, 0)
+    said = " | ".join(words(plot_swim(small, late, counted_from=2.0)))
+    assert f"core: {2 * SPEED / small.morphology.length:.2g} body lengths/s (0.1 m/s)" in said
+    assert "0.4 m" in said and "in 4 s, after the first 2 s" in said
 
 
 @pytest.mark.slow
 def test_the_surface_is_named_where_it_is_in_sight(small):
     said = words(plot_swim(small, swim(small, depth=0.02)))
     assert "water surface" in said
-    assert "depth" not in said
+    assert not any("depth" in word for word in said)
 
 
 @pytest.mark.slow
-def test_the_picture_is_whole_and_always_the_same(small, tmp_path):
-    image = draw(small, swim(small), tmp_path / "a.png")
-    assert image.shape == (900, 1600, 3)
-    draw_swim(small, swim(small), tmp_path / "b.png")
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "b.png"]
+def test_the_picture_is_whole_and_always_the_same(small):
+    assert draw(small, swim(small)).shape == (900, 1600, 3)
+    first, second = (figure_png(plot_swim(small, swim(small))) for _ in range(2))
+    assert first == second
 
 
 @pytest.mark.parametrize("heading", [0.0, pytest.param(2.0, marks=pytest.mark.slow)])
-def test_the_robot_is_inside_the_frame_whichever_way_it_swims(small, tmp_path, heading):
+def test_the_robot_is_inside_the_frame_whichever_way_it_swims(small, heading):
     """Bright red: nothing else on the page is, so its pixels are the robot's."""
     modules = tuple(replace(m, rgb=(1.0, 0.0, 0.0)) for m in small.morphology.modules)
     red = build_robot(replace(small.morphology, modules=modules), small.world)
-    image = draw(red, swim(red, heading), tmp_path / "swim.png")
+    image = draw(red, swim(red, heading))
     hot = (image[..., 0] > 0.45) & (image[..., 1:].max(-1) < 0.3)
     rows, columns = np.nonzero(hot)
     assert len(rows) > 300
@@ -183,10 +137,11 @@ def test_the_robot_is_inside_the_frame_whichever_way_it_swims(small, tmp_path, h
 
 
 @pytest.mark.slow
-def test_a_robot_that_stays_is_drawn_once(small, tmp_path):
+def test_a_robot_that_stays_is_drawn_once(small):
     still = swim(small, speed=0.0)
     said = words(plot_swim(small, still))
-    assert [w for w in said if w.endswith(" s") and w[0].isdigit() and " " not in w[:-2]] == ["6 s"]
+    # The last pose alone, and how deep; the strip says when with a sign or two decimals.
+    assert [w for w in said if w[0].isdigit() and "depth" in w] == ["6 s\ndepth 1.00 m"]
     assert "core: 0 body lengths/s (0 m/s)" in said
 
 
@@ -194,12 +149,12 @@ def test_a_robot_that_stays_is_drawn_once(small, tmp_path):
 def test_rows_after_the_first_that_is_not_finite_are_left_out(small):
     broken = swim(small)
     broken.qpos[150:] = np.nan
-    short = SimpleNamespace(time=TIME[:150], qpos=broken.qpos[:150])
+    short = trajectory(small, TIME[:150], broken.qpos[:150])
     assert words(plot_swim(small, broken)) == words(plot_swim(small, short))
 
 
 def test_a_single_row_is_a_portrait(elbow):
-    said = words(plot_swim(elbow, SimpleNamespace(time=TIME[:1], qpos=swim(elbow).qpos[:1])))
+    said = words(plot_swim(elbow, trajectory(elbow, TIME[:1], swim(elbow).qpos[:1])))
     assert "elbow" in said  # a name without a speed
 
 
@@ -231,19 +186,3 @@ def test_wrong_trajectories(elbow, fields, message):
     with pytest.raises(InputError) as caught:
         plot_swim(elbow, wrong(elbow, **fields))
     assert str(caught.value) == message
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("swim.jpg", "{}/swim.jpg: expected a name that ends in .png; found '.jpg'"),
-        ("no/swim.png", "{0}/no/swim.png: expected the folder {0}/no to exist; found none"),
-        ("folder.png", "{}/folder.png: expected a file; found a folder"),
-    ],
-)
-def test_wrong_paths(elbow, tmp_path, name, message):
-    (tmp_path / "folder.png").mkdir()
-    with pytest.raises(InputError) as caught:
-        draw_swim(elbow, swim(elbow), tmp_path / name)
-    assert str(caught.value) == message.format(tmp_path)
-    assert [p.name for p in tmp_path.iterdir()] == ["folder.png"]

@@ -19,8 +19,8 @@ from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view import page_data as page_data_module
-from mjx_revolve.view.course import speed_over
 from mjx_revolve.view.forces import module_forces, sum_modules
+from mjx_revolve.view.motion import speed_over
 from mjx_revolve.view.page_data import page_data
 from mjx_revolve.view.swim_picture import pose_scene
 from mjx_revolve.view.viewer import make_page, write_viewer

@@ -12,10 +12,10 @@ import numpy as np
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
-from mjx_revolve.view.course import bed_at, finite_part, nearer_signs, pose_robot, speed_over
+from mjx_revolve.view.course import bed_at, finite_part, nearer_signs, pose_robot
 from mjx_revolve.view.film.camera import Shots, plan_shots
 from mjx_revolve.view.forces import water_at
-from mjx_revolve.view.swim_picture import smooth_path, stroke_period
+from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
 from mjx_revolve.water.flow import Water
 
 

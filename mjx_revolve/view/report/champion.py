@@ -1,4 +1,4 @@
-"""What a run's champion does: one episode, its score, its forces of work, its oscillators."""
+"""What a run's champion does: one episode, its score and measures, its oscillators."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.episodes.champion import Episode
+from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.fitness import Fitness
-from mjx_revolve.episodes.scoring import first_counted, judge_tracks, replay_key
+from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.report.data import RunRecord, number
+from mjx_revolve.view.motion import Motion, analyse_motion, count_finite, counted_time
+from mjx_revolve.view.report.record import RunRecord, number
 
 # A replay further than this from the recorded mean is another swim: standard deviations over the
 # fresh starts, and a share of the score itself where those hardly differ.
@@ -28,38 +29,14 @@ class Replay:
     """A champion's episode.
 
     Attributes:
-        episode: the episode; its trajectory ends before the first row that is not finite.
+        motion: what it did, up to the first row that is not finite.
         score: of this episode; NaN where it blew up.
         measures: of this episode, as in `metrics.csv`.
-        counted_from: when counting starts: at the first record behind the settling time [s].
-        phases: `[T, nhinge]` phase of each oscillator of a CPG [rad], 0 when its target passes the
-            middle upwards; None for other controllers.
     """
 
-    episode: Episode
+    motion: Motion
     score: float
     measures: dict[str, float]
-    counted_from: float
-    phases: np.ndarray | None = None
-
-    @property
-    def weight(self) -> float:
-        """Of the robot in air [N]."""
-        robot = self.episode.robot
-        return robot.morphology.mass * max(robot.world.gravity, 1e-9)
-
-
-def path_of(replay: Replay) -> tuple[np.ndarray, np.ndarray]:
-    """The way of the core.
-
-    Args:
-        replay: the episode.
-
-    Returns:
-        `[T]` times [s] and `[T, 3]` places, world frame [m].
-    """
-    trajectory = replay.episode.trajectory
-    return np.asarray(trajectory.time, float), np.asarray(trajectory.xpos, float)[:, 1]
 
 
 def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
@@ -82,32 +59,18 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
             f"champion/genes.yaml: genes: expected {fitness.num_genes}, as config.yaml has it; "
             f"found {len(record.genes)}"
         )
-    task = fitness.config.task
     key = replay_key(record.config.evolution.seed)
-    whole: Trajectory = jax.tree.map(np.asarray, fitness.replay(record.genes, key))
-    score, measures = judge(fitness, whole, key)
-    finite = np.isfinite(np.asarray(whole.qpos)).all(axis=1)
-    count = len(finite) if finite.all() else int(finite.argmin())
+    trajectory: Trajectory = jax.tree.map(np.asarray, fitness.replay(record.genes, key))
+    score, measures = fitness.judge(trajectory, key)
+    count = count_finite(trajectory.qpos)
     if count < 2:
         raise InputError("the champion's replay is not finite from its first step on")
-    if count < len(finite):
-        record.note("changed", f"the replay blows up after {float(whole.time[count]):.3g} s")
-    trajectory = jax.tree.map(lambda x: x[:count], whole)
-    phases = cpg_phases(fitness, record.genes, count) if has_phases(fitness) else None
-    episode = Episode(
-        title=f"{fitness.robot.morphology.name}: {task.name.replace('_', ' ')}",
-        robot=fitness.robot,
-        trajectory=trajectory,
-        score=number(record.champion.get("score")),
-        score_unit=record.unit,
-        genes=record.genes,
-        fitness=fitness,
-        folder=record.folder,
-    )
+    if count < len(trajectory.qpos):
+        record.note("changed", f"the replay blows up after {float(trajectory.time[count]):.3g} s")
     _compare(record, score)
-    interval = fitness.record_every * fitness.robot.world.timestep
-    start = interval * (1 + first_counted(fitness.config.task, fitness.robot.world.timestep))
-    return Replay(episode, score, measures, start, phases)
+    phases = cpg_phases(fitness, record.genes, count) if has_phases(fitness) else None
+    begin = counted_time(fitness.config.task, fitness.robot.world.timestep)
+    return Replay(analyse_motion(fitness.robot, trajectory, begin, phases), score, measures)
 
 
 def has_phases(fitness: Fitness) -> bool:
@@ -130,48 +93,6 @@ def _compare(record: RunRecord, score: float) -> None:
         )
 
 
-def judge(
-    fitness: Fitness, trajectory: Trajectory, key: jax.Array
-) -> tuple[float, dict[str, float]]:
-    """Scores one episode, as evolution does, from its trajectory.
-
-    Args:
-        fitness: the task.
-        trajectory: from `fitness.replay(genes, key)`, whole.
-        key: which start.
-
-    Returns:
-        The score, NaN where the rollout blew up, and the measures.
-    """
-    every, records = fitness.record_every, fitness.num_records
-    position = np.asarray(trajectory.xpos)[every - 1 :: every, 1][:records]
-    work = np.asarray(trajectory.power) * fitness.robot.world.timestep
-    energy = work.reshape(records, every).sum(1)
-    score, measures = _judge(fitness)(position, energy, fitness.starts(key)[0][2, :1])
-    return float(score[0]), {name: float(value[0]) for name, value in measures.items()}
-
-
-@lru_cache(maxsize=8)
-def _judge(fitness: Fitness) -> Any:
-    """The task and the measures of one lane, compiled once for all runs of a configuration."""
-    task, world, robot = fitness.config.task, fitness.robot.world, fitness.robot
-
-    def run(position: jax.Array, energy: jax.Array, start_height: jax.Array) -> Any:
-        body = robot.morphology
-        return judge_tracks(
-            task,
-            fitness.task,
-            world,
-            position[..., None],
-            energy[:, None],
-            start_height,
-            body.length,
-            body.mass * max(world.gravity, 1e-9),
-        )
-
-    return jax.jit(run)
-
-
 def cpg_phases(fitness: Fitness, genes: np.ndarray, steps: int) -> np.ndarray:
     """Phases of the oscillators, which a trajectory does not hold.
 
@@ -191,18 +112,17 @@ def cpg_phases(fitness: Fitness, genes: np.ndarray, steps: int) -> np.ndarray:
 @lru_cache(maxsize=8)
 def _oscillators(fitness: Fitness, steps: int) -> Any:
     """The states of all oscillators, `[steps, nhinge]` each, from genes."""
-    robot, controller = fitness.robot, fitness.controller
-    order = np.array([*robot.servos, *robot.thrusters], int)
+    controller, plant = fitness.controller, plant_of(fitness.robot)
     blind: Any = None  # oscillators sense nothing
 
     def run(genes: jax.Array) -> Any:
-        parameters = controller.decode(genes[:, None], order)
+        parameters = controller.decode(genes[:, None], plant)
 
         def step(state: Any, time: jax.Array) -> tuple[Any, Any]:
             state, _ = controller.step(parameters, state, time, blind)
             return state, (state[0][:, 0], state[1][:, 0])
 
-        times = robot.world.timestep * jnp.arange(steps, dtype=genes.dtype)
+        times = plant.timestep * jnp.arange(steps, dtype=genes.dtype)
         return jax.lax.scan(step, controller.init(parameters), times)[1]
 
     return jax.jit(run)

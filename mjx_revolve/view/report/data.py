@@ -10,11 +10,10 @@ import csv
 import importlib.metadata
 import io
 import json
-import math
 import re
 import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,137 +23,12 @@ from pydantic import BaseModel
 import mjx_revolve
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import Config, make_config
-from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.evolution.runs import Run
 from mjx_revolve.inputs.errors import InputError, load_yaml
-from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.view.report.record import Problem, RunRecord
 
 # Whose version decides what a replay gives.
 _PACKAGES = ("mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax")
-# Kinds of problems, gravest first, and what they make of the run.
-KINDS = {
-    "damaged": "damaged",
-    "missing": "incomplete",
-    "unfinished": "not finished",
-    "version": "of another version",
-    "changed": "changed",
-    "copy": "a copy",
-}
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Something that is wrong with a run folder.
-
-    Attributes:
-        kind: one of `KINDS`.
-        text: one line for a reader.
-    """
-
-    kind: str
-    text: str
-
-
-@dataclass
-class RunRecord:
-    """What could be read of a run.
-
-    Attributes:
-        folder: the run folder.
-        label: what the report calls it.
-        info: `run.json`; empty where there is none.
-        settings: `config.yaml` as plain values; empty where there is none.
-        config: the same, checked; None where it cannot be used.
-        metrics: columns of `metrics.csv`, `[T]` each, one row per generation; empty without any.
-        genes: `[G]` of the champion; None without one.
-        champion: facts about it: score, score_std, origin, final, measures.
-        stand_in: where the genes are from, if they are not the champion's own.
-        problems: what is missing, damaged or otherwise to be known.
-    """
-
-    folder: Path
-    label: str
-    info: dict[str, Any] = field(default_factory=dict)
-    settings: dict[str, Any] = field(default_factory=dict)
-    config: Config | None = None
-    metrics: dict[str, np.ndarray] = field(default_factory=dict)
-    genes: np.ndarray | None = None
-    champion: dict[str, Any] = field(default_factory=dict)
-    stand_in: str = ""
-    problems: list[Problem] = field(default_factory=list)
-
-    def note(self, kind: str, text: str) -> None:
-        """Adds a problem; what it says of the folder is said once."""
-        problem = Problem(kind, text.replace(f"{self.folder}/", ""))
-        if problem not in self.problems:
-            self.problems.append(problem)
-
-    def setting(self, path: str, default: Any = None) -> Any:
-        """A setting by its dotted name; the default where nothing is known."""
-        data: Any = self.settings if self.config is None else self.config.model_dump()
-        for part in path.split("."):
-            data = data.get(part) if isinstance(data, Mapping) else None
-        return default if data is None else data
-
-    @property
-    def seed(self) -> int | None:
-        """The seed, or None."""
-        seed = self.setting("evolution.seed", self.info.get("seed"))
-        return seed if isinstance(seed, int) else None
-
-    @property
-    def task(self) -> str:
-        """The task's type; a user's own by what its file holds; "" where it is not known."""
-        return content_name(self._task_type)
-
-    @property
-    def unit(self) -> str:
-        """Of the fitness; "" where it is not known."""
-        return score_unit(self._task_type)
-
-    @property
-    def _task_type(self) -> str:
-        task = self.setting("task.type", "")
-        return task if isinstance(task, str) else ""
-
-    @property
-    def generations(self) -> int:
-        """How many generations the metrics have."""
-        return int(self.metrics["generation"][-1]) if self.metrics else 0
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether its champion was judged on fresh starts."""
-        return "finished" in self.info and number(self.champion.get("score")) is not None
-
-    @property
-    def state(self) -> str:
-        """What the problems make of it, in words; "" for a sound run."""
-        kinds = {problem.kind for problem in self.problems}
-        words = [word for kind, word in KINDS.items() if kind in kinds]
-        return ", ".join(words)
-
-    @property
-    def warning(self) -> str:
-        """One line about all problems."""
-        return f"{self.label}: {self.state}: {'; '.join(p.text for p in self.problems)}"
-
-
-def number(value: Any) -> float | None:
-    """A finite number, or None.
-
-    Args:
-        value: anything.
-
-    Returns:
-        The number as a float.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        return float(value) if math.isfinite(value) else None
-    except OverflowError:  # a whole number of hundreds of digits
-        return None
 
 
 def read_run(folder: str | Path) -> RunRecord:
@@ -179,7 +53,9 @@ def read_run(folder: str | Path) -> RunRecord:
     record = RunRecord(path.absolute(), label)
     _read_info(record)
     _read_config(record)
-    _read_metrics(record)
+    record.metrics, problems = read_metrics(record.folder / "metrics.csv")
+    for problem in problems:
+        record.note(problem.kind, problem.text)
     _read_champion(record)
     _check_end(record)
     _check_versions(record)
@@ -190,14 +66,45 @@ def read_run(folder: str | Path) -> RunRecord:
     return record
 
 
+def read_runs(names: Sequence[str]) -> tuple[list[RunRecord], list[str]]:
+    """Reads several runs.
+
+    Args:
+        names: of their folders.
+
+    Returns:
+        The runs, and a line about each folder of which nothing could be read.
+
+    Raises:
+        InputError: a folder is missing or named twice, or nothing can be read of any.
+    """
+    records: list[RunRecord] = []
+    lost: list[str] = []
+    seen: dict[Path, str] = {}
+    for name in names:
+        try:
+            record = read_run(name)
+        except InputError as error:
+            if not Path(name).is_dir():  # a slip of the finger rather than a damaged run
+                raise
+            lost.append(str(error))
+            continue
+        place = record.folder.resolve()
+        if place in seen:
+            raise InputError(f"{name}: expected each run once; found it as {seen[place]}, too")
+        seen[place] = name
+        records.append(record)
+    if not records:
+        raise InputError(lost[0])
+    return records, lost
+
+
 def _read_info(record: RunRecord) -> None:
     if not (record.folder / "run.json").is_file():
         record.note("missing", "run.json is missing: versions, machine and times are not known")
         return
-    try:
+    with record.noting_damage():
         record.info = Run(record.folder).info
-    except InputError as error:
-        record.note("damaged", str(error))
 
 
 # --- the configuration ----------------------------------------------------------------------------
@@ -227,36 +134,30 @@ def _read_config(record: RunRecord) -> None:
     if not path.is_file():
         record.note("missing", "config.yaml is missing: neither settings nor a replay")
         return
-    try:
+    data: Any = None
+    with record.noting_damage():
         data = load_yaml(path)
-    except InputError as error:
-        record.note("damaged", str(error))
+        if not isinstance(data, dict) or not data:
+            raise InputError("config.yaml: expected a mapping of settings; found something else")
+        record.settings = data
+    if not record.settings:
         return
-    if not isinstance(data, dict) or not data:
-        record.note("damaged", "config.yaml: expected a mapping of settings; found something else")
-        return
-    record.settings = data
     known, unknown = _split_unknown(data)
     if unknown:
-        record.note(
-            "version",
-            f"config.yaml: this version does not know {', '.join(unknown)}; read without",
-        )
+        names = ", ".join(unknown)
+        record.note("version", f"config.yaml: this version does not know {names}; read without")
     try:
         record.config = make_config(known, record.folder, source=str(path))
     except InputError as error:
         spare = record.folder / "champion" / "morphology.yaml"
-        lost = "morphology: expected a file; found none" in str(error)
-        if lost and spare.is_file():
-            record.note("missing", f"{known['morphology']} is missing: champion/morphology.yaml "
-                        "stands in for it")  # fmt: skip
-            try:
-                spared = {**known, "morphology": str(spare), "trim": "none"}
-                record.config = make_config(spared, record.folder, source=str(path))
-            except InputError as second:
-                record.note("damaged", str(second))
-        else:
+        if "morphology: expected a file; found none" not in str(error) or not spare.is_file():
             record.note("missing" if "found none" in str(error) else "damaged", str(error))
+            return
+        record.note("missing", f"{known['morphology']} is missing: champion/morphology.yaml "
+                    "stands in for it")  # fmt: skip
+        with record.noting_damage():
+            spared = {**known, "morphology": str(spare), "trim": "none"}
+            record.config = make_config(spared, record.folder, source=str(path))
 
 
 # --- the metrics ----------------------------------------------------------------------------------
@@ -276,12 +177,10 @@ def read_metrics(path: Path) -> tuple[dict[str, np.ndarray], list[Problem]]:
         return {}, [Problem("missing", f"{path.name} is missing: no convergence")]
     try:
         text = path.read_bytes().decode(errors="replace")
-    except OSError as error:
-        return {}, [Problem("damaged", f"{path.name}: cannot be read: {error.strerror}")]
-    problems = []
-    try:
         # A last line without an end is being written, or was cut there.
         lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))
+    except OSError as error:
+        return {}, [Problem("damaged", f"{path.name}: cannot be read: {error.strerror}")]
     except csv.Error as error:
         return {}, [Problem("damaged", f"{path.name}: expected a CSV file; found: {error}")]
     if not text.strip("\0 \r\n"):
@@ -291,8 +190,8 @@ def read_metrics(path: Path) -> tuple[dict[str, np.ndarray], list[Problem]]:
         return {}, [Problem("damaged", f"{path.name}: expected a header with a column generation; "
                             f"found {str(header)[:60]}")]  # fmt: skip
     rows: dict[float, list[float]] = {}
-    bad = 0
     place = header.index("generation")
+    bad = 0
     for line in lines[1:]:
         try:
             row = [float(cell) for cell in line]
@@ -302,6 +201,7 @@ def read_metrics(path: Path) -> tuple[dict[str, np.ndarray], list[Problem]]:
             rows[row[place]] = row  # of two, the later one is the resumed run's
         else:
             bad += 1
+    problems = []
     if bad:
         what = "line is" if bad == 1 else "lines are"
         problems.append(Problem("damaged", f"{path.name}: {bad} {what} damaged and left out"))
@@ -313,13 +213,7 @@ def read_metrics(path: Path) -> tuple[dict[str, np.ndarray], list[Problem]]:
     if len(table) != last:
         gap = f"{last - len(table)} of {last} generations are not in it"
         problems.append(Problem("damaged", f"{path.name}: {gap}"))
-    return {name: table[:, k] for k, name in enumerate(header)}, problems
-
-
-def _read_metrics(record: RunRecord) -> None:
-    record.metrics, problems = read_metrics(record.folder / "metrics.csv")
-    for problem in problems:
-        record.note(problem.kind, problem.text)
+    return dict(zip(header, table.T, strict=True)), problems
 
 
 # --- the champion ---------------------------------------------------------------------------------
@@ -332,15 +226,12 @@ def _read_champion(record: RunRecord) -> None:
     if not path.is_file():
         record.note("missing", "champion/genes.yaml is missing")
     else:
-        try:
+        with record.noting_damage():
             genes = load_genes(path)
             if not genes.size or not np.isfinite(genes).all():
                 raise InputError(f"{path}: genes: expected finite numbers; found others")
             record.genes = genes
-            facts = load_yaml(path)
-            record.champion = {key: facts[key] for key in facts if key != "genes"}
-        except (InputError, OverflowError) as error:
-            record.note("damaged", str(error))
+            record.champion = {k: fact for k, fact in load_yaml(path).items() if k != "genes"}
     judged = record.info.get("champion")
     if isinstance(judged, dict):  # the same facts, and there even where genes.yaml is not
         record.champion = record.champion | judged
@@ -396,6 +287,15 @@ def _check_end(record: RunRecord) -> None:
                     "champion is not judged on fresh starts")  # fmt: skip
 
 
+def _version(package: str) -> str:
+    """Of a package here; "" where it is not installed, as a checkout of ours need not be."""
+    if package == "mjx_revolve":
+        return mjx_revolve.__version__
+    with suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(package)
+    return ""
+
+
 def _numbers(version: str) -> list[int]:
     return [int(part) for part in re.findall(r"\d+", version)]
 
@@ -409,16 +309,8 @@ def _check_versions(record: RunRecord) -> None:
         return
     found = []
     for name in _PACKAGES:
-        before = versions.get(name)
-        try:
-            now = (
-                mjx_revolve.__version__
-                if name == "mjx_revolve"
-                else importlib.metadata.version(name)
-            )
-        except importlib.metadata.PackageNotFoundError:
-            continue
-        if isinstance(before, str) and before != now:
+        before, now = versions.get(name), _version(name)
+        if isinstance(before, str) and now and before != now:
             age = "older" if _numbers(before) < _numbers(now) else "newer"
             found.append(f"{age} {name} {before} (here {now})")
     if found:

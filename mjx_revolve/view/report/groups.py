@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
+from scipy import stats
 
 from mjx_revolve.evolution.fingerprints import hash_text
 from mjx_revolve.inputs.own_code import content_name, parse_own
-from mjx_revolve.view.report.data import RunRecord, number
+from mjx_revolve.view.report.record import RunRecord, number
 
 # Settings that do not make it another configuration: they only say how it is kept.
 _KEEPING = ("checkpoint_every", "keep_checkpoints", "tensorboard")
@@ -26,13 +27,12 @@ LEVEL = 0.95  # of all confidence intervals
 _LABEL = 56  # longest name of a group in a legend [characters]
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """A mean over seeds and how sure it is.
 
     Attributes:
         mean: of the finite values; NaN without any.
-        half: half width of its confidence interval, Student's t; NaN below two values.
+        half: half width of its confidence interval; NaN below two values.
         count: how many values.
     """
 
@@ -54,18 +54,13 @@ def mean_interval(values: Any) -> Interval:
         Numbers, or `[T]` each.
     """
     x = np.asarray(values, float)
-    finite = np.isfinite(x)
-    count = finite.sum(axis=0)
-    total = np.where(finite, x, 0.0).sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = total / count
-        square = np.where(finite, (x - mean) ** 2, 0.0).sum(axis=0)
-        freedom = np.maximum(count - 1, 1)
-        half = student.ppf(0.5 + LEVEL / 2, freedom) * np.sqrt(square / freedom / count)
-        half = np.where(count > 1, half, np.nan)
-    if x.ndim == 1:
-        return Interval(float(mean), float(half), int(count))
-    return Interval(mean, half, count)
+    x = np.where(np.isfinite(x), x, np.nan)
+    count = np.isfinite(x).sum(axis=0)
+    with warnings.catch_warnings():  # of columns with too few values: NaN is the answer
+        warnings.simplefilter("ignore")
+        mean, error = np.nanmean(x, axis=0), stats.sem(x, axis=0, nan_policy="omit")
+        half = np.asarray(stats.t.ppf(0.5 + LEVEL / 2, count - 1) * error)
+    return Interval(mean[()], half[()], count[()])
 
 
 def mean_difference(values: Any, others: Any) -> Interval:
@@ -83,17 +78,21 @@ def mean_difference(values: Any, others: Any) -> Interval:
     a, b = (np.asarray(x, float)[np.isfinite(x)] for x in (values, others))
     count = min(len(a), len(b))
     if not count:
-        return Interval(float("nan"), float("nan"), 0)
+        return Interval(np.nan, np.nan, 0)
     difference = float(a.mean() - b.mean())
-    if count < 2:
-        return Interval(difference, float("nan"), count)
-    u, v = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
-    if u + v == 0.0:
+    if count > 1 and not np.ptp(a) and not np.ptp(b):
         return Interval(difference, 0.0, count)
-    freedom = (u + v) ** 2 / (u**2 / (len(a) - 1) + v**2 / (len(b) - 1))
-    return Interval(
-        difference, float(student.ppf(0.5 + LEVEL / 2, freedom) * np.sqrt(u + v)), count
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        welch = stats.ttest_ind(a, b, equal_var=False).confidence_interval(LEVEL)
+    return Interval(difference, float(welch.high - welch.low) / 2, count)
+
+
+def quantiles(values: np.ndarray, shares: Sequence[float]) -> np.ndarray:
+    """Quantiles `[q, T]` of values `[n, T]` over the seeds; NaN where there is no finite value."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return np.nanquantile(np.where(np.isfinite(values), values, np.nan), shares, axis=0)
 
 
 def format_interval(interval: Interval) -> str:
@@ -174,6 +173,14 @@ class Group:
         """Scores of the champions that were judged on fresh starts."""
         found = [number(r.champion.get("score")) for r in self.records if r.is_finished]
         return [score for score in found if score is not None]
+
+    def best_after(self, generations: int) -> list[float]:
+        """The best so far that each run had after so many generations, if it has got there."""
+        early = [
+            r.metrics["champion"][r.metrics["generation"] <= generations]
+            for r in self.shown if "champion" in r.metrics
+        ]  # fmt: skip
+        return [float(values[-1]) for values in early if len(values)]
 
     def best(self) -> RunRecord:
         """The run with the best champion: judged ones first, else by the best so far."""

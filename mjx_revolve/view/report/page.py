@@ -1,202 +1,306 @@
-"""The page of a report: one HTML file that needs nothing else, for screens, phones and printers."""
+"""The page of a report: numbers, tables and pictures of runs, put into the templates beside this.
+
+Words and markup are in `sections.html`, a function for each section, and `page.html`, their frame.
+"""
 
 from __future__ import annotations
 
 import base64
-import html
-from collections.abc import Iterable, Sequence
+import datetime
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
-_STYLE = """
-:root { color-scheme: light; --ink: #1d2a33; --soft: #5b6a75; --line: #d9dfe3; --pale: #f4f7f9; }
-* { box-sizing: border-box; }
-body { margin: 0; color: var(--ink); background: #fff; line-height: 1.5;
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "Noto Sans", Helvetica, Arial, sans-serif; }
-main { max-width: 1080px; margin: 0 auto; padding: 1.5rem 1.25rem 4rem; }
-h1 { font-size: 1.75rem; line-height: 1.2; margin: .5rem 0 .25rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.25rem; margin: 2.6rem 0 .75rem; padding-bottom: .3rem;
-  border-bottom: 2px solid var(--line); overflow-wrap: anywhere; }
-h3 { font-size: 1.02rem; margin: 1.6rem 0 .5rem; overflow-wrap: anywhere; }
-p { margin: .5rem 0; max-width: 75ch; }
-.soft, figcaption { color: var(--soft); font-size: .875rem; }
-nav { margin: 1rem 0 0; font-size: .9rem; } nav a { margin-right: 1.1rem; white-space: nowrap; }
-a { color: #0b5c94; }
-.figures { display: flex; flex-wrap: wrap; gap: .8rem 1.4rem; margin: 1rem 0; }
-.figures div b { display: block; font-size: 1.35rem; font-weight: 600; line-height: 1.25; }
-.figures div { min-width: 8.5rem; }
-.box { border: 1px solid #d9a400; border-left: 6px solid #e69f00; background: #fff9ea;
-  border-radius: 4px; padding: .7rem 1rem; margin: 1.2rem 0; overflow-wrap: anywhere; }
-.box h2 { border: 0; margin: 0 0 .3rem; padding: 0; font-size: 1.05rem; }
-.box ul { margin: .2rem 0 .5rem; padding-left: 1.3rem; }
-.scroll { overflow-x: auto; margin: .8rem 0; }
-table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .32rem .6rem; text-align: right; border-bottom: 1px solid var(--line);
-  vertical-align: top; white-space: nowrap; }
-th { font-weight: 600; white-space: normal; vertical-align: bottom;
-  border-bottom: 1.5px solid var(--ink); }
-th small { display: block; font-weight: 400; color: var(--soft); }
-.left { text-align: left; } td.wrap { white-space: normal; min-width: 11rem; }
-tfoot td { border-top: 1.5px solid var(--ink); border-bottom: 0; font-weight: 600; }
-.swatch { display: inline-block; width: .8em; height: .8em; border-radius: 2px;
-  margin-right: .45em; vertical-align: -.05em; }
-figure { margin: 1.1rem 0 1.6rem; break-inside: avoid; }
-figure .scroll { margin: 0; } figure img { display: block; width: 100%; min-width: 640px; }
-figcaption { margin-top: .35rem; max-width: 85ch; }
-pre { background: var(--pale); border: 1px solid var(--line); border-radius: 4px; margin: .4rem 0;
-  padding: .6rem .8rem; font: .85rem/1.45 ui-monospace, "SF Mono", Menlo, Consolas, monospace;
-  overflow-x: auto; }
-pre.command { user-select: all; white-space: pre-wrap; overflow-wrap: anywhere; }
-details { margin: .6rem 0; } summary { cursor: pointer; color: #0b5c94; }
-footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: .6rem; }
-@media (max-width: 600px) { main { padding: 1rem .9rem 3rem; } h1 { font-size: 1.4rem; } }
-@media print { @page { margin: 14mm; } body { font-size: 10.5pt; } main { max-width: none;
-  padding: 0; } nav, details:not([open]) { display: none; } figure img { min-width: 0; }
-  h2, h3 { break-after: avoid; } tr, .box { break-inside: avoid; } .scroll { overflow: visible; }
-  th, td { white-space: normal; padding: .2rem .45rem; } a { color: inherit; } }
-"""
-GENERATOR = "mjx_revolve.report"
+import jinja2
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from mjx_revolve import __version__
+from mjx_revolve.body.morphology import Morphology, load_morphology
+from mjx_revolve.episodes.fitness import make_fitness
+from mjx_revolve.episodes.scoring import REPORT_EPISODES
+from mjx_revolve.evolution.fingerprints import model_hash
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.plots import COLORS, figure_svg, plot_fitness, plot_way
+from mjx_revolve.view.report import champion_pictures, run_pictures, tables
+from mjx_revolve.view.report.champion import Replay, replay_champion
+from mjx_revolve.view.report.groups import Group, group_runs
+from mjx_revolve.view.report.record import RunRecord
+from mjx_revolve.view.report.repeat import environment, repeat_commands, sources
+from mjx_revolve.view.swim_picture import draw_motion
+
+GENERATOR = "mjx_revolve.report"  # tells our pages from others
 
 
-def escape(text: object) -> str:
-    """Text for HTML, quotes included."""
-    return html.escape(str(text), quote=True)
+def _make_templates() -> jinja2.Environment:
+    """The templates beside this file; all that is put into them is escaped."""
+    templates = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    templates.filters["digits"] = tables.format_number
+    templates.filters["letter"] = run_pictures.letter
+    templates.filters["color"] = lambda index: COLORS[index % len(COLORS)]
+    templates.globals["episodes"] = REPORT_EPISODES
+    return templates
 
 
-def picture(data: bytes, kind: str, alt: str, caption: str) -> str:
-    """A picture inside the page.
-
-    Args:
-        data: the file's bytes.
-        kind: "svg+xml", "png" or "jpeg".
-        alt: what it shows, for those who cannot see it.
-        caption: below it.
-
-    Returns:
-        HTML.
-    """
-    text = base64.b64encode(data).decode()
-    return (
-        f'<figure><div class="scroll"><img alt="{escape(alt)}" '
-        f'src="data:image/{kind};base64,{text}"></div>'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
+_TEMPLATES = _make_templates()
+# Its macros, each a function from values to HTML.
+sections: Any = _TEMPLATES.get_template("sections.html").module
 
 
-class Cell(str):
-    """A cell that is HTML already."""
-
-
-def table(
-    header: Sequence[str],
-    rows: Iterable[Sequence[object]],
-    left: Sequence[int] = (0,),
-    foot: Sequence[object] | None = None,
-    wrap: Sequence[int] = (),
+def make_report(
+    records: Sequence[RunRecord], lost: Sequence[str] = (), every_champion: bool = False
 ) -> str:
-    """A table.
+    """Makes the page.
 
     Args:
-        header: names of the columns; what follows a line break is small: the unit.
-        rows: the cells; text is escaped, a `Cell` is not.
-        left: columns set to the left.
-        foot: a last row that sums up.
-        wrap: columns with words that may break.
+        records: the runs, from `read_run`; problems that show only now are added to theirs.
+        lost: lines about folders of which nothing could be read.
+        every_champion: whether each run's champion is shown in full.
 
     Returns:
-        HTML.
+        A complete HTML document that needs no other file.
     """
-
-    def cell(tag: str, value: object, k: int) -> str:
-        classes = ["left"] * (k in left) + ["wrap"] * (k in wrap and tag == "td")
-        text = value if isinstance(value, Cell) else escape(value)
-        attribute = f' class="{" ".join(classes)}"' if classes else ""
-        return f"<{tag}{attribute}>{text}</{tag}>"
-
-    def head(text: str) -> Cell:
-        name, _, unit = text.partition("\n")
-        return Cell(escape(name) + (f"<small>{escape(unit)}</small>" if unit else ""))
-
-    def line(tag: str, values: Iterable[object]) -> str:
-        return "<tr>" + "".join(cell(tag, value, k) for k, value in enumerate(values)) + "</tr>"
-
-    body = "".join(line("td", row) for row in rows)
-    last = f"<tfoot>{line('td', foot)}</tfoot>" if foot is not None else ""
-    return (
-        f'<div class="scroll"><table><thead>{line("th", map(head, header))}</thead>'
-        f"<tbody>{body}</tbody>{last}</table></div>"
-    )
-
-
-def figures(pairs: Iterable[tuple[str, str]]) -> str:
-    """A few important numbers, large, each before what it is."""
-    return (
-        '<div class="figures">'
-        + "".join(f"<div><b>{escape(value)}</b>{escape(name)}</div>" for value, name in pairs)
-        + "</div>"
-    )
-
-
-def fold(summary: str, inside: str, is_open: bool = False) -> str:
-    """Something long that opens on a click; printers leave it out while it is closed."""
-    attribute = " open" if is_open else ""
-    return f"<details{attribute}><summary>{escape(summary)}</summary>{inside}</details>"
-
-
-def listing(text: str, command: bool = False) -> str:
-    """Text as it is; one click selects all of a command."""
-    attribute = ' class="command"' if command else ""
-    return f"<pre{attribute}>{escape(text)}</pre>"
-
-
-def problem_box(runs: Sequence[tuple[str, str, Sequence[str]]], is_grave: bool) -> str:
-    """A box about what is wrong with the runs.
-
-    Args:
-        runs: for each its name, what its problems make of it, and the problems.
-        is_grave: whether something could not be read.
-
-    Returns:
-        HTML; "" without problems.
-    """
-    if not runs:
-        return ""
-    parts = [
-        f"<p><b>{escape(name)}</b>{escape(': ' + state if state else '')}</p><ul>"
-        + "".join(f"<li>{escape(problem)}</li>" for problem in problems)
-        + "</ul>"
-        for name, state, problems in runs
+    groups = group_runs(records)
+    replays, robots = _replay(groups)
+    first, single = records[0], len(records) == 1
+    if single:
+        robot = f"{robots[0][1].name}: " if robots else ""
+        title = f"{robot}{first.task.replace('_', ' ') or 'evolution'} ({Path(first.label).name})"
+    else:
+        title = f"{len(records)} runs"
+        title += f" of {groups[0].name}" if len(groups) == 1 else f", {len(groups)} configurations"
+    content = [
+        ("results", "Results", _results(groups)),
+        ("convergence", "Convergence", _convergence(groups)),
+        ("champions", "Champions side by side", _side_by_side(groups, replays)),
+        *_champions(groups, replays, every_champion),
+        ("robot", "Robot", _robots(robots)),
+        ("runs", "Runs", "" if single else sections.runs(*tables.runs_table(groups))),
+        ("repeat", "Repeat it", _repeat(groups)),
     ]
-    heading = "<h2>Worth knowing</h2>"
-    if is_grave:
-        heading = "<h2>Not everything could be read</h2><p>The report shows what is left.</p>"
-    return f'<section class="box" role="alert">{heading}{"".join(parts)}</section>'
+    kinds = {problem.kind for record in records for problem in record.problems}
+    is_grave = bool(lost) or bool(kinds & {"damaged", "missing"})
+    lead = sections.headline(tables.headline(groups))
+    lead += sections.problems([record for record in records if record.problems], lost, is_grave)
+    return make_page(title, ", ".join(record.label for record in records), lead, content)
 
 
-def make_page(title: str, lead: str, sections: Sequence[tuple[str, str, str]], foot: str) -> str:
-    """The whole page.
+def make_page(title: str, words: str, lead: str, content: Sequence[tuple[str, str, str]]) -> str:
+    """The frame around the sections.
 
     Args:
-        title: of the page, plain text.
-        lead: HTML below the title.
-        sections: anchor, heading and HTML of each.
-        foot: plain text at the end.
+        title: of the page.
+        words: below the title.
+        lead: HTML below that.
+        content: anchor, heading and HTML of each section; those without HTML are left out.
 
     Returns:
         A complete HTML document.
     """
-    shown = [section for section in sections if section[2]]
-    links = " ".join(
-        f'<a href="#{anchor}">{escape(name.partition(":")[0].partition(",")[0])}</a>'
-        for anchor, name, _ in shown
-    )
-    body = "".join(
-        f'<section id="{anchor}"><h2>{escape(name)}</h2>{content}</section>'
-        for anchor, name, content in shown
-    )
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta name="generator" content="{GENERATOR}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{_STYLE}</style></head>"
-        f"<body><main><header><h1>{escape(title)}</h1>{lead}<nav>{links}</nav></header>{body}"
-        f'<footer class="soft"><p>{escape(foot)}</p></footer></main></body></html>\n'
-    )
+    now = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    return _TEMPLATES.get_template("page.html").render(
+        generator=GENERATOR, title=title, words=words, lead=lead,
+        sections=[section for section in content if section[2].strip()],
+        foot=f"Made by mjx_revolve {__version__}, {now}.",
+    )  # fmt: skip
+
+
+# --- what the champions do ------------------------------------------------------------------------
+
+
+def _replay(
+    groups: Sequence[Group],
+) -> tuple[dict[Path, Replay], list[tuple[str, Morphology]]]:
+    """All champions' episodes by run folder, and the robots of the groups."""
+    replays: dict[Path, Replay] = {}
+    robots: list[tuple[str, Morphology]] = []
+    for group in groups:
+        fitness = None
+        for record in (*group.records, *group.copies):
+            if record.config is None:
+                continue
+            try:
+                # The seed is all that differs within a group, and the fitness does not know it.
+                fitness = make_fitness(record.config) if fitness is None else fitness
+                known = record.info.get("model_hash")
+                if isinstance(known, str) and known != model_hash(fitness):
+                    record.note("version", "the robot or its world is built differently by this "
+                                "version than when it evolved: the replay may differ")  # fmt: skip
+                if record.genes is not None:
+                    replays[record.folder] = replay_champion(record, fitness)
+            except InputError as error:
+                record.note("damaged", f"no replay: {error}")
+        if fitness is not None:
+            robots.append((group.name, fitness.robot.morphology))
+        else:
+            robots += _robot_alone(group)
+    return replays, robots
+
+
+def _robot_alone(group: Group) -> list[tuple[str, Morphology]]:
+    """The body that a run left behind, where its configuration cannot be used."""
+    for record in group.records:
+        path = record.folder / "champion" / "morphology.yaml"
+        if path.is_file():
+            try:
+                return [(group.name, load_morphology(path, allow_overlap=True))]
+            except InputError as error:
+                record.note("damaged", str(error))
+    return []
+
+
+def _champions(
+    groups: Sequence[Group], replays: Mapping[Path, Replay], every: bool
+) -> list[tuple[str, str, str]]:
+    """A section for each champion that is shown in full."""
+    found = []
+    for k, group in enumerate(groups):
+        best = group.best()
+        if best.folder not in replays:  # another seed's, rather than none
+            best = next((r for r in group.records if r.folder in replays), best)
+        for record in group.records:
+            if record is not best and not every:
+                continue
+            heading = "Champion"
+            if len(groups) > 1:
+                heading += f" of {run_pictures.letter(k)}, {group.name}"
+            if len(group.records) > 1:
+                heading += f": {'the best, ' if record is best else ''}seed {record.seed}"
+            replay = replays.get(record.folder)
+            content = _saved_pictures(record) if replay is None else _champion(record, replay)
+            found.append((f"champion-{k}-{record.seed}", heading, content))
+    return found
+
+
+def _champion(record: RunRecord, replay: Replay) -> str:
+    """All about one champion."""
+    motion = replay.motion
+    robot = motion.robot
+    drawn = {
+        "way": plot_way(motion.time, motion.path, float(robot.world.surface_height)),
+        "joints": champion_pictures.plot_joints(motion) if robot.num_hinges else None,
+        "phases": None if motion.phases is None else champion_pictures.plot_phases(motion),
+        "thrusters": champion_pictures.plot_thrusters(motion) if robot.num_thrusters else None,
+        "energy": champion_pictures.plot_energy(motion),
+    }
+    pictures = {name: figure and _svg(figure) for name, figure in drawn.items()}
+    pictures["swim"] = _source(_swim_jpeg(replay), "jpeg")
+    origin = record.stand_in or record.champion.get("origin")
+    return sections.champion(
+        robot.morphology.name, float(motion.time[-1]), motion.counted_from,
+        origin if isinstance(origin, str) else "", tables.measures_table(record, replay), pictures,
+    )  # fmt: skip
+
+
+def _swim_jpeg(replay: Replay) -> bytes:
+    """The swim picture as a JPEG, a quarter of the PNG's size."""
+    figure = draw_motion(replay.motion)
+    figure.canvas.draw()
+    pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "JPEG", quality=90, subsampling=0)
+    return buffer.getvalue()
+
+
+def _saved_pictures(record: RunRecord) -> str:
+    """Pictures that a run left behind, where its champion cannot be replayed."""
+    found = []
+    for name in ("swim.png", "trajectory.png"):
+        path = record.folder / name
+        data = path.read_bytes() if path.is_file() else b""
+        if data.startswith(b"\x89PNG") and data.rstrip().endswith(b"IEND\xaeB`\x82"):
+            found.append((name, _source(data, "png")))
+    return sections.saved_pictures(found)
+
+
+def _source(data: bytes, kind: str) -> str:
+    """A picture's bytes as an address that holds them: kind "svg+xml", "png" or "jpeg"."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _svg(figure: Figure) -> str:
+    return _source(figure_svg(figure), "svg+xml")
+
+
+# --- several runs ---------------------------------------------------------------------------------
+
+
+def _results(groups: Sequence[Group]) -> str:
+    """Final scores of all configurations, and in what they differ."""
+    if len(groups) == 1 and len(groups[0].records) == 1:
+        return ""
+    differ = tables.different_settings(groups)
+    return sections.results(tables.task_tables(groups), differ, len(groups))
+
+
+def _convergence(groups: Sequence[Group]) -> str:
+    """How the fitness grew."""
+    styles = {group.name: k for k, group in enumerate(groups)}
+    shown = [group for group in groups if group.shown]
+    comparisons = []
+    for task in dict.fromkeys(group.task for group in shown):
+        members = [group for group in groups if group.task == task]
+        if sum(bool(group.shown) for group in members) > 1 or len(members[0].shown) > 1:
+            comparisons.append(_svg(run_pictures.plot_comparison(members, styles)))
+    entries = []
+    for group in shown:
+        record, several = group.shown[0], len(group.shown) > 1
+        label = f"fitness ({record.unit})" if record.unit else "fitness"
+        quartiles = "lower_quartile" in record.metrics
+        entries.append({
+            "name": group.name,
+            "index": styles[group.name] if len(groups) > 1 else None,
+            "label": record.label,
+            "band": "quartiles" if quartiles else "mean and standard deviation",
+            "seeds": _svg(run_pictures.plot_seeds(group)) if several else None,
+            "fitness": None if several else _svg(plot_fitness(record.metrics, "", label)),
+        })  # fmt: skip
+    return sections.convergence(comparisons, entries)
+
+
+def _side_by_side(groups: Sequence[Group], replays: Mapping[Path, Replay]) -> str:
+    """All champions in one picture, where there are several."""
+    members = [
+        (group.name, k, [replays[r.folder].motion for r in group.records if r.folder in replays])
+        for k, group in enumerate(groups)
+    ]
+    members = [member for member in members if member[2]]
+    if sum(len(found) for *_, found in members) < 2:
+        return ""
+    return sections.side_by_side(_svg(run_pictures.plot_champions(members)))
+
+
+# --- the end --------------------------------------------------------------------------------------
+
+
+def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
+    """The robots, each once."""
+    entries: list[dict[str, Any]] = []
+    seen: list[Morphology] = []
+    for name, morphology in found:
+        if any(morphology == other for other in seen):
+            continue
+        seen.append(morphology)
+        counts = f"{morphology.num_modules} modules, {morphology.num_hinges} hinges"
+        if morphology.num_thrusters:
+            counts += f", {morphology.num_thrusters} thrusters"
+        heading = f"{morphology.name}: {counts}"
+        heading += f" ({name})" if len({m.name for _, m in found}) > 1 else ""
+        rows, foot = tables.count_modules(morphology)
+        modules = tables.list_modules(morphology)
+        entries.append({"heading": heading, "rows": rows, "foot": foot, "modules": modules})
+    return sections.robots(entries)
+
+
+def _repeat(groups: Sequence[Group]) -> str:
+    """How to get the same runs again."""
+    return sections.repeat([
+        {"label": record.label, "seed": record.seed, "commands": repeat_commands(record),
+         "environment": environment(record), "sources": sources(record)}
+        for group in groups for record in group.records
+    ])  # fmt: skip

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any
+
+import yaml
 
 from mjx_revolve.episodes.config import Config, load_config
+from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.own_code import content_name
-from mjx_revolve.view.report.data import RunRecord
+from mjx_revolve.view.report.record import RunRecord
 
 # Set to 1 by the command itself where nobody sets them.
 _THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -60,7 +61,7 @@ def _started(record: RunRecord) -> list[str] | None:
         return None
     try:
         config = load_config(file, settings)
-        if _content(config) != _content(record.config):
+        if not _is_same(config, record.config):
             return None
     except (InputError, OSError):
         return None
@@ -74,26 +75,24 @@ def _started(record: RunRecord) -> list[str] | None:
     return words
 
 
-def _content(config: Config) -> dict[str, Any]:
-    """All settings; files by what they hold, because a run has copies of its own."""
-    data = config.model_dump()
-    data["morphology"] = Path(config.morphology).read_bytes()
-    for section in ("controller", "task"):
-        data[section]["type"] = content_name(data[section]["type"])
-    if isinstance(data["world"], str):
-        data["world"] = {"name": data["world"]}
-    return data
+def _is_same(config: Config, other: Config) -> bool:
+    """Whether all settings are; files by what they hold, because a run has copies of its own."""
+    return (
+        settings_hash(config) == settings_hash(other)
+        and config.evolution == other.evolution
+        and _held(config) == _held(other)
+    )
+
+
+def _held(config: Config) -> list[bytes | str | None]:
+    """What is in the files that a configuration names, or the names of what is no file."""
+    world = config.world if isinstance(config.world, str) else config.world["name"]
+    names = (config.morphology, config.modules, world)
+    return [Path(n).read_bytes() if n is not None and Path(n).is_file() else n for n in names]
 
 
 def environment(record: RunRecord) -> list[tuple[str, str]]:
-    """What the bits of a run depend on beside its settings.
-
-    Args:
-        record: the run.
-
-    Returns:
-        Names and values, as far as `run.json` knows them.
-    """
+    """What a run's bits depend on beside its settings, as far as `run.json` says: name, value."""
     info = record.info
     rows: list[tuple[str, str]] = []
     versions = info.get("versions")
@@ -117,3 +116,21 @@ def environment(record: RunRecord) -> list[tuple[str, str]]:
         after = [str(entry.get("generation")) for entry in resumed if isinstance(entry, dict)]
         rows.append(("resumed after generation", ", ".join(after)))
     return rows
+
+
+def sources(record: RunRecord) -> list[tuple[str, str]]:
+    """Configuration, robot and genes of a run as text, so that the page alone is enough.
+
+    Each with what it is called.
+    """
+    found = []
+    if record.settings and (record.folder / "config.yaml").is_file():
+        found.append(record.folder / "config.yaml")
+    if record.config is not None and Path(record.config.morphology).is_file():
+        found.append(Path(record.config.morphology))
+    texts = [(path.name, path.read_text(errors="replace")) for path in found]
+    if record.genes is not None:
+        data = {"genes": [float(gene) for gene in record.genes]}
+        genes = yaml.safe_dump(data, default_flow_style=None, width=90)
+        texts.append(("The champion's genes", genes))
+    return texts

@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from mjx_revolve.view.plots import COLORS, dress, new_figure
-from mjx_revolve.view.report.champion import Replay, path_of
-from mjx_revolve.view.report.groups import Group, mean_interval
+from mjx_revolve.view.motion import Motion
+from mjx_revolve.view.plots import COLORS, WIDE, dress, head, limit_to_most, new_figure
+from mjx_revolve.view.report.groups import Group, mean_interval, quantiles
 
 _INK, _PALE = "#222222", "#9aaab5"
 _BLUE, _ORANGE = COLORS[:2]
@@ -24,33 +24,17 @@ _DASHES: tuple[str | tuple, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6,
 _LOG_FROM = 5.0
 # The interval of two seeds is wider than any page: t(0.975, 1) is 12.7.
 _BAND_FROM = 3
-_WIDE = 9.0  # of all figures [inches]
 
 
 def style_of(index: int) -> dict[str, Any]:
-    """Colour and dash of a group: colours first, then other dashes.
-
-    Args:
-        index: which group.
-
-    Returns:
-        Keyword arguments for a line.
-    """
+    """Colour and dash of a group's lines, by its number: colours first, then other dashes."""
     dash = _DASHES[(index // len(COLORS)) % len(_DASHES)]
     return {"color": COLORS[index % len(COLORS)], "linestyle": dash}
 
 
 def letter(index: int) -> str:
-    """A, B ... Z, AA, AB ...: what tables and pictures call a group.
-
-    Args:
-        index: which group.
-
-    Returns:
-        The letters.
-    """
-    head = letter(index // 26 - 1) if index >= 26 else ""
-    return head + chr(ord("A") + index % 26)
+    """What tables and pictures call a group, by its number: A, B ... Z, AA, AB ..."""
+    return (letter(index // 26 - 1) if index >= 26 else "") + chr(ord("A") + index % 26)
 
 
 def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
@@ -59,10 +43,6 @@ def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     if labels:
         figure.legend(handles, labels, loc="outside lower center", fontsize=8.5, frameon=False,
                       ncols=min(columns, len(labels)))  # fmt: skip
-
-
-def _title(axes: Axes, text: str) -> None:
-    axes.set_title(text, loc="left", fontsize=10, color=_INK)
 
 
 # --- runs -----------------------------------------------------------------------------------------
@@ -79,62 +59,31 @@ def plot_seeds(group: Group) -> Figure:
         seeds the best, the median and the quartiles, as far as all runs reach, and each run as a
         thin line as far as it goes.
     """
-    figure = new_figure(_WIDE, 3.9)
+    figure = new_figure(WIDE, 3.9)
     middle = "median" if all("median" in r.metrics for r in group.shown) else "mean"
     panels = (("champion", "best so far"), (middle, f"population's {middle}"))
-    first: Axes | None = None
-    for k, (column, words) in enumerate(panels):
-        axes = figure.add_subplot(1, 2, k + 1, sharex=first)
-        first = first or axes
+    both = figure.subplots(1, 2, sharex=True)
+    for axes, (column, words) in zip(both, panels, strict=True):
         x, values = group.curve(column)
         for record in group.shown:
             if column in record.metrics:
                 axes.plot(record.metrics["generation"], record.metrics[column], color=_PALE,
                           linewidth=0.7, zorder=1)  # fmt: skip
         if len(x) and np.isfinite(values).any():
-            low, median, high = _quantiles(values)
+            low, median, high, best = quantiles(values, (0.25, 0.5, 0.75, 1.0))
             axes.fill_between(x, low, high, color=_BLUE, alpha=0.2, linewidth=0, label="quartiles")
             axes.plot(x, median, color=_BLUE, linewidth=1.8, label="median")
-            axes.plot(x, _over_seeds(np.nanmax, values), color=_ORANGE, linewidth=1.3, label="best")
+            axes.plot(x, best, color=_ORANGE, linewidth=1.3, label="best")
             axes.plot([], [], color=_PALE, linewidth=0.9, label="each run")
         axes.set_xlabel("generation")
         axes.set_ylabel(f"fitness ({group.unit})" if group.unit else "fitness")
-        _title(axes, f"{words}, over {len(group.shown)} seeds")
+        head(axes, f"{words}, over {len(group.shown)} seeds")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10], nbins=6))
         dress(axes)
-        _frame(axes, [r.metrics[column] for r in group.shown if column in r.metrics])
-    if first is not None:
-        _legend_below(figure, first, 4)
+        curves = [r.metrics[column] for r in group.shown if column in r.metrics]
+        limit_to_most(axes, curves, curves)
+    _legend_below(figure, both[0], 4)
     return figure
-
-
-def _over_seeds(reduce: object, values: np.ndarray) -> np.ndarray:
-    """A statistic of each column that has a finite value; NaN elsewhere."""
-    out = np.full(values.shape[1], np.nan)
-    some = np.isfinite(values).any(axis=0)
-    out[some] = reduce(values[:, some], axis=0)  # type: ignore[operator]
-    return out
-
-
-def _quantiles(values: np.ndarray) -> list[np.ndarray]:
-    return [
-        _over_seeds(lambda x, axis, q=q: np.nanquantile(x, q, axis=axis), values)
-        for q in (0.25, 0.5, 0.75)
-    ]
-
-
-def _frame(axes: Axes, curves: Sequence[np.ndarray]) -> None:
-    """Limits that the first, often terrible, generations do not set."""
-    values = np.concatenate([np.ravel(curve) for curve in curves] or [np.zeros(0)])
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return
-    low, high = float(np.percentile(finite, 2)), float(finite.max())
-    if high - finite.min() < 2.0 * (high - low):
-        low = float(finite.min())
-    margin = 0.07 * (high - low) or 0.1 * max(abs(high), 1e-3)
-    bottom, top = axes.get_ylim()
-    axes.set_ylim(max(bottom, low - margin), min(top, high + margin) if top > high else top)
 
 
 def plot_comparison(groups: Sequence[Group], styles: Mapping[str, int]) -> Figure:
@@ -152,9 +101,8 @@ def plot_comparison(groups: Sequence[Group], styles: Mapping[str, int]) -> Figur
     sizes = {group.settings.get("evolution.population_size") for group in shown}
     known = all("evaluations" in r.metrics for group in shown for r in group.shown)
     over = "evaluations" if len(sizes) > 1 and known else "generation"
-    figure = new_figure(_WIDE, 4.4)
-    grid = figure.add_gridspec(1, 2, width_ratios=(2.3, 1.0))
-    left, right = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+    figure = new_figure(WIDE, 4.4)
+    left, right = figure.subplots(1, 2, width_ratios=(2.3, 1.0))
     ends: list[float] = []
     core: list[np.ndarray] = []
     for group in shown:
@@ -186,9 +134,9 @@ def plot_comparison(groups: Sequence[Group], styles: Mapping[str, int]) -> Figur
     left.set_xlabel(over if over == "generation" else "evaluated individuals")
     unit = shown[0].unit if shown else ""
     left.set_ylabel(f"best fitness so far ({unit})" if unit else "best fitness so far")
-    _title(left, "mean over seeds and 95 % confidence band")
+    head(left, "mean over seeds and 95 % confidence band")
     dress(left)
-    _frame(left, core)
+    limit_to_most(left, core, core)
     _legend_below(figure, left, 2)
     _draw_finals(right, groups, styles)
     right.set_ylabel(f"champion's score ({unit})" if unit else "champion's score")
@@ -212,62 +160,59 @@ def _draw_finals(axes: Axes, groups: Sequence[Group], styles: Mapping[str, int])
                           capsize=4, linewidth=1.6)  # fmt: skip
     axes.set_xticks(range(len(groups)), [letter(styles[group.name]) for group in groups])
     axes.set_xlim(-0.6, len(groups) - 0.4)
-    _title(axes, "final, on fresh starts")
+    head(axes, "final, on fresh starts")
     dress(axes)
     axes.grid(False, axis="x")
 
 
-def plot_champions(replays: Sequence[tuple[str, int, Sequence[Replay]]]) -> Figure:
+def plot_champions(groups: Sequence[tuple[str, int, Sequence[Motion]]]) -> Figure:
     """Draws the champions of several runs beside each other.
 
     Args:
-        replays: for each group its name, the number of its colour, and its champions' episodes.
+        groups: for each group its name, the number of its colour, and what its champions did.
 
     Returns:
         The figure: ways from above and from the side, all from one start, and the distance from
         the start over time, mean over the seeds with its 95 % confidence band.
     """
-    figure = new_figure(_WIDE, 3.7)
-    above, side, away = (figure.add_subplot(1, 3, k + 1) for k in range(3))
-    spans = [
-        np.ptp(path_of(replay)[1][:, :2], axis=0) for *_, members in replays for replay in members
-    ]
+    figure = new_figure(WIDE, 3.7)
+    above, side, away = figure.subplots(1, 3)
+    spans = [np.ptp(motion.path[:, :2], axis=0) for *_, members in groups for motion in members]
     ahead = int(np.argmax(np.max(spans, axis=0)))  # the side on which they get ahead
-    for name, index, members in replays:
+    for name, index, members in groups:
         style = style_of(index)
         curves = []
-        for replay in members:
-            time, path = path_of(replay)
-            way = path - path[0]
+        for motion in members:
+            way = motion.path - motion.path[0]
             thin = np.unique(np.linspace(0, len(way) - 1, min(len(way), 300)).astype(int))
             for axes, j, k in ((above, 0, 1), (side, ahead, 2)):
                 axes.plot(way[thin, j], way[thin, k], linewidth=1.1, alpha=0.8, **style)
                 axes.plot(*way[-1, [j, k]], "s", color=style["color"], markersize=4)
-            curves.append((time, np.linalg.norm(way, axis=1)))
-        count = min(len(time) for time, _ in curves)
-        middle = mean_interval([distance[:count] for _, distance in curves])
-        time = curves[0][0][:count]
+            curves.append(np.linalg.norm(way, axis=1))
+        count = min(map(len, curves))
+        middle = mean_interval([distance[:count] for distance in curves])
+        time = members[0].time[:count]
         away.plot(time, middle.mean, linewidth=1.7,
                   label=f"{letter(index)}: {name}, n = {len(curves)}", **style)  # fmt: skip
         if len(curves) >= _BAND_FROM:
             away.fill_between(time, np.maximum(middle.mean - middle.half, 0),
                               middle.mean + middle.half, color=style["color"], alpha=0.16,
                               linewidth=0)  # fmt: skip
-        for moments, distance in curves:
-            away.plot(moments, distance, linewidth=0.5, alpha=0.5, **style)
+        for motion, distance in zip(members, curves, strict=True):
+            away.plot(motion.time, distance, linewidth=0.5, alpha=0.5, **style)
     panels = ((above, "from above", "x", "y"), (side, "from the side", "xy"[ahead], "z"))
     for axes, words, across, up in panels:
         axes.plot(0, 0, "o", color="white", markeredgecolor=_INK, markersize=7, zorder=5)
         axes.set(xlabel=f"{across} (m)", ylabel=f"{up} (m)")
         axes.locator_params(nbins=5)
         axes.set_aspect("equal", adjustable="datalim")
-        _title(axes, words)
+        head(axes, words)
     away.set(xlabel="time (s)", ylabel="distance from the start (m)")
     away.set_xlim(left=0)
     away.set_ylim(bottom=0)
-    _title(away, "mean and 95 % band")
+    head(away, "mean and 95 % band")
     for axes in (above, side, away):
         dress(axes)
-    if len(replays) > 1:
+    if len(groups) > 1:
         _legend_below(figure, away, 2)
     return figure

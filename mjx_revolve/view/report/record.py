@@ -1,0 +1,142 @@
+"""What is known of a run, and what is wrong with its folder."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.own_code import content_name
+
+# Kinds of problems, gravest first, and what they make of the run.
+KINDS = {
+    "damaged": "damaged",
+    "missing": "incomplete",
+    "unfinished": "not finished",
+    "version": "of another version",
+    "changed": "changed",
+    "copy": "a copy",
+}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that is wrong with a run folder.
+
+    Attributes:
+        kind: one of `KINDS`.
+        text: one line for a reader.
+    """
+
+    kind: str
+    text: str
+
+
+@dataclass
+class RunRecord:
+    """What could be read of a run.
+
+    Attributes:
+        folder: the run folder.
+        label: what the report calls it.
+        info: `run.json`; empty where there is none.
+        settings: `config.yaml` as plain values; empty where there is none.
+        config: the same, checked; None where it cannot be used.
+        metrics: columns of `metrics.csv`, `[T]` each, one row per generation; empty without any.
+        genes: `[G]` of the champion; None without one.
+        champion: facts about it: score, score_std, origin, final, measures.
+        stand_in: where the genes are from, if they are not the champion's own.
+        problems: what is missing, damaged or otherwise to be known.
+    """
+
+    folder: Path
+    label: str
+    info: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    config: Config | None = None
+    metrics: dict[str, np.ndarray] = field(default_factory=dict)
+    genes: np.ndarray | None = None
+    champion: dict[str, Any] = field(default_factory=dict)
+    stand_in: str = ""
+    problems: list[Problem] = field(default_factory=list)
+
+    def note(self, kind: str, text: str) -> None:
+        """Adds a problem; what it says of the folder is said once."""
+        problem = Problem(kind, text.replace(f"{self.folder}/", ""))
+        if problem not in self.problems:
+            self.problems.append(problem)
+
+    @contextmanager
+    def noting_damage(self) -> Iterator[None]:
+        """What cannot be read in here is a problem rather than the end."""
+        try:
+            yield
+        except (InputError, OverflowError) as error:
+            self.note("damaged", str(error))
+
+    def setting(self, path: str, default: Any = None) -> Any:
+        """A setting by its dotted name; the default where nothing is known."""
+        data: Any = self.settings if self.config is None else self.config.model_dump()
+        for part in path.split("."):
+            data = data.get(part) if isinstance(data, Mapping) else None
+        return default if data is None else data
+
+    @property
+    def seed(self) -> int | None:
+        """The seed, or None."""
+        seed = self.setting("evolution.seed", self.info.get("seed"))
+        return seed if isinstance(seed, int) else None
+
+    @property
+    def task(self) -> str:
+        """The task's type; a user's own by what its file holds; "" where it is not known."""
+        return content_name(self._task_type)
+
+    @property
+    def unit(self) -> str:
+        """Of the fitness; "" where it is not known."""
+        return score_unit(self._task_type)
+
+    @property
+    def _task_type(self) -> str:
+        task = self.setting("task.type", "")
+        return task if isinstance(task, str) else ""
+
+    @property
+    def generations(self) -> int:
+        """How many generations the metrics have."""
+        return int(self.metrics["generation"][-1]) if self.metrics else 0
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether its champion was judged on fresh starts."""
+        return "finished" in self.info and number(self.champion.get("score")) is not None
+
+    @property
+    def state(self) -> str:
+        """What the problems make of it, in words; "" for a sound run."""
+        kinds = {problem.kind for problem in self.problems}
+        return ", ".join(word for kind, word in KINDS.items() if kind in kinds)
+
+    @property
+    def warning(self) -> str:
+        """One line about all problems."""
+        return f"{self.label}: {self.state}: {'; '.join(p.text for p in self.problems)}"
+
+
+def number(value: Any) -> float | None:
+    """A finite number as a float; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value) if math.isfinite(value) else None
+    except OverflowError:  # a whole number of hundreds of digits
+        return None

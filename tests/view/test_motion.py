@@ -1,0 +1,186 @@
+"""What a robot did, as plain values: known swims against what the analysis says of them."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mjx_revolve.episodes.config import TaskConfig
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.motion import (
+    analyse_motion,
+    choose_poses,
+    count_finite,
+    counted_time,
+    last_strokes,
+    last_swings,
+    mean_frequency,
+    mean_rate,
+    rms,
+    smooth_path,
+    speed_over,
+    stroke_period,
+    stroke_rows,
+)
+
+PERIOD, SPEED, SECONDS = 0.8, 0.05, 6.0
+TIME = np.arange(0.02, SECONDS + 1e-9, 0.02)
+HEADING = 0.6
+
+
+def episode(robot, time, qpos, **columns):
+    """A trajectory of a robot that is not told anything and needs no power."""
+    still = {"ctrl": np.zeros((len(time), robot.mj_model.nu)), "power": 0 * time, "command": None}
+    return SimpleNamespace(time=time, qpos=qpos, **still | columns)
+
+
+@pytest.fixture(scope="module")
+def sine(elbow):
+    """Straight ahead at one speed and 2 W, hinges beating, 1.5 m deep, from the third second on."""
+    qpos = np.tile(elbow.mj_model.qpos0, (len(TIME), 1))
+    qpos[:, 0], qpos[:, 1] = SPEED * math.cos(HEADING) * TIME, SPEED * math.sin(HEADING) * TIME
+    qpos[:, 2] = -1.5
+    beat = 0.5 * np.sin(2 * np.pi * TIME / PERIOD)
+    qpos[:, 7:] = beat[:, None]
+    ctrl = qpos[:, 7:] + np.array([0.1, -0.2])
+    phases = np.outer(2 * np.pi * TIME / PERIOD, [1, -1])
+    trajectory = episode(elbow, TIME, qpos, ctrl=ctrl, power=np.full(len(TIME), 2.0))
+    return analyse_motion(elbow, trajectory, counted_from=2.0, phases=phases)
+
+
+# ------------------------------------------------------------------ a known swim
+
+
+def test_how_fast_how_far_and_where_to(elbow, sine):
+    assert sine.speed == pytest.approx(SPEED)
+    assert (sine.seconds, sine.distance) == pytest.approx((4.0, 4.0 * SPEED))
+    assert sine.along == pytest.approx([math.cos(HEADING), math.sin(HEADING)])
+    assert sine.depth == pytest.approx(1.5)
+    assert sine.length == elbow.morphology.length
+    assert sine.weight == pytest.approx(9.81 * elbow.morphology.mass)
+    assert speed_over(sine.time, sine.path) == pytest.approx(SPEED)
+
+
+def test_strokes_and_joints(sine):
+    assert sine.period == pytest.approx(PERIOD, rel=0.02)
+    assert rms(sine.angles - sine.targets) == pytest.approx([0.1, 0.2])
+    assert mean_frequency(sine.time, sine.phases) == pytest.approx([1 / PERIOD, -1 / PERIOD])
+    rows = stroke_rows(sine.time, sine.period, 4)
+    assert np.diff(TIME[rows]) == pytest.approx(PERIOD / 4, abs=0.02)
+    assert TIME[rows[0]] == pytest.approx(SECONDS - PERIOD, abs=0.02)
+    assert sine.angles[rows, 0] == pytest.approx(sine.qpos[rows, 7])
+
+
+def test_energy_and_its_cost(sine):
+    assert sine.energy[-1] == pytest.approx(2.0 * SECONDS)
+    assert mean_rate(sine.time, sine.energy) == pytest.approx(2.0)
+    # Power over weight times speed, from where it counts; unknown before, and at its start.
+    assert sine.cost == sine.costs[-1] == pytest.approx(2.0 / (sine.weight * SPEED))
+    assert np.isnan(sine.costs[: sine.first + 1]).all()
+    assert np.isfinite(sine.costs[TIME > 2.5]).all()
+
+
+def test_rows_after_the_first_that_is_not_finite_are_left_out(elbow, sine):
+    qpos = sine.qpos.copy()
+    qpos[150] = np.nan
+    assert count_finite(qpos) == 150
+    short = analyse_motion(elbow, episode(elbow, TIME, qpos))
+    assert {len(short.time), len(short.path), len(short.power), len(short.targets)} == {150}
+    with pytest.raises(InputError, match="expected finite numbers in its first row; found none"):
+        analyse_motion(elbow, episode(elbow, TIME, np.nan * qpos))
+
+
+def test_who_stays_has_no_heading_and_no_speed(elbow):
+    still = np.tile(elbow.mj_model.qpos0, (len(TIME), 1))
+    motion = analyse_motion(elbow, episode(elbow, TIME, still))
+    assert motion.along.tolist() == [1.0, 0.0]
+    assert (motion.speed, motion.period) == (0.0, None)
+    assert motion.poses == [len(TIME) - 1]
+    one = analyse_motion(elbow, episode(elbow, TIME[:1], still[:1]))
+    assert (one.speed, one.poses, one.first) == (0.0, [0], 0)
+
+
+def test_a_task_counts_from_its_first_record():
+    # Records every 0.1 s, the first of them one interval late: 2.0 s are the rows 0 to 19.
+    assert counted_time(
+        TaskConfig(type="speed", duration=10.0, settle=2.0), 0.005
+    ) == pytest.approx(2.1)
+
+
+# ------------------------------------------------------------------ paths and strokes
+
+
+def test_poses_are_spread_over_the_way():
+    path = np.zeros((len(TIME), 3))
+    path[:, 0] = SPEED * TIME
+    # 0.3 m are ten lengths of 3 cm: six poses at equal times, the two ends among them.
+    rows = choose_poses(TIME, path, 0.03)
+    assert rows[0] == 0
+    assert rows[-1] == len(TIME) - 1
+    assert len(rows) == 6
+    assert np.ptp(np.diff(rows)) <= 1
+    # Of 0.3 m, at least 0.55 lengths of 0.2 m between neighbours: three, 0.15 m apart.
+    assert len(choose_poses(TIME, path, 0.2)) == 3
+    # Two alone may be closer, and who stays is shown once, at the end.
+    assert len(choose_poses(TIME, path, 0.7)) == 2
+    assert choose_poses(TIME, path, 2.0) == [len(TIME) - 1]
+
+
+def test_poses_that_come_back_are_told_apart():
+    """Out and back: at no two times shown is the robot in one place."""
+    path = np.zeros((len(TIME), 3))
+    path[:, 0] = np.interp(TIME, [0, SECONDS / 2, SECONDS], [0, 0.5, 0.2])
+    rows = choose_poses(TIME, path, 0.2)
+    x = path[rows, 0]
+    assert np.diff(np.sort(x)).min() >= 0.35 * 0.2
+
+
+@pytest.mark.parametrize("period", [0.4, 0.8, 1.1])
+def test_period_of_a_stroke(period):
+    phase = 2 * np.pi * TIME[:, None] / period
+    angles = np.column_stack([np.sin(phase), 0.3 * np.sin(2 * phase + 1), 0 * phase])
+    assert stroke_period(TIME, 0.5 * angles) == pytest.approx(period, rel=0.02)
+
+
+def test_no_period_where_nothing_repeats():
+    draw = np.random.default_rng(0)
+    assert stroke_period(TIME, np.zeros((len(TIME), 2))) is None
+    assert stroke_period(TIME, np.zeros((len(TIME), 0))) is None
+    assert stroke_period(TIME, 0.3 * draw.normal(size=(len(TIME), 2))) is None
+    assert stroke_period(TIME, 0.1 * TIME[:, None]) is None  # a drift
+    assert stroke_period(TIME[:10], np.sin(20 * TIME[:10, None])) is None  # too short to say
+
+
+def test_smooth_path_takes_out_the_strokes_alone():
+    path = np.zeros((len(TIME), 3))
+    path[:, 0] = SPEED * TIME
+    swaying = path.copy()
+    swaying[:, 1] = 0.01 * np.sin(2 * np.pi * TIME / PERIOD)
+    assert smooth_path(TIME, path, PERIOD) == pytest.approx(path, abs=1e-12)
+    inner = slice(20, -20)  # half a stroke from the ends
+    assert np.abs(smooth_path(TIME, swaying, PERIOD)[inner, 1]).max() < 5e-4
+    # The ends stay where they are.
+    assert smooth_path(TIME, swaying, PERIOD)[[0, -1]] == pytest.approx(swaying[[0, -1]])
+
+
+def test_rates_over_a_stroke_know_no_strokes():
+    """A to and fro of one period vanishes over that period, at the ends, too."""
+    path = np.zeros((len(TIME), 3))
+    path[:, 0] = SPEED * TIME
+    path[:, 1] = 0.02 * np.sin(2 * np.pi * TIME / PERIOD)
+    assert speed_over(TIME, path, PERIOD) == pytest.approx(SPEED, rel=1e-6)
+    assert speed_over(TIME, path, 0.04).max() > 2 * SPEED
+    assert speed_over(TIME, path, 100.0) == pytest.approx(SPEED, rel=0.01)  # all there is
+    assert mean_rate(TIME[:1], path[:1]).tolist() == [[0.0, 0.0, 0.0]]
+
+
+def test_the_end_of_an_episode_is_shown_where_it_is_lively():
+    assert last_strokes(TIME, None, 6.0) == 0
+    assert last_strokes(TIME, 0.8, 6.0) == 0  # hardly more than that in all
+    assert TIME[last_strokes(TIME, 0.5, 6.0)] == pytest.approx(3.0, abs=0.021)
+    command = np.sin(2 * np.pi * TIME[:, None] / 0.2)  # thirty swings
+    assert TIME[last_swings(TIME, command, 10.0)] == pytest.approx(4.0, abs=0.1)
+    assert last_swings(TIME, command, 15.0) == 0
