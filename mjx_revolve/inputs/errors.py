@@ -8,6 +8,7 @@ place in it, what was expected and what was found. Command lines turn it into ex
 from __future__ import annotations
 
 import re
+import reprlib
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,18 @@ _MAX_NODES = 200_000
 
 class InputError(ValueError):
     """A user's input is wrong; the message says where, what was expected and what was found."""
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 60
+
+
+def show(value: Any) -> str:
+    """A value as a message shows it: short, whatever it is."""
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # Python refuses to print integers of more than 4300 digits
+        return "a huge integer"
 
 
 class SafeLoader(yaml.SafeLoader):
