@@ -22,22 +22,7 @@ from mjx_revolve.body.module_files import read_modules
 from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Part, Slot
 from mjx_revolve.body.plates import LiftDrag
 from mjx_revolve.body.propellers import Thruster
-from mjx_revolve.inputs.errors import InputError, load_yaml
-
-__all__ = [
-    "MODULES",
-    "THESIS_MODULES",
-    "Box",
-    "Hinge",
-    "LiftDrag",
-    "ModuleType",
-    "Mount",
-    "Part",
-    "Slot",
-    "Thruster",
-    "load_modules",
-]
-
+from mjx_revolve.inputs.errors import load_yaml, reading
 
 # ------------------------------------------------------------------------- the catalogue
 
@@ -276,7 +261,5 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
         InputError: the file cannot be read or something in it is wrong; the message says where.
     """
     data = load_yaml(path)
-    try:
+    with reading(path):
         return read_modules(data, MODULES)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import re
 import types
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
@@ -88,16 +88,16 @@ def _problem(error: Any, kind: Any, data: Any) -> tuple[str, str]:
         return place, "expected the name of a setting; found a key that is no text"
     if error["type"] in _UNKNOWN:
         _, annotation = _follow(kind, steps[:-1])
-        hint = _suggest(str(steps[-1]), _inner(annotation), steps[:-1], kind)
-        known = ", ".join(fields_of(_inner(annotation)))
-        return place, f"expected one of {known}; found an unknown key{hint}"
+        known = list(fields_of(_open(annotation)[0]))
+        hint = _suggest(str(steps[-1]), known, steps[:-1], kind)
+        return place, f"expected one of {', '.join(known)}; found an unknown key{hint}"
     missing = error["type"] == "missing"
     if missing and isinstance(steps[-1], int):  # a vector that is too short: all of it
         missing = False
         steps.pop()
     if steps and steps[-1] == "[key]":
         taken, annotation = _follow(kind, steps[:-2])
-        found, annotation = steps[-2], get_args(_inner(annotation))[0]
+        found, annotation = steps[-2], get_args(_open(annotation)[0])[0]
     else:
         taken, annotation = _follow(kind, steps)
         taken, found = _look_up(data, taken, error["input"])
@@ -130,72 +130,62 @@ def fields_of(kind: Any) -> dict[str, FieldInfo]:
     return getattr(kind, "model_fields", None) or getattr(kind, "__pydantic_fields__", {})
 
 
-def _split(annotation: Any) -> tuple[Any, list[Any]]:
-    """A type and its metadata."""
-    if get_origin(annotation) is not Annotated:
-        return annotation, []
-    kind, *given = get_args(annotation)
+def _open(annotation: Any) -> tuple[Any, list[Any], bool]:
+    """A type itself, its metadata (outer ones last), and whether it may be None."""
     metadata: list[Any] = []
-    for item in given:
-        metadata += item.metadata if isinstance(item, FieldInfo) else [item]
-        metadata += [doc(item.description)] if getattr(item, "description", None) else []
-    return kind, metadata
+    optional = False
+    while True:
+        branches = [x for x in get_args(annotation) if x is not type(None)]
+        if get_origin(annotation) is Annotated:
+            annotation, *given = get_args(annotation)
+            outer: list[Any] = []
+            for item in given:
+                outer += item.metadata if isinstance(item, FieldInfo) else [item]
+                outer += [doc(item.description)] if getattr(item, "description", None) else []
+            metadata = outer + metadata
+        elif _is_union(annotation) and len(branches) == 1:
+            annotation, optional = branches[0], True
+        else:
+            return annotation, metadata, optional
 
 
-def _inner(annotation: Any) -> Any:
-    """The type without metadata, and without None."""
-    kind, _ = _split(annotation)
-    if get_origin(kind) in (Union, types.UnionType):
-        branches = [branch for branch in get_args(kind) if branch is not type(None)]
-        if len(branches) == 1:
-            return _inner(branches[0])
-    return kind
+def _is_union(annotation: Any) -> bool:
+    return get_origin(annotation) in (Union, types.UnionType)
 
 
-def _metadata(annotation: Any, kind: type) -> list[Any]:
-    """Metadata of one kind, of the type and of what it may be beside None; outer ones last."""
-    inner, metadata = _split(annotation)
-    below = []
-    if get_origin(inner) in (Union, types.UnionType):
-        branches = [branch for branch in get_args(inner) if branch is not type(None)]
-        below = _metadata(branches[0], kind) if len(branches) == 1 else []
-    return below + [item for item in metadata if isinstance(item, kind)]
-
-
-def _follow(kind: Any, steps: Sequence[Any]) -> tuple[list[Any], Any]:
+def _follow(annotation: Any, steps: Sequence[Any]) -> tuple[list[Any], Any]:
     """As many steps as can be followed into a type, and the annotation there."""
     taken: list[Any] = []
     for step in steps:
-        here = _inner(kind)
-        inside, arguments = fields_of(here), get_args(here)
-        if step in inside:
-            found: Any = Annotated[(inside[step].annotation, inside[step])]
-        elif get_origin(here) in (tuple, list) and isinstance(step, int):
+        kind, metadata, _ = _open(annotation)
+        fields, arguments = fields_of(kind), get_args(kind)
+        found: Any
+        if step in fields:
+            found = Annotated[(fields[step].annotation, fields[step])]
+        elif get_origin(kind) is tuple and isinstance(step, int):
             found = arguments[0 if Ellipsis in arguments else min(step, len(arguments) - 1)]
-        elif get_origin(here) is dict:
+        elif get_origin(kind) is dict:
             found = arguments[1]
         else:
             break
         # A vector's unit is that of its numbers.
-        units = _metadata(kind, Unit) if not inside else []
-        kind = Annotated[(found, *units)] if units else found
+        units = [item for item in metadata if isinstance(item, Unit)]
+        annotation = Annotated[(found, *units)] if units else found
         taken.append(step)
-    return taken, kind
+    return taken, annotation
 
 
-def _names(kind: Any, prefix: str = "") -> list[str]:
-    """All fields by dotted name, sections before what they hold."""
-    found = []
+def _names(kind: Any, prefix: str = "") -> dict[str, str]:
+    """All fields' dotted names by their last part."""
+    found: dict[str, str] = {}
     for name, field in fields_of(kind).items():
-        found += [prefix + name, *_names(_inner(field.annotation), f"{prefix}{name}.")]
+        found |= {name: prefix + name, **_names(_open(field.annotation)[0], f"{prefix}{name}.")}
     return found
 
 
-def _suggest(name: str, section: Any, place: Sequence[Any], root: Any) -> str:
+def _suggest(name: str, known: Sequence[str], place: Sequence[Any], root: Any) -> str:
     """The name the user may have meant: a sibling, or a field from elsewhere."""
-    siblings = {key: join(*place, key) for key in fields_of(section)}
-    elsewhere = {key.rpartition(".")[2]: key for key in _names(root)}
-    for names in (siblings, elsewhere):
+    for names in ({key: join(*place, key) for key in known}, _names(root)):
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
         if near:
             return f"; did you mean {names[near[0]]}?"
@@ -204,7 +194,7 @@ def _suggest(name: str, section: Any, place: Sequence[Any], root: Any) -> str:
 
 _WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
 _COUNTS = {2: "two", 3: "three"}
-_SIGNS = {Gt: ">", Ge: ">=", Lt: "<", Le: "<="}
+_SIGNS = {Gt: "> ", Ge: ">= ", Lt: "< ", Le: "<= "}
 
 
 def describe(annotation: Any) -> str:
@@ -216,31 +206,20 @@ def describe(annotation: Any) -> str:
     Returns:
         The words.
     """
-    said = _metadata(annotation, DocInfo)
+    kind, metadata, optional = _open(annotation)
+    said = [item.documentation for item in metadata if isinstance(item, DocInfo)]
     if said:
-        return said[-1].documentation
-    kind, _ = _split(annotation)
-    if get_origin(kind) in (Union, types.UnionType):
-        branches = [describe(branch) for branch in get_args(kind) if branch is not type(None)]
-        optional = ", or nothing" if len(branches) < len(get_args(kind)) else ""
-        return " or ".join(branches) + optional
-    bounds = " and ".join(
-        f"{sign} {bound:g}" if isinstance(bound, float) else f"{sign} {bound}"
-        for sign, bound in _bounds(annotation)
-    )
-    units = [f"[{unit.unit}]" for unit in _metadata(annotation, Unit)[-1:]]
-    return " ".join(part for part in (_name(kind), bounds, *units) if part)
-
-
-def _bounds(annotation: Any) -> Iterator[tuple[str, Any]]:
-    """Signs and bounds of a number, or of those of a vector."""
-    kind, _ = _split(annotation)
-    if get_origin(kind) is tuple:
-        annotation = get_args(kind)[0]
-    for item in _metadata(annotation, object):
-        if isinstance(item, Gt | Ge | Lt | Le):
+        return said[-1]
+    # The bounds of a vector are those of its numbers.
+    numbers = _open(get_args(kind)[0])[1] if get_origin(kind) is tuple else metadata
+    bounds = []
+    for item in numbers:
+        if type(item) in _SIGNS:
             (bound,) = dataclasses.astuple(item)
-            yield _SIGNS[type(item)], bound
+            bounds.append(_SIGNS[type(item)] + (f"{bound:g}" if bound % 1 else f"{bound:.0f}"))
+    units = [f"[{item.unit}]" for item in metadata if isinstance(item, Unit)]
+    words = " ".join(part for part in (_name(kind), " and ".join(bounds), *units[-1:]) if part)
+    return words + ", or nothing" * optional
 
 
 def _name(kind: Any) -> str:
@@ -248,9 +227,11 @@ def _name(kind: Any) -> str:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Literal:
         return "one of " + ", ".join(str(argument) for argument in arguments)
-    if origin in (tuple, list):
-        one = _name(_inner(arguments[0]))
-        count = "a list of" if Ellipsis in arguments or origin is list else _COUNTS[len(arguments)]
+    if _is_union(kind):
+        return " or ".join(describe(branch) for branch in arguments)
+    if origin is tuple:
+        one = _name(_open(arguments[0])[0])
+        count = "a list of" if Ellipsis in arguments else _COUNTS[len(arguments)]
         plural = re.sub(r"^an? (\w+( number)?)", r"\1s", one)
         return f"{count} {plural}"
     if origin is dict or fields_of(kind):

@@ -25,8 +25,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Unit
-from annotated_types import doc as words
+from annotated_types import Ge, Gt, Le, Unit, doc
 from pydantic import (
     AfterValidator,
     AllowInfNan,
@@ -42,31 +41,10 @@ from pydantic_core import ArgsKwargs
 from mjx_revolve.inputs.complaints import MisfitError, fields_of, find_problems, join, refuse
 from mjx_revolve.inputs.errors import show
 
-__all__ = [
-    "Direction",
-    "Law",
-    "Maybe",
-    "MisfitError",
-    "NonNegative",
-    "Number",
-    "Pair",
-    "Positive",
-    "Row",
-    "Share",
-    "Switch",
-    "Text",
-    "Triple",
-    "Vector",
-    "Whole",
-    "as_tuple",
-    "checked",
-    "is_off",
-    "read",
-    "show",
-    "words",
-]
-
 T = TypeVar("T")
+
+words = doc
+"""What messages say of a type instead of its name, as metadata of `Annotated`."""
 
 
 # --- types ----------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ import numpy as np
 from annotated_types import Ge, Le, Unit
 from pydantic import BeforeValidator
 
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.schema import (
     MisfitError,
     NonNegative,
@@ -300,20 +300,12 @@ def load_current_field(path: str | Path) -> CurrentField:
         InputError: it cannot be read or is no full grid; the message names file and place.
     """
     path = Path(path)
-    try:
+    with reading(path):
         if path.suffix.lower() == ".npz":
             return _read_arrays(path)
         if path.suffix.lower() == ".csv":
             return _read_table(path)
         raise InputError("expected a file .npz or .csv")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file; found none") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: expected a file; found a folder") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
 
 
 def _read_arrays(path: Path) -> CurrentField:
@@ -335,10 +327,7 @@ def _read_arrays(path: Path) -> CurrentField:
 
 
 def _read_table(path: Path) -> CurrentField:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"expected UTF-8 text; found {error.reason}") from None
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
     heading = [name.strip() for name in lines[0].split(",")] if lines else []
     for name in _COLUMNS:
         if heading.count(name) != 1:

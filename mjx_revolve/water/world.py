@@ -16,7 +16,7 @@ from annotated_types import Ge, Le, MinLen, Unit
 from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 
 from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.inputs.errors import InputError, load_yaml, reading
 from mjx_revolve.inputs.schema import (
     Law,
     Maybe,
@@ -202,14 +202,12 @@ def load_world(name: str | Path, **overrides: Any) -> World:
             f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
         )
     data = load_yaml(path)
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a mapping of world fields; found {show(data)}")
-    fields: dict[Any, Any] = {"name": path.stem} | data
-    try:
+    with reading(path):
+        if not isinstance(data, dict):
+            raise InputError(f"expected a mapping of world fields; found {show(data)}")
+        fields: dict[Any, Any] = {"name": path.stem} | data
         # A world file names its field's file from where it stands itself.
         world = read(World, fields, context=path.parent)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     if not overrides:
         return world
     for key, value in overrides.items():
@@ -218,7 +216,5 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         if isinstance(below, Mapping) and isinstance(value, Mapping):
             alike = value.get("kind", below.get("kind")) == below.get("kind")
             overrides[key] = {**below, **value} if alike else value
-    try:
+    with reading(f"world {world.name}"):
         return read(World, fields | {"current_field": world.current_field} | overrides)
-    except InputError as error:
-        raise InputError(f"world {world.name}: {error}") from None
