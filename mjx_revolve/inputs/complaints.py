@@ -65,8 +65,9 @@ def find_problems(error: ValidationError, kind: Any, data: Any) -> dict[str, str
     """
     problems: dict[str, str] = {}
     # Unknown keys first: they may be the missing ones, misspelt.
+    strange = (*_UNKNOWN, "invalid_key")
     found = error.errors(include_url=False)
-    for item in sorted(found, key=lambda item: item["type"] not in _UNKNOWN):
+    for item in sorted(found, key=lambda item: item["type"] not in strange):
         place, text = _problem(item, kind, data)
         problems.setdefault(place, text)
     return problems

@@ -333,13 +333,14 @@ def _read_table(path: Path) -> CurrentField:
         if heading.count(name) != 1:
             found = f"{name} twice" if name in heading else f"no {name}"
             raise InputError(f"line 1: expected columns {', '.join(_COLUMNS)}; found {found}")
-    try:
-        table = np.array([line.split(",") for line in lines[1:] if line.strip()], np.float64)
-        sound = bool(np.all(np.isfinite(table)))
-    except ValueError:
-        sound = False
-    if not sound or table.ndim != 2 or table.shape[1] != len(heading):
-        _refuse_line(lines, len(heading))
+    rows = []
+    for number, line in enumerate(lines[1:], 2):
+        if line.strip():
+            with reading(f"line {number}"):
+                rows.append(_read_row(line.split(","), len(heading)))
+    if not rows:
+        raise InputError("line 2: expected rows of numbers; found none")
+    table = np.array(rows)
     columns = {name: table[:, heading.index(name)] for name in _COLUMNS}
     axes = [np.unique(columns[name]) for name in "xyz"]
     shape = tuple(len(axis) for axis in axes)
@@ -358,19 +359,15 @@ def _read_table(path: Path) -> CurrentField:
     return CurrentField(axes[0], axes[1], axes[2], velocity, str(path))
 
 
-def _refuse_line(lines: Sequence[str], count: int) -> None:
-    """Says which line of a table is wrong."""
-    for number, line in enumerate(lines[1:], 2):
-        if not line.strip():
-            continue
-        cells = [cell.strip() for cell in line.split(",")]
-        if len(cells) != count:
-            raise InputError(f"line {number}: expected {count} numbers; found {len(cells)}")
-        for cell in cells:
-            try:
-                finite = math.isfinite(float(cell))
-            except ValueError:
-                raise InputError(f"line {number}: expected a number; found {cell!r}") from None
-            if not finite:
-                raise InputError(f"line {number}: expected a finite number; found {cell!r}")
-    raise InputError("line 2: expected rows of numbers; found none")
+def _read_row(cells: Sequence[str], count: int) -> list[float]:
+    if len(cells) != count:
+        raise InputError(f"expected {count} numbers; found {len(cells)}")
+    row = []
+    for cell in cells:
+        try:
+            row.append(float(cell))
+        except ValueError:
+            raise InputError(f"expected a number; found {cell.strip()!r}") from None
+        if not math.isfinite(row[-1]):
+            raise InputError(f"expected a finite number; found {cell.strip()!r}")
+    return row
