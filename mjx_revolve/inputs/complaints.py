@@ -9,7 +9,6 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-import numpy as np
 from annotated_types import DocInfo, Ge, Gt, Le, Lt, Unit, doc
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
@@ -114,7 +113,9 @@ def join(*steps: Any) -> str:
 def _look_up(data: Any, steps: list[Any], otherwise: Any) -> tuple[list[Any], Any]:
     """What the user wrote at a place, which ends where a short way of writing it does."""
     for i, step in enumerate(steps):
-        if isinstance(data, int | float | np.generic):  # one number for several
+        if (
+            isinstance(data, int | float) or getattr(data, "shape", None) == ()
+        ):  # one number for several
             return steps[:i], data
         try:
             data = data[step]

@@ -24,7 +24,6 @@ import re
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
-import numpy as np
 from annotated_types import Ge, Gt, Le, Unit, doc
 from pydantic import (
     AfterValidator,
@@ -52,7 +51,7 @@ words = doc
 
 def _plain(value: Any) -> Any:
     """A NumPy scalar as Python's own number."""
-    return value.item() if isinstance(value, np.generic) else value
+    return value.item() if getattr(value, "shape", None) == () else value
 
 
 def as_tuple(value: Any) -> Any:
