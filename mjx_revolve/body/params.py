@@ -7,27 +7,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Annotated, Any
 
-from annotated_types import Unit
+from annotated_types import MinLen, Unit
 from pydantic import AfterValidator, BeforeValidator
 
 from mjx_revolve.body.module_types import ModuleType, PartBuoyancy, PartDrag
 from mjx_revolve.body.plates import LiftDrag
 from mjx_revolve.body.propellers import Thruster
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.schema import (
-    MisfitError,
-    NonNegative,
-    Number,
-    Share,
-    Switch,
-    Triple,
-    read,
-    show,
-    words,
-)
+from mjx_revolve.inputs.schema import NonNegative, Number, Share, Switch, Text, Triple, read, words
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
@@ -40,24 +30,11 @@ def read_number(value: Any) -> Any:
     return value
 
 
-def _some_of(kind: type) -> Any:
-    """A mapping with fields of a class, whose values are checked where it is made."""
-    known = ", ".join(field.name for field in fields(kind))
-
-    def check(given: dict[Any, Any]) -> dict[Any, Any]:
-        if not given:
-            raise MisfitError("", f"a mapping with any of {known}", "an empty one")
-        for name in given:
-            if name not in kind.__dataclass_fields__:  # type: ignore[attr-defined]
-                raise MisfitError("", f"only {known}", show(name))
-        return given
-
-    return Annotated[dict[Any, Any], AfterValidator(check), words(f"a mapping with any of {known}")]
-
-
 _Loose = BeforeValidator(read_number)
 _Amount = Annotated[NonNegative, _Loose]
 _Place = Annotated[Triple[Annotated[Number, _Loose]], AfterValidator(list), Unit("m")]
+# Its values are checked where they are applied.
+_Some = Annotated[dict[Text, Any], MinLen(1), words("a mapping with any of its fields")]
 # What every part takes over as it is.
 _PLAIN: dict[str, Any] = {
     "drag_coefficient": Annotated[_Amount, Unit("-")],
@@ -76,8 +53,8 @@ _OVERRIDES: dict[str, Any] = _PLAIN | {
     "ballast_position": _Place,
     "center_of_volume": _Place,
     "thrust": Annotated[_Amount, Unit("N")],
-    "lift_drag": _some_of(LiftDrag),
-    "thruster": _some_of(Thruster),
+    "lift_drag": _Some,
+    "thruster": _Some,
 }
 
 

@@ -882,8 +882,8 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
             "params: thruster: expected a module with a thruster; found type Ac",
         ),
         (
-            HINGE_ON % "params: {thruster: {power: 1}}",
-            "body.children.1.params.thruster: expected only axis, position, curve, gain",
+            JET_ON % "thruster: {power: 1}",
+            "body.children.1.params: thruster: power: expected one of axis, position, curve, gain",
         ),
         (
             HINGE_ON % "params: {thruster: 1}",
@@ -895,7 +895,7 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
         ),
         (
             HINGE_ON % "params: {lift_drag: {Cla: 1}}",
-            "params.lift_drag: expected only a0, cla, cda",
+            "params: lift_drag: Cla: expected one of a0, cla, cda",
         ),
         (
             HINGE_ON % "params: {lift_drag: {cla: x}}",
