@@ -15,43 +15,14 @@ mesh volumes are those of RoboGen's meshes as the thesis tabulates them (Table 1
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from mjx_revolve.body.boxes import union_measure
-from mjx_revolve.body.module_types import (
-    Box,
-    Hinge,
-    ModuleType,
-    Mount,
-    Part,
-    Slot,
-    Thruster,
-    Vector,
-    show,
-)
+from mjx_revolve.body.module_files import read_modules
+from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Part, Slot
 from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.inputs.errors import InputError, load_yaml
-
-__all__ = [
-    "MODULES",
-    "THESIS_MODULES",
-    "Box",
-    "Hinge",
-    "LiftDrag",
-    "ModuleType",
-    "Mount",
-    "Part",
-    "Slot",
-    "Thruster",
-    "load_modules",
-]
-
+from mjx_revolve.body.propellers import Thruster
+from mjx_revolve.inputs.errors import load_yaml, reading
 
 # ------------------------------------------------------------------------- the catalogue
 
@@ -109,13 +80,7 @@ _HINGE = ModuleType(
     ),
     mount=Mount((-_FRAME_BACK, 0.0, 0.0), (1.0, 0.0, 0.0)),
     slots={1: Slot((_SERVO_FRONT, 0.0, 0.0), (1.0, 0.0, 0.0))},
-    hinge=Hinge(
-        axis=(0.0, 1.0, 0.0),
-        anchor=(_HINGE_ANCHOR, 0.0, 0.0),
-        range=(-math.pi / 4, math.pi / 4),  # Revolve, SDF/joint.py
-        effort=0.17658,  # ditto
-        speed=5.235988,  # ditto
-    ),
+    hinge=Hinge(axis=(0.0, 1.0, 0.0), anchor=(_HINGE_ANCHOR, 0.0, 0.0)),
 )
 
 # Revolve gives no pose to its touch sensor; that the thin side looks outwards is a choice. Revolve
@@ -295,137 +260,6 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
     Raises:
         InputError: the file cannot be read or something in it is wrong; the message says where.
     """
-    data = _check_keys(load_yaml(path), str(path), ("modules",))
-    table = data["modules"]
-    if not isinstance(table, dict) or not table:
-        raise InputError(
-            f"{path}: modules: expected a mapping from names to module types; found {show(table)}"
-        )
-    kinds: dict[str, ModuleType] = {}
-    for name, item in table.items():
-        if not isinstance(name, str):
-            raise InputError(f"{path}: modules: expected names of types; found {show(name)}")
-        kind = _read_type(name, item, f"{path}: modules.{name}")
-        for key in (kind.name, *kind.aliases):
-            if key in kinds:
-                raise InputError(
-                    f"{path}: modules.{name}: expected each name and alias once; found {key} twice"
-                )
-            kinds[key] = kind
-    return kinds
-
-
-def _check_keys(
-    item: Any, place: str, required: Sequence[str], optional: Sequence[str] = ()
-) -> dict[str, Any]:
-    """A mapping that has all of `required` and nothing beyond `optional`."""
-    known = (*required, *optional)
-    if not isinstance(item, dict):
-        raise InputError(f"{place}: expected a mapping with {', '.join(known)}; found {show(item)}")
-    for key in item:
-        if key not in known:
-            raise InputError(f"{place}: expected only {', '.join(known)}; found {show(key)}")
-    for key in required:
-        if key not in item:
-            raise InputError(f"{place}: expected the key {key}; found none")
-    return item
-
-
-def _make(kind: Callable[..., Any], place: str, **values: Any) -> Any:
-    """Builds a value; its message gets the place in the file in front."""
-    try:
-        return kind(**values)
-    except InputError as error:
-        raise InputError(f"{place}: {error}") from None
-
-
-def _read_type(name: Any, item: Any, place: str) -> ModuleType:
-    _check_keys(item, place, ("parts", "mount"), ("slots", "hinge", "sensor", "aliases"))
-    listed = item["parts"]
-    if not isinstance(listed, list) or not listed:
-        raise InputError(f"{place}.parts: expected a list of parts; found {show(listed)}")
-    parts = [_read_part(part, i, f"{place}.parts.{i}") for i, part in enumerate(listed)]
-    hinge = item.get("hinge")
-    if hinge is not None:
-        servo = _HINGE.hinge
-        assert servo is not None
-        usual = {"range": servo.range, "effort": servo.effort, "speed": servo.speed}
-        _check_keys(hinge, f"{place}.hinge", ("axis", "anchor"), tuple(usual))
-        hinge = _make(Hinge, place, **(usual | hinge))
-    slots = item.get("slots") or {}
-    if not isinstance(slots, dict):
-        raise InputError(
-            f"{place}.slots: expected a mapping from numbers to faces; found {show(slots)}"
-        )
-    holder = parts[-1] if hinge is not None else parts[0]
-    usual_aliases = MODULES[name].aliases if name in MODULES else ()
-    aliases = item.get("aliases", usual_aliases)
-    if not isinstance(aliases, list | tuple):
-        raise InputError(f"{place}.aliases: expected a list of names; found {show(aliases)}")
-    return _make(
-        ModuleType,
-        place,
-        name=name,
-        parts=tuple(parts),
-        mount=_read_mount(item["mount"], parts[0], f"{place}.mount"),
-        slots={key: _read_slot(s, holder, f"{place}.slots.{key}") for key, s in slots.items()},
-        hinge=hinge,
-        sensor=item.get("sensor", False),
-        aliases=tuple(aliases),
-    )
-
-
-def _read_part(item: Any, index: int, place: str) -> Part:
-    sized = ("size", "boxes")
-    plain = tuple(f.name for f in fields(Part) if f.name not in ("mass", *sized))
-    _check_keys(item, place, ("mass",), (*sized, *plain))
-    if ("size" in item) == ("boxes" in item):
-        raise InputError(f"{place}: expected one of size and boxes; found both or neither")
-    listed = item.get("boxes", [{"size": item.get("size")}])
-    if not isinstance(listed, list) or not listed:
-        raise InputError(f"{place}.boxes: expected a list of boxes; found {show(listed)}")
-    boxes = []
-    for i, box in enumerate(listed):
-        at = f"{place}.boxes.{i}" if "boxes" in item else place
-        boxes.append(_make(Box, at, **_check_keys(box, at, ("size",), ("position",))))
-    center = np.array([box.position for box in boxes])
-    half = np.array([box.size for box in boxes]) / 2
-    values = {"name": f"part{index}", "volume": union_measure(center - half, center + half)}
-    values |= {key: item[key] for key in (*plain, "mass") if key in item}
-    for key, kind in (("lift_drag", LiftDrag), ("thruster", Thruster)):
-        if values.get(key) is not None:
-            known = [f.name for f in fields(kind)]
-            given = _check_keys(values[key], f"{place}.{key}", (), known)
-            values[key] = _make(kind, place, **given)
-    # YAML 1.1 reads a bare `off` as False.
-    values |= {key: "off" for key in ("buoyancy", "drag") if values.get(key) is False}
-    return _make(Part, place, boxes=tuple(boxes), **values)
-
-
-def _read_face(text: str, part: Part, place: str) -> tuple[Vector, Vector]:
-    """Centre of a level face of a part's main box, module frame [m], and its outward normal."""
-    if not re.fullmatch(r"[-+]?[xy]", text):
-        raise InputError(
-            f"{place}: expected -x, +x, -y, +y or a mapping with position; found {show(text)}"
-        )
-    normal = [0.0, 0.0, 0.0]
-    axis = "xy".index(text[-1])
-    normal[axis] = -1.0 if text[0] == "-" else 1.0
-    position = list(part.position)
-    position[axis] += normal[axis] * part.boxes[0].size[axis] / 2
-    return (position[0], position[1], position[2]), (normal[0], normal[1], normal[2])
-
-
-def _read_mount(item: Any, part: Part, place: str) -> Mount | None:
-    if item is None:
-        return None
-    if isinstance(item, str):
-        position, (x, y, z) = _read_face(item, part, place)
-        return Mount(position, (-x, -y, -z))
-    return _make(Mount, place, **_check_keys(item, place, ("position", "outward")))
-
-
-def _read_slot(item: Any, part: Part, place: str) -> Slot:
-    if isinstance(item, str):
-        return Slot(*_read_face(item, part, place))
-    return _make(Slot, place, **_check_keys(item, place, ("position", "direction"), ("up",)))
+    data = load_yaml(path)
+    with reading(path):
+        return read_modules(data, MODULES)

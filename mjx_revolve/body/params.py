@@ -7,38 +7,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
+from typing import Annotated, Any
 
-from mjx_revolve.body.module_types import (
-    ModuleType,
-    Part,
-    Thruster,
-    check_number,
-    check_vector,
-    show,
-)
+from annotated_types import MinLen, Unit
+from pydantic import AfterValidator, BeforeValidator
+
+from mjx_revolve.body.module_types import ModuleType, PartBuoyancy, PartDrag
 from mjx_revolve.body.plates import LiftDrag
+from mjx_revolve.body.propellers import Thruster
 from mjx_revolve.inputs.errors import InputError
-
-_NUMBERS = {
-    "mass": "kg",
-    "volume": "m3",
-    "electronics_volume": "m3",
-    "ballast": "kg",
-    "ballast_volume": "m3",
-    "drag_coefficient": "-",
-    "added_mass_coefficient": "-",
-    "entrained_water": "-",
-    "thrust": "N",
-}
-_VECTORS = ("ballast_position", "center_of_volume")
-_TABLES = {"lift_drag": LiftDrag, "thruster": Thruster}
-# What every part takes over as it is, and checks.
-_PLAIN = (
-    "drag_coefficient", "added_mass_coefficient", "entrained_water",
-    "buoyancy", "drag", "added_mass",
-)  # fmt: skip
+from mjx_revolve.inputs.schema import NonNegative, Number, Share, Switch, Text, Triple, read, words
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
@@ -51,8 +30,36 @@ def read_number(value: Any) -> Any:
     return value
 
 
+_Loose = BeforeValidator(read_number)
+_Amount = Annotated[NonNegative, _Loose]
+_Place = Annotated[Triple[Annotated[Number, _Loose]], AfterValidator(list), Unit("m")]
+# Its values are checked where they are applied.
+_Some = Annotated[dict[Text, Any], MinLen(1), words("a mapping with any of its fields")]
+# What every part takes over as it is.
+_PLAIN: dict[str, Any] = {
+    "drag_coefficient": Annotated[_Amount, Unit("-")],
+    "added_mass_coefficient": Annotated[_Amount, Unit("-")],
+    "entrained_water": Annotated[Share, _Loose],
+    "buoyancy": PartBuoyancy,
+    "drag": PartDrag,
+    "added_mass": Switch,
+}
+_OVERRIDES: dict[str, Any] = _PLAIN | {
+    "mass": Annotated[_Amount, Unit("kg")],
+    "volume": Annotated[_Amount, Unit("m3")],
+    "electronics_volume": Annotated[_Amount, Unit("m3")],
+    "ballast": Annotated[_Amount, Unit("kg")],
+    "ballast_volume": Annotated[_Amount, Unit("m3")],
+    "ballast_position": _Place,
+    "center_of_volume": _Place,
+    "thrust": Annotated[_Amount, Unit("N")],
+    "lift_drag": _Some,
+    "thruster": _Some,
+}
+
+
 def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """The params with numbers and vectors checked and made plain floats.
+    """The params with overrides checked, numbers as floats.
 
     Args:
         params: of one module; keys that are no overrides are kept as they are.
@@ -64,30 +71,10 @@ def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
     Raises:
         InputError: a value is out of range.
     """
-    found = dict(params)
-    for key, unit in _NUMBERS.items():
-        if key in found:
-            found[key] = check_number(read_number(found[key]), f"{place}.{key}", unit)
-    for key in _VECTORS:
-        if key in found:
-            value = found[key]
-            listed = [read_number(x) for x in value] if isinstance(value, list) else value
-            found[key] = list(check_vector(listed, f"{place}.{key}", "m"))
-    for key, kind in _TABLES.items():
-        if key not in found:
-            continue
-        known = [f.name for f in fields(kind)]
-        if not isinstance(found[key], dict) or not found[key]:
-            raise InputError(
-                f"{place}.{key}: expected a mapping with any of {', '.join(known)}; "
-                f"found {show(found[key])}"
-            )
-        for name in found[key]:
-            if name not in known:
-                raise InputError(
-                    f"{place}.{key}: expected only {', '.join(known)}; found {show(name)}"
-                )
-    return found
+    return {
+        key: read(_OVERRIDES[key], value, f"{place}.{key}") if key in _OVERRIDES else value
+        for key, value in params.items()
+    }
 
 
 def _share(values: list[float], total: float) -> list[float]:
@@ -111,69 +98,54 @@ def apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
     Raises:
         InputError: a value is out of range, or of something that the type does not have.
     """
-    known = (*_NUMBERS, *_VECTORS, *_TABLES, *_PLAIN)
-    if not any(key in params for key in known):
+    if not _OVERRIDES.keys() & params:
         return kind
-    parts = list(kind.parts)
+    parts = kind.parts
+    changes = [{key: params[key] for key in _PLAIN if key in params} for _ in parts]
     for key in ("mass", "volume"):
         if key in params:
-            values = _share([getattr(part, key) for part in parts], params[key])
-            changes: list[dict[str, Any]] = [{key: value} for value in values]
-            parts = [replace(p, **change) for p, change in zip(parts, changes, strict=True)]
-    largest = max(range(len(parts)), key=lambda i: kind.parts[i].volume)
+            shares = _share([getattr(part, key) for part in parts], params[key])
+            for change, share in zip(changes, shares, strict=True):
+                change[key] = share
+    largest = max(range(len(parts)), key=lambda i: parts[i].volume)
     if "electronics_volume" in params:
-        parts = [
-            replace(part, electronics_volume=params["electronics_volume"] if i == largest else 0.0)
-            for i, part in enumerate(parts)
-        ]
+        for change in changes:
+            change["electronics_volume"] = 0.0
+        changes[largest]["electronics_volume"] = params["electronics_volume"]
     if "center_of_volume" in params:
-        place = tuple(params["center_of_volume"])
-        parts[largest] = replace(parts[largest], center_of_volume=place)
-    parts[0] = _with_ballast(parts[0], params)
-    plain = {key: params[key] for key in _PLAIN if key in params}
-    # YAML 1.1 reads a bare `off` as False.
-    plain |= {key: "off" for key in ("buoyancy", "drag") if plain.get(key) is False}
-    parts = [replace(part, **plain) for part in parts]
+        changes[largest]["center_of_volume"] = params["center_of_volume"]
+    if "ballast_volume" in params or "ballast_position" in params:
+        names = {"ballast": "ballast_mass"}
+        placed = ("ballast", "ballast_volume", "ballast_position")
+        changes[0] |= {names.get(key, key): params[key] for key in placed if key in params}
+    elif "ballast" in params:
+        changes[0]["mass"] = changes[0].get("mass", parts[0].mass) + params["ballast"]
     if "lift_drag" in params:
         # A module without a fin becomes one, whole.
-        own = any(part.lift_drag is not None for part in parts)
-        parts = [
-            replace(part, lift_drag=replace(part.lift_drag or LiftDrag(), **params["lift_drag"]))
-            if part.lift_drag is not None or not own
-            else part
-            for part in parts
-        ]
+        for part, change in zip(parts, changes, strict=True):
+            if part.lift_drag is not None or not kind.is_fin:
+                change["lift_drag"] = replace(part.lift_drag or LiftDrag(), **params["lift_drag"])
     if "thruster" in params or "thrust" in params:
-        parts = [_with_thruster(part, params) for part in parts]
-        if all(part.thruster is None for part in parts):
+        if not kind.is_thruster:
             key = "thruster" if "thruster" in params else "thrust"
             raise InputError(f"{key}: expected a module with a thruster; found type {kind.name}")
-    return replace(kind, parts=tuple(parts))
+        for part, change in zip(parts, changes, strict=True):
+            if part.thruster is not None:
+                change["thruster"] = _change_thruster(part.thruster, params)
+    changed = [replace(part, **change) for part, change in zip(parts, changes, strict=True)]
+    return replace(kind, parts=tuple(changed))
 
 
-def _with_ballast(part: Part, params: Mapping[str, Any]) -> Part:
-    """The first part with its ballast: spread over it, or a point where it has a place."""
-    placed = {key: params[key] for key in ("ballast_volume", "ballast_position") if key in params}
-    if not placed:
-        return replace(part, mass=part.mass + params.get("ballast", 0.0))
-    if "ballast" in params:
-        placed["ballast_mass"] = params["ballast"]
-    return replace(part, **placed)
-
-
-def _with_thruster(part: Part, params: Mapping[str, Any]) -> Part:
-    """The part with its thruster's numbers, then its curve scaled to a thrust [N]."""
-    thruster = part.thruster
-    if thruster is None:
-        return part
+def _change_thruster(thruster: Thruster, params: Mapping[str, Any]) -> Thruster:
+    """The thruster with its own numbers, then its curve scaled to a thrust [N]."""
     thruster = replace(thruster, **params.get("thruster", {}))
-    if "thrust" in params:
-        ahead = thruster.range[1]
-        full = thruster.thrust_at(ahead)
-        if full <= 0.0:
-            raise InputError(
-                f"thrust: expected a thruster that pushes at its highest command {ahead:g}; found "
-                f"{full:g} N there"
-            )
-        thruster = thruster.scaled(params["thrust"] / full)
-    return replace(part, thruster=thruster)
+    if "thrust" not in params:
+        return thruster
+    ahead = thruster.range[1]
+    full = thruster.thrust_at(ahead)
+    if full <= 0.0:
+        raise InputError(
+            f"thrust: expected a thruster that pushes at its highest command {ahead:g}; found "
+            f"{full:g} N there"
+        )
+    return thruster.scaled(params["thrust"] / full)

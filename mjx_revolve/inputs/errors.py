@@ -7,8 +7,10 @@ place in it, what was expected and what was found. Command lines turn it into ex
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Hashable
+import reprlib
+from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,42 @@ _MAX_NODES = 200_000
 
 class InputError(ValueError):
     """A user's input is wrong; the message says where, what was expected and what was found."""
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 60
+
+
+def show(value: Any) -> str:
+    """A value as a message shows it: short, whatever it is."""
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # Python refuses to print integers of more than 4300 digits
+        return "a huge integer"
+
+
+@contextlib.contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Puts a file's path before what is wrong with it, whoever says so.
+
+    Args:
+        path: the file that is read in the body of the `with`.
+
+    Raises:
+        InputError: the body raised one, or could not read the file.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file; found none") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: expected a file; found a folder") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected UTF-8 text; found {error.reason}") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
 
 
 class SafeLoader(yaml.SafeLoader):
@@ -83,29 +121,20 @@ def load_yaml(path: str | Path) -> Any:
         InputError: the file is missing, unreadable, no valid YAML, nested too deeply, or repeats a
             key.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file; found none") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: expected a file; found a folder") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected UTF-8 text; found {error.reason}") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
-    try:
-        data = yaml.load(text, Loader=SafeLoader)
-        _check_size(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except RecursionError:
-        raise InputError(f"{path}: expected at most {_MAX_DEPTH} levels; found more") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"line {mark.line + 1}: " if mark else ""
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise InputError(f"{path}: {place}expected valid YAML; found: {problem}") from None
-    except ValueError as error:  # e.g. an impossible date
-        raise InputError(f"{path}: expected valid YAML values; found: {error}") from None
+    with reading(path):
+        text = Path(path).read_text(encoding="utf-8")
+        try:
+            data = yaml.load(text, Loader=SafeLoader)
+            _check_size(data)
+        except RecursionError:
+            raise InputError(f"expected at most {_MAX_DEPTH} levels; found more") from None
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            place = f"line {mark.line + 1}: " if mark else ""
+            problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+            raise InputError(f"{place}expected valid YAML; found: {problem}") from None
+        except InputError:
+            raise
+        except ValueError as error:  # e.g. an impossible date
+            raise InputError(f"expected valid YAML values; found: {error}") from None
     return data

@@ -7,13 +7,13 @@ MuJoCo gets a height field sampled from the same function, so pictures and physi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
+from annotated_types import Unit
 
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.schema import MisfitError, NonNegative, Number, Positive, checked
 from mjx_revolve.numerics.spatial import namespace, sincos
 
 # The thesis's lake: bed about 998 m x 998 m, z from -112.8 m to +36.7 m (shared facts, section 2).
@@ -23,10 +23,8 @@ LAKE_HIGHEST = 36.7
 # Height of the dunes as a share of the lake's: 0.8 m in the thesis's lake. A choice.
 _DUNES = 0.8 / (LAKE_HIGHEST - LAKE_LOWEST)
 
-CONTACTS = ("penalty", "mjx")
 
-
-@dataclass(frozen=True)
+@checked
 class Bed:
     """The ground below the water.
 
@@ -43,34 +41,19 @@ class Bed:
             and ignores `stiffness`.
     """
 
-    kind: str = "flat"
-    height: float = -100.0
-    highest: float = LAKE_HIGHEST
-    extent: float = 2000.0
-    stiffness: float = 3000.0
-    friction: float = 0.6
-    contact: str = "penalty"
+    kind: Literal["flat", "lake"] = "flat"
+    height: Annotated[Number, Unit("m")] = -100.0
+    highest: Annotated[Number, Unit("m")] = LAKE_HIGHEST
+    extent: Annotated[Positive, Unit("m")] = 2000.0
+    stiffness: Annotated[Positive, Unit("N/m")] = 3000.0
+    friction: Annotated[NonNegative, Unit("-")] = 0.6
+    contact: Literal["penalty", "mjx"] = "penalty"
 
     def __post_init__(self) -> None:
-        if self.kind not in ("flat", "lake"):
-            raise InputError(f"bed.kind: expected 'flat' or 'lake'; found {self.kind!r}")
-        if self.contact not in CONTACTS:
-            raise InputError(f"bed.contact: expected 'penalty' or 'mjx'; found {self.contact!r}")
-        for name in ("height", "highest", "extent", "stiffness", "friction"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise InputError(f"bed.{name}: expected a number; found {value!r}")
-            if not np.isfinite(value):
-                raise InputError(f"bed.{name}: expected a finite number; found {value!r}")
-        if self.extent <= 0 or self.stiffness <= 0 or self.friction < 0:
-            raise InputError(
-                "bed: expected extent > 0, stiffness > 0 and friction >= 0; found "
-                f"{self.extent}, {self.stiffness}, {self.friction}"
-            )
+        """Checks that a lake is deepest at its deepest place."""
         if self.kind == "lake" and self.highest <= self.height:
-            raise InputError(
-                f"bed.highest: expected more than bed.height ({self.height}); found {self.highest}"
-            )
+            above = f"more than height ({self.height:g})"
+            raise MisfitError("highest", above, f"{self.highest:g}")
 
 
 def bed_height(bed: Bed, x: Any, y: Any) -> Any:

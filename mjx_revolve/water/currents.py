@@ -1,6 +1,6 @@
 """Parameters of the water's own motion: shear, gusts, waves, velocities on a grid.
 
-Worlds hold them and need no JAX for it; `water.py` has their laws.
+Worlds hold them; `flow.py` has their laws.
 """
 
 from __future__ import annotations
@@ -12,79 +12,41 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le, Unit
+from pydantic import BeforeValidator
 
-from mjx_revolve.inputs.errors import InputError
-
-PROFILES = ("linear", "power", "exponential")
+from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.schema import (
+    MisfitError,
+    NonNegative,
+    Number,
+    Triple,
+    Vector,
+    checked,
+    words,
+)
 
 # Shortest wave [m]. Far below 0.1 m surface tension drives waves, which these laws do not know.
 _SHORTEST = 0.01
 
-
-def listed(choices: Sequence[str]) -> str:
-    """Choices as messages list them."""
-    return ", ".join(map(repr, choices))
-
-
-def check_number(
-    place: str, value: Any, low: float | None = None, high: float | None = None
-) -> None:
-    """Refuses what is no finite number between two bounds.
-
-    Args:
-        place: what messages call it.
-        value: what was given.
-        low: smallest allowed.
-        high: largest allowed.
-
-    Raises:
-        InputError: it is not.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{place}: expected a number; found {value!r}")
-    try:
-        finite = math.isfinite(value)
-    except OverflowError:  # an integer of more than 308 digits
-        finite, value = False, "a huge integer"
-    if not finite:
-        raise InputError(f"{place}: expected a finite number; found {value!r}")
-    if low is not None and value < low:
-        raise InputError(f"{place}: expected at least {low:g}; found {value!r}")
-    if high is not None and value > high:
-        raise InputError(f"{place}: expected at most {high:g}; found {value!r}")
+# At least 1e-3 m or s: what is divided by it stays finite.
+_Small = Annotated[Number, Ge(1e-3)]
+# Degrees would otherwise pass for radians unseen.
+_Angle = Annotated[Number, Ge(-2 * math.pi - 1e-6), Le(2 * math.pi + 1e-6), Unit("rad")]
 
 
-def read_vector(place: str, value: Any) -> tuple[float, ...]:
-    """Any sequence of three finite numbers as three floats.
-
-    Args:
-        place: what messages call it.
-        value: what was given.
-
-    Returns:
-        The three.
-
-    Raises:
-        InputError: it is something else.
-    """
-    try:
-        vector = tuple(value) if not isinstance(value, str) else None
-    except TypeError:
-        vector = None
-    if vector is None or len(vector) != 3:
-        raise InputError(f"{place}: expected 3 numbers; found {value!r}")
-    plain = [v.item() if hasattr(v, "item") else v for v in vector]
-    for axis, v in zip("xyz", plain, strict=True):
-        check_number(f"{place}.{axis}", v)
-    return tuple(float(v) for v in plain)
+def _level(std: Any) -> Any:
+    """One number as that of x and y."""
+    plain = isinstance(std, int | float | np.number) and not isinstance(std, bool)
+    return (std, std, 0.0) if plain else std
 
 
-@dataclass(frozen=True)
+@checked
 class Shear:
-    """A current that fades with depth, on top of the uniform one; see `water.shear_flow`.
+    """A current that fades with depth, on top of the uniform one; see `flow.shear_flow`.
 
     Attributes:
         velocity: at the surface, world frame [m/s], length 3.
@@ -93,53 +55,33 @@ class Shear:
         exponent: of "power" [-].
     """
 
-    velocity: tuple[float, ...]
-    depth: float = 10.0
-    profile: str = "linear"
-    exponent: float = 1 / 7
-
-    def __post_init__(self) -> None:
-        """Checks the numbers."""
-        object.__setattr__(self, "velocity", read_vector("shear.velocity", self.velocity))
-        check_number("shear.depth", self.depth, low=1e-3)
-        check_number("shear.exponent", self.exponent, low=1e-3)
-        if self.profile not in PROFILES:
-            raise InputError(
-                f"shear.profile: expected one of {listed(PROFILES)}; found {self.profile!r}"
-            )
+    velocity: Annotated[Vector, Unit("m/s")]
+    depth: Annotated[_Small, Unit("m")] = 10.0
+    profile: Literal["linear", "power", "exponential"] = "linear"
+    exponent: Annotated[_Small, Unit("-")] = 1 / 7
 
 
-@dataclass(frozen=True)
+@checked
 class Gust:
-    """A current that wanders around its mean and returns; see `water.gust_path`.
+    """A current that wanders around its mean and returns; see `flow.gust_path`.
 
     Attributes:
         std: its standard deviation along world x, y, z [m/s]; one number counts for x and y.
         time: over which its correlation falls to 1/e [s].
     """
 
-    std: tuple[float, ...]
-    time: float = 10.0
-
-    def __post_init__(self) -> None:
-        """Checks the numbers."""
-        std: Any = self.std
-        if isinstance(std, np.generic):
-            std = std.item()
-        if isinstance(std, int | float) and not isinstance(std, bool):
-            check_number("gust.std", std, low=0.0)
-            std = (std, std, 0.0)
-        elif not isinstance(std, Sequence | np.ndarray) or isinstance(std, str) or len(std) != 3:
-            raise InputError(f"gust.std: expected a number or 3 numbers; found {std!r}")
-        object.__setattr__(self, "std", read_vector("gust.std", std))
-        for axis, value in zip("xyz", self.std, strict=True):
-            check_number(f"gust.std.{axis}", value, low=0.0)
-        check_number("gust.time", self.time, low=1e-3)
+    std: Annotated[
+        Triple[NonNegative],
+        BeforeValidator(_level),
+        Unit("m/s"),
+        words("a number or three numbers >= 0 [m/s]"),
+    ]
+    time: Annotated[_Small, Unit("s")] = 10.0
 
 
-@dataclass(frozen=True)
+@checked
 class Wave:
-    """One regular wave, η = a cos(k·x - ωt + φ); see `water.wave_flow`.
+    """One regular wave, η = a cos(k·x - ωt + φ); see `flow.wave_flow`.
 
     Attributes:
         amplitude: a, half the height from trough to crest [m].
@@ -149,30 +91,17 @@ class Wave:
         phase: φ, at the world's origin at time 0 [rad].
     """
 
-    amplitude: float
-    wavelength: float | None = None
-    period: float | None = None
-    direction: float = 0.0
-    phase: float = 0.0
+    amplitude: Annotated[NonNegative, Unit("m")]
+    wavelength: Annotated[Number, Ge(_SHORTEST), Unit("m")] | None = None
+    period: Annotated[_Small, Unit("s")] | None = None
+    direction: _Angle = 0.0
+    phase: _Angle = 0.0
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
-        check_number("waves.amplitude", self.amplitude, low=0.0)
+        """Checks that its length is given once."""
         if (self.wavelength is None) == (self.period is None):
             found = "none" if self.period is None else "both"
-            raise InputError(f"waves: expected either wavelength or period; found {found}")
-        if self.wavelength is not None:
-            check_number("waves.wavelength", self.wavelength, low=_SHORTEST)
-        else:
-            check_number("waves.period", self.period, low=1e-3)
-        for name in ("direction", "phase"):
-            value = getattr(self, name)
-            check_number(f"waves.{name}", value)
-            # Degrees would otherwise pass for radians unseen.
-            if abs(value) > 2 * math.pi + 1e-6:
-                raise InputError(
-                    f"waves.{name}: expected an angle between -2 pi and 2 pi [rad]; found {value!r}"
-                )
+            raise MisfitError("", "either wavelength or period", found)
 
     def wavenumber(self, gravity: float, water_depth: float | None) -> float:
         """k, from its length, or from its period by the dispersion relation ω² = g k tanh(k h).
@@ -216,38 +145,41 @@ class Wave:
         return math.sqrt(gravity * k * (1.0 if water_depth is None else math.tanh(k * water_depth)))
 
 
-def check_wave(wave: Wave, gravity: float, water_depth: float | None) -> None:
+def check_wave(wave: Wave, gravity: float, water_depth: float | None, place: str) -> None:
     """Refuses a wave that would break, or that is too short to be driven by gravity.
 
     Args:
         wave: the wave.
         gravity: [m/s²].
         water_depth: [m], or None for deep water.
+        place: what messages call it.
 
     Raises:
-        InputError: the message calls it `waves`.
+        MisfitError: it is one.
     """
     if gravity <= 0:
-        raise InputError(f"waves: expected gravity above 0; found {gravity:g}")
+        raise MisfitError(place, "gravity above 0", f"{gravity:g}")
     k = wave.wavenumber(gravity, water_depth)
     length = 2 * math.pi / k
     if length < 0.999 * _SHORTEST:
-        raise InputError(
-            f"waves.period: expected that of a wave of at least {_SHORTEST:g} m; found "
-            f"{wave.period:g} s, a wave of {length:.3g} m"
+        raise MisfitError(
+            f"{place}.period",
+            f"that of a wave of at least {_SHORTEST:g} m",
+            f"{wave.period:g} s, a wave of {length:.3g} m",
         )
     # Miche 1944 (Dean & Dalrymple 1991, § 4.8): height over length where crests break.
     highest = 0.142 * length * (1.0 if water_depth is None else math.tanh(k * water_depth))
     if 2 * wave.amplitude > highest:
-        raise InputError(
-            f"waves.amplitude: expected at most {highest / 2:.3g}, or a wave {length:.4g} m long "
-            f"breaks; found {wave.amplitude!r}"
+        raise MisfitError(
+            f"{place}.amplitude",
+            f"at most {highest / 2:.3g}, or a wave {length:.4g} m long breaks",
+            f"{wave.amplitude:g}",
         )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CurrentField:
-    """Steady velocities of the water on a grid; see `water.field_flow`.
+    """Steady velocities of the water on a grid; see `flow.field_flow`.
 
     Two are equal if their numbers are, wherever they were read.
 
@@ -368,20 +300,12 @@ def load_current_field(path: str | Path) -> CurrentField:
         InputError: it cannot be read or is no full grid; the message names file and place.
     """
     path = Path(path)
-    try:
+    with reading(path):
         if path.suffix.lower() == ".npz":
             return _read_arrays(path)
         if path.suffix.lower() == ".csv":
             return _read_table(path)
         raise InputError("expected a file .npz or .csv")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file; found none") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: expected a file; found a folder") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
 
 
 def _read_arrays(path: Path) -> CurrentField:
@@ -403,22 +327,20 @@ def _read_arrays(path: Path) -> CurrentField:
 
 
 def _read_table(path: Path) -> CurrentField:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"expected UTF-8 text; found {error.reason}") from None
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
     heading = [name.strip() for name in lines[0].split(",")] if lines else []
     for name in _COLUMNS:
         if heading.count(name) != 1:
             found = f"{name} twice" if name in heading else f"no {name}"
             raise InputError(f"line 1: expected columns {', '.join(_COLUMNS)}; found {found}")
-    try:
-        table = np.array([line.split(",") for line in lines[1:] if line.strip()], np.float64)
-        sound = bool(np.all(np.isfinite(table)))
-    except ValueError:
-        sound = False
-    if not sound or table.ndim != 2 or table.shape[1] != len(heading):
-        _refuse_line(lines, len(heading))
+    rows = []
+    for number, line in enumerate(lines[1:], 2):
+        if line.strip():
+            with reading(f"line {number}"):
+                rows.append(_read_row(line.split(","), len(heading)))
+    if not rows:
+        raise InputError("line 2: expected rows of numbers; found none")
+    table = np.array(rows)
     columns = {name: table[:, heading.index(name)] for name in _COLUMNS}
     axes = [np.unique(columns[name]) for name in "xyz"]
     shape = tuple(len(axis) for axis in axes)
@@ -437,19 +359,15 @@ def _read_table(path: Path) -> CurrentField:
     return CurrentField(axes[0], axes[1], axes[2], velocity, str(path))
 
 
-def _refuse_line(lines: Sequence[str], count: int) -> None:
-    """Says which line of a table is wrong."""
-    for number, line in enumerate(lines[1:], 2):
-        if not line.strip():
-            continue
-        cells = [cell.strip() for cell in line.split(",")]
-        if len(cells) != count:
-            raise InputError(f"line {number}: expected {count} numbers; found {len(cells)}")
-        for cell in cells:
-            try:
-                finite = math.isfinite(float(cell))
-            except ValueError:
-                raise InputError(f"line {number}: expected a number; found {cell!r}") from None
-            if not finite:
-                raise InputError(f"line {number}: expected a finite number; found {cell!r}")
-    raise InputError("line 2: expected rows of numbers; found none")
+def _read_row(cells: Sequence[str], count: int) -> list[float]:
+    if len(cells) != count:
+        raise InputError(f"expected {count} numbers; found {len(cells)}")
+    row = []
+    for cell in cells:
+        try:
+            row.append(float(cell))
+        except ValueError:
+            raise InputError(f"expected a number; found {cell.strip()!r}") from None
+        if not math.isfinite(row[-1]):
+            raise InputError(f"expected a finite number; found {cell.strip()!r}")
+    return row

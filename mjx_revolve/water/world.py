@@ -1,43 +1,54 @@
 """The world a robot swims in: water, gravity, surface, bed, current. Knows nothing of robots.
 
 A world is one small frozen value, read from a small YAML file. The two worlds of the thesis are in
-`mjx_revolve/worlds/`; users write their own and name the file.
+`mjx_revolve/water/worlds/`; users write their own and name the file.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le, MinLen, Unit
+from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 
 from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.inputs.errors import InputError, load_yaml, reading
+from mjx_revolve.inputs.schema import (
+    Law,
+    Maybe,
+    MisfitError,
+    NonNegative,
+    Number,
+    Row,
+    Switch,
+    Text,
+    Vector,
+    as_tuple,
+    checked,
+    is_off,
+    read,
+    show,
+    words,
+)
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.currents import (
     CurrentField,
     Gust,
     Shear,
     Wave,
-    check_number,
     check_wave,
     find_field,
-    listed,
     load_current_field,
-    read_vector,
 )
-
-BUOYANCY = ("partial", "mask", "off")
-DRAG = ("faces", "lift_drag", "inertia_box", "ellipsoid", "off")
 
 _FOLDER = Path(__file__).parent / "worlds"
 
 
-@dataclass(frozen=True)
+@checked
 class SurfaceTension:
     """Surface tension along the waterline; see `buoyancy.surface_tension`.
 
@@ -46,15 +57,49 @@ class SurfaceTension:
         contact_angle: between water and module, through the water [rad]; below π/2 it wets.
     """
 
-    gamma: float = 0.0728
-    contact_angle: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_number("surface_tension.gamma", self.gamma, low=1e-6)
-        check_number("surface_tension.contact_angle", self.contact_angle, low=0.0, high=math.pi)
+    gamma: Annotated[Number, Ge(1e-6), Unit("N/m")] = 0.0728
+    contact_angle: Annotated[Number, Ge(0), Le(math.pi), Unit("rad")] = 0.0
 
 
-@dataclass(frozen=True)
+def _read_gravity(value: Any) -> Any:
+    """MuJoCo's and Gazebo's vector (0, 0, -g) as the plain number g."""
+    value = as_tuple(value)
+    if not isinstance(value, tuple):
+        return value
+    plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in value)
+    if not plain or len(value) != 3 or value[:2] != (0, 0) or value[2] > 0:
+        down = "a number, or (0, 0, -g), since the surface is level [m/s2]"
+        raise MisfitError("", down, show(value))
+    return -value[2]
+
+
+def _read_bed(value: Any) -> Any:
+    """A height as a flat bed at it."""
+    if is_off(value):
+        return None
+    plain = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return {"height": value} if plain else value
+
+
+def _read_waves(value: Any) -> Any:
+    """One wave as a list of one."""
+    if is_off(value):
+        return ()
+    return (value,) if isinstance(value, Wave | Mapping) else value
+
+
+def _read_field(value: Any, info: ValidationInfo) -> Any:
+    """Reads the file of a path, which, if relative, starts from the context's folder."""
+    if is_off(value):
+        return None
+    if isinstance(value, CurrentField):
+        return value
+    if not isinstance(value, str | Path) or not str(value):
+        raise MisfitError("", "the path of a file", show(value))
+    return load_current_field(find_field(value, info.context or Path()))
+
+
+@checked
 class World:
     """Water, gravity, surface, bed and current, and which fluid laws act.
 
@@ -83,130 +128,35 @@ class World:
         timestep: of the simulation [s].
     """
 
-    name: str = "water"
-    density: float = 999.1026
-    viscosity: float = 1.138e-3
-    gravity: float = 9.81
-    surface_height: float = 0.0
-    current: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    bed: Bed | None = None
-    buoyancy: str = "partial"
-    drag: str = "faces"
-    added_mass: bool = True
-    lift_drag: LiftDrag = dataclasses.field(default_factory=LiftDrag)
-    shear: Shear | None = None
-    current_field: CurrentField | None = None
-    gust: Gust | None = None
-    waves: tuple[Wave, ...] = ()
-    water_depth: float | None = None
-    surface_tension: SurfaceTension | None = None
-    timestep: float = 0.005
+    name: Annotated[Text, MinLen(1)] = "water"
+    density: Annotated[NonNegative, Unit("kg/m3")] = 999.1026
+    viscosity: Annotated[NonNegative, Unit("Pa s")] = 1.138e-3
+    gravity: Annotated[NonNegative, BeforeValidator(_read_gravity), Unit("m/s2")] = 9.81
+    surface_height: Annotated[Number, Unit("m")] = 0.0
+    current: Annotated[Vector, Unit("m/s")] = (0.0, 0.0, 0.0)
+    bed: Annotated[
+        Bed | None,
+        BeforeValidator(_read_bed),
+        words("'off', a height in metres or a mapping with kind"),
+    ] = None
+    buoyancy: Law[Literal["partial", "mask", "off"]] = "partial"
+    drag: Law[Literal["faces", "lift_drag", "inertia_box", "ellipsoid", "off"]] = "faces"
+    added_mass: Switch = True
+    lift_drag: LiftDrag = LiftDrag()
+    shear: Maybe[Shear] = None
+    current_field: Annotated[InstanceOf[CurrentField] | None, BeforeValidator(_read_field)] = None
+    gust: Maybe[Gust] = None
+    waves: Annotated[Row[Wave], BeforeValidator(_read_waves)] = ()
+    water_depth: Annotated[Number, Ge(1e-2), Unit("m")] | None = None
+    surface_tension: Annotated[
+        Maybe[SurfaceTension], BeforeValidator(lambda value: {} if value is True else value)
+    ] = None
+    timestep: Annotated[Number, Ge(1e-5), Le(0.1), Unit("s")] = 0.005
 
     def __post_init__(self) -> None:
-        check_number("density", self.density, low=0.0)
-        check_number("viscosity", self.viscosity, low=0.0)
-        check_number("gravity", self.gravity, low=0.0)
-        check_number("surface_height", self.surface_height)
-        check_number("timestep", self.timestep, low=1e-5, high=0.1)
-        for axis, value in zip("xyz", self.current, strict=True):
-            check_number(f"current.{axis}", value)
-        if self.buoyancy not in BUOYANCY:
-            raise InputError(
-                f"buoyancy: expected one of {listed(BUOYANCY)}; found {self.buoyancy!r}"
-            )
-        if self.drag not in DRAG:
-            raise InputError(f"drag: expected one of {listed(DRAG)}; found {self.drag!r}")
-        if not isinstance(self.added_mass, bool):
-            raise InputError(f"added_mass: expected true or false; found {self.added_mass!r}")
-        if self.water_depth is not None:
-            check_number("water_depth", self.water_depth, low=1e-2)
+        """Checks that the waves fit the water."""
         for i, wave in enumerate(self.waves):
-            try:
-                check_wave(wave, self.gravity, self.water_depth)
-            except InputError as error:
-                raise InputError(_numbered(error, i)) from None
-        if not isinstance(self.name, str) or not self.name:
-            raise InputError(f"name: expected a text; found {self.name!r}")
-
-
-def _read_gravity(value: Any) -> Any:
-    """Accepts MuJoCo's and Gazebo's vector (0, 0, -g) beside the plain number g."""
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        return value
-    if len(value) != 3 or any(isinstance(v, str | bool) for v in value):
-        raise InputError(f"gravity: expected a number or 3 numbers; found {list(value)!r}")
-    if value[0] != 0 or value[1] != 0 or value[2] > 0:
-        raise InputError(f"gravity: expected (0, 0, -g), the surface is level; found {value!r}")
-    return -float(value[2])
-
-
-def _read_part(place: str, value: Any, kind: type) -> Any:
-    if isinstance(value, kind):
-        return value
-    if not isinstance(value, Mapping):
-        raise InputError(f"{place}: expected a mapping; found {value!r}")
-    known = [field.name for field in dataclasses.fields(kind)]
-    for name in value:
-        if name not in known:
-            raise InputError(f"{place}: expected one of {', '.join(known)}; found {name!r}")
-    for field in dataclasses.fields(kind):
-        required = field.default is dataclasses.MISSING
-        if required and field.name not in value:
-            raise InputError(f"{place}: expected {field.name}; found none")
-    return kind(**{k: v.item() if isinstance(v, np.generic) else v for k, v in value.items()})
-
-
-def _numbered(error: InputError, i: int) -> str:
-    return str(error).replace("waves", f"waves.{i}", 1)
-
-
-def _is_off(value: Any) -> bool:
-    """Whether a value says that there is none: YAML 1.1 reads a bare `off` as False."""
-    return value is None or value is False or (isinstance(value, str) and value == "off")
-
-
-def _read_waves(value: Any) -> tuple[Wave, ...]:
-    if _is_off(value):
-        return ()
-    if isinstance(value, Wave | Mapping):
-        value = [value]
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise InputError(f"waves: expected a list of mappings; found {value!r}")
-    waves = []
-    for i, item in enumerate(value):
-        try:
-            waves.append(_read_part("waves", item, Wave))
-        except InputError as error:
-            raise InputError(_numbered(error, i)) from None
-    return tuple(waves)
-
-
-def _read_field(value: Any, folder: Path) -> CurrentField | None:
-    if _is_off(value):
-        return None
-    if isinstance(value, CurrentField):
-        return value
-    if not isinstance(value, str | Path) or not str(value):
-        raise InputError(f"current_field: expected the path of a file; found {value!r}")
-    try:
-        return load_current_field(find_field(value, folder))
-    except InputError as error:
-        raise InputError(f"current_field: {error}") from None
-
-
-def _read_bed(value: Any) -> Bed | None:
-    if value is None or value == "off" or value is False:
-        return None
-    if hasattr(value, "item") and not getattr(value, "shape", ()):
-        value = value.item()
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        check_number("bed", value)
-        return Bed(kind="flat", height=float(value))
-    if not isinstance(value, Bed | Mapping):
-        raise InputError(
-            f"bed: expected 'off', a height in metres or a mapping with kind; found {value!r}"
-        )
-    return _read_part("bed", value, Bed)
+            check_wave(wave, self.gravity, self.water_depth, f"waves.{i}")
 
 
 def make_world(**fields: Any) -> World:
@@ -224,42 +174,7 @@ def make_world(**fields: Any) -> World:
     Raises:
         InputError: an unknown field or a value out of range.
     """
-    known = [field.name for field in dataclasses.fields(World)]
-    for name in fields:
-        if name not in known:
-            raise InputError(f"{name}: expected one of {', '.join(known)}; found {name!r}")
-    values = dict(fields)
-    for name in ("density", "viscosity", "surface_height", "timestep", "gravity", "water_depth"):
-        if hasattr(values.get(name), "item") and not hasattr(values[name], "__len__"):
-            values[name] = values[name].item()
-    if "gravity" in values:
-        if hasattr(values["gravity"], "tolist"):
-            values["gravity"] = values["gravity"].tolist()
-        values["gravity"] = _read_gravity(values["gravity"])
-    if "current" in values:
-        values["current"] = read_vector("current", values["current"])
-    if "bed" in values:
-        values["bed"] = _read_bed(values["bed"])
-    # YAML 1.1 reads a bare `off` as False.
-    for name in ("buoyancy", "drag"):
-        if values.get(name) is False:
-            values[name] = "off"
-    if "lift_drag" in values:
-        values["lift_drag"] = _read_part("lift_drag", values["lift_drag"], LiftDrag)
-    for name, kind in (("shear", Shear), ("gust", Gust), ("surface_tension", SurfaceTension)):
-        if name not in values:
-            continue
-        if _is_off(values[name]):
-            values[name] = None
-        elif name == "surface_tension" and values[name] is True:
-            values[name] = SurfaceTension()
-        else:
-            values[name] = _read_part(name, values[name], kind)
-    if "waves" in values:
-        values["waves"] = _read_waves(values["waves"])
-    if "current_field" in values:
-        values["current_field"] = _read_field(values["current_field"], Path())
-    return World(**values)
+    return read(World, fields)
 
 
 def load_world(name: str | Path, **overrides: Any) -> World:
@@ -287,19 +202,12 @@ def load_world(name: str | Path, **overrides: Any) -> World:
             f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
         )
     data = load_yaml(path)
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a mapping of world fields; found {data!r}")
-    for key in data:
-        if not isinstance(key, str):
-            raise InputError(f"{path}: expected names of world fields; found {key!r}")
-    fields: dict[str, Any] = {"name": path.stem} | data
-    try:
-        if "current_field" in fields:
-            # A world file names its field's file from where it stands itself.
-            fields["current_field"] = _read_field(fields["current_field"], path.parent)
-        world = make_world(**fields)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    with reading(path):
+        if not isinstance(data, dict):
+            raise InputError(f"expected a mapping of world fields; found {show(data)}")
+        fields: dict[Any, Any] = {"name": path.stem} | data
+        # A world file names its field's file from where it stands itself.
+        world = read(World, fields, context=path.parent)
     if not overrides:
         return world
     for key, value in overrides.items():
@@ -308,7 +216,5 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         if isinstance(below, Mapping) and isinstance(value, Mapping):
             alike = value.get("kind", below.get("kind")) == below.get("kind")
             overrides[key] = {**below, **value} if alike else value
-    try:
-        return make_world(**fields | overrides)
-    except InputError as error:
-        raise InputError(f"world {world.name}: {error}") from None
+    with reading(f"world {world.name}"):
+        return read(World, fields | {"current_field": world.current_field} | overrides)

@@ -859,19 +859,19 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
         (HINGE_ON % "params: {ballast_volume: -1}", "ballast_volume: expected a number >= 0 [m3]"),
         (
             HINGE_ON % "params: {entrained_water: 2}",
-            "body.children.1.params: part 'frame': entrained_water: expected a share from 0 to 1",
+            "body.children.1.params.entrained_water: expected a number >= 0 and <= 1 [-]; found 2",
         ),
         (HINGE_ON % "params: {entrained_water: x}", "params.entrained_water: expected a number >="),
         (HINGE_ON % "params: {drag_coefficient: -1}", "params.drag_coefficient: expected a number"),
         (HINGE_ON % "params: {added_mass_coefficient: }", "added_mass_coefficient: expected a num"),
         (
             HINGE_ON % "params: {buoyancy: on}",
-            "children.1.params: part 'frame': buoyancy: expected one of partial, mask, off; foun",
+            "children.1.params.buoyancy: expected one of partial, mask, off; found True",
         ),
-        (HINGE_ON % "params: {drag: 3}", "drag: expected one of faces, lift_drag, ellipsoid, off;"),
+        (HINGE_ON % "params: {drag: 3}", "drag: expected one of faces, lift_drag, ellipsoid, off"),
         (
             HINGE_ON % "params: {drag: inertia_box}",
-            "ellipsoid, off (a law of whole bodies: the world's); found 'inertia_box'",
+            "ellipsoid, off (inertia_box is a law of whole bodies); found 'inertia_box'",
         ),
         (HINGE_ON % "params: {added_mass: 2}", "added_mass: expected true or false; found 2"),
         (
@@ -883,8 +883,8 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
             "params: thruster: expected a module with a thruster; found type Ac",
         ),
         (
-            HINGE_ON % "params: {thruster: {power: 1}}",
-            "body.children.1.params.thruster: expected only axis, position, curve, gain",
+            JET_ON % "thruster: {power: 1}",
+            "body.children.1.params: thruster: power: expected one of axis, position, curve, gain",
         ),
         (
             HINGE_ON % "params: {thruster: 1}",
@@ -896,11 +896,11 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
         ),
         (
             HINGE_ON % "params: {lift_drag: {Cla: 1}}",
-            "params.lift_drag: expected only a0, cla, cda",
+            "params: lift_drag: Cla: expected one of a0, cla, cda",
         ),
         (
             HINGE_ON % "params: {lift_drag: {cla: x}}",
-            "body.children.1.params: lift_drag.cla: expected a number; found 'x'",
+            "body.children.1.params: lift_drag: cla: expected a number [1/rad]; found 'x'",
         ),
         (JET_ON % "thrust: -1", "params.thrust: expected a number >= 0 [N]; found -1"),
         (

@@ -59,13 +59,13 @@ def test_it_is_frozen(folder):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("task.duration=-3", "--set task.duration: expected a number > 0; found -3"),
-        ("task.duration=abc", "--set task.duration: expected a number > 0; found 'abc'"),
-        ("task.duration=.nan", "--set task.duration: expected a number > 0; found nan"),
-        ("task.duration=.inf", "--set task.duration: expected a number > 0; found inf"),
-        ("task.duration=true", "--set task.duration: expected a number > 0; found True"),
-        ("task.duration=", "--set task.duration: expected a number > 0; found None"),
-        ("task.duration.x=3", "--set task.duration: expected a number > 0; found {'x': 3}"),
+        ("task.duration=-3", "--set task.duration: expected a number > 0 [s]; found -3"),
+        ("task.duration=abc", "--set task.duration: expected a number > 0 [s]; found 'abc'"),
+        ("task.duration=.nan", "--set task.duration: expected a number > 0 [s]; found nan"),
+        ("task.duration=.inf", "--set task.duration: expected a number > 0 [s]; found inf"),
+        ("task.duration=true", "--set task.duration: expected a number > 0 [s]; found True"),
+        ("task.duration=", "--set task.duration: expected a number > 0 [s]; found None"),
+        ("task.duration.x=3", "--set task.duration: expected a number > 0 [s]; found {'x': 3}"),
         ("task.settle=10", "task.settle: expected a time below task.duration (10 s); found 10"),
         ("task.trials=0", "task.trials: expected a whole number >= 1; found 0"),
         ("task.trials=2.0", "task.trials: expected a whole number >= 1; found 2.0"),
@@ -82,20 +82,19 @@ def test_it_is_frozen(folder):
         ("controller.params.a=1", "controller.params: expected none, as only own functions"),
         ("task.type=reach_target", "task.target: expected three numbers, because task.type is "
          "reach_target; found none"),
-        ("task.target=[1, 2]", "task.target: expected three finite numbers or nothing; "
+        ("task.target=[1, 2]", "task.target: expected three numbers [m], or nothing; "
          "found [1, 2]"),
-        ("task.direction=[1, 0, a]", "task.direction: expected three finite numbers; "
-         "found [1, 0, 'a']"),
+        ("task.direction=[1, 0, a]", "task.direction.2: expected a number [-]; found 'a'"),
         ("task.direction=[0, 0, 0]", "task.direction: expected a vector of some length; found"),
-        ("task.depth=-1", "task.depth: expected a number >= 0; found -1"),
-        ("task.depth_tolerance=0", "task.depth_tolerance: expected a number > 0; found 0"),
-        ("task.start_tilt=-1", "task.start_tilt: expected a number >= 0; found -1"),
+        ("task.depth=-1", "task.depth: expected a number >= 0 [m]; found -1"),
+        ("task.depth_tolerance=0", "task.depth_tolerance: expected a number > 0 [m]; found 0"),
+        ("task.start_tilt=-1", "task.start_tilt: expected a number >= 0 [rad]; found -1"),
         ("task.durtion=5", "task.durtion: expected one of type, duration, settle"),
         ("task.durtion=5", "found an unknown key; did you mean task.duration?"),
         ("duration=5", "found an unknown key; did you mean task.duration?"),
         ("wrld=lake", "found an unknown key; did you mean world?"),
         ("qqqqqq=1", "task, evolution; found an unknown key"),
-        ("task=3", "--set task: expected a mapping; found 3"),
+        ("task=3", "--set task: expected a mapping with type; found 3"),
         ("trim=no", "--set trim: expected one of neutral, none; found False"),
         ("engine=gpu", "--set engine: expected one of population, mjx; found 'gpu'"),
         ("allow_overlap=1", "--set allow_overlap: expected true or false; found 1"),
@@ -103,8 +102,8 @@ def test_it_is_frozen(folder):
             "controller.type=splines",
             "expected one of cpg, sine, feedback, or FILE.py:FUNCTION; found 'splines'",
         ),
-        ("controller.max_frequency=21", "expected a number > 0 and <= 20; found 21"),
-        ("controller.amplitude=0", "expected a number > 0 and <= 1; found 0"),
+        ("controller.max_frequency=21", "expected a number > 0 and <= 20 [Hz]; found 21"),
+        ("controller.amplitude=0", "expected a number > 0 and <= 1 [-]; found 0"),
         ("world=3", "--set world: expected a world's name or path, or a mapping of name and "
          "overrides; found 3"),
         ("world={density: 1}", "expected a `name` (a world's name or path) beside the overrides"),
@@ -117,7 +116,7 @@ def test_it_is_frozen(folder):
         ("evolution.population_size=3", "expected a whole number >= 4; found 3"),
         ("evolution.generations=0", "expected a whole number >= 1; found 0"),
         ("evolution.seed=-1", "expected a whole number >= 0 and < 4294967296; found -1"),
-        ("evolution.std_init=0", "evolution.std_init: expected a number > 0; found 0"),
+        ("evolution.std_init=0", "evolution.std_init: expected a number > 0 [-]; found 0"),
         ("evolution.strategy_params=3", "evolution.strategy_params: expected a mapping; found 3"),
         ("task.duration", "--set task.duration: expected KEY.PATH=VALUE; found 'task.duration'"),
         ("=3", "--set =3: expected KEY.PATH=VALUE; found '=3'"),
@@ -138,7 +137,7 @@ def test_wrong_settings(folder, setting, message):
         ("- 1", "bad.yaml: expected a mapping of settings; found [1]"),
         ("world: lake", "bad.yaml: morphology: expected the path of a morphology YAML; found none "
          "(and 1 more: task)"),
-        (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0; found -3"),
+        (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0 [s]; found -3"),
         (GOOD + "  2: 3", "bad.yaml: task.2: expected the name of a setting"),
         (GOOD + "3: 3", "bad.yaml: 3: expected the name of a setting"),
         (GOOD + "world: lake", "bad.yaml: line 6: expected each key once; found 'world' twice"),
@@ -148,7 +147,7 @@ def test_wrong_settings(folder, setting, message):
          "bad.yaml: task.type: expected a file; found none at"),
         (GOOD.replace("type: directed_swim", "trials: 2"), "bad.yaml: task.type: expected one of"),
         (GOOD.replace("\n  type: directed_swim", ""),
-         "bad.yaml: task: expected a mapping; found None"),
+         "bad.yaml: task: expected a mapping with type; found None"),
         ("a: [", "bad.yaml: line 1: expected valid YAML"),
     ],
 )  # fmt: skip
@@ -165,7 +164,7 @@ def test_missing_file(folder):
 
 def test_several_problems_are_one_line(folder):
     check_message(
-        "--set task.duration: expected a number > 0; found -1 (and 2 more: task.trials, "
+        "--set task.duration: expected a number > 0 [s]; found -1 (and 2 more: task.trials, "
         "evolution.seed)",
         lambda: load_config(
             folder / "good.yaml", ["task.duration=-1", "task.trials=0", "evolution.seed=-1"]

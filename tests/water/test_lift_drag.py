@@ -376,33 +376,33 @@ def test_gazebo_defaults():
 
 
 BAD = [
-    ({"cla": "steep"}, "lift_drag.cla: expected a number; found 'steep'"),
-    ({"cda": True}, "lift_drag.cda: expected a number; found True"),
-    ({"cma": math.nan}, "lift_drag.cma: expected a finite number; found nan"),
+    ({"cla": "steep"}, "lift_drag: cla: expected a number [1/rad]; found 'steep'"),
+    ({"cda": True}, "lift_drag: cda: expected a number [1/rad]; found True"),
+    ({"cma": math.nan}, "lift_drag: cma: expected a number [m/rad]; found nan"),
     (
         {"cma_stall": 10**400},
-        "lift_drag.cma_stall: expected a finite number; found 'a huge integer'",
+        "lift_drag: cma_stall: expected a number [m/rad]; found 1000",
     ),
     (
         {"alpha_stall": 0},
-        "lift_drag.alpha_stall: expected an angle above 0, at most pi/2 [rad]; found 0",
+        "lift_drag: alpha_stall: expected a number > 0 and <= 1.5708 [rad]; found 0",
     ),
-    ({"alpha_stall": 2.0}, "at most pi/2 [rad]; found 2"),
-    ({"area": -1}, "lift_drag.area: expected at least 0; found -1"),
-    ({"density": -1}, "lift_drag.density: expected at least 0; found -1"),
-    ({"cp": 3}, "lift_drag.cp: expected three numbers; found 3"),
-    ({"cp": "abc"}, "lift_drag.cp: expected three numbers; found 'abc'"),
-    ({"cp": (0, 0, "z")}, "lift_drag.cp: expected a number; found 'z'"),
+    ({"alpha_stall": 2.0}, "and <= 1.5708 [rad]; found 2"),
+    ({"area": -1}, "lift_drag: area: expected a number >= 0 [m2], or nothing; found -1"),
+    ({"density": -1}, "lift_drag: density: expected a number >= 0 [kg/m3], or nothing; found -1"),
+    ({"cp": 3}, "lift_drag: cp: expected three numbers [m], or nothing; found 3"),
+    ({"cp": "abc"}, "lift_drag: cp: expected three numbers [m], or nothing; found 'abc'"),
+    ({"cp": (0, 0, "z")}, "lift_drag: cp.2: expected a number [m]; found 'z'"),
     ({"forward": (1, 0, 0)}, "lift_drag: expected both forward and upward, or neither; found one"),
     (
         {"forward": (0, 0, 0), "upward": (0, 0, 1)},
-        "lift_drag.forward: expected a direction, not zero",
+        "lift_drag: forward: expected a direction, not zero",
     ),
     (
         {"forward": (1, 0, 0), "upward": (1, 0, 1)},
-        "lift_drag.upward: expected a vector perpendicular",
+        "lift_drag: upward: expected a vector perpendicular",
     ),
-    ({"radial_symmetry": 1}, "lift_drag.radial_symmetry: expected true or false; found 1"),
+    ({"radial_symmetry": 1}, "lift_drag: radial_symmetry: expected true or false; found 1"),
 ]
 
 

@@ -1,0 +1,59 @@
+"""The paths in a configuration, made absolute where they are written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.own_code import parse_own
+
+
+def is_path(world: str) -> bool:
+    """Whether a world is given as a file rather than by name.
+
+    Args:
+        world: what was written.
+
+    Returns:
+        True if it ends in `.yaml` or `.yml`, or contains a folder.
+    """
+    return world.endswith((".yaml", ".yml")) or "/" in world or os.sep in world
+
+
+def resolve_paths(data: dict[str, Any], origin: Callable[[str], tuple[Path, str]]) -> None:
+    """Makes all paths absolute in place.
+
+    Args:
+        data: the settings, checked or not.
+        origin: for the place of a path, the folder from which it starts and what stands before the
+            place in messages.
+
+    Raises:
+        InputError: there is no such file.
+    """
+
+    def resolve(section: Any, key: str, within: str = "") -> None:
+        value = section.get(key) if isinstance(section, dict) else None
+        if not isinstance(value, str) or not value:
+            return
+        own = parse_own(value) if key == "type" else None
+        if (key == "type" and own is None) or (key in ("world", "name") and not is_path(value)):
+            return
+        place = within + key
+        folder, before = origin(place)
+        file = own.path if own else value
+        path = Path(os.path.abspath(folder / Path(file).expanduser()))
+        if not path.is_file():
+            what = "a folder" if path.is_dir() else "none"
+            raise InputError(f"{before}{place}: expected a file; found {what} at {path}")
+        section[key] = f"{path}:{own.function}" if own else str(path)
+
+    for key in ("morphology", "modules", "world"):
+        resolve(data, key)
+    for key in ("name", "current_field"):
+        resolve(data.get("world"), key, "world.")
+    for section in ("controller", "task"):
+        resolve(data.get(section), "type", f"{section}.")

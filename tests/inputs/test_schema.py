@@ -1,0 +1,187 @@
+"""Checked values: what they take, and every kind of complaint in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import pickle
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+from annotated_types import Ge, Le, Lt, MinLen, Unit
+from pydantic import BaseModel
+
+from mjx_revolve.inputs.complaints import describe
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.schema import (
+    Direction,
+    Law,
+    Maybe,
+    MisfitError,
+    NonNegative,
+    Number,
+    Pair,
+    Positive,
+    Row,
+    Switch,
+    Text,
+    Vector,
+    Whole,
+    checked,
+    read,
+    words,
+)
+
+
+@checked
+class Leaf:
+    """The end of a branch."""
+
+    length: Annotated[Positive, Unit("m")]
+    range: Annotated[Pair[Number], Unit("rad")] = (-1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if self.range[0] > self.range[1]:
+            raise MisfitError("range", "a rising one", str(list(self.range)))
+
+
+@checked
+class Tree:
+    """A name, some numbers, and what grows on it."""
+
+    name: Annotated[Text, words("a name")]
+    axis: Direction = (0.0, 0.0, 1.0)
+    place: Annotated[Vector, Unit("m")] = (0.0, 0.0, 0.0)
+    leaves: Row[Leaf] = ()
+    by_number: dict[Annotated[Whole, Ge(0)], Leaf] = dataclasses.field(default_factory=dict)
+    first: Maybe[Leaf] = None
+    age: Annotated[Whole, Ge(0), Lt(2**32)] = 0
+    mass: Annotated[NonNegative, Unit("kg")] | None = None
+    shade: Law[Literal["some", "off"]] = "some"
+    green: Switch = True
+
+
+def test_values_become_plain():
+    tree = Tree(
+        "oak",
+        axis=np.array([0.0, 3.0, 4.0]),
+        place=[np.float32(1.5), 2, np.int64(3)],
+        leaves=[{"length": 1}, Leaf(2, range=[0, 1])],
+        first="off",
+        shade=False,
+    )
+    assert tree == Tree(
+        name="oak",
+        axis=(0.0, 0.6, 0.8),
+        place=(1.5, 2.0, 3.0),
+        leaves=(Leaf(1.0), Leaf(2.0, (0.0, 1.0))),
+        shade="off",
+    )
+    plain = [*tree.axis, *tree.place, tree.leaves[0].length]
+    assert {type(x) for x in plain} == {float}
+    assert read(Tree, {"name": "oak", "first": {"length": 3}}).first == Leaf(3)
+
+
+def test_they_are_frozen_dataclasses():
+    leaf = Leaf(1)
+    assert hash(leaf) == hash(Leaf(1.0)) and repr(leaf) == "Leaf(length=1.0, range=(-1.0, 1.0))"
+    assert pickle.loads(pickle.dumps(leaf)) == leaf
+    assert dataclasses.replace(leaf, length=2) == Leaf(2)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        leaf.length = 2.0
+    with pytest.raises(InputError, match=r"^leaf: length: expected a number > 0 \[m\]; found 0$"):
+        dataclasses.replace(leaf, length=0)
+
+
+NAMES = "name, axis, place, leaves, by_number, first, age, mass, shade, green"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"name": 3}, "name: expected a name; found 3"),
+        ({"axis": (0, 0, 0)}, "axis: expected a direction, not zero; found [0.0, 0.0, 0.0]"),
+        ({"axis": (1e300, 1e300, 0)}, "axis: expected a direction, not zero; found [1e+300, 1e"),
+        ({"place": (1, 2)}, "place: expected three numbers [m]; found (1, 2)"),
+        ({"place": [1, 2, 3, 4]}, "place: expected three numbers [m]; found [1, 2, 3, 4]"),
+        ({"place": "xyz"}, "place: expected three numbers [m]; found 'xyz'"),
+        ({"place": {1, 2, 3}}, "place: expected three numbers [m]; found {1, 2, 3}"),
+        ({"place": (1, True, 3)}, "place.1: expected a number [m]; found True"),
+        ({"place": (1, "2", 3)}, "place.1: expected a number [m]; found '2'"),
+        ({"place": (1, 2, math.nan)}, "place.2: expected a number [m]; found nan"),
+        ({"place": (10**400, 2, 3)}, "place.0: expected a number [m]; found 1000"),
+        ({"place": (10**5000, 2, 3)}, "place.0: expected a number [m]; found a huge integer"),
+        ({"leaves": 3}, "leaves: expected a list of mappings with length; found 3"),
+        ({"leaves": [3]}, "leaves.0: expected a mapping with length; found 3"),
+        ({"leaves": [{}]}, "leaves.0.length: expected a number > 0 [m]; found none"),
+        (
+            {"leaves": [Leaf(1), {"length": 2, "range": [1, "a"]}]},
+            "leaves.1.range.1: expected a number [rad]; found 'a'",
+        ),
+        (
+            {"leaves": [{"length": 2, "range": [1, 0]}]},
+            "leaves.0.range: expected a rising one; found [1.0, 0.0]",
+        ),
+        ({"by_number": {"a": {}}}, "by_number: expected a whole number >= 0; found 'a'"),
+        ({"by_number": {-1: Leaf(1)}}, "by_number: expected a whole number >= 0; found -1"),
+        ({"by_number": {2: {"length": -1}}}, "by_number.2.length: expected a number > 0 [m]; fo"),
+        ({"first": 3}, "first: expected a mapping with length, or nothing; found 3"),
+        ({"age": 2**32}, "age: expected a whole number >= 0 and < 4294967296; found 4294967296"),
+        ({"age": 1.0}, "age: expected a whole number >= 0 and < 4294967296; found 1.0"),
+        ({"mass": -1}, "mass: expected a number >= 0 [kg], or nothing; found -1"),
+        ({"shade": "much"}, "shade: expected one of some, off; found 'much'"),
+        ({"green": 1}, "green: expected true or false; found 1"),
+        ({"gren": 1}, f"gren: expected one of {NAMES}; found an unknown key; did you mean green?"),
+        ({"lenght": 1}, f"expected one of {NAMES}; found an unknown key; did you mean first.leng"),
+        ({"xyz": 1}, f"xyz: expected one of {NAMES}; found an unknown key"),
+        ({"first": {3: 4}}, "first.3: expected the name of a setting; found a key that is no t"),
+        (
+            {"age": -1, "green": 1, "colour": 2},
+            f"colour: expected one of {NAMES}; found an unknown key (and 2 more: age, green)",
+        ),
+    ],
+)
+def test_complaints(values, message):
+    for name, make in (("tree 'ash'", lambda x: Tree(**x)), ("here", lambda x: read(Tree, x))):
+        given: dict[str, Any] = {"name": "ash"} | values
+        with pytest.raises(InputError) as caught:
+            make(given)
+        found = str(caught.value)
+        assert message in found and "\n" not in found
+        if name != "here":
+            assert found.startswith(f"tree {given['name']!r}: ")
+
+
+def test_places_go_in_front():
+    with pytest.raises(InputError, match=r"^garden.2.leaves.0: expected a mapping with length; f"):
+        read(Tree, {"name": "ash", "leaves": [3]}, "garden.2")
+    with pytest.raises(InputError, match=r"^garden: expected a mapping with name; found 3$"):
+        read(Tree, 3, "garden")
+    with pytest.raises(InputError, match=r"^leaf: length: expected a number > 0 \[m\]; found none"):
+        Leaf()
+
+
+class Model(BaseModel):
+    """Described like a checked class."""
+
+    leaf: Leaf
+    size: Annotated[float, Ge(0.5), Le(2)] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (Number, "a number"),
+        (Annotated[Number, Ge(-0.5), Le(1), Unit("m")], "a number >= -0.5 and <= 1 [m]"),
+        (Annotated[Number, Unit("m")] | None, "a number [m], or nothing"),
+        (str | dict[str, Any], "a text or a mapping"),
+        (Row[Number], "a list of numbers"),
+        (Annotated[Row[Whole], MinLen(1)], "a list of whole numbers"),
+        (Annotated[Pair[NonNegative], Unit("s")], "two numbers >= 0 [s]"),
+        (Annotated[str, words("a colour")], "a colour"),
+        (Model, "a mapping with leaf"),
+    ],
+)
+def test_types_in_words(kind, text):
+    assert describe(kind) == text
