@@ -23,6 +23,7 @@ from mjx_revolve.body.module_types import ModuleType, Part, Vector, check_number
 from mjx_revolve.body.params import apply_overrides, check_overrides, read_number
 from mjx_revolve.body.placement import Module, attach, find_bounds, find_overlaps, frozen, same
 from mjx_revolve.inputs.errors import InputError, SafeLoader, load_yaml
+from mjx_revolve.inputs.shipped import find_shipped
 
 __all__ = ["Module", "Morphology", "load_morphology", "save_morphology", "trim_neutral"]
 
@@ -228,7 +229,7 @@ def load_morphology(
       left-handed propeller; `thrust` [N] at its highest command, which scales its curve.
 
     Args:
-        path: the file.
+        path: the file, or a shipped morphology's name.
         modules: the types of modules by name and alias.
         allow_overlap: load a robot whose modules overlap at rest; `overlaps` then names them.
 
@@ -239,7 +240,7 @@ def load_morphology(
         InputError: the file cannot be read, or something in it is wrong; the message says where,
             what was expected and what was found.
     """
-    path = Path(path)
+    path = find_shipped(path, "morphologies")
     data = load_yaml(path)
     if not isinstance(data, dict):
         found = "an empty file" if data is None else show(data)

@@ -32,6 +32,7 @@ from pydantic.fields import FieldInfo
 from mjx_revolve.inputs import errors
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.own_code import parse_own, short_name
+from mjx_revolve.inputs.shipped import find_shipped
 
 
 def _as_tuple(value: Any) -> Any:
@@ -432,7 +433,10 @@ def _resolve(data: dict[str, Any], key: str, folder: Path, origin: str) -> None:
         return
     if not isinstance(value, str) or not value or (key == "world" and not is_path(value)):
         return
-    path = Path(os.path.abspath(folder / Path(value).expanduser()))
+    path = folder / Path(value).expanduser()
+    if key == "morphology":
+        path = find_shipped(Path(value).expanduser(), "morphologies", folder, f"{origin}{key}")
+    path = Path(os.path.abspath(path))
     if not path.is_file():
         what = "a folder" if path.is_dir() else "none"
         place = origin if key == "file" else f"{origin}{key}"
@@ -511,7 +515,8 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
     """Reads a configuration file.
 
     Args:
-        path: the YAML file. Relative paths in it start from its folder.
+        path: the YAML file, or a shipped configuration's name. Relative paths in it start from
+            its folder.
         overrides: values that replace the file's: a mapping of dotted keys or nested mappings
             (`{"task.duration": 5.0}`), or texts as on the command line (`["task.duration=5"]`).
             `world.current=[...]` works on a world given by name, too.
@@ -523,7 +528,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         InputError: the file is missing or no YAML, a key is unknown or missing, a value is out of
             bounds, or a file it names is missing.
     """
-    path = Path(path)
+    path = find_shipped(path, "configs")
     data = errors.load_yaml(path)
     if not isinstance(data, dict):
         found = "an empty file" if data is None else _found(data)
