@@ -157,20 +157,19 @@ def _evolve(start: Start) -> int:
     from mjx_revolve.evolution.loop import REPORT_EPISODES
 
     run, config = start.run, start.config
-    search = session.load_search(start)
-    if search is not None and session.is_finished(start, search):
-        done = search.generation
+    done = start.search.generation if start.search else 0
+    if start.is_finished:
         print(
             f"{_shown(run.folder)}: finished after {done} generations; to go on: "
             f"--set evolution.generations={2 * done}"
         )
         return 0
     print(_describe(start), flush=True)
-    if search is not None:
-        print(f"resuming after generation {search.generation}", flush=True)
+    if start.search:
+        print(f"resuming after generation {done}", flush=True)
     with Interrupts("finishing what is under way") as interrupts:
-        session.write_start(start, search)
-        search = session.run_generations(start, search, interrupts)
+        session.write_start(start)
+        search = session.run_generations(start, interrupts)
         if interrupts.signal and search.generation < config.evolution.generations:
             saved = f"stopped after generation {search.generation}; all of it is saved"
             print(f"{saved}\n{_resume_hint(run)}", flush=True)

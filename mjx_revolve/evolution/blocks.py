@@ -19,20 +19,17 @@ import numpy as np
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.numerics.xla import LANES, on_cpu
 
+Scored = tuple[list[np.ndarray], list[str]]
+
 
 class Workplace(Protocol):
     """Whoever scores blocks."""
 
     @property
     def hosts(self) -> list[dict[str, Any]]:
-        """The hosts at work: `node`, `cpu`, `xla_flags` and the number of `workers` of each.
+        """Who is at work: `node`, `cpu`, `xla_flags`, number of `workers`; empty: this process."""
 
-        Empty where all is done in this process.
-        """
-
-    def score(
-        self, blocks: Sequence[np.ndarray], key: jax.Array
-    ) -> tuple[list[np.ndarray], list[str]]:
+    def score(self, blocks: Sequence[np.ndarray], key: jax.Array) -> Scored:
         """Scores blocks.
 
         Args:
@@ -40,8 +37,7 @@ class Workplace(Protocol):
             key: draws the episodes' starts.
 
         Returns:
-            `[1 + measures, rows]` float32 scores and measures of each block, and the measures'
-            names.
+            `[1 + measures, rows]` float32 scores and measures of each block; the measures' names.
         """
 
     def close(self, reason: str | None = None) -> None:
@@ -55,9 +51,7 @@ class ThisProcess:
         self.fitness = fitness
         self.hosts: list[dict[str, Any]] = []
 
-    def score(
-        self, blocks: Sequence[np.ndarray], key: jax.Array
-    ) -> tuple[list[np.ndarray], list[str]]:
+    def score(self, blocks: Sequence[np.ndarray], key: jax.Array) -> Scored:
         """See `Workplace`."""
         scored = [evaluate_block(self.fitness, block, key) for block in blocks]
         return [rows for rows, _ in scored], scored[-1][1]

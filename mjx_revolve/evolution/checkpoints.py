@@ -54,20 +54,7 @@ def generation_of(path: Path) -> int:
 def write_checkpoint(
     folder: Path, generation: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]
 ) -> Path:
-    """Writes a checkpoint.
-
-    Args:
-        folder: where to.
-        generation: for its name.
-        arrays: any arrays but object arrays.
-        meta: plain values that JSON can hold.
-
-    Returns:
-        The file.
-
-    Raises:
-        OSError: the disk is full.
-    """
+    """Writes a checkpoint: any arrays but object arrays, and values that JSON can hold."""
     path = folder / f"generation_{generation:06d}.npz"
     buffer = io.BytesIO()
     text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
@@ -80,12 +67,6 @@ def write_checkpoint(
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """Reads a checkpoint, every byte of which is checked.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The checkpoint.
 
     Raises:
         DamageError: it is damaged, or no checkpoint.

@@ -39,40 +39,27 @@ class WorkerError(RuntimeError):
     """A worker died, hangs, or never came; the message says which and what is known of it."""
 
 
-def name_function(make_fitness: Callable[[Config], Any] | None) -> str:
-    """The name by which workers import a function.
-
-    Args:
-        make_fitness: a function, or None for the real one.
-
-    Returns:
-        `MODULE:NAME`.
-
-    Raises:
-        ValueError: it cannot be imported by its name.
-    """
-    if make_fitness is None:
-        return MAKE_FITNESS
-    name = f"{make_fitness.__module__}:{make_fitness.__qualname__}"
-    if make_fitness.__module__ == "__main__" or "<" in name:
-        raise ValueError(f"make_fitness: expected a function that can be imported; found {name}")
-    return name
-
-
-def make_job(config: Config, make: str, place: Place, cache: Path | None,
+def make_job(config: Config, make_fitness: Callable | None, place: Place, cache: Path | None,
              patience: float) -> dict[str, Any]:  # fmt: skip
     """What a worker is told on its standard input; `Crew` adds its number and core.
 
     Args:
         config: of the run.
-        make: the function that makes the fitness, by its name.
+        make_fitness: a function that workers can import by its name; None: the real one.
         place: this host's, with the address at which its workers find the leader.
         cache: the compilation cache's folder.
         patience: how long the leader may take to listen [s].
 
-    Returns:
-        Plain values.
+    Raises:
+        ValueError: the function cannot be imported by its name.
     """
+    make = MAKE_FITNESS
+    if make_fitness is not None:
+        make = f"{make_fitness.__module__}:{make_fitness.__qualname__}"
+        if make_fitness.__module__ == "__main__" or "<" in make:
+            raise ValueError(
+                f"make_fitness: expected a function that can be imported; found {make}"
+            )
     return {
         "config": config.model_dump(),
         "source": config.source,

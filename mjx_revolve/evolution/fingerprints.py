@@ -29,14 +29,7 @@ def hash_text(*texts: str) -> str:
 
 
 def plain_settings(config: Config) -> dict[str, Any]:
-    """All settings that may not change while a run goes on, in one form.
-
-    Args:
-        config: the configuration.
-
-    Returns:
-        Nested plain values; a world is always a mapping.
-    """
+    """All settings that may not change while a run goes on; a world is always a mapping."""
     data = config.model_dump()
     for key in FREE_SETTINGS:
         del data["evolution"][key]
@@ -50,12 +43,6 @@ def settings_hash(config: Config) -> str:
 
     Files count by their content, not by their place; so do the users' own tasks and controllers.
     The robot and the world have a fingerprint of their own (`model_hash`).
-
-    Args:
-        config: the configuration.
-
-    Returns:
-        16 hexadecimal digits.
     """
     data = plain_settings(config)
     del data["morphology"], data["modules"]
@@ -68,14 +55,7 @@ def settings_hash(config: Config) -> str:
 
 
 def model_hash(fitness: Any) -> str:
-    """Of the compiled robot and the water around it.
-
-    Args:
-        fitness: from `make_fitness`; one without a robot will do.
-
-    Returns:
-        16 hexadecimal digits.
-    """
+    """Of the compiled robot and the water around it; a fitness without a robot will do."""
     robot = getattr(fitness, "robot", None)
     return hash_text() if robot is None else hash_text(robot.mj_spec.to_xml(), repr(robot.world))
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from mjx_revolve.episodes.config import Config, load_config, override_config
-from mjx_revolve.evolution.crew import Crew, WorkerError, make_job, name_function
+from mjx_revolve.evolution.crew import Crew, WorkerError, make_job
 from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.evolution.place import Place
 from mjx_revolve.inputs.errors import InputError
@@ -27,14 +26,6 @@ _PATIENCE = 300.0
 
 def load_served_config(path: str | None, resume: str | None, settings: Sequence[str]) -> Config:
     """The leader's configuration, from the same command line.
-
-    Args:
-        path: the configuration, or None.
-        resume: the run folder that is continued, or None.
-        settings: what was typed to change the configuration.
-
-    Returns:
-        The configuration.
 
     Raises:
         InputError: it is wrong, or there is none.
@@ -54,35 +45,20 @@ def load_served_config(path: str | None, resume: str | None, settings: Sequence[
 
 
 def start_crew(
-    config: Config,
-    make_fitness: Callable[[Config], Any] | None,
-    workers: int | None,
-    place: Place,
+    config: Config, make_fitness: Callable | None, workers: int | None, place: Place
 ) -> Crew:
-    """Starts this host's workers, which report to the leader.
-
-    Args:
-        config: the leader's configuration.
-        make_fitness: see `pool.make_pool`.
-        workers: how many to start; None: one for each core.
-        place: this host's place; not 0.
-
-    Returns:
-        The workers.
+    """Starts this host's workers, which report to the leader; see `pool.make_pool`.
 
     Raises:
         WorkerError: they cannot be started.
     """
     cache = runtime.prepare_process()
-    job = make_job(config, name_function(make_fitness), place, cache, _PATIENCE)
+    job = make_job(config, make_fitness, place, cache, _PATIENCE)
     return Crew(workers or runtime.usable_cores(), job)
 
 
 def serve(crew: Crew) -> int:
     """Waits until the leader stops the workers, and ends them all as soon as one fails.
-
-    Args:
-        crew: this host's workers.
 
     Returns:
         The exit code: 0 when the run is done, 130 or 143 when interrupted.

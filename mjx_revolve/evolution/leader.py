@@ -26,6 +26,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.crew import Crew, WorkerError
 from mjx_revolve.evolution.messages import PROTOCOL, Channel, SecretError
 from mjx_revolve.inputs.errors import InputError
@@ -218,41 +219,31 @@ class Leader:
                 f"expected workers of the leader's version of mjx_revolve; found protocol "
                 f"{hello.get('protocol')} rather than {PROTOCOL}"
             )
-        host = hello["host"]
-        several = self._num_hosts > 1
-        who = f"host {host} ({hello['node']})" if several else f"worker {hello['worker']}"
+        ours, hosts, host = self._identity, self._num_hosts, hello["host"]
+        who = f"host {host} ({hello['node']})" if hosts > 1 else f"worker {hello['worker']}"
         # This host has the same files, unless somebody is at work on them.
-        versions = self._identity["versions"] if host else {}
-        for package, version in versions.items():
+        for package, version in (ours["versions"] if host else {}).items():
             found = hello["versions"].get(package)
             if found != version:
                 what = "source" if package == "mjx_revolve" else "version"
                 return f"{who}: {package}: expected the leader's {what} {version}; found {found}"
-        if hello["hosts"] != self._num_hosts:
-            return (
-                f"{who}: --hosts: expected {self._num_hosts} as on host 0; found {hello['hosts']}"
-            )
-        if hello["settings_hash"] != self._identity["settings_hash"]:
-            return (
-                f"{who}: expected the leader's configuration (the same command line and the same "
-                "files on each host); found another"
-            )
-        if hello["model_hash"] != self._identity["model_hash"]:
-            return (
-                f"{who}: expected the leader's robot and world (the same files on each host); "
-                "found others"
-            )
-        if (host, hello["worker"]) in self._workers:
-            return f"{who}: --host-index: expected each host once; found {host} twice"
-        if not 0 <= host < self._num_hosts:
-            return f"{who}: --host-index: expected 0 to {self._num_hosts - 1}; found {host}"
-        return ""
+        checks = (
+            (hello["hosts"] == hosts,
+             f"--hosts: expected {hosts} as on host 0; found {hello['hosts']}"),
+            (hello["settings_hash"] == ours["settings_hash"],
+             "expected the leader's configuration (the same command line and the same files on "
+             "each host); found another"),
+            (hello["model_hash"] == ours["model_hash"],
+             "expected the leader's robot and world (the same files on each host); found others"),
+            ((host, hello["worker"]) not in self._workers,
+             f"--host-index: expected each host once; found {host} twice"),
+            (0 <= host < hosts, f"--host-index: expected 0 to {hosts - 1}; found {host}"),
+        )  # fmt: skip
+        return next((f"{who}: {text}" for right, text in checks if not right), "")
 
     # --- who does what ---
 
-    def score(
-        self, blocks: Sequence[np.ndarray], key: jax.Array
-    ) -> tuple[list[np.ndarray], list[str]]:
+    def score(self, blocks: Sequence[np.ndarray], key: jax.Array) -> Scored:
         """See `blocks.Workplace`.
 
         Raises:

@@ -14,15 +14,7 @@ from mjx_revolve.inputs.files import with_path
 
 
 def append_metrics(path: Path, row: Mapping[str, float]) -> None:
-    """Adds a line; the first one brings the header.
-
-    Args:
-        path: the CSV.
-        row: the figures by column; the same columns every time.
-
-    Raises:
-        OSError: the disk is full.
-    """
+    """Adds a line of figures by column, the same columns every time; the first brings a header."""
     new = not path.exists() or path.stat().st_size == 0
     text = io.StringIO()
     writer = csv.writer(text)
@@ -43,9 +35,6 @@ def _number(value: float) -> str:
 
 def load_metrics(path: str | Path) -> dict[str, np.ndarray]:
     """Reads a metrics file, also one that is being written.
-
-    Args:
-        path: the CSV.
 
     Returns:
         One float array per column; a last line that is still incomplete is left out.

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import pkgutil
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from mjx_revolve.evolution.crew import MAKE_FITNESS, Crew, make_job, name_function
+from mjx_revolve.evolution.crew import MAKE_FITNESS, Crew, make_job
 from mjx_revolve.evolution.place import Place, alone
-from mjx_revolve.evolution.worker import load_function
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 
@@ -186,7 +186,7 @@ def make_pool(
     if workers is None:
         workers = 1 if make_fitness else runtime.usable_cores() if place else choose_workers(config)
     if workers == 1 and place is None:
-        fitness = (make_fitness or load_function(MAKE_FITNESS))(config)
+        fitness = (make_fitness or pkgutil.resolve_name(MAKE_FITNESS))(config)
         return Pool(fitness, choose_block(fitness))
     _expect_cpu("--hosts" if place else "--workers")
     fitness, leader = _start_workers(config, workers, make_fitness, place or alone(), limits, cache)
@@ -215,16 +215,16 @@ def _start_workers(
     """Starts this host's workers, builds the fitness meanwhile, and waits for all to report."""
     from mjx_revolve.evolution import leader
 
-    make, limits = name_function(make_fitness), limits or leader.LIMITS
+    limits = limits or leader.LIMITS
     with contextlib.ExitStack() as undo:
         listener = undo.enter_context(place.listen())
-        job = make_job(config, make, place.seen_from_here(listener), cache, limits.start)
+        job = make_job(config, make_fitness, place.seen_from_here(listener), cache, limits.start)
         crew = Crew(workers, job)
         undo.callback(crew.close, 0.0)
         from mjx_revolve.evolution.blocks import choose_block
         from mjx_revolve.evolution.fingerprints import identify
 
-        fitness = load_function(make)(config)
+        fitness = pkgutil.resolve_name(job["make"])(config)
         identity = identify(config, fitness)
         lead = leader.Leader(listener, crew, place.secret, identity, place.hosts, limits)
         undo.pop_all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import time
@@ -24,26 +25,22 @@ class _Bar(tqdm):
     monitor_interval = 0
 
 
+class _Nowhere(io.StringIO):
+    """Where the bar is drawn when nobody looks: it still tells the time left."""
+
+    def write(self, text: str) -> int:
+        """Forgets it."""
+        return len(text)
+
+
 def choose_stride(total: int) -> int:
-    """Generations between two plain lines: 1, 2, 5, 10, 20, 50 ..., for at most 60 lines.
-
-    Args:
-        total: generations of the whole run.
-
-    Returns:
-        The stride.
-    """
+    """Generations between two plain lines: 1, 2, 5, 10, 20, 50 ..., for at most 60 lines."""
     stride, factors = 1, (2.0, 2.5, 2.0)
     count = 0
     while total / stride > _LINES:
         stride = round(stride * factors[count % 3])
         count += 1
     return stride
-
-
-def _open_sink() -> TextIO:
-    """Where the bar is drawn when nobody looks; it still tells the time left."""
-    return open(os.devnull, "w", encoding="utf-8")
 
 
 class Progress:
@@ -65,10 +62,10 @@ class Progress:
         self._total = total
         self._out = sys.stdout if out is None else out
         self._live = self._out.isatty() and os.environ.get("TERM") != "dumb"
-        self._sink = self._out if self._live else _open_sink()
+        file, line = (self._out, _LIVE) if self._live else (_Nowhere(), _LINE)
         self._bar = _Bar(
-            total=total, initial=done, desc="compiling", file=self._sink, miniters=1,
-            ncols=self._columns(), bar_format=_LIVE if self._live else _LINE,
+            total=total, initial=done, desc="compiling", file=file, miniters=1,
+            ncols=self._columns(), bar_format=line,
         )  # fmt: skip
         self._stride = choose_stride(total)
         self._written = time.monotonic()
@@ -120,5 +117,3 @@ class Progress:
     def close(self) -> None:
         """Leaves the last state of the line where it stands."""
         self._bar.close()
-        if not self._live:
-            self._sink.close()

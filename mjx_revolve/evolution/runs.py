@@ -91,15 +91,7 @@ class Run:
         return load_config(self.folder / "config.yaml")
 
     def write(self, name: str, content: bytes | Callable[[Path], None]) -> Path:
-        """Writes any file below the folder.
-
-        Args:
-            name: relative to the folder.
-            content: see `write_atomic`.
-
-        Returns:
-            The file's path.
-        """
+        """Writes any file below the folder, whole or not at all, and returns its path."""
         write_atomic(self.folder / name, content)
         return self.folder / name
 
@@ -134,17 +126,7 @@ class Run:
     def save_checkpoint(
         self, generation: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], keep: int
     ) -> Path:
-        """Saves a checkpoint and removes the oldest ones.
-
-        Args:
-            generation: for its name.
-            arrays: any arrays but object arrays.
-            meta: plain values that JSON can hold.
-            keep: how many checkpoints to keep.
-
-        Returns:
-            The file.
-        """
+        """Saves a checkpoint, of which the newest `keep` stay; see `write_checkpoint`."""
         meta = {**meta, "generation": generation, "metrics_position": self._metrics_position()}
         path = write_checkpoint(self.folder / "checkpoints", generation, arrays, meta)
         for old in self.checkpoints()[keep:]:
@@ -191,12 +173,7 @@ class Run:
     # --- champion ---
 
     def save_champion(self, genes: np.ndarray, **facts: Any) -> None:
-        """Writes `champion/genes.yaml`.
-
-        Args:
-            genes: `[G]`.
-            **facts: plain values to go with them (score, origin, ...).
-        """
+        """Writes `champion/genes.yaml`: genes `[G]`, and plain values that go with them."""
         data = {**facts, "config": "../config.yaml", "genes": [float(gene) for gene in genes]}
         text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
         self.write("champion/genes.yaml", text.encode())

@@ -14,7 +14,6 @@ from mjx_revolve.evolution.loop import (
     Search,
     choose_champion,
     evolve,
-    search_from_arrays,
     search_to_arrays,
     start_search,
 )
@@ -25,42 +24,14 @@ from mjx_revolve.evolution.strategies import make_strategy
 from mjx_revolve.evolution.tensorboard import TensorBoardLog
 
 
-def load_search(start: Start) -> Search | None:
-    """Where a run goes on; None for a new one.
-
-    Args:
-        start: the run.
-
-    Returns:
-        The search of its checkpoint.
-
-    Raises:
-        InputError: the checkpoint is another search's.
-    """
-    if start.checkpoint is None:
-        return None
-    genes, arrays = start.fitness.num_genes, start.checkpoint.arrays
-    return search_from_arrays(start.config.evolution, genes, arrays)
-
-
-def is_finished(start: Start, search: Search | None) -> bool:
-    """Whether a run has all its generations and its champion."""
-    last = start.config.evolution.generations
-    return search is not None and search.generation >= last and "finished" in start.run.info
-
-
-def write_start(start: Start, search: Search | None) -> None:
-    """Writes down who evolves what; a run that goes on forgets what came after its checkpoint.
-
-    Args:
-        start: the run.
-        search: where it goes on.
-    """
+def write_start(start: Start) -> None:
+    """Writes down who evolves what; a run that goes on forgets what came after its checkpoint."""
     run = start.run
-    if start.checkpoint is not None and search is not None:
+    if start.checkpoint is not None and start.search is not None:
         run.rewind(start.checkpoint)
         run.save_config(start.config)
-        resumption = {"time": timestamp(), "generation": search.generation, "argv": sys.argv}
+        done = start.search.generation
+        resumption = {"time": timestamp(), "generation": done, "argv": sys.argv}
         resumed = [*run.info.get("resumed", []), resumption]
         run.update_info(resumed=resumed, finished=None, champion=None)
     run.update_info(workers=start.fitness.describe())
@@ -71,12 +42,11 @@ def write_start(start: Start, search: Search | None) -> None:
         run.write("champion/robot.xml", robot.mj_spec.to_xml().encode())
 
 
-def run_generations(start: Start, begin: Search | None, interrupts: Interrupts) -> Search:
+def run_generations(start: Start, interrupts: Interrupts) -> Search:
     """All generations, or as many as there are before an interrupt or a worker's death.
 
     Args:
         start: the run.
-        begin: where it goes on; None: at the start.
         interrupts: looked at after each generation.
 
     Returns:
@@ -87,11 +57,12 @@ def run_generations(start: Start, begin: Search | None, interrupts: Interrupts) 
         OSError: the disk is full.
     """
     run, evolution, fitness = start.run, start.config.evolution, start.fitness
-    search, before = begin, 0 if begin is None else begin.generation
+    search = start.search
+    before = 0 if search is None else search.generation
     log = _open_log(run, before) if evolution.tensorboard else None
     progress = Progress(before, evolution.generations)
     try:
-        for search, row in evolve(evolution, fitness, begin):
+        for search, row in evolve(evolution, fitness, start.search):
             run.append_metrics(row)
             if log is not None:
                 log.add(row)

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjx_revolve.episodes.config import Config, load_config, override_config
 from mjx_revolve.evolution.fingerprints import (
@@ -25,6 +25,9 @@ from mjx_revolve.inputs.own_code import content_name
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.numerics import runtime
 
+if TYPE_CHECKING:
+    from mjx_revolve.evolution.loop import Search
+
 # What the bits of a run depend on, besides its configuration.
 _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
 _log = logging.getLogger(__name__)
@@ -38,13 +41,21 @@ class Start:
         run: its folder, locked.
         config: its configuration, which names the folder's copies.
         fitness: what scores a population.
-        checkpoint: where it goes on; None: a new run.
+        search: where it goes on; None: a new run.
+        checkpoint: where `search` is from.
     """
 
     run: Run
     config: Config
     fitness: Pool
+    search: Search | None = None
     checkpoint: Checkpoint | None = None
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it has all its generations and its champion already."""
+        done = self.search.generation if self.search else 0
+        return done >= self.config.evolution.generations and "finished" in self.run.info
 
 
 def begin_run(
@@ -131,6 +142,8 @@ def continue_run(
     if checkpoint.meta["settings_hash"] != settings_hash(config):
         raise InputError(f"{label}: expected the config.yaml that it began with; found it changed")
     fitness = make_pool(config)
+    from mjx_revolve.evolution.loop import search_from_arrays
+
     if checkpoint.meta["model_hash"] != model_hash(fitness):
         raise InputError(
             f"{label}: expected the robot and the world that it began with; found them changed (a "
@@ -142,7 +155,8 @@ def continue_run(
             "the run continues, but not bit for bit, because this process differs: %s",
             "; ".join(found),
         )
-    return Start(run, config, fitness, checkpoint)
+    search = search_from_arrays(config.evolution, fitness.num_genes, checkpoint.arrays)
+    return Start(run, config, fitness, search, checkpoint)
 
 
 def _default_folder(config: Config) -> Path:
@@ -166,12 +180,7 @@ def _differences(old: Any, new: Any, place: str = "") -> list[str]:
 
 
 def check_unchanged(old: Config, new: Config, label: str) -> None:
-    """Refuses a configuration that would make another run.
-
-    Args:
-        old: the run's.
-        new: the one to go on with.
-        label: what messages begin with.
+    """Refuses a configuration that would make another run than the old one.
 
     Raises:
         InputError: they differ in more than `FREE_SETTINGS`.

@@ -13,9 +13,9 @@ Heavy imports stand inside functions: thread settings must be made before NumPy 
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
+import pkgutil
 import signal
 import socket
 import sys
@@ -82,12 +82,6 @@ def _end_with_parent() -> NoReturn:
     os._exit(1)
 
 
-def load_function(name: str) -> Any:
-    """The function that `MODULE:NAME` names."""
-    module, _, attribute = name.partition(":")
-    return getattr(importlib.import_module(module), attribute)
-
-
 def _work(job: dict[str, Any]) -> int:
     import jax
     import numpy as np
@@ -97,7 +91,7 @@ def _work(job: dict[str, Any]) -> int:
     from mjx_revolve.evolution.fingerprints import identify
 
     config = make_config(job["config"], "/", source=job["source"])
-    fitness = load_function(job["make"])(config)
+    fitness = pkgutil.resolve_name(job["make"])(config)
     hello = identify(config, fitness) | {
         "type": "hello",
         "protocol": PROTOCOL,
