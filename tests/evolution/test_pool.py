@@ -33,9 +33,9 @@ from mjx_revolve.evolution.place import RANKS, read_place
 from mjx_revolve.evolution.pool import Pool, make_pool
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
+from toys import CLOCK
 
 ROOT = Path(__file__).resolve().parents[2]
-CLOCK = ("seconds", "evaluations_per_second")
 SECRET = "correct horse"
 KEY = jax.random.key(1)
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="lists processes by /proc")
