@@ -21,6 +21,7 @@ from mjx_revolve.body.params import apply_overrides, check_overrides, read_numbe
 from mjx_revolve.body.placement import Module, attach, check_overlaps, frozen
 from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
 from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.inputs.shipped import find_shipped
 
 __all__ = [
     "Module",
@@ -50,7 +51,8 @@ def load_morphology(
     """Reads a robot's body from Revolve's YAML, as `make_morphology` does from a mapping.
 
     Args:
-        path: the file; without an `id` in it, the robot is named after it.
+        path: the file, or a shipped morphology's name; without an `id` in it, the robot is named
+            after it.
         modules: the types of modules by name and alias.
         allow_overlap: load a robot whose modules overlap at rest; `overlaps` then names them.
 
@@ -61,7 +63,7 @@ def load_morphology(
         InputError: the file cannot be read, or something in it is wrong; the message says where,
             what was expected and what was found.
     """
-    path = Path(path)
+    path = find_shipped(path, "morphologies")
     data = load_yaml(path)
     if data is None:
         raise InputError(f"{path}: expected a mapping with id, body and brain; found an empty file")

@@ -22,6 +22,7 @@ from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.water.flow import Water, gust_path
 from mjx_revolve.water.world import load_world
 
@@ -83,6 +84,7 @@ def load_episode(
     path = Path(path)
     if path.is_dir():
         return _champion(_genes_file(path), world, duration, seed)
+    path = find_shipped(path, "morphologies")
     data = load_yaml(path)
     if isinstance(data, dict) and "genes" in data:
         return _champion(path, world, duration, seed)

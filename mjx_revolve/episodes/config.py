@@ -39,6 +39,7 @@ from mjx_revolve.inputs.schema import (
     show,
     words,
 )
+from mjx_revolve.inputs.shipped import find_shipped
 
 # The names of ours; `control/controllers.py` and `tasks.py` have the functions.
 CONTROLLERS = ("cpg", "sine", "feedback")
@@ -286,7 +287,8 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
     """Reads a configuration file.
 
     Args:
-        path: the YAML file. Relative paths in it start from its folder.
+        path: the YAML file, or a shipped configuration's name. Relative paths in it start from its
+            folder.
         overrides: values that replace the file's: a mapping of dotted keys or nested mappings
             (`{"task.duration": 5.0}`), or texts as on the command line (`["task.duration=5"]`).
             `world.current=[...]` works on a world given by name, too.
@@ -298,7 +300,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         InputError: the file is missing or no YAML, a key is unknown or missing, a value is out of
             bounds, or a file it names is missing.
     """
-    path = Path(path)
+    path = find_shipped(path, "configs")
     data = load_yaml(path)
     if not isinstance(data, dict):
         found = "an empty file" if data is None else show(data)

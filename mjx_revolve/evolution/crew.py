@@ -1,7 +1,7 @@
 """The worker processes of one host: started together, watched, and gone when they should be.
 
-They are plain processes (`python -m mjx_revolve.evolution.worker`), not forks: JAX's threads do not
-survive a fork, and a script that uses a pool needs no `if __name__ == "__main__"`.
+They are plain processes that run `worker.main`, not forks: JAX's threads do not survive a fork, and
+a script that uses a pool needs no `if __name__ == "__main__"`.
 """
 
 from __future__ import annotations
@@ -14,19 +14,63 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from mjx_revolve.numerics import runtime
 
+if TYPE_CHECKING:
+    from mjx_revolve.episodes.config import Config
+    from mjx_revolve.evolution.place import Place
+
+# What a worker runs: it finds modules where this process finds them.
+_PROGRAM = (
+    "import sys; sys.path[:] = sys.argv[1:]; from mjx_revolve.evolution.worker import main; main()"
+)
 # How much of a worker's last words is looked at [bytes].
 _TAIL = 4096
 # What a worker may take to leave when it was told to [s].
 _FAREWELL = 5.0
+MAKE_FITNESS = "mjx_revolve.episodes.fitness:make_fitness"
 
 
 class WorkerError(RuntimeError):
     """A worker died, hangs, or never came; the message says which and what is known of it."""
+
+
+def make_job(config: Config, make_fitness: Callable | None, place: Place, cache: Path | None,
+             patience: float) -> dict[str, Any]:  # fmt: skip
+    """What a worker is told on its standard input; `Crew` adds its number and core.
+
+    Args:
+        config: of the run.
+        make_fitness: a function that workers can import by its name; None: the real one.
+        place: this host's, with the address at which its workers find the leader.
+        cache: the compilation cache's folder.
+        patience: how long the leader may take to listen [s].
+
+    Raises:
+        ValueError: the function cannot be imported by its name.
+    """
+    make = MAKE_FITNESS
+    if make_fitness is not None:
+        make = f"{make_fitness.__module__}:{make_fitness.__qualname__}"
+        if make_fitness.__module__ == "__main__" or "<" in make:
+            raise ValueError(
+                f"make_fitness: expected a function that can be imported; found {make}"
+            )
+    return {
+        "config": config.model_dump(),
+        "source": config.source,
+        "make": make,
+        "address": place.address,
+        "secret": place.secret.decode(),
+        "cache": str(cache) if cache else None,
+        "host": place.index,
+        "hosts": place.hosts,
+        "patience": patience,
+    }
 
 
 class WorkerProcess:
@@ -39,19 +83,13 @@ class WorkerProcess:
     def __init__(self, job: dict[str, Any]) -> None:
         # Appending, so that reading in between does not move the place of writing.
         self._log: IO[bytes] = tempfile.TemporaryFile("a+b")  # noqa: SIM115  (kept open)
-        here = str(Path(__file__).resolve().parents[2])
-        paths = [here, *filter(None, [os.environ.get("PYTHONPATH")])]
         # A group of its own: Ctrl-C and Ctrl-Z at the terminal reach only who leads.
         group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "mjx_revolve.evolution.worker"],
-                stdin=subprocess.PIPE,
-                stdout=self._log,
-                stderr=self._log,
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-                **group,
-            )
+                [sys.executable, "-c", _PROGRAM, *sys.path],
+                stdin=subprocess.PIPE, stdout=self._log, stderr=self._log, **group,
+            )  # fmt: skip
         except OSError:
             self._log.close()
             raise
@@ -62,11 +100,12 @@ class WorkerProcess:
             self.process.stdin.flush()
 
     def last_words(self) -> str:
-        """The last line that it wrote, or nothing."""
+        """The last line that it wrote, without `error: `, or nothing."""
         self._log.seek(0, os.SEEK_END)
         self._log.seek(max(0, self._log.tell() - _TAIL))
         lines = self._log.read().decode(errors="replace").split("\n")
-        return next((line.strip() for line in reversed(lines) if line.strip()), "")
+        words = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return words.removeprefix("error: ")
 
     def describe_end(self, patience: float = 2.0) -> str:
         """How it ended, in words, waiting a little for it to do so."""
@@ -78,7 +117,7 @@ class WorkerProcess:
             with contextlib.suppress(ValueError):
                 return f"killed by {signal.Signals(-code).name}"
         words = self.last_words()
-        return f"exit code {code}" + (f": {words.removeprefix('error: ')}" if words else "")
+        return f"exit code {code}" + (f": {words}" if words else "")
 
     def end(self, deadline: float) -> None:
         """Waits for it until `deadline` (of `time.monotonic`), then kills it; never returns early.
@@ -110,7 +149,7 @@ class Crew:
             count: how many. When they are at least as many as there are cores, each is pinned to a
                 core; fewer are left to the system, so that several such runs on one host do not
                 crowd on the same cores.
-            job: what to do; see `mjx_revolve.evolution.worker`.
+            job: what to do; see `make_job`.
 
         Raises:
             WorkerError: the system refuses to start so many.
@@ -121,17 +160,16 @@ class Crew:
         try:
             for index in range(count):
                 core = cores[index % len(cores)] if pinned else None
-                more = {"worker": index, "workers": count, "core": core, "path": sys.path}
+                more = {"worker": index, "workers": count, "core": core}
                 self.workers.append(WorkerProcess(job | more))
-        except OSError as error:
+        except BaseException as error:
             begun = len(self.workers)
             self.close(0.0)
+            if not isinstance(error, OSError):
+                raise
             raise WorkerError(
                 f"expected to start {count} workers; found after {begun}: {error.strerror or error}"
             ) from None
-        except BaseException:
-            self.close(0.0)
-            raise
 
     def find_ended(self) -> int | None:
         """The number of a worker that has ended, or None."""

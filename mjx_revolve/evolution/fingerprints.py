@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
 
 FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard")
 """What may change in `evolution` when a run is resumed; all else would make it another run."""
+# What must be the same in all processes of a run, besides our own source.
+_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 
 
 def hash_text(*texts: str) -> str:
@@ -24,39 +28,48 @@ def hash_text(*texts: str) -> str:
     return digest.hexdigest()[:16]
 
 
+def plain_settings(config: Config) -> dict[str, Any]:
+    """All settings that may not change while a run goes on; a world is always a mapping."""
+    data = config.model_dump()
+    for key in FREE_SETTINGS:
+        del data["evolution"][key]
+    if isinstance(data["world"], str):
+        data["world"] = {"name": data["world"]}
+    return data
+
+
 def settings_hash(config: Config) -> str:
     """Of all settings that may not change while a run goes on.
 
     Files count by their content, not by their place; so do the users' own tasks and controllers.
     The robot and the world have a fingerprint of their own (`model_hash`).
-
-    Args:
-        config: the configuration.
-
-    Returns:
-        16 hexadecimal digits.
     """
-    data = config.model_dump(exclude={"morphology", "modules"})
-    for key in FREE_SETTINGS:
-        del data["evolution"][key]
+    data = plain_settings(config)
+    del data["morphology"], data["modules"]
     for section in ("controller", "task"):
         data[section]["type"] = content_name(data[section]["type"])
         if not data[section]["params"]:  # as runs have it from before there were any
             del data[section]["params"]
-    if isinstance(data["world"], str):
-        data["world"] = {"name": data["world"]}
     data["world"]["name"] = Path(data["world"]["name"]).name
     return hash_text(json.dumps(data, sort_keys=True, default=str))
 
 
 def model_hash(fitness: Any) -> str:
-    """Of the compiled robot and the water around it.
-
-    Args:
-        fitness: from `make_fitness`; one without a robot will do.
-
-    Returns:
-        16 hexadecimal digits.
-    """
+    """Of the compiled robot and the water around it; a fitness without a robot will do."""
     robot = getattr(fitness, "robot", None)
     return hash_text() if robot is None else hash_text(robot.mj_spec.to_xml(), repr(robot.world))
+
+
+def program_versions() -> dict[str, str]:
+    """What must be the same in all processes of a run: our source and the engines' versions."""
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"mjx_revolve": runtime.source_hash(), **versions}
+
+
+def identify(config: Config, fitness: Any) -> dict[str, Any]:
+    """What a worker must have in common with its leader: program, settings, robot and world."""
+    return {
+        "versions": program_versions(),
+        "settings_hash": settings_hash(config),
+        "model_hash": model_hash(fitness),
+    }

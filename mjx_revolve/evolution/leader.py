@@ -1,4 +1,4 @@
-"""The leader's side of a pool of workers: who is there, who does what, and who has gone silent.
+"""The leader of a pool of workers: who is there, who does what, and who has gone silent.
 
 Work goes out in blocks, to whichever worker is free, so that faster cores do more of it. A worker
 that ends, fails or keeps a block for too long ends the run at once by a `WorkerError`: the caller
@@ -13,20 +13,22 @@ would go unused.
 from __future__ import annotations
 
 import contextlib
-import selectors
+import logging
 import socket
 import statistics
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import wait
 from typing import Any
 
+import jax
 import numpy as np
 
+from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.crew import Crew, WorkerError
-from mjx_revolve.evolution.wire import PROTOCOL, Channel, SecretError
+from mjx_revolve.evolution.messages import PROTOCOL, Channel, SecretError
 from mjx_revolve.inputs.errors import InputError
 
 # How long a handshake may hold the leader up, and how long any later message may take [s].
@@ -35,6 +37,7 @@ _HANDSHAKE, _MESSAGE = 5.0, 30.0
 _TICK = 0.25
 # Number of the block that only warms a worker up.
 _WARM_UP = 0
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class _Worker:
 
 
 class Leader:
-    """Hands out blocks to workers. Whoever makes one closes it."""
+    """Hands out blocks to workers; a `blocks.Workplace`. Whoever makes one closes it."""
 
     def __init__(
         self,
@@ -101,7 +104,8 @@ class Leader:
             listener: where workers report.
             crew: this host's workers, started already.
             secret: of the run.
-            identity: entries of the workers' hello that must be equal to these.
+            identity: what a worker must have in common with the leader; see
+                `fingerprints.identify`.
             hosts: how many there are, this one included.
             limits: how long to wait.
         """
@@ -109,18 +113,23 @@ class Leader:
         self._crew = crew
         self._secret = secret
         self._identity = identity
-        self._hosts = hosts
+        self._num_hosts = hosts
         self._limits = limits
         self._workers: dict[tuple[int, int], _Worker] = {}
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(listener, selectors.EVENT_READ, None)
         self._number = _WARM_UP
         self._times: deque[float] = deque(maxlen=101)
-        self._warm_up: tuple[np.ndarray, list[int], str] | None = None
+        self._warm_up = np.zeros((0, 0), np.float32)
 
     # --- who is there ---
 
-    def gather(self, rows: int, genes: int, key: list[int], kind: str) -> None:
+    @property
+    def hosts(self) -> list[dict[str, Any]]:
+        """See `blocks.Workplace`."""
+        heads = [worker for place, worker in sorted(self._workers.items()) if place[1] == 0]
+        names = ("node", "cpu", "xla_flags", "workers")
+        return [{name: worker.hello[name] for name in names} for worker in heads]
+
+    def gather(self, rows: int, genes: int) -> None:
         """Waits until all workers have reported, and has the first of each host compile.
 
         The others of a host with a compilation cache wait for that one and read what it compiled;
@@ -129,8 +138,6 @@ class Leader:
         Args:
             rows: of every block.
             genes: of every individual.
-            key: data of a key like those that will come.
-            kind: the name of its implementation.
 
         Raises:
             InputError: a worker runs another program or another configuration.
@@ -149,7 +156,7 @@ class Leader:
                 how = self._crew.workers[ended].describe_end()
                 raise WorkerError(f"{self._name(0, ended, len(self._crew.workers))} ended ({how})")
         self._stop_listening()
-        self._warm_up = np.zeros((rows, genes), np.float32), key, kind
+        self._warm_up = np.zeros((rows, genes), np.float32)
         for worker in self._workers.values():
             if worker.place[1] == 0 or not worker.hello["cached"]:
                 self._warm(worker)
@@ -157,22 +164,20 @@ class Leader:
     def _missing(self) -> str:
         """Which workers have not reported, in words; nothing if all have."""
         names = []
-        for host in range(self._hosts):
-            there = [w for place, w in self._workers.items() if place[0] == host]
-            expected = len(self._crew.workers) if host == 0 else 0
-            if there:
-                expected = there[0].hello["workers"]
+        for host in range(self._num_hosts):
+            there = [worker for place, worker in self._workers.items() if place[0] == host]
             if host and not there:
                 names.append(f"host {host}")
-            elif len(there) < expected:
-                count = expected - len(there)
-                words = f"{count} of {expected} workers"
-                names.append(f"{words} of host {host}" if self._hosts > 1 else words)
+                continue
+            expected = there[0].hello["workers"] if there else len(self._crew.workers)
+            if len(there) < expected:
+                words = f"{expected - len(there)} of {expected} workers"
+                names.append(f"{words} of host {host}" if self._num_hosts > 1 else words)
         return ", ".join(names)
 
     def _name(self, host: int, worker: int, workers: int, node: str = "") -> str:
         name = f"worker {worker + 1} of {workers}"
-        if self._hosts > 1:
+        if self._num_hosts > 1:
             name += f" of host {host}" + (f" ({node})" if node else "")
         return name
 
@@ -182,8 +187,8 @@ class Leader:
         connection, address = self._listener.accept()
         channel = Channel(connection, _HANDSHAKE)
         try:
-            channel.admit(self._secret)
-            hello, _ = channel.receive()
+            channel.prove_secret(self._secret, leads=True)
+            hello, _ = channel.receive_message()
             channel.set_patience(_MESSAGE)
         except (EOFError, OSError) as error:
             channel.close()
@@ -192,20 +197,17 @@ class Leader:
             if isinstance(error, SecretError):
                 reason = "it has another MJX_REVOLVE_SECRET"
             peer = address[0].removeprefix("::ffff:")  # an IPv4 address on an IPv6 socket
-            print(f"note: refused a connection from {peer}: {reason}", file=sys.stderr)
+            _log.warning("refused a connection from %s: %s", peer, reason)
             return
         problem = self._check(hello)
         if problem:
             with contextlib.suppress(OSError):
-                channel.send({"type": "refused", "reason": problem})
+                channel.send_message({"type": "refused", "reason": problem})
             channel.close()
             raise InputError(problem)
         name = self._name(hello["host"], hello["worker"], hello["workers"], hello["node"])
         worker = _Worker(name, channel, hello)
         self._workers[worker.place] = worker
-        self._selector.register(channel, selectors.EVENT_READ, worker)
-        with self._blaming(worker):
-            channel.send({"type": "welcome"})
 
     def _check(self, hello: dict[str, Any]) -> str:
         """What is wrong with a worker, in words that its host prints, too; nothing if all is well.
@@ -217,53 +219,32 @@ class Leader:
                 f"expected workers of the leader's version of mjx_revolve; found protocol "
                 f"{hello.get('protocol')} rather than {PROTOCOL}"
             )
-        host = hello["host"]
-        who = f"host {host} ({hello['node']})" if self._hosts > 1 else f"worker {hello['worker']}"
+        ours, hosts, host = self._identity, self._num_hosts, hello["host"]
+        who = f"host {host} ({hello['node']})" if hosts > 1 else f"worker {hello['worker']}"
         # This host has the same files, unless somebody is at work on them.
-        versions = self._identity["versions"] if host else {}
-        for package, version in versions.items():
+        for package, version in (ours["versions"] if host else {}).items():
             found = hello["versions"].get(package)
             if found != version:
                 what = "source" if package == "mjx_revolve" else "version"
                 return f"{who}: {package}: expected the leader's {what} {version}; found {found}"
-        if hello["hosts"] != self._hosts:
-            return f"{who}: --hosts: expected {self._hosts} as on host 0; found {hello['hosts']}"
-        if hello["settings_hash"] != self._identity["settings_hash"]:
-            return (
-                f"{who}: expected the leader's configuration (the same command line and the same "
-                "files on each host); found another"
-            )
-        if hello["model_hash"] != self._identity["model_hash"]:
-            return (
-                f"{who}: expected the leader's robot and world (the same files on each host); "
-                "found others"
-            )
-        if (host, hello["worker"]) in self._workers:
-            return f"{who}: --host-index: expected each host once; found {host} twice"
-        if not 0 <= host < self._hosts:
-            return f"{who}: --host-index: expected 0 to {self._hosts - 1}; found {host}"
-        return ""
-
-    def describe(self) -> list[dict[str, Any]]:
-        """The hosts: name, CPU, XLA's flags and the number of workers of each."""
-        heads = [worker for place, worker in sorted(self._workers.items()) if place[1] == 0]
-        names = ("node", "cpu", "xla_flags", "workers")
-        return [{name: worker.hello[name] for name in names} for worker in heads]
+        checks = (
+            (hello["hosts"] == hosts,
+             f"--hosts: expected {hosts} as on host 0; found {hello['hosts']}"),
+            (hello["settings_hash"] == ours["settings_hash"],
+             "expected the leader's configuration (the same command line and the same files on "
+             "each host); found another"),
+            (hello["model_hash"] == ours["model_hash"],
+             "expected the leader's robot and world (the same files on each host); found others"),
+            ((host, hello["worker"]) not in self._workers,
+             f"--host-index: expected each host once; found {host} twice"),
+            (0 <= host < hosts, f"--host-index: expected 0 to {hosts - 1}; found {host}"),
+        )  # fmt: skip
+        return next((f"{who}: {text}" for right, text in checks if not right), "")
 
     # --- who does what ---
 
-    def score(
-        self, blocks: Sequence[np.ndarray], key: list[int], kind: str
-    ) -> tuple[list[np.ndarray], list[str]]:
-        """Scores blocks.
-
-        Args:
-            blocks: `[rows, genes]` each.
-            key: the key's data.
-            kind: the name of the key's implementation.
-
-        Returns:
-            `[1 + measures, rows]` scores and measures of each block, and the measures' names.
+    def score(self, blocks: Sequence[np.ndarray], key: jax.Array) -> Scored:
+        """See `blocks.Workplace`.
 
         Raises:
             WorkerError: a worker died, failed or hangs.
@@ -277,21 +258,20 @@ class Leader:
             for worker in self._workers.values():
                 if pending and worker.block is None and worker.done:
                     number = pending.popleft()
-                    self._send(worker, number, blocks[number - first], key, kind)
+                    self._send(worker, number, blocks[number - first], key)
             for number, names_, scores in self._attend():
                 if number >= first:  # an older one is from a call that was interrupted
                     results[number], names = scores, names_
         return [results[number] for number in range(first, self._number + 1)], names
 
     def _warm(self, worker: _Worker) -> None:
-        assert self._warm_up is not None
-        self._send(worker, _WARM_UP, *self._warm_up)
+        self._send(worker, _WARM_UP, self._warm_up, jax.random.key(0))
 
-    def _send(
-        self, worker: _Worker, number: int, block: np.ndarray, key: list[int], kind: str
-    ) -> None:
+    def _send(self, worker: _Worker, number: int, block: np.ndarray, key: jax.Array) -> None:
+        data, kind = np.asarray(jax.random.key_data(key)).tolist(), str(jax.random.key_impl(key))
+        order = {"type": "block", "block": number, "key": data, "kind": kind}
         with self._blaming(worker):
-            worker.channel.send({"type": "block", "block": number, "key": key, "kind": kind}, block)
+            worker.channel.send_message(order, block)
         worker.block, worker.age = number, 0.0
 
     @contextlib.contextmanager
@@ -299,7 +279,7 @@ class Leader:
         """Turns a broken connection into a `WorkerError` that says whose."""
         try:
             yield
-        except TimeoutError:
+        except BlockingIOError:
             raise WorkerError(f"{worker.name} hangs in the middle of a message") from None
         except (EOFError, OSError) as error:
             host, index = worker.place
@@ -315,26 +295,27 @@ class Leader:
             Number, measures and scores of each block that came back.
         """
         began = time.monotonic()
-        events = self._selector.select(_TICK)
+        sources: list[Any] = [worker.channel for worker in self._workers.values()]
+        ready = wait(sources + ([self._listener] if self._listener else []), _TICK)
         # Not more, even if this process was itself stopped meanwhile: nobody else is to blame.
         waited = min(time.monotonic() - began, 2 * _TICK)
-        for worker in self._workers.values():
-            if worker.block is not None:
-                worker.age += waited
+        busy = [worker for worker in self._workers.values() if worker.block is not None]
+        for worker in busy:
+            worker.age += waited
         news = []
-        for event, _ in events:
-            if event.data is None:
-                self._admit()
-            else:
-                news += self._receive(event.data)
-        for worker in self._workers.values():
+        for worker in list(self._workers.values()):
+            if worker.channel in ready:
+                news += self._receive(worker)
+        if self._listener in ready:
+            self._admit()
+        for worker in busy:
             if worker.block is not None:
                 self._check_age(worker)
         return news
 
     def _receive(self, worker: _Worker) -> list[tuple[int, list[str], np.ndarray]]:
         with self._blaming(worker):
-            header, scores = worker.channel.receive()
+            header, scores = worker.channel.receive_message()
         if header["type"] == "failed":
             raise WorkerError(f"{worker.name} failed ({header['reason']})")
         number, worker.block = worker.block, None
@@ -350,8 +331,6 @@ class Leader:
 
     def _check_age(self, worker: _Worker) -> None:
         limit = self._limits.later if worker.done else self._limits.first
-        if worker.age <= limit:
-            return
         if worker.done and self._times:
             limit = max(limit, self._limits.factor * statistics.median(self._times))
         if worker.age > limit:
@@ -361,7 +340,6 @@ class Leader:
 
     def _stop_listening(self) -> None:
         if self._listener is not None:
-            self._selector.unregister(self._listener)
             self._listener.close()
             self._listener = None
 
@@ -376,10 +354,9 @@ class Leader:
         for worker in self._workers.values():
             with contextlib.suppress(OSError):
                 worker.channel.set_patience(1.0)
-                worker.channel.send({"type": "stop", "reason": reason or ""})
+                worker.channel.send_message({"type": "stop", "reason": reason or ""})
             worker.channel.close()
         self._workers.clear()
-        self._selector.close()
         if reason is None:
             self._crew.close()
         else:

@@ -44,7 +44,9 @@ class Fitness(Protocol):
     and a number `block`: it fills populations up to multiples of that many rows by itself.
     """
 
-    num_genes: int
+    @property
+    def num_genes(self) -> int:
+        """Length of an individual's genes."""
 
     def evaluate(self, population: Any, key: jax.Array) -> tuple[Any, Mapping[str, Any]]:
         """Scores `[P, G]` genes: `[P]`, higher is better, and further measures, each `[P]`."""

@@ -3,25 +3,22 @@
     with make_pool("configs/lake_swim.yaml") as fitness:
         scores, measures = fitness.evaluate(population, key)
 
-A population is cut into blocks of as many individuals as fill one chunk of `xla.LANES` lanes, the
-last one padded with copies of its first row. Each block is scored by one run of the same compiled
-program, in this process or in a worker's, so that scores do not depend, to the last bit, on how
-many workers there are nor on who scores what. Each process runs one block at a time: two at once in
-one process can lock XLA's CPU back end up.
+Imports stand inside functions: `make_pool` sets threads before NumPy and JAX are loaded, and
+workers start while the rest is.
 """
 
 from __future__ import annotations
 
-import secrets
-import socket
-import sys
-from collections.abc import Callable, Sequence
+import contextlib
+import logging
+import pkgutil
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from mjx_revolve.evolution.crew import Crew
-from mjx_revolve.evolution.worker import load_function, program_versions
+from mjx_revolve.evolution.crew import MAKE_FITNESS, Crew, make_job
+from mjx_revolve.evolution.place import Place, alone
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 
@@ -30,10 +27,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.hosts import Place
+    from mjx_revolve.evolution.blocks import Workplace
     from mjx_revolve.evolution.leader import Leader, Limits
 
-_MAKE_FITNESS = "mjx_revolve.episodes.fitness:make_fitness"
+_log = logging.getLogger(__name__)
 
 
 class Pool:
@@ -42,15 +39,25 @@ class Pool:
     Attributes:
         fitness: this process's own, for replays, and for scores if there are no workers.
         block: individuals in a block; None: the whole population, whatever its size.
+        hosts: who scores; see `blocks.Workplace`.
         workers: how many processes score, on all hosts.
     """
 
-    def __init__(self, fitness: Any, block: int | None, leader: Leader | None = None) -> None:
+    def __init__(self, fitness: Any, block: int | None, workplace: Workplace | None = None) -> None:
+        """Opens a pool.
+
+        Args:
+            fitness: this process's own.
+            block: individuals in a block; None: the whole population, whatever its size.
+            workplace: scores blocks, and is closed with the pool; None: this process.
+        """
+        from mjx_revolve.evolution.blocks import ThisProcess
+
         self.fitness = fitness
         self.block = block
-        self._leader = leader
+        self._workplace: Workplace = workplace or ThisProcess(fitness)
         self._closed = False
-        self.hosts: list[dict[str, Any]] = leader.describe() if leader else []
+        self.hosts = self._workplace.hosts
         self.workers: int = sum(host["workers"] for host in self.hosts) or 1
 
     def __getattr__(self, name: str) -> Any:
@@ -81,6 +88,8 @@ class Pool:
         """
         import numpy as np
 
+        from mjx_revolve.evolution.blocks import split_blocks
+
         if self._closed:
             raise RuntimeError("expected an open pool; found it closed")
         population = np.asarray(population, np.float32)
@@ -90,7 +99,7 @@ class Pool:
             )
         blocks = split_blocks(population, self.block or len(population))
         try:
-            results, names = self._score(blocks, key)
+            results, names = self._workplace.score(blocks, key)
         except BaseException as error:
             # Interrupted anywhere: what the workers are at, and how far a message has come, is
             # unknown.
@@ -98,22 +107,6 @@ class Pool:
             raise
         rows = np.concatenate(results, 1)[:, : len(population)]
         return rows[0].copy(), dict(zip(names, rows[1:], strict=True))
-
-    def _score(
-        self, blocks: Sequence[np.ndarray], key: jax.Array
-    ) -> tuple[list[np.ndarray], list[str]]:
-        import jax
-        import numpy as np
-
-        if self._leader is not None:
-            return self._leader.score(blocks, *_plain_key(key))
-        results, names = [], []
-        for block in blocks:
-            scores, measures = self.fitness.evaluate(jax.numpy.asarray(block), key)
-            rows = [np.asarray(values, np.float32) for values in (scores, *measures.values())]
-            results.append(np.stack(rows))
-            names = list(measures)
-        return results, names
 
     def describe(self) -> dict[str, Any]:
         """Who scores, for `run.json`."""
@@ -126,8 +119,8 @@ class Pool:
         Args:
             reason: why, if it is not that all is done; workers of other hosts print it.
         """
-        if not self._closed and self._leader is not None:
-            self._leader.close(reason)
+        if not self._closed:
+            self._workplace.close(reason)
         self._closed = True
 
     def __enter__(self) -> Pool:
@@ -147,42 +140,10 @@ def _reason(error: BaseException) -> str:
     return str(error).partition("\n")[0] or type(error).__name__
 
 
-def _plain_key(key: jax.Array) -> tuple[list[int], str]:
-    """A key as plain values: its data, and its implementation's name."""
-    import jax
-    import numpy as np
-
-    return np.asarray(jax.random.key_data(key)).tolist(), str(jax.random.key_impl(key))
-
-
-def split_blocks(population: np.ndarray, size: int) -> list[np.ndarray]:
-    """Cuts a population into blocks of one shape.
-
-    Args:
-        population: `[P, G]`.
-        size: rows of a block.
-
-    Returns:
-        `[size, G]` each; the last one is padded with copies of its first row.
-    """
-    import numpy as np
-
-    blocks = [population[start : start + size] for start in range(0, len(population), size)]
-    short = size - len(blocks[-1])
-    if short:
-        blocks[-1] = np.concatenate([blocks[-1], np.repeat(blocks[-1][:1], short, 0)])
-    return blocks
-
-
-def block_size(trials: int) -> int | None:
-    """Individuals in a block: as many as fill a chunk of lanes; None: all, on an accelerator."""
-    from mjx_revolve.numerics.xla import LANES, on_cpu
-
-    return max(1, LANES // trials) if on_cpu() else None
-
-
 def choose_workers(config: Config) -> int:
     """How many workers a run gets: one for each core, but none without a block of its own."""
+    from mjx_revolve.evolution.blocks import block_size
+
     block = block_size(config.task.trials)
     if block is None:
         return 1
@@ -216,18 +177,21 @@ def make_pool(
         InputError: the configuration is wrong, or one of the workers has another.
         WorkerError: workers cannot be started, or one died or never came.
     """
-    from mjx_revolve.episodes.config import load_config
-
     cache = runtime.prepare_process()
+    from mjx_revolve.episodes.config import load_config
+    from mjx_revolve.evolution.blocks import choose_block
+
     if isinstance(config, str | Path):
         config = load_config(config)
     if workers is None:
         workers = 1 if make_fitness else runtime.usable_cores() if place else choose_workers(config)
-    if workers > 1 or place is not None:
-        _expect_cpu("--hosts" if place else "--workers")
-        return _start_pool(config, workers, make_fitness, place, limits, cache)
-    fitness = (make_fitness or load_function(_MAKE_FITNESS))(config)
-    return Pool(fitness, _block_of(fitness))
+    if workers == 1 and place is None:
+        fitness = (make_fitness or pkgutil.resolve_name(MAKE_FITNESS))(config)
+        return Pool(fitness, choose_block(fitness))
+    _expect_cpu("--hosts" if place else "--workers")
+    fitness, leader = _start_workers(config, workers, make_fitness, place or alone(), limits, cache)
+    _note_differences(leader.hosts)
+    return Pool(fitness, choose_block(fitness) or config.evolution.population_size, leader)
 
 
 def _expect_cpu(option: str) -> None:
@@ -240,103 +204,43 @@ def _expect_cpu(option: str) -> None:
         )
 
 
-def _block_of(fitness: Any) -> int | None:
-    own = getattr(fitness, "block_size", None)
-    config = getattr(fitness, "config", None)
-    return own if own or config is None else block_size(config.task.trials)
-
-
-def name_function(make_fitness: Callable[[Config], Any] | None) -> str:
-    """The name by which workers import a function.
-
-    Args:
-        make_fitness: a function, or None for the real one.
-
-    Returns:
-        `MODULE:NAME`.
-
-    Raises:
-        ValueError: it cannot be imported by its name.
-    """
-    if make_fitness is None:
-        return _MAKE_FITNESS
-    name = f"{make_fitness.__module__}:{make_fitness.__qualname__}"
-    if make_fitness.__module__ == "__main__" or "<" in name:
-        raise ValueError(f"make_fitness: expected a function that can be imported; found {name}")
-    return name
-
-
-def make_job(config: Config, make: str, address: tuple[str, int], secret: bytes, cache: Path | None,
-             host: int, hosts: int, patience: float) -> dict[str, Any]:  # fmt: skip
-    """What a worker is told on its standard input; `Crew` adds its number and core."""
-    return {
-        "config": config.model_dump(),
-        "source": config.source,
-        "make": make,
-        "address": address,
-        "secret": secret.decode(),
-        "cache": str(cache) if cache else None,
-        "host": host,
-        "hosts": hosts,
-        "patience": patience,
-    }
-
-
-def _start_pool(
+def _start_workers(
     config: Config,
     workers: int,
     make_fitness: Callable[[Config], Any] | None,
-    place: Place | None,
+    place: Place,
     limits: Limits | None,
     cache: Path | None,
-) -> Pool:
+) -> tuple[Any, Leader]:
     """Starts this host's workers, builds the fitness meanwhile, and waits for all to report."""
-    import jax
-
     from mjx_revolve.evolution import leader
-    from mjx_revolve.evolution.fingerprints import model_hash, settings_hash
 
     limits = limits or leader.LIMITS
-    make = name_function(make_fitness)
-    secret = place.secret if place else secrets.token_hex(32).encode()
-    hosts = place.hosts if place else 1
-    listener = place.listen() if place else socket.create_server(("127.0.0.1", 0), backlog=1024)
-    address = place.reach(listener) if place else listener.getsockname()[:2]
-    try:
-        job = make_job(config, make, address, secret, cache, 0, hosts, limits.start)
+    with contextlib.ExitStack() as undo:
+        listener = undo.enter_context(place.listen())
+        job = make_job(config, make_fitness, place.seen_from_here(listener), cache, limits.start)
         crew = Crew(workers, job)
-    except BaseException:
-        listener.close()
-        raise
-    lead = None
+        undo.callback(crew.close, 0.0)
+        from mjx_revolve.evolution.blocks import choose_block
+        from mjx_revolve.evolution.fingerprints import identify
+
+        fitness = pkgutil.resolve_name(job["make"])(config)
+        identity = identify(config, fitness)
+        lead = leader.Leader(listener, crew, place.secret, identity, place.hosts, limits)
+        undo.pop_all()
     try:
-        fitness = load_function(make)(config)
-        identity = {
-            "versions": program_versions(),
-            "settings_hash": settings_hash(config),
-            "model_hash": model_hash(fitness),
-        }
-        lead = leader.Leader(listener, crew, secret, identity, hosts, limits)
-        block = _block_of(fitness) or config.evolution.population_size
-        lead.gather(block, fitness.num_genes, *_plain_key(jax.random.key(0)))
+        lead.gather(choose_block(fitness) or config.evolution.population_size, fitness.num_genes)
     except BaseException as error:
-        if lead is not None:
-            lead.close(_reason(error))
-        else:
-            listener.close()
-            crew.close(0.0)
+        lead.close(_reason(error))
         raise
-    pool = Pool(fitness, block, lead)
-    _note_differences(pool)
-    return pool
+    return fitness, lead
 
 
-def _note_differences(pool: Pool) -> None:
+def _note_differences(hosts: list[dict[str, Any]]) -> None:
     for name, what in (("cpu", "CPUs"), ("xla_flags", "XLA_FLAGS")):
-        found = sorted({host[name] for host in pool.hosts})
+        found = sorted({host[name] for host in hosts})
         if len(found) > 1:
-            print(
-                f"note: the hosts have different {what} ({'; '.join(found)}): the last bits of "
-                "scores may depend on which host computes them",
-                file=sys.stderr,
-            )
+            _log.warning(
+                "the hosts have different %s (%s): the last bits of scores may depend on which "
+                "host computes them", what, "; ".join(found),
+            )  # fmt: skip

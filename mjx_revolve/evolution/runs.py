@@ -13,14 +13,11 @@ moved there. Nothing here knows what the numbers mean.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 import re
-import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,6 +25,15 @@ import numpy as np
 import yaml
 
 from mjx_revolve.episodes.config import Config, dump_config, load_config
+from mjx_revolve.evolution.checkpoints import (
+    Checkpoint,
+    DamageError,
+    generation_of,
+    list_checkpoints,
+    read_checkpoint,
+    write_checkpoint,
+)
+from mjx_revolve.evolution.metrics import append_metrics, load_metrics
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import with_path, write_atomic
 from mjx_revolve.inputs.own_code import parse_own
@@ -38,24 +44,6 @@ except ImportError:  # not on Windows: there, nothing keeps two processes off on
     fcntl = None  # type: ignore[assignment]
 
 _TEMPORARY = re.compile(r"\.\d+-")
-_CHECKPOINT = re.compile(r"generation_(\d+)\.npz")
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """What a checkpoint holds.
-
-    Attributes:
-        path: the file.
-        arrays: the arrays that were saved.
-        meta: the plain values that were saved.
-        damaged: names of newer checkpoints that could not be used, and why.
-    """
-
-    path: Path
-    arrays: dict[str, np.ndarray]
-    meta: dict[str, Any]
-    damaged: tuple[str, ...] = ()
 
 
 @dataclass
@@ -103,15 +91,7 @@ class Run:
         return load_config(self.folder / "config.yaml")
 
     def write(self, name: str, content: bytes | Callable[[Path], None]) -> Path:
-        """Writes any file below the folder.
-
-        Args:
-            name: relative to the folder.
-            content: see `write_atomic`.
-
-        Returns:
-            The file's path.
-        """
+        """Writes any file below the folder, whole or not at all, and returns its path."""
         write_atomic(self.folder / name, content)
         return self.folder / name
 
@@ -123,22 +103,8 @@ class Run:
         return self.folder / "metrics.csv"
 
     def append_metrics(self, row: Mapping[str, float]) -> None:
-        """Adds a line to `metrics.csv`; the first one brings the header.
-
-        Args:
-            row: the figures by column; the same columns every time.
-        """
-        new = not self.metrics_path.exists() or self.metrics_path.stat().st_size == 0
-        text = io.StringIO()
-        writer = csv.writer(text)
-        if new:
-            writer.writerow(row)
-        writer.writerow(_number(value) for value in row.values())
-        try:
-            with open(self.metrics_path, "ab") as file:
-                file.write(text.getvalue().encode())
-        except OSError as error:
-            raise with_path(error, self.metrics_path) from None
+        """Adds a line to `metrics.csv`; see `metrics.append_metrics`."""
+        append_metrics(self.metrics_path, row)
 
     def load_metrics(self) -> dict[str, np.ndarray]:
         """Reads `metrics.csv` as one float array per column."""
@@ -155,32 +121,14 @@ class Run:
 
     def checkpoints(self) -> list[Path]:
         """The checkpoint files, newest first."""
-        folder = self.folder / "checkpoints"
-        found = [path for path in folder.glob("*.npz") if _CHECKPOINT.fullmatch(path.name)]
-        return sorted(found, key=_generation, reverse=True)
+        return list_checkpoints(self.folder / "checkpoints")
 
     def save_checkpoint(
         self, generation: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], keep: int
     ) -> Path:
-        """Saves a checkpoint and removes the oldest ones.
-
-        Args:
-            generation: for its name.
-            arrays: any arrays but object arrays.
-            meta: plain values that JSON can hold.
-            keep: how many checkpoints to keep.
-
-        Returns:
-            The file.
-        """
+        """Saves a checkpoint, of which the newest `keep` stay; see `write_checkpoint`."""
         meta = {**meta, "generation": generation, "metrics_position": self._metrics_position()}
-        path = self.folder / "checkpoints" / f"generation_{generation:06d}.npz"
-        buffer = io.BytesIO()
-        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
-        # Names go into the zip as they are; "meta" cannot collide with an "array:" one.
-        named: dict[str, Any] = {f"array:{name}": value for name, value in arrays.items()}
-        np.savez(buffer, meta=text, **named)
-        write_atomic(path, buffer.getvalue())
+        path = write_checkpoint(self.folder / "checkpoints", generation, arrays, meta)
         for old in self.checkpoints()[keep:]:
             old.unlink(missing_ok=True)
         return path
@@ -197,16 +145,14 @@ class Run:
         damaged: list[str] = []
         for path in self.checkpoints():
             try:
-                arrays, meta = _read_checkpoint(path)
+                checkpoint = read_checkpoint(path)
                 have = self.metrics_path.stat().st_size if self.metrics_path.exists() else 0
-                if have < meta["metrics_position"]:
-                    raise ValueError(f"metrics.csv lacks lines: {have} bytes long")
-            # Whatever a damaged zip, header or JSON makes the readers raise.
-            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError,
-                    NotImplementedError, MemoryError, SyntaxError) as error:  # fmt: skip
-                damaged.append(f"{path.name} ({str(error).splitlines()[0] if str(error) else ''})")
+                if have < checkpoint.meta["metrics_position"]:
+                    raise DamageError(f"metrics.csv lacks lines: {have} bytes long")
+            except DamageError as error:
+                damaged.append(f"{path.name} ({error})")
                 continue
-            return Checkpoint(path, arrays, meta, tuple(damaged))
+            return replace(checkpoint, damaged=tuple(damaged))
         found = f"only damaged ones: {', '.join(damaged)}" if damaged else "none"
         raise InputError(
             f"{self.folder / 'checkpoints'}: expected a checkpoint to resume from; found {found}"
@@ -218,7 +164,7 @@ class Run:
         if self.metrics_path.exists():
             os.truncate(self.metrics_path, position)
         for path in self.checkpoints():
-            if _generation(path) > checkpoint.meta["generation"]:
+            if generation_of(path) > checkpoint.meta["generation"]:
                 path.unlink(missing_ok=True)
         for path in self.folder.rglob(".*"):
             if _TEMPORARY.match(path.name):
@@ -227,12 +173,7 @@ class Run:
     # --- champion ---
 
     def save_champion(self, genes: np.ndarray, **facts: Any) -> None:
-        """Writes `champion/genes.yaml`.
-
-        Args:
-            genes: `[G]`.
-            **facts: plain values to go with them (score, origin, ...).
-        """
+        """Writes `champion/genes.yaml`: genes `[G]`, and plain values that go with them."""
         data = {**facts, "config": "../config.yaml", "genes": [float(gene) for gene in genes]}
         text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
         self.write("champion/genes.yaml", text.encode())
@@ -242,63 +183,6 @@ class Run:
         if self._lock is not None:
             self._lock.close()
             self._lock = None
-
-
-def _number(value: float) -> str:
-    """Few digits, but enough to read the same float32 back."""
-    return str(value) if isinstance(value, int | np.integer) else f"{value:.9g}"
-
-
-def _generation(path: Path) -> int:
-    match = _CHECKPOINT.fullmatch(path.name)
-    return int(match.group(1)) if match else -1
-
-
-def _read_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    with zipfile.ZipFile(path) as file:
-        broken = file.testzip()  # every checksum; np.load looks only at what it happens to read
-    if broken:
-        raise ValueError(f"{broken} is damaged")
-    with np.load(path, allow_pickle=False) as file:
-        meta = json.loads(file["meta"].tobytes())
-        arrays = {
-            name.removeprefix("array:"): file[name]
-            for name in file.files
-            if name.startswith("array:")
-        }
-    if not isinstance(meta, dict) or not isinstance(meta["metrics_position"], int):
-        raise ValueError("meta is no mapping")
-    return arrays, meta
-
-
-def load_metrics(path: str | Path) -> dict[str, np.ndarray]:
-    """Reads a metrics file, also one that is being written.
-
-    Args:
-        path: the CSV.
-
-    Returns:
-        One float array per column; a last line that is still incomplete is left out.
-
-    Raises:
-        InputError: there is no such file, or it holds something else.
-    """
-    try:
-        text = Path(path).read_bytes().decode()
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file; found none") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected a CSV file; found: {error}") from None
-    rows = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))
-    if not rows:
-        return {}
-    header, lines = rows[0], rows[1:]
-    try:
-        values = np.array([[float(cell) for cell in line] for line in lines], float)
-        values = values.reshape(len(lines), len(header))
-    except ValueError as error:
-        raise InputError(f"{path}: expected a number in every cell; found: {error}") from None
-    return {name: values[:, column] for column, name in enumerate(header)}
 
 
 def check_new_folder(folder: str | Path, option: str = "--out") -> None:

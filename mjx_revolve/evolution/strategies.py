@@ -10,7 +10,6 @@ from __future__ import annotations
 import difflib
 import inspect
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -231,14 +230,10 @@ def _constructor_settings(
         used["learning_rate"] = float(settings.get("learning_rate", 0.2 * std_init))
         keywords["optimizer"] = optax.adam(used["learning_rate"])
     if name == "RandomSearch":
-        keywords["sampling_fn"] = _normal_sampler(std_init, num_genes)
+        keywords["sampling_fn"] = lambda key: std_init * jax.random.normal(key, (num_genes,))
     if name == "GESMR_GA":  # about sqrt(P) groups; evosax's single one leaves the step to chance
         keywords["num_groups"] = max(n for n in range(1, int(size**0.5) + 1) if (size - 1) % n == 0)
     return keywords, used
-
-
-def _normal_sampler(std: float, num_genes: int) -> Callable[[jax.Array], jax.Array]:
-    return lambda key: std * jax.random.normal(key, (num_genes,))
 
 
 def make_strategy(config: EvolutionConfig, num_genes: int) -> Strategy:

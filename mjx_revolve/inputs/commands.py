@@ -1,20 +1,24 @@
-"""What the command lines share: how arguments are read, and how mistakes end.
+"""What the command lines share: how arguments are read, how notes are shown, how mistakes end.
 
-A mistake is one line on stderr and an exit code. Nothing heavy is imported here: `--help` is there
+What the package says by `logging` is a line on stderr, `note: ...`; a mistake is one line there and
+an exit code. Nothing heavy is imported here: `--help` is there
 at once.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import logging
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.shipped import list_shipped
 
 _SEEDS = 2**32  # what JAX's keys take, and a run's configuration
 # A day [s]: its poses already take several GB.
@@ -83,7 +87,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         parser: of a command that shows an episode.
     """
     parser.add_argument(
-        "path", type=read_path, help="run folder, champion's genes.yaml, or morphology YAML"
+        "path", type=read_path, help="run folder, genes.yaml, or morphology (YAML or name)"
     )
     parser.add_argument(
         "--duration", type=read_seconds, metavar="S", help="[s] (default: the task's, or 10)"
@@ -96,13 +100,17 @@ def check_episode_path(path: str | Path) -> None:
     """Refuses a path at which there is nothing, before anything heavy is imported.
 
     Args:
-        path: of a run folder, a `genes.yaml` or a morphology.
+        path: of a run folder, a `genes.yaml` or a morphology; or a shipped morphology's name.
 
     Raises:
         InputError: there is nothing.
     """
-    if not Path(path).exists():
-        raise InputError(f"{path}: expected a run folder, a genes.yaml or a morphology; found none")
+    shipped = list_shipped("morphologies")
+    if not Path(path).exists() and str(path) not in shipped:
+        raise InputError(
+            f"{path}: expected a run folder, a genes.yaml or a morphology; found none, and no "
+            f"shipped morphology of this name ({', '.join(shipped)})"
+        )
 
 
 def check_place(path: str | Path, label: str) -> None:
@@ -126,6 +134,19 @@ def check_place(path: str | Path, label: str) -> None:
             raise InputError(f"{label}: expected the folder {folder}; found a file")
 
 
+@contextlib.contextmanager
+def show_notes() -> Iterator[None]:
+    """Shows on stderr what the package says by `logging`, while it is entered."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("note: %(message)s"))
+    logger = logging.getLogger("mjx_revolve")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
 def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
     """Runs a command line's `main`; what goes wrong by no fault of ours becomes one line.
 
@@ -138,7 +159,8 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         refused something (a full disk, too little memory), and 130 when interrupted.
     """
     try:
-        return main(argv)
+        with show_notes():
+            return main(argv)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

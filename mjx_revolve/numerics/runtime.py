@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib.metadata
+import logging
 import os
 import platform
 import subprocess
@@ -27,6 +28,8 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 # What a worker compiles faster than this is not worth a file [s]. The leader keeps everything: a
 # start runs a hundred small programs, 2 s to compile and .3 s to read back.
 _WORKER_MIN_COMPILE_TIME = 0.5
+_PACKAGE = Path(__file__).resolve().parents[1]
+_log = logging.getLogger(__name__)
 
 
 def prepare_process() -> Path | None:
@@ -50,7 +53,7 @@ def prepare_process() -> Path | None:
             folder.mkdir(parents=True, exist_ok=True)
             remove_broken_entries(folder)
         except OSError as error:  # a read-only home: slower starts, the same results
-            print(f"no compilation cache: {error.strerror}: {folder}", file=sys.stderr)
+            _log.warning("no compilation cache: %s: %s", error.strerror, folder)
             folder = None
 
     _use_cache(folder, 0.0)
@@ -187,19 +190,16 @@ def remove_broken_entries(folder: Path) -> list[str]:
 
 def _git_revision() -> str | None:
     """The checkout's commit, with `+` when files differ from it; None outside a checkout."""
-    folder = Path(__file__).resolve().parent
-    command = ["git", "-C", str(folder)]
+    root = _PACKAGE.parent
+    if not (root / ".git").exists():  # an installed package, perhaps within another checkout
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--dirty=+",
+               "--exclude=*"]  # fmt: skip
     try:
-        commit = subprocess.run(
-            [*command, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
-        ).stdout.strip()
-        changes = subprocess.run(
-            [*command, "status", "--porcelain", "--untracked-files=no", "."],
-            capture_output=True, text=True, timeout=5, check=True,
-        ).stdout.strip()  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
-    return commit + ("+" if changes else "")
+    return done.stdout.strip()
 
 
 def cpu_model() -> str:
@@ -211,11 +211,14 @@ def cpu_model() -> str:
 
 
 def source_hash() -> str:
-    """A fingerprint of this package's Python files: two checkouts of one version may differ."""
+    """A fingerprint of this package's Python files and worlds: two of one version may differ.
+
+    The same in a checkout and in a wheel that was built from it. The configuration and the robot
+    are compared by what is in them, wherever they are from.
+    """
     digest = hashlib.sha256()
-    package = Path(__file__).resolve().parents[1]
-    for path in sorted(package.rglob("*.py")):
-        name = path.relative_to(package).as_posix()
+    paths = [*_PACKAGE.rglob("*.py"), *(_PACKAGE / "water" / "worlds").glob("*.yaml")]
+    for name, path in sorted((path.relative_to(_PACKAGE).as_posix(), path) for path in paths):
         digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:12]
 

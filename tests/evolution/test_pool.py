@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
@@ -23,18 +22,21 @@ import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.evolution import hosts, leader, runs, wire
+from mjx_revolve.evolution import leader, messages, runs
+from mjx_revolve.evolution.blocks import block_size, split_blocks
 from mjx_revolve.evolution.crew import Crew, WorkerError
+from mjx_revolve.evolution.fingerprints import program_versions
 from mjx_revolve.evolution.leader import Leader, Limits
 from mjx_revolve.evolution.loop import choose_champion, evolve
-from mjx_revolve.evolution.pool import Pool, block_size, make_pool, split_blocks
-from mjx_revolve.evolution.wire import Channel, SecretError
-from mjx_revolve.evolution.worker import program_versions
+from mjx_revolve.evolution.messages import Channel, SecretError
+from mjx_revolve.evolution.place import RANKS, read_place
+from mjx_revolve.evolution.pool import Pool, make_pool
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
+from toys import CLOCK
 
-CLOCK = ("seconds", "evaluations_per_second")
 SECRET = "correct horse"
+KEY = jax.random.key(1)
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="lists processes by /proc")
 
 
@@ -209,7 +211,7 @@ def test_each_worker_has_a_core_of_its_own(crowd):
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) > 3:
         pytest.skip("fewer workers than cores are not pinned")
-    processes = [worker.process for worker in pool._leader._crew.workers]
+    processes = [worker.process for worker in pool._workplace._crew.workers]
     expected = [{cores[i % len(cores)]} for i in range(3)]
     pool(np.zeros((2, 5)), jax.random.key(0))
     deadline = time.monotonic() + 30  # until the last one's first block is done
@@ -223,7 +225,7 @@ def test_each_worker_has_a_core_of_its_own(crowd):
 
 def test_workers_ignore_interrupts(crowd):
     _, pool = crowd
-    for worker in pool._leader._crew.workers:
+    for worker in pool._workplace._crew.workers:
         worker.process.send_signal(signal.SIGINT)
         worker.process.send_signal(signal.SIGTERM)
     assert len(pool(np.zeros((12, 5)), jax.random.key(0))) == 12
@@ -390,14 +392,13 @@ class FakeWorker(threading.Thread):
     def run(self):
         try:
             channel = Channel(socket.create_connection(self.address), 20.0)
-            channel.introduce(self.secret.encode())
-            channel.send(self.hello)
-            reply, _ = channel.receive()
-            while reply["type"] in ("welcome", "block"):
-                reply, block = channel.receive()
-                if reply["type"] == "block":
-                    self.seen.append(reply["block"])
-                    self.act(channel, reply, block)
+            channel.prove_secret(self.secret.encode(), leads=False)
+            channel.send_message(self.hello)
+            reply, block = channel.receive_message()
+            while reply["type"] == "block":
+                self.seen.append(reply["block"])
+                self.act(channel, reply, block)
+                reply, block = channel.receive_message()
             self.outcome = reply
             channel.close()
         except (OSError, EOFError) as error:
@@ -406,13 +407,13 @@ class FakeWorker(threading.Thread):
 
 def answer(channel, order, block):
     scores = np.stack([block.sum(1), block.min(1)])
-    channel.send({"type": "scores", "block": order["block"], "measures": ["least"]}, scores)
+    channel.send_message({"type": "scores", "measures": ["least"]}, scores)
 
 
 IDENTITY = {"versions": program_versions(), "settings_hash": "s", "model_hash": "m"}
 HELLO = IDENTITY | {
-    "type": "hello", "protocol": wire.PROTOCOL, "host": 1, "hosts": 2, "worker": 0, "workers": 1,
-    "node": "node7", "cpu": "a cpu", "xla_flags": "", "process": 1, "cached": False,
+    "type": "hello", "protocol": messages.PROTOCOL, "host": 1, "hosts": 2, "worker": 0,
+    "workers": 1, "node": "node7", "cpu": "a cpu", "xla_flags": "", "cached": False,
 }  # fmt: skip
 
 
@@ -434,7 +435,7 @@ def lead():
 
 
 def gather(one):
-    one.gather(4, 5, [0, 0], "threefry2x32")
+    one.gather(4, 5)
 
 
 def blocks_of(count):
@@ -453,7 +454,7 @@ def test_whoever_is_free_gets_the_next_block(lead):
     ]
     gather(one)
     for _ in range(2):
-        results, names = one.score(blocks_of(12), [0, 1], "threefry2x32")
+        results, names = one.score(blocks_of(12), KEY)
         assert [result[0].tolist() for result in results] == [[5.0 * i] * 4 for i in range(12)]
         assert names == ["least"]
     assert len(workers[0].seen) < 8 < len(workers[1].seen)
@@ -480,7 +481,7 @@ def test_where_there_is_a_cache_one_compiles_for_all(lead):
     gather(one)
 
     def both_score():
-        one.score(blocks_of(6), [0, 1], "threefry2x32")
+        one.score(blocks_of(6), KEY)
         return order.count(1) > 1
 
     wait_for(both_score)
@@ -521,7 +522,7 @@ def test_an_index_twice(lead):
         gather(one)
 
 
-def test_strangers_are_noted_and_change_nothing(lead, capsys, monkeypatch):
+def test_strangers_are_noted_and_change_nothing(lead, caplog, monkeypatch):
     monkeypatch.setattr(leader, "_HANDSHAKE", 0.3)
     one, address = lead()
     liar = FakeWorker(address, secret="another one")
@@ -530,11 +531,11 @@ def test_strangers_are_noted_and_change_nothing(lead, capsys, monkeypatch):
         loud.sendall(b"GET / HTTP/1.1\r\n" + 100 * b"\r\n")
         worker = FakeWorker(address)
         gather(one)
-        assert silent.fileno() and one.score(blocks_of(2), [0, 1], "threefry2x32")
-    err = capsys.readouterr().err
-    assert "note: refused a connection from 127.0.0.1: it has another MJX_REVOLVE_SECRET\n" in err
-    assert err.count("note: refused a connection from 127.0.0.1: no worker of ours\n") == 1
-    assert err.count("\n") == 3
+        assert silent.fileno() and one.score(blocks_of(2), KEY)
+    said = [record.getMessage() for record in caplog.records]
+    assert "refused a connection from 127.0.0.1: it has another MJX_REVOLVE_SECRET" in said
+    assert said.count("refused a connection from 127.0.0.1: no worker of ours") == 2
+    assert len(said) == 3
     assert isinstance(liar.outcome, SecretError)
     assert worker.outcome is None
 
@@ -543,12 +544,11 @@ def test_a_leader_must_know_the_secret_too():
     with socket.create_server(("127.0.0.1", 0)) as listener:
         ours = socket.create_connection(listener.getsockname())
         theirs, _ = listener.accept()
-    impostor = threading.Thread(target=lambda: theirs.sendall(bytes(64)), daemon=True)
-    impostor.start()
-    with pytest.raises(SecretError):
-        Channel(ours, 5.0).introduce(SECRET.encode())
-    impostor.join()
-    theirs.close()
+    with Channel(theirs, 5.0) as impostor, Channel(ours, 5.0) as worker:
+        for _ in ("a number", "a proof"):
+            impostor.send_bytes(bytes(32))
+        with pytest.raises(SecretError):
+            worker.prove_secret(SECRET.encode(), leads=False)
 
 
 @pytest.mark.parametrize(
@@ -568,9 +568,12 @@ def test_hosts_that_do_not_come(lead, count, missing):
     [
         (lambda channel, order, block: time.sleep(9), r"hangs \(no answer for \d s\)"),
         (lambda channel, order, block: channel.close(), r"died \(its connection closed\)"),
-        (lambda channel, order, block: channel._socket.sendall(b"\0\0"), "hangs in the middle of"),
-        (lambda channel, order, block: channel._socket.sendall(8 * b"\xff"), r"died \(expected"),
-        (lambda channel, order, block: channel.send({"type": "failed", "reason": "no"}),
+        (lambda channel, order, block: os.write(channel.fileno(), b"\0\0"),
+         "hangs in the middle of"),
+        (lambda channel, order, block: os.write(channel.fileno(), 8 * b"\x7f"),
+         r"died \(bad message length\)"),
+        (lambda channel, order, block: channel.send_bytes(b"hello"), r"died \(expected one of our"),
+        (lambda channel, order, block: channel.send_message({"type": "failed", "reason": "no"}),
          r"failed \(no\)"),
     ],
 )  # fmt: skip
@@ -580,7 +583,7 @@ def test_whatever_a_worker_does_the_leader_goes_on(lead, act, message, monkeypat
     FakeWorker(address, act=lambda *args: (answer if args[1]["block"] == 0 else act)(*args))
     gather(one)
     with pytest.raises(WorkerError, match=rf"worker 1 of 1 of host 1 \(node7\) {message}"):
-        one.score(blocks_of(2), [0, 1], "threefry2x32")
+        one.score(blocks_of(2), KEY)
 
 
 def test_a_slow_block_is_no_hang(lead):
@@ -592,7 +595,7 @@ def test_a_slow_block_is_no_hang(lead):
 
     FakeWorker(address, act=act)
     gather(one)
-    assert len(one.score(blocks_of(9), [0, 1], "threefry2x32")[0]) == 9
+    assert len(one.score(blocks_of(9), KEY)[0]) == 9
 
 
 # --- several hosts ---
@@ -688,19 +691,13 @@ def test_a_host_with_another_secret(folder, lead):
     ]
 
 
-def arguments(**changes):
-    names = ("hosts", "coordinator", "host_index")
-    return argparse.Namespace(**dict.fromkeys(names) | changes)
-
-
 def test_a_launcher_tells_the_index():
-    given = arguments(hosts="3", coordinator="node1:7777")
     for name in ("SLURM_PROCID", "OMPI_COMM_WORLD_RANK", "PMI_RANK"):
-        place = hosts.parse_place(given, {name: "2", "MJX_REVOLVE_SECRET": SECRET})
+        place = read_place(3, "node1:7777", None, {name: "2", "MJX_REVOLVE_SECRET": SECRET})
         assert (place.hosts, place.index, place.address) == (3, 2, ("node1", 7777))
         assert SECRET not in repr(place)
-    given = arguments(hosts="3", coordinator="[::1]:80", host_index="1")
-    place = hosts.parse_place(given, {"SLURM_PROCID": "2", "MJX_REVOLVE_SECRET": SECRET})
+    environment = {"SLURM_PROCID": "2", "MJX_REVOLVE_SECRET": SECRET}
+    place = read_place(3, "[::1]:80", "1", environment)
     assert (place.index, place.address) == (1, ("::1", 80))
 
 
@@ -729,7 +726,7 @@ def test_a_launcher_tells_the_index():
 )  # fmt: skip
 def test_wrong_arguments_are_one_line(folder, argv, message, capsys, monkeypatch):
     monkeypatch.setenv("MJX_REVOLVE_SECRET", SECRET)
-    for name in hosts._RANKS:
+    for name in RANKS:
         monkeypatch.delenv(name, raising=False)
     config = (
         [] if {"none.yaml", "--resume"} & set(argv) or argv == [*on_hosts(77, 1)] else ["toy.yaml"]

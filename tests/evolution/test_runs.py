@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.evolution import runs
 from mjx_revolve.inputs.errors import InputError
@@ -252,12 +253,12 @@ def test_champion_genes_come_back_bit_for_bit(run):
     genes = np.random.default_rng(0).normal(size=30).astype(np.float32)
     run.save_champion(genes, score=0.25, origin="test")
     for place in (run.folder, run.folder / "champion", run.folder / "champion" / "genes.yaml"):
-        assert runs.load_genes(place).tobytes() == genes.tobytes()
+        assert load_genes(place).tobytes() == genes.tobytes()
     (run.folder / "champion" / "genes.yaml").write_text("genes: [1, a]")
     with pytest.raises(InputError, match=r"genes.yaml: genes: expected a list of numbers; found"):
-        runs.load_genes(run.folder)
+        load_genes(run.folder)
     with pytest.raises(InputError, match=r"genes.yaml: expected a file; found none"):
-        runs.load_genes(run.folder / "inputs")
+        load_genes(run.folder / "inputs")
 
 
 # --- the compilation cache ---

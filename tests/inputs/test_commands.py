@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import logging
 import subprocess
 import sys
 
@@ -109,6 +110,18 @@ def test_what_is_no_fault_of_ours_is_one_line(error, code, line, capsys):
     assert run_command(main, []) == code
     written = capsys.readouterr().err
     assert written.startswith(line) and written.count("\n") == 1
+
+
+def test_notes_of_the_package_are_shown_by_commands_alone(capsys):
+    def note(argv):
+        logging.getLogger("mjx_revolve.body").warning("%s has %d legs", "it", 8)
+        logging.getLogger("another").warning("no affair of ours")
+        return 0
+
+    for _ in range(2):  # once each, however often a command runs
+        assert run_command(note, []) == 0
+        assert capsys.readouterr().err == "note: it has 8 legs\n"
+    assert not logging.getLogger("mjx_revolve").handlers
 
 
 def test_our_own_faults_keep_their_traceback():

@@ -21,6 +21,7 @@ from mjx_revolve.episodes.fitness import make_fitness
 from mjx_revolve.episodes.tasks import TASKS, UNITS, score_unit
 from mjx_revolve.evolution import runs
 from mjx_revolve.evolution.fingerprints import settings_hash
+from mjx_revolve.evolution.start import check_unchanged
 from mjx_revolve.inputs import own_code
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
@@ -315,9 +316,9 @@ def test_only_the_same_code_goes_on_with_a_run(folder):
     config = load_config("swim.yaml")
     run, kept = runs.create_run("run", config)
     run.close()
-    evolve._check_unchanged(kept, config, "--resume run")
+    check_unchanged(kept, config, "--resume run")
     (folder / "mine" / "own.py").write_text(OWN + "\n")
     check_line(
         "--resume run: controller.type: expected '",
-        lambda: evolve._check_unchanged(kept, config, "--resume run"),
+        lambda: check_unchanged(kept, config, "--resume run"),
     )

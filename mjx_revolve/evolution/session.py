@@ -1,0 +1,143 @@
+"""A run from its first generation, or a later one, to its champion: what is saved, and when."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from mjx_revolve.evolution.crew import WorkerError
+from mjx_revolve.evolution.fingerprints import model_hash, settings_hash
+from mjx_revolve.evolution.interrupts import Interrupts
+from mjx_revolve.evolution.loop import (
+    Champion,
+    Search,
+    choose_champion,
+    evolve,
+    search_to_arrays,
+    start_search,
+)
+from mjx_revolve.evolution.progress import Progress
+from mjx_revolve.evolution.runs import Run
+from mjx_revolve.evolution.start import Start, describe_host, timestamp
+from mjx_revolve.evolution.strategies import make_strategy
+from mjx_revolve.evolution.tensorboard import TensorBoardLog
+
+
+def write_start(start: Start) -> None:
+    """Writes down who evolves what; a run that goes on forgets what came after its checkpoint."""
+    run = start.run
+    if start.checkpoint is not None and start.search is not None:
+        run.rewind(start.checkpoint)
+        run.save_config(start.config)
+        done = start.search.generation
+        resumption = {"time": timestamp(), "generation": done, "argv": sys.argv}
+        resumed = [*run.info.get("resumed", []), resumption]
+        run.update_info(resumed=resumed, finished=None, champion=None)
+    run.update_info(workers=start.fitness.describe())
+    # The champion's body is the same for all, so it is there from the start.
+    robot = getattr(start.fitness, "robot", None)
+    if robot is not None:
+        run.write("champion/morphology.yaml", robot.morphology.save)
+        run.write("champion/robot.xml", robot.mj_spec.to_xml().encode())
+
+
+def run_generations(start: Start, interrupts: Interrupts) -> Search:
+    """All generations, or as many as there are before an interrupt or a worker's death.
+
+    Args:
+        start: the run.
+        interrupts: looked at after each generation.
+
+    Returns:
+        The search, which is saved.
+
+    Raises:
+        WorkerError: a worker died or hangs; what was done until then is saved.
+        OSError: the disk is full.
+    """
+    run, evolution, fitness = start.run, start.config.evolution, start.fitness
+    search = start.search
+    before = 0 if search is None else search.generation
+    log = _open_log(run, before) if evolution.tensorboard else None
+    progress = Progress(before, evolution.generations)
+    try:
+        for search, row in evolve(evolution, fitness, start.search):
+            run.append_metrics(row)
+            if log is not None:
+                log.add(row)
+            progress.show(row)
+            done = search.generation
+            last = done == evolution.generations
+            if last or interrupts.signal or done % evolution.checkpoint_every == 0:
+                _save(start, search)
+            if interrupts.signal:
+                break
+    except WorkerError as error:
+        if search is None:
+            search = start_search(evolution, make_strategy(evolution, fitness.num_genes))
+        _save(start, search)
+        done = search.generation
+        what = f"generation {done}" if done else "the start, before any generation,"
+        raise WorkerError(f"{error}; {what} is saved") from None
+    finally:
+        progress.close()
+        if log is not None:
+            log.close()
+    assert search is not None  # there is at least one generation, or a checkpoint
+    return search
+
+
+def _open_log(run: Run, done: int) -> TensorBoardLog:
+    """TensorBoard's copy of the metrics."""
+    table = run.load_metrics() if done else {}
+    rows = [dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True)]
+    return TensorBoardLog(run.folder / "tensorboard", done, rows)
+
+
+def _save(start: Start, search: Search) -> None:
+    """A checkpoint, and the champion so far."""
+    config, fitness = start.config, start.fitness
+    meta = {
+        "settings_hash": settings_hash(config),
+        "model_hash": model_hash(fitness),
+        "chunk_shape": [fitness.block or config.evolution.population_size, fitness.num_genes],
+        "strategy": config.evolution.strategy,
+        "host": describe_host(),
+    }
+    arrays = search_to_arrays(config.evolution, search)
+    keep = config.evolution.keep_checkpoints
+    start.run.save_checkpoint(search.generation, arrays, meta, keep)
+    if search.generation:
+        start.run.save_champion(
+            search.elites[0], score=float(search.elite_scores[0]), final=False,
+            origin=f"best of generation {search.elite_generations[0]}, not yet judged on "
+            "fresh starts",
+        )  # fmt: skip
+
+
+def finish_run(start: Start, search: Search, draw: Callable[[Champion], None]) -> Champion:
+    """Judges the champion, and closes the books.
+
+    Args:
+        start: the run.
+        search: after the last generation.
+        draw: draws the run's pictures; the run counts as finished once they are there.
+
+    Returns:
+        The champion.
+    """
+    config = start.config
+    champion = choose_champion(config.evolution, start.fitness, search)
+    facts: dict[str, Any] = {
+        "score": champion.score,
+        "score_std": champion.std,
+        "origin": champion.origin,
+        "controller": config.controller.name,
+        "task": config.task.name,
+        "measures": champion.measures,
+    }
+    start.run.save_champion(champion.genes, final=True, **facts)
+    draw(champion)
+    start.run.update_info(finished=timestamp(), generations=search.generation, champion=facts)
+    return champion

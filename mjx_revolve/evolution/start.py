@@ -1,0 +1,224 @@
+"""How a run begins, and how one that was stopped goes on: all that is checked before it does."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjx_revolve.episodes.config import Config, load_config, override_config
+from mjx_revolve.evolution.fingerprints import (
+    FREE_SETTINGS,
+    model_hash,
+    plain_settings,
+    settings_hash,
+)
+from mjx_revolve.evolution.pool import Pool
+from mjx_revolve.evolution.runs import Checkpoint, Run, check_new_folder, create_run, open_run
+from mjx_revolve.evolution.tensorboard import check_tensorboard
+from mjx_revolve.inputs.commands import check_place
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.numerics import runtime
+
+if TYPE_CHECKING:
+    from mjx_revolve.evolution.loop import Search
+
+# What the bits of a run depend on, besides its configuration.
+_HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Start:
+    """A run that is ready to go.
+
+    Attributes:
+        run: its folder, locked.
+        config: its configuration, which names the folder's copies.
+        fitness: what scores a population.
+        search: where it goes on; None: a new run.
+        checkpoint: where `search` is from.
+    """
+
+    run: Run
+    config: Config
+    fitness: Pool
+    search: Search | None = None
+    checkpoint: Checkpoint | None = None
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it has all its generations and its champion already."""
+        done = self.search.generation if self.search else 0
+        return done >= self.config.evolution.generations and "finished" in self.run.info
+
+
+def begin_run(
+    path: str, settings: Sequence[str], out: str | None, make_pool: Callable[[Config], Pool]
+) -> Start:
+    """Begins a new run.
+
+    Args:
+        path: the configuration: a file or a shipped one's name.
+        settings: what was typed to change it, `KEY.PATH=VALUE` each.
+        out: the run folder; None: one below `runs/`, named after the configuration and the time.
+        make_pool: makes the fitness.
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: the configuration is wrong, or the folder holds something.
+        WorkerError: workers cannot be started.
+    """
+    config = load_config(path, settings)
+    if config.evolution.tensorboard:
+        check_tensorboard(config.source)
+    folder = Path(out) if out else _default_folder(config)
+    check_new_folder(folder)  # before the expensive part
+    check_place(folder / "any", f"--out {folder}")
+    fitness = make_pool(config)
+    # Not before: workers compile while evosax is imported, which takes a while.
+    from mjx_revolve.evolution.strategies import make_strategy
+
+    try:
+        make_strategy(config.evolution, fitness.num_genes)
+    except InputError as error:
+        if str(error).startswith("evolution."):
+            raise InputError(f"{config.source}: {error}") from None
+        raise
+    run, config = create_run(
+        folder,
+        config,
+        started=timestamp(),
+        seed=config.evolution.seed,
+        config_file=str(find_shipped(path, "configs").absolute()),
+        settings=_portable(settings, config),
+        model_hash=model_hash(fitness),
+        **runtime.describe_process(),
+    )
+    return Start(run, config, fitness)
+
+
+def continue_run(
+    folder: str, path: str | None, settings: Sequence[str], make_pool: Callable[[Config], Pool]
+) -> Start:
+    """Opens a run that was stopped, at its newest checkpoint that is whole.
+
+    Args:
+        folder: the run folder.
+        path: the configuration, if it was given again; it must be what the run has.
+        settings: what was typed to change it.
+        make_pool: makes the fitness.
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: it is no run folder, has no checkpoint, or would become another run.
+        WorkerError: workers cannot be started.
+    """
+    label = f"--resume {folder}"
+    run = open_run(folder)
+    old = run.load_config()
+    earlier = run.info.get("settings", [])
+    if path is None:
+        config = override_config(old, settings)
+    else:
+        config = load_config(path, [*earlier, *settings])
+    check_unchanged(old, config, label)
+    free = {key: getattr(config.evolution, key) for key in FREE_SETTINGS}
+    config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
+    if config.evolution.tensorboard:
+        check_tensorboard(label)
+    checkpoint = run.load_checkpoint()
+    for name in checkpoint.damaged:
+        _log.warning("passed over a damaged checkpoint: %s", name)
+    if checkpoint.meta["settings_hash"] != settings_hash(config):
+        raise InputError(f"{label}: expected the config.yaml that it began with; found it changed")
+    fitness = make_pool(config)
+    from mjx_revolve.evolution.loop import search_from_arrays
+
+    if checkpoint.meta["model_hash"] != model_hash(fitness):
+        raise InputError(
+            f"{label}: expected the robot and the world that it began with; found them changed (a "
+            "file that config.yaml names, or the program)"
+        )
+    run.update_info(settings=[*earlier, *_portable(settings, config)])
+    if found := _differences(checkpoint.meta["host"], describe_host()):
+        _log.warning(
+            "the run continues, but not bit for bit, because this process differs: %s",
+            "; ".join(found),
+        )
+    search = search_from_arrays(config.evolution, fitness.num_genes, checkpoint.arrays)
+    return Start(run, config, fitness, search, checkpoint)
+
+
+def _default_folder(config: Config) -> Path:
+    stem = f"{config.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    folder, count = Path("runs") / stem, 1
+    while folder.exists():
+        count += 1
+        folder = Path("runs") / f"{stem}-{count}"
+    return folder
+
+
+def _differences(old: Any, new: Any, place: str = "") -> list[str]:
+    """Places at which two nested values differ, with both values."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        return [
+            line
+            for key in old | new
+            for line in _differences(old.get(key), new.get(key), f"{place}.{key}".strip("."))
+        ]
+    return [] if old == new else [f"{place}: expected {old!r} as in the run; found {new!r}"]
+
+
+def check_unchanged(old: Config, new: Config, label: str) -> None:
+    """Refuses a configuration that would make another run than the old one.
+
+    Raises:
+        InputError: they differ in more than `FREE_SETTINGS`.
+    """
+    before, after = plain_settings(old), plain_settings(new)
+    # The run holds a copy of the morphology: its words count, not its place.
+    if Path(before["morphology"]).read_bytes() == Path(after["morphology"]).read_bytes():
+        after["morphology"] = before["morphology"]
+    for section in ("controller", "task"):  # likewise code of the user's own
+        if content_name(before[section]["type"]) == content_name(after[section]["type"]):
+            after[section]["type"] = before[section]["type"]
+    found = _differences(before, after)
+    if found:
+        more = f" (and {len(found) - 1} more)" if found[1:] else ""
+        free = f"evolution.{', '.join(FREE_SETTINGS)}"
+        raise InputError(f"{label}: {found[0]}{more}; only {free} may change")
+
+
+def _portable(settings: Sequence[str], config: Config) -> list[str]:
+    """Settings that mean the same in another folder."""
+    places = {"morphology": config.morphology, "modules": config.modules}
+    places |= {"world": config.world_name, "world.name": config.world_name}
+    places |= {"controller.type": config.controller.type, "task.type": config.task.type}
+    portable = []
+    for setting in settings:
+        key, _, value = setting.partition("=")
+        is_text = not value.lstrip().startswith("{")
+        place = places.get(key.strip()) if is_text else None
+        portable.append(f"{key}={place}" if place else setting)
+    return portable
+
+
+def describe_host() -> dict[str, Any]:
+    """What the bits of a run depend on, besides its configuration."""
+    info = runtime.describe_process()
+    return {key: info[key] for key in _HOST}
+
+
+def timestamp() -> str:
+    """Now, in ISO 8601 with the offset from UTC."""
+    return datetime.datetime.now().astimezone().isoformat(timespec="seconds")

@@ -1,0 +1,62 @@
+"""Configurations and robots that come with the package, found by their names.
+
+They lie at the top of a checkout, and inside an installed package.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from mjx_revolve.inputs.errors import InputError
+
+Kind = Literal["configs", "morphologies"]
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def list_shipped(kind: Kind) -> dict[str, Path]:
+    """The files of a kind that come with the package.
+
+    Args:
+        kind: which.
+
+    Returns:
+        Their paths by name, in alphabetical order.
+    """
+    folders = (_PACKAGE / kind, _PACKAGE.parent / kind)
+    folder = next((folder for folder in folders if folder.is_dir()), folders[0])
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def find_shipped(
+    path: str | Path, kind: Kind, folder: str | Path = "", label: str | None = None
+) -> Path:
+    """The file that a user means, who may write a shipped one's name.
+
+    Args:
+        path: a path, or a name. A file of that path wins over a shipped one of that name.
+        kind: what is wanted.
+        folder: where a relative path starts; "": the current folder.
+        label: the place that named it, for the message; None: it is called by itself.
+
+    Returns:
+        The path; as it is where it looks like one (it has a folder or a suffix), so that whoever
+        reads the file says what is wrong with it.
+
+    Raises:
+        InputError: there is neither such a file nor such a name.
+    """
+    path = Path(path)
+    here = folder / path
+    if here.is_file() or path.suffix or len(path.parts) != 1:
+        return here
+    shipped = list_shipped(kind)
+    if path.name in shipped:
+        return shipped[path.name]
+    if here.exists():
+        return here
+    found = "none" if label is None else f"{str(path)!r}"
+    raise InputError(
+        f"{label or path}: expected a file, or one of {', '.join(shipped)}, which come with the "
+        f"package; found {found}"
+    )

@@ -1,0 +1,135 @@
+"""What a run says while it goes on."""
+
+import io
+import re
+
+import pytest
+
+from mjx_revolve.evolution import progress
+
+# --- what it says while it goes on ---
+
+
+class Terminal(io.StringIO):
+    """A terminal; `drawn` is what stood on it, one after the other."""
+
+    def __init__(self, encoding="utf-8"):
+        super().__init__()
+        self.code = encoding
+
+    encoding = property(lambda self: self.code)
+
+    def isatty(self):
+        return True
+
+    @property
+    def drawn(self):
+        return self.getvalue().split("\r")[1:]
+
+
+def row(generation, **more):
+    return {"generation": generation, "best": 0.25, "mean": 1 / 3, "std": 0.1,
+            "evaluations_per_second": 1234.5} | more  # fmt: skip
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time that passes only when told to."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
+    monkeypatch.setenv("TERM", "xterm")
+    return now
+
+
+@pytest.mark.parametrize(
+    ("total", "stride"), [(1, 1), (60, 1), (61, 2), (120, 2), (200, 5), (500, 10), (2000, 50)]
+)
+def test_a_log_has_sixty_lines_at_most(total, stride, clock):
+    assert progress.choose_stride(total) == stride
+    out = io.StringIO()
+    shown = progress.Progress(0, total, out)
+    for generation in range(1, total + 1):
+        shown.show(row(generation))
+    shown.close()
+    told = [int(line.split("/")[0].split()[1]) for line in out.getvalue().splitlines()]
+    middle = range(stride, total + 1, stride)
+    assert told == sorted({1, total, *middle})
+
+
+def test_a_log_is_never_silent_for_long(clock):
+    out = io.StringIO()
+    shown = progress.Progress(0, 500, out)
+    for generation in range(1, 6):
+        shown.show(row(generation))
+        clock[0] += 31.0
+    assert len(out.getvalue().splitlines()) == 5
+
+
+def test_plain_lines_tell_the_time_left(clock):
+    out = io.StringIO()
+    shown = progress.Progress(4, 10, out)
+    clock[0] += 40.0  # compiling does not count
+    shown.show(row(5))
+    clock[0] += 15.0
+    shown.show(row(6, failed=3))
+    assert out.getvalue().splitlines() == [
+        "generation 5/10  best 0.25  mean 0.3333  evaluations/s 1234  left ?",
+        "generation 6/10  best 0.25  mean 0.3333  evaluations/s 1234  failed 3  left 01:00",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "00:00"), (60.0, "01:00"), (11159.0, "3:05:59")]
+)
+def test_times_left(seconds, text, clock):
+    out = io.StringIO()
+    shown = progress.Progress(0, 3, out)
+    shown.show(row(1))
+    clock[0] += seconds
+    shown.show(row(2))
+    assert out.getvalue().splitlines()[-1].endswith(f"  left {text}")
+
+
+@pytest.mark.parametrize("columns", [20, 50, 80, 200])
+def test_the_live_line_fits_its_terminal(columns, clock, monkeypatch):
+    monkeypatch.setattr(progress.Progress, "_columns", lambda self: columns - 1)
+    out = Terminal()
+    shown = progress.Progress(0, 4, out)
+    for generation in (1, 2, 3):
+        clock[0] += 2.0
+        shown.show(row(generation))
+    clock[0] += 0.01
+    shown.show(row(4))  # the last one, too soon for any other
+    shown.close()
+    assert all(len(line.rstrip("\n")) < columns for line in out.drawn)
+    assert out.drawn[0].startswith("generation 0/4  ")
+    assert out.drawn[-1].startswith("generation 4/4  ")
+    assert len(out.drawn) == 5
+    assert out.getvalue().endswith("\n")
+    if columns == 200:
+        head, bar, *figures = re.split("  +", out.drawn[3])
+        assert head == "generation 3/4" and set(bar[:-1]) == {"█"}
+        assert figures == ["best 0.25", "mean 0.3333", "evaluations/s 1234", "left 00:02"]
+
+
+def test_the_live_line_is_not_drawn_too_often(clock, monkeypatch):
+    monkeypatch.setattr(progress.Progress, "_columns", lambda self: 120)
+    out = Terminal("ascii")
+    shown = progress.Progress(0, 1000, out)
+    for generation in range(1, 101):
+        clock[0] += 0.01
+        shown.show(row(generation))
+    assert len(out.drawn) < 15
+    shown.close()  # interrupted: the last generation is there
+    assert out.drawn[-1].startswith("generation 100/1000  ###")
+    out.getvalue().encode("ascii")
+
+
+def test_dumb_terminals_get_plain_lines(clock, monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    out = Terminal()
+    progress.Progress(0, 4, out).show(row(1))
+    assert out.getvalue() == (
+        "generation 1/4  best 0.25  mean 0.3333  evaluations/s 1234  left ?\n"
+    )
