@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 
-from mjx_revolve.engine.step import Root
+from mjx_revolve.engine.state import Root
 from mjx_revolve.numerics.spatial import Vec, quat_to_rows
 from mjx_revolve.water.flow import Water
 

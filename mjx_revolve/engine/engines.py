@@ -5,7 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.step import Engine, make_population_engine
+from mjx_revolve.engine.state import Engine
+from mjx_revolve.engine.step import make_population_engine
 from mjx_revolve.inputs.errors import InputError
 
 ENGINES = ("population", "mjx")

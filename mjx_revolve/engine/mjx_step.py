@@ -16,18 +16,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_revolve.engine.dynamics import outer_forces, with_water
 from mjx_revolve.engine.levels import Levels, make_levels
 from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.engine.pushes import push_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
 from mjx_revolve.engine.servos import end_stop, servo
-from mjx_revolve.engine.step import (
-    Engine,
-    Root,
-    outer_forces,
-    push_of,
-    turn_quat,
-    with_water,
-)
+from mjx_revolve.engine.state import Engine, Root, turn_quat
 from mjx_revolve.engine.step import init as start
 from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.numerics.inertia import Motion, SpatialInertia, cross_force, gyroscope

@@ -19,7 +19,8 @@ from mjx_revolve.control.controller import Controller
 from mjx_revolve.engine.batch import Bodies, Capacity
 from mjx_revolve.engine.plant import Figure
 from mjx_revolve.engine.rows import Rows
-from mjx_revolve.engine.step import Engine, make_step_engine
+from mjx_revolve.engine.state import Engine
+from mjx_revolve.engine.step import make_step_engine
 from mjx_revolve.episodes.config import Config, TaskConfig
 from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.episodes.scoring import (

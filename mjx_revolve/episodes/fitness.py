@@ -28,7 +28,7 @@ from mjx_revolve.engine.batch import Bodies, Capacity, fit_capacity, pack_bodies
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.plant import Plant, actuators_of, figure_of, plant_of
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
-from mjx_revolve.engine.step import Engine
+from mjx_revolve.engine.state import Engine
 from mjx_revolve.episodes.config import Config, load_config, make_config
 from mjx_revolve.episodes.evaluation import Setup, make_recorder, pick_water
 from mjx_revolve.episodes.scoring import WORST, judge_tracks, may_touch_bed

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_revolve.control.sense import Sense, feel
-from mjx_revolve.engine.step import Engine
+from mjx_revolve.engine.state import Engine
 from mjx_revolve.numerics.xla import fused_scan, share_once
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World

@@ -14,8 +14,9 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.engine.levels import make_levels
+from mjx_revolve.engine.pushes import part_forces
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.step import init, part_forces
+from mjx_revolve.engine.step import init
 from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mjx_revolve.control.controllers import CONTROLLERS, bind_genes, make_cpg, make_sine
 
 from laboratory import WATER, at_rest, body, elbow_robot, march, random_states, read, world
-from mjx_revolve.control.controllers import CONTROLLERS, bind_genes, make_cpg, make_sine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.step import Sense
 from mjx_revolve.episodes.config import ControllerConfig
