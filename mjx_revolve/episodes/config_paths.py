@@ -9,6 +9,7 @@ from typing import Any
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.own_code import parse_own
+from mjx_revolve.inputs.shipped import find_shipped
 
 
 def is_path(world: str) -> bool:
@@ -24,7 +25,7 @@ def is_path(world: str) -> bool:
 
 
 def resolve_paths(data: dict[str, Any], origin: Callable[[str], tuple[Path, str]]) -> None:
-    """Makes all paths absolute in place.
+    """Makes all paths absolute in place; a shipped morphology may be given by name.
 
     Args:
         data: the settings, checked or not.
@@ -32,7 +33,7 @@ def resolve_paths(data: dict[str, Any], origin: Callable[[str], tuple[Path, str]
             place in messages.
 
     Raises:
-        InputError: there is no such file.
+        InputError: there is no such file, and no shipped morphology of that name.
     """
 
     def resolve(section: Any, key: str, within: str = "") -> None:
@@ -44,8 +45,10 @@ def resolve_paths(data: dict[str, Any], origin: Callable[[str], tuple[Path, str]
             return
         place = within + key
         folder, before = origin(place)
-        file = own.path if own else value
-        path = Path(os.path.abspath(folder / Path(file).expanduser()))
+        file = folder / Path(own.path if own else value).expanduser()
+        if key == "morphology":
+            file = find_shipped(Path(value).expanduser(), "morphologies", folder, before + place)
+        path = Path(os.path.abspath(file))
         if not path.is_file():
             what = "a folder" if path.is_dir() else "none"
             raise InputError(f"{before}{place}: expected a file; found {what} at {path}")

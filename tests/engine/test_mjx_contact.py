@@ -75,7 +75,7 @@ def test_the_setting():
 def test_a_wrong_setting(found):
     with pytest.raises(InputError) as caught:
         load_world("lake", bed={"contact": found})
-    expected = f"world lake: bed.contact: expected 'penalty' or 'mjx'; found {found!r}"
+    expected = f"world lake: bed.contact: expected one of penalty, mjx; found {found!r}"
     assert str(caught.value) == expected
 
 
