@@ -8,7 +8,7 @@ paths; `dump_config` writes the resolved values back, so that a run folder docum
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,7 +26,7 @@ from pydantic import (
 
 from mjx_revolve.episodes.config_paths import is_path as is_path
 from mjx_revolve.episodes.config_paths import resolve_paths
-from mjx_revolve.inputs.complaints import find_problems, refuse
+from mjx_revolve.inputs.complaints import describe, find_problems, refuse
 from mjx_revolve.inputs.errors import InputError, load_yaml
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
 from mjx_revolve.inputs.own_code import parse_own, short_name
@@ -41,12 +41,19 @@ from mjx_revolve.inputs.schema import (
 )
 from mjx_revolve.inputs.shipped import find_shipped
 
-# The names of ours; `control/controllers.py` and `tasks.py` have the functions.
-CONTROLLERS = ("cpg", "sine", "feedback")
-TASKS = ("directed_swim", "speed", "reach_target", "hold_depth", "crawl")
+# What is of use to one kind of controller only; `control.kinds.CONTROLLERS` has the functions.
+CONTROLLERS = {"cpg": (), "sine": ("harmonics",), "feedback": ("gain", "depth")}
+# What a task cannot do without; `tasks.TASKS` has the tasks themselves.
+TASKS = {
+    "directed_swim": (),
+    "speed": (),
+    "reach_target": ("target",),
+    "hold_depth": (),
+    "crawl": (),
+}
 
 
-def _one_of(names: Sequence[str]) -> Any:
+def _one_of(names: Iterable[str]) -> Any:
     """A name of ours or a function in a file of the user's own, as `Annotated` takes it."""
     return Field(
         pattern=rf"^({'|'.join(names)}|.+\.py:[^\W\d]\w*)$",
@@ -117,8 +124,13 @@ class ControllerConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
         self._refuse(self.params)
-        if self.type in ("cpg", "feedback") and self.harmonics != 1:
-            raise MisfitError("harmonics", "1, as only type sine has more", str(self.harmonics))
+        for kind, settings in CONTROLLERS.items():
+            for name in settings if kind != self.type and not self.is_own else ():
+                usual, found = type(self).model_fields[name].default, getattr(self, name)
+                if found != usual:
+                    usual = "null" if usual is None else f"{usual:g}"
+                    only = f"as only type {kind} has it (--set controller.{name}={usual})"
+                    raise MisfitError(name, f"{usual}, {only}", f"{found:g}")
         return self
 
 
@@ -161,9 +173,11 @@ class TaskConfig(Section):
         if self.settle >= self.duration:
             below = f"a time below task.duration ({self.duration:g} s)"
             raise MisfitError("settle", below, f"{self.settle:g}")
-        if self.type == "reach_target" and self.target is None:
-            because = "three numbers, because task.type is reach_target"
-            raise MisfitError("target", because, "none")
+        for name in TASKS.get(self.type, ()):
+            if getattr(self, name) is None:
+                field = type(self).model_fields[name]
+                what = describe(Annotated[(field.annotation, field)]).removesuffix(", or nothing")
+                raise MisfitError(name, f"{what}, because task.type is {self.type}", "none")
         if math.hypot(*self.direction) < 1e-9:
             raise MisfitError("direction", "a vector of some length", show(list(self.direction)))
         return self

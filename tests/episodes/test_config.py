@@ -5,6 +5,8 @@ import re
 import pytest
 
 from laboratory import ROOT
+from mjx_revolve.control import kinds
+from mjx_revolve.episodes import config, tasks
 from mjx_revolve.episodes.config import dump_config, load_config, make_config, override_config
 from mjx_revolve.inputs.errors import InputError
 
@@ -80,8 +82,14 @@ def test_it_is_frozen(folder):
          "found a"),
         ("task.params=3", "task.params: expected a mapping; found 3"),
         ("controller.params.a=1", "controller.params: expected none, as only own functions"),
-        ("task.type=reach_target", "task.target: expected three numbers, because task.type is "
+        ("task.type=reach_target", "task.target: expected three numbers [m], because task.type is "
          "reach_target; found none"),
+        ("controller.harmonics=3", "--set controller.harmonics: expected 1, as only type sine has "
+         "it (--set controller.harmonics=1); found 3"),
+        ("controller.gain=3.5", "--set controller.gain: expected 2, as only type feedback has it "
+         "(--set controller.gain=2); found 3.5"),
+        ("controller.depth=1", "--set controller.depth: expected null, as only type feedback has "
+         "it (--set controller.depth=null); found 1"),
         ("task.target=[1, 2]", "task.target: expected three numbers [m], or nothing; "
          "found [1, 2]"),
         ("task.direction=[1, 0, a]", "task.direction.2: expected a number [-]; found 'a'"),
@@ -154,6 +162,16 @@ def test_wrong_settings(folder, setting, message):
 def test_wrong_files(folder, text, message):
     (folder / "bad.yaml").write_text(text)
     check_message(message, lambda: load_config(folder / "bad.yaml"))
+
+
+def test_the_kinds_are_those_there_are():
+    assert config.CONTROLLERS.keys() == kinds.CONTROLLERS.keys()
+    assert config.TASKS.keys() == tasks.TASKS.keys()
+    for what, kind in (
+        (config.ControllerConfig, config.CONTROLLERS),
+        (config.TaskConfig, config.TASKS),
+    ):
+        assert {name for names in kind.values() for name in names} <= what.model_fields.keys()
 
 
 def test_missing_file(folder):
