@@ -162,7 +162,7 @@ def _messages(
     speeds = np.ascontiguousarray(qvel[:, [joint.qvel for joint in joints]])
     targets = np.ascontiguousarray(ctrl[:, [joint.ctrl for joint in joints]])
     # The torque of the motors, without the joints' friction.
-    torques = motor_torques(robot, qpos, qvel, ctrl)
+    torques = np.ascontiguousarray(motor_torques(robot, qpos, qvel, ctrl), np.float64)
     commands = ctrl[:, list(robot.thrusters)]
     if trajectory.command is not None:
         commands = np.asarray(trajectory.command, np.float64)[rows]
