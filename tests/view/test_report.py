@@ -261,7 +261,7 @@ DAMAGES = [
     (lambda run: (run / "config.yaml").write_text("a: {"), "damaged", "config.yaml: line "),
     (lambda run: (run / "config.yaml").write_text("[]"), "damaged", "config.yaml: expected a map"),
     (lambda run: edit(run / "config.yaml", "duration: 1.0", "duration: -1"), "damaged",
-     "config.yaml: task.duration: expected a number > 0; found -1"),
+     "config.yaml: task.duration: expected a number > 0 [s]; found -1"),
     (lambda run: edit(run / "config.yaml", "engine: population", "engine: population\nflux: 3"),
      "of another version", "config.yaml: this version does not know flux; read without"),
     (lambda run: edit(run / "config.yaml", "trials: 1", "trials: 1\n  trails: 2"),
@@ -538,7 +538,8 @@ def test_the_commands_give_the_same_settings(lab, copy):
     for command in (own, started):
         assert command.startswith("python -m mjx_revolve.evolve ")
         arguments = evolve._parser().parse_args(command.split()[3:])
-        config = load_config(arguments.config, evolve._seed_setting(arguments))
+        seed = [] if arguments.seed is None else [f"evolution.seed={arguments.seed}"]
+        config = load_config(arguments.config, [*arguments.settings, *seed])
         assert settings_hash(config) == settings_hash(record.config)
     assert "--seed 0 --set controller.max_frequency=1.0" in started
 
