@@ -152,9 +152,9 @@ def _lead(
 
 def _evolve(start: Start) -> int:
     """Everything after the arguments are known to be right."""
+    from mjx_revolve.episodes.scoring import REPORT_EPISODES
     from mjx_revolve.episodes.tasks import score_unit
     from mjx_revolve.evolution import session
-    from mjx_revolve.evolution.loop import REPORT_EPISODES
 
     run, config = start.run, start.config
     done = start.search.generation if start.search else 0
@@ -194,6 +194,7 @@ def _evolve(start: Start) -> int:
 def _draw(start: Start, champion: Champion, result: str, unit: str) -> None:
     """The run's pictures, as far as its fitness can replay the champion."""
     from mjx_revolve.view import plots
+    from mjx_revolve.view.motion import counted_time
     from mjx_revolve.view.swim_picture import plot_swim
 
     run, fitness = start.run, start.fitness
@@ -206,7 +207,8 @@ def _draw(start: Start, champion: Champion, result: str, unit: str) -> None:
         height = float(getattr(getattr(robot, "world", None), "surface_height", 0.0))
         figures["trajectory.png"] = plots.plot_trajectory(trajectory, height, title)
         if robot is not None:
-            figures["swim.png"] = plot_swim(robot, trajectory)
+            counted = counted_time(start.config.task, robot.world.timestep)
+            figures["swim.png"] = plot_swim(robot, trajectory, counted)
     for name, figure in figures.items():
         run.write(name, plots.figure_png(figure))
 

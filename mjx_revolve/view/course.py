@@ -12,6 +12,7 @@ import numpy as np
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.motion import count_finite
 from mjx_revolve.water.bed import Bed, bed_height
 from mjx_revolve.water.flow import Water, flow
 
@@ -45,10 +46,9 @@ def finite_part(episode: Episode) -> tuple[Episode, float | None]:
         InputError: not even the first row is finite.
     """
     rows = jax.tree.map(np.asarray, episode.trajectory)
-    finite = np.isfinite(rows.qpos).all(axis=1) & np.isfinite(rows.qvel).all(axis=1)
-    if finite.all():
+    count = count_finite(np.hstack([rows.qpos, rows.qvel]))
+    if count == len(rows.qpos):
         return replace(episode, trajectory=rows), None
-    count = int(finite.argmin())
     if count == 0:
         raise InputError(
             f"{episode.title}: trajectory.qpos: expected finite numbers in its first row; found "

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
-import mujoco
 import numpy as np
 
 from mjx_revolve.engine.levels import make_levels
@@ -20,6 +19,7 @@ from mjx_revolve.engine.step import init
 from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.course import pose_robot
 from mjx_revolve.water.flow import Water, water_of
 
 
@@ -91,18 +91,7 @@ def module_forces(
         return part_forces(levels, init(levels, qpos, qvel), water, thrusts)
 
     found = jax.jit(run)(qpos.T, qvel.T, command.T, now)
-    return Forces(rows, time, _places(robot, qpos), *map(np.asarray, found))
-
-
-def _places(robot: Robot, qpos: np.ndarray) -> np.ndarray:
-    """`[S, npart, 3]` centres of the parts' boxes, world frame [m], by MuJoCo's kinematics."""
-    table, data, found = robot.fluid, mujoco.MjData(robot.mj_model), []
-    for q in np.asarray(qpos, float):
-        data.qpos[:] = q
-        mujoco.mj_kinematics(robot.mj_model, data)
-        frame = data.xmat.reshape(-1, 3, 3)[table.body]
-        found.append(data.xpos[table.body] + np.einsum("pij,pj->pi", frame, table.position))
-    return np.array(found)
+    return Forces(rows, time, pose_robot(robot, qpos).parts, *map(np.asarray, found))
 
 
 def sum_modules(robot: Robot, force: np.ndarray) -> np.ndarray:

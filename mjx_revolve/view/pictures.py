@@ -19,10 +19,7 @@ from scipy.ndimage import gaussian_filter
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
-from mjx_revolve.view.pieces import Piece as Piece
 from mjx_revolve.view.pieces import Scene, rest_scene
-from mjx_revolve.view.pieces import make_pieces as make_pieces
-from mjx_revolve.view.pieces import place_pieces as place_pieces
 from mjx_revolve.view.raster import depth_buffer, draw_scene, make_view
 
 _DPI = 130

@@ -1,6 +1,6 @@
 """Picture of a swimming robot: poses along its way, and one stroke seen by a camera that follows.
 
-Drawn with the depth buffer of `pictures`, so it needs no display and no graphics driver. The view
+Drawn with the depth buffer of `raster`, so it needs no display and no graphics driver. The view
 is a parallel projection from a little above, turned so that the robot swims to the right. In it a
 pixel further down may be deeper or nearer, so depths are written beside the robot, not on an axis.
 """
@@ -20,13 +20,8 @@ from matplotlib.figure import Figure
 
 from mjx_revolve.view.labels import INK, SOFT, Places, draw_scale_bars, write
 from mjx_revolve.view.motion import Motion, analyse_motion, stroke_rows
-from mjx_revolve.view.pictures import (
-    Piece,
-    Scene,
-    make_pieces,
-    make_view,
-    place_pieces,
-)
+from mjx_revolve.view.pieces import Piece, Scene, make_pieces, mount_piece, place_pieces
+from mjx_revolve.view.raster import make_view
 from mjx_revolve.view.water_panel import (
     Panel,
     Surface,
@@ -69,18 +64,11 @@ def pose_scene(robot: Robot, qpos: np.ndarray, pieces: Sequence[Piece] | None = 
     data = mujoco.MjData(robot.mj_model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(robot.mj_model, data)
-    modules, fluid = robot.morphology.modules, robot.fluid
-    row = np.cumsum([0] + [len(module.kind.parts) for module in modules])
 
     def place(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-        k = row[piece.module] + piece.part
-        part = modules[piece.module].kind.parts[piece.part]
-        body = fluid.body[k]
+        body, position, rotation = mount_piece(robot, piece)
         frame = data.xmat[body].reshape(3, 3)
-        rotation = frame @ fluid.rotation[k]
-        # The table has the centre of the part's main box.
-        center = np.asarray(part.position) + np.asarray(part.boxes[0].position)
-        return data.xpos[body] + frame @ fluid.position[k] - rotation @ center, rotation
+        return data.xpos[body] + frame @ position, frame @ rotation
 
     return place_pieces(make_pieces(robot.morphology) if pieces is None else pieces, place)
 

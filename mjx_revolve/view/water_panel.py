@@ -1,6 +1,6 @@
 """A view into the water: its colours, the ground and the surface, and robots in it.
 
-Drawn as arrays of pixels with the depth buffer of `pictures`, row 0 the lowest.
+Drawn as arrays of pixels with the depth buffer of `raster`, row 0 the lowest.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from mjx_revolve.view.pictures import Scene, draw_scene
+from mjx_revolve.view.pieces import Scene
+from mjx_revolve.view.raster import draw_scene
 
 _HIGH_WATER, _LOW_WATER = np.array([0.925, 0.968, 0.985]), np.array([0.52, 0.745, 0.86])
 _SAND = np.array([0.80, 0.74, 0.58])

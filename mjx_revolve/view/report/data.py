@@ -9,9 +9,7 @@ from __future__ import annotations
 import csv
 import importlib.metadata
 import io
-import json
 import re
-import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +21,7 @@ from pydantic import BaseModel
 import mjx_revolve
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import Config, make_config
+from mjx_revolve.evolution.checkpoints import DamageError, read_checkpoint
 from mjx_revolve.evolution.runs import Run
 from mjx_revolve.inputs.errors import InputError, load_yaml
 from mjx_revolve.view.report.record import Problem, RunRecord
@@ -247,18 +246,10 @@ def _read_checkpoints(record: RunRecord) -> tuple[np.ndarray | None, str]:
     paths = Run(record.folder).checkpoints()
     for path in paths:
         try:
-            with zipfile.ZipFile(path) as file:
-                broken = file.testzip()
-            if broken:
-                raise ValueError(f"{broken} is damaged")
-            with np.load(path, allow_pickle=False) as file:
-                elites, scores = file["array:elites"], file["array:elite_scores"]
-                json.loads(file["meta"].tobytes())
-        # Whatever a damaged zip, header or JSON makes the readers raise.
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError,
-                NotImplementedError, MemoryError, SyntaxError) as error:  # fmt: skip
-            what = str(error).splitlines()[0] if str(error) else type(error).__name__
-            record.note("damaged", f"checkpoints/{path.name}: {what}")
+            arrays = read_checkpoint(path).arrays
+            elites, scores = arrays["elites"], arrays["elite_scores"]
+        except (DamageError, KeyError) as error:
+            record.note("damaged", f"checkpoints/{path.name}: {error}")
             continue
         if found[0] is None and np.isfinite(scores[0]) and np.isfinite(elites[0]).all():
             found = np.asarray(elites[0], np.float32), f"checkpoints/{path.name}"
