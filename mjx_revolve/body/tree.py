@@ -174,11 +174,6 @@ class Morphology:
         return float(-self.corners[:, 2].min())
 
     @property
-    def horizontal_radius(self) -> float:
-        """Distance of the farthest corner from the core's vertical axis at rest [m]."""
-        return float(np.linalg.norm(self.corners[:, :2], axis=1).max())
-
-    @property
     def radius(self) -> float:
         """Of the sphere about the core's centre that holds all corners at rest [m]."""
         return float(np.linalg.norm(self.corners, axis=1).max())

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 import trimesh
 
@@ -19,6 +18,7 @@ from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.body.solids import part_mesh
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.numerics.spatial import quat_to_rows
 from mjx_revolve.water.bed import Bed, bed_height
 from mjx_revolve.water.world import World
 
@@ -193,9 +193,8 @@ def plain(name: str) -> str:
 
 def matrix(quat: np.ndarray) -> np.ndarray:
     """`[3, 3]` rotation of a quaternion (w, x, y, z)."""
-    flat = np.zeros(9)
-    mujoco.mju_quat2Mat(flat, np.asarray(quat, np.float64))
-    return flat.reshape(3, 3)
+    w, x, y, z = np.asarray(quat, np.float64)
+    return np.array(quat_to_rows((w, x, y, z)))
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:

@@ -16,8 +16,7 @@ from annotated_types import Unit
 from mjx_revolve.inputs.schema import MisfitError, NonNegative, Number, Positive, checked
 from mjx_revolve.numerics.spatial import namespace, sincos
 
-# The thesis's lake: bed about 998 m x 998 m, z from -112.8 m to +36.7 m (shared facts, section 2).
-LAKE_EXTENT = 998.0
+# The thesis's lake: bed about 998 m x 998 m, z from -112.8 m to +36.7 m.
 LAKE_LOWEST = -112.8
 LAKE_HIGHEST = 36.7
 # Height of the dunes as a share of the lake's: 0.8 m in the thesis's lake. A choice.

@@ -51,14 +51,6 @@ def needs_place(world: World) -> bool:
     return not is_uniform(world)
 
 
-def is_moving(world: World, water: Water) -> bool:
-    """Whether the water may move: a traced current counts, a plain 0 does not."""
-    still = all(
-        isinstance(x, int | float) and x == 0 for x in (*water.current, *water.acceleration)
-    )
-    return not (still and is_uniform(world))
-
-
 def _running(world: World) -> tuple[Wave, ...]:
     """The waves that have a height."""
     return tuple(wave for wave in world.waves if wave.amplitude > 0)

@@ -1,4 +1,4 @@
-"""Thrusters: command → clamp → lag → thrust and reaction torque, as pure functions.
+"""Thrusters: command → lag → thrust and power, as pure functions.
 
 Source: UUV Simulator (Manhães, Scherer, Voss, Douat, Rauschenbach, "UUV Simulator: A Gazebo-based
 package for underwater intervention and multi-robot simulation", OCEANS 2016), package
@@ -8,7 +8,9 @@ Kreuzer, "Thruster dynamics compensation for the positioning of underwater robot
 a fuzzy sliding mode based approach", ABCM Symposium Series in Mechatronics 2, 2006). Deviations:
 
 - a lag starts from rest; the original ignores the first update of a run;
-- the propeller's torque acts back on its robot; the original has none;
+- the propeller's torque acts back on its robot, -c T about the axis; the original has none. Both go
+  with the square of the propeller's speed at standstill, so that c = K_Q D / K_T is constant
+  (Carlton, Marine Propellers and Propulsion, chapter 6);
 - the original's lags of Yoerger and of Bessa are left out: explicit, and unstable at long steps.
 
 Not modelled: the loss of thrust as the inflow grows, wake, wall and neighbouring propellers.
@@ -120,22 +122,6 @@ def interpolated_thrust(command: Any, commands: Sequence[Any], thrusts: Sequence
     return result
 
 
-def reaction_torque(thrust: Any, torque_ratio: Any) -> Any:
-    """Torque of a propeller on its robot, about the thruster's axis: -c T.
-
-    Both thrust and torque of a propeller at standstill go with the square of its speed, so that
-    their ratio c = K_Q D / K_T is constant (Carlton, Marine Propellers and Propulsion, chapter 6).
-
-    Args:
-        thrust: T [N].
-        torque_ratio: c [m]; positive for a right-handed propeller.
-
-    Returns:
-        Torque [N·m].
-    """
-    return -_like(torque_ratio, thrust) * thrust
-
-
 def ideal_power(thrust: Scalar, disc: Any, density: float) -> Scalar:
     """Power that an ideal propeller at rest in the water needs: |T|^(3/2) / √(2 ρ A).
 
@@ -158,28 +144,6 @@ def ideal_power(thrust: Scalar, disc: Any, density: float) -> Scalar:
 
 
 # ------------------------------------------------------------------------- of one thruster
-
-
-def clamp_command(thruster: Thruster, command: Scalar) -> Scalar:
-    """A command within the thruster's range [-]."""
-    return _numpy_of(command).clip(command, *thruster.range)
-
-
-def lag_command(thruster: Thruster, before: Scalar, command: Scalar, dt: float) -> Scalar:
-    """The command behind the thruster's lag after a step; see `first_order_lag`.
-
-    Args:
-        thruster: whose time constant τ; 0 is no lag.
-        before: s, `[lanes]` [-].
-        command: x, clamped, held during the step [-].
-        dt: [s].
-
-    Returns:
-        s after the step [-].
-    """
-    if thruster.time_constant == 0:
-        return command
-    return first_order_lag(before, command, thruster.time_constant, dt)
 
 
 def thrust(thruster: Thruster, command: Any) -> Any:

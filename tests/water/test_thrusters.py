@@ -12,13 +12,10 @@ import pytest
 from mjx_revolve.body.catalogue import MODULES, Thruster
 from mjx_revolve.water.thrusters import (
     basic_thrust,
-    clamp_command,
     dead_band_thrust,
     first_order_lag,
     ideal_power,
     interpolated_thrust,
-    lag_command,
-    reaction_torque,
     thrust,
 )
 
@@ -70,20 +67,7 @@ def test_each_thruster_has_its_own_lag_and_some_none():
     assert np.asarray(after) == pytest.approx(np.tile(expected[:, None], 4), rel=1e-6)
 
 
-def test_lag_of_a_thruster():
-    slow, quick = Thruster(time_constant=0.1), Thruster()
-    assert lag_command(slow, 0.2, 1.0, 0.1) == pytest.approx(1 - 0.8 / math.e)
-    assert lag_command(quick, 0.2, 1.0, 0.1) == 1.0
-
-
 # ------------------------------------------------------------------------- curves
-
-
-def test_commands_are_clamped_to_the_range():
-    thruster = Thruster(range=(-0.25, 1.0))
-    assert clamp_command(thruster, LANES) == pytest.approx(np.clip(LANES, -0.25, 1.0))
-    clamped = clamp_command(thruster, jnp.asarray(LANES))
-    assert np.asarray(clamped) == pytest.approx(np.clip(LANES, -0.25, 1.0), rel=1e-6)
 
 
 def test_basic_thrust_goes_with_the_square_of_the_command():
@@ -142,7 +126,7 @@ def test_curves_take_constants_per_thruster():
 def test_the_table_of_a_thruster_is_its_curve(name):
     """`Thruster.thrust_at`, for tables and pictures, against the law that acts in the water."""
     thruster = curve(name)
-    clamped = clamp_command(thruster, LANES)
+    clamped = LANES.clip(*thruster.range)
     assert thrust(thruster, clamped) == pytest.approx([thruster.thrust_at(x) for x in LANES])
     twice = thruster.scaled(2.0)
     assert thrust(twice, clamped) == pytest.approx(2 * thrust(thruster, clamped), abs=1e-15)
@@ -152,11 +136,12 @@ def test_the_table_of_a_thruster_is_its_curve(name):
 @pytest.mark.parametrize("x64", [False, True])
 def test_jax_and_numpy_agree_and_keep_the_precision(name, x64):
     thruster, kind = curve(name), np.float64 if x64 else np.float32
+    tau = thruster.time_constant
     with jax.enable_x64(x64):
 
         def push(before, asked):
-            asked = clamp_command(thruster, asked)
-            return thrust(thruster, lag_command(thruster, before, asked, 0.005))
+            lagged = first_order_lag(before, asked.clip(*thruster.range), tau, 0.005)
+            return thrust(thruster, lagged)
 
         found = jax.jit(push)(jnp.zeros(len(LANES), kind), jnp.asarray(LANES, kind))
         assert found.dtype == kind
@@ -171,7 +156,7 @@ def test_gradients_are_finite_everywhere_and_true_off_the_corners(name):
     with jax.enable_x64(True):
 
         def push(asked):
-            return thrust(thruster, clamp_command(thruster, asked))
+            return thrust(thruster, asked.clip(*thruster.range))
 
         edge = math.sqrt(0.3)
         corners = jnp.array([-1.0, -0.2, -0.1, 0.0, 0.1, 0.3, edge, 1.0])
@@ -188,12 +173,7 @@ def test_gradients_are_finite_everywhere_and_true_off_the_corners(name):
         assert np.isfinite(jax.vmap(jax.grad(power))(corners)).all()
 
 
-# ------------------------------------------------------------------------- torque and power
-
-
-def test_a_right_handed_propeller_turns_its_robot_left_handed():
-    assert reaction_torque(LANES, 0.0035) == pytest.approx(-0.0035 * LANES)
-    assert float(reaction_torque(jnp.array(2.0), -0.0035)) == pytest.approx(0.007)
+# ------------------------------------------------------------------------- power
 
 
 def test_ideal_power_is_thrust_times_the_speed_in_the_disc():
