@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import random
-import tempfile
-from pathlib import Path
 from typing import Any
 
-import yaml
-
 from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.morphology import Morphology, load_morphology
+from mjx_revolve.body.morphology import Morphology, make_morphology
 from mjx_revolve.inputs.errors import InputError
 
 
@@ -29,25 +25,24 @@ def random_body(seed: int, hinges: int, bricks: int | None = None) -> Morphology
     root: dict[str, Any] = {"type": "Core"}
     left = ["ActiveHinge"] * hinges + ["FixedBrick"] * (hinges if bricks is None else bricks)
     draw.shuffle(left)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"random_{seed}.yaml"
-        found = _load(root, path)
-        while left:
-            free = _free(root)
-            parent, slot = free[draw.randrange(len(free))]
-            turn = draw.choice([0, 90, 180, 270])
-            parent.setdefault("children", {})[slot] = {"type": left[-1], "orientation": turn}
-            try:
-                found = _load(root, path)
-                left.pop()
-            except InputError:  # it would overlap
-                del parent["children"][slot]
+    found = make_morphology(_in_order(root), name=f"random_{seed}")
+    while left:
+        free = _free(root)
+        parent, slot = free[draw.randrange(len(free))]
+        turn = draw.choice([0, 90, 180, 270])
+        parent.setdefault("children", {})[slot] = {"type": left[-1], "orientation": turn}
+        try:
+            found = make_morphology(_in_order(root), name=f"random_{seed}")
+            left.pop()
+        except InputError:  # it would overlap
+            del parent["children"][slot]
     return found
 
 
-def _load(root: dict[str, Any], path: Path) -> Morphology:
-    path.write_text(yaml.safe_dump({"id": path.stem, "body": root}), encoding="utf-8")
-    return load_morphology(path)
+def _in_order(node: dict[str, Any]) -> dict[str, Any]:
+    """The tree with its children by slot."""
+    children = sorted(node.get("children", {}).items())
+    return node | {"children": {slot: _in_order(child) for slot, child in children}}
 
 
 def _free(node: dict[str, Any]) -> list[tuple[dict[str, Any], int]]:
