@@ -8,7 +8,7 @@ not from the bodies at hand: products with such numbers fold away while the step
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from mjx_revolve.engine.columns import (
     pick_level,
     read_columns,
 )
-from mjx_revolve.engine.level import Laws, Level, Thrusters
+from mjx_revolve.engine.level import Laws, Level, Parts, Thrusters
 from mjx_revolve.engine.plant import Figure, Plant, actuator_places, figure_of
 from mjx_revolve.engine.robot import FRICTION, Robot
 from mjx_revolve.engine.thrusters import propeller_discs, stack_thrusters
@@ -62,6 +62,7 @@ class Capacity:
         root_points: of the root, likewise.
         carries: whether water may be carried along.
         timestep: of the world [s].
+        nothing: a part that does nothing, with the numbers of every law.
         row: numbers that are the same in all rows of all robots, in their places; None elsewhere.
         root: likewise of the roots.
     """
@@ -76,6 +77,7 @@ class Capacity:
     root_points: int
     carries: bool
     timestep: float
+    nothing: Any
     row: Any = None
     root: Any = None
 
@@ -267,13 +269,38 @@ def fit_capacity(
         root_points=root_points,
         carries=carries,
         timestep=world.timestep,
+        nothing=_nothing(all_columns),
     )
     types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
     types |= {kind.name: kind for kind in kinds}
-    one = _pick_rows(_alike(all_columns)[:1], capacity, [list_rows(all_columns[0], room)])
+    one = _pick_rows(all_columns[:1], capacity, [list_rows(all_columns[0], room)])
     known = list(types.values())
     return replace(
         capacity, root=_constants(one[0], known, False), row=_constants(one[1], known, True)
+    )
+
+
+def resize(capacity: Capacity, **changes: Any) -> Capacity:
+    """A capacity with other room.
+
+    Args:
+        capacity: from `fit_capacity`.
+        **changes: fields of it, numbers of `rows`, `slots`, `hinges` and so on, or `groups` of the
+            same laws.
+
+    Returns:
+        The capacity; what is constant stays so.
+    """
+    found = replace(capacity, **changes)
+
+    def counted(level: Level, count: Callable[[Group], int]) -> Level:
+        pairs = zip(level.parts, found.groups, strict=True)
+        return replace(level, parts=tuple(replace(p, count=count(g)) for p, g in pairs))
+
+    return replace(
+        found,
+        row=counted(found.row, lambda group: group.parts),
+        root=counted(found.root, lambda group: group.root_parts),
     )
 
 
@@ -381,9 +408,10 @@ def _pick_rows(
         at_body += len(columns.parent)
         at_part += len(columns.laws) + 1
         at_point += len(columns.point_body) + 1
-    joined = listed[0]
+    alike = [_alike(columns, capacity.nothing) for columns in listed]
+    joined = alike[0]
     if count > 1:
-        numbers = [(c.hinges, c.bodies, c.parts, c.points) for c in _alike(listed)]
+        numbers = [(c.hinges, c.bodies, c.parts, c.points) for c in alike]
         together = jax.tree.map(lambda *x: np.concatenate(x), *numbers)
         joined = joined._replace(
             hinges=together[0], bodies=together[1], parts=together[2], points=together[3]
@@ -394,27 +422,34 @@ def _pick_rows(
     return root, level
 
 
-def _alike(listed: Sequence[Columns]) -> list[Columns]:
-    """Columns whose parts all have the numbers that any of them has."""
-    fields = (
-        "exposed", "drag_linear", "drag_angular", "carried", "plate", "plate_area",
-        "plate_forward", "plate_upward", "plate_center", "ellipsoid", "mounts",
-    )  # fmt: skip
-    usual: dict[str, Any] = {}
-    for name in fields:
-        usual[name] = next((x for c in listed if (x := getattr(c.parts, name)) is not None), None)
-    found = []
+# What parts have only where a law of the robot's asks for it.
+_OPTIONAL = (
+    "exposed", "drag_linear", "drag_angular", "carried", "plate", "plate_area", "plate_forward",
+    "plate_upward", "plate_center", "ellipsoid", "mounts",
+)  # fmt: skip
+
+
+def _nothing(listed: Sequence[Columns]) -> Parts:
+    """A part that does nothing, `[1]`, with the numbers of every law of any robot."""
+    last = lambda x: x[-1:]  # noqa: E731
+    found: Parts = jax.tree.map(last, listed[0].parts)
     for columns in listed:
-        count = len(columns.laws) + 1
-        missing = {
-            # Nothing, as the last column of each table has it.
-            name: jax.tree.map(lambda v, n=count: np.broadcast_to(v[-1:], (n,)), x)
-            for name, x in usual.items()
-            if x is not None and getattr(columns.parts, name) is None
-        }
-        parts = replace(columns.parts, count=0, **missing)
-        found.append(columns._replace(parts=parts))
+        given = {name: getattr(columns.parts, name) for name in _OPTIONAL}
+        more = {name: jax.tree.map(last, x) for name, x in given.items() if x is not None}
+        found = replace(found, **more)
     return found
+
+
+def _alike(columns: Columns, nothing: Parts) -> Columns:
+    """Columns whose parts have all the numbers that `nothing` has."""
+    count = len(columns.laws) + 1
+    wide = lambda x: np.broadcast_to(x, (count,))  # noqa: E731
+    missing = {
+        name: jax.tree.map(wide, getattr(nothing, name))
+        for name in _OPTIONAL
+        if getattr(columns.parts, name) is None
+    }
+    return columns._replace(parts=replace(columns.parts, count=0, **missing))
 
 
 def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.float32) -> Bodies:

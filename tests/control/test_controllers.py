@@ -9,11 +9,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from mjx_revolve.control.controllers import CONTROLLERS, bind_genes, make_cpg, make_sine
 
 from laboratory import WATER, at_rest, body, elbow_robot, march, random_states, read, world
+from mjx_revolve.control.controller import bind_genes
+from mjx_revolve.control.cpg import make_cpg
+from mjx_revolve.control.kinds import CONTROLLERS
+from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.sine import make_sine
+from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.step import Sense
 from mjx_revolve.episodes.config import ControllerConfig
 
 EFFORT, SPEED = 0.17658, 5.235988
@@ -26,10 +30,10 @@ def robot_of(name):
     return build_robot(body(name), world())
 
 
-def play(controller, genes, steps, dt=0.005, order=None):
+def play(robot, controller, genes, steps, dt=0.005, order=None):
     """`[steps, nu, lanes]` targets and the controller's states, in float64."""
     with jax.enable_x64(True):
-        parameters = controller.decode(jnp.asarray(genes, jnp.float64), order)
+        parameters = controller.decode(jnp.asarray(genes, jnp.float64), plant_of(robot, order))
 
         def step(state, k):
             state, target = controller.step(parameters, state, k * dt, STILL)
@@ -80,11 +84,11 @@ def test_every_gene_has_a_name_of_its_own(kind):
 
 
 def test_the_names_that_a_configuration_gives():
-    robot = robot_of("spider")
+    plant = plant_of(robot_of("spider"))
     assert set(CONTROLLERS) == {"cpg", "sine", "feedback"}
     for kind, genes in (("cpg", 18), ("sine", 25), ("feedback", 8 * (1 + 7))):
-        assert CONTROLLERS[kind](robot, ControllerConfig(type=kind)).num_genes == genes
-    assert CONTROLLERS["sine"](robot, ControllerConfig(type="sine", harmonics=2)).num_genes == 41
+        assert CONTROLLERS[kind](plant, ControllerConfig(type=kind)).num_genes == genes
+    assert CONTROLLERS["sine"](plant, ControllerConfig(type="sine", harmonics=2)).num_genes == 41
 
 
 def test_bound_controllers_keep_what_they_were_given():
@@ -102,7 +106,7 @@ def test_bound_controllers_keep_what_they_were_given():
 def test_zero_genes_keep_still(kind):
     robot = robot_of("spider")
     controller = MAKERS[kind](robot)
-    targets, _ = play(controller, np.zeros((controller.num_genes, 2)), 400, order=np.arange(8))
+    targets, _ = play(robot, controller, np.zeros((controller.num_genes, 2)), 400)
     assert not targets.any()
 
 
@@ -112,7 +116,7 @@ def test_targets_stay_within_the_range(kind, amplitude):
     """CPG and plain sine by themselves; offsets and harmonics add up, and the servo clips them."""
     robot = robot_of("spider")
     controller = MAKERS[kind](robot, amplitude=amplitude)
-    targets, _ = play(controller, drawn(controller, 64, scale=5.0), 800, order=np.arange(8))
+    targets, _ = play(robot, controller, drawn(controller, 64, scale=5.0), 800)
     widest = {"cpg": 1.0, "sine": 1.5, "sine3": 0.5 + 1 + 1 / 2 + 1 / 3}[kind]
     assert np.abs(targets).max() <= widest * amplitude * np.pi / 4 + 1e-9
     assert np.abs(targets).max() > 0.5 * amplitude * np.pi / 4
@@ -124,8 +128,9 @@ def test_targets_stay_within_the_range(kind, amplitude):
 
 def test_cpg_keeps_its_norm():
     """The system matrix is antisymmetric: Σ x² + y² is constant to what Runge-Kutta errs by."""
-    controller = make_cpg(robot_of("spider"))
-    _, (x, y) = play(controller, drawn(controller, 16), 4000, order=np.arange(8))
+    robot = robot_of("spider")
+    controller = make_cpg(robot)
+    _, (x, y) = play(robot, controller, drawn(controller, 16), 4000)
     norm = (x**2 + y**2).sum(1)
     assert norm == pytest.approx(8.0, rel=2e-3)
     assert np.abs(x).max() > 1.2  # the coupling moves energy between hinges
@@ -137,7 +142,7 @@ def test_an_uncoupled_cpg_is_a_sine():
     controller = make_cpg(robot, max_frequency=1.5)
     genes = np.zeros((18, 1))
     genes[:8, 0] = np.linspace(-1.2, 1.2, 8)
-    targets, _ = play(controller, genes, 400, order=np.arange(8))
+    targets, _ = play(robot, controller, genes, 400)
     time = 0.005 * np.arange(1, 401)
     w = 2 * np.pi * 1.5 * np.sin(genes[:8, 0])
     expected = np.pi / 4 * np.tanh(np.sin(w * time[:, None]))
@@ -153,7 +158,7 @@ def test_a_coupled_pair_against_the_matrix_exponential():
     genes = np.array([[0.7], [-0.4], [0.9]])
     w, c = 2 * np.pi * np.sin(genes[:2, 0]), np.pi * np.sin(0.9)
     matrix = np.array([[0, c, w[0], 0], [-c, 0, 0, w[1]], [-w[0], 0, 0, 0], [0, -w[1], 0, 0]])
-    _, (x, y) = play(controller, genes, 400, order=np.arange(2))
+    _, (x, y) = play(robot, controller, genes, 400)
     expected = expm(matrix * 2.0) @ [0, 0, 1, 1]
     assert np.concatenate([x[-1, :, 0], y[-1, :, 0]]) == pytest.approx(expected, abs=1e-5)
 
@@ -164,7 +169,7 @@ def test_sine_is_a_sine():
     controller = make_sine(robot, max_frequency=1.2)
     genes = np.zeros((25, 1))
     genes[0], genes[8], genes[16], genes[24] = 0.5, -0.8, 0.3, 0.6
-    targets, _ = play(controller, genes, 600, order=np.arange(8))
+    targets, _ = play(robot, controller, genes, 600)
     time = 0.005 * np.arange(600)
     size, phase = np.hypot(0.5, 0.8), np.arctan2(-0.8, 0.5)
     frequency = 1.2 * (1 + np.sin(0.6)) / 2
@@ -177,20 +182,22 @@ def test_sine_is_a_sine():
 @pytest.mark.parametrize("kind", MAKERS)
 def test_order_only_permutes_the_rows(kind):
     """What reaches each hinge does not depend on the order in which an engine lists them."""
-    controller = MAKERS[kind](robot_of("spider"))
+    robot = robot_of("spider")
+    controller = MAKERS[kind](robot)
     genes = drawn(controller)
-    plain, _ = play(controller, genes, 200, order=np.arange(8))
+    plain, _ = play(robot, controller, genes, 200)
     order = np.random.default_rng(1).permutation(8)
-    turned, _ = play(controller, genes, 200, order=order)
+    turned, _ = play(robot, controller, genes, 200, order=order)
     assert turned == pytest.approx(plain[:, order], abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", MAKERS)
 def test_gradients_are_finite_at_zero_genes(kind):
-    controller = MAKERS[kind](elbow_robot(world()))
+    plant = plant_of(elbow_robot(world()))
+    controller = MAKERS[kind](plant)
 
     def last(genes):
-        parameters = controller.decode(genes, np.arange(2))
+        parameters = controller.decode(genes, plant)
         state = controller.init(parameters)
         for k in range(3):
             state, target = controller.step(parameters, state, jnp.asarray(0.3 * k), STILL)

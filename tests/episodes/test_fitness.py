@@ -11,7 +11,6 @@ import pytest
 
 from laboratory import QUICK, ROOT
 from mjx_revolve import InputError, make_fitness
-from mjx_revolve.episodes import fitness as fitness_module
 from mjx_revolve.episodes.fitness import WORST
 from mjx_revolve.episodes.tasks import TASKS, Track, measure
 
@@ -37,7 +36,7 @@ TASK = {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 2}
 def quick_compiles():
     """Leaves out the compiler's optimisations; test_end_to_end.py runs with them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitness_module, "compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.episodes.evaluation.compiler_options", lambda: QUICK)
         yield
 
 
@@ -184,7 +183,7 @@ SETTINGS = SimpleNamespace(direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, targe
     ],
 )
 def test_tasks_with_known_scores(task, given, score):
-    assert float(TASKS[task](given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
+    assert float(TASKS[task].score(given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
 
 
 def test_measures_with_known_values():

@@ -10,11 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from mjx_revolve.control.controllers import bind_genes, make_cpg, make_sine
 
 from laboratory import QUICK, USUAL, WATER, body, elbow_robot, march, read, world
 from mjx_revolve.body.morphology import trim_neutral
+from mjx_revolve.control.controller import bind_genes
+from mjx_revolve.control.cpg import make_cpg
+from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.kinematics import body_positions
+from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.inputs.errors import InputError
@@ -120,7 +123,7 @@ def test_a_controller_with_its_genes(elbow, make):
     controller = make(elbow)
     genes = np.random.default_rng(3).normal(size=controller.num_genes)
     trajectory = simulate(elbow, bind_genes(controller, genes), SPAN)
-    parameters = controller.decode(jnp.asarray(genes, jnp.float32)[:, None], np.arange(2))
+    parameters = controller.decode(jnp.asarray(genes, jnp.float32)[:, None], plant_of(elbow))
     state, expected = controller.init(parameters), []
     for k in range(STEPS):
         state, target = controller.step(parameters, state, jnp.float32(k * DT), None)

@@ -16,9 +16,10 @@ import pytest
 
 from laboratory import _ELBOW as ELBOW
 from mjx_revolve import evolve
+from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.config import load_config, override_config
 from mjx_revolve.episodes.fitness import make_fitness
-from mjx_revolve.episodes.tasks import TASKS, UNITS, score_unit
+from mjx_revolve.episodes.tasks import TASKS, score_unit
 from mjx_revolve.evolution import runs
 from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.evolution.start import check_unchanged
@@ -39,7 +40,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.control.controllers import Controller
+from mjx_revolve.control.controller import Controller
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,13 @@ def bare(track, settings):
     return rise(track, settings)
 
 
-def make_hold(robot, settings):
+def make_hold(plant, settings):
     """Each actuator holds an angle of its own."""
-    n = robot.mj_model.nu
-    reach = settings.amplitude * robot.mj_model.actuator_ctrlrange[:, 1:]
+    n = plant.num_actuators
+    share = settings.amplitude
 
-    def decode(genes, order):
-        return (jnp.asarray(reach, genes.dtype) * jnp.sin(genes))[np.asarray(order)]
+    def decode(genes, plant):
+        return share * plant.reach(genes) * plant.arrange(jnp.sin(genes))
 
     def step(parameters, state, time, sense):
         return state + 1, parameters + 0 * state
@@ -122,7 +123,7 @@ def test_targets_stand_in_the_order_that_is_asked_for(lab):
     reach = lab.robot.mj_model.actuator_ctrlrange[:, 1]
     angles = reach * np.sin(np.asarray(GENES[0]))
     for order in ([0, 1], [1, 0]):
-        parameters = lab.controller.decode(GENES.T, np.array(order))
+        parameters = lab.controller.decode(GENES.T, plant_of(lab.robot, order))
         state = lab.controller.init(parameters)
         _, targets = lab.controller.step(parameters, state, 0.0, None)
         assert np.asarray(targets)[:, 0] == pytest.approx(angles[order], rel=1e-6)
@@ -133,7 +134,7 @@ def test_units_are_those_of_the_docstrings(folder):
     assert score_unit(f"{path}:rise") == "kg"  # the last brackets of the first line
     assert score_unit(f"{path}:bare") == score_unit(f"{path}:none") == score_unit("gone.py:x") == ""
     for name, task in TASKS.items():
-        assert f"[{UNITS[name]}]" in task.__doc__.splitlines()[0]
+        assert f"[{task.unit}]" in task.score.__doc__.splitlines()[0], name
 
 
 def test_a_changed_file_is_read_anew_and_an_unchanged_one_is_not(folder):
@@ -206,15 +207,15 @@ def test_wrong_tasks(folder, text, message):
         ("Controller(n,", "Controller(n + 0.5,", "{own}: make_hold: num_genes: expected a whole "
          "number >= 0; found 2.5"),
         ("parameters + 0 * state", "parameters[0]", "{own}: make_hold: step: expected targets "
-         "[nu, lanes], here [2, 3]; found [3]"),
-        ("parameters + 0 * state", "None", "step: expected targets [nu, lanes], here [2, 3]; found "
+         "[n, lanes], here [2, 3]; found [3]"),
+        ("parameters + 0 * state", "None", "step: expected targets [n, lanes], here [2, 3]; found "
          "NoneType"),
         ("return state + 1,", "return parameters,", "{own}: make_hold: step: expected a state of "
          "the shapes that init gives, float32[3]; found float32[2, 3]"),
         ("jnp.sin(genes)", "jnp.sin(gene)", "{own}: line 38: expected make_hold's decode, init and "
          "step to give targets; found NameError: name 'gene' is not defined"),
-        ("n = robot", "n = robots", "{own}: line 34: expected make_hold to make a controller; "
-         "found NameError: name 'robots' is not defined"),
+        ("n = plant", "n = plants", "{own}: line 34: expected make_hold to make a controller; "
+         "found NameError: name 'plants' is not defined"),
         ("jnp.sin(genes)", "genes[[0, 1, 2]]", "{own}: line 38: expected make_hold's decode"),
     ],
 )  # fmt: skip
@@ -229,7 +230,7 @@ def test_the_command_says_so_in_one_line(folder, capsys):
     (folder / "mine" / "own.py").write_text("rise = 3\nmake_hold = 3")
     assert run_command(evolve.main, ["swim.yaml", "--workers", "1"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("error: swim.yaml: controller.type: expected a function make_hold in ")
+    assert error.startswith("error: swim.yaml: task.type: expected a function rise in ")
     assert error.count("\n") == 1
     assert not (folder / "runs").exists()
 

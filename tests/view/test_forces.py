@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from mjx_revolve.body.plates import LiftDrag
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.forces import Forces, module_forces, part_motion, sum_modules
+from mjx_revolve.view.forces import Forces, module_forces, sum_modules
 from mjx_revolve.water.flow import Water, flow, water_of
 
 RHO, G = 999.1026, 9.81
@@ -34,6 +36,53 @@ def states(robot: Robot, qpos, qvel=None, ctrl=None, command=None, time=None) ->
         power=np.zeros(count),
         command=command,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How parts are placed and move, world frame.
+
+    Attributes:
+        place: `[S, npart, 3]` centres of their boxes [m].
+        turn: `[S, npart, 3, 3]` world from part.
+        velocity: `[S, npart, 3]` of the centres [m/s].
+        spin: `[S, npart, 3]` angular velocity [rad/s].
+    """
+
+    place: np.ndarray
+    turn: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+
+
+def part_motion(robot: Robot, qpos: np.ndarray, qvel: np.ndarray) -> Motion:
+    """Where a robot's parts are and how they move, by MuJoCo's own kinematics.
+
+    Args:
+        robot: from `build_robot`.
+        qpos: `[S, nq]`.
+        qvel: `[S, nv]`.
+
+    Returns:
+        Of the parts, in the order of the fluid table.
+    """
+    model, table = robot.mj_model, robot.fluid
+    data, body = mujoco.MjData(model), table.body
+    place, turn, velocity, spin = [], [], [], []
+    for q, v in zip(np.asarray(qpos, float), np.asarray(qvel, float), strict=True):
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        frame = data.xmat.reshape(-1, 3, 3)[body]
+        at = data.xpos[body] + np.einsum("pij,pj->pi", frame, table.position)
+        # MuJoCo gives velocities at the centre of mass of the whole robot.
+        arm = at - data.subtree_com[1]
+        place.append(at)
+        turn.append(frame @ table.rotation)
+        velocity.append(data.cvel[body, 3:] + np.cross(data.cvel[body, :3], arm))
+        spin.append(data.cvel[body, :3])
+    return Motion(*(np.array(x) for x in (place, turn, velocity, spin)))
 
 
 def pose(x=0.0, y=0.0, z=-5.0, quat=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:

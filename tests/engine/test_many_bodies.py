@@ -1,0 +1,365 @@
+"""Different bodies in one batch: against the step for one body, and that padding changes nothing.
+
+Tolerances: accelerations agree to 1e-9 relative in float64 (sums run in another order; velocities
+and inertias span four decades), scores over 500 float32 steps to 1e-5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.random_bodies import random_body
+from laboratory import QUICK, ROOT, WATER, accelerate, body, march, random_states, read, world
+from mjx_revolve import load_config, make_fitness, make_mixed_fitness
+from mjx_revolve.control.controller import gene_places
+from mjx_revolve.engine.batch import fit_capacity, list_rows, pack_bodies, resize
+from mjx_revolve.engine.columns import read_columns
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.rows import Rows
+from mjx_revolve.engine.step import acceleration, make_step_engine
+from mjx_revolve.episodes.rollout import roll_out
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.xla import share_once
+from mjx_revolve.water.flow import water_of
+
+BED = {"kind": "flat", "height": -5.0}
+WORLDS = {
+    "default": WATER,
+    "ellipsoid": {"gravity": 9.81, "buoyancy": "partial", "drag": "ellipsoid"},
+    "inertia_box": {"drag": "inertia_box"},
+    "contact": WATER | {"bed": BED},
+    "waves": WATER | {"waves": [{"amplitude": 0.02, "wavelength": 1.0, "direction": 0.5}]},
+}
+
+
+@lru_cache(maxsize=8)
+def zoo(name):
+    """A random tree, a chain, a body without hinges, one with thrusters, one with fins."""
+    tank = world(**WORLDS[name])
+    bodies = [random_body(4, 5, 9), body("snake"), body("core"), body("auv"), body("fish")]
+    return tuple(build_robot(b, tank) for b in bodies)
+
+
+def states(robots, capacity, each, depth):
+    """`[7 + hinges, lanes]`, `[6 + hinges, lanes]`, commands, and each robot's own."""
+    lanes, hinges = len(robots) * each, capacity.hinges
+    qpos, qvel = np.zeros((7 + hinges, lanes)), np.zeros((6 + hinges, lanes))
+    ctrl, own = np.zeros((hinges + capacity.thrusters, lanes)), []
+    for k, robot in enumerate(robots):
+        q, v = random_states(robot, each, seed=k, depth=depth)
+        c = np.random.default_rng(k).uniform(-0.7, 0.7, (robot.mj_model.nu, each))
+        own.append((q, v, c))
+        here = slice(k * each, (k + 1) * each)
+        qpos[: len(q), here], qvel[: len(v), here] = q, v
+        ctrl[: robot.num_hinges, here] = c[list(robot.servos)]
+        ctrl[hinges : hinges + robot.num_thrusters, here] = c[list(robot.thrusters)]
+    return (qpos, qvel, ctrl), own
+
+
+def pack(robots, capacity, each):
+    """The tables in float64, so many of each robot."""
+    bodies = pack_bodies([r for r in robots for _ in range(each)], capacity, np.float64)
+    return jax.tree.map(jnp.asarray, bodies)
+
+
+def mixed_acceleration(robots, capacity, each, arrays):
+    """`step.acceleration` of all robots side by side, in float64."""
+    tank = robots[0].world
+    with jax.enable_x64(True):
+
+        def run(bodies, q, v, c):
+            rows = Rows(tank, capacity, bodies)
+            return acceleration(rows, q, v, bodies.plant.arrange(c), water_of(tank))
+
+        jitted = jax.jit(share_once(run), compiler_options=QUICK)
+        return np.asarray(jitted(pack(robots, capacity, each), *map(jnp.asarray, arrays)))
+
+
+@pytest.mark.parametrize(
+    "name", ["default", *(pytest.param(n, marks=pytest.mark.slow) for n in list(WORLDS)[1:])]
+)
+def test_accelerations_are_those_of_each_body_alone(name):
+    robots = zoo(name)
+    capacity = fit_capacity(robots)
+    # Half under water, or with some points in the bed.
+    depth = 4.95 if name == "contact" else 0.0
+    arrays, own = states(robots, capacity, 4, depth)
+    found = mixed_acceleration(robots, capacity, 4, arrays)
+    for k, (robot, (q, v, c)) in enumerate(zip(robots, own, strict=True)):
+        here = found[:, 4 * k : 4 * k + 4]
+        expected = accelerate(robot, q, v, c)
+        scale = np.abs(expected).max(0)
+        assert np.all(np.abs(here[: len(v)] - expected).max(0) < 1e-9 * scale), k
+        assert np.all(here[len(v) :] == 0)
+
+
+@pytest.mark.slow
+def test_more_padding_and_more_riders_change_nothing():
+    """More rows, a deeper stack, a larger root, and bodies cut into more or fewer rows."""
+    robots = zoo("default")
+    capacity = fit_capacity(robots)
+    arrays, _ = states(robots, capacity, 2, 0.0)
+    found = mixed_acceleration(robots, capacity, 2, arrays)
+    scale = np.abs(found).max(0)
+    groups = tuple(g._replace(root_parts=g.root_parts + 2) for g in capacity.groups)
+    padded = resize(
+        capacity,
+        rows=capacity.rows + 5,
+        slots=capacity.slots + 1,
+        groups=groups,
+        pairs=capacity.pairs + 3,
+    )
+    again = mixed_acceleration(robots, padded, 2, arrays)
+    assert np.all(np.abs(again - found).max(0) < 1e-11 * scale)
+    groups = tuple(g._replace(parts=1) for g in capacity.groups)
+    single = resize(capacity, rows=40, slots=5, groups=groups)
+    room = {g.laws: 1 for g in groups}
+    assert max(len(list_rows(read_columns(r), room)) for r in robots) > capacity.rows
+    again = mixed_acceleration(robots, single, 2, arrays)
+    assert np.all(np.abs(again - found).max(0) < 1e-9 * scale)
+
+
+def test_a_short_stack_holds_any_tree():
+    """Slots stay below log2 of the bodies, and every row finds its parent in its slot."""
+    tank = world(**WATER)
+    for seed in range(12):
+        robot = build_robot(random_body(seed, 2 + seed, 3), tank)
+        columns = read_columns(robot)
+        for parts in (1, 2, 5):
+            rows = list_rows(columns, dict.fromkeys(columns.laws, parts))
+            assert 2 ** (max(r.slot for r in rows) + 1) - 1 <= len(rows) + 1
+            parents = robot.mj_model.body_parentid
+            stack = {0: 1}  # the root
+            for row in rows:
+                host = row.body if row.rider else parents[row.body]
+                assert stack[row.source] == host
+                stack[row.slot] = None if row.rider else row.body
+
+
+@pytest.mark.slow
+def test_a_trajectory_is_that_of_the_body_alone():
+    """Lagged thrusters, carried water and all, through the compiled step that users run."""
+    robots, each = zoo("default"), 2
+    capacity = fit_capacity(robots)
+    (qpos, qvel, ctrl), own = states(robots, capacity, each, 0.2)
+    tank = robots[0].world
+    with jax.enable_x64(True):
+
+        def run(bodies, qpos, qvel, ctrl):
+            engine = make_step_engine(Rows(tank, capacity, bodies), bodies.plant)
+            asked = engine.plant.arrange(ctrl)
+            return roll_out(
+                engine,
+                lambda state, time, row, sense: (state, asked),
+                lambda time, row: water_of(tank),
+                lambda state, ctrl, energy, water: (*engine.observe(state), energy),
+                engine.init(qpos, qvel),
+                (),
+                None,
+                records=10,
+                every=10,
+                timestep=tank.timestep,
+            )[1]
+
+        jitted = jax.jit(run, compiler_options=QUICK)
+        kept = jitted(pack(robots, capacity, each), *map(jnp.asarray, (qpos, qvel, ctrl)))
+        q, v, work = map(np.asarray, kept)
+    for k, (robot, (q0, v0, c0)) in enumerate(zip(robots, own, strict=True)):
+        _, q1, v1, work1 = march(robot, 0.5, q0, v0, c0, every=10)
+        here = slice(each * k, each * (k + 1))
+        assert q[:, : len(q0), here] == pytest.approx(q1, abs=1e-7)
+        assert v[:, : len(v0), here] == pytest.approx(v1, abs=1e-5)
+        assert work[:, here] == pytest.approx(work1, abs=1e-8)
+
+
+# ------------------------------------------------------------------------- scores
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_config(
+        ROOT / "configs" / "lake_swim.yaml",
+        overrides={"task.duration": 2.5, "task.settle": 0.5, "trim": "none"},
+    )
+
+
+@pytest.fixture(scope="module")
+def fitness(config):
+    return make_mixed_fitness(config, [random_body(3, 6), body("snake")])
+
+
+def alone(config, robot, folder, **overrides):
+    """The fitness of one body by itself."""
+    path = folder / f"{robot.morphology.name}.yaml"
+    robot.morphology.save(path)
+    return make_fitness(config, morphology=str(path), **overrides)
+
+
+@pytest.mark.slow
+def test_scores_are_those_of_each_body_alone(config, fitness, tmp_path):
+    robots = [fitness.build(random_body(3, 6)), fitness.build(body("snake"))]
+    draw, key = np.random.default_rng(0), jax.random.key(1)
+    pick = [0, 1, 1, 0, 1]
+    own = [draw.normal(size=7 * robots[k].num_hinges + 1).astype(np.float32) for k in pick]
+    genes = jnp.stack([fitness.pad_genes(g, robots[k]) for g, k in zip(own, pick, strict=True)])
+    scores, measures = fitness.evaluate([robots[k] for k in pick], genes, key)
+    for k, robot in enumerate(robots):
+        here = [i for i in range(5) if pick[i] == k]
+        again = [fitness.own_genes(genes[i], robot) for i in here]
+        assert np.array_equal(again, [own[i] for i in here])
+        single = alone(config, robot, tmp_path)
+        expected, more = single.evaluate(np.stack([own[i] for i in here]), key)
+        assert np.asarray(scores)[here] == pytest.approx(np.asarray(expected), abs=1e-5)
+        speed = np.asarray(measures["speed_m_s"])[here]
+        assert speed == pytest.approx(np.asarray(more["speed_m_s"]), abs=1e-5)
+    # The same program for other bodies, and bits that do not depend on who swims beside.
+    compiled = fitness.setup._jitted._cache_size()
+    others = [robots[1], robots[0], *(robots[k] for k in pick[2:])]
+    swapped = jnp.stack([genes[1], genes[0], *genes[2:]])
+    once_more = fitness(others, swapped, key)
+    assert fitness.setup._jitted._cache_size() == compiled
+    assert np.array_equal(np.asarray(once_more)[[1, 0, 2, 3, 4]], np.asarray(scores))
+    # Nor on whether they all happen to have its body.
+    snakes = fitness([robots[1]] * 5, swapped.at[1:].set(0.0), key)
+    assert np.asarray(snakes)[0] == np.asarray(scores)[1]
+
+
+OWN = """
+import jax.numpy as jnp
+from mjx_revolve.control.controller import make_controller, of_actuators
+
+def make_wave(plant, settings):
+    def decode(genes, plant):
+        return plant.arrange(genes), plant.reach(genes), plant.middle(genes)
+
+    def step(parameters, state, time, sense):
+        late, reach, middle = parameters
+        return state, middle + reach * jnp.sin(6.0 * time + late) * jnp.tanh(10 * time)
+
+    return make_controller(plant, of_actuators(plant, "late"), decode, lambda p: (), step)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "tank", "task"),
+    [
+        ("cpg", {"name": "lake"}, {}),
+        ("feedback", {"name": "lake", "gust": {"std": 0.05, "time": 2.0}}, {"task.trials": 2}),
+        ("sine", {"name": "lake", "bed": {"kind": "flat", "height": -3.0}}, {"task.type": "crawl"}),
+        ("own", {"name": "lake", "waves": [{"amplitude": 0.02, "wavelength": 1.0}]}, {}),
+    ],
+)
+def test_every_controller_drives_every_body(config, tmp_path, kind, tank, task):
+    """With thrusters and fins, crawling, in gusts and waves: each as if it were alone."""
+    (tmp_path / "own.py").write_text(OWN)
+    settings = {
+        "controller.type": f"{tmp_path / 'own.py'}:make_wave" if kind == "own" else kind,
+        "controller.harmonics": 1,
+        "world": tank,
+        "task.duration": 1.0,
+        "task.settle": 0.2,
+        "task.depth": 0.5,
+        **task,
+    }
+    bodies = [random_body(4, 4, 3), body("auv"), body("fish")]
+    fitness = make_mixed_fitness(config, bodies, **settings)
+    robots, key = [fitness.build(b) for b in bodies], jax.random.key(2)
+    genes = 0.7 * jax.random.normal(jax.random.key(3), (3, fitness.num_genes))
+    scores, measures = fitness.evaluate(robots, genes, key)
+    for k, robot in enumerate(robots):
+        single = alone(config, robot, tmp_path, **settings)
+        own = fitness.own_genes(genes[k : k + 1], robot)
+        expected, more = single.evaluate(own, key)
+        # In float32; a loop that feels what it does amplifies the rounding.
+        assert float(scores[k]) == pytest.approx(float(expected[0]), abs=1e-4)
+        for name, value in more.items():
+            found = float(measures[name][k])
+            assert found == pytest.approx(float(value[0]), rel=2e-3, abs=1e-4), name
+
+
+def test_genes_find_their_joints_again(fitness):
+    robot = fitness.build(body("snake"))
+    places = gene_places(fitness.controller_of(robot), fitness.setup.controller)
+    assert len(set(places.tolist())) == len(places) == fitness.controller_of(robot).num_genes
+    with pytest.raises(InputError, match=rf"genes: expected \[..., {len(places)}\]; found \[2, 3"):
+        fitness.pad_genes(np.zeros((2, 3)), robot)
+
+
+def test_what_it_cannot_do_is_refused_by_name(config, fitness):
+    tank = world(**WATER)
+    snakes = fit_capacity([build_robot(body("snake"), tank)])
+    zeros = np.zeros((2, fitness.num_genes))
+    cases = [
+        (lambda: fit_capacity([]), "robots: expected at least one; found none"),
+        (
+            lambda: pack_bodies([build_robot(body("auv"), tank)], snakes),
+            "'auv': expected parts under one of the laws [('partial', 'faces', False)]",
+        ),
+        (
+            lambda: pack_bodies([build_robot(random_body(1, 9), tank)], snakes),
+            "'random_1': expected at most 8 hinges; found 9",
+        ),
+        (
+            lambda: make_mixed_fitness(config, [body("snake")], engine="mjx"),
+            "engine: expected population, as bodies differ; found mjx",
+        ),
+        (lambda: make_mixed_fitness(config, []), "examples: expected at least one morphology"),
+        (
+            lambda: fitness([fitness.build(body("snake"))], zeros, None),
+            "robots: expected 2, one each; found 1",
+        ),
+        (
+            lambda: fitness([body("snake")], zeros[:1], None),
+            "robots: expected what `build` returns; found Morphology",
+        ),
+        (
+            lambda: fitness([], np.zeros((2, 3)), None),
+            f"population: expected [P, {fitness.num_genes}]; found [2, 3]",
+        ),
+    ]
+    for make, message in cases:
+        with pytest.raises(InputError) as error:
+            make()
+        assert message in str(error.value)
+
+
+# ------------------------------------------------------------------------- what is constant
+
+
+def test_constants_follow_from_the_types_of_modules_not_from_examples():
+    """A capacity made for a snake, whose parts all point one way, holds any body of its types."""
+    tank = world(**WATER)
+    capacity = fit_capacity([build_robot(body("snake"), tank)], hinges=12, rows=30)
+    groups = tuple(g._replace(parts=12, root_parts=30) for g in capacity.groups)
+    roomy = resize(capacity, groups=groups)
+    pack_bodies([build_robot(random_body(seed, 5, 6), tank) for seed in range(12)], roomy)
+
+
+def test_a_number_that_is_the_same_in_all_bodies_of_the_types_must_stay_so():
+    """Say, hinges of other friction."""
+    tank = world(**WATER)
+    capacity = fit_capacity([build_robot(body("snake"), tank)])
+    assert capacity.row.hinges.damping > 0
+    other = build_robot(body("snake"), tank)
+    other.mj_model.dof_damping[6:] *= 2
+    with pytest.raises(InputError, match=r"'snake': hinges.damping: expected .* types of modules"):
+        pack_bodies([other], capacity)
+
+
+def test_slanted_modules_are_no_constants():
+    """A type that leaves the right angles frees what right angles would fix."""
+    limb = "{type: ActiveHinge, children: {1: {type: FixedBrick}}}"
+    robot = build_robot(read(f"body: {{type: Core, children: {{1: {limb}}}}}"), world(**WATER))
+    kind = robot.morphology.modules[2].kind
+    slot = replace(kind.slots[1], direction=(0.6, 0.8, 0.0))
+    slanted = replace(kind, name="Slanted", slots={1: slot})
+    square, free = fit_capacity([robot]), fit_capacity([robot], [slanted])
+    assert square.row.parts[0].rotation[0][1] == 0.0
+    assert free.row.parts[0].rotation[0][1] is None
