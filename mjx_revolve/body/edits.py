@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.module_types import ModuleType, show
+from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import (
     MAX_MODULES,
     RESERVED,
@@ -31,7 +31,7 @@ from mjx_revolve.body.morphology import (
 )
 from mjx_revolve.body.placement import Module, attach, check_overlaps
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, show
 
 
 def free_slots(body: Morphology) -> tuple[tuple[int, int], ...]:

@@ -11,13 +11,15 @@ from __future__ import annotations
 import io
 import math
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Annotated
 
 import numpy as np
 import trimesh
+from annotated_types import Unit
 from numpy.typing import ArrayLike
 
-from mjx_revolve.body.module_types import check_number
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.schema import Positive, read
 
 # A mesh is a `trimesh.Trimesh` or a pair (vertices [n, 3], faces [m, 3]).
 Mesh = trimesh.Trimesh | tuple[ArrayLike, ArrayLike]
@@ -271,7 +273,7 @@ def load_mesh(
             format or damaged, `scale` is not a positive finite number, or `check_mesh` refuses the
             mesh.
     """
-    scale = check_number(scale, f"{path}: scale", "m per unit", above=True)
+    scale = read(Annotated[Positive, Unit("m per unit")], scale, f"{path}: scale")
     file = Path(path) if folder is None else _confined(path, folder)
     suffix = file.suffix.lower()
     if suffix not in _FORMATS:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import field
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Unit
+from annotated_types import Ge, Unit
 from pydantic import StringConstraints
 
 from mjx_revolve.body.boxes import union_measure
@@ -34,7 +34,6 @@ from mjx_revolve.inputs.schema import (
     Vector,
     Whole,
     checked,
-    read,
     show,
     words,
 )
@@ -53,25 +52,6 @@ PartDrag = Annotated[
     Law[Literal["faces", "lift_drag", "ellipsoid", "off"]],
     words("one of faces, lift_drag, ellipsoid, off (inertia_box is a law of whole bodies)"),
 ]
-
-
-def check_number(value: Any, place: str, unit: str, low: float = 0.0, above: bool = False) -> float:
-    """A finite number that is at least `low`.
-
-    Args:
-        value: what the user gave.
-        place: where, for the message.
-        unit: for the message.
-        low: the smallest value allowed.
-        above: refuse `low` itself too.
-
-    Returns:
-        The number as a float.
-
-    Raises:
-        InputError: not a number, not finite, or too small.
-    """
-    return read(Annotated[Number, Gt(low) if above else Ge(low), Unit(unit)], value, place)
 
 
 @checked

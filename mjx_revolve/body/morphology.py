@@ -11,16 +11,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Unit
 
 from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.module_types import ModuleType, check_number, show
+from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, read_number
 from mjx_revolve.body.placement import Module, attach, check_overlaps, frozen
 from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
-from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.inputs.errors import InputError, load_yaml, show
+from mjx_revolve.inputs.schema import Positive, read, words
 from mjx_revolve.inputs.shipped import find_shipped
 
 __all__ = [
@@ -38,6 +40,7 @@ MAX_MODULES = 1000
 # Names that the MuJoCo model keeps for itself.
 RESERVED = ("world", "root")
 
+_Children = Annotated[dict[Any, Any], words("a mapping from slots to modules")]
 _MODULE_KEYS = ("id", "type", "slot", "orientation", "params", "children")
 
 _ORIGIN = frozen(np.zeros(3)), frozen(np.eye(3))
@@ -248,12 +251,8 @@ def _read_children(item: dict[str, Any], place: str, module: Module) -> dict[int
     if children is None:
         return {}
     place = f"{place}.children"
-    if not isinstance(children, dict):
-        raise InputError(
-            f"{place}: expected a mapping from slots to modules; found {show(children)}"
-        )
     found: dict[int, Any] = {}
-    for key, child in children.items():
+    for key, child in read(_Children, children, place).items():
         number = read_slot(key, module.kind, place)
         if number in found:
             raise InputError(f"{place}: expected each slot once; found slot {number} twice")
@@ -332,21 +331,15 @@ def _read_params(
         return None, {}
     if not isinstance(params, dict):
         raise InputError(f"{place}: expected a mapping; found {show(params)}")
-    rest = {key: copy.deepcopy(params[key]) for key in params if key not in COLORS}
-    rest = check_overrides(rest, place) if rest else rest
-    given = [key for key in COLORS if key in params]
-    if not given:
+    rest = check_overrides(copy.deepcopy(params), place)
+    levels = {key: rest.pop(key) for key in COLORS if key in rest}
+    if not levels:
         return None, rest
-    if len(given) < 3:
+    if len(levels) < 3:
         raise InputError(
-            f"{place}: expected red, green and blue, or none; found {', '.join(given)} only"
+            f"{place}: expected red, green and blue, or none; found {', '.join(levels)} only"
         )
-    levels = [read_number(params[key]) for key in COLORS]
-    for key, level in zip(COLORS, levels, strict=True):
-        number = isinstance(level, int | float) and not isinstance(level, bool)
-        if not number or not 0.0 <= level <= 1.0:
-            raise InputError(f"{place}.{key}: expected a number from 0 to 1; found {show(level)}")
-    return (float(levels[0]), float(levels[1]), float(levels[2])), rest
+    return (levels["red"], levels["green"], levels["blue"]), rest
 
 
 def _with_unique_names(modules: list[Module]) -> tuple[Module, ...]:
@@ -383,7 +376,7 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
     Raises:
         InputError: the robot floats, so that no added volume can trim it.
     """
-    density = check_number(density, "density", "kg/m3", above=True)
+    density = read(Annotated[Positive, Unit("kg/m3")], density, "density")
     core = morphology.modules[0]
     inside = sum(part.electronics_volume for part in core.kind.parts)
     total = morphology.mass / density - (morphology.volume - inside)

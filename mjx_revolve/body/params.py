@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BeforeValidator
 from mjx_revolve.body.module_types import ModuleType, PartBuoyancy, PartDrag
 from mjx_revolve.body.plates import LiftDrag
 from mjx_revolve.body.propellers import Thruster
+from mjx_revolve.body.tree import COLORS
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import NonNegative, Number, Share, Switch, Text, Triple, read, words
 
@@ -44,6 +45,7 @@ _PLAIN: dict[str, Any] = {
     "drag": PartDrag,
     "added_mass": Switch,
 }
+# The others; colours are no overrides, and checked beside them.
 _OVERRIDES: dict[str, Any] = _PLAIN | {
     "mass": Annotated[_Amount, Unit("kg")],
     "volume": Annotated[_Amount, Unit("m3")],
@@ -56,13 +58,14 @@ _OVERRIDES: dict[str, Any] = _PLAIN | {
     "lift_drag": _Some,
     "thruster": _Some,
 }
+_READ = _OVERRIDES | dict.fromkeys(COLORS, Annotated[Share, _Loose, words("a number from 0 to 1")])
 
 
 def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """The params with overrides checked, numbers as floats.
+    """The params with overrides and colours checked, numbers as floats.
 
     Args:
-        params: of one module; keys that are no overrides are kept as they are.
+        params: of one module; other keys are kept as they are.
         place: where, for messages.
 
     Returns:
@@ -72,7 +75,7 @@ def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
         InputError: a value is out of range.
     """
     return {
-        key: read(_OVERRIDES[key], value, f"{place}.{key}") if key in _OVERRIDES else value
+        key: read(_READ[key], value, f"{place}.{key}") if key in _READ else value
         for key, value in params.items()
     }
 
