@@ -24,7 +24,6 @@ from pydantic import (
     model_validator,
 )
 
-from mjx_revolve.episodes.config_paths import is_path as is_path
 from mjx_revolve.episodes.config_paths import resolve_paths
 from mjx_revolve.inputs.complaints import describe, find_problems, refuse
 from mjx_revolve.inputs.errors import InputError, load_yaml

@@ -12,7 +12,7 @@ from mjx_revolve.inputs.own_code import parse_own
 from mjx_revolve.inputs.shipped import find_shipped
 
 
-def is_path(world: str) -> bool:
+def _is_path(world: str) -> bool:
     """Whether a world is given as a file rather than by name.
 
     Args:
@@ -41,7 +41,7 @@ def resolve_paths(data: dict[str, Any], origin: Callable[[str], tuple[Path, str]
         if not isinstance(value, str) or not value:
             return
         own = parse_own(value) if key == "type" else None
-        if (key == "type" and own is None) or (key in ("world", "name") and not is_path(value)):
+        if (key == "type" and own is None) or (key in ("world", "name") and not _is_path(value)):
             return
         place = within + key
         folder, before = origin(place)
