@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import pkgutil
@@ -30,6 +31,136 @@ def test_every_public_name_has_a_docstring(name):
             and (inspect.isfunction(value) or inspect.isclass(value))
         ):
             assert (value.__doc__ or "").strip(), key
+
+
+# ------------------------------------------------------------------ texts and the code
+
+PACKAGE = ROOT / "mjx_revolve"
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+COMMENTED = [*sorted((ROOT / "configs").glob("*.yaml")), *sorted((ROOT / "morphologies").glob("*"))]
+
+
+def imports_of(path):
+    """Dotted names in the package that a file imports, those for annotations alone left out."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            node.body = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mjx_revolve"):
+            yield node.module
+            yield from (f"{node.module}.{name.name}" for name in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (name.name for name in node.names if name.name.startswith("mjx_revolve"))
+
+
+def imports_between_rooms(rooms):
+    """Pairs of rooms of which the first imports from the second."""
+    found = set()
+    for room in rooms:
+        for path in (PACKAGE / room).rglob("*.py"):
+            others = {name.split(".")[1] for name in imports_of(path) if "." in name}
+            found |= {(room, other) for other in others & {*rooms} - {room}}
+    return found
+
+
+def below(room, pairs):
+    """All rooms that a room imports from, directly or not."""
+    found = {b for a, b in pairs if a == room}
+    return found.union(*(below(b, pairs) for b in found))
+
+
+@pytest.fixture(scope="module")
+def architecture():
+    return (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def rooms(architecture):
+    """In the order of the table."""
+    return re.findall(r"^\| `(\w+)/` \|", architecture, re.MULTILINE)
+
+
+def test_rooms_import_only_from_rooms_above_them(rooms):
+    assert {*rooms} == {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    pairs = imports_between_rooms(rooms)
+    assert len(pairs) > 20
+    assert [(a, b) for a, b in pairs if rooms.index(a) < rooms.index(b)] == []
+    shown = re.search(
+        r"^ROOMS = \((.*?)\)", (ROOT / "docs" / "reference.py").read_text(), re.M | re.S
+    )
+    assert re.findall(r"\w+", shown[1]) == rooms
+
+
+def test_the_picture_of_the_rooms_is_that_of_their_imports(architecture, rooms):
+    """No arrow that is not there, and none missing that does not follow from others."""
+    drawn = {*re.findall(r"^ +(\w+) --> (\w+)$", architecture, re.MULTILINE)}
+    pairs = imports_between_rooms(rooms)
+    assert drawn <= pairs
+    for room in rooms:
+        assert below(room, drawn) - {"inputs"} == below(room, pairs) - {"inputs"}
+        # None follows from the others.
+        for other in (b for a, b in drawn if a == room):
+            assert other not in below(room, drawn - {(room, other)})
+        assert ((room, "inputs") in pairs) == (room not in ("inputs", "numerics"))
+
+
+def test_every_file_stands_in_its_room_behind_those_that_it_imports(architecture, rooms):
+    for room in rooms:
+        text = re.search(rf"^`{room}/`\n\n((?:- .*\n)+)", architecture, re.MULTILINE)[1]
+        listed = re.findall(r"^- `([\w/]+)\.py`", text, re.MULTILINE)
+        folder = PACKAGE / room
+        assert {*listed} == {
+            path.relative_to(folder).with_suffix("").as_posix()
+            for path in folder.rglob("*.py")
+            if path.name != "__init__.py"
+        }
+        dotted = [f"mjx_revolve.{room}.{name.replace('/', '.')}" for name in listed]
+        for k, name in enumerate(listed):
+            later = {*dotted[k + 1 :]} & {*imports_of(folder / f"{name}.py")}
+            assert later == set(), f"{room}/{name}.py imports from files listed behind it"
+
+
+@pytest.mark.parametrize(
+    "room", ["inputs", "body"], ids=lambda room: f"{room} without JAX and MuJoCo"
+)
+def test_rooms_know_nothing_of_what_they_need_not(room):
+    for path in (PACKAGE / room).rglob("*.py"):
+        assert not re.search(r"^\s*(?:import|from) (?:jax|mujoco)", path.read_text(), re.MULTILINE)
+
+
+def exists(name):
+    """Whether a dotted name is a module of ours, or something in one."""
+    parts = name.split(".")
+    for k in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:k]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[k:]:
+            if not hasattr(found, part):
+                return False
+            found = getattr(found, part)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("path", [*TEXTS, *COMMENTED], ids=lambda path: path.name)
+def test_every_file_and_name_that_a_text_mentions_exists(path):
+    """`mjx_revolve/…` and dotted names anywhere; paths of Python files between backticks."""
+    text = path.read_text(encoding="utf-8")
+    for name in re.findall(r"\bmjx_revolve/[\w/]+\.(?:py|yaml)\b", text):
+        assert (ROOT / name).is_file(), name
+    for name in re.findall(r"\bmjx_revolve\.\w+(?:\.\w+)*", text):
+        assert exists(name), name
+    if path.suffix == ".md" and path.stem != "tutorial":  # whose reader writes files of their own
+        places = (ROOT, PACKAGE, PACKAGE / "view")
+        for name in re.findall(r"`((?:\w+/)+\w+\.py)\b", text):
+            ours = any((place / name.partition("/")[0]).is_dir() for place in places)
+            assert not ours or any((place / name).is_file() for place in places), name
+
+
+# ------------------------------------------------------------------ pages
 
 
 @pytest.fixture(scope="module")
