@@ -22,6 +22,7 @@ from mjx_revolve.inputs.commands import (
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import check_name
 from mjx_revolve.numerics import runtime
 
 # By option: what its file is called in a folder, what it may end in, and what it is.
@@ -69,15 +70,9 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
     for name, (_, endings, _) in _FORMATS.items():
         if getattr(arguments, name) is None:
             continue
-        path = files[name] = Path(getattr(arguments, name))
-        if path.suffix.lower() not in endings:
-            raise InputError(
-                f"--{name} {path}: expected a name that ends in {' or '.join(endings)}; found "
-                f"{path.suffix!r}"
-            )
-        if path.is_dir():
-            raise InputError(f"--{name} {path}: expected a file; found a folder")
-        check_place(path, f"--{name} {path}")
+        label = f"--{name} {getattr(arguments, name)}"
+        files[name] = check_name(getattr(arguments, name), endings, label)
+        check_place(files[name], label)
     if arguments.out is None:
         return files
     if files:

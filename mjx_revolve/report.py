@@ -14,7 +14,7 @@ from pathlib import Path
 
 from mjx_revolve.inputs.commands import Parser, read_path, run_command
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
 from mjx_revolve.numerics import runtime
 
 
@@ -37,11 +37,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _named_file(out: str) -> Path:
     """The page that was asked for, whatever is there."""
-    path = Path(out)
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"--out {path}: expected a name that ends in .html; found {path.name}")
-    if path.is_dir():
-        raise InputError(f"--out {path}: expected a file; found a folder")
+    path = check_name(out, PAGES, f"--out {out}")
     if not path.parent.is_dir():
         raise InputError(f"--out {path}: expected the folder {path.parent}; found none")
     return path

@@ -18,7 +18,8 @@ from mjx_revolve.inputs.commands import (
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.viewer import check_page_path, write_viewer
+from mjx_revolve.inputs.files import PAGES, check_name
+from mjx_revolve.view.viewer import write_viewer
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -48,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
-        check_place(check_page_path(arguments.out), arguments.out)
+        check_place(check_name(arguments.out, PAGES), arguments.out)
     check_episode_path(arguments.path)
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episodes.champion import load_episode

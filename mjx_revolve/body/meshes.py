@@ -18,7 +18,8 @@ import trimesh
 from annotated_types import Unit
 from numpy.typing import ArrayLike
 
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.files import resolve_inside
 from mjx_revolve.inputs.schema import Positive, read
 
 # A mesh is a `trimesh.Trimesh` or a pair (vertices [n, 3], faces [m, 3]).
@@ -240,16 +241,7 @@ def _confined(path: str | Path, folder: str | Path) -> Path:
     for kind in (PurePosixPath(text), PureWindowsPath(text)):
         if kind.is_absolute() or kind.drive or kind.root or ".." in kind.parts:
             raise InputError(f"{text}: expected a path inside {folder}; found one that leads out")
-    try:
-        inside = Path(folder).resolve()
-        full = (inside / text).resolve()
-    except ValueError:
-        raise InputError(f"{text!r}: expected a file name; found a null byte") from None
-    except (OSError, RuntimeError):
-        raise InputError(f"{text}: expected a readable file; found a loop of links") from None
-    if not full.is_relative_to(inside):
-        raise InputError(f"{text}: expected a path inside {folder}; found a link that leads out")
-    return full
+    return resolve_inside(text, folder)
 
 
 def load_mesh(
@@ -279,14 +271,10 @@ def load_mesh(
     if suffix not in _FORMATS:
         found = f"'{suffix}'" if suffix else "no suffix"
         raise InputError(f"{path}: expected one of {', '.join(_FORMATS)}; found {found}")
-    try:
+    with reading(path):
         if file.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{path}: expected at most {_MAX_BYTES // 2**20} MiB; found more")
+            raise InputError(f"expected at most {_MAX_BYTES // 2**20} MiB; found more")
         data = file.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file; found none") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
     mesh = _parse(data, suffix[1:], str(path))
     vertices, faces = np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces)
     if np.isfinite(vertices).all() and ((faces >= 0) & (faces < len(vertices))).all():

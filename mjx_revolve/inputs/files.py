@@ -1,11 +1,67 @@
-"""Files written so that nothing is lost: the old one or the new one, never half of it."""
+"""Where files may be read and written, and writing so that nothing is lost."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+from mjx_revolve.inputs.errors import InputError
+
+PAGES = (".html", ".htm")
+"""What the name of a page for browsers may end in."""
+
+
+def check_name(path: str | Path, endings: Sequence[str], label: str | None = None) -> Path:
+    """Refuses a name that a file to write may not have.
+
+    Args:
+        path: as a user gave it.
+        endings: what it may end in.
+        label: what messages call it; by default the path.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: it ends in none of them, or is a folder.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in endings:
+        raise InputError(
+            f"{label or path}: expected a name that ends in {' or '.join(endings)}; found "
+            f"{path.suffix!r}"
+        )
+    if path.is_dir():
+        raise InputError(f"{label or path}: expected a file; found a folder")
+    return path
+
+
+def resolve_inside(path: str | Path, folder: str | Path) -> Path:
+    """A file's real path, which must lie inside a folder.
+
+    Args:
+        path: as it was written, from the folder on.
+        folder: that it must not lead out of, by no link either.
+
+    Returns:
+        The path without links.
+
+    Raises:
+        InputError: it leads out, or nowhere.
+    """
+    try:
+        inside = Path(folder).resolve()
+        full = (inside / path).resolve()
+    except ValueError:
+        raise InputError(f"{str(path)!r}: expected a file name; found a null byte") from None
+    except (OSError, RuntimeError):
+        raise InputError(f"{path}: expected a readable file; found a loop of links") from None
+    if not full.is_relative_to(inside):
+        found = "one" if ".." in Path(path).parts else "a link"
+        raise InputError(f"{path}: expected a path inside {folder}; found {found} that leads out")
+    return full
 
 
 def write_atomic(path: Path, content: bytes | Callable[[Path], None]) -> None:

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.inputs.files import check_name, write_atomic
 from mjx_revolve.view.pieces import Scene, rest_scene
 from mjx_revolve.view.raster import depth_buffer, draw_scene, make_view
 
@@ -208,11 +208,7 @@ def check_picture_path(path: str | Path) -> Path:
     Raises:
         InputError: `path` does not end in `.png`, is a folder, or lies in none.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: expected a name that ends in .png; found '{path.suffix}'")
-    if path.is_dir():
-        raise InputError(f"{path}: expected a file; found a folder")
+    path = check_name(path, (".png",))
     if not path.parent.is_dir():
         raise InputError(f"{path}: expected the folder {path.parent} to exist; found none")
     return path

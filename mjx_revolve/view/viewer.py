@@ -11,8 +11,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.champion import Episode
@@ -33,27 +32,7 @@ def write_viewer(episode: Episode, path: str | Path) -> None:
         InputError: `path` has another ending, or the episode has no finite row.
         OSError: the file cannot be written.
     """
-    write_atomic(check_page_path(path), make_page(episode).encode())
-
-
-def check_page_path(path: str | Path) -> Path:
-    """The path of a page to write.
-
-    Args:
-        path: as a user gave it.
-
-    Returns:
-        The same.
-
-    Raises:
-        InputError: it does not end in `.html`, or is a folder.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{path}: expected a file name that ends in .html; found {path.name!r}")
-    if path.is_dir():
-        raise InputError(f"{path}: expected a file to write; found a folder")
-    return path
+    write_atomic(check_name(path, PAGES), make_page(episode).encode())
 
 
 def make_page(episode: Episode) -> str:

@@ -19,6 +19,7 @@ from annotated_types import Ge, Le, Unit
 from pydantic import BeforeValidator
 
 from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.files import resolve_inside
 from mjx_revolve.inputs.schema import (
     MisfitError,
     NonNegative,
@@ -271,15 +272,7 @@ def find_field(path: str | Path, folder: str | Path) -> Path:
     """
     if Path(path).is_absolute():
         return Path(path)
-    try:
-        inside = Path(folder).resolve()
-        full = (inside / path).resolve()
-    except ValueError:
-        raise InputError(f"{str(path)!r}: expected a file name; found a null byte") from None
-    except (OSError, RuntimeError):
-        raise InputError(f"{path}: expected a readable file; found a loop of links") from None
-    if not full.is_relative_to(inside):
-        raise InputError(f"{path}: expected a path inside {inside}; found one that leads out")
+    resolve_inside(path, folder)
     return Path(folder) / path
 
 

@@ -239,7 +239,9 @@ def test_titles_cannot_break_the_page():
 @pytest.mark.parametrize("name", ["page.txt", "page", "folder.html"])
 def test_paths_are_checked(tmp_path, name):
     (tmp_path / "folder.html").mkdir()
-    with pytest.raises(InputError, match=r"expected a file"):
+    with pytest.raises(
+        InputError, match=r"expected a (name that ends in .html or .htm|file); found"
+    ):
         write_viewer(small_episode(world()), tmp_path / name)
 
 
@@ -444,7 +446,10 @@ def test_command(tmp_path, monkeypatch, capsys, quick_compiles):
     "arguments, message",
     [
         ([], r"the following arguments are required: path \(see --help\)"),
-        ([CORE, "--out", "page.png"], r"page.png: expected a file name that ends in .html; found"),
+        (
+            [CORE, "--out", "page.png"],
+            r"page.png: expected a name that ends in .html or .htm; found",
+        ),
         ([CORE, "--duration", "0"], r"--duration: expected seconds > 0; found '0'"),
         ([CORE, "--duration", "nan"], r"--duration: expected seconds > 0; found 'nan'"),
         ([CORE, "--duration", "soon"], r"--duration: expected seconds > 0; found 'soon'"),

@@ -456,13 +456,13 @@ def test_relative_paths_start_where_they_are_written(tmp_path, monkeypatch):
     assert load_world("lake", current_field="flow.npz").current_field.x[2] == 3.0
     path.write_text("current_field: ../flow.npz")
     (folder / "link.npz").symlink_to(tmp_path / "flow.npz")
-    for name in ("../flow.npz", "link.npz"):
+    for name, found in (("../flow.npz", "one"), ("link.npz", "a link")):
         path.write_text(f"current_field: {name}")
         with pytest.raises(InputError) as caught:
             load_world(path)
         assert str(caught.value) == (
             f"{path}: current_field: {name}: expected a path inside {folder}; "
-            "found one that leads out"
+            f"found {found} that leads out"
         )
     path.write_text(f"current_field: {tmp_path / 'flow.npz'}")
     assert load_world(path).current_field is not None
