@@ -50,8 +50,9 @@ def fresh_traces():
 # Files are dealt out whole, in this order: those that take a minute or more go first, so that no
 # worker is left alone with one at the end.
 _LONGEST = (
-    "test_tutorial", "test_rollout", "test_step", "test_mixed", "test_fitness", "test_experiments",
-    "test_end_to_end", "test_pool", "test_mjx_contact", "test_evolve", "test_dynamics",
+    "test_tutorial", "test_rollout", "test_step", "test_many_bodies", "test_fitness",
+    "test_experiments", "test_end_to_end", "test_pool", "test_mjx_contact", "test_evolve",
+    "test_loop", "test_dynamics", "test_wheel",
 )  # fmt: skip
 
 
