@@ -175,8 +175,8 @@ class Morphology:
 
     @property
     def radius(self) -> float:
-        """Of the sphere about the core's centre that holds all corners at rest [m]."""
-        return float(np.linalg.norm(self.corners, axis=1).max())
+        """How far the corners reach from the core's vertical at rest [m]."""
+        return float(np.linalg.norm(self.corners[:, :2], axis=1).max())
 
     @cached_property
     def exposed(self) -> np.ndarray:

@@ -32,6 +32,7 @@ class FluidTable:
         volume: `[npart]` displaced volume: tabulated mesh volume, electronics and ballast [m³].
         mass: `[npart]` [kg].
         exposed: `[npart, 3]` share of each pair of faces that the water reaches [-].
+        face_area: `[npart, 3]` that the water reaches of a face across each axis [m²].
         buoyancy: `[npart]` names of the buoyancy laws.
         drag: `[npart]` names of the drag laws.
         drag_linear: `[npart, 3]` ½ C_d A of each pair of faces [m²].
@@ -57,6 +58,7 @@ class FluidTable:
     volume: np.ndarray
     mass: np.ndarray
     exposed: np.ndarray
+    face_area: np.ndarray
     buoyancy: tuple[str, ...]
     drag: tuple[str, ...]
     drag_linear: np.ndarray
@@ -149,6 +151,7 @@ def make_fluid_table(
         volume=np.array([p.total_volume for p in parts]),
         mass=np.array([p.total_mass for p in parts]),
         exposed=exposed,
+        face_area=exposed * areas,
         buoyancy=tuple(
             "off" if world.buoyancy == "off" else p.buoyancy or world.buoyancy for p in parts
         ),

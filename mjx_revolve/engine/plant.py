@@ -39,19 +39,11 @@ class Figure(NamedTuple):
 def figure_of(robot: Robot) -> Figure:
     """The size of a robot, in its world."""
     body, world = robot.morphology, robot.world
-    corners = []
-    for module in body.modules:
-        for part in module.kind.parts:
-            low, high = part.bounds
-            signs = np.array(list(np.ndindex(2, 2, 2)), bool)
-            local = np.asarray(part.position) + np.where(signs, high, low)
-            corners.append(module.position + local @ module.rotation.T)
-    cloud = np.concatenate(corners)
     return Figure(
         length=body.length,
         weight=body.mass * max(world.gravity, 1e-9),
-        lowest=float(-cloud[:, 2].min()),
-        radius=float(np.linalg.norm(cloud[:, :2], axis=1).max()),
+        lowest=body.lowest,
+        radius=body.radius,
         sinks=world.buoyancy == "off" or world.density * body.volume < body.mass / 2,
     )
 

@@ -17,7 +17,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_revolve.body.exposure import exposed_shares
 from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.engine.fluid_table import FluidTable, drag_law, make_fluid_table
@@ -178,7 +177,7 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
             [row["module"] for row in rows],
             [row["at"] for row in rows],
             [row["turn"] for row in rows],
-            np.array(exposed_shares(morphology)),
+            morphology.exposed,
             world,
         ),
         contact_body=np.array([body[name] for name, _ in points], int),
@@ -387,23 +386,24 @@ def _limit_stiffness(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     it is well damped while k dt² is at most 1.5 (I + d dt). Only hinges that carry next to nothing
     are touched.
     """
-    dt = model.opt.timestep
-    for actuator in spec.actuators:
-        if actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
-            continue
-        joint = model.joint(actuator.target).id
-        body, axis = model.jnt_bodyid[joint], model.jnt_axis[joint]
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.body_iquat[body])
-        along = turn.reshape(3, 3).T @ axis
-        arm = np.cross(axis, model.body_ipos[body])
-        inertia = model.body_inertia[body] @ along**2 + model.body_mass[body] * (arm @ arm)
-        most = 1.5 * (inertia / dt**2 + model.dof_damping[model.jnt_dofadr[joint]] / dt)
-        stiffness = min(actuator.gainprm[0], most)
-        if stiffness < actuator.gainprm[0]:  # in the compiled model too: no need for another
+    driven = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    joint = model.actuator_trnid[driven, 0]
+    body, axis, dt = model.jnt_bodyid[joint], model.jnt_axis[joint], model.opt.timestep
+    turn = np.zeros((len(driven), 9))
+    for matrix, quat in zip(turn, model.body_iquat[body], strict=True):
+        mujoco.mju_quat2Mat(matrix, quat)
+    along = np.einsum("kji,kj->ki", turn.reshape(-1, 3, 3), axis)
+    arm = np.cross(axis, model.body_ipos[body])
+    inertia = np.sum(model.body_inertia[body] * along**2, 1)
+    inertia += model.body_mass[body] * np.sum(arm**2, 1)
+    most = 1.5 * (inertia / dt**2 + model.dof_damping[model.jnt_dofadr[joint]] / dt)
+    for index, stiffness in zip(driven, most, strict=True):
+        if stiffness < model.actuator_gainprm[index, 0]:
+            actuator = spec.actuators[index]
             actuator.gainprm[0], actuator.biasprm[1] = stiffness, -stiffness
-            model.actuator_gainprm[actuator.id, 0] = stiffness
-            model.actuator_biasprm[actuator.id, 1] = -stiffness
+            # In the compiled model too: no need for another.
+            model.actuator_gainprm[index, 0] = stiffness
+            model.actuator_biasprm[index, 1] = -stiffness
 
 
 def _add_geoms(
@@ -472,9 +472,10 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
     for body in np.unique(table.body[explicit]):
         rows = explicit & (table.body == body)
         mass = model.body_mass[body] + world.density * table.carried_mass[rows].min(-1).sum()
-        # Twice ½ C_d A v, the slope of the force, with the two laws' C_d of 1.
-        slope = 2 * world.density * (table.drag_linear[rows] / 1.05).max(-1).sum() * _BRISK
-        longest = 2 * mass / slope
+        # Twice ½ C_d A v, the slope of the force: the two laws have a C_d of 1 of their own,
+        # whatever the parts' coefficients are.
+        slope = world.density * table.face_area[rows].max(-1).sum() * _BRISK
+        longest = 2 * mass / max(slope, 1e-30)
         if world.timestep > longest:
             raise InputError(
                 f"timestep: expected at most {longest:.2g} s, as drag: {world.drag} is explicit "

@@ -7,6 +7,7 @@ MuJoCo gets a height field sampled from the same function, so pictures and physi
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
@@ -115,6 +116,7 @@ def bed_slope(bed: Bed, x: Any, y: Any) -> tuple[Any, Any]:
     )
 
 
+@lru_cache(maxsize=8)  # every robot that is compiled above a bed asks for it
 def sample_bed(bed: Bed, n: int = 201) -> np.ndarray:
     """The bed on a grid, for MuJoCo's height field and for pictures.
 
@@ -128,4 +130,6 @@ def sample_bed(bed: Bed, n: int = 201) -> np.ndarray:
     # float32, as the population step computes it.
     line = np.linspace(-bed.extent / 2, bed.extent / 2, n).astype(np.float32)
     x, y = np.meshgrid(line, line)
-    return bed_height(bed, x, y).astype(np.float64)
+    heights = bed_height(bed, x, y).astype(np.float64)
+    heights.flags.writeable = False
+    return heights

@@ -1011,7 +1011,7 @@ def test_the_layout_is_that_of_the_modules(path):
     corners = np.array(corners)
     assert robot.corners == pytest.approx(corners)
     assert robot.lowest == pytest.approx(-corners[:, 2].min())
-    assert robot.radius == pytest.approx(np.linalg.norm(corners, axis=1).max())
+    assert robot.radius == pytest.approx(np.linalg.norm(corners[:, :2], axis=1).max())
     assert robot.bounds[0] == pytest.approx(corners.min(axis=0))
     assert robot.exposed.shape == (len(parts), 3)
     assert (robot.exposed >= 0).all() and (robot.exposed <= 1).all()
