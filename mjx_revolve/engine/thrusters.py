@@ -15,7 +15,13 @@ import numpy as np
 from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.engine.level import Thrusters
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.water.thrusters import dead_band_thrust, ideal_power, interpolated_thrust
+from mjx_revolve.water.thrusters import (
+    dead_band_thrust,
+    ideal_power,
+    interpolated_thrust,
+    kept_share,
+    mix_command,
+)
 
 # What stands where a robot has fewer thrusters than others.
 _NONE = Thruster(gain=0.0)
@@ -62,7 +68,6 @@ def stack_thrusters(
         )
 
     backward = lambda t: t.gain if t.gain_backward is None else t.gain_backward  # noqa: E731
-    kept = lambda t: np.exp(-dt / t.time_constant) if t.time_constant > 0 else 0.0  # noqa: E731
     lines = [t for some in padded for t in some if t.curve == "interpolated"]
     line = None
     if lines:
@@ -76,7 +81,7 @@ def stack_thrusters(
         count=count,
         low=column(lambda t: t.range[0]),
         high=column(lambda t: t.range[1]),
-        kept=column(kept),
+        kept=kept_share(column(lambda t: t.time_constant), dt),
         delayed=column(lambda t: t.time_constant > 0, bool),
         backward=column(backward),
         forward=column(lambda t: t.gain),
@@ -115,9 +120,7 @@ def run_thrusters(
     """
     cast = lambda x: x if isinstance(x, jax.Array) else np.asarray(x, ctrl.dtype)  # noqa: E731
     asked = jnp.clip(ctrl, cast(thrusters.low), cast(thrusters.high))
-    kept = cast(thrusters.kept)
-    # Not x + kept (s - x): at rest at x, rounding must leave s alone.
-    after = lagged * kept + asked * (1 - kept)
+    after = mix_command(lagged, asked, thrusters.kept)
     acting = jnp.where(thrusters.delayed, lagged, asked)
     push = dead_band_thrust(
         acting,

@@ -125,7 +125,6 @@ class Task:
         records: what the track holds beside the core's position and the energy, of `RECORDS`.
         start: where episodes begin, like `start_at_depth`.
         on_bed: whether episodes begin on the bed, so that there must be one.
-        needs: settings without which the task has no meaning.
     """
 
     score: Callable[[Track, Any], jax.Array]
@@ -133,7 +132,6 @@ class Task:
     records: tuple[str, ...] = ()
     start: Callable[[Any, World, Figure, jax.Array], jax.Array] = start_at_depth
     on_bed: bool = False
-    needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Checks what a user may have got wrong."""
@@ -200,7 +198,7 @@ _SPEED = "body lengths/s"
 TASKS: Mapping[str, Task] = {
     "directed_swim": Task(directed_swim, _SPEED),
     "speed": Task(speed, _SPEED),
-    "reach_target": Task(reach_target, "body lengths", needs=("target",)),
+    "reach_target": Task(reach_target, "body lengths"),
     "hold_depth": Task(hold_depth, "body lengths"),
     "crawl": Task(crawl, _SPEED, start=start_on_bed, on_bed=True),
 }

@@ -57,8 +57,17 @@ def first_order_lag(before: Any, command: Any, time_constant: Any, dt: float) ->
     Returns:
         s after the step [-].
     """
+    return mix_command(before, command, kept_share(time_constant, dt))
+
+
+def kept_share(time_constant: Any, dt: float) -> np.ndarray:
+    """e^(-dt/τ): what is left after a step of a command behind its lag; 0 without a lag [-]."""
     tau = np.asarray(time_constant, float)
-    kept = np.where(tau > 0, np.exp(-dt / np.where(tau > 0, tau, 1.0)), 0.0)
+    return np.where(tau > 0, np.exp(-dt / np.where(tau > 0, tau, 1.0)), 0.0)
+
+
+def mix_command(before: Any, command: Any, kept: Any) -> Any:
+    """The lagged command, from what is kept of it and the one that is asked for [-]."""
     # Not x + kept (s - x): at rest at x, rounding must leave s alone.
     return before * _like(kept, before) + command * _like(1 - kept, command)
 

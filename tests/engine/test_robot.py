@@ -9,7 +9,7 @@ import pytest
 from laboratory import OURS, ROOT, WILD, body, box_robot, read, world
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
-from mjx_revolve.engine.robot import build_robot, export_mjcf
+from mjx_revolve.engine.robot import build_robot, check_timestep, export_mjcf
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height
 from mjx_revolve.water.world import load_world
@@ -279,3 +279,15 @@ def test_a_body_that_mujoco_refuses_is_an_input_error():
         box_robot((0.1, 0.1, 0.1), 1e-20, world())
     assert str(caught.value).startswith("box: expected a body that MuJoCo can simulate; found: ")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 1.05, 3.0])
+def test_the_longest_step_of_mujocos_laws_does_not_depend_on_ours(coefficient):
+    """Their C_d is 1: a plate of 100 cm² and 1 g bears 2 m / (ρ A v) = 0.2 ms at 1 m/s."""
+    tank = world(drag="ellipsoid", timestep=0.001)
+    plate = box_robot((0.1, 0.1, 0.002), 0.001, tank, drag_coefficient=coefficient)
+    with pytest.raises(
+        InputError, match=r"timestep: expected at most 0.0002 s, as drag: ellipsoid"
+    ):
+        check_timestep(plate)
+    check_timestep(box_robot((0.1, 0.1, 0.002), 0.02, tank, drag_coefficient=coefficient))
