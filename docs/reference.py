@@ -115,6 +115,20 @@ def mend_tuples(module: types.ModuleType) -> None:
                 vars(value)[name].__doc__ = ""
 
 
+def mend_checked(module: types.ModuleType) -> None:
+    """Makes a module's checked dataclasses readable.
+
+    What their fields are checked for is left out of their types. Their constructors name a type
+    that is there for type checkers only.
+    """
+    for value in vars(module).values():
+        if isinstance(value, type) and "__pydantic_fields__" in vars(value):
+            init: Any = value.__init__  # type: ignore[misc]
+            if "__dataclass_self__" in getattr(init, "__annotations__", {}):
+                del init.__annotations__["__dataclass_self__"]
+                value.__annotations__ = typing.get_type_hints(value)
+
+
 def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     """Writes all pages.
 
@@ -141,6 +155,7 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     for name in [PACKAGE, *(f"{PACKAGE}.{room}" for room in rooms if room), *modules]:
         module = importlib.import_module(name)
         mend_tuples(module)
+        mend_checked(module)
         documents[name] = pdoc.doc.Module(module)
     pdoc.render.configure(
         docformat="google",
