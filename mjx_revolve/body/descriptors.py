@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from mjx_revolve.body.placement import Module
-    from mjx_revolve.body.tree import Morphology
+from mjx_revolve.body.placement import Module
 
 # Positions nearer than this are the same place [m]; a choice, far below a module's size.
 _SAME_PLACE = 1e-3
 
 
-def describe(morphology: Morphology) -> dict[str, float]:
+def describe(modules: Sequence[Module], extent: np.ndarray) -> dict[str, float]:
     """Measures of a body, to compare robots and to spread them in quality-diversity searches.
 
     After Miras, Haasdijk, Glette and Eiben, "Search space analysis of evolvable robot
@@ -26,7 +24,8 @@ def describe(morphology: Morphology) -> dict[str, float]:
     positions at rest (to 1 mm).
 
     Args:
-        morphology: the robot.
+        modules: of the robot, the core first, parents before their children.
+        extent: `[3]` edges of its bounding box at rest [m].
 
     Returns:
         - num_modules, num_bricks, num_hinges, num_sensors, num_thrusters, num_fins: counts (bricks:
@@ -46,7 +45,6 @@ def describe(morphology: Morphology) -> dict[str, float]:
         - symmetry: share of modules off the core's axis that have a mirror image, about the xz or
           the yz plane, whichever is more; 0 where none is off the axis.
     """
-    modules = morphology.modules
     children = [0] * len(modules)
     depth = [0] * len(modules)
     for i, module in enumerate(modules):
@@ -67,7 +65,7 @@ def describe(morphology: Morphology) -> dict[str, float]:
     free = sum(len(modules[i].kind.slots) - children[i] for i in body)
     working = sum(children[i] > 0 for i in hinges)
     most_tips = size - 1 if size < 6 else 2 * ((size - 6) // 3) + (size - 6) % 3 + 4
-    extent, box_volume = morphology.extent, morphology.box_volume
+    box_volume = sum(module.kind.box_volume for module in modules)
     return {
         "num_modules": float(len(modules)),
         "num_bricks": float(len(bricks)),
@@ -75,8 +73,8 @@ def describe(morphology: Morphology) -> dict[str, float]:
         "num_sensors": float(sensors),
         "num_thrusters": float(sum(thrusters)),
         "num_fins": float(sum(fins)),
-        "mass": morphology.mass,
-        "volume": morphology.volume,
+        "mass": sum(module.kind.mass for module in modules),
+        "volume": sum(module.kind.volume for module in modules),
         "box_volume": box_volume,
         "extent_x": float(extent[0]),
         "extent_y": float(extent[1]),

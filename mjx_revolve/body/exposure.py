@@ -6,12 +6,9 @@ and a limb would be no harder to move sideways than lengthwise; swimming lives o
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from mjx_revolve.body.tree import Morphology
+from mjx_revolve.body.placement import Layout
 
 # A face is covered where a neighbour is found at one of these distances in front of it [m]:
 # Revolve's joints leave up to 2 mm, or sink a plate of 1 mm into the neighbour's face; limbs keep
@@ -24,7 +21,7 @@ _BITS = 1 << np.arange(_POINTS)
 _SLACK = 1e-6
 
 
-def exposed_shares(morphology: Morphology) -> np.ndarray:
+def exposed_shares(parts: Layout) -> np.ndarray:
     """The share of each part's faces that no other part covers, at rest.
 
     A choice: the pose at rest stands for all poses; a bent hinge opens a little more. Opposite
@@ -32,14 +29,13 @@ def exposed_shares(morphology: Morphology) -> np.ndarray:
     keeps them.
 
     Args:
-        morphology: the robot.
+        parts: of the robot, `Morphology.layout`.
 
     Returns:
         `[npart, 3]` exposed share of the silhouette along each part's x, y and z axes [-], parts of
         all modules in order.
     """
-    parts = morphology.layout
-    part, box, center, turn = _near(morphology)
+    part, box, center, turn = _near(parts)
     # Boxes that stand square to a face cover a rectangle of it: each axis tells on its own.
     square = (np.abs(turn - np.round(turn)) < 1e-9).all(axis=(1, 2))
     reach = np.einsum("pij,pj->pi", np.abs(turn), parts.box_half[box] + _SLACK)[:, None]
@@ -72,14 +68,13 @@ def exposed_shares(morphology: Morphology) -> np.ndarray:
     return shares
 
 
-def _near(morphology: Morphology) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _near(parts: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Parts and boxes of other parts that may cover a face of theirs.
 
     Returns:
         `[pair]` parts and `[pair]` boxes; `[pair, 3]` centre [m] and `[pair, 3, 3]` rotation of the
         box in the part's frame.
     """
-    parts = morphology.layout
     place = parts.box_centers()
     # The part's bounding box, thicker by the largest distance, in the core's frame.
     middle, half = (parts.low + parts.high) / 2, (parts.high - parts.low) / 2

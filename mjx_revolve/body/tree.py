@@ -181,7 +181,7 @@ class Morphology:
     @cached_property
     def exposed(self) -> np.ndarray:
         """`[npart, 3]` share of each part's faces that the water reaches; `exposed_shares`."""
-        return frozen(exposed_shares(self))
+        return frozen(exposed_shares(self.layout))
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +203,7 @@ class Morphology:
     @cached_property
     def descriptors(self) -> dict[str, float]:
         """Measures of the body; see `descriptors.describe`."""
-        return describe(self)
+        return describe(self.modules, self.extent)
 
     def to_mapping(self) -> dict[str, Any]:
         """The body as a morphology file has it: `make_morphology` makes an equal one of it.
