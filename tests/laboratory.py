@@ -125,7 +125,7 @@ def _accelerator(robot: Robot, still: bool):
 
 
 def accelerate(robot: Robot, qpos, qvel, ctrl=None, water=None, x64: bool = True) -> np.ndarray:
-    """`dynamics.acceleration` of lanes of states, as NumPy: `[nv, lanes]`."""
+    """`step.acceleration` of lanes of states, as NumPy: `[nv, lanes]`."""
     with jax.enable_x64(x64):
         kind = jnp.float64 if x64 else jnp.float32
         ctrl = np.zeros((robot.mj_model.nu, np.shape(qpos)[-1])) if ctrl is None else ctrl

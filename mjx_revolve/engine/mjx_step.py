@@ -100,7 +100,7 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         contact: whether the robot can touch the bed.
 
     Returns:
-        The engine; see `step.Engine`.
+        The engine; see `state.Engine`.
 
     Raises:
         InputError: the model holds a joint that the water's tables cannot follow.
@@ -222,7 +222,7 @@ def _start(
 ) -> tuple[Any, _Flow]:
     """All that follows from place and velocity; contacts see the velocity over the ground."""
     seen, qvel = qvel, qvel.at[:3].add(-current)
-    # Momenta that turn are taken half a step ahead (see `step.accelerate`).
+    # Momenta that turn are taken half a step ahead (see `dynamics.accelerate`).
     ahead = qvel
     if pace is not None:
         ahead = qvel + 0.5 * plan.dt * pace.at[:3].set(_rows(qpos) @ pace[:3])
@@ -360,7 +360,7 @@ def _add_servos(
 
 
 def _advance(plan: _Plan, flow: _Flow, rates: Any, current: Any) -> tuple[Any, Any, Any]:
-    """The end of a step: semi-implicit Euler, as `step.advance` has it."""
+    """The end of a step: semi-implicit Euler, as `state.advance` has it."""
     dt, new, turn = plan.dt, flow.qvel + plan.dt * rates, _rows(flow.qpos)
     ahead, before = flow.ahead, turn.T @ flow.qvel[:3]
     pace = rates.at[:3].set(turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3]))

@@ -329,7 +329,7 @@ def _add_hinge(spec: mujoco.MjSpec, parent: _Link, module: Any) -> _Link:
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         range=list(hinge.range),
         damping=FRICTION * hinge.effort / hinge.speed,
-        # MuJoCo has no speed limit; `dynamics.servo` reads it from here.
+        # MuJoCo has no speed limit; `servos.servo` reads it from here.
         userdata=[hinge.speed],
     )
     stiffness = hinge.effort / FULL_TORQUE_ERROR

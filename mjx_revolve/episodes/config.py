@@ -106,7 +106,7 @@ class ControllerConfig(Section):
     """What turns genes into joint targets."""
 
     type: Annotated[str, _one_of(CONTROLLERS)] = "cpg"
-    """`cpg`, `sine`, `feedback`, or FILE.py:FUNCTION, a function like `controllers.make_sine`."""
+    """`cpg`, `sine`, `feedback`, or FILE.py:FUNCTION, a function of a plant and this section."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """The fastest oscillation [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0

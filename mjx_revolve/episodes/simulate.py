@@ -131,7 +131,7 @@ def simulate(
     Args:
         robot: from `build_robot`.
         ctrl: joint targets [rad]: None (all 0), `[nu]` (held), `[T, nu]` (a row for each step), a
-            `BoundController` (see `controllers.bind_genes`), or a function of time [s] that
+            `BoundController` (see `controller.bind_genes`), or a function of time [s] that
             returns `[nu]` and that JAX can trace. Thrusters take commands within their range.
         duration: [s]; by default as long as `ctrl` has rows, else 5.
         qpos: `[nq]` start; by default the rest pose 1 m below the surface. Root position, world

@@ -109,7 +109,7 @@ def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Wa
 
     Args:
         world: whose gusts they are.
-        path: `[steps + 1, 3, ...]` from `water.gust_path` [m/s], around the world's current.
+        path: `[steps + 1, 3, ...]` from `flow.gust_path` [m/s], around the world's current.
         water: what else differs from the world; its current is that around which the gusts blow.
 
     Returns:

@@ -81,7 +81,7 @@ read_seed = whole(0, _SEEDS - 1)
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds what `episode.load_episode` is to be told: path, duration, seed and world.
+    """Adds what `champion.load_episode` is to be told: path, duration, seed and world.
 
     Args:
         parser: of a command that shows an episode.

@@ -1,7 +1,7 @@
 """What the water does to each part of a robot along a trajectory: for pictures and reports.
 
-By the very terms that a step adds up (`step.part_forces`). What is left out is no force of its own:
-added and entrained water count as inertia.
+By the very terms that a step adds up (`pushes.part_forces`). What is left out is no force of its
+own: added and entrained water count as inertia.
 """
 
 from __future__ import annotations
