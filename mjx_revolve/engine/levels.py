@@ -79,7 +79,7 @@ class Levels:
         """The way back from `spread`; `[0, lanes]` of the kind of `like` without hinges."""
         if not self.below:
             return jnp.zeros((0, *like.shape), like.dtype)
-        return jnp.concatenate(values)[np.argsort(self.hinge_order)]
+        return jnp.concatenate(values)[np.argsort(self.hinge_order).astype(np.int32)]
 
     # The traversal.
 

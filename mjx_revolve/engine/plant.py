@@ -139,7 +139,8 @@ class Plant:
 
 def actuators_of(robot: Robot) -> np.ndarray:
     """`[nu]` MuJoCo's actuators in the robot's own order: hinges, then thrusters."""
-    return np.array([*robot.servos, *robot.thrusters], int)
+    # 32 bits: JAX keeps one typed copy of an array that it meets, in either mode.
+    return np.array([*robot.servos, *robot.thrusters], np.int32)
 
 
 def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:

@@ -65,7 +65,7 @@ def _compiled(
     dt = robot.world.timestep
     # MuJoCo's actuators in the robot's own order, and where each stands among the engine's rows.
     own = actuators_of(robot)
-    back = np.argsort(own[simulator.plant.source[:, 0]])
+    back = np.argsort(own[simulator.plant.source[:, 0]]).astype(np.int32)
 
     def run(
         qpos: Any, qvel: Any, drive_input: Any, water: Water | None, derived: bool = False
