@@ -52,8 +52,8 @@ class Hinges(NamedTuple):
         target: limits of the servo's target, low and high [rad].
         range: limits of the joint, low and high [rad].
         stop: stiffness of the end stops [N·m/rad].
-        motor: the line between speed and torque near the top speed, or None where no servo has
-            one: torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s].
+        motor: the line between speed and torque near the top speed, far above any torque where
+            a servo has none: torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s].
         base_inertia: of all that is on the parent's side of the hinge, about its axis, at rest
             [kg·m²].
     """
@@ -70,7 +70,7 @@ class Hinges(NamedTuple):
     target: tuple[Scalar, Scalar]
     range: tuple[Scalar, Scalar]
     stop: Scalar
-    motor: tuple[Scalar, Scalar, Scalar] | None
+    motor: tuple[Scalar, Scalar, Scalar]
     base_inertia: Scalar
 
 

@@ -57,8 +57,6 @@ def servo(
     torque = sub(torque, mul(hinges.servo_damping, speed))
     low, high = (_cast(x, torque) for x in hinges.effort)
     torque = jnp.clip(torque, low, high)
-    if hinges.motor is None:
-        return torque, jnp.zeros_like(torque)
     friction, slope, top = (_cast(x, torque) for x in hinges.motor)
     forward = jnp.sign(torque)
     rate, push = forward * speed, jnp.abs(torque)

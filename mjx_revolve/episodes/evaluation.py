@@ -185,11 +185,9 @@ class Setup:
             )
             return kept
 
-        # MJX's step is differentiated as it is.
-        fuses = self.engine is None or self.engine.fuses
-        episode = (
-            derived_by(partial(run, False), partial(run, True)) if fuses else partial(run, True)
-        )
+        episode: Any = partial(run, False)
+        if self.engine is None or self.engine.fuses:  # MJX's step is differentiated as it is
+            episode = derived_by(episode, partial(run, True))
         recorded = episode(bodies, root, parameters, starts.water, rows)
         figure = self.figure_of(bodies)
         return score_episodes(self.task, settings, world, recorded, root[:3], figure)
