@@ -8,27 +8,21 @@ paths; `dump_config` writes the resolved values back, so that a run folder docum
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
 from annotated_types import Ge, Le, Lt, MinLen, Unit
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    PrivateAttr,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
 
+from mjx_revolve.episodes.bodies_config import BodiesConfig
 from mjx_revolve.episodes.config_paths import resolve_paths
+from mjx_revolve.episodes.settings import Section, Settings, one_of
 from mjx_revolve.inputs.complaints import describe, find_problems, refuse
 from mjx_revolve.inputs.errors import InputError, load_yaml
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
-from mjx_revolve.inputs.own_code import parse_own, short_name
+from mjx_revolve.inputs.own_code import parse_own
 from mjx_revolve.inputs.schema import (
     MisfitError,
     NonNegative,
@@ -52,14 +46,6 @@ TASKS = {
 }
 
 
-def _one_of(names: Iterable[str]) -> Any:
-    """A name of ours or a function in a file of the user's own, as `Annotated` takes it."""
-    return Field(
-        pattern=rf"^({'|'.join(names)}|.+\.py:[^\W\d]\w*)$",
-        description=f"one of {', '.join(names)}, or FILE.py:FUNCTION",
-    )
-
-
 def _check_world(value: str | dict[str, Any]) -> str | dict[str, Any]:
     if value == "":
         raise MisfitError("", "a name or a path", "an empty text")
@@ -76,36 +62,10 @@ _World = Annotated[
 ]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
-    )
-
-
-class Section(_Model):
-    """A section whose `type` names one of ours, or a function in a file of the user's own."""
-
-    type: str
-
-    @property
-    def name(self) -> str:
-        """What titles call it: its type, or the name of the user's own function."""
-        return short_name(self.type)
-
-    @property
-    def is_own(self) -> bool:
-        """Whether it is a function in a file of the user's own."""
-        return parse_own(self.type) is not None
-
-    def _refuse(self, params: Mapping[str, Any]) -> None:
-        if params and not self.is_own:
-            raise MisfitError("params", "none, as only own functions take them", ", ".join(params))
-
-
 class ControllerConfig(Section):
     """What turns genes into joint targets."""
 
-    type: Annotated[str, _one_of(CONTROLLERS)] = "cpg"
+    type: Annotated[str, one_of(CONTROLLERS)] = "cpg"
     """`cpg`, `sine`, `feedback`, or FILE.py:FUNCTION, a function of a plant and this section."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """The fastest oscillation [Hz]."""
@@ -117,12 +77,12 @@ class ControllerConfig(Section):
     """Largest answer to an error of normal size, as a share of the range; `type: feedback` [-]."""
     depth: Annotated[NonNegative, Unit("m")] | None = None
     """Depth that `type: feedback` holds; that of the task's start where none is given [m]."""
-    params: dict[str, Any] = {}
+    params: dict[str, Any] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
-        self._refuse(self.params)
+        self.refuse_params(self.params)
         for kind, settings in CONTROLLERS.items():
             for name in settings if kind != self.type and not self.is_own else ():
                 usual, found = type(self).model_fields[name].default, getattr(self, name)
@@ -136,7 +96,7 @@ class ControllerConfig(Section):
 class TaskConfig(Section):
     """What the robot is scored for, and how its episodes start."""
 
-    type: Annotated[str, _one_of(TASKS)]
+    type: Annotated[str, one_of(TASKS)]
     """`directed_swim`, `speed`, `reach_target`, `hold_depth`, `crawl`, or FILE.py:FUNCTION, a
     function like those in `tasks`."""
     duration: Annotated[Positive, Unit("s")] = 10.0
@@ -163,12 +123,12 @@ class TaskConfig(Section):
     """Standard deviation of the start's place, along each axis [m]."""
     current_std: Annotated[NonNegative, Unit("m/s")] = 0.0
     """Standard deviation of an extra horizontal current, drawn for each episode [m/s]."""
-    params: dict[str, Any] = {}
+    params: dict[str, Any] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 
     @model_validator(mode="after")
     def _check(self) -> TaskConfig:
-        self._refuse(self.params)
+        self.refuse_params(self.params)
         if self.settle >= self.duration:
             below = f"a time below task.duration ({self.duration:g} s)"
             raise MisfitError("settle", below, f"{self.settle:g}")
@@ -182,7 +142,7 @@ class TaskConfig(Section):
         return self
 
 
-class EvolutionConfig(_Model):
+class EvolutionConfig(Settings):
     """How genes are searched for."""
 
     strategy: Annotated[str, MinLen(1)] = "CMA_ES"
@@ -198,15 +158,15 @@ class EvolutionConfig(_Model):
     """How many of the newest checkpoints are kept."""
     tensorboard: bool = False
     """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
-    strategy_params: dict[str, Any] = {}
+    strategy_params: dict[str, Any] = Field({})
     """Settings of the strategy itself, by evosax's names."""
 
 
-class Config(_Model):
+class Config(Settings):
     """A whole run. Paths are absolute once it went through `make_config` or `load_config`."""
 
-    morphology: Annotated[str, MinLen(1), words("the path of a morphology YAML")]
-    """The robot: a morphology YAML."""
+    morphology: Annotated[str, MinLen(1), words("the path of a morphology YAML")] | None = None
+    """The robot: a morphology YAML; none where bodies evolve."""
     modules: Annotated[str, MinLen(1), words("the path of a YAML, or nothing")] | None = None
     """The user's own module types: a YAML, or None."""
     allow_overlap: bool = False
@@ -219,7 +179,28 @@ class Config(_Model):
     """`population` steps the whole population at once; `mjx` is MJX's own step, the reference."""
     controller: ControllerConfig = ControllerConfig()
     task: TaskConfig
+    bodies: BodiesConfig | None = None
+    """How bodies evolve; without it only the controller of the one `morphology` does."""
     evolution: EvolutionConfig = EvolutionConfig()
+
+    @model_validator(mode="after")
+    def _check(self) -> Config:
+        if self.bodies is None:
+            if self.morphology is None:
+                what = "the path of a morphology YAML, or bodies: how they evolve"
+                raise MisfitError("morphology", what, "nothing")
+            return self
+        if self.morphology is not None:
+            what = "none, as bodies evolve (bodies.seeds names robots to begin with)"
+            raise MisfitError("morphology", what, self.morphology)
+        if self.engine != "population":
+            raise MisfitError("engine", "population, as bodies evolve", self.engine)
+        for name in ("strategy", "strategy_params"):
+            usual, found = EvolutionConfig.model_fields[name].default, getattr(self.evolution, name)
+            if found != usual:
+                what = f"{usual!r}, as bodies evolve (see bodies.selection and bodies.learning)"
+                raise MisfitError(f"evolution.{name}", what, repr(found))
+        return self
 
     _source: str = PrivateAttr("config")
     _written: dict[str, Any] = PrivateAttr(default_factory=dict)
@@ -357,6 +338,12 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
     data = copy_plain(config.model_dump())
     data["morphology"] = shorten(data["morphology"])
     data["modules"] = shorten(data["modules"])
+    bodies = data["bodies"]
+    if bodies is not None:
+        bodies["seeds"] = [shorten(path) for path in bodies["seeds"]]
+        own = parse_own(bodies["genotype"])
+        if own is not None:
+            bodies["genotype"] = f"{shorten(own.path)}:{own.function}"
     for section in ("controller", "task"):
         own = parse_own(data[section]["type"])
         if own is not None:

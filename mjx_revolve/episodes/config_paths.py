@@ -36,17 +36,19 @@ def resolve_paths(data: dict[str, Any], origin: Callable[[str], tuple[Path, str]
         InputError: there is no such file, and no shipped morphology of that name.
     """
 
-    def resolve(section: Any, key: str, within: str = "") -> None:
-        value = section.get(key) if isinstance(section, dict) else None
+    def resolve(section: Any, key: Any, within: str = "", robot: bool = False) -> None:
+        value = section[key] if isinstance(section, list) else None
+        value = section.get(key) if isinstance(section, dict) else value
         if not isinstance(value, str) or not value:
             return
-        own = parse_own(value) if key == "type" else None
-        if (key == "type" and own is None) or (key in ("world", "name") and not _is_path(value)):
+        code = key in ("type", "genotype")
+        own = parse_own(value) if code else None
+        if (code and own is None) or (key in ("world", "name") and not _is_path(value)):
             return
-        place = within + key
+        place = f"{within}{key}"
         folder, before = origin(place)
         file = folder / Path(own.path if own else value).expanduser()
-        if key == "morphology":
+        if robot:
             file = find_shipped(Path(value).expanduser(), "morphologies", folder, before + place)
         path = Path(os.path.abspath(file))
         if not path.is_file():
@@ -55,8 +57,13 @@ def resolve_paths(data: dict[str, Any], origin: Callable[[str], tuple[Path, str]
         section[key] = f"{path}:{own.function}" if own else str(path)
 
     for key in ("morphology", "modules", "world"):
-        resolve(data, key)
+        resolve(data, key, robot=key == "morphology")
     for key in ("name", "current_field"):
         resolve(data.get("world"), key, "world.")
     for section in ("controller", "task"):
         resolve(data.get(section), "type", f"{section}.")
+    bodies = data.get("bodies")
+    resolve(bodies, "genotype", "bodies.")
+    seeds = bodies.get("seeds") if isinstance(bodies, dict) else None
+    for index in range(len(seeds) if isinstance(seeds, list) else 0):
+        resolve(seeds, index, "bodies.seeds.", robot=True)

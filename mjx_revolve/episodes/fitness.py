@@ -339,6 +339,11 @@ def make_fitness(config: Config | str | Path | Mapping[str, Any], **overrides: A
     """
     config = _read(config, overrides)
     modules = MODULES | load_modules(config.modules) if config.modules else MODULES
+    if config.morphology is None:
+        raise InputError(
+            f"{config.source}: morphology: expected one, as this is the fitness of one body; found "
+            "bodies that evolve (see make_mixed_fitness)"
+        )
     morphology = load_morphology(config.morphology, modules, config.allow_overlap)
     world, task = _place(config)
     robot = _build(config, world, morphology)

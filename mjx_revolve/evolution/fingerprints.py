@@ -50,6 +50,12 @@ def settings_hash(config: Config) -> str:
         data[section]["type"] = content_name(data[section]["type"])
         if not data[section]["params"]:  # as runs have it from before there were any
             del data[section]["params"]
+    if data["bodies"] is None:
+        del data["bodies"]
+    else:
+        bodies = data["bodies"]
+        bodies["genotype"] = content_name(bodies["genotype"])
+        bodies["seeds"] = [hash_text(Path(path).read_text("utf-8")) for path in bodies["seeds"]]
     data["world"]["name"] = Path(data["world"]["name"]).name
     return hash_text(json.dumps(data, sort_keys=True, default=str))
 

@@ -230,22 +230,35 @@ def create_run(folder: str | Path, config: Config, **info: Any) -> tuple[Run, Co
     except OSError as error:
         raise with_path(error, folder) from None
     run = _lock_run(folder)
-    copy = folder / "inputs" / Path(config.morphology).name
-    write_atomic(copy, Path(config.morphology).read_bytes())
-    config = config.model_copy(update={"morphology": str(copy)})
-    config = _copy_own_code(config, folder / "inputs")
+    config = _copy_own_code(_copy_robots(config, folder / "inputs"), folder / "inputs")
     run.save_config(config)
     run.update_info(**info)
     return run, config
+
+
+def _copy_robots(config: Config, folder: Path) -> Config:
+    """Keeps the morphology, or those that begin the population, and names the copies."""
+    copies: dict[str, str] = {}
+    bodies = config.bodies
+    for path in [config.morphology] if config.morphology else bodies.seeds if bodies else ():
+        copy = folder / Path(path).name
+        if path not in copies and str(copy) in copies.values():  # two files of one name
+            copy = folder / f"{len(copies)}_{copy.name}"
+        write_atomic(copy, Path(path).read_bytes())
+        copies[path] = str(copy)
+    if bodies is None:
+        return config.model_copy(update={"morphology": copies[config.morphology or ""]})
+    seeds = tuple(copies[path] for path in bodies.seeds)
+    return config.model_copy(update={"bodies": bodies.model_copy(update={"seeds": seeds})})
 
 
 def _copy_own_code(config: Config, folder: Path) -> Config:
     """Keeps the files of the user's own functions, and names the copies."""
     copies: dict[str, Path] = {}
     changes = {}
-    for section in ("controller", "task"):
+    for section, key in (("controller", "type"), ("task", "type"), ("bodies", "genotype")):
         settings = getattr(config, section)
-        own = parse_own(settings.type)
+        own = parse_own(getattr(settings, key, None))
         if own is None:
             continue
         if own.path not in copies:
@@ -255,7 +268,7 @@ def _copy_own_code(config: Config, folder: Path) -> Config:
             write_atomic(copy, Path(own.path).read_bytes())
             copies[own.path] = copy
         named = f"{copies[own.path]}:{own.function}"
-        changes[section] = settings.model_copy(update={"type": named})
+        changes[section] = settings.model_copy(update={key: named})
     return config.model_copy(update=changes)
 
 

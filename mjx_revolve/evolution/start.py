@@ -186,17 +186,28 @@ def check_unchanged(old: Config, new: Config, label: str) -> None:
         InputError: they differ in more than `FREE_SETTINGS`.
     """
     before, after = plain_settings(old), plain_settings(new)
-    # The run holds a copy of the morphology: its words count, not its place.
-    if Path(before["morphology"]).read_bytes() == Path(after["morphology"]).read_bytes():
-        after["morphology"] = before["morphology"]
-    for section in ("controller", "task"):  # likewise code of the user's own
-        if content_name(before[section]["type"]) == content_name(after[section]["type"]):
-            after[section]["type"] = before[section]["type"]
+    # The run holds copies of files: what is in them counts, not their places.
+    if before["morphology"] and after["morphology"]:
+        after["morphology"] = _same_file(before["morphology"], after["morphology"])
+    for section, key in (("controller", "type"), ("task", "type"), ("bodies", "genotype")):
+        if before[section] and after[section]:
+            old_name, new_name = before[section][key], after[section][key]
+            if content_name(old_name) == content_name(new_name):
+                after[section][key] = old_name
+    if before["bodies"] and after["bodies"]:
+        seeds = zip(before["bodies"]["seeds"], after["bodies"]["seeds"], strict=False)
+        rest = after["bodies"]["seeds"][len(before["bodies"]["seeds"]) :]
+        after["bodies"]["seeds"] = (*(_same_file(*pair) for pair in seeds), *rest)
     found = _differences(before, after)
     if found:
         more = f" (and {len(found) - 1} more)" if found[1:] else ""
         free = f"evolution.{', '.join(FREE_SETTINGS)}"
         raise InputError(f"{label}: {found[0]}{more}; only {free} may change")
+
+
+def _same_file(old: str, new: str) -> str:
+    """The old path where the new one holds the same."""
+    return old if Path(old).read_bytes() == Path(new).read_bytes() else new
 
 
 def _portable(settings: Sequence[str], config: Config) -> list[str]:

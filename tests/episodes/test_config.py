@@ -101,7 +101,7 @@ def test_it_is_frozen(folder):
         ("task.durtion=5", "found an unknown key; did you mean task.duration?"),
         ("duration=5", "found an unknown key; did you mean task.duration?"),
         ("wrld=lake", "found an unknown key; did you mean world?"),
-        ("qqqqqq=1", "task, evolution; found an unknown key"),
+        ("qqqqqq=1", "bodies, evolution; found an unknown key"),
         ("task=3", "--set task: expected a mapping with type; found 3"),
         ("trim=no", "--set trim: expected one of neutral, none; found False"),
         ("engine=gpu", "--set engine: expected one of population, mjx; found 'gpu'"),
@@ -143,8 +143,10 @@ def test_wrong_settings(folder, setting, message):
     [
         ("", "bad.yaml: expected a mapping of settings; found an empty file"),
         ("- 1", "bad.yaml: expected a mapping of settings; found [1]"),
-        ("world: lake", "bad.yaml: morphology: expected the path of a morphology YAML; found none "
-         "(and 1 more: task)"),
+        ("world: lake", "bad.yaml: task: expected "),
+        ("world: lake\ntask: {type: speed}", "bad.yaml: morphology: expected the path of a "
+         "morphology YAML, or bodies: how they evolve; found nothing"),
+        (GOOD + "bodies: {genotype: tree}", "bad.yaml: morphology: expected none, as bodies evolve"),
         (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0 [s]; found -3"),
         (GOOD + "  2: 3", "bad.yaml: task.2: expected the name of a setting"),
         (GOOD + "3: 3", "bad.yaml: 3: expected the name of a setting"),

@@ -87,7 +87,8 @@ def _is_same(config: Config, other: Config) -> bool:
 def _held(config: Config) -> list[bytes | str | None]:
     """What is in the files that a configuration names, or the names of what is no file."""
     world = config.world if isinstance(config.world, str) else config.world["name"]
-    names = (config.morphology, config.modules, world)
+    seeds = config.bodies.seeds if config.bodies else ()
+    names = (config.morphology, *seeds, config.modules, world)
     return [Path(n).read_bytes() if n is not None and Path(n).is_file() else n for n in names]
 
 
@@ -126,8 +127,10 @@ def sources(record: RunRecord) -> list[tuple[str, str]]:
     found = []
     if record.settings and (record.folder / "config.yaml").is_file():
         found.append(record.folder / "config.yaml")
-    if record.config is not None and Path(record.config.morphology).is_file():
-        found.append(Path(record.config.morphology))
+    named = record.config.morphology if record.config is not None else None
+    robot = Path(named) if named else record.folder / "champion" / "morphology.yaml"
+    if robot.is_file():
+        found.append(robot)
     texts = [(path.name, path.read_text(errors="replace")) for path in found]
     if record.genes is not None:
         data = {"genes": [float(gene) for gene in record.genes]}
