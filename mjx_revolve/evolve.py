@@ -198,6 +198,8 @@ def _draw(start: Start, champion: Champion, result: str, unit: str) -> None:
     from mjx_revolve.view.swim_picture import plot_swim
 
     run, fitness = start.run, start.fitness
+    if start.config.bodies is not None:
+        fitness = fitness.single(run.folder / "champion" / "morphology.yaml")
     title = f"{run.folder.name}: {result}"
     label = f"fitness ({unit})" if unit else "fitness"
     figures = {"fitness.png": plots.plot_fitness(run.load_metrics(), title, label)}
@@ -223,6 +225,8 @@ def _describe(start: Start) -> str:
     if robot is not None:
         counts = f"{robot.num_hinges} hinges, {robot.morphology.num_modules} modules"
         body = f"{robot.morphology.name} ({counts}), "
+    if config.bodies is not None:
+        body = f"bodies ({config.bodies.name}, at most {config.bodies.max_modules} modules), "
     evolution = config.evolution
     device = jax.devices()[0].device_kind
     if device == "cpu":
@@ -232,9 +236,18 @@ def _describe(start: Start) -> str:
         device += f" on {len(fitness.hosts)} hosts" if len(fitness.hosts) > 1 else ""
     return (
         f"{body}{fitness.num_genes} genes | {config.task.name} in {Path(config.world_name).stem} | "
-        f"{evolution.strategy} {evolution.population_size} x {evolution.generations}, "
+        f"{_search_name(config)} {evolution.population_size} x {evolution.generations}, "
         f"seed {evolution.seed} | {device} | {_shown(start.run.folder)}"
     )
+
+
+def _search_name(config: Config) -> str:
+    """How it is searched."""
+    if config.bodies is None:
+        return config.evolution.strategy
+    selection, learning = config.bodies.selection, config.bodies.learning
+    learns = f", {learning.trials} trials a life" if learning.trials > 1 else ""
+    return f"{selection.type}{learns},"
 
 
 def _shown(path: Path) -> str:

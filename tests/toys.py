@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.evolution.body_fitness import BodyFitness, make_body_fitness
+
 # In metrics.csv, all but these is reproducible.
 CLOCK = ("seconds", "evaluations_per_second")
 
@@ -109,3 +111,41 @@ def make_broken(config):
     if os.environ.get("TOY_LEADER") != str(os.getpid()):
         raise RuntimeError("no such luck")
     return Toy()
+
+
+def write_bodies_config(path: Path, bodies=(), **evolution) -> Path:
+    """Writes a configuration of evolving bodies for `make_toy_bodies`; 5 generations of 6."""
+    data = {
+        "world": "empty_underwater",
+        "controller": {"type": "sine"},
+        "task": {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 1},
+        "bodies": {"max_modules": 8, "max_hinges": 4} | dict(bodies),
+        "evolution": {"population_size": 6, "generations": 5, "checkpoint_every": 1} | evolution,
+    }
+    path.write_text(json.dumps(data))
+    return path
+
+
+class BodyToy(BodyFitness):
+    """Bodies are to have three hinges, and all their genes are to be a half."""
+
+    block_size = 8
+
+    def evaluate(self, bodies, which, genes, key):
+        hinges = np.array([body.num_hinges for body in bodies])[np.asarray(which)]
+        own = np.zeros(np.shape(genes), bool)
+        for row, k in enumerate(np.asarray(which)):
+            own[row, self.layout(bodies[k]).columns] = True
+        away = np.sum(np.where(own, np.asarray(genes) - 0.5, 0) ** 2, 1) / own.sum(1)
+        noise = 0.01 * np.asarray(jax.random.normal(key))
+        names = dict.fromkeys(self.measured, np.asarray(hinges, np.float32))
+        return -((hinges - 3.0) ** 2) - away + noise, names
+
+    def single(self, path):
+        """What nothing can be replayed with."""
+        return object()
+
+
+def make_toy_bodies(config):
+    made = make_body_fitness(config)
+    return BodyToy(made.config, made.genotype, made.mixed, made.brains, made.seeds)

@@ -21,7 +21,7 @@ from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.episodes.tasks import score_unit
-from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.inputs.errors import InputError, load_yaml, show
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.water.flow import Water, gust_path
 from mjx_revolve.water.world import load_world
@@ -137,6 +137,14 @@ def _champion(path: Path, world: str | None, duration: float | None, seed: int |
         raise InputError(f"{path}: config: expected the run's config.yaml; found no {source}")
     overrides = {} if duration is None else {"task.duration": float(duration)}
     config: Config = load_config(source, overrides=overrides)
+    body = data.get("morphology")
+    if config.bodies is not None:
+        if not isinstance(body, str) or not (path.parent / body).is_file():
+            raise InputError(
+                f"{path}: morphology: expected the path of the champion's body, as bodies have "
+                f"evolved; found {show(body)}"
+            )
+        config = config.for_body((path.parent / body).absolute())
     fitness = make_fitness(config)
     if len(genes) != fitness.num_genes:
         raise InputError(

@@ -220,6 +220,10 @@ class Config(Settings):
         """A short name: the file's name without its suffix."""
         return Path(self._source).stem
 
+    def for_body(self, morphology: str | Path) -> Config:
+        """The same for one body alone, from a morphology's path; only its brain would evolve."""
+        return self.model_copy(update={"morphology": str(morphology), "bodies": None})
+
     @property
     def world_name(self) -> str:
         """The world's name, or the absolute path of its YAML."""

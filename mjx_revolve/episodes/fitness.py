@@ -319,6 +319,14 @@ class MixedFitness:
                 )
         return pack_bodies(robots, self.capacity)
 
+    def misfit(self, robot: Robot) -> str | None:
+        """Why there is no room for a body, in one line; None where there is."""
+        try:
+            self.pack([robot])
+        except InputError as error:
+            return str(error)
+        return None
+
 
 # ------------------------------------------------------------------ making them
 

@@ -62,6 +62,9 @@ def settings_hash(config: Config) -> str:
 
 def model_hash(fitness: Any) -> str:
     """Of the compiled robot and the water around it; a fitness without a robot will do."""
+    identity = getattr(fitness, "identity", None)
+    if isinstance(identity, str):
+        return hash_text(identity)
     robot = getattr(fitness, "robot", None)
     return hash_text() if robot is None else hash_text(robot.mj_spec.to_xml(), repr(robot.world))
 

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
+from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.config import EvolutionConfig
 from mjx_revolve.episodes.scoring import REPORT_EPISODES, REPORT_STREAM, replay_key
 from mjx_revolve.evolution.strategies import FAILED_SCORE, STD_FLOOR, Strategy, make_strategy
@@ -34,7 +35,7 @@ _FILL_UP_TO = 128
 _STALL_SPREAD = 2.0
 _STALL_GENERATIONS = 10
 # Streams of random numbers that no generation uses.
-_CHOOSE_STREAM = 2**32 - 1
+CHOOSE_STREAM = 2**32 - 1
 
 
 class Fitness(Protocol):
@@ -87,12 +88,13 @@ class Champion:
     """The winner, judged on starts that evolution never saw.
 
     Attributes:
-        genes: `[G]`.
+        genes: `[G]`; those of the body's own controller.
         score: mean over `REPORT_EPISODES` fresh keys; `FAILED_SCORE` stands for a failed rollout.
         std: standard deviation over those keys.
         origin: where it came from, in words.
         measures: mean of each measure over those keys.
         key: the first of those keys, to replay.
+        body: the champion's, where bodies have evolved.
     """
 
     genes: np.ndarray
@@ -101,6 +103,7 @@ class Champion:
     origin: str
     measures: dict[str, float]
     key: jax.Array
+    body: Morphology | None = None
 
 
 def start_search(config: EvolutionConfig, strategy: Strategy) -> Search:
@@ -192,7 +195,7 @@ def _advance(
     return search, {
         "generation": generation,
         "evaluations": search.evaluations,
-        **_summary(scores),
+        **summarize(scores),
         "champion": float(search.elite_scores[0]),
         "step_size": spread,
         "failed": int(np.sum(~np.isfinite(scores))),
@@ -223,7 +226,8 @@ def _evaluate(
     return scores, {name: np.asarray(values) for name, values in measures.items()}
 
 
-def _summary(scores: np.ndarray) -> dict[str, float]:
+def summarize(scores: np.ndarray) -> dict[str, float]:
+    """Figures of a generation's finite scores `[P]`: best, mean, std, median and quartiles."""
     finite = scores[np.isfinite(scores)].astype(np.float64)
     if not finite.size:
         names = ("best", "mean", "std", "median", "lower_quartile", "upper_quartile")
@@ -283,7 +287,7 @@ def choose_champion(config: EvolutionConfig, fitness: Fitness, search: Search) -
     candidates += [candidates[0]] * (size - count if size <= _FILL_UP_TO and not fills_up else 0)
     rows = np.stack(candidates).astype(np.float32)
     root = jax.random.key(config.seed)
-    scores, _ = _fresh(fitness, rows, jax.random.fold_in(root, _CHOOSE_STREAM), CHOOSE_EPISODES)
+    scores, _ = _fresh(fitness, rows, jax.random.fold_in(root, CHOOSE_STREAM), CHOOSE_EPISODES)
     # Empty places among the elites hold zero genes and must not win.
     means = scores.mean(axis=0)[:count]
     means[: len(search.elite_scores)][~np.isfinite(search.elite_scores)] = -np.inf

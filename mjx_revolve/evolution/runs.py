@@ -4,6 +4,8 @@
     run.json           versions, seed, arguments, platform, thread settings, times
     metrics.csv        one line per generation (RFC 4180), readable while the run goes on
     checkpoints/       the newest few, one npz each
+    individuals.jsonl  where bodies evolve: one line for each individual, as it was born and lived
+    generations.jsonl  likewise: one line per generation: who is alive
     champion/          genes.yaml, morphology.yaml, robot.xml
     fitness.png, trajectory.png
 
@@ -16,7 +18,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
@@ -24,6 +26,7 @@ from typing import IO, Any
 import numpy as np
 import yaml
 
+from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.config import Config, dump_config, load_config
 from mjx_revolve.evolution.checkpoints import (
     Checkpoint,
@@ -43,6 +46,8 @@ try:
 except ImportError:  # not on Windows: there, nothing keeps two processes off one folder
     fcntl = None  # type: ignore[assignment]
 
+LOGS = ("individuals.jsonl", "generations.jsonl")
+"""Files that only grow, a line at a time; a run that goes on cuts them to its checkpoint."""
 _TEMPORARY = re.compile(r"\.\d+-")
 
 
@@ -117,6 +122,28 @@ class Run:
             os.fsync(file.fileno())  # the checkpoint will count on these lines
             return file.seek(0, os.SEEK_END)
 
+    # --- logs ---
+
+    def append_lines(self, name: str, lines: Iterable[str]) -> None:
+        """Adds lines to one of `LOGS`."""
+        path = self.folder / name
+        try:
+            with open(path, "ab") as file:
+                file.write("".join(f"{line}\n" for line in lines).encode())
+        except OSError as error:
+            raise with_path(error, path) from None
+
+    def _log_positions(self) -> dict[str, int]:
+        """How long the logs are, which a checkpoint will count on."""
+        found = {}
+        for name in LOGS:
+            path = self.folder / name
+            if path.exists():
+                with open(path, "rb+") as file:
+                    os.fsync(file.fileno())
+                    found[name] = file.seek(0, os.SEEK_END)
+        return found
+
     # --- checkpoints ---
 
     def checkpoints(self) -> list[Path]:
@@ -127,7 +154,8 @@ class Run:
         self, generation: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], keep: int
     ) -> Path:
         """Saves a checkpoint, of which the newest `keep` stay; see `write_checkpoint`."""
-        meta = {**meta, "generation": generation, "metrics_position": self._metrics_position()}
+        at = {"metrics_position": self._metrics_position(), "positions": self._log_positions()}
+        meta = {**meta, "generation": generation, **at}
         path = write_checkpoint(self.folder / "checkpoints", generation, arrays, meta)
         for old in self.checkpoints()[keep:]:
             old.unlink(missing_ok=True)
@@ -149,6 +177,11 @@ class Run:
                 have = self.metrics_path.stat().st_size if self.metrics_path.exists() else 0
                 if have < checkpoint.meta["metrics_position"]:
                     raise DamageError(f"metrics.csv lacks lines: {have} bytes long")
+                for name, position in checkpoint.meta.get("positions", {}).items():
+                    path = self.folder / name
+                    have = path.stat().st_size if path.exists() else 0
+                    if have < position:
+                        raise DamageError(f"{name} lacks lines: {have} bytes long")
             except DamageError as error:
                 damaged.append(f"{path.name} ({error})")
                 continue
@@ -160,9 +193,10 @@ class Run:
 
     def rewind(self, checkpoint: Checkpoint) -> None:
         """Forgets what came after a checkpoint: metrics, checkpoints, half-written files."""
-        position = checkpoint.meta["metrics_position"]
-        if self.metrics_path.exists():
-            os.truncate(self.metrics_path, position)
+        positions = {"metrics.csv": checkpoint.meta["metrics_position"]}
+        for name, position in (positions | checkpoint.meta.get("positions", {})).items():
+            if (self.folder / name).exists():
+                os.truncate(self.folder / name, position)
         for path in self.checkpoints():
             if generation_of(path) > checkpoint.meta["generation"]:
                 path.unlink(missing_ok=True)
@@ -172,9 +206,18 @@ class Run:
 
     # --- champion ---
 
-    def save_champion(self, genes: np.ndarray, **facts: Any) -> None:
-        """Writes `champion/genes.yaml`: genes `[G]`, and plain values that go with them."""
-        data = {**facts, "config": "../config.yaml", "genes": [float(gene) for gene in genes]}
+    def save_champion(
+        self, genes: np.ndarray, body: Morphology | None = None, **facts: Any
+    ) -> None:
+        """Writes `champion/genes.yaml`: genes `[G]`, and plain values that go with them.
+
+        Where bodies have evolved, the champion's is written beside it.
+        """
+        data = {**facts, "config": "../config.yaml"}
+        if body is not None:
+            self.write("champion/morphology.yaml", body.save)
+            data["morphology"] = "morphology.yaml"
+        data["genes"] = [float(gene) for gene in genes]
         text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
         self.write("champion/genes.yaml", text.encode())
 

@@ -9,18 +9,10 @@ from typing import Any
 from mjx_revolve.evolution.crew import WorkerError
 from mjx_revolve.evolution.fingerprints import model_hash, settings_hash
 from mjx_revolve.evolution.interrupts import Interrupts
-from mjx_revolve.evolution.loop import (
-    Champion,
-    Search,
-    choose_champion,
-    evolve,
-    search_to_arrays,
-    start_search,
-)
+from mjx_revolve.evolution.loop import Champion
 from mjx_revolve.evolution.progress import Progress
 from mjx_revolve.evolution.runs import Run
 from mjx_revolve.evolution.start import Start, describe_host, timestamp
-from mjx_revolve.evolution.strategies import make_strategy
 from mjx_revolve.evolution.tensorboard import TensorBoardLog
 
 
@@ -35,14 +27,14 @@ def write_start(start: Start) -> None:
         resumed = [*run.info.get("resumed", []), resumption]
         run.update_info(resumed=resumed, finished=None, champion=None)
     run.update_info(workers=start.fitness.describe())
-    # The champion's body is the same for all, so it is there from the start.
+    # Where the body is the same for all, it is there from the start.
     robot = getattr(start.fitness, "robot", None)
     if robot is not None:
         run.write("champion/morphology.yaml", robot.morphology.save)
         run.write("champion/robot.xml", robot.mj_spec.to_xml().encode())
 
 
-def run_generations(start: Start, interrupts: Interrupts) -> Search:
+def run_generations(start: Start, interrupts: Interrupts) -> Any:
     """All generations, or as many as there are before an interrupt or a worker's death.
 
     Args:
@@ -56,14 +48,15 @@ def run_generations(start: Start, interrupts: Interrupts) -> Search:
         WorkerError: a worker died or hangs; what was done until then is saved.
         OSError: the disk is full.
     """
-    run, evolution, fitness = start.run, start.config.evolution, start.fitness
+    run, evolution, method = start.run, start.config.evolution, start.method
     search = start.search
     before = 0 if search is None else search.generation
     log = _open_log(run, before) if evolution.tensorboard else None
     progress = Progress(before, evolution.generations)
     try:
-        for search, row in evolve(evolution, fitness, start.search):
+        for search, row in method.advance(start.search):
             run.append_metrics(row)
+            method.record(run, search)
             if log is not None:
                 log.add(row)
             progress.show(row)
@@ -75,7 +68,7 @@ def run_generations(start: Start, interrupts: Interrupts) -> Search:
                 break
     except WorkerError as error:
         if search is None:
-            search = start_search(evolution, make_strategy(evolution, fitness.num_genes))
+            search = method.start()
         _save(start, search)
         done = search.generation
         what = f"generation {done}" if done else "the start, before any generation,"
@@ -95,28 +88,23 @@ def _open_log(run: Run, done: int) -> TensorBoardLog:
     return TensorBoardLog(run.folder / "tensorboard", done, rows)
 
 
-def _save(start: Start, search: Search) -> None:
+def _save(start: Start, search: Any) -> None:
     """A checkpoint, and the champion so far."""
     config, fitness = start.config, start.fitness
     meta = {
         "settings_hash": settings_hash(config),
         "model_hash": model_hash(fitness),
         "chunk_shape": [fitness.block or config.evolution.population_size, fitness.num_genes],
-        "strategy": config.evolution.strategy,
+        "strategy": config.evolution.strategy if config.bodies is None else config.bodies.name,
         "host": describe_host(),
     }
-    arrays = search_to_arrays(config.evolution, search)
     keep = config.evolution.keep_checkpoints
-    start.run.save_checkpoint(search.generation, arrays, meta, keep)
+    start.run.save_checkpoint(search.generation, start.method.to_arrays(search), meta, keep)
     if search.generation:
-        start.run.save_champion(
-            search.elites[0], score=float(search.elite_scores[0]), final=False,
-            origin=f"best of generation {search.elite_generations[0]}, not yet judged on "
-            "fresh starts",
-        )  # fmt: skip
+        start.method.save_best(start.run, search)
 
 
-def finish_run(start: Start, search: Search, draw: Callable[[Champion], None]) -> Champion:
+def finish_run(start: Start, search: Any, draw: Callable[[Champion], None]) -> Champion:
     """Judges the champion, and closes the books.
 
     Args:
@@ -128,7 +116,7 @@ def finish_run(start: Start, search: Search, draw: Callable[[Champion], None]) -
         The champion.
     """
     config = start.config
-    champion = choose_champion(config.evolution, start.fitness, search)
+    champion = start.method.judge(search)
     facts: dict[str, Any] = {
         "score": champion.score,
         "score_std": champion.std,
@@ -137,7 +125,7 @@ def finish_run(start: Start, search: Search, draw: Callable[[Champion], None]) -
         "task": config.task.name,
         "measures": champion.measures,
     }
-    start.run.save_champion(champion.genes, final=True, **facts)
+    start.run.save_champion(champion.genes, champion.body, final=True, **facts)
     draw(champion)
     start.run.update_info(finished=timestamp(), generations=search.generation, champion=facts)
     return champion

@@ -26,7 +26,7 @@ from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
-    from mjx_revolve.evolution.loop import Search
+    from mjx_revolve.evolution.methods import Method
 
 # What the bits of a run depend on, besides its configuration.
 _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
@@ -41,6 +41,7 @@ class Start:
         run: its folder, locked.
         config: its configuration, which names the folder's copies.
         fitness: what scores a population.
+        method: how it is evolved.
         search: where it goes on; None: a new run.
         checkpoint: where `search` is from.
     """
@@ -48,7 +49,8 @@ class Start:
     run: Run
     config: Config
     fitness: Pool
-    search: Search | None = None
+    method: Method
+    search: Any = None
     checkpoint: Checkpoint | None = None
 
     @property
@@ -84,12 +86,12 @@ def begin_run(
     check_place(folder / "any", f"--out {folder}")
     fitness = make_pool(config)
     # Not before: workers compile while evosax is imported, which takes a while.
-    from mjx_revolve.evolution.strategies import make_strategy
+    from mjx_revolve.evolution.methods import make_method
 
     try:
-        make_strategy(config.evolution, fitness.num_genes)
+        make_method(config, fitness)
     except InputError as error:
-        if str(error).startswith("evolution."):
+        if str(error).startswith(("evolution.", "bodies.")):
             raise InputError(f"{config.source}: {error}") from None
         raise
     run, config = create_run(
@@ -102,7 +104,7 @@ def begin_run(
         model_hash=model_hash(fitness),
         **runtime.describe_process(),
     )
-    return Start(run, config, fitness)
+    return Start(run, config, fitness, make_method(config, fitness))
 
 
 def continue_run(
@@ -142,7 +144,7 @@ def continue_run(
     if checkpoint.meta["settings_hash"] != settings_hash(config):
         raise InputError(f"{label}: expected the config.yaml that it began with; found it changed")
     fitness = make_pool(config)
-    from mjx_revolve.evolution.loop import search_from_arrays
+    from mjx_revolve.evolution.methods import make_method
 
     if checkpoint.meta["model_hash"] != model_hash(fitness):
         raise InputError(
@@ -155,8 +157,9 @@ def continue_run(
             "the run continues, but not bit for bit, because this process differs: %s",
             "; ".join(found),
         )
-    search = search_from_arrays(config.evolution, fitness.num_genes, checkpoint.arrays)
-    return Start(run, config, fitness, search, checkpoint)
+    method = make_method(config, fitness)
+    search = method.from_arrays(checkpoint.arrays)
+    return Start(run, config, fitness, method, search, checkpoint)
 
 
 def _default_folder(config: Config) -> Path:

@@ -1,0 +1,234 @@
+"""Scores of bodies that evolve: morphologies and genes in, scores out, wherever it is computed.
+
+A worker gets morphologies, compiles them, and evaluates all in one program. Which program that is
+follows from the configuration alone. Where each body tries at least half a chunk of brains at a
+time, a chunk holds one body, which is the faster way; else bodies share chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_revolve.body.catalogue import MODULES, load_modules
+from mjx_revolve.body.module_types import ModuleType
+from mjx_revolve.body.morphology import Morphology, load_morphology
+from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.episodes.bodies_config import BodiesConfig
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.fitness import (
+    Fitness,
+    MixedFitness,
+    make_fitness,
+    make_mixed_fitness,
+)
+from mjx_revolve.episodes.measure_table import MEASURES
+from mjx_revolve.evolution.blocks import block_size
+from mjx_revolve.evolution.brains import Brains, Layout, lay_out_genes, make_brains
+from mjx_revolve.genotypes.genotype import Genotype, Space, make_space
+from mjx_revolve.genotypes.kinds import make_genotype
+from mjx_revolve.inputs.errors import InputError
+
+# Random bodies that say how much room the tables need. A choice: bodies that need more are refused
+# while they are drawn, like those with too many modules.
+_EXAMPLES = 64
+# Compiled bodies that are remembered. A choice: some megabytes.
+_REMEMBERED = 512
+
+
+@dataclass(frozen=True, eq=False)
+class BodyFitness:
+    """Scores of different bodies with different brains.
+
+    Attributes:
+        config: the configuration.
+        genotype: what bodies are grown from.
+        mixed: the fitness of any bodies within the space.
+        brains: the kind of brain.
+        seeds: robots that begin the population.
+    """
+
+    config: Config
+    genotype: Genotype
+    mixed: MixedFitness
+    brains: Brains
+    seeds: tuple[Morphology, ...]
+
+    @property
+    def bodies(self) -> BodiesConfig:
+        """How bodies evolve."""
+        assert self.config.bodies is not None
+        return self.config.bodies
+
+    @property
+    def num_genes(self) -> int:
+        """Of the largest body."""
+        return self.mixed.num_genes
+
+    @property
+    def worst_score(self) -> float:
+        """The score of a rollout that blew up."""
+        return self.mixed.worst_score
+
+    @cached_property
+    def block_size(self) -> int | None:
+        """Individuals in a block; None: as many as there are."""
+        return block_size(self.config.task.trials)
+
+    @property
+    def alone(self) -> bool:
+        """Whether each block holds one body."""
+        tried, block = self.bodies.learning.population_size, self.block_size
+        return block is not None and 2 * tried >= block
+
+    @property
+    def identity(self) -> str:
+        """What scores depend on beside settings: the world and the types of modules."""
+        kinds = [repr(kind) for kind in self.space_types.values()]
+        return "\n".join([repr(self.mixed.world), *kinds, *(repr(s.modules) for s in self.seeds)])
+
+    @cached_property
+    def space_types(self) -> Mapping[str, ModuleType]:
+        """Types of modules that bodies are grown of."""
+        modules = read_modules(self.config)
+        names = (self.bodies.core, *self.bodies.modules)
+        return {name: modules[name] for name in names}
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the measures of a life."""
+        asked = self.config.task.measures
+        return tuple(name for name, m in MEASURES.items() if not m.record or name in asked)
+
+    @cached_property
+    def figures(self) -> tuple[str, ...]:
+        """Names of all figures of an individual: the score, measures and descriptors."""
+        example = self.genotype.develop(self.genotype.random(np.random.default_rng(0)))
+        return ("score", *self.measured, *example.descriptors)
+
+    def single(self, path: str | Path) -> Fitness:
+        """The fitness of one body alone, read from a file, for replays."""
+        return make_fitness(self.config.for_body(path))
+
+    @cached_property
+    def _built(self) -> dict[int, tuple[Morphology, Robot]]:
+        return {}
+
+    def build(self, body: Morphology) -> Robot:
+        """The compiled body; those of the last generations are remembered."""
+        known = self._built.get(id(body))
+        if known is None or known[0] is not body:
+            while len(self._built) >= _REMEMBERED:
+                del self._built[next(iter(self._built))]
+            known = self._built[id(body)] = (body, self.mixed.build(body))
+        return known[1]
+
+    def layout(self, body: Morphology) -> Layout:
+        """Where the genes of a body belong."""
+        robot = self.build(body)
+        own = self.mixed.controller_of(robot)
+        return lay_out_genes(own, self.mixed.setup.controller, plant_of(robot))
+
+    def evaluate(
+        self, bodies: Sequence[Morphology], which: np.ndarray, genes: np.ndarray, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Scores a block.
+
+        Args:
+            bodies: not trimmed; just one where each block holds one.
+            which: `[P]` the body of each individual.
+            genes: `[P, num_genes]`.
+            key: draws the episodes' starts and water.
+
+        Returns:
+            `[P]` scores and `[P]` measures.
+        """
+        robots = [self.build(body) for body in bodies]
+        if self.alone:
+            return self.mixed.evaluate(robots[0], genes, key)
+        return self.mixed.evaluate([robots[k] for k in which], genes, key)
+
+
+def read_modules(config: Config) -> Mapping[str, ModuleType]:
+    """All types of modules of a configuration, by name and alias."""
+    return MODULES | load_modules(config.modules) if config.modules else MODULES
+
+
+def make_body_fitness(config: Config) -> BodyFitness:
+    """Builds the fitness of a configuration whose bodies evolve.
+
+    Args:
+        config: the configuration.
+
+    Returns:
+        The fitness.
+
+    Raises:
+        InputError: the configuration, a seed or the world is wrong; the message says where.
+    """
+    config = _ask_for_measures(config)
+    bodies = config.bodies
+    assert bodies is not None
+    modules = read_modules(config)
+    try:
+        space = make_space(bodies, modules)
+        seeds = tuple(_load_seed(path, modules, config, space) for path in bodies.seeds)
+        free = make_genotype(bodies.genotype, space, bodies.params, config.source)
+        _check_seeds(bodies, free)
+        examples = [*seeds, *_examples(free)]
+        kinds = [modules[name] for name in (bodies.core, *bodies.modules)]
+        mixed = make_mixed_fitness(config, examples, hinges=bodies.max_hinges, kinds=kinds)
+        brains = make_brains(bodies.brains, mixed.setup.controller)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(config.source) else f"{config.source}: {text}") from None
+
+    def accepts(body: Morphology) -> bool:
+        return mixed.misfit(mixed.build(body)) is None
+
+    genotype = make_genotype(
+        bodies.genotype, space._replace(accepts=accepts), bodies.params, config.source
+    )
+    return BodyFitness(config, genotype, mixed, brains, seeds)
+
+
+def _ask_for_measures(config: Config) -> Config:
+    """With all measures recorded that objectives and archive name."""
+    bodies = config.bodies
+    assert bodies is not None
+    named = [name.lstrip("-") for name in (*bodies.selection.objectives, *bodies.selection.novelty)]
+    named += bodies.archive.axes if bodies.archive else ()
+    extra = [name for name in named if name in MEASURES and MEASURES[name].record]
+    wanted = tuple(dict.fromkeys((*config.task.measures, *extra)))
+    task = config.task.model_copy(update={"measures": wanted})
+    return config.model_copy(update={"task": task})
+
+
+def _examples(genotype: Genotype) -> list[Morphology]:
+    """Random bodies, the same in all processes."""
+    rng = np.random.default_rng(0)
+    found = [genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES)]
+    return found
+
+
+def _load_seed(path: str, modules: Any, config: Config, space: Space) -> Morphology:
+    body = load_morphology(path, modules, config.allow_overlap)
+    reason = space.refuses(body)
+    if reason:
+        raise InputError(f"{path}: expected a robot within the bounds of bodies; found {reason}")
+    return body
+
+
+def _check_seeds(bodies: BodiesConfig, genotype: Genotype) -> None:
+    if bodies.seeds and genotype.adopt is None:
+        raise InputError(
+            f"bodies.seeds: expected none, as no {bodies.name} grows into a given robot; found "
+            f"{len(bodies.seeds)}"
+        )

@@ -1,0 +1,169 @@
+"""Brains for bodies that change: what children get, and how it becomes genes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from laboratory import body
+from mjx_revolve.body.edits import add_module, remove_module
+from mjx_revolve.control.cpg import make_cpg
+from mjx_revolve.control.sine import make_sine
+from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.bodies_config import BrainsConfig
+from mjx_revolve.evolution.brains import lay_out_genes, make_brains
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.world import load_world
+
+SNAKE = body("snake")
+LAKE = load_world("lake")
+
+
+def layout_of(morphology, make=make_sine, common=None):
+    plant = plant_of(build_robot(morphology, LAKE))
+    own = make(plant)
+    return lay_out_genes(own, common or own, plant)
+
+
+def common(make=make_sine):
+    """The controller for the largest body of these tests."""
+    return make(plant_of(build_robot(SNAKE, LAKE)))
+
+
+def joints(**settings):
+    return make_brains(BrainsConfig(**settings), common())
+
+
+def shorter():
+    """The snake without its last hinge and what it carries."""
+    return remove_module(SNAKE, SNAKE.hinges[-1])
+
+
+def test_places_of_genes():
+    """A hinge's genes stand where it turns; a pair's between its two hinges."""
+    layout = layout_of(SNAKE, make_cpg)
+    anchors = []
+    for index in SNAKE.hinges:
+        module = SNAKE.modules[index]
+        anchors.append(module.position + module.rotation @ np.asarray(module.kind.hinge.anchor))
+    for gene, place, reach in zip(layout.genes, layout.place, layout.reach, strict=True):
+        if gene.place == "hinge":
+            np.testing.assert_allclose(place, anchors[gene.number], atol=1e-12)
+            assert not reach.any()
+        else:
+            i, j = SNAKE.hinge_neighbours()[gene.number]
+            np.testing.assert_allclose(place, (anchors[i] + anchors[j]) / 2, atol=1e-12)
+            np.testing.assert_allclose(reach, anchors[j] - anchors[i], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["joints", "cppn"])
+def test_vectors_and_files_keep_all_bits(kind):
+    brains = make_brains(BrainsConfig(type=kind), common())
+    layout = layout_of(shorter(), common=common())
+    brain = brains.draw(np.random.default_rng(3), layout)
+    vector = brains.to_vector(brain, layout)
+    assert vector.shape == (brains.size,) and vector.dtype == np.float32
+    assert brains.from_vector(vector, layout) == brain
+    assert brains.check(json.loads(json.dumps(brain))) == brain
+
+
+@pytest.mark.parametrize("kind", ["joints", "cppn"])
+def test_genes_of_joints_that_a_body_lacks_are_zero(kind):
+    brains = make_brains(BrainsConfig(type=kind), common())
+    layout = layout_of(shorter(), common=common())
+    genes = brains.express(np.ones((2, brains.size), np.float32), layout)
+    assert genes.shape == (2, common().num_genes)
+    missing = np.setdiff1d(np.arange(common().num_genes), layout.columns)
+    assert len(missing) == 3  # u, v and offset of one hinge
+    assert not genes[:, missing].any()
+    assert genes[:, layout.columns].all()
+
+
+def test_a_child_with_its_parents_body_has_its_genes():
+    brains, layout = joints(mutation=0.0), layout_of(SNAKE)
+    parent = brains.draw(np.random.default_rng(0), layout)
+    assert brains.inherit(np.random.default_rng(1), [parent], layout) == parent
+    # Noise of the size asked for, on all of them.
+    child = joints(mutation=0.2).inherit(np.random.default_rng(1), [parent], layout)
+    noise = np.array([child[name] - parent[name] for name in layout.names])
+    assert 0.1 < noise.std() < 0.3 and noise.all()
+
+
+def test_a_joint_that_has_grown_does_as_the_nearest():
+    """A hinge more at the snake's end takes over what the last one had; the others keep theirs."""
+    brains = make_brains(BrainsConfig(mutation=0.0), common())
+    small = layout_of(shorter(), common=common())
+    parent = brains.draw(np.random.default_rng(0), small)
+    layout = layout_of(SNAKE)
+    child = brains.inherit(np.random.default_rng(1), [parent], layout)
+    new = SNAKE.modules[SNAKE.hinges[-1]].name
+    before = SNAKE.modules[SNAKE.hinges[-2]].name
+    for name in layout.names:
+        if name.endswith(f" {new}"):
+            assert child[name] == parent[name.replace(new, before)]
+        else:
+            assert child[name] == parent[name]
+
+
+def test_of_two_parents_the_first_ones_joints_come_first():
+    brains = make_brains(BrainsConfig(mutation=0.0), common())
+    small, large = layout_of(shorter(), common=common()), layout_of(SNAKE)
+    first = dict.fromkeys(small.names, 1.0)
+    second = dict.fromkeys(large.names, 2.0)
+    child = brains.inherit(np.random.default_rng(0), [first, second], large)
+    assert child == second | first
+
+
+def test_a_limb_where_there_was_none():
+    """With nobody to learn from, genes are drawn."""
+    brains = joints(std_init=0.5, mutation=0.0)
+    bare = body("core")
+    one = add_module(bare, 0, 0, "ActiveHinge", name="first")
+    layout = layout_of(one, common=common())
+    child = brains.inherit(np.random.default_rng(0), [{"frequency": 0.7}], layout)
+    assert child["frequency"] == np.float32(0.7)
+    drawn = [child[name] for name in layout.names if name != "frequency"]
+    assert len(drawn) == 3 and all(drawn)
+
+
+def test_the_network_by_hand():
+    """With one weight from x to the first kind of gene, those genes are x in units of .1 m."""
+    brains, layout = make_brains(BrainsConfig(type="cppn"), common()), layout_of(SNAKE)
+    weights = np.zeros(brains.size, np.float32)
+    hidden, inputs = 12, 7
+    weights[hidden * inputs + hidden + 1] = 2.0  # output 0 ("u"), behind the hidden nodes, input x
+    weights[-1] = 0.3  # the frequency
+    genes = brains.express(weights, layout)
+    for gene, place, value in zip(layout.genes, layout.place, genes[layout.columns], strict=True):
+        if gene.what == "frequency":
+            assert value == np.float32(0.3)
+        elif gene.what == "u":
+            np.testing.assert_allclose(value, 20 * place[0], rtol=1e-6, atol=1e-9)
+        else:
+            assert value == 0
+    # A hidden node: the first is a sine, of y here.
+    weights[:] = 0
+    weights[2] = 3.0
+    weights[hidden * inputs] = 1.0
+    genes = brains.express(weights, layout)[layout.columns]
+    for gene, place, value in zip(layout.genes, layout.place, genes, strict=True):
+        expected = np.sin(30 * place[1]) if gene.what == "u" else 0.0
+        np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-7)
+
+
+def test_network_children():
+    """Each weight comes of one of the parents."""
+    brains = make_brains(BrainsConfig(type="cppn", mutation=0.0), common())
+    ones, twos = [1.0] * brains.size, [2.0] * brains.size
+    child = brains.inherit(np.random.default_rng(0), [ones, twos], layout_of(SNAKE))
+    share = child.count(1.0) / brains.size
+    assert set(child) == {1.0, 2.0} and 0.3 < share < 0.7
+    assert brains.inherit(np.random.default_rng(0), [ones], layout_of(SNAKE)) == ones
+
+
+@pytest.mark.parametrize(("kind", "brain"), [("joints", [1.0]), ("joints", {"a": "b"}),
+                                            ("cppn", {}), ("cppn", [1.0, 2.0])])  # fmt: skip
+def test_damaged_brains(kind, brain):
+    with pytest.raises(InputError, match="brain: expected"):
+        make_brains(BrainsConfig(type=kind), common()).check(brain)

@@ -1,0 +1,341 @@
+"""Bodies that evolve, on a fitness that costs nothing: lives, generations, run folders."""
+
+import csv
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import toys
+from mjx_revolve import evolve as command
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.episodes.config import load_config
+from mjx_revolve.evolution import coevolution, runs
+from mjx_revolve.evolution.individuals import from_record, to_record
+from mjx_revolve.evolution.life import evaluate, live, make_learner
+from mjx_revolve.evolution.pool import Pool
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from toys import CLOCK, make_toy_bodies
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    monkeypatch.chdir(tmp_path)
+    toys.write_bodies_config(tmp_path / "toy.yaml")
+    return tmp_path
+
+
+def start(folder, bodies=(), **evolution):
+    """A pool over the toy, with other settings."""
+    config = load_config(toys.write_bodies_config(folder / "other.yaml", bodies, **evolution))
+    fitness = make_toy_bodies(config)
+    return config, Pool(fitness, fitness.block_size)
+
+
+def run(config, pool, search=None):
+    """All generations: the last search, and all rows."""
+    rows = []
+    for found, row in coevolution.coevolve(config, pool, search):
+        search = found
+        rows.append(row)
+    return search, rows
+
+
+def same(one, other, fitness):
+    """Whether two individuals are the same in every bit, what they were through included."""
+    return to_record(one, fitness.genotype) == to_record(other, fitness.genotype)
+
+
+def main(*argv):
+    return run_command(lambda argv: command.main(argv, make_toy_bodies), [str(a) for a in argv])
+
+
+# --- lives ---
+
+
+def strangers(config, pool):
+    return coevolution._Step(config, pool)._strangers(coevolution.start_search(config), 1)
+
+
+def test_a_life_alone_is_the_life_among_others(folder):
+    for learning in ({}, {"population_size": 4, "generations": 3}):
+        config, pool = start(folder, {"learning": learning})
+        learner = make_learner(config.bodies.learning, pool.fitness.brains.size)
+        born, key = strangers(config, pool), jax.random.key(3)
+        together = live(pool, learner, born, key)
+        alone = live(pool, learner, born[4:5], key)
+        assert same(alone[0], together[4], pool.fitness)
+        assert not np.isnan(alone[0].score)
+
+
+def test_learning_improves_and_is_what_counts(folder):
+    """One trial is the brain of birth; more find better ones, and the score is the best one's."""
+    config, pool = start(folder)
+    born, key = strangers(config, pool), jax.random.key(0)
+    naive = live(pool, None, born, key)
+    for individual in naive:
+        assert individual.learnt == individual.brain and individual.trials == 1
+    config, pool = start(folder, {"learning": {"population_size": 8, "generations": 6}})
+    learner = make_learner(config.bodies.learning, pool.fitness.brains.size)
+    learned = live(pool, learner, born, key)
+    gains = [after.score - before.score for before, after in zip(naive, learned, strict=True)]
+    assert min(gains) >= 0 and np.mean(gains) > 0.05
+    for individual in learned:
+        assert individual.trials == 48 and individual.brain in [n.brain for n in naive]
+    # Scored by itself, what was learnt gives the score again, on the same starts.
+    genes = [coevolution.brain_genes(pool.fitness, individual)[None] for individual in learned]
+    again = evaluate(pool, learned, genes, jax.random.split(key)[0])
+    for (score, _), individual in zip(again, learned, strict=True):
+        assert score[0] == pytest.approx(individual.score, abs=1e-6)
+
+
+def test_blocks_hold_one_body_where_many_brains_are_tried(folder):
+    for size, alone in ((1, False), (3, False), (4, True), (20, True)):
+        config, pool = start(folder, {"learning": {"population_size": size}})
+        seen = []
+        inner = pool.fitness.evaluate
+        object.__setattr__(pool.fitness, "evaluate", lambda *a, i=inner: (seen.append(a), i(*a))[1])
+        live(pool, None, strangers(config, pool), jax.random.key(0))
+        assert pool.fitness.alone == alone
+        assert {len(genes) for _, _, genes, _ in seen} == {8}
+        assert all(len(bodies) == 1 for bodies, *_ in seen) == alone
+        assert len(seen) == (6 * -(-size // 8) if alone else -(-6 * size // 8))
+
+
+def test_those_that_fail_have_no_score(folder):
+    config, pool = start(folder, {"learning": {"population_size": 4, "generations": 2}})
+    inner = pool.fitness.evaluate
+
+    def fail(bodies, which, genes, key):
+        scores, measures = inner(bodies, which, genes, key)
+        lost = np.array([body.num_hinges < 3 for body in bodies])[which]
+        return np.where(lost, pool.fitness.worst_score, scores), measures
+
+    object.__setattr__(pool.fitness, "evaluate", fail)
+    learner = make_learner(config.bodies.learning, pool.fitness.brains.size)
+    for individual in live(pool, learner, strangers(config, pool), jax.random.key(0)):
+        lost = individual.body.num_hinges < 3
+        assert np.isnan(individual.score) == lost == (individual.learnt is None)
+    search, rows = run(config, pool)
+    assert any(row["failed"] for row in rows)
+    assert all(individual.body.num_hinges >= 3 for individual in search.elites)
+
+
+@pytest.mark.parametrize(("learning", "message"), [
+    ({"generations": 2}, "bodies.learning.population_size: expected at least 2"),
+    ({"generations": 2, "population_size": 4, "strategy": "nope"}, "bodies.learning.strategy"),
+    ({"generations": 2, "population_size": 4, "strategy_params": {"x": 1}}, "strategy_params.x"),
+])  # fmt: skip
+def test_wrong_learners(folder, learning, message):
+    config, pool = start(folder, {"learning": learning})
+    with pytest.raises(InputError, match=message):
+        coevolution.check_bodies(config, pool)
+
+
+# --- generations ---
+
+SCHEMES = [
+    {"type": "plus"},
+    {"type": "comma", "offspring": 9},
+    {"type": "generational", "elites": 2},
+    {"type": "steady", "offspring": 3},
+    {"type": "plus", "max_age": 2},
+    {"type": "random"},
+    {"type": "nsga2", "objectives": ["score", "-num_modules", "novelty"],
+     "novelty": ["num_hinges", "length"]},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("selection", SCHEMES, ids=lambda s: s["type"])
+def test_generations(folder, selection):
+    """The bookkeeping of all schemes, and that the same seed gives the same bits."""
+    config, pool = start(folder, {"selection": selection})
+    search, rows = run(config, pool)
+    per = selection.get("offspring", 6)
+    assert [row["generation"] for row in rows] == [1, 2, 3, 4, 5]
+    assert search.next_number == search.trials == rows[-1]["evaluations"] == 6 + 4 * per
+    assert len(search.living) == 6
+    champions = [row["champion"] for row in rows]
+    assert champions == sorted(champions) and champions[-1] == search.elites[0].score
+    if selection["type"] == "plus" and "max_age" not in selection:
+        assert search.elites[0].number in {i.number for i in search.living}
+        means = [row["living_mean"] for row in rows]
+        assert means == sorted(means)
+    for individual in search.living:
+        assert all(parent < individual.number for parent in individual.parents)
+        assert individual.born == 1 or individual.parents or selection["type"] == "random"
+    again, repeated = run(config, pool)
+    assert all(map(lambda a, b: same(a, b, pool.fitness), search.living, again.living))
+    for row, other in zip(rows, repeated, strict=True):
+        assert {k: v for k, v in row.items() if k not in CLOCK} == pytest.approx(
+            {k: v for k, v in other.items() if k not in CLOCK}, nan_ok=True, abs=0, rel=0
+        )
+
+
+def test_evolution_finds_what_is_asked_for(folder):
+    """Three hinges, and genes near a half: far above what random search finds."""
+    found = {}
+    for kind in ("plus", "random"):
+        bodies = {"selection": {"type": kind}, "brains": {"mutation": 0.1}}
+        config, pool = start(folder, bodies, population_size=10, generations=20)
+        search, _ = run(config, pool)
+        found[kind] = search.elites[0].score
+        assert search.elites[0].body.num_hinges == 3
+    assert found["plus"] > found["random"] > -0.5
+    assert found["plus"] > -0.06
+
+
+def test_inheritance(folder):
+    """Children begin with what their parents learnt, were born with, or with nothing of either."""
+    learning = {"population_size": 8, "generations": 4, "std_init": 0.5}
+    for how in ("lamarckian", "darwinian", "none"):
+        brains = {"inheritance": how, "mutation": 0.0}
+        config, pool = start(folder, {"brains": brains, "learning": learning, "crossover": 0.0})
+        people, pairs = {}, 0
+        for search, _ in coevolution.coevolve(config, pool):
+            for child in search.newborn:
+                people[child.number] = child
+                for parent in (people[number] for number in child.parents):
+                    same_joints = child.brain.keys() & parent.brain.keys()
+                    source = parent.learnt if how == "lamarckian" else parent.brain
+                    alike = [child.brain[name] == source[name] for name in same_joints]
+                    assert any(alike) == all(alike) == (how != "none")
+                    pairs += 1
+        assert pairs == 24
+
+
+@pytest.mark.parametrize("genotype", ["plasticoding", "cppn"])
+def test_other_genotypes(folder, genotype):
+    config, pool = start(folder, {"genotype": genotype, "brains": {"type": "cppn"}})
+    search, _ = run(config, pool)
+    for individual in search.living:
+        again = from_record(
+            json.loads(json.dumps(to_record(individual, pool.fitness.genotype))),
+            pool.fitness.genotype, coevolution.read_modules(config), pool.fitness.brains.check,
+        )  # fmt: skip
+        assert same(individual, again, pool.fitness)
+
+
+def test_seeds_begin_the_population(folder):
+    bodies = {"seeds": ["snake", "spider"], "random": 0.5, "max_modules": 30, "max_hinges": 10}
+    config, pool = start(folder, bodies)
+    first = strangers(config, pool)
+    assert [i.origin for i in first] == ["seed snake", "seed spider", "mutant of snake",
+                                        "random", "random", "random"]  # fmt: skip
+    for individual, seed in zip(first, pool.fitness.seeds, strict=False):
+        assert individual.body.modules == seed.modules
+    assert first[2].body.modules != first[0].body.modules
+
+
+@pytest.mark.parametrize(("bodies", "message"), [
+    ({"seeds": ["snake"]}, "snake.yaml: expected a robot within the bounds of bodies; found"),
+    ({"seeds": ["snake"], "genotype": "cppn", "max_modules": 30, "max_hinges": 10},
+     "bodies.seeds: expected none"),
+    ({"modules": ["Wing"]}, "bodies.modules"),
+    ({"params": {"nope": 1}}, "bodies.params.nope"),
+])  # fmt: skip
+def test_wrong_bodies(folder, bodies, message):
+    with pytest.raises(InputError, match=message):
+        start(folder, bodies)
+
+
+@pytest.mark.parametrize(("bodies", "message"), [
+    ({"selection": {"type": "nsga2", "objectives": ["score", "sped"]}}, "objectives: expected"),
+    ({"archive": {"axes": {"num_hinges": {"low": 0, "high": 4}, "x": {"low": 0, "high": 1}}}},
+     "archive.axes: expected"),
+    ({"selection": {"type": "comma", "offspring": 2}}, "offspring"),
+])  # fmt: skip
+def test_wrong_selections(folder, bodies, message):
+    config, pool = start(folder, bodies)
+    with pytest.raises(InputError, match=message):
+        coevolution.check_bodies(config, pool)
+
+
+# --- the archive ---
+
+ARCHIVE = {
+    "selection": {"type": "map_elites", "offspring": 8},
+    "archive": {"axes": {"num_hinges": {"low": 0.5, "high": 4.5, "cells": 4},
+                         "num_modules": {"low": 1.5, "high": 8.5, "cells": 7}}},
+}  # fmt: skip
+
+
+def test_map_elites_keeps_the_best_of_each_kind(folder):
+    config, pool = start(folder, ARCHIVE, generations=12)
+    best: dict = {}
+    for search, row in coevolution.coevolve(config, pool):
+        for one in search.newborn:
+            cell = (one.body.num_hinges, one.body.num_modules)
+            if cell not in best or one.score > best[cell].score:
+                best[cell] = one
+        assert {i.number for i in search.living} == {i.number for i in best.values()}
+        assert row["coverage"] == pytest.approx(len(best) / 28)
+    assert len(best) > 12
+
+
+# --- run folders ---
+
+
+def contents(folder):
+    """What must be the same for two runs of the same seed."""
+    found = runs.Run(folder)
+    arrays = {n: a.tobytes() for n, a in found.load_checkpoint().arrays.items() if n not in CLOCK}
+    table = {n: c.tobytes() for n, c in found.load_metrics().items() if n not in CLOCK}
+    names = ("champion/genes.yaml", "champion/morphology.yaml", "individuals.jsonl",
+             "generations.jsonl")  # fmt: skip
+    return arrays, table, [(folder / name).read_text() for name in names]
+
+
+@pytest.mark.parametrize("bodies", [
+    {"learning": {"population_size": 4, "generations": 2, "strategy": "CMA_ES"}},
+    ARCHIVE,
+    {"selection": {"type": "nsga2", "objectives": ["score", "novelty"], "novelty": ["length"]},
+     "genotype": "plasticoding", "brains": {"type": "cppn"}},
+], ids=["learning", "map_elites", "plasticoding"])  # fmt: skip
+def test_a_run_that_goes_on_ends_as_one_that_never_stopped(folder, bodies, capsys):
+    toys.write_bodies_config(folder / "toy.yaml", bodies)
+    assert main("toy.yaml", "--out", "whole") == 0
+    assert main("toy.yaml", "--out", "parts", "--set", "evolution.generations=2") == 0
+    assert main("--resume", "parts", "--set", "evolution.generations=5") == 0
+    assert "resuming after generation 2" in capsys.readouterr().out
+    assert contents(folder / "whole") == contents(folder / "parts")
+
+
+def test_what_is_in_a_run_folder(folder, capsys):
+    toys.write_bodies_config(folder / "toy.yaml", ARCHIVE)
+    assert main("toy.yaml", "--out", "run") == 0
+    out = capsys.readouterr().out
+    assert "bodies (tree, at most 8 modules)" in out and "champion: " in out
+    run_folder = folder / "run"
+    people = [json.loads(line) for line in (run_folder / "individuals.jsonl").open()]
+    assert [person["id"] for person in people] == list(range(len(people)))
+    last = [json.loads(line) for line in (run_folder / "generations.jsonl").open()][-1]
+    rows = list(csv.DictReader((run_folder / "archive.csv").open()))
+    assert {int(row["id"]) for row in rows} == set(last["living"])
+    for row in rows:
+        person = people[int(row["id"])]
+        assert float(row["score"]) == pytest.approx(person["score"])
+        assert float(row["num_hinges"]) == person["descriptors"]["num_hinges"]
+    body = load_morphology(run_folder / "champion" / "morphology.yaml")
+    assert body.num_hinges == 3
+    table = runs.Run(run_folder).load_metrics()
+    assert table["coverage"][-1] == pytest.approx(len(rows) / 28)
+
+
+@pytest.mark.parametrize("changed", ["bodies.max_modules=9", "bodies.selection.type=steady"])
+def test_a_run_cannot_become_another(folder, changed, capsys):
+    assert main("toy.yaml", "--out", "run", "--set", "evolution.generations=2") == 0
+    assert main("--resume", "run", "--set", changed) == 2
+    assert f"bodies.{changed.split('.')[1].split('=')[0]}" in capsys.readouterr().err
+
+
+def test_workers_change_nothing(folder):
+    """The same bits from this process and from two others."""
+    toys.write_bodies_config(folder / "toy.yaml", {"learning": {"population_size": 4}})
+    assert main("toy.yaml", "--out", "one", "--set", "evolution.generations=2") == 0
+    argv = ("toy.yaml", "--out", "two", "--workers", "2", "--set", "evolution.generations=2")
+    assert main(*argv) == 0
+    assert contents(folder / "one") == contents(folder / "two")
