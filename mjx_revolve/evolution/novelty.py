@@ -1,0 +1,48 @@
+"""Novelty: how far an individual is from those that it resembles most.
+
+After Lehman and Stanley, "Abandoning objectives: evolution through the search for novelty alone",
+Evolutionary Computation 19(2), 2011.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+
+def novelty(
+    points: np.ndarray, others: np.ndarray, neighbours: int, scale: np.ndarray
+) -> np.ndarray:
+    """Mean distances to the nearest neighbours.
+
+    Args:
+        points: `[N, D]` descriptors of individuals. One with a value that is not finite has no
+            place: its novelty is 0, and it is nobody's neighbour.
+        others: `[K, D]` of further ones that may be neighbours, such as an archive's.
+        neighbours: how many of the nearest; fewer where there are not so many.
+        scale: `[D]` a distance of 1 along each axis, see `spread`.
+
+    Returns:
+        `[N]` Euclidean distances; 0 where there is no neighbour.
+    """
+    found = np.zeros(len(points))
+    placed = np.isfinite(points).all(1)
+    own = points[placed] / scale
+    distances = cdist(own, np.concatenate([own, others[np.isfinite(others).all(1)] / scale]))
+    np.fill_diagonal(distances, np.inf)  # nobody is their own neighbour
+    count = min(neighbours, distances.shape[1] - 1)
+    if count > 0:
+        nearest = np.partition(distances, count - 1, axis=1)[:, :count]
+        found[placed] = np.sort(nearest, axis=1).mean(1)
+    return found
+
+
+def spread(points: np.ndarray) -> np.ndarray:
+    """Standard deviations `[D]` of points `[N, D]` along each axis; 1 where there is none."""
+    placed = points[np.isfinite(points).all(1)]
+    if not len(placed):
+        return np.ones(points.shape[1])
+    deviation = placed.std(0)
+    # What is left of equal values by rounding is no spread.
+    tiny = 1e-12 * np.abs(placed).max(0)
+    return np.where(deviation > tiny, deviation, 1.0)
