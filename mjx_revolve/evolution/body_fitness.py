@@ -8,7 +8,7 @@ time, a chunk holds one body, which is the faster way; else bodies share chunks.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -194,7 +194,7 @@ def make_body_fitness(config: Config) -> BodyFitness:
         return mixed.misfit(mixed.build(body)) is None
 
     genotype = make_genotype(
-        bodies.genotype, space._replace(accepts=accepts), bodies.params, config.source
+        bodies.genotype, replace(space, accepts=accepts), bodies.params, config.source
     )
     return BodyFitness(config, genotype, mixed, brains, seeds)
 
@@ -222,7 +222,7 @@ def _load_seed(path: str, modules: Any, config: Config, space: Space) -> Morphol
     body = load_morphology(path, modules, config.allow_overlap)
     reason = space.refuses(body)
     if reason:
-        raise InputError(f"{path}: expected a robot within the bounds of bodies; found {reason}")
+        raise InputError(f"{path}: {reason}")
     return body
 
 

@@ -184,8 +184,9 @@ def test_evolution_finds_what_is_asked_for(folder):
         search, _ = run(config, pool)
         found[kind] = search.elites[0].score
         assert search.elites[0].body.num_hinges == 3
-    assert found["plus"] > found["random"] > -0.5
-    assert found["plus"] > -0.06
+    # Both find the hinges; of what is left, inheritance leaves less than half.
+    assert found["random"] > -0.5
+    assert found["plus"] > found["random"] / 2
 
 
 def test_inheritance(folder):
@@ -231,7 +232,7 @@ def test_seeds_begin_the_population(folder):
 
 
 @pytest.mark.parametrize(("bodies", "message"), [
-    ({"seeds": ["snake"]}, "snake.yaml: expected a robot within the bounds of bodies; found"),
+    ({"seeds": ["snake"]}, r"snake.yaml: expected 2 to 8 modules; found"),
     ({"seeds": ["snake"], "genotype": "cppn", "max_modules": 30, "max_hinges": 10},
      "bodies.seeds: expected none"),
     ({"modules": ["Wing"]}, "bodies.modules"),
