@@ -27,8 +27,8 @@ PACKAGE = "mjx_revolve"
 FIRST = ("tutorial", "viewer", "replay", "report", "interchange", "physics", "parallel")
 # The package's rooms in reading order: each imports only from itself and from those before it.
 ROOMS = (
-    "inputs", "numerics", "body", "water", "engine", "control", "episodes", "evolution", "formats",
-    "view",
+    "inputs", "numerics", "body", "genotypes", "water", "engine", "control", "episodes",
+    "evolution", "formats", "view",
 )  # fmt: skip
 
 _DOT = r'((?:</span><span class="o">)?\.(?:</span><span class="n">)?)'

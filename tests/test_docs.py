@@ -122,7 +122,7 @@ def test_every_file_stands_in_its_room_behind_those_that_it_imports(architecture
 
 
 @pytest.mark.parametrize(
-    "room", ["inputs", "body"], ids=lambda room: f"{room} without JAX and MuJoCo"
+    "room", ["inputs", "body", "genotypes"], ids=lambda room: f"{room} without JAX and MuJoCo"
 )
 def test_rooms_know_nothing_of_what_they_need_not(room):
     for path in (PACKAGE / room).rglob("*.py"):

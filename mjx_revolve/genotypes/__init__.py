@@ -1,0 +1,1 @@
+"""What bodies are grown from and how they vary. No worlds, brains or evolution; NumPy only."""

@@ -1,0 +1,236 @@
+"""What a genotype is, and the space of bodies that all of them stay in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_revolve.body.module_types import ModuleType
+from mjx_revolve.body.tree import Morphology
+from mjx_revolve.inputs.errors import InputError, show
+
+# Bounds on length and mass are kept up to rounding.
+SLACK = 1 + 1e-9
+# Variations of a parent that are tried before it is left as it is, and random genomes before it is
+# said that there are none. Choices: most bounds let every second or third pass.
+TRIES = 50
+_RANDOM_TRIES = 300
+
+
+class Genotype(NamedTuple):
+    """What bodies are grown from: plain functions of genomes, which are plain values.
+
+    All genomes that they return develop into bodies of the space, and all randomness comes from the
+    generator that they are given.
+
+    Attributes:
+        name: as a configuration gives it.
+        random: generator → genome. Raises `InputError` where none of many draws is in the space.
+        mutate: (generator, genome) → genome that differs a little; the genome itself where none of
+            `TRIES` mutants is in the space.
+        cross: (generator, genome, genome) → one child; the first genome itself where none of
+            `TRIES` children is in the space.
+        develop: genome → valid body in the space, without a brain. A module that stays in its place
+            keeps its name.
+        adopt: body → genome that develops into it, but for its brain and path. Raises `InputError`
+            where it is not in the space. None where there is no such genome.
+        to_plain: genome → what JSON can hold, exactly.
+        from_plain: its inverse. Raises `InputError` where it is no such genome.
+    """
+
+    name: str
+    random: Callable[[np.random.Generator], Any]
+    mutate: Callable[[np.random.Generator, Any], Any]
+    cross: Callable[[np.random.Generator, Any, Any], Any]
+    develop: Callable[[Any], Morphology]
+    adopt: Callable[[Morphology], Any] | None
+    to_plain: Callable[[Any], Any]
+    from_plain: Callable[[Any], Any]
+
+
+def accept_all(body: Morphology) -> bool:
+    """True: no further limits."""
+    return True
+
+
+@dataclass(frozen=True)
+class Space:
+    """Which bodies there may be.
+
+    Attributes:
+        catalogue: all types of modules by name and alias.
+        modules: names of the types that bodies are grown of, beside the core.
+        core: name of the core's type.
+        min_modules: fewest modules, the core included.
+        max_modules: most of them.
+        min_hinges: fewest hinges.
+        max_hinges: most of them.
+        max_length: longest edge of the bounding box at rest [m]; None: any.
+        max_mass: [kg]; None: any.
+        accepts: whether a body within these bounds will do.
+    """
+
+    catalogue: Mapping[str, ModuleType]
+    modules: tuple[str, ...]
+    core: str
+    min_modules: int
+    max_modules: int
+    min_hinges: int
+    max_hinges: int
+    max_length: float | None = None
+    max_mass: float | None = None
+    accepts: Callable[[Morphology], bool] = accept_all
+
+    @cached_property
+    def kinds(self) -> tuple[ModuleType, ...]:
+        """The types that bodies are grown of."""
+        return tuple(self.catalogue[name] for name in self.modules)
+
+    def refuses(self, body: Morphology) -> str | None:
+        """Why a body is not in the space.
+
+        Args:
+            body: any body.
+
+        Returns:
+            The reason, "expected X; found Y"; None where it is in the space.
+        """
+        strange = next((m.type for m in body.modules if m.type not in self.catalogue), None)
+        if strange is not None:
+            return f"expected types of modules of the catalogue; found {show(strange)}"
+        if body.overlaps:
+            return f"expected modules that do not overlap; found {' and '.join(body.overlaps[0])}"
+        counts = {"modules": body.num_modules, "hinges": body.num_hinges}
+        for what, count in counts.items():
+            least, most = getattr(self, f"min_{what}"), getattr(self, f"max_{what}")
+            if not least <= count <= most:
+                return f"expected {least} to {most} {what}; found {count}"
+        if self.max_mass is not None and body.mass > self.max_mass * SLACK:
+            return f"expected at most {self.max_mass:g} kg (max_mass); found {body.mass:g}"
+        if self.max_length is not None and body.length > self.max_length * SLACK:
+            return f"expected at most {self.max_length:g} m (max_length); found {body.length:g}"
+        if not self.accepts(body):
+            return "expected a body that there is room for; found one that is too large or complex"
+        return None
+
+
+def make_space(
+    bodies: Any,
+    catalogue: Mapping[str, ModuleType],
+    accepts: Callable[[Morphology], bool] = accept_all,
+) -> Space:
+    """The space of bodies that a configuration asks for.
+
+    Args:
+        bodies: settings like `episodes.bodies_config.BodiesConfig`.
+        catalogue: all types of modules by name and alias.
+        accepts: whether a body within the settings' bounds will do, such as a capacity.
+
+    Returns:
+        The space; its types go by their names, not by their aliases.
+
+    Raises:
+        InputError: there is no such type, one is named twice, or bodies need a hinge and none of
+            the types has one.
+    """
+
+    def find(place: str, name: str, core: bool) -> str:
+        kind = catalogue.get(name)
+        if kind is None or (kind.mount is None) != core:
+            known = sorted(n for n, k in catalogue.items() if (k.mount is None) == core)
+            raise InputError(f"bodies.{place}: expected one of {', '.join(known)}; found {name!r}")
+        return kind.name
+
+    names = [find(f"modules.{i}", name, False) for i, name in enumerate(bodies.modules)]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise InputError(f"bodies.modules.{i}: expected each type once; found {name!r} again")
+    if bodies.min_hinges > 0 and all(catalogue[name].hinge is None for name in names):
+        raise InputError(
+            f"bodies.modules: expected a type with a hinge, since min_hinges is "
+            f"{bodies.min_hinges}; found {', '.join(names)}"
+        )
+    return Space(
+        catalogue=catalogue,
+        modules=tuple(names),
+        core=find("core", bodies.core, True),
+        min_modules=bodies.min_modules,
+        max_modules=bodies.max_modules,
+        min_hinges=bodies.min_hinges,
+        max_hinges=bodies.max_hinges,
+        max_length=bodies.max_length,
+        max_mass=bodies.max_mass,
+        accepts=accepts,
+    )
+
+
+# ------------------------------------------------------------------------- what genotypes share
+
+
+def draw_within(
+    space: Space, develop: Callable[[Any], Morphology], draw: Callable[[], Any], place: str
+) -> Any:
+    """A random genome whose body is in the space.
+
+    Args:
+        space: the space.
+        develop: genome → body.
+        draw: draws any genome.
+        place: where the bounds were given, for the message.
+
+    Returns:
+        The first that is.
+
+    Raises:
+        InputError: none of many is.
+    """
+    reason: str | None = None
+    for _ in range(_RANDOM_TRIES):
+        genome = draw()
+        reason = space.refuses(develop(genome))
+        if reason is None:
+            return genome
+    raise InputError(
+        f"{place}: expected bounds that random bodies can keep; found none of {_RANDOM_TRIES} that "
+        f"does (the last: {reason})"
+    )
+
+
+def vary_within(
+    space: Space, develop: Callable[[Any], Morphology], vary: Callable[[], Any], parent: Any
+) -> Any:
+    """A varied genome whose body is in the space.
+
+    Args:
+        space: the space.
+        develop: genome → body.
+        vary: varies the parent; None where what it drew cannot be done.
+        parent: what is returned where none of `TRIES` is in the space.
+
+    Returns:
+        The first that is.
+    """
+    for _ in range(TRIES):
+        child = vary()
+        if child is not None and space.refuses(develop(child)) is None:
+            return child
+    return parent
+
+
+def check_within(space: Space, body: Morphology) -> None:
+    """Refuses a body that is not in the space.
+
+    Args:
+        space: the space.
+        body: any body.
+
+    Raises:
+        InputError: it is not; the message says why.
+    """
+    reason = space.refuses(body)
+    if reason is not None:
+        raise InputError(f"{body.path or body.name}: {reason}")

@@ -1,0 +1,365 @@
+"""The direct genotype: the genome is the body itself, and varies by edits.
+
+Modules keep their names while others come and go around them, so that what is known of a joint
+stays with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Unit
+
+from mjx_revolve.body.edits import (
+    add_module,
+    free_slots,
+    graft_subtree,
+    remove_module,
+    replace_module,
+    swap_subtrees,
+    turn_module,
+)
+from mjx_revolve.body.module_types import ModuleType, Slot
+from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.body.tree import Morphology
+from mjx_revolve.genotypes.genotype import (
+    Genotype,
+    Space,
+    check_within,
+    draw_within,
+    vary_within,
+)
+from mjx_revolve.genotypes.growth import Growth, name_place
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.schema import MisfitError, NonNegative, checked, read
+
+_Rate = Annotated[NonNegative, Unit("-")]
+
+
+@checked
+class TreeSettings:
+    """How often each mutation is drawn, relative to the others; one is made at a time.
+
+    Attributes:
+        add: a module at a free slot.
+        delete: a module that carries none.
+        prune: a module with all that it carries.
+        duplicate: a subtree, at a free slot.
+        mirror: the mirror image of a limb takes the place of what is at the opposite slot.
+        swap: two subtrees exchange their places.
+        retype: a module becomes one of another type.
+        turn: a module is turned with all that it carries.
+
+    Raises:
+        InputError: a number is negative, or all are 0.
+    """
+
+    # Choices: mostly small changes; as much comes as goes.
+    add: _Rate = 3.0
+    delete: _Rate = 2.0
+    prune: _Rate = 0.5
+    duplicate: _Rate = 0.5
+    mirror: _Rate = 1.0
+    swap: _Rate = 0.5
+    retype: _Rate = 1.5
+    turn: _Rate = 1.5
+
+    def __post_init__(self) -> None:
+        """Checks that something can happen."""
+        if not any(getattr(self, field.name) for field in fields(self)):
+            raise MisfitError("", "a number > 0 among the mutations", "all of them 0")
+
+
+def make_tree(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
+    """The direct genotype.
+
+    Args:
+        space: the bodies that there may be.
+        params: fields of `TreeSettings`.
+        place: where they were given, for messages.
+
+    Returns:
+        The genotype; its genomes are bodies.
+
+    Raises:
+        InputError: a parameter is wrong.
+    """
+    settings = read(TreeSettings, dict(params), f"{place}.params")
+    rates = {name: getattr(settings, name) for name in _MUTATIONS}
+    mutations = [_MUTATIONS[name] for name, rate in rates.items() if rate > 0.0]
+    bounds = np.cumsum([rate for rate in rates.values() if rate > 0.0])
+
+    def vary(rng: np.random.Generator, body: Morphology) -> Morphology | None:
+        """One mutation that is drawn; None where it cannot be done."""
+        drawn = np.searchsorted(bounds, rng.random() * bounds[-1], side="right")
+        return _try(mutations[drawn], space, rng, body)
+
+    def adopt(body: Morphology) -> Morphology:
+        check_within(space, body)
+        return replace(body, brain=None, path=None)
+
+    def from_plain(plain: Any) -> Morphology:
+        body = make_morphology(plain, space.catalogue, source="genome")
+        check_within(space, body)
+        return body
+
+    return Genotype(
+        name="tree",
+        random=lambda rng: draw_within(space, _same, lambda: _grow(space, rng), place),
+        mutate=lambda rng, body: vary_within(space, _same, lambda: vary(rng, body), body),
+        cross=lambda rng, a, b: vary_within(
+            space, _same, lambda: _try(_exchange, space, rng, a, b), a
+        ),
+        develop=_same,
+        adopt=adopt,
+        to_plain=Morphology.to_mapping,
+        from_plain=from_plain,
+    )
+
+
+def _same(body: Morphology) -> Morphology:
+    return body
+
+
+def _try(edit: Callable[..., Morphology | None], *arguments: Any) -> Morphology | None:
+    """An edit; None where it cannot be done."""
+    try:
+        return edit(*arguments)
+    except InputError:
+        return None
+
+
+def _pick(rng: np.random.Generator, things: Any) -> Any:
+    """One of several."""
+    return things[rng.integers(len(things))]
+
+
+def _turn(rng: np.random.Generator) -> float:
+    return 90.0 * int(rng.integers(4))
+
+
+# ------------------------------------------------------------------------- random bodies
+
+
+def _grow(space: Space, rng: np.random.Generator) -> Morphology:
+    """A body of a random size, grown at random slots."""
+    growth = Growth(space)
+    size = int(rng.integers(space.min_modules, space.max_modules + 1))
+    free = [(0, slot) for slot in growth.modules[0].kind.slots]
+    while free and len(growth.modules) < size:
+        parent, slot = free.pop(int(rng.integers(len(free))))
+        missing = space.min_hinges - growth.num_hinges
+        kinds = [
+            kind
+            for kind in space.kinds
+            if (kind.hinge is None or growth.num_hinges < space.max_hinges)
+            and (kind.hinge is not None or missing < size - len(growth.modules))
+            and (kind.slots or free)
+        ]
+        kind = _pick(rng, kinds or space.kinds)
+        index = growth.attach(parent, slot, kind, _turn(rng))
+        if index is not None:
+            free += [(index, slot) for slot in kind.slots]
+    return growth.finish("robot")
+
+
+# ------------------------------------------------------------------------- mutations
+
+
+def _path(body: Morphology, index: int) -> tuple[int, ...]:
+    """The slots from the core to a module."""
+    path: tuple[int, ...] = ()
+    while index > 0:
+        module = body.modules[index]
+        path, index = (module.slot, *path), module.parent
+    return path
+
+
+def _drawn(rng: np.random.Generator, body: Morphology) -> int | None:
+    """A module that is not the core."""
+    return int(rng.integers(1, body.num_modules)) if body.num_modules > 1 else None
+
+
+def _add(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+    free = free_slots(body)
+    if not free or body.num_modules >= space.max_modules:
+        return None
+    parent, slot = _pick(rng, free)
+    kind = _pick(rng, space.kinds)
+    name = name_place(kind, (*_path(body, parent), slot))
+    turn = _turn(rng)
+    return add_module(body, parent, slot, kind.name, turn, None, name, space.catalogue)
+
+
+def _delete(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+    carriers = {module.parent for module in body.modules}
+    leaves = [i for i in range(1, body.num_modules) if i not in carriers]
+    return remove_module(body, _pick(rng, leaves)) if leaves else None
+
+
+def _prune(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+    index = _drawn(rng, body)
+    return None if index is None else remove_module(body, index)
+
+
+def _duplicate(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+    index, free = _drawn(rng, body), free_slots(body)
+    if index is None or not free or body.num_modules + _size(body, index) > space.max_modules:
+        return None
+    parent, slot = _pick(rng, free)
+    return graft_subtree(body, parent, slot, body, index)
+
+
+def _swap(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+    one, other = _drawn(rng, body), _drawn(rng, body)
+    return None if one is None or other is None else swap_subtrees(body, one, other)
+
+
+def _retype(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+    index = _drawn(rng, body)
+    if index is None:
+        return None
+    others = [name for name in space.modules if name != body.modules[index].type]
+    if not others:
+        return None
+    return replace_module(body, index, _pick(rng, others), modules=space.catalogue)
+
+
+def _turn_one(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+    index = _drawn(rng, body)
+    if index is None:
+        return None
+    turned = body.modules[index].orientation + 90.0 * int(rng.integers(1, 4))
+    return turn_module(body, index, turned % 360.0)
+
+
+def _mirror(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+    index = _drawn(rng, body)
+    if index is None:
+        return None
+    limb = body.modules[index]
+    slot = opposite_slot(body.modules[limb.parent].kind, limb.slot)
+    if slot is None:
+        return None
+    image = mirror_limb(body, index)
+    if image is None:
+        return None
+    parent = body.modules[limb.parent].name
+    there = [m.name for m in body.modules if (m.parent, m.slot) == (limb.parent, slot)]
+    for name in there:
+        body = remove_module(body, name)
+    return graft_subtree(body, parent, slot, image, limb.name)
+
+
+_MUTATIONS: dict[str, Callable[[Space, np.random.Generator, Morphology], Morphology | None]] = {
+    "add": _add,
+    "delete": _delete,
+    "prune": _prune,
+    "duplicate": _duplicate,
+    "mirror": _mirror,
+    "swap": _swap,
+    "retype": _retype,
+    "turn": _turn_one,
+}
+
+
+def _size(body: Morphology, index: int) -> int:
+    """Modules of a subtree."""
+    inside = {index}
+    for i in range(index + 1, body.num_modules):
+        if body.modules[i].parent not in inside:
+            break
+        inside.add(i)
+    return len(inside)
+
+
+# ------------------------------------------------------------------------- symmetry
+
+
+def opposite_slot(kind: ModuleType, slot: int) -> int | None:
+    """The slot at the other side of a module.
+
+    Args:
+        kind: the module's type.
+        slot: one of its slots.
+
+    Returns:
+        Its mirror image, in the upright plane in which the module is attached, or of a core across
+        the slot's direction; None where there is none, or where it is the slot itself.
+    """
+    away = kind.slots[slot].direction if kind.mount is None else _side(kind)
+    found = _mirrored_slot(kind, slot, away)
+    return None if found == slot else found
+
+
+def mirror_limb(body: Morphology, index: int) -> Morphology | None:
+    """A body with the mirror image of a subtree in its place; only to be grafted from.
+
+    Seen from where it is attached, the image has left and right exchanged: turns the other way
+    round, and slots at the other side.
+
+    Args:
+        body: the robot.
+        index: of the subtree's first module, not the core.
+
+    Returns:
+        The body, whose poses are as they were; None where a slot has no mirror image.
+    """
+    modules = list(body.modules)
+    for i in range(index, index + _size(body, index)):
+        module, above = modules[i], body.modules[modules[i].parent]
+        slot: int | None = module.slot
+        if i > index:
+            slot = _mirrored_slot(above.kind, module.slot, _side(above.kind))
+        if slot is None:
+            return None
+        modules[i] = replace(module, slot=slot, orientation=-module.orientation % 360.0)
+    return replace(body, modules=tuple(modules))
+
+
+def _side(kind: ModuleType) -> tuple[float, float, float]:
+    """A module's direction to the right: across the one in which it is attached, and level."""
+    assert kind.mount is not None
+    x, y, _ = kind.mount.outward
+    return (y, -x, 0.0)
+
+
+def _mirrored_slot(kind: ModuleType, slot: int, away: tuple[float, float, float]) -> int | None:
+    """The slot that lies where another one lies in a mirror; `away` is the mirror's normal."""
+    normal = np.array(away)
+
+    def image(vector: Any) -> np.ndarray:
+        return np.array(vector) - 2 * (normal @ np.array(vector)) * normal
+
+    def pose(one: Slot, through: Callable[[Any], np.ndarray]) -> np.ndarray:
+        return np.concatenate([through(one.position), through(one.direction), through(one.up)])
+
+    wanted = pose(kind.slots[slot], image)
+    for number, other in kind.slots.items():
+        if np.allclose(pose(other, np.array), wanted, atol=1e-9):
+            return number
+    return None
+
+
+# ------------------------------------------------------------------------- crossover
+
+
+def _exchange(
+    space: Space, rng: np.random.Generator, a: Morphology, b: Morphology
+) -> Morphology | None:
+    """The first body with a subtree of the second in place of one of its own."""
+    given = _drawn(rng, b)
+    if given is None:
+        return None
+    taken = _drawn(rng, a)
+    if taken is None:
+        parent, slot = _pick(rng, free_slots(a))
+        return graft_subtree(a, parent, slot, b, given)
+    if a.num_modules - _size(a, taken) + _size(b, given) > space.max_modules:
+        return None
+    old = a.modules[taken]
+    parent = a.modules[old.parent].name
+    return graft_subtree(remove_module(a, taken), parent, old.slot, b, given)
