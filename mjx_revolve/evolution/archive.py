@@ -1,0 +1,289 @@
+"""An archive of the best of each kind, in cells of a grid or of a Voronoi tessellation.
+
+MAP-Elites after Mouret and Clune, "Illuminating search spaces by mapping elites", arXiv:1504.04909,
+2015; centroidal Voronoi cells (CVT) after Vassiliades, Chatzilygeroudis and Mouret, "Using
+centroidal Voronoi tessellations to scale up the multidimensional archive of phenotypic elites
+algorithm", IEEE Trans. Evolutionary Computation 22(4), 2018.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
+
+from mjx_revolve.episodes.bodies_config import ArchiveConfig
+from mjx_revolve.inputs.errors import InputError
+
+# What `insert` says of an individual.
+REFUSED, BETTER, NEW = 0, 1, 2
+# Samples per cell, and rounds, with which the tessellation is found. From evenly spread points, ten
+# rounds leave the cells' volumes within what so many samples can tell (14 % standard deviation).
+_SAMPLES, _ROUNDS = 50, 10
+
+
+@dataclass(frozen=True)
+class Archive:
+    """Cells and who is in them.
+
+    Attributes:
+        names: `[D]` of the axes: descriptors and measures.
+        lows: `[D]` where each axis begins, in its own unit.
+        highs: `[D]` where it ends.
+        shape: `[D]` cells along each axis of a grid, the last axis running fastest; empty where
+            cells are those of a tessellation.
+        centers: `[cells, D]` middles of the cells, in the axes' units.
+        ids: `[cells]` who is there; -1: nobody.
+        scores: `[cells]` their scores; NaN: nobody.
+        points: `[cells, D]` their descriptors, which may lie outside the axes; NaN: nobody.
+    """
+
+    names: tuple[str, ...]
+    lows: np.ndarray
+    highs: np.ndarray
+    shape: tuple[int, ...]
+    centers: np.ndarray
+    ids: np.ndarray
+    scores: np.ndarray
+    points: np.ndarray
+
+
+def make_archive(settings: ArchiveConfig, seed: int) -> Archive:
+    """An empty archive.
+
+    Args:
+        settings: axes and cells.
+        seed: of a tessellation; the same seed, the same cells.
+
+    Returns:
+        The archive.
+    """
+    axes = settings.axes.values()
+    lows, highs = (np.array([getattr(axis, end) for axis in axes]) for end in ("low", "high"))
+    if settings.type == "grid":
+        shape = tuple(axis.cells for axis in axes)
+        indices = np.indices(shape).reshape(len(shape), -1).T
+        centers = (indices + 0.5) / shape
+    else:
+        shape = ()
+        centers = _tessellate(settings.cells, len(lows), np.random.default_rng(seed))
+    count = len(centers)
+    return Archive(
+        names=tuple(settings.axes),
+        lows=lows,
+        highs=highs,
+        shape=shape,
+        centers=lows + (highs - lows) * centers,
+        ids=np.full(count, -1),
+        scores=np.full(count, np.nan),
+        points=np.full((count, len(lows)), np.nan),
+    )
+
+
+def _tessellate(cells: int, axes: int, rng: np.random.Generator) -> np.ndarray:
+    """Centroids `[cells, axes]` of Voronoi cells of the unit cube, by Lloyd's algorithm.
+
+    It begins with points that are spread evenly: those of Roberts, "The unreasonable effectiveness
+    of quasirandom sequences", 2018, shifted by chance.
+    """
+    samples = rng.random((_SAMPLES * cells, axes))
+    ratio = 1.0
+    for _ in range(64):  # the root of x^(axes + 1) = x + 1, to the last bit
+        ratio = (1.0 + ratio) ** (1.0 / (axes + 1))
+    steps = ratio ** -np.arange(1.0, axes + 1)
+    centers = (rng.random(axes) + np.arange(cells)[:, None] * steps) % 1.0
+    for _ in range(_ROUNDS):
+        nearest = KDTree(centers).query(samples)[1]
+        count = np.bincount(nearest, minlength=cells)[:, None]
+        sums = np.stack([np.bincount(nearest, x, cells) for x in samples.T], axis=1)
+        centers = np.where(count > 0, sums / np.maximum(count, 1), centers)
+    return centers
+
+
+def scale_points(archive: Archive, points: np.ndarray) -> np.ndarray:
+    """Points `[N, D]` in units of the axes: 0 at their lower, 1 at their upper end.
+
+    What lies outside is moved to the border; what is not finite becomes NaN.
+    """
+    points = np.where(np.isfinite(points), points, np.nan)
+    inside = np.clip(points, archive.lows, archive.highs)
+    return (inside - archive.lows) / (archive.highs - archive.lows)
+
+
+def cell_of(archive: Archive, points: np.ndarray) -> np.ndarray:
+    """Whose cells points belong to.
+
+    Args:
+        archive: the archive.
+        points: `[N, D]` descriptors. Those outside the axes belong to the cells at the border.
+
+    Returns:
+        `[N]` cells; -1 where a value is not finite. A point on a border of a grid belongs to the
+        cell above it. In a tessellation it is the nearest centre, each axis having length 1.
+    """
+    points = np.asarray(points, float)
+    found = np.full(len(points), -1)
+    known = np.isfinite(points).all(1)
+    if archive.shape:
+        inside = np.clip(points[known], archive.lows, archive.highs)
+        # In the order of `ribs`, so that both round alike.
+        steps = archive.shape * (inside - archive.lows) / (archive.highs - archive.lows)
+        indices = np.minimum(steps.astype(int), np.array(archive.shape) - 1)
+        found[known] = np.ravel_multi_index(tuple(indices.T), archive.shape)
+    elif known.any():
+        centers = scale_points(archive, archive.centers)
+        found[known] = cdist(scale_points(archive, points[known]), centers).argmin(1)
+    return found
+
+
+def insert(
+    archive: Archive, ids: np.ndarray, scores: np.ndarray, points: np.ndarray
+) -> tuple[Archive, np.ndarray]:
+    """Lets individuals into the archive, one after the other, the oldest first.
+
+    Args:
+        archive: as it was; it stays so.
+        ids: `[N]` from 0 on, unique; lower ones are older.
+        scores: `[N]` higher is better; one that is not finite is never let in.
+        points: `[N, D]` descriptors, see `cell_of`.
+
+    Returns:
+        The archive, and `[N]` what happened: `NEW` in a cell that was empty, `BETTER` than who was
+        there, or `REFUSED`. Who is as good as who is there is refused. One that was let in may have
+        been replaced by a later one.
+    """
+    cells, status = cell_of(archive, points), np.full(len(ids), REFUSED)
+    cells = np.where(np.isfinite(scores), cells, -1)
+    new = replace(
+        archive,
+        ids=archive.ids.copy(), scores=archive.scores.copy(), points=archive.points.copy(),
+    )  # fmt: skip
+    for row in np.argsort(ids):
+        cell = cells[row]
+        if cell < 0 or new.scores[cell] >= scores[row]:
+            continue
+        status[row] = BETTER if new.ids[cell] >= 0 else NEW
+        new.ids[cell], new.scores[cell], new.points[cell] = ids[row], scores[row], points[row]
+    return new, status
+
+
+# --- what is in it --------------------------------------------------------------------------------
+
+
+def filled(archive: Archive) -> np.ndarray:
+    """The cells in which somebody is."""
+    return np.flatnonzero(archive.ids >= 0)
+
+
+def coverage(archive: Archive) -> float:
+    """Share of the cells in which somebody is."""
+    return len(filled(archive)) / len(archive.ids)
+
+
+def qd_score(archive: Archive, offset: float = 0.0) -> float:
+    """Sum of the scores above `offset`, which should be the lowest that is possible.
+
+    Pugh, Soros and Stanley, "Quality diversity", Frontiers in Robotics and AI 3, 2016.
+    """
+    return float((archive.scores[filled(archive)] - offset).sum())
+
+
+def best(archive: Archive) -> int:
+    """The cell with the highest score, of equal ones that of the oldest; -1: nobody is there."""
+    cells = filled(archive)
+    if not cells.size:
+        return -1
+    return int(cells[np.lexsort((archive.ids[cells], -archive.scores[cells]))[0]])
+
+
+# --- to and from elsewhere ------------------------------------------------------------------------
+
+
+def to_arrays(archive: Archive) -> dict[str, np.ndarray]:
+    """An archive as named arrays, for a checkpoint; nothing is rounded."""
+    arrays = {field.name: np.asarray(getattr(archive, field.name)) for field in fields(archive)}
+    return arrays | {"shape": np.array(archive.shape, int)}
+
+
+def from_arrays(arrays: Mapping[str, np.ndarray]) -> Archive:
+    """The inverse of `to_arrays`."""
+    found: dict[str, Any] = {field.name: arrays[field.name] for field in fields(Archive)}
+    names, shape = (tuple(found[name].tolist()) for name in ("names", "shape"))
+    return Archive(**found | {"names": names, "shape": shape})
+
+
+def rows(archive: Archive) -> list[dict[str, float]]:
+    """Who is in the archive, cell by cell, as lines of a table.
+
+    Args:
+        archive: the archive.
+
+    Returns:
+        For each cell in which somebody is: cell, id, score, and for each axis its value by its
+        name, NAME_center and, in a grid, NAME_cell.
+    """
+    found = []
+    for cell in filled(archive).tolist():
+        row = {"cell": cell, "id": int(archive.ids[cell]), "score": float(archive.scores[cell])}
+        where = np.unravel_index(cell, archive.shape) if archive.shape else ()
+        for k, name in enumerate(archive.names):
+            row[name] = float(archive.points[cell, k])
+            row[f"{name}_center"] = float(archive.centers[cell, k])
+            if archive.shape:
+                row[f"{name}_cell"] = int(where[k])
+        found.append(row)
+    return found
+
+
+def to_ribs(archive: Archive, solutions: Sequence[object]) -> Any:
+    """The archive as one of `ribs` (pyribs), with the same cells.
+
+    Args:
+        archive: the archive.
+        solutions: what stands for each individual, in the order of `rows`; any objects.
+
+    Returns:
+        A `ribs.archives.GridArchive`, or a `CVTArchive`. `ribs` measures distances in the axes' own
+        units, which may be as different as metres and modules, so there each axis runs from 0 to 1.
+        The fields `id` and `descriptors` hold numbers and descriptors as they are here.
+
+    Raises:
+        InputError: `ribs` is not installed.
+        ValueError: there are not as many solutions as individuals.
+    """
+    if importlib.util.find_spec("ribs") is None:
+        raise InputError(
+            "archive: expected the package ribs; found none (pip install 'mjx_revolve[ribs]')"
+        )
+    from ribs.archives import CVTArchive, GridArchive
+
+    cells = filled(archive)
+    if len(solutions) != len(cells):
+        raise ValueError(f"expected {len(cells)} solutions; found {len(solutions)}")
+    usual: dict[str, Any] = {
+        "solution_dim": (), "solution_dtype": object,
+        "extra_fields": {"id": ((), np.int64), "descriptors": (len(archive.names), np.float64)},
+    }  # fmt: skip
+    points = archive.points[cells]
+    if archive.shape:
+        ranges = list(zip(archive.lows, archive.highs, strict=True))
+        # Without its own margin at the borders, cells are the same as here.
+        found = GridArchive(dims=archive.shape, ranges=ranges, epsilon=0.0, **usual)
+        measures = np.clip(points, archive.lows, archive.highs)
+    else:
+        ranges = [(0.0, 1.0)] * len(archive.names)
+        centers = scale_points(archive, archive.centers)
+        found = CVTArchive(centroids=centers, ranges=ranges, **usual)
+        measures = scale_points(archive, points)
+    if len(cells):
+        column = np.empty(len(cells), object)  # one by one: rows of rows must not become a matrix
+        for k, solution in enumerate(solutions):
+            column[k] = solution
+        found.add(column, archive.scores[cells], measures, id=archive.ids[cells],
+                  descriptors=points)  # fmt: skip
+    return found
