@@ -12,7 +12,7 @@ import io
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -89,9 +89,7 @@ def check_bodies(config: Config, pool: Pool) -> None:
     for place, names in named.items():
         for name in names:
             if name not in known and not (name == "novelty" and place.endswith("objectives")):
-                raise InputError(
-                    f"{place}: expected any of {', '.join(known)}; found {name!r}"
-                )
+                raise InputError(f"{place}: expected any of {', '.join(known)}; found {name!r}")
 
 
 def coevolve(

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.episodes.bodies_config import LearningConfig
@@ -174,9 +173,7 @@ def evaluate(
         # The last block is filled up with its own first row: one shape, one program.
         full = np.concatenate([part, np.full(size - len(part), part[0])])
         bodies, which = np.unique(owner[full], return_inverse=True)
-        blocks.append(
-            ([individuals[k].body for k in bodies], which.astype(np.int32), rows[full])
-        )
+        blocks.append(([individuals[k].body for k in bodies], which.astype(np.int32), rows[full]))
     scores = np.full(len(rows), np.nan, np.float32)
     measures: dict[str, np.ndarray] = {}
     for part, (found, figures) in zip(cut, pool.score(blocks, key), strict=True):

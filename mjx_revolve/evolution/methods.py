@@ -83,7 +83,9 @@ def _of_bodies(config: Config, pool: Pool) -> Method:
     fitness = pool.fitness
 
     def record(run: Run, search: coevolution.BodySearch) -> None:
-        run.append_lines("individuals.jsonl", (to_text(i, fitness.genotype) for i in search.newborn))
+        run.append_lines(
+            "individuals.jsonl", (to_text(i, fitness.genotype) for i in search.newborn)
+        )
         living = [individual.number for individual in search.living]
         line = {"generation": search.generation, "living": living}
         run.append_lines("generations.jsonl", [json.dumps(line, separators=(",", ":"))])
