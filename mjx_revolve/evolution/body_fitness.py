@@ -188,9 +188,8 @@ def make_body_fitness(config: Config) -> BodyFitness:
         brains = make_brains(bodies.brains, mixed.setup.controller)
     except InputError as error:
         text = str(error)
-        raise InputError(
-            text if text.startswith(config.source) else f"{config.source}: {text}"
-        ) from None
+        place = "" if text.startswith(config.source) else f"{config.source}: "
+        raise InputError(place + text) from None
 
     def accepts(body: Morphology) -> bool:
         return mixed.misfit(mixed.build(body)) is None

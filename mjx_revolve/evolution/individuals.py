@@ -26,6 +26,7 @@ class Individual:
         body: what has grown of it, not trimmed.
         brain: the one that it was born with; see `brains.Brains`.
         learnt: the best one of its life; None before that, and where every trial failed.
+        genes: `learnt` as genes of the body's own controller; None where there is none.
         score: of `learnt`; NaN where there is none.
         measures: of `learnt`, see `measures`.
         trials: brains that it has tried.
@@ -39,6 +40,7 @@ class Individual:
     body: Morphology
     brain: Any = field(repr=False)
     learnt: Any = field(default=None, repr=False)
+    genes: tuple[float, ...] | None = field(default=None, repr=False)
     score: float = float("nan")
     measures: Mapping[str, float] = field(default_factory=dict, repr=False)
     trials: int = 0
@@ -84,6 +86,7 @@ def to_record(individual: Individual, genotype: Genotype) -> dict[str, Any]:
         "descriptors": {name: float(x) for name, x in individual.descriptors.items()},
         "brain": individual.brain,
         "learnt": individual.learnt,
+        "genes": None if individual.genes is None else list(individual.genes),
         "genome": None if genome == body else genome,
         "body": body,
     }
@@ -108,7 +111,7 @@ def from_record(record: Any, genotype: Genotype, modules: Any, check: Any) -> In
         plain = record["body"] if record["genome"] is None else record["genome"]
         genome = genotype.from_plain(plain)
         score = record["score"]
-        learnt = record["learnt"]
+        learnt, genes = record["learnt"], record["genes"]
         found = Individual(
             number=int(record["id"]),
             parents=tuple(map(int, record["parents"])),
@@ -118,6 +121,7 @@ def from_record(record: Any, genotype: Genotype, modules: Any, check: Any) -> In
             body=make_morphology(record["body"], modules, allow_overlap=True),
             brain=check(record["brain"]),
             learnt=None if learnt is None else check(learnt),
+            genes=None if genes is None else tuple(map(float, genes)),
             score=float("nan") if score is None else float(score),
             measures={str(name): float(x) for name, x in record["measures"].items()},
             trials=int(record["trials"]),
@@ -127,7 +131,8 @@ def from_record(record: Any, genotype: Genotype, modules: Any, check: Any) -> In
     grown = genotype.develop(genome)
     if grown.modules != found.body.modules:
         raise InputError(
-            f"individual {found.number}: expected the body that its genome grows into; found another"
+            f"individual {found.number}: expected the body that its genome grows into; found "
+            "another one"
         )
     return replace(found, body=grown)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from mjx_revolve.episodes.bodies_config import LearningConfig
 from mjx_revolve.evolution.body_fitness import BodyFitness
-from mjx_revolve.evolution.brains import Layout
+from mjx_revolve.evolution.brains import Brains, Layout
 from mjx_revolve.evolution.individuals import Individual
 from mjx_revolve.evolution.pool import Pool
 from mjx_revolve.evolution.strategies import Strategy, make_strategy
@@ -99,16 +99,7 @@ def live(
         scored = evaluate(pool, [life.individual for life in lives], genes, key_starts)
         for life, (scores, measures) in zip(lives, scored, strict=True):
             _tell(life, learner, scores, measures, round_)
-    return [
-        replace(
-            life.individual,
-            learnt=None if life.learnt is None else brains.from_vector(life.learnt, life.layout),
-            score=life.best,
-            measures=life.measures or {},
-            trials=settings.trials,
-        )
-        for life in lives
-    ]
+    return [_end(life, brains, settings.trials) for life in lives]
 
 
 def _ask(life: _Life, learner: Strategy | None, settings: LearningConfig, round_: int) -> None:
@@ -141,6 +132,21 @@ def _tell(
     if not scores[best] <= life.best:
         life.best, life.learnt = float(scores[best]), life.tried[best]
         life.measures = {name: float(values[best]) for name, values in measures.items()}
+
+
+def _end(life: _Life, brains: Brains, trials: int) -> Individual:
+    """What comes of a life."""
+    if life.learnt is None:
+        return replace(life.individual, trials=trials)
+    genes = brains.express(life.learnt, life.layout)[life.layout.columns]
+    return replace(
+        life.individual,
+        learnt=brains.from_vector(life.learnt, life.layout),
+        genes=tuple(map(float, genes)),
+        score=life.best,
+        measures=life.measures or {},
+        trials=trials,
+    )
 
 
 def evaluate(

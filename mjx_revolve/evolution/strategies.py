@@ -20,6 +20,7 @@ import numpy as np
 import optax
 from evosax.algorithms import algorithms, distribution_based_algorithms
 
+from mjx_revolve.episodes.bodies_config import LearningConfig
 from mjx_revolve.episodes.config import EvolutionConfig
 from mjx_revolve.inputs.errors import InputError
 
@@ -236,7 +237,7 @@ def _constructor_settings(
     return keywords, used
 
 
-def make_strategy(config: EvolutionConfig, num_genes: int) -> Strategy:
+def make_strategy(config: EvolutionConfig | LearningConfig, num_genes: int) -> Strategy:
     """Builds the strategy that a configuration names.
 
     `config.strategy_params` may hold evosax's own parameters of the strategy, and where they apply
