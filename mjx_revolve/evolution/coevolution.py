@@ -385,7 +385,7 @@ def judge(config: Config, pool: Pool, search: BodySearch) -> Champion:
     winner = search.elites[int(np.argmax(means))]
     scores, measures = fresh([winner], REPORT_STREAM, REPORT_EPISODES)
     return Champion(
-        genes=own_genes(fitness, winner),
+        genes=np.array(winner.genes, np.float32),
         score=float(scores.mean()),
         std=float(scores.std()),
         origin=describe_origin(winner),
@@ -405,12 +405,6 @@ def brain_genes(fitness: BodyFitness, individual: Individual) -> np.ndarray:
     layout = fitness.layout(individual.body)
     brain = individual.brain if individual.learnt is None else individual.learnt
     return fitness.brains.express(fitness.brains.to_vector(brain, layout)[None], layout)[0]
-
-
-def own_genes(fitness: BodyFitness, individual: Individual) -> np.ndarray:
-    """`[n]` the same, as a fitness of this body alone takes it."""
-    columns = fitness.layout(individual.body).columns
-    return brain_genes(fitness, individual)[columns]
 
 
 def archive_table(search: BodySearch) -> str:

@@ -97,7 +97,7 @@ def _of_bodies(config: Config, pool: Pool) -> Method:
             return
         best = search.elites[0]
         run.save_champion(
-            coevolution.own_genes(fitness, best), best.body, score=best.score, final=False,
+            np.array(best.genes, np.float32), best.body, score=best.score, final=False,
             origin=f"{coevolution.describe_origin(best)}, {_UNJUDGED}", individual=best.number,
         )  # fmt: skip
 

@@ -146,7 +146,7 @@ def test_wrong_settings(folder, setting, message):
         ("world: lake", "bad.yaml: task: expected "),
         ("world: lake\ntask: {type: speed}", "bad.yaml: morphology: expected the path of a "
          "morphology YAML, or bodies: how they evolve; found nothing"),
-        (GOOD + "bodies: {genotype: tree}", "bad.yaml: morphology: expected none, as bodies evolve"),
+        (GOOD + "bodies: {genotype: tree}", "bad.yaml: morphology: expected none, as bodies ev"),
         (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0 [s]; found -3"),
         (GOOD + "  2: 3", "bad.yaml: task.2: expected the name of a setting"),
         (GOOD + "3: 3", "bad.yaml: 3: expected the name of a setting"),

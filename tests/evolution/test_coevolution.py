@@ -92,12 +92,22 @@ def test_learning_improves_and_is_what_counts(folder):
         assert score[0] == pytest.approx(individual.score, abs=1e-6)
 
 
+def watch(fitness, seen):
+    """Notes the arguments of all evaluations."""
+    inner = fitness.evaluate
+
+    def note(*arguments):
+        seen.append(arguments)
+        return inner(*arguments)
+
+    object.__setattr__(fitness, "evaluate", note)
+
+
 def test_blocks_hold_one_body_where_many_brains_are_tried(folder):
     for size, alone in ((1, False), (3, False), (4, True), (20, True)):
         config, pool = start(folder, {"learning": {"population_size": size}})
-        seen = []
-        inner = pool.fitness.evaluate
-        object.__setattr__(pool.fitness, "evaluate", lambda *a, i=inner: (seen.append(a), i(*a))[1])
+        seen: list = []
+        watch(pool.fitness, seen)
         live(pool, None, strangers(config, pool), jax.random.key(0))
         assert pool.fitness.alone == alone
         assert {len(genes) for _, _, genes, _ in seen} == {8}
