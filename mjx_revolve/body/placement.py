@@ -11,16 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.body.boxes import boxes_overlap, quarter_turn
-from mjx_revolve.body.module_types import ModuleType, Slot, Vector
+from mjx_revolve.body.module_types import ModuleType, Part, Slot, Vector
 from mjx_revolve.inputs.errors import InputError
 
 # Boxes are shrunk by this much at each face [m] before they are tested for overlap, thin ones by
 # half their half-edge at most. A choice: a brick's box stands 1.5 mm proud of its attachment faces,
 # so that two bricks on neighbouring faces of a third share 3 mm by design.
 OVERLAP_TOLERANCE = 0.002
-
-# Types whose geometry is remembered: the catalogue's, and those that modules' own `params` make.
-_MOST_SHAPES = 4096
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,10 +129,13 @@ def attach(
 
 
 class Layout(NamedTuple):
-    """All parts of a body at rest, and all of their boxes, part after part.
+    """All parts at rest and all of their boxes, part after part, of one body or several.
 
     Attributes:
-        module: `[npart]` index of each part's module.
+        parts: those that differ, each once.
+        kind: `[npart]` which of them each part is.
+        body: `[npart]` index of each part's body.
+        module: `[npart]` index of its module, counted through all bodies.
         position: `[npart, 3]` origin of the part's frame, core frame [m].
         rotation: `[npart, 3, 3]` core frame from part frame.
         low: `[npart, 3]` lowest corner of the part's boxes, part frame [m].
@@ -146,6 +146,9 @@ class Layout(NamedTuple):
         box_half: `[nbox, 3]` its half edges, part frame [m].
     """
 
+    parts: tuple[Part, ...]
+    kind: np.ndarray
+    body: np.ndarray
     module: np.ndarray
     position: np.ndarray
     rotation: np.ndarray
@@ -159,64 +162,87 @@ class Layout(NamedTuple):
     def box_centers(self) -> np.ndarray:
         """`[nbox, 3]` centres of the boxes, core frame [m]."""
         k = self.box_part
-        return self.position[k] + np.einsum("bij,bj->bi", self.rotation[k], self.box_position)
+        return self.position[k] + turned(self.rotation[k], self.box_position)
 
     def box_reaches(self) -> np.ndarray:
         """`[nbox, 3]` how far each box reaches from its centre along the core's axes [m]."""
-        return np.einsum("bij,bj->bi", np.abs(self.rotation[self.box_part]), self.box_half)
+        return turned(np.abs(self.rotation[self.box_part]), self.box_half)
+
+    def corners(self) -> np.ndarray:
+        """`[npart, 8, 3]` corners of the boxes around each part, part frame [m]."""
+        return np.where(_CORNERS, self.high[:, None], self.low[:, None])
+
+    def core_corners(self) -> np.ndarray:
+        """`[npart, 8, 3]` the same, core frame [m]."""
+        return self.position[:, None] + self.corners() @ self.rotation.swapaxes(1, 2)
 
 
-_shapes: dict[int, tuple[ModuleType, tuple[np.ndarray, ...]]] = {}
+_CORNERS = np.array(list(np.ndindex(2, 2, 2)), bool)
 
 
-def _shape(kind: ModuleType) -> tuple[np.ndarray, ...]:
-    """What a layout needs of a type: the same for all of its modules, so found once."""
-    # Types hold dictionaries and have no hash. The type is kept with its shape, so that no other
-    # comes to have its id.
-    if id(kind) not in _shapes:
-        if len(_shapes) >= _MOST_SHAPES:
-            _shapes.clear()
-        boxes = [(k, box) for k, part in enumerate(kind.parts) for box in part.boxes]
-        owner = np.array([k for k, _ in boxes])
-        shape = (
-            np.array([part.position for part in kind.parts], float),
-            np.array([part.bounds[0] for part in kind.parts], float),
-            np.array([part.bounds[1] for part in kind.parts], float),
-            np.searchsorted(owner, np.arange(len(kind.parts))),
-            owner,
-            np.array([box.position for _, box in boxes], float),
-            np.array([box.size for _, box in boxes], float) / 2,
-        )
-        _shapes[id(kind)] = kind, shape
-    return _shapes[id(kind)][1]
+def turned(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """`[n, 3]` vectors, each turned by its `[n, 3, 3]` matrix; bits do not depend on n."""
+    return (rotation @ vector[..., None])[..., 0]
 
 
-def lay_out(modules: Sequence[Module]) -> Layout:
-    """Where all parts and boxes of a body lie at rest.
+def counted(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Runs of some lengths: whose run each place lies in, and which place of the run it is."""
+    owner = np.repeat(np.arange(len(count)), count)
+    return owner, np.arange(len(owner)) - (np.cumsum(count) - count)[owner]
+
+
+def pairs_within(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of things of the same body, for which two lists are sorted.
 
     Args:
-        modules: a robot's modules.
+        first: `[n]` bodies of the things on the one side, in order.
+        second: `[m]` bodies of those on the other side, in order.
+
+    Returns:
+        `[pair]` indices into `first` and `[pair]` into `second`, sorted.
+    """
+    start, stop = (np.searchsorted(second, first, side=side) for side in ("left", "right"))
+    one, rank = counted(stop - start)
+    return one, start[one] + rank
+
+
+def lay_out(*bodies: Sequence[Module]) -> Layout:
+    """Where all parts and boxes lie at rest.
+
+    Args:
+        *bodies: the modules of each body.
 
     Returns:
         The layout.
     """
-    shapes = [_shape(m.kind) for m in modules]
-    place, low, high, main, owner, center, half = map(np.concatenate, zip(*shapes, strict=True))
-    parts, boxes = [len(s[0]) for s in shapes], [len(s[4]) for s in shapes]
-    module = np.repeat(np.arange(len(modules)), parts)
-    before = np.cumsum([0, *parts[:-1]]), np.cumsum([0, *boxes[:-1]])
+    modules = [m for body in bodies for m in body]
+    listed = [part for m in modules for part in m.kind.parts]
+    # Most modules share their type, and so its parts: what follows from a part is read once.
+    number: dict[int, int] = {}
+    kind = np.array([number.setdefault(id(part), len(number)) for part in listed])
+    given = {id(part): part for part in listed}
+    parts = tuple(given[key] for key in number)
+    boxes = [box for part in parts for box in part.boxes]
+    size = np.array([len(part.boxes) for part in parts])
+    bounds = np.array([part.bounds for part in parts])
+    module = counted(np.array([len(m.kind.parts) for m in modules]))[0]
     rotation = np.array([m.rotation for m in modules])[module]
     origin = np.array([m.position for m in modules])[module]
+    box_part, rank = counted(size[kind])
+    box = (np.cumsum(size) - size)[kind[box_part]] + rank
     return Layout(
+        parts=parts,
+        kind=kind,
+        body=np.repeat(np.arange(len(bodies)), [len(body) for body in bodies])[module],
         module=module,
-        position=origin + np.einsum("pij,pj->pi", rotation, place),
+        position=origin + turned(rotation, np.array([part.position for part in parts])[kind]),
         rotation=rotation,
-        low=low,
-        high=high,
-        main=main + np.repeat(before[1], parts),
-        box_part=owner + np.repeat(before[0], boxes),
-        box_position=center,
-        box_half=half,
+        low=bounds[kind, 0],
+        high=bounds[kind, 1],
+        main=np.cumsum(size[kind]) - size[kind],
+        box_part=box_part,
+        box_position=np.array([box.position for box in boxes])[box],
+        box_half=np.array([box.size for box in boxes])[box] / 2,
     )
 
 
@@ -239,7 +265,7 @@ def find_overlaps(
     center, turn = all_parts.position, all_parts.rotation
     half = all_parts.box_half[all_parts.main]
     half = half - np.minimum(OVERLAP_TOLERANCE, half / 2)
-    reach = np.einsum("pij,pj->pi", np.abs(turn), half)
+    reach = turned(np.abs(turn), half)
     rows = np.arange(len(center))
     if moved is not None:
         rows = rows[np.isin(all_parts.module, list(moved))]

@@ -163,10 +163,7 @@ class Morphology:
     @cached_property
     def corners(self) -> np.ndarray:
         """`[8 npart, 3]` corners of the boxes around each part at rest, core frame [m]."""
-        here, which = self.layout, np.array(list(np.ndindex(2, 2, 2)), bool)
-        local = np.where(which, here.high[:, None], here.low[:, None])
-        place = here.position[:, None] + np.einsum("pij,pcj->pci", here.rotation, local)
-        return frozen(place.reshape(-1, 3))
+        return frozen(self.layout.core_corners().reshape(-1, 3))
 
     @property
     def lowest(self) -> float:

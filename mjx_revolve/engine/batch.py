@@ -8,7 +8,7 @@ not from the bodies at hand: products with such numbers fold away while the step
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -16,6 +16,8 @@ import jax
 import numpy as np
 
 from mjx_revolve.body.module_types import ModuleType
+from mjx_revolve.body.placement import counted
+from mjx_revolve.engine.assembly import FRICTION, Assembly, assemble
 from mjx_revolve.engine.columns import (
     LIMIT_OVERSHOOT,
     Columns,
@@ -24,9 +26,9 @@ from mjx_revolve.engine.columns import (
     read_columns,
 )
 from mjx_revolve.engine.level import Laws, Level, Parts, Thrusters
-from mjx_revolve.engine.plant import Figure, Plant, actuator_places, figure_of
-from mjx_revolve.engine.robot import FRICTION, Robot
-from mjx_revolve.engine.thrusters import propeller_discs, stack_thrusters
+from mjx_revolve.engine.plant import Figure, Plant, figures_of, read_actuators
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.thrusters import read_thrusters
 from mjx_revolve.inputs.errors import InputError
 
 # What a row costs in a step beside its parts, in parts [-]; measured, alike under both drag laws.
@@ -122,72 +124,108 @@ class Bodies(NamedTuple):
     figure: Figure
 
 
-class Row(NamedTuple):
-    """A row of one robot.
+class Order(NamedTuple):
+    """The rows of robots: which bodies and parts they hold, and how they hang together.
+
+    Those of a robot stand in preorder, the child with the largest subtree last; all rows stand
+    robot after robot, the roots, which are no rows, not among them.
 
     Attributes:
-        body: MuJoCo's.
-        parts: rows of the fluid table.
-        rider: whether it is fixed to the body's first row.
-        slot: where it stands in the stack.
-        source: where its parent stands.
-        inner: whether it has children.
+        length: `[robots]` how many rows each has.
+        robot: `[row]` whose it is.
+        place: `[row]` which of its robot's rows.
+        body: `[row]` moving body that it is, or is fixed to.
+        rider: `[row]` whether it is fixed to the body's first row.
+        slot: `[row]` where it stands in the stack.
+        source: `[row]` where its parent stands.
+        inner: `[row]` whether it has children.
+        first: `[nbody]` the first row of each body, counted through all robots; -1 without one.
+        chunk: `[npart]` which of its body's rows a part stands in.
+        rank: `[npart]` which of the parts there that obey its laws it is.
     """
 
-    body: int
-    parts: tuple[int, ...]
-    rider: bool
-    slot: int
-    source: int
-    inner: bool
+    length: np.ndarray
+    robot: np.ndarray
+    place: np.ndarray
+    body: np.ndarray
+    rider: np.ndarray
+    slot: np.ndarray
+    source: np.ndarray
+    inner: np.ndarray
+    first: np.ndarray
+    chunk: np.ndarray
+    rank: np.ndarray
 
 
-def list_rows(columns: Columns, room: dict[Laws, int]) -> list[Row]:
-    """The rows of a robot, in preorder, the child with the largest subtree last.
+def order_rows(assembly: Assembly, columns: Columns, room: Mapping[Laws, int]) -> Order:
+    """The rows of robots.
 
     Args:
-        columns: of the robot.
+        assembly: of the robots.
+        columns: of the robots.
         room: how many parts of each kind a row holds.
 
     Returns:
         The rows.
     """
-    nbody = len(columns.parent)
-    chunks: dict[int, list[list[int]]] = {b: [[]] for b in range(1, nbody)}
-    counts: dict[int, list[dict[Laws, int]]] = {b: [{}] for b in range(1, nbody)}
-    for part, body in enumerate(columns.part_body.tolist()):
-        laws = columns.laws[part]
-        if body == 1 or laws not in room:
-            continue
-        spot = next((k for k, c in enumerate(counts[body]) if c.get(laws, 0) < room[laws]), None)
-        if spot is None:
-            spot = len(chunks[body])
-            chunks[body].append([])
-            counts[body].append({})
-        chunks[body][spot].append(part)
-        counts[body][spot][laws] = counts[body][spot].get(laws, 0) + 1
-    children: dict[int, list[int]] = {b: [] for b in chunks}
-    for b in range(2, nbody):
-        children[int(columns.parent[b])].append(b)
-    size: dict[int, int] = {}
+    nbody, parent = len(assembly.parent), assembly.parent.tolist()
+    # How many parts before each one are on its body and obey its laws.
+    rank = _ranks(columns.part_body * len(columns.laws) + columns.part_laws)
+    most = np.array([room.get(laws, nbody + len(rank)) for laws in columns.laws])
+    most = most[columns.part_laws]
+    below = np.array(parent)[columns.part_body] > 0  # a root has room for all of its parts
+    chunk = np.where(below, rank // most, 0)
+    rank = np.where(below, rank % most, rank)
+    pieces = np.ones(nbody, int)
+    np.maximum.at(pieces, columns.part_body, chunk + 1)
+    own = pieces.tolist()
+    size, children = list(own), [[] for _ in own]  # type: list[int], list[list[int]]
     for b in reversed(range(1, nbody)):
-        size[b] = len(chunks[b]) + sum(size[c] for c in children[b])
-    rows: list[Row] = []
+        if parent[b]:
+            size[parent[b]] += size[b]
+            children[parent[b]].append(b)
+    first, slot, source = [-1] * nbody, [0] * nbody, [0] * nbody
+    start = 0
+    for b in range(1, nbody):
+        if not parent[b]:  # a root stands before its rows, in slot 0
+            spot, start = start, start + size[b] - 1
+        else:
+            spot = first[b] + own[b]
+        left = sorted(reversed(children[b]), key=size.__getitem__)
+        for child in left:
+            first[child], spot = spot, spot + size[child]
+            source[child], slot[child] = slot[b], slot[b] + (child != left[-1])
+    rows = np.flatnonzero(parent)
+    rows = rows[np.argsort(np.array(first)[rows])]  # the bodies in the order of their rows
+    which, piece = counted(pieces[rows])
+    body = rows[which]
+    leaf = np.array([not below for below in children])[body]
+    base, rider = np.array(slot)[body], piece > 0
+    # A rider is its body's last child where it has no other one.
+    last = leaf & (piece == pieces[body] - 1)
+    robot = assembly.robot[body]
+    length = np.bincount(robot, minlength=len(assembly.roots))
+    return Order(
+        length=length,
+        robot=robot,
+        place=counted(length)[1],
+        body=body,
+        rider=rider,
+        slot=np.where(rider & ~last, base + 1, base),
+        source=np.where(rider, base, np.array(source)[body]),
+        inner=~rider & ~(leaf & (pieces[body] == 1)),
+        first=np.array(first),
+        chunk=chunk,
+        rank=rank,
+    )
 
-    def visit(body: int, slot: int, source: int) -> None:
-        below = sorted(children[body], key=lambda c: size[c])
-        riders = chunks[body][1:]
-        if body > 1:
-            inner = bool(below or riders)
-            rows.append(Row(body, tuple(chunks[body][0]), False, slot, source, inner))
-        for k, piece in enumerate(riders):
-            last = not below and k == len(riders) - 1
-            rows.append(Row(body, tuple(piece), True, slot if last else slot + 1, slot, False))
-        for k, child in enumerate(below):
-            visit(child, slot if k == len(below) - 1 else slot + 1, slot)
 
-    visit(1, 0, 0)
-    return rows
+def _ranks(key: np.ndarray) -> np.ndarray:
+    """`[n]` how many before each one have the same key."""
+    order = np.argsort(key, kind="stable")
+    found = np.empty(len(key), int)
+    found[order] = counted(np.unique(key, return_counts=True)[1])[1]
+    return found
 
 
 # ------------------------------------------------------------------ capacity
@@ -217,35 +255,23 @@ def fit_capacity(
     """
     if not robots:
         raise InputError("robots: expected at least one; found none")
-    all_columns = [read_columns(robot) for robot in robots]
-    world = robots[0].world
-    carries = any(c.parts.carried is not None for c in all_columns)
-    most: dict[Laws, int] = {}
-    most_root: dict[Laws, int] = {}
-    for columns in all_columns:
-        counts: dict[tuple[Laws, int], int] = {}
-        for laws, body in zip(columns.laws, columns.part_body.tolist(), strict=True):
-            # Nothing acts on what neither floats nor drags nor carries nor pushes.
-            if laws[:2] != ("off", "off") or laws.pushes or columns.parts.carried is not None:
-                counts[laws, body] = counts.get((laws, body), 0) + 1
-        for (laws, body), count in counts.items():
-            held = most_root if body == 1 else most
-            held[laws] = max(held.get(laws, 0), count)
-    every = sorted(most.keys() | most_root.keys())
-    points, root_points = 0, 0
-    if contact and world.bed is not None:
-        for columns in all_columns:
-            found = np.bincount(columns.point_body, minlength=len(columns.parent))
-            points = max(points, int(found[2:].max(initial=0)))
-            root_points = max(root_points, int(found[1]))
+    assembly = assemble_all(robots)
+    columns, world = read_columns(assembly), robots[0].world
+    carries = columns.parts.carried is not None
+    sizes = _sizes(assembly, columns)
+    # Nothing acts on what neither floats nor drags nor carries nor pushes.
+    every = [x for x in columns.laws if x[:2] != ("off", "off") or x.pushes or carries]
+    most = {laws: int(sizes.parts[laws].max()) for laws in every}
+    most_root = {laws: int(sizes.root_parts[laws].max()) for laws in every}
+    near = contact and world.bed is not None
     # The inertia box belongs to a body as a whole, and so does its submerged share: no riders.
     least = max(1, *most.values()) if world.drag == "inertia_box" and most else 1
     best: tuple[float, dict[Laws, int], int, int] | None = None
     for limit in range(least, max(9, least + 1)):
-        room = {laws: min(limit, most.get(laws, 1)) for laws in every}
-        listed = [list_rows(columns, room) for columns in all_columns]
-        count = max(1, rows, hinges, *map(len, listed))
-        slots = 1 + max((r.slot for x in listed for r in x), default=0)
+        room = {laws: min(limit, most[laws]) or 1 for laws in every}
+        order = order_rows(assembly, columns, room)
+        count = max(1, rows, hinges, int(order.length.max()))
+        slots = 1 + int(order.slot.max(initial=0))
         cost = count * (_ROW_COST + sum(room.values()))
         if best is None or cost < best[0]:
             best = (cost, room, count, slots)
@@ -254,26 +280,25 @@ def fit_capacity(
     if rows or hinges:
         # 2^n - 1 bodies are needed for n edges that do not lead to the largest subtree.
         slots = max(slots, int(np.log2(count + 2)))
-    largest = max(robot.num_hinges for robot in robots)
-    pairs = max(len(robot.morphology.hinge_neighbours()) for robot in robots)
+    largest, pairs = int(sizes.hinges.max()), int(sizes.pairs.max())
     if hinges > largest:
         pairs = hinges * (hinges - 1) // 2  # any two may share the core
     capacity = Capacity(
         hinges=max(largest, hinges),
-        thrusters=max(robot.num_thrusters for robot in robots),
+        thrusters=int(sizes.thrusters.max()),
         pairs=pairs,
         rows=count,
         slots=slots,
-        groups=tuple(Group(laws, room[laws], max(1, most_root.get(laws, 0))) for laws in every),
-        points=points,
-        root_points=root_points,
+        groups=tuple(Group(laws, room[laws], max(1, most_root[laws])) for laws in every),
+        points=int(sizes.points.max()) if near else 0,
+        root_points=int(sizes.root_points.max()) if near else 0,
         carries=carries,
         timestep=world.timestep,
-        nothing=_nothing(all_columns),
+        nothing=jax.tree.map(lambda x: x[-1:], columns.parts),
     )
     types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
     types |= {kind.name: kind for kind in kinds}
-    one = _pick_rows(all_columns[:1], capacity, [list_rows(all_columns[0], room)])
+    one = _pick_rows(assembly, columns, capacity, order_rows(assembly, columns, room))
     known = list(types.values())
     return replace(
         capacity, root=_constants(one[0], known, False), row=_constants(one[1], known, True)
@@ -365,60 +390,45 @@ def _is_square(kinds: Sequence[ModuleType]) -> bool:
 
 
 def _pick_rows(
-    listed: Sequence[Columns], capacity: Capacity, rows: Sequence[list[Row]]
+    assembly: Assembly, columns: Columns, capacity: Capacity, order: Order
 ) -> tuple[Level, Level]:
     """Roots `[1, R]` and rows `[rows, 1, R]` of R robots, all of their numbers."""
-    count = len(listed)
-    body = np.zeros((capacity.rows, count), int)
-    parts = {g.laws: np.zeros((capacity.rows, g.parts, count), int) for g in capacity.groups}
-    root_parts = {g.laws: np.zeros((g.root_parts, count), int) for g in capacity.groups}
-    points = np.zeros((capacity.rows, capacity.points, count), int) if capacity.points else None
-    root_points = np.zeros((capacity.root_points, count), int) if capacity.root_points else None
-    roots = np.zeros(count, int)
-    at_body = at_part = at_point = 0
-    riders: list[tuple[int, int]] = []
-    for r, (columns, own) in enumerate(zip(listed, rows, strict=True)):
-        roots[r] = at_body + 1
-        nothing = at_part + len(columns.laws)
-        body[:, r] = at_body
-        for laws, index in parts.items():
-            index[:, :, r] = nothing
-            held: Any = [
-                p for p in np.flatnonzero(columns.part_body == 1) if columns.laws[p] == laws
-            ]
-            root_parts[laws][:, r] = nothing
-            root_parts[laws][: len(held), r] = at_part + np.array(held, int)
-        if points is not None:
-            points[:, :, r] = at_point + len(columns.point_body)
-        if root_points is not None:
-            held = np.flatnonzero(columns.point_body == 1)
-            root_points[:, r] = at_point + len(columns.point_body)
-            root_points[: len(held), r] = at_point + held
-        for k, row in enumerate(own):
-            if row.rider:
-                riders.append((k, r))
-            else:
-                body[k, r] = at_body + row.body
-                if points is not None:
-                    held = np.flatnonzero(columns.point_body == row.body)
-                    points[k, : len(held), r] = at_point + held
-            for laws, index in parts.items():
-                held = [p for p in row.parts if columns.laws[p] == laws]
-                index[k, : len(held), r] = at_part + np.array(held, int)
-        at_body += len(columns.parent)
-        at_part += len(columns.laws) + 1
-        at_point += len(columns.point_body) + 1
-    alike = [_alike(columns, capacity.nothing) for columns in listed]
-    joined = alike[0]
-    if count > 1:
-        numbers = [(c.hinges, c.bodies, c.parts, c.points) for c in alike]
-        together = jax.tree.map(lambda *x: np.concatenate(x), *numbers)
-        joined = joined._replace(
-            hinges=together[0], bodies=together[1], parts=together[2], points=together[3]
-        )
+    count, rows = len(assembly.roots), capacity.rows
+    whose, on_root = assembly.robot[columns.part_body], assembly.parent[columns.part_body] == 0
+    body = np.zeros((rows, count), int)
+    body[order.place, order.robot] = np.where(order.rider, 0, order.body)
+    parts, root_parts = {}, {}
+    for group in capacity.groups:
+        ours = np.zeros(len(whose), bool)
+        if group.laws in columns.laws:
+            ours = columns.part_laws == columns.laws.index(group.laws)
+        # Past the end stands the part that does nothing.
+        index = np.full((rows, group.parts, count), len(whose))
+        k = np.flatnonzero(ours & ~on_root)
+        row = order.place[order.first[columns.part_body[k]] + order.chunk[k]]
+        index[row, order.rank[k], whose[k]] = k
+        parts[group.laws] = index
+        index = np.full((group.root_parts, count), len(whose))
+        k = np.flatnonzero(ours & on_root)
+        index[order.rank[k], whose[k]] = k
+        root_parts[group.laws] = index
+    points = root_points = None
+    if capacity.points or capacity.root_points:
+        held = columns.point_body
+        rank = _ranks(held)
+        owner, at_root = assembly.robot[held], assembly.parent[held] == 0
+        if capacity.points:
+            points = np.full((rows, capacity.points, count), len(held))
+            k = np.flatnonzero(~at_root)
+            points[order.place[order.first[held[k]]], rank[k], owner[k]] = k
+        if capacity.root_points:
+            root_points = np.full((capacity.root_points, count), len(held))
+            k = np.flatnonzero(at_root)
+            root_points[rank[k], owner[k]] = k
+    alike = _alike(columns, capacity.nothing)
     finish = lambda x: np.expand_dims(x, -2)  # noqa: E731
-    root = pick_level(joined, roots, root_parts, root_points, True, 1, finish)
-    level = pick_level(joined, body, parts, points, False, 1, finish)
+    root = pick_level(alike, assembly.roots, root_parts, root_points, True, 1, finish)
+    level = pick_level(alike, body, parts, points, False, 1, finish)
     return root, level
 
 
@@ -429,20 +439,9 @@ _OPTIONAL = (
 )  # fmt: skip
 
 
-def _nothing(listed: Sequence[Columns]) -> Parts:
-    """A part that does nothing, `[1]`, with the numbers of every law of any robot."""
-    last = lambda x: x[-1:]  # noqa: E731
-    found: Parts = jax.tree.map(last, listed[0].parts)
-    for columns in listed:
-        given = {name: getattr(columns.parts, name) for name in _OPTIONAL}
-        more = {name: jax.tree.map(last, x) for name, x in given.items() if x is not None}
-        found = replace(found, **more)
-    return found
-
-
 def _alike(columns: Columns, nothing: Parts) -> Columns:
     """Columns whose parts have all the numbers that `nothing` has."""
-    count = len(columns.laws) + 1
+    count = len(columns.part_laws) + 1
     wide = lambda x: np.broadcast_to(x, (count,))  # noqa: E731
     missing = {
         name: jax.tree.map(wide, getattr(nothing, name))
@@ -469,33 +468,19 @@ def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.flo
     unique: dict[int, Robot] = {id(robot): robot for robot in robots}
     place = {key: k for k, key in enumerate(unique)}
     pick = np.array([place[id(robot)] for robot in robots], int)
-    listed = [read_columns(robot) for robot in unique.values()]
-    room = {g.laws: g.parts for g in capacity.groups}
-    rows = []
-    for robot, columns in zip(unique.values(), listed, strict=True):
-        _check_fit(robot, columns, capacity)
-        rows.append(list_rows(columns, room))
-        _check_rows(robot, rows[-1], capacity)
-    root, level = _pick_rows(listed, capacity, rows)
-    names = [str(robot.morphology.name) for robot in unique.values()]
-    real = np.zeros((capacity.rows, 1, len(rows)), bool)
-    for r, own in enumerate(rows):
-        real[: len(own), 0, r] = [not row.rider for row in own]
+    assembly = assemble_all(list(unique.values()))
+    columns = read_columns(assembly)
+    _check_fit(assembly, columns, capacity)
+    order = order_rows(assembly, columns, {g.laws: g.parts for g in capacity.groups})
+    _check_rows(assembly, order, capacity)
+    root, level = _pick_rows(assembly, columns, capacity, order)
+    names = [str(body.name) for body in assembly.morphologies]
+    real = np.zeros((capacity.rows, 1, len(names)), bool)
+    real[order.place, 0, order.robot] = ~order.rider
     root = _leave_out(root, capacity.root, names, None)
     level = _leave_out(level, capacity.row, names, real)
-    orders = [
-        _order(robot, own, capacity) for robot, own in zip(unique.values(), rows, strict=True)
-    ]
-    order = {key: np.stack([x[key] for x in orders], -1) for key in orders[0]}
-    wires = [_wire(robot, own, capacity) for robot, own in zip(unique.values(), rows, strict=True)]
-    wire = {key: np.stack([x[key] for x in wires], -1) for key in wires[0]}
-    thrusters = stack_thrusters(
-        [[p.thruster for p in r.thruster_part if p.thruster] for r in unique.values()],
-        [propeller_discs(r) for r in unique.values()],
-        capacity.thrusters,
-        capacity.timestep,
-    )
-    figures = Figure(*np.array([figure_of(r) for r in unique.values()], float).T)
+    hanging = _hang(assembly, order, capacity)
+    figures = Figure(*(x.astype(float) for x in figures_of(assembly)))
 
     def wide(x: np.ndarray) -> np.ndarray:
         kinds = {"f": dtype, "i": np.int32, "b": bool}
@@ -506,50 +491,112 @@ def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.flo
         Bodies(
             root=root,
             rows=level,
-            thrusters=thrusters,
-            plant=replace(capacity.plant, **wire),  # type: ignore[arg-type]
+            thrusters=read_thrusters(assembly, capacity.thrusters),
+            plant=_wire(assembly, hanging["row"], capacity),
             figure=figures,
-            **order,
+            **hanging,
         ),
     )
 
 
-def _check_fit(robot: Robot, columns: Columns, capacity: Capacity) -> None:
-    """Refuses what there is no room for."""
-    name = robot.morphology.name
-    own: Any = []
-    if capacity.points or capacity.root_points:
-        own = np.bincount(columns.point_body, minlength=len(columns.parent))
-    held = columns.part_body == 1
-    sizes = [
-        ("hinges", robot.num_hinges, capacity.hinges),
-        ("thrusters", robot.num_thrusters, capacity.thrusters),
-        ("pairs of neighbouring hinges", len(robot.morphology.hinge_neighbours()), capacity.pairs),
-        ("contact points in a body", int(max(own[2:], default=0)), capacity.points),
-        ("contact points on the core's body", int(own[1]) if len(own) else 0, capacity.root_points),
-    ]
+def assemble_all(robots: Sequence[Robot]) -> Assembly:
+    """Robots of one world, one behind the other."""
+    [first, *rest] = robots
+    if not rest:
+        return first.assembly
+    for robot in rest:
+        if robot.world is not first.world and robot.world != first.world:
+            raise InputError(
+                f"robot {robot.morphology.name!r}: expected the world of "
+                f"{first.morphology.name!r}; found another one"
+            )
+    return assemble([robot.morphology for robot in robots], first.world)
+
+
+class _Sizes(NamedTuple):
+    """How large robots are, `[robots]` each, or by laws: what a capacity must have room for."""
+
+    hinges: np.ndarray
+    thrusters: np.ndarray
+    pairs: np.ndarray
+    points: np.ndarray
+    root_points: np.ndarray
+    parts: dict[Laws, np.ndarray]
+    root_parts: dict[Laws, np.ndarray]
+
+
+def _sizes(assembly: Assembly, columns: Columns) -> _Sizes:
+    """How large robots are."""
+    robots, nbody, roots = len(assembly.roots), len(assembly.parent), assembly.roots
+
+    def most(held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of things on bodies, those on each robot's root, and the most on another body of it."""
+        count = np.bincount(held, minlength=nbody)
+        on_root = count[roots]
+        count[[0, *roots]] = 0
+        return on_root, np.maximum.reduceat(count, roots)
+
+    by_laws = {
+        laws: most(columns.part_body[columns.part_laws == k]) for k, laws in enumerate(columns.laws)
+    }
+    root_points, points = most(columns.point_body)
+    return _Sizes(
+        hinges=np.bincount(assembly.robot[1:], minlength=robots) - 1,
+        thrusters=np.bincount(assembly.layout.body[assembly.thruster_row], minlength=robots),
+        pairs=np.array([len(body.hinge_neighbours()) for body in assembly.morphologies]),
+        points=points,
+        root_points=root_points,
+        parts={laws: x[1] for laws, x in by_laws.items()},
+        root_parts={laws: x[0] for laws, x in by_laws.items()},
+    )
+
+
+def _check_fit(assembly: Assembly, columns: Columns, capacity: Capacity) -> None:
+    """Refuses robots that are larger than there is room for."""
+    found = _sizes(assembly, columns)
     room = {group.laws: group for group in capacity.groups}
-    for laws in sorted(set(columns.laws)):
-        count = sum(1 for k in np.flatnonzero(held) if columns.laws[k] == laws)
+    sizes = [
+        ("hinges", found.hinges, capacity.hinges),
+        ("thrusters", found.thrusters, capacity.thrusters),
+        ("pairs of neighbouring hinges", found.pairs, capacity.pairs),
+    ]
+    if capacity.points or capacity.root_points:
+        sizes += [
+            ("contact points in a body", found.points, capacity.points),
+            ("contact points on the core's body", found.root_points, capacity.root_points),
+        ]
+    for laws in columns.laws:
         if laws in room:
-            sizes.append(("parts on the core's body", count, room[laws].root_parts))
+            sizes.append(
+                ("parts on the core's body", found.root_parts[laws], room[laws].root_parts)
+            )
         elif laws[:2] != ("off", "off") or laws.pushes:
+            part = int(np.argmax(columns.part_laws == columns.laws.index(laws)))
+            name = assembly.morphologies[assembly.layout.body[part]].name
             known = [tuple(x) for x in room]
             raise InputError(
                 f"robot {name!r}: expected parts under one of the laws {known} (buoyancy, drag, "
                 f"thruster); found {tuple(laws)}"
             )
-    for what, found, most in sizes:
-        if found > most:
-            raise InputError(f"robot {name!r}: expected at most {most} {what}; found {found}")
+    for what, counts, most in sizes:
+        if np.any(counts > most):
+            k = int(np.argmax(counts > most))
+            raise InputError(
+                f"robot {assembly.morphologies[k].name!r}: expected at most {most} {what}; found "
+                f"{counts[k]}"
+            )
 
 
-def _check_rows(robot: Robot, rows: list[Row], capacity: Capacity) -> None:
-    deepest = max((row.slot for row in rows), default=0)
-    if len(rows) > capacity.rows or deepest >= capacity.slots:
+def _check_rows(assembly: Assembly, order: Order, capacity: Capacity) -> None:
+    """Refuses robots that need more rows, or a deeper stack, than there is."""
+    deep = np.zeros(len(order.length), int)
+    np.maximum.at(deep, order.robot, order.slot)
+    wrong = (order.length > capacity.rows) | (deep >= capacity.slots)
+    if np.any(wrong):
+        k = int(np.argmax(wrong))
         raise InputError(
-            f"robot {robot.morphology.name!r}: expected at most {capacity.rows} rows, "
-            f"{capacity.slots} deep; found {len(rows)}, {deepest + 1} deep"
+            f"robot {assembly.morphologies[k].name!r}: expected at most {capacity.rows} rows, "
+            f"{capacity.slots} deep; found {order.length[k]}, {deep[k] + 1} deep"
         )
 
 
@@ -581,62 +628,54 @@ def _leave_out(level: Level, constant: Level, names: list[str], real: Any) -> Le
     return jax.tree_util.tree_map_with_path(compare, constant, level, is_leaf=lambda x: x is None)
 
 
-def _order(robot: Robot, rows: list[Row], capacity: Capacity) -> dict[str, np.ndarray]:
-    """How the rows of a robot hang together, padded."""
-    count = len(rows)
-    slot, source = np.zeros(capacity.rows, int), np.full(capacity.rows, -1)
+def _hang(assembly: Assembly, order: Order, capacity: Capacity) -> dict[str, np.ndarray]:
+    """How the rows of robots hang together, padded."""
+    count = len(assembly.roots)
+    at = order.place, order.robot
+    slot, inner = np.zeros((capacity.rows, count), int), np.zeros((capacity.rows, count), bool)
     # Padding writes where nobody reads any more: backwards it comes first, forwards last.
-    slot[:count] = [r.slot for r in rows]
-    source[:count] = [r.source for r in rows]
-    inner = np.zeros(capacity.rows, bool)
-    inner[:count] = [r.inner for r in rows]
-    hinge, row = _hinge_rows(robot, rows, capacity)
+    source = np.full((capacity.rows, count), -1)
+    slot[at], source[at], inner[at] = order.slot, order.source, order.inner
+    hinge = np.full((capacity.rows, count), capacity.hinges)
+    row = np.full((capacity.hinges, count), capacity.rows)
+    real = ~order.rider
+    place, robot = order.place[real], order.robot[real]
+    # Behind its root, a robot's bodies stand in the order of its hinges.
+    index = order.body[real] - assembly.roots[robot] - 1
+    hinge[place, robot], row[index, robot] = index, place
     return {
         "slot": slot,
         "source": source,
         "inner": inner,
         "hinge": hinge,
         "row": row,
-        "count": np.array(count),
+        "count": order.length,
     }
 
 
-def _hinge_rows(robot: Robot, rows: list[Row], capacity: Capacity) -> tuple[np.ndarray, np.ndarray]:
-    """`[rows]` the hinge of each row, and `[hinges]` the row of each hinge."""
-    hinge = np.full(capacity.rows, capacity.hinges)
-    row = np.full(capacity.hinges, capacity.rows)
-    m = robot.mj_model
-    for k, r in enumerate(rows):
-        if not r.rider:
-            index = int(m.jnt_qposadr[m.body_jntadr[r.body]]) - 7
-            hinge[k], row[index] = index, k
-    return hinge, row
-
-
-def _wire(robot: Robot, rows: list[Row], capacity: Capacity) -> dict[str, np.ndarray]:
-    """A robot's columns of the plant, padded."""
-    n = capacity.rows + capacity.thrusters
-    none = capacity.hinges + capacity.thrusters
-    row = _hinge_rows(robot, rows, capacity)[1]
-    low, high, source = np.zeros(n), np.zeros(n), np.full(n, none)
-    place = np.zeros((n, 3))
-    places, ranges = actuator_places(robot), robot.mj_model.actuator_ctrlrange
-    for index, actuator in enumerate(robot.servos):
-        k = int(row[index])
-        source[k], place[k] = index, places[index]
-        low[k], high[k] = ranges[actuator]
-    for index, actuator in enumerate(robot.thrusters):
-        k = capacity.rows + index
-        source[k], place[k] = capacity.hinges + index, places[robot.num_hinges + index]
-        low[k], high[k] = ranges[actuator]
-    first, second = np.full(capacity.pairs, n), np.full(capacity.pairs, n)
-    for k, (i, j) in enumerate(robot.morphology.hinge_neighbours()):
-        first[k], second[k] = row[i], row[j]
-    return {
-        "low": low,
-        "high": high,
-        "place": place,
-        "source": source,
-        "first": first,
-        "second": second,
-    }
+def _wire(assembly: Assembly, row: np.ndarray, capacity: Capacity) -> Plant:
+    """The plants of robots, padded; `row` of each hinge."""
+    n, robots = capacity.rows + capacity.thrusters, len(assembly.roots)
+    moved, jets = assembly.moved, assembly.layout.body[assembly.thruster_row]
+    robot = np.concatenate([assembly.robot[moved], jets])
+    hinge = moved - assembly.roots[assembly.robot[moved]] - 1
+    rank = counted(np.bincount(jets, minlength=robots))[1]
+    k = np.concatenate([row[hinge, assembly.robot[moved]], capacity.rows + rank])
+    low, high = np.zeros((2, n, robots))
+    place = np.zeros((n, 3, robots))
+    source = np.full((n, robots), capacity.hinges + capacity.thrusters)
+    low[k, robot], high[k, robot], place[k, :, robot] = read_actuators(assembly)
+    source[k, robot] = np.concatenate([hinge, capacity.hinges + rank])
+    first, second = np.full((2, capacity.pairs, robots), n)
+    for r, body in enumerate(assembly.morphologies):
+        pairs = np.array(body.hinge_neighbours(), int).reshape(-1, 2)
+        first[: len(pairs), r], second[: len(pairs), r] = row[pairs.T, r]
+    return replace(
+        capacity.plant,
+        low=low,
+        high=high,
+        place=place,
+        source=source,
+        first=first,
+        second=second,
+    )

@@ -1,6 +1,6 @@
-"""All numbers that the step needs of a compiled robot, one column for each body, part and point.
+"""All numbers that the step needs of robots, one column for each body, part and point.
 
-Read once from the MuJoCo model and the fluid table, for all bodies at a time; `pick` then takes the
+Read from the assembly and its fluid table, for all bodies at a time; `pick_level` then takes the
 columns of any bodies as the constants of a `Level`. Each kind of column ends, or for bodies begins,
 with one that stands for nothing: what rows and levels are padded with.
 """
@@ -14,6 +14,9 @@ import jax
 import mujoco
 import numpy as np
 
+from mjx_revolve.body.placement import counted, pairs_within, turned
+from mjx_revolve.engine.assembly import Assembly
+from mjx_revolve.engine.fluid_table import drag_law
 from mjx_revolve.engine.level import (
     Hinges,
     InertiaBox,
@@ -23,8 +26,7 @@ from mjx_revolve.engine.level import (
     Parts,
     Points,
 )
-from mjx_revolve.engine.robot import Robot
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.engine.mujoco_model import ellipsoid_fluid
 from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.spatial import SYM, clean
 from mjx_revolve.water.drag import ellipsoid_constants
@@ -40,21 +42,23 @@ KNEE = 0.75
 LOCKED = 1e30
 # Stands for infinity where arithmetic must stay finite.
 _FAR = 1e30
+# MuJoCo's `geom_fluid` where its ellipsoid law does not act.
+_NONE = np.zeros(12)
 
 
 class Columns(NamedTuple):
     """Leaves are NumPy arrays, component by component.
 
     Attributes:
-        hinges: `[nbody]`, by MuJoCo's bodies; 0, the world, is nothing, and so is the root's.
+        hinges: `[nbody]`, by the moving bodies; 0, the world, is nothing, and so is a root's.
         bodies: `[nbody]` mass, moment and inertia, and the inertia box or None.
         parts: `[npart + 1]` a `Parts` of all laws, in the order of the fluid table.
         points: `[npoint + 1]` (position, mass share), or None without a bed.
-        laws: `[npart]` of the parts.
-        part_body: `[npart]` MuJoCo's bodies that carry them.
+        laws: those that parts obey, in order.
+        part_laws: `[npart]` which of them each part obeys.
+        part_body: `[npart]` bodies that carry them, as `Assembly` numbers them.
         point_body: `[npoint]` likewise.
-        parent: `[nbody]` MuJoCo's parents.
-        frame: `[nbody, 3, 3]` MuJoCo's body frame from ours, whose z is the hinge.
+        frame: `[nbody, 3, 3]` body frame from ours, whose z is the hinge.
     """
 
     hinges: Hinges
@@ -62,21 +66,13 @@ class Columns(NamedTuple):
     parts: Parts
     points: Any
     laws: tuple[Laws, ...]
+    part_laws: np.ndarray
     part_body: np.ndarray
     point_body: np.ndarray
-    parent: np.ndarray
     frame: np.ndarray
 
 
 # ------------------------------------------------------------------ small algebra on columns
-
-
-def _rotations(quats: np.ndarray) -> np.ndarray:
-    """`[n, 4]` unit quaternions to `[n, 3, 3]`."""
-    found = np.zeros((len(quats), 9))
-    for matrix, quat in zip(found, quats, strict=True):
-        mujoco.mju_quat2Mat(matrix, quat)
-    return clean(found.reshape(-1, 3, 3))
 
 
 def _skews(r: np.ndarray) -> np.ndarray:
@@ -124,110 +120,82 @@ def _end(x: Any, blank: Any) -> np.ndarray:
 # ------------------------------------------------------------------ reading
 
 
-def read_columns(robot: Robot) -> Columns:
-    """Reads the columns of a robot.
+def read_columns(assembly: Assembly) -> Columns:
+    """Reads the columns of a robot, or of several one behind the other.
 
     Args:
-        robot: compiled.
+        assembly: of the robots.
 
     Returns:
         The columns.
-
-    Raises:
-        InputError: the model holds a joint that the population step cannot do; it is named.
     """
-    frame = _frames(robot)
+    table, count = assembly.fluid, len(assembly.parent)
+    frames = {axis: _z_frame(np.array(axis)) for axis in set(map(tuple, assembly.axis.tolist()))}
+    frame = np.array([frames[axis] for axis in map(tuple, assembly.axis.tolist())])
     points, touching = None, np.zeros(0, int)
-    if robot.world.bed is not None:
-        touching = robot.contact_body
-        place = np.einsum("pji,pj->pi", frame[touching], robot.contact_position)
-        count = np.maximum(np.bincount(touching, minlength=robot.mj_model.nbody), 1)
-        share = (robot.mj_model.body_mass / count)[touching]
+    if assembly.world.bed is not None:
+        touching, place = assembly.points
+        place = turned(frame[touching].swapaxes(1, 2), place)
+        share = assembly.mass / np.maximum(np.bincount(touching, minlength=count), 1)
         # A padded point has no mass, so its spring, damper and friction vanish.
-        points = (_vec(_end(place.reshape(-1, 3), 0.0)), _end(share, 0.0))
-    table = robot.fluid
-    pushing = np.isin(np.arange(len(table.volume)), robot.thruster_row)
+        points = (_vec(_end(place, 0.0)), _end(share[touching], 0.0))
+    pushing = np.zeros(len(table.volume), bool)
+    pushing[assembly.thruster_row] = True
+    each = list(zip(table.buoyancy, table.drag, pushing.tolist(), strict=True))
+    laws = sorted(set(each))
+    number = {law: k for k, law in enumerate(laws)}
     return Columns(
-        hinges=_read_hinges(robot, frame),
-        bodies=_read_bodies(robot, frame),
-        parts=_read_parts(robot, frame),
+        hinges=_read_hinges(assembly, frame),
+        bodies=_read_bodies(assembly, frame),
+        parts=_read_parts(assembly, frame),
         points=points,
-        laws=tuple(map(Laws, table.buoyancy, table.drag, pushing.tolist())),
+        laws=tuple(Laws(*law) for law in laws),
+        part_laws=np.array([number[law] for law in each]),
         part_body=table.body,
         point_body=touching,
-        parent=robot.mj_model.body_parentid,
         frame=frame,
     )
 
 
-def _frames(robot: Robot) -> np.ndarray:
-    """`[nbody, 3, 3]` MuJoCo's body frame from ours."""
-    m = robot.mj_model
-    frame = np.broadcast_to(np.eye(3), (m.nbody, 3, 3)).copy()
-    driven = {int(m.actuator_trnid[k, 0]) for k in robot.servos}
-    for body in range(1, m.nbody):
-        name, joint = m.body(body).name, int(m.body_jntadr[body])
-        kind = m.jnt_type[joint] if m.body_jntnum[body] == 1 else None
-        if body == 1 and kind == mujoco.mjtJoint.mjJNT_FREE:
-            continue
-        if body == 1 or kind != mujoco.mjtJoint.mjJNT_HINGE or np.any(m.jnt_pos[joint]):
-            raise InputError(
-                f"engine population: body {name!r}: expected one hinge at the body's origin below "
-                "one free root; use engine: mjx"
-            )
-        if joint not in driven:
-            raise InputError(f"engine population: joint {name!r}: expected a servo; found none")
-        frame[body] = _z_frame(m.jnt_axis[joint])
-    return frame
-
-
-def _read_hinges(robot: Robot, frame: np.ndarray) -> Hinges:
-    m = robot.mj_model
-    moving = np.arange(2, m.nbody)
-    joint = m.body_jntadr[moving]
-    servo = {int(m.actuator_trnid[k, 0]): k for k in robot.servos}
-    act = np.array([servo[int(j)] for j in joint], int)
-    dof = m.jnt_dofadr[joint]
-    up = frame[m.body_parentid[moving]].swapaxes(1, 2)
+def _read_hinges(assembly: Assembly, frame: np.ndarray) -> Hinges:
+    position, rotation = assembly.from_parents()
+    up = frame[assembly.parent].swapaxes(1, 2)
     # At rest, ours of the child seen from ours of the parent.
-    rest = up @ _rotations(m.body_quat[moving]) @ frame[moving]
-    toward = np.array([_z_frame(x) for x in clean(rest[:, :, 2])]).reshape(-1, 3, 3)
-    offset = np.einsum("bji,bj->bi", toward, rest[:, :, 0])[:, :2]
-    effort = _limits(m.actuator_forcerange[act], m.actuator_forcelimited[act])
-    target = _limits(m.actuator_ctrlrange[act], m.actuator_ctrllimited[act])
-    limits = _limits(m.jnt_range[joint], m.jnt_limited[joint])
-    strong = np.where(np.isfinite(effort[:, 1]), effort[:, 1], 1.0)
-    top = m.jnt_user[joint, 0] if m.nuser_jnt else np.full(len(joint), np.inf)
-    damping = m.dof_damping[dof]
+    rest = clean(up @ rotation @ frame)
+    known: dict[bytes, np.ndarray] = {}
+    keys = [axis.tobytes() for axis in rest[:, :, 2]]
+    for key, axis in zip(keys, rest[:, :, 2], strict=True):
+        if key not in known:
+            known[key] = _z_frame(axis)
+    toward = np.array([known[key] for key in keys])
+    offset = clean(turned(toward.swapaxes(1, 2), rest[:, :, 0]))
+    jointed = assembly.parent > 0
 
     def column(x: np.ndarray, blank: Any) -> np.ndarray:
-        """With the world's and the root's, which are nothing."""
-        none = np.broadcast_to(np.asarray(blank, float), (2, *x.shape[1:]))
-        return np.concatenate([none, x])
+        """Without the world's and the roots', which are nothing."""
+        return np.where(jointed.reshape(-1, *[1] * (x.ndim - 1)), x, blank)
 
-    pair = lambda x, low, high: (column(x[:, 0], low), column(x[:, 1], high))  # noqa: E731
-    motor = motor_line(top, effort[:, 1], damping)
+    effort, damping = assembly.effort, assembly.damping
+    low, high = assembly.range.T
+    zero = np.zeros(len(jointed))
+    motor = motor_line(assembly.speed, effort, damping)
+    limits = column(low, 0.0), column(high, 0.0)
     return Hinges(
         rotation=_mat(column(toward, np.eye(3))),
-        offset=pair(clean(offset), 1.0, 0.0),
-        position=_vec(column(np.einsum("bij,bj->bi", up, m.body_pos[moving]), 0.0)),
-        armature=column(m.dof_armature[dof], LOCKED),
+        offset=(column(offset[:, 0], 1.0), column(offset[:, 1], 0.0)),
+        position=_vec(column(turned(up, position), 0.0)),
+        armature=column(zero, LOCKED),
         damping=column(damping, 0.0),
-        gain=column(m.actuator_gainprm[act, 0], 0.0),
-        stiffness=column(-m.actuator_biasprm[act, 1], 0.0),
-        servo_damping=column(-m.actuator_biasprm[act, 2], 0.0),
-        effort=pair(effort, 0.0, 0.0),
-        target=pair(target, 0.0, 0.0),
-        range=pair(limits, -_FAR, _FAR),
-        stop=column(strong / LIMIT_OVERSHOOT, 0.0),
+        gain=column(assembly.stiffness, 0.0),
+        stiffness=column(assembly.stiffness, 0.0),
+        servo_damping=zero,
+        effort=(column(-effort, 0.0), column(effort, 0.0)),
+        target=limits,
+        range=(column(low, -_FAR), column(high, _FAR)),
+        stop=column(effort / LIMIT_OVERSHOOT, 0.0),
         motor=(column(motor[0], _FAR), column(motor[1], 0.0), column(motor[2], 1.0)),
-        base_inertia=column(_base_inertias(robot)[2:], 1.0),
+        base_inertia=column(_base_inertias(assembly), 1.0),
     )
-
-
-def _limits(ranges: np.ndarray, limited: np.ndarray) -> np.ndarray:
-    """`[n, 2]` ranges, infinite where there are none."""
-    return np.where(limited.astype(bool)[:, None], ranges, [-np.inf, np.inf])
 
 
 def motor_line(top: Any, effort: Any, damping: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -249,70 +217,96 @@ def motor_line(top: Any, effort: Any, damping: Any) -> tuple[np.ndarray, np.ndar
     return friction, np.where(limited, slope, 0.0), speed
 
 
-def _base_inertias(robot: Robot) -> np.ndarray:
+def _base_inertias(assembly: Assembly) -> np.ndarray:
     """For each body, the inertia about its hinge's axis of all that the hinge does not move.
 
     Bodies and the water that they carry, at rest; `[nbody]` [kg·m²].
     """
-    m, table, density = robot.mj_model, robot.fluid, robot.world.density
-    data = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, data)
-    turns = data.xmat.reshape(-1, 3, 3)
-    # Bodies and parts alike: whose, centre, axes, mass and inertia along the axes.
-    body = np.concatenate([np.arange(1, m.nbody), table.body])
-    at = np.einsum("pij,pj->pi", turns[table.body], table.position)
-    center = np.concatenate([data.xipos[1:], data.xpos[table.body] + at])
-    axes = np.concatenate([data.ximat[1:].reshape(-1, 3, 3), turns[table.body] @ table.rotation])
-    mass = np.concatenate([np.repeat(m.body_mass[1:, None], 3, 1), density * table.carried_mass])
-    inertia = np.concatenate([m.body_inertia[1:], density * table.carried_inertia])
-    moved = np.eye(m.nbody, dtype=bool)
-    for c in range(2, m.nbody):
-        moved[:, c] |= moved[:, m.body_parentid[c]]
-    axis, anchor = data.xaxis[m.body_jntadr], data.xpos
-    arm = np.cross(axis[:, None], center[None] - anchor[:, None])
-    swing = np.einsum("pji,bpj->bpi", axes, arm)
-    turn = np.einsum("pji,bj->bpi", axes, axis)
-    about = np.sum(mass * swing**2 + inertia * turn**2, -1)
-    return np.sum(np.where(moved[:, body], 0.0, about), 1)
+    table, layout, density = assembly.fluid, assembly.layout, assembly.world.density
+    count = len(assembly.parent)
+    axis = turned(assembly.rotation, assembly.axis)
+
+    def about(
+        owner: np.ndarray, center: np.ndarray, axes: np.ndarray, mass: Any, inertia: Any
+    ) -> np.ndarray:
+        """Of things on bodies: `[n, 3]` masses and `[n, 3, 3]` inertias along their axes."""
+        hinge, thing = pairs_within(assembly.robot, assembly.robot[owner])
+        moves = (owner[thing] >= hinge) & (owner[thing] < assembly.end[hinge])
+        hinge, thing = hinge[~moves], thing[~moves]
+        arm = np.cross(axis[hinge], center[thing] - assembly.position[hinge])
+        back = axes[thing].swapaxes(1, 2)
+        swing, turn = turned(back, arm), turned(back, axis[hinge])
+        found = np.sum(mass[thing] * swing**2 + turn * turned(inertia[thing], turn), 1)
+        return np.bincount(hinge, found, count)
+
+    bodies = np.arange(1, count)
+    center = assembly.position + turned(assembly.rotation, assembly.center)
+    mass = np.repeat(assembly.mass[1:, None], 3, 1)
+    total = about(bodies, center[1:], assembly.rotation[1:], mass, assembly.inertia[1:])
+    if not (np.any(table.carried_mass) or np.any(table.carried_inertia)):
+        return total
+    inertia = density * table.carried_inertia[:, None] * np.eye(3)
+    carried = density * table.carried_mass
+    # Parts are sorted by robots, as bodies are.
+    return total + about(table.body, layout.position, layout.rotation, carried, inertia)
 
 
-def _read_bodies(robot: Robot, frame: np.ndarray) -> tuple[Any, ...]:
+def _read_bodies(assembly: Assembly, frame: np.ndarray) -> tuple[Any, ...]:
     """Mass, moment, inertia about the origin, and the inertia box."""
-    m = robot.mj_model
-    back = frame.swapaxes(1, 2)
-    center = np.einsum("bij,bj->bi", back, m.body_ipos)
-    axes = back @ _rotations(m.body_iquat)
+    back, mass = frame.swapaxes(1, 2), assembly.mass
+    center = turned(back, assembly.center)
     x = _skews(center)
-    inertia = np.einsum("bij,bj,bkj->bik", axes, m.body_inertia, axes)
-    inertia = inertia - m.body_mass[:, None, None] * (x @ x)
+    inertia = back @ assembly.inertia @ frame - mass[:, None, None] * (x @ x)
     box = None
-    if robot.world.drag == "inertia_box":
+    if assembly.world.drag == "inertia_box":
         # MuJoCo: a uniform box of the same mass and principal inertia.
-        i = m.body_inertia
+        i, axes = _principal(assembly)
         edges = np.maximum(i[:, [1, 0, 0]] + i[:, [2, 2, 1]] - i, 0)
-        size = np.sqrt(6 * edges / np.maximum(m.body_mass, 1e-30)[:, None])
-        box = InertiaBox(_mat(axes), _vec(center), _vec(size))
-    return m.body_mass.copy(), _vec(m.body_mass[:, None] * center), _sym(inertia), box
+        size = np.sqrt(6 * edges / np.maximum(mass, 1e-30)[:, None])
+        box = InertiaBox(_mat(back @ axes), _vec(center), _vec(size))
+    return mass.copy(), _vec(mass[:, None] * center), _sym(inertia), box
 
 
-def _read_parts(robot: Robot, frame: np.ndarray) -> Parts:
+def _principal(assembly: Assembly) -> tuple[np.ndarray, np.ndarray]:
+    """`[nbody, 3]` principal inertias and `[nbody, 3, 3]` axes, body frame, as MuJoCo has them.
+
+    A body of equal inertias has no axes of its own; then its box is a matter of MuJoCo's method,
+    and of a body that is one box, that box's axes count.
+    """
+    table, parts = assembly.fluid, assembly.layout.parts
+    pieces = np.array([(p.mass > 0) + (p.ballast_mass > 0) for p in parts])[assembly.layout.kind]
+    single = np.bincount(table.body, pieces, len(assembly.parent)) == 1
+    moments, axes = np.zeros((len(single), 3)), np.tile(np.eye(3), (len(single), 1, 1))
+    quat, matrix = np.zeros(4), np.zeros(9)
+    for k in range(1, len(single)):
+        if single[k]:
+            [row] = np.flatnonzero((table.body == k) & (pieces > 0))
+            axes[k] = table.rotation[row]
+            moments[k] = np.diag(axes[k].T @ assembly.inertia[k] @ axes[k])
+            continue
+        mujoco.mju_eig3(moments[k], matrix, quat, assembly.inertia[k].ravel())
+        axes[k] = matrix.reshape(3, 3)
+    return moments, axes
+
+
+def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
     """All parts, with the numbers of every law that any of them obeys."""
-    table, world = robot.fluid, robot.world
+    table, world = assembly.fluid, assembly.world
     back = frame[table.body].swapaxes(1, 2)
     turn = clean(back @ table.rotation)
-    position = np.einsum("pij,pj->pi", back, table.position)
-    center = position + np.einsum("pij,pj->pi", turn, table.center_of_volume)
+    position = turned(back, table.position)
+    center = position + turned(turn, table.center_of_volume)
     # The part's axes in the frame that describes it: the body's where both have the same.
     square = np.all((turn == 0) | (np.abs(turn) == 1), (1, 2))
     swap = np.where(square[:, None, None], turn, np.eye(3))
-    along = lambda x: np.einsum("pij,pj->pi", swap, x)  # noqa: E731
-    size = lambda x: np.einsum("pij,pj->pi", np.abs(swap), x)  # noqa: E731
+    along = lambda x: turned(swap, x)  # noqa: E731
+    size = lambda x: turned(np.abs(swap), x)  # noqa: E731
     drags = set(table.drag)
-    linear = world.density * np.einsum("pij,pj,pkj->pik", turn, table.carried_mass, turn)
-    angular = world.density * np.einsum("pij,pj,pkj->pik", turn, table.carried_inertia, turn)
-    x = _skews(position)
     carried = None
     if np.any(table.carried_mass) or np.any(table.carried_inertia):
+        x, across = _skews(position), turn.swapaxes(1, 2)
+        linear = world.density * (turn * table.carried_mass[:, None]) @ across
+        angular = world.density * (turn * table.carried_inertia[:, None]) @ across
         carried = SpatialInertia(
             _sym(_end(angular - x @ linear @ x, 0.0)),
             _mat(_end(x @ linear, 0.0)),
@@ -340,33 +334,35 @@ def _read_parts(robot: Robot, frame: np.ndarray) -> Parts:
         drag_linear=_vec(_end(size(world.density * table.drag_linear), 0.0)) if facing else None,
         drag_angular=_vec(_end(size(world.density * table.drag_angular), 0.0)) if facing else None,
         carried=carried,
-        ellipsoid=_ellipsoids(robot, size) if "ellipsoid" in drags else None,
-        mounts=_mounts(robot, turn, position) if robot.thruster_row else None,
+        ellipsoid=_ellipsoids(assembly, size) if "ellipsoid" in drags else None,
+        mounts=_mounts(assembly, turn, position) if len(assembly.thruster_row) else None,
         **plate,
     )
 
 
-def _ellipsoids(robot: Robot, size: Any) -> Any:
+def _ellipsoids(assembly: Assembly, size: Any) -> Any:
     """Constants of MuJoCo's ellipsoid law of all parts."""
-    m, world = robot.mj_model, robot.world
-    fluid = m.geom_fluid[[m.geom(name).id for name in robot.part_geoms]]
+    table, world = assembly.fluid, assembly.world
+    known = [
+        ellipsoid_fluid(part.boxes[0].size) if drag_law(part, world) == "ellipsoid" else _NONE
+        for part in assembly.layout.parts
+    ]
+    fluid = np.array(known)[assembly.layout.kind]
     # Three columns of `geom_fluid` are along the geom's axes, and three about them.
     fluid = np.concatenate([fluid[:, :6], size(fluid[:, 6:9]), size(fluid[:, 9:])], 1)
-    half = _end(size(robot.fluid.half_size), 1.0)
+    half = _end(size(table.half_size), 1.0)
     return ellipsoid_constants(half, _end(fluid, 0.0), world.density, world.viscosity)
 
 
-def _mounts(robot: Robot, turn: np.ndarray, position: np.ndarray) -> Mounts:
-    count = len(position)
+def _mounts(assembly: Assembly, turn: np.ndarray, position: np.ndarray) -> Mounts:
+    count, rows = len(position), assembly.thruster_row
+    jets = [part.thruster for part in assembly.thruster_part if part.thruster is not None]
     which, axis, place = np.full(count, -1), np.zeros((count, 3)), np.zeros((count, 3))
     ratio = np.zeros(count)
-    pairs = zip(robot.thruster_row, robot.thruster_part, strict=True)
-    for index, (row, part) in enumerate(pairs):
-        thruster = part.thruster
-        assert thruster is not None
-        which[row], ratio[row] = index, thruster.torque_ratio
-        axis[row] = turn[row] @ np.asarray(thruster.axis)
-        place[row] = position[row] + turn[row] @ np.asarray(thruster.position)
+    which[rows] = counted(np.bincount(assembly.layout.body[rows]))[1]
+    ratio[rows] = [jet.torque_ratio for jet in jets]
+    axis[rows] = turned(turn[rows], np.array([jet.axis for jet in jets]))
+    place[rows] = position[rows] + turned(turn[rows], np.array([jet.position for jet in jets]))
     return Mounts(_end(which, -1), _vec(_end(axis, 0.0)), _vec(_end(place, 0.0)), _end(ratio, 0.0))
 
 

@@ -8,10 +8,13 @@ The tables come from the module types; where a part makes no choice of its own, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from mjx_revolve.body.exposure import exposed_shares
 from mjx_revolve.body.module_types import Part
+from mjx_revolve.body.placement import Layout
 from mjx_revolve.water.added_mass import box_added_mass, entrained_water
 from mjx_revolve.water.drag import face_drag_coefficients
 from mjx_revolve.water.lift_drag import LiftDrag
@@ -20,7 +23,7 @@ from mjx_revolve.water.world import World
 
 @dataclass(frozen=True)
 class FluidTable:
-    """Tables of a robot's parts; NumPy arrays, never traced.
+    """Tables of the parts of a robot, or of several one behind the other; NumPy, never traced.
 
     Attributes:
         body: `[npart]` MuJoCo body that carries the part.
@@ -94,75 +97,71 @@ def drag_law(part: Part, world: World) -> str:
 
 
 def make_fluid_table(
-    parts: list[Part],
-    body: list[int],
-    module: list[int],
-    position: list[np.ndarray],
-    rotation: list[np.ndarray],
-    exposed: np.ndarray,
-    world: World,
+    layout: Layout, body: np.ndarray, position: np.ndarray, rotation: np.ndarray, world: World
 ) -> FluidTable:
-    """Stacks the rows of all parts; drag and added mass act on exposed faces only.
+    """The rows of all parts; drag and added mass act on exposed faces only.
 
     Args:
-        parts: the parts, in the order of the modules.
-        body: of each part.
-        module: of each part.
-        position: of each part's frame, body frame [m].
-        rotation: of each part, body from part.
-        exposed: `[npart, 3]` from `exposure.exposed_shares`.
+        layout: of the parts at rest.
+        body: `[npart]` which moving body carries each.
+        position: `[npart, 3]` of each part's frame, body frame [m].
+        rotation: `[npart, 3, 3]` of each part, body from part.
         world: whose laws hold where a part has none of its own.
 
     Returns:
         The table.
     """
+    parts, kind, exposed = layout.parts, layout.kind, exposed_shares(layout)
+    # Once for each part that differs from the others.
     half = np.array([p.boxes[0].size for p in parts]) / 2
-    scale = np.array([p.added_mass_coefficient for p in parts])[:, None]
-    # Water that turns about an axis is pushed by the four faces beside it.
-    beside = (exposed[:, [1, 2, 0]] + exposed[:, [2, 0, 1]]) / 2
+    areas = np.array([p.face_areas for p in parts])
     mass, inertia = box_added_mass(half)
-    added_mass, added_inertia = scale * exposed * mass, scale * beside * inertia
+    scale = np.array([p.added_mass_coefficient for p in parts])[:, None]
     free = np.array([p.free_volume for p in parts])
     inside = entrained_water(half, free, np.array([p.entrained_water for p in parts]))
-    on = [world.added_mass and p.added_mass is not False for p in parts]
-    flooded = np.array([[world.added_mass]])
-    drag = [
-        face_drag_coefficients(np.array(p.boxes[0].size), p.face_areas, p.drag_coefficient, e)
-        for p, e in zip(parts, exposed, strict=True)
-    ]
-    areas = np.array([p.face_areas for p in parts])
+    on = np.array([[world.added_mass and p.added_mass is not False] for p in parts])
     upward = areas.argmax(-1)
     # The chord runs along the longer of the two edges that lie in the plate.
     forward = np.where(np.arange(3) == upward[:, None], -np.inf, half).argmax(-1)
-    plates = tuple(p.lift_drag or world.lift_drag for p in parts)
-    given = lambda name, usual: np.array(  # noqa: E731
-        [
-            np.asarray(getattr(plate, name) if getattr(plate, name) is not None else x, float)
-            for plate, x in zip(plates, usual, strict=True)
-        ]
+    plates = [p.lift_drag or world.lift_drag for p in parts]
+    buoyancy = ["off" if world.buoyancy == "off" else p.buoyancy or world.buoyancy for p in parts]
+    drag = [drag_law(p, world) for p in parts]
+
+    def given(name: str, usual: np.ndarray) -> np.ndarray:
+        found = zip((getattr(plate, name) for plate in plates), usual, strict=True)
+        return np.array([np.asarray(y if x is None else x, float) for x, y in found])[kind]
+
+    def each(values: list[Any]) -> tuple[Any, ...]:
+        return tuple(values[k] for k in kind.tolist())
+
+    # Water that turns about an axis is pushed by the four faces beside it.
+    beside = (exposed[:, [1, 2, 0]] + exposed[:, [2, 0, 1]]) / 2
+    added_mass = exposed * (scale * mass)[kind]
+    added_inertia = beside * (scale * inertia)[kind]
+    coefficient = np.array([p.drag_coefficient for p in parts])[kind]
+    drag_linear, drag_angular = face_drag_coefficients(
+        2 * half[kind], areas[kind], coefficient, exposed
     )
     return FluidTable(
-        body=np.array(body, int),
-        module=np.array(module, int),
-        position=np.array(position),
-        rotation=np.array(rotation),
-        half_size=half,
-        center_of_volume=np.array([p.displaced_center for p in parts], float),
-        volume=np.array([p.total_volume for p in parts]),
-        mass=np.array([p.total_mass for p in parts]),
+        body=body,
+        module=layout.module,
+        position=position,
+        rotation=rotation,
+        half_size=half[kind],
+        center_of_volume=np.array([p.displaced_center for p in parts], float)[kind],
+        volume=np.array([p.total_volume for p in parts])[kind],
+        mass=np.array([p.total_mass for p in parts])[kind],
         exposed=exposed,
-        face_area=exposed * areas,
-        buoyancy=tuple(
-            "off" if world.buoyancy == "off" else p.buoyancy or world.buoyancy for p in parts
-        ),
-        drag=tuple(drag_law(p, world) for p in parts),
-        drag_linear=np.array([d[0] for d in drag]),
-        drag_angular=np.array([d[1] for d in drag]),
+        face_area=exposed * areas[kind],
+        buoyancy=each(buoyancy),
+        drag=each(drag),
+        drag_linear=drag_linear,
+        drag_angular=drag_angular,
         added_mass=added_mass,
         added_inertia=added_inertia,
-        carried_mass=np.array(on)[:, None] * added_mass + flooded * inside[0],
-        carried_inertia=np.array(on)[:, None] * added_inertia + flooded * inside[1],
-        plate=plates,
+        carried_mass=on[kind] * added_mass + (world.added_mass * inside[0])[kind],
+        carried_inertia=on[kind] * added_inertia + (world.added_mass * inside[1])[kind],
+        plate=each(plates),
         plate_area=given("area", areas.max(-1)),
         plate_forward=given("forward", np.eye(3)[forward]),
         plate_upward=given("upward", np.eye(3)[upward]),

@@ -171,22 +171,17 @@ def make_levels(robot: Robot, contact: bool = True) -> Levels:
 
     Returns:
         The levels.
-
-    Raises:
-        InputError: the model holds a joint that the population step cannot do; it is named.
     """
-    columns = read_columns(robot)
+    assembly = robot.assembly
+    columns, parent = read_columns(assembly), assembly.parent.tolist()
     depth = {1: 0}
-    for body in range(2, len(columns.parent)):
-        depth[body] = depth[int(columns.parent[body])] + 1
+    for body in range(2, len(parent)):
+        depth[body] = depth[parent[body]] + 1
     ids = [[b for b in depth if depth[b] == d] for d in range(max(depth.values()) + 1)]
     made = [_make_level(columns, bodies, contact, d == 0) for d, bodies in enumerate(ids)]
     parents = tuple(
-        tuple(above.index(int(columns.parent[b])) for b in bodies)
-        for above, bodies in itertools.pairwise(ids)
+        tuple(above.index(parent[b]) for b in bodies) for above, bodies in itertools.pairwise(ids)
     )
-    m = robot.mj_model
-    joints = [int(m.body_jntadr[b]) for bodies in ids[1:] for b in bodies]
     return Levels(
         world=robot.world,
         root=made[0][0],
@@ -195,8 +190,9 @@ def make_levels(robot: Robot, contact: bool = True) -> Levels:
         bodies=tuple(map(tuple, ids)),
         frames=tuple(columns.frame[bodies] for bodies in ids),
         part_rows=tuple(rows for _, rows in made),
-        hinge_order=np.array([int(m.jnt_qposadr[j]) - 7 for j in joints], np.int32),
-        thrusters=read_thrusters(robot),
+        # Hinge k carries body k + 2: the root is 1.
+        hinge_order=np.array([b - 2 for bodies in ids[1:] for b in bodies], np.int32),
+        thrusters=read_thrusters(assembly, robot.num_thrusters),
         carries=columns.parts.carried is not None,
         robot=robot,
     )
@@ -209,7 +205,7 @@ def _make_level(
     held: dict[Laws, list[list[int]]] = {}
     for k, body in enumerate(bodies):
         for part in np.flatnonzero(columns.part_body == body):
-            lists = held.setdefault(columns.laws[part], [[] for _ in bodies])
+            lists = held.setdefault(columns.laws[columns.part_laws[part]], [[] for _ in bodies])
             lists[k].append(int(part))
     parts = {
         laws: _stack(rows)

@@ -103,7 +103,7 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         The engine; see `state.Engine`.
 
     Raises:
-        InputError: the model holds a joint that the water's tables cannot follow.
+        InputError: the world is not one that it can step.
     """
     m, world = robot.mj_model, robot.world
     solves = contact and world.bed is not None and world.bed.contact == "mjx"

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.body.placement import turned
+from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.robot import Robot
 
 
@@ -40,14 +42,28 @@ class Figure(NamedTuple):
 
 def figure_of(robot: Robot) -> Figure:
     """The size of a robot, in its world."""
-    body, world = robot.morphology, robot.world
+    return Figure(*(x.item() for x in figures_of(robot.assembly)))
+
+
+def figures_of(assembly: Assembly) -> Figure:
+    """The sizes of robots, in their world, `[robots]`."""
+    layout, table, world = assembly.layout, assembly.fluid, assembly.world
+    robots = len(assembly.morphologies)
+    first = np.searchsorted(layout.body, np.arange(robots))
+    boxes = np.searchsorted(layout.box_part, first)
+    center, reach = layout.box_centers(), layout.box_reaches()
+    extent = np.maximum.reduceat(center + reach, boxes) - np.minimum.reduceat(center - reach, boxes)
+    corners = layout.core_corners()
+    across = np.hypot(corners[..., 0], corners[..., 1])
+    mass = np.bincount(layout.body, table.mass)
+    displaced = world.density * np.bincount(layout.body, table.volume)
     return Figure(
-        length=body.length,
-        weight=body.mass * max(world.gravity, 1e-9),
-        lowest=body.lowest,
-        radius=body.radius,
-        sinks=world.buoyancy == "off" or world.density * body.volume < body.mass / 2,
-        num_hinges=body.num_hinges,
+        length=extent.max(1),
+        weight=mass * max(world.gravity, 1e-9),
+        lowest=-np.minimum.reduceat(corners[..., 2].min(1), first),
+        radius=np.maximum.reduceat(across.max(1), first),
+        sinks=(displaced < mass / 2) | (world.buoyancy == "off"),
+        num_hinges=np.array([float(body.num_hinges) for body in assembly.morphologies]),
     )
 
 
@@ -151,47 +167,49 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
 
     Args:
         robot: from `build_robot`.
-        order: `[nu]` MuJoCo's actuators in the order of an engine; by default hinges in the order
-            of the modules, then thrusters.
+        order: `[nu]` its actuators in the order of an engine; by default hinges in the order of the
+            modules, then thrusters.
 
     Returns:
         Its table, `[n, 1]`.
     """
-    m, own = robot.mj_model, actuators_of(robot).tolist()
-    rows = np.asarray(own if order is None else order, int)
-    source = np.array([own.index(k) for k in rows], np.int32)
-    row = {int(k): i for i, k in enumerate(source)}
-    names = tuple(m.actuator(k).name for k in own)
-    pairs = robot.morphology.hinge_neighbours()
-    low, high = m.actuator_ctrlrange[rows].reshape(-1, 2).T
+    body, (low, high, place) = robot.morphology, read_actuators(robot.assembly)
+    source = np.array(range(len(low)) if order is None else order, np.int32)
+    row = np.argsort(source)
+    names = tuple(
+        body.modules[k].name for k in (*body.hinges, *(index for index, _ in body.thrusters))
+    )
+    pairs = body.hinge_neighbours()
     ends = np.array([(row[i], row[j]) for i, j in pairs], np.int32).reshape(-1, 2)
     return Plant(
-        num_hinges=len(robot.servos),
-        num_thrusters=len(robot.thrusters),
+        num_hinges=robot.num_hinges,
+        num_thrusters=robot.num_thrusters,
         num_pairs=len(pairs),
         names=names,
         pairs=tuple(f"{names[i]}~{names[j]}" for i, j in pairs),
         timestep=robot.world.timestep,
-        low=low[:, None],
-        high=high[:, None],
-        place=actuator_places(robot)[source][..., None],
+        low=low[source, None],
+        high=high[source, None],
+        place=place[source][..., None],
         source=source[:, None],
         first=ends[:, :1],
         second=ends[:, 1:],
     )
 
 
-def actuator_places(robot: Robot) -> np.ndarray:
-    """`[nu, 3]` of hinges, then thrusters, at rest, core frame [m]."""
-    body, found = robot.morphology, []
-    for index in body.hinges:
-        module = body.modules[index]
-        assert module.kind.hinge is not None
-        found.append(module.position + module.rotation @ np.asarray(module.kind.hinge.anchor))
-    for index, k in body.thrusters:
-        module = body.modules[index]
-        part = module.kind.parts[k]
-        assert part.thruster is not None
-        at = np.asarray(part.position) + np.asarray(part.thruster.position)
-        found.append(module.position + module.rotation @ at)
-    return np.array(found, float).reshape(-1, 3)
+def read_actuators(assembly: Assembly) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Hinges of all robots, then thrusters of all: their least and greatest commands and places.
+
+    Args:
+        assembly: of the robots.
+
+    Returns:
+        `[n]` and `[n]` ends of the range [rad] or [-], and `[n, 3]` places at rest, core frame [m].
+    """
+    layout, rows, moved = assembly.layout, assembly.thruster_row, assembly.moved
+    jets = [part.thruster for part in assembly.thruster_part if part.thruster is not None]
+    at = np.array([jet.position for jet in jets], float).reshape(-1, 3)
+    thrusters = layout.position[rows] + turned(layout.rotation[rows], at)
+    ranges = np.array([jet.range for jet in jets], float).reshape(-1, 2)
+    low, high = np.concatenate([assembly.range[moved], ranges]).T
+    return low, high, np.concatenate([assembly.position[moved], thrusters])

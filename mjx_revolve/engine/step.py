@@ -149,7 +149,7 @@ def make_population_engine(robot: Robot, contact: bool = True) -> Engine:
         The engine.
 
     Raises:
-        InputError: the model holds something that the population step cannot do.
+        InputError: the world is not one that it can step.
     """
     levels = make_levels(robot, contact)
     check_timestep(robot)
@@ -158,9 +158,8 @@ def make_population_engine(robot: Robot, contact: bool = True) -> Engine:
 
 def level_plant(levels: Levels) -> Plant:
     """The plant of one robot in the order of its levels."""
-    robot = levels.robot
-    hinges = [robot.servos[k] for k in levels.hinge_order]
-    return plant_of(robot, [*hinges, *robot.thrusters])
+    robot, order = levels.robot, levels.hinge_order.tolist()
+    return plant_of(robot, [*order, *range(len(order), len(order) + robot.num_thrusters)])
 
 
 def robot_acceleration(

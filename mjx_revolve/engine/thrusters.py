@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.body.module_types import Thruster
+from mjx_revolve.body.placement import counted
+from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.level import Thrusters
-from mjx_revolve.engine.robot import Robot
 from mjx_revolve.water.thrusters import (
     dead_band_thrust,
     ideal_power,
@@ -27,44 +28,32 @@ from mjx_revolve.water.thrusters import (
 _NONE = Thruster(gain=0.0)
 
 
-def read_thrusters(robot: Robot) -> Thrusters:
-    """The thrusters of a robot, `[nthruster, 1]`."""
-    listed = [part.thruster for part in robot.thruster_part if part.thruster is not None]
-    discs = propeller_discs(robot)
-    return stack_thrusters([listed], [discs], len(listed), robot.world.timestep)
-
-
-def propeller_discs(robot: Robot) -> list[float]:
-    """Area of each propeller's disc: the circle in its box, seen along its axis [m²]."""
-    discs = []
-    for row, part in zip(robot.thruster_row, robot.thruster_part, strict=True):
-        assert part.thruster is not None
-        size = 2 * robot.fluid.half_size[row]
-        across = np.prod(size) / size
-        discs.append(float(np.pi / 4 * np.abs(np.asarray(part.thruster.axis)) @ across))
-    return discs
-
-
-def stack_thrusters(
-    listed: list[list[Thruster]], discs: list[list[float]], count: int, dt: float
-) -> Thrusters:
-    """Thrusters of several robots side by side.
+def read_thrusters(assembly: Assembly, count: int) -> Thrusters:
+    """The thrusters of robots side by side.
 
     Args:
-        listed: of each robot.
-        discs: areas of their propellers' discs [m²].
+        assembly: of the robots.
         count: how many a robot may have; the others do nothing.
-        dt: of a step [s].
 
     Returns:
         Tables `[count, robots]`.
     """
-    padded = [[*some, *[_NONE] * (count - len(some))] for some in listed]
-    disc = [[*some, *[0.0] * (count - len(some))] for some in discs]
+    robots, rows = len(assembly.morphologies), assembly.thruster_row
+    owner = assembly.layout.body[rows]
+    rank = counted(np.bincount(owner, minlength=robots))[1]
+    disc = np.zeros((count, robots))
+    padded = [[_NONE] * count for _ in range(robots)]
+    size = 2 * assembly.fluid.half_size[rows]
+    for k, part in enumerate(assembly.thruster_part):
+        assert part.thruster is not None
+        padded[owner[k]][rank[k]] = part.thruster
+        # The circle in its box, seen along its axis.
+        across = np.prod(size[k]) / size[k]
+        disc[rank[k], owner[k]] = np.pi / 4 * np.abs(np.asarray(part.thruster.axis)) @ across
 
     def column(look: Any, dtype: Any = np.float64) -> np.ndarray:
         return np.array([[look(t) for t in some] for some in padded], dtype).T.reshape(
-            count, len(padded)
+            count, robots
         )
 
     backward = lambda t: t.gain if t.gain_backward is None else t.gain_backward  # noqa: E731
@@ -81,14 +70,14 @@ def stack_thrusters(
         count=count,
         low=column(lambda t: t.range[0]),
         high=column(lambda t: t.range[1]),
-        kept=kept_share(column(lambda t: t.time_constant), dt),
+        kept=kept_share(column(lambda t: t.time_constant), assembly.world.timestep),
         delayed=column(lambda t: t.time_constant > 0, bool),
         backward=column(backward),
         forward=column(lambda t: t.gain),
         dead_low=column(lambda t: t.dead_band[0]),
         dead_high=column(lambda t: t.dead_band[1]),
         line=line,
-        disc=np.array(disc, float).T.reshape(count, len(padded)),
+        disc=disc,
     )
 
 

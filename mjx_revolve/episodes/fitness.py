@@ -31,7 +31,7 @@ from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.episodes.config import Config, load_config, make_config
 from mjx_revolve.episodes.evaluation import Setup, make_recorder, pick_water
-from mjx_revolve.episodes.scoring import WORST, judge_tracks, may_touch_bed
+from mjx_revolve.episodes.scoring import WORST, farthest, judge_tracks, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import start_pose
 from mjx_revolve.episodes.tasks import Task, find_task
@@ -309,15 +309,18 @@ class MixedFitness:
                 raise InputError(
                     f"robots: expected what `build` returns; found {type(robot).__name__}"
                 )
-            near = not self.touches and may_touch_bed(
-                self.setup.task, self.config.task, self.world, figure_of(robot)
-            )
-            if near:
+        bodies = pack_bodies(robots, self.capacity)
+        if not self.touches:
+            task, settings = self.setup.task, self.config.task
+            reach = farthest(settings, self.world, bodies.figure)
+            k = int(np.argmax(reach))
+            if may_touch_bed(task, settings, self.world, reach[k]):
                 raise InputError(
-                    f"robot {robot.morphology.name!r}: expected a body that cannot reach the bed, "
-                    "as the examples cannot; found one that may (give one like it as an example)"
+                    f"robot {robots[k].morphology.name!r}: expected a body that cannot reach the "
+                    "bed, as the examples cannot; found one that may (give one like it as an "
+                    "example)"
                 )
-        return pack_bodies(robots, self.capacity)
+        return bodies
 
     def misfit(self, robot: Robot) -> str | None:
         """Why there is no room for a body, in one line; None where there is."""
@@ -356,7 +359,8 @@ def make_fitness(config: Config | str | Path | Mapping[str, Any], **overrides: A
     world, task = _place(config)
     robot = _build(config, world, morphology)
     figure = figure_of(robot)
-    engine = make_engine(robot, config.engine, may_touch_bed(task, config.task, world, figure))
+    reach = farthest(config.task, world, figure)
+    engine = make_engine(robot, config.engine, may_touch_bed(task, config.task, world, reach))
     controller = _find_controller(config, engine.plant)
     return Fitness(Setup(config, world, task, controller, engine, figure), robot)
 
@@ -398,8 +402,8 @@ def make_mixed_fitness(
         check_timestep(robot)
     if not robots:
         raise InputError("examples: expected at least one morphology; found none")
-    figures = [figure_of(robot) for robot in robots]
-    touches = any(may_touch_bed(task, config.task, world, figure) for figure in figures)
+    reach = max(farthest(config.task, world, figure_of(robot)) for robot in robots)
+    touches = may_touch_bed(task, config.task, world, reach)
     capacity = fit_capacity(robots, kinds, touches, hinges, rows)
     example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
     controller = _find_controller(config, capacity.plant, example)

@@ -175,15 +175,14 @@ def farthest(settings: TaskConfig, world: World, figure: Figure) -> Any:
     return swum + figure.sinks * fall + figure.length
 
 
-def may_touch_bed(task: Task, settings: TaskConfig, world: World, figure: Figure) -> bool:
-    """Whether the bed is within reach of an episode; if not, the step needs no contact.
+def may_touch_bed(task: Task, settings: TaskConfig, world: World, reach: float) -> bool:
+    """Whether the bed is within `farthest` of an episode; if not, the step needs no contact.
 
-    Reach is what a robot at `_FASTEST` covers, plus its fall where the water does not carry it. An
+    That is what a robot at `_FASTEST` covers, plus its fall where the water does not carry it. An
     individual that outruns it counts as blown up, so nothing can pass through an absent bed unseen.
     """
     if world.bed is None:
         return False
-    reach = float(farthest(settings, world, figure))
     line = np.linspace(-reach, reach, 101)
     highest = float(np.max(bed_height(world.bed, *np.meshgrid(line, line))))
     return task.on_bed or world.surface_height - settings.depth - reach < highest

@@ -33,10 +33,10 @@ ELLIPSOID_COEFFICIENTS = (0.5, 0.25, 1.5, 1.0, 1.0)
 def face_drag_coefficients(
     size: np.ndarray,
     face_areas: np.ndarray,
-    drag_coefficient: float,
+    drag_coefficient: Any,
     exposed: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Quadratic drag of a box from its faces, per unit density.
+    """Quadratic drag of boxes from their faces, per unit density.
 
     Along axis i the pressure acts on the face A_i: F = ½ ρ C_d A_i |v| v. Turning about axis i,
     each strip of the two pairs of faces beside it meets the water at ω r; integrating ½ ρ C_d (ω
@@ -44,24 +44,22 @@ def face_drag_coefficients(
     law).
 
     Args:
-        size: `[3]` edges of the box [m].
-        face_areas: `[3]` area that faces each axis [m²].
-        drag_coefficient: C_d of a face that meets the flow [-].
-        exposed: `[3]` share of each pair of faces that the water reaches [-]; by default all.
+        size: `[..., 3]` edges of the box [m].
+        face_areas: `[..., 3]` area that faces each axis [m²].
+        drag_coefficient: `[...]` C_d of a face that meets the flow [-].
+        exposed: `[..., 3]` share of each pair of faces that the water reaches [-]; by default all.
 
     Returns:
-        `[3]` ½ C_d A [m²] and `[3]` the angular one [m⁵].
+        `[..., 3]` ½ C_d A [m²] and `[..., 3]` the angular one [m⁵].
     """
     b = np.asarray(size, np.float64)
     e = np.ones(3) if exposed is None else np.asarray(exposed, np.float64)
-    linear = 0.5 * drag_coefficient * e * np.asarray(face_areas, np.float64)
-    angular = []
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        # The faces across k are strips along j, and the other way round.
-        strips = e[k] * b[j] ** 4 + e[j] * b[k] ** 4
-        angular.append(drag_coefficient * b[i] * strips / 64)
-    return linear, np.array(angular)
+    drag = np.asarray(drag_coefficient, np.float64)[..., None]
+    linear = 0.5 * drag * e * np.asarray(face_areas, np.float64)
+    j, k = [1, 2, 0], [2, 0, 1]
+    # The faces across k are strips along j, and the other way round.
+    strips = e[..., k] * b[..., j] ** 4 + e[..., j] * b[..., k] ** 4
+    return linear, drag * b * strips / 64
 
 
 def quadratic_drag(rate: Scalar, coefficient: Scalar, share: Scalar) -> tuple[Scalar, Scalar]:

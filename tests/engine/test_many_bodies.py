@@ -16,9 +16,9 @@ import pytest
 
 from experiments.random_bodies import random_body
 from laboratory import QUICK, ROOT, WATER, accelerate, body, march, random_states, read, world
-from mjx_revolve import load_config, make_fitness, make_mixed_fitness
+from mjx_revolve import MODULES, load_config, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.control.controller import gene_places
-from mjx_revolve.engine.batch import fit_capacity, list_rows, pack_bodies, resize
+from mjx_revolve.engine.batch import fit_capacity, order_rows, pack_bodies, resize
 from mjx_revolve.engine.columns import read_columns
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.rows import Rows
@@ -131,7 +131,8 @@ def test_more_padding_and_more_riders_change_nothing():
     groups = tuple(g._replace(parts=1) for g in capacity.groups)
     single = resize(capacity, rows=40, slots=5, groups=groups)
     room = {g.laws: 1 for g in groups}
-    assert max(len(list_rows(read_columns(r), room)) for r in robots) > capacity.rows
+    order = order_rows(robots[0].assembly, read_columns(robots[0].assembly), room)
+    assert order.length[0] > capacity.rows
     again = mixed_acceleration(robots, single, 2, arrays)
     assert np.all(np.abs(again - found).max(0) < 1e-9 * scale)
 
@@ -141,16 +142,16 @@ def test_a_short_stack_holds_any_tree():
     tank = world(**WATER)
     for seed in range(12):
         robot = build_robot(random_body(seed, 2 + seed, 3), tank)
-        columns = read_columns(robot)
+        assembly = robot.assembly
+        columns = read_columns(assembly)
         for parts in (1, 2, 5):
-            rows = list_rows(columns, dict.fromkeys(columns.laws, parts))
-            assert 2 ** (max(r.slot for r in rows) + 1) - 1 <= len(rows) + 1
-            parents = robot.mj_model.body_parentid
+            rows = order_rows(assembly, columns, dict.fromkeys(columns.laws, parts))
+            assert 2 ** (rows.slot.max() + 1) - 1 <= rows.length[0] + 1 == len(rows.slot) + 1
             stack = {0: 1}  # the root
-            for row in rows:
-                host = row.body if row.rider else parents[row.body]
-                assert stack[row.source] == host
-                stack[row.slot] = None if row.rider else row.body
+            each = zip(rows.body, rows.rider, rows.source, rows.slot, strict=True)
+            for own, rider, source, slot in each:
+                assert stack[source] == (own if rider else assembly.parent[own])
+                stack[slot] = None if rider else own
 
 
 @pytest.mark.slow
@@ -363,8 +364,10 @@ def test_a_number_that_is_the_same_in_all_bodies_of_the_types_must_stay_so():
     tank = world(**WATER)
     capacity = fit_capacity([build_robot(body("snake"), tank)])
     assert capacity.row.hinges.damping > 0
-    other = build_robot(body("snake"), tank)
-    other.mj_model.dof_damping[6:] *= 2
+    hinge = MODULES["ActiveHinge"]
+    slow = replace(hinge, hinge=replace(hinge.hinge, speed=hinge.hinge.speed / 2))
+    path = ROOT / "morphologies" / "snake.yaml"
+    other = build_robot(load_morphology(path, MODULES | {"ActiveHinge": slow}), tank)
     with pytest.raises(InputError, match=r"'snake': hinges.damping: expected .* types of modules"):
         pack_bodies([other], capacity)
 

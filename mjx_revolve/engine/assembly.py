@@ -1,0 +1,241 @@
+"""Moving bodies and hinges of robots as arrays: what their MuJoCo models and their tables share.
+
+Modules that are welded together are one moving body. All robots of a batch are assembled at once,
+one behind the other, which costs little more than a single one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mjx_revolve.body.module_types import Part
+from mjx_revolve.body.morphology import Morphology
+from mjx_revolve.body.placement import Layout, lay_out, turned
+from mjx_revolve.engine.fluid_table import FluidTable, make_fluid_table
+from mjx_revolve.water.world import World
+
+# Error at which the servo gives its full torque [rad]. A choice: hobby servos are stiff.
+FULL_TORQUE_ERROR = 0.05
+# Share of the servo's effort that its gears' viscous friction takes at the speed limit [-]. A
+# choice; it is also what damps the servo, which has no velocity gain of its own.
+FRICTION = 1 / 5
+# A ballast is a point mass; MuJoCo wants some size, and a millimetre turns nothing [m].
+BALLAST_RADIUS = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """Robots as moving bodies, at rest: hinges at 0, each core at the origin of its own frame.
+
+    Moving bodies stand in preorder, those of one robot after those of another; 0 is the world. For
+    a robot by itself these are MuJoCo's numbers. NumPy arrays.
+
+    Attributes:
+        morphologies: of the robots.
+        world: around them.
+        layout: their parts at rest.
+        roots: `[robots]` the bodies that hold the cores; the hinges' bodies follow theirs in the
+            order of the modules.
+        robot: `[nbody]` whose each body is, -1 for the world.
+        names: `[nbody]` of the modules that the bodies are called after.
+        parent: `[nbody]` bodies that carry them, 0 for roots.
+        end: `[nbody]` behind the last body of each one's subtree.
+        position: `[nbody, 3]` of the body's frame, core frame [m]: hinges lie at its origin.
+        rotation: `[nbody, 3, 3]` core frame from body frame.
+        mass: `[nbody]` [kg].
+        center: `[nbody, 3]` centre of mass, body frame [m].
+        inertia: `[nbody, 3, 3]` about it, body frame [kg·m²].
+        axis: `[nbody, 3]` of the hinge, unit vector in the body's frame; anything for roots, as
+            below.
+        range: `[nbody, 2]` lowest and highest angle [rad].
+        effort: `[nbody]` largest torque of the servo [N·m].
+        speed: `[nbody]` its top speed [rad/s].
+        damping: `[nbody]` friction of the hinge [N·m·s/rad].
+        stiffness: `[nbody]` of the servo [N·m/rad].
+        fluid: tables of the parts.
+        thruster_row: `[nthruster]` their parts.
+    """
+
+    morphologies: tuple[Morphology, ...]
+    world: World
+    layout: Layout
+    roots: np.ndarray
+    robot: np.ndarray
+    names: tuple[str, ...]
+    parent: np.ndarray
+    end: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+    mass: np.ndarray
+    center: np.ndarray
+    inertia: np.ndarray
+    axis: np.ndarray
+    range: np.ndarray
+    effort: np.ndarray
+    speed: np.ndarray
+    damping: np.ndarray
+    stiffness: np.ndarray
+    fluid: FluidTable
+    thruster_row: np.ndarray
+
+    @property
+    def moved(self) -> np.ndarray:
+        """`[nhinges]` the bodies that hinges carry."""
+        return np.flatnonzero(self.parent)
+
+    @property
+    def thruster_part(self) -> tuple[Part, ...]:
+        """Each thruster's part."""
+        return tuple(self.layout.parts[k] for k in self.layout.kind[self.thruster_row])
+
+    def from_parents(self) -> tuple[np.ndarray, np.ndarray]:
+        """`[nbody, 3]` positions [m] and `[nbody, 3, 3]` rotations in the parents' frames."""
+        up = self.rotation[self.parent].swapaxes(1, 2)
+        return turned(up, self.position - self.position[self.parent]), up @ self.rotation
+
+    @cached_property
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """`[npoint]` body of each point that may touch the bed; `[npoint, 3]` body frame [m]."""
+        layout, table = self.layout, self.fluid
+        touching = np.array([part.contact for part in layout.parts])[layout.kind]
+        corners = layout.corners()[touching] @ table.rotation[touching].swapaxes(1, 2)
+        place = table.position[touching, None] + corners
+        return np.repeat(table.body[touching], 8), place.reshape(-1, 3)
+
+
+def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
+    """Assembles robots in a world.
+
+    Args:
+        morphologies: their bodies.
+        world: the water.
+
+    Returns:
+        The assembly.
+    """
+    modules = [module for body in morphologies for module in body.modules]
+    below: list[int] = []  # the moving body that each module is fixed to
+    above: list[int] = []  # the one that carries its children
+    parent, named, robot, roots = [0], [-1], [-1], []
+    for r, body in enumerate(morphologies):
+        first = len(above)
+        roots.append(len(parent))
+        for k, module in enumerate(body.modules, first):
+            if module.parent < 0 or module.kind.hinge is not None:
+                below.append(0 if module.parent < 0 else above[first + module.parent])
+                above.append(len(parent))
+                parent.append(below[-1])
+                named.append(k)
+                robot.append(r)
+                if module.parent < 0:
+                    below[-1] = above[-1]
+            else:
+                below.append(above[first + module.parent])
+                above.append(below[-1])
+    end = list(range(1, len(parent) + 1))
+    for k in reversed(range(1, len(parent))):
+        end[parent[k]] = max(end[parent[k]], end[k])
+    layout = lay_out(*(body.modules for body in morphologies))
+    # Of a module with a hinge, the first part stays with what it is attached to.
+    stays = np.append(True, np.diff(layout.module) > 0)
+    carrier = np.where(stays, np.array(below)[layout.module], np.array(above)[layout.module])
+    hinges = [modules[k].kind.hinge if p else None for k, p in zip(named, parent, strict=True)]
+    anchor = np.array([(0.0, 0.0, 0.0) if h is None else h.anchor for h in hinges])
+    rotation = np.array([np.eye(3), *(modules[k].rotation for k in named[1:])])
+    position = np.array([np.zeros(3), *(modules[k].position for k in named[1:])])
+    position += turned(rotation, anchor)
+    back = rotation[carrier].swapaxes(1, 2)
+    place = turned(back, layout.position - position[carrier])
+    turn = back @ layout.rotation
+    mass, center, inertia = _weigh(layout, carrier, place, turn, len(parent))
+    effort = np.array([1.0 if h is None else h.effort for h in hinges])
+    speed = np.array([1.0 if h is None else h.speed for h in hinges])
+    axis = np.array([(0.0, 0.0, 1.0) if h is None else h.axis for h in hinges])
+    damping = FRICTION * effort / speed
+    pushing = np.array([part.thruster is not None for part in layout.parts])[layout.kind]
+    return Assembly(
+        morphologies=tuple(morphologies),
+        world=world,
+        layout=layout,
+        roots=np.array(roots),
+        robot=np.array(robot),
+        names=("world", *(modules[k].name for k in named[1:])),
+        parent=np.array(parent),
+        end=np.array(end),
+        position=position,
+        rotation=rotation,
+        mass=mass,
+        center=center,
+        inertia=inertia,
+        axis=axis,
+        range=np.array([(0.0, 0.0) if h is None else h.range for h in hinges]),
+        effort=effort,
+        speed=speed,
+        damping=damping,
+        stiffness=np.minimum(
+            effort / FULL_TORQUE_ERROR,
+            _most_stiffness(mass, center, inertia, axis, damping, world.timestep),
+        ),
+        fluid=make_fluid_table(layout, carrier, place, turn, world),
+        thruster_row=np.flatnonzero(pushing),
+    )
+
+
+def _weigh(
+    layout: Layout, carrier: np.ndarray, place: np.ndarray, turn: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass, centre of mass and inertia about it of moving bodies, from their parts."""
+    parts, kind = layout.parts, layout.kind
+    ballast = np.array([part.ballast_mass for part in parts])
+    box = np.array([part.mass for part in parts])
+    at = np.array([part.ballast_position for part in parts], float)
+    own = np.array([part.center_of_mass for part in parts], float)
+    square = np.array([part.boxes[0].size for part in parts]) ** 2
+    around = box[:, None] / 12 * (square.sum(1, keepdims=True) - square)
+    around += 2 / 5 * BALLAST_RADIUS**2 * ballast[:, None]
+    inertias = _diagonal(around) + _steiner(box, own) + _steiner(ballast, at - own)
+
+    def total(x: np.ndarray) -> np.ndarray:
+        columns = x.reshape(len(x), -1).T
+        found = [np.bincount(carrier, column, count) for column in columns]
+        return np.stack(found, -1).reshape(count, *x.shape[1:])
+
+    weight = (box + ballast)[kind]
+    middle = place + turned(turn, own[kind])
+    mass = total(weight)
+    center = total(weight[:, None] * middle) / np.where(mass == 0, 1.0, mass)[:, None]
+    inertia = turn @ inertias[kind] @ turn.swapaxes(1, 2)
+    return mass, center, total(inertia + _steiner(weight, middle - center[carrier]))
+
+
+def _diagonal(x: np.ndarray) -> np.ndarray:
+    """`[n, 3]` to `[n, 3, 3]`."""
+    return x[:, None] * np.eye(3)
+
+
+def _steiner(mass: np.ndarray, arm: np.ndarray) -> np.ndarray:
+    """`[n, 3, 3]` inertias of point masses at `[n, 3]` arms."""
+    square = np.sum(arm**2, 1)[:, None, None] * np.eye(3)
+    return mass[:, None, None] * (square - arm[:, :, None] * arm[:, None])
+
+
+def _most_stiffness(
+    mass: np.ndarray,
+    center: np.ndarray,
+    inertia: np.ndarray,
+    axis: np.ndarray,
+    damping: np.ndarray,
+    dt: float,
+) -> np.ndarray:
+    """`[nbody]` the stiffest servos that suit the limb that they move and the time step.
+
+    MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d implicitly;
+    it is well damped while k dt² is at most 1.5 (I + d dt). Only hinges that carry next to nothing
+    are touched.
+    """
+    about = np.sum(axis * turned(inertia + _steiner(mass, center), axis), 1)
+    return 1.5 * (about / dt**2 + damping / dt)

@@ -1,0 +1,267 @@
+"""A robot as MuJoCo has it: the assembly written into a spec, and that compiled.
+
+Modules that are welded together become one MuJoCo body, so a spider has 9 moving bodies, but every
+part keeps its own geom. The models are for MJX, viewers and files; our own step knows the numbers
+before there is one.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_revolve.body.module_types import Part
+from mjx_revolve.body.morphology import Morphology
+from mjx_revolve.body.placement import Module
+from mjx_revolve.engine.assembly import BALLAST_RADIUS, Assembly
+from mjx_revolve.engine.fluid_table import drag_law
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.bed import sample_bed
+from mjx_revolve.water.drag import ELLIPSOID_COEFFICIENTS
+from mjx_revolve.water.thrusters import thrust as thruster_curve
+from mjx_revolve.water.world import World
+
+# Cells of a bed that MuJoCo's solver meets [m], and the most points along its side. A choice: in
+# the lake, chords of 1 m miss the dunes by 4 mm at most; a finer grid would fill megabytes.
+_GRID, _MOST_POINTS = 1.0, 1001
+# Contacts that MJX's solver has room for, if the robot does not lie on more. A choice.
+_LEAST_CONTACTS = 32
+# Corners within this of the outermost lie flush with it [m].
+_FLUSH = 1e-3
+
+# Colour of a module whose YAML gives none (Revolve's default grey).
+_GREY = (0.5, 0.5, 0.5)
+
+
+def compile_model(assembly: Assembly) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """Writes one robot's model and compiles it.
+
+    Args:
+        assembly: of the robot.
+
+    Returns:
+        The editable model, and the compiled one.
+
+    Raises:
+        InputError: MuJoCo refuses the model (a massless moving part, say).
+    """
+    [morphology], world = assembly.morphologies, assembly.world
+    spec = mujoco.MjSpec()
+    spec.modelname = str(morphology.name)
+    spec.compiler.degree = False
+    spec.nuser_jnt = 1
+    spec.option.timestep = world.timestep
+    spec.option.gravity = [0.0, 0.0, -world.gravity]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    # MuJoCo's own fluid stays off in every engine: hydrodynamics owns the water.
+    spec.option.density = 0.0
+    spec.option.viscosity = 0.0
+    _add_bed(spec, morphology, world)
+    _add_bodies(spec, assembly)
+    try:
+        return spec, spec.compile()
+    except ValueError as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"{morphology.path or morphology.name}: expected a body that MuJoCo can simulate; "
+            f"found: {reason}"
+        ) from None
+
+
+@lru_cache(maxsize=4096)
+def ellipsoid_fluid(size: tuple[float, float, float]) -> np.ndarray:
+    """`[12]` what MuJoCo's ellipsoid law needs of a box of these edges (`geom_fluid`)."""
+    spec = mujoco.MjSpec()
+    geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[edge / 2 for edge in size])
+    _make_ellipsoid(geom)
+    found: np.ndarray = spec.compile().geom_fluid[0].copy()
+    return found
+
+
+def _make_ellipsoid(geom: Any) -> None:
+    geom.fluid_ellipsoid = 1
+    geom.fluid_coefs = list(ELLIPSOID_COEFFICIENTS)
+
+
+def _quat(rotation: np.ndarray) -> np.ndarray:
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation, np.float64).ravel())
+    return quat
+
+
+def _add_bed(spec: mujoco.MjSpec, morphology: Morphology, world: World) -> None:
+    """The ground as a geom: to be seen, and with `contact: mjx` to be met by MuJoCo's solver."""
+    bed = world.bed
+    if bed is None:
+        return
+    half, points = bed.extent / 2, 201
+    common: dict[str, Any] = {"name": "bed", "contype": 0, "conaffinity": 0}
+    common["rgba"] = [0.76, 0.70, 0.50, 1.0]
+    if bed.contact == "mjx":
+        # Modules (contype 1) meet the bed (conaffinity 1), not each other. Its priority makes the
+        # bed's friction count, not the larger of the two.
+        common |= {"conaffinity": 1, "priority": 1, "friction": [bed.friction, 0.0, 0.0]}
+        # MuJoCo's least friction is 1e-5; MJX divides by it.
+        rough = bed.friction > 1e-5
+        common["condim"] = 3 if rough else 1
+        if rough:  # a round cone: the default pyramid loses 30 % of the friction across its edges
+            spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        # MJX's cost grows with the square of it; the deepest contacts are those that are kept.
+        most = max(_LEAST_CONTACTS, _flush_corners(morphology))
+        spec.add_numeric(name="max_contact_points", data=[most], size=1)
+        points = int(np.clip(bed.extent / _GRID + 1, points, _MOST_POINTS))
+    if bed.kind == "flat":
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[half, half, 1.0],
+            pos=[0, 0, bed.height],
+            **common,
+        )
+        return
+    heights = sample_bed(bed, points)
+    span = bed.highest - bed.height
+    spec.add_hfield(
+        name="bed",
+        nrow=heights.shape[0],
+        ncol=heights.shape[1],
+        size=[half, half, span, 1.0],
+        userdata=((heights - bed.height) / span).ravel(),
+    )
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="bed", pos=[0, 0, bed.height], **common
+    )
+
+
+def _flush_corners(morphology: Morphology) -> int:
+    """Most corners that touch a plane on which the robot lies, as it is at rest."""
+    corners = []
+    for module in morphology.modules:
+        for part in (part for part in module.kind.parts if part.contact):
+            for box in part.boxes:
+                signs = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+                place = np.asarray(part.position) + box.position + signs * box.size
+                corners.append(module.position + place @ module.rotation.T)
+    if not corners:
+        return 0
+    place = np.concatenate(corners)
+    high, low = place > place.max(0) - _FLUSH, place < place.min(0) + _FLUSH
+    return int(max(high.sum(0).max(), low.sum(0).max()))
+
+
+def _add_bodies(spec: mujoco.MjSpec, assembly: Assembly) -> None:
+    """Bodies with their joints and servos, parts and thrusters, module by module."""
+    [morphology], table = assembly.morphologies, assembly.fluid
+    place, turn = assembly.from_parents()
+    bodies = [spec.worldbody]
+    row = 0
+    for index, module in enumerate(morphology.modules):
+        if index == 0:
+            bodies.append(spec.worldbody.add_body(name=module.name))
+            bodies[1].add_freejoint(name="root")
+        if module.kind.hinge is not None:
+            number = len(bodies)
+            above = bodies[assembly.parent[number]]
+            quat = _quat(turn[number])
+            bodies.append(above.add_body(name=module.name, pos=place[number], quat=quat))
+            _add_hinge(spec, assembly, number, bodies[number])
+        for part in module.kind.parts:
+            carrier = bodies[table.body[row]]
+            pose = table.position[row], table.rotation[row]
+            _add_geoms(carrier, module, part, *pose, assembly.world)
+            if part.thruster is not None:
+                _add_thruster(spec, carrier, f"{module.name}/{part.name}", part, *pose)
+            row += 1
+
+
+def _add_hinge(spec: mujoco.MjSpec, assembly: Assembly, number: int, body: Any) -> None:
+    """The hinge that moves a body, and its servo."""
+    name, low_high = assembly.names[number], list(assembly.range[number])
+    effort, stiffness = assembly.effort[number], assembly.stiffness[number]
+    body.add_joint(
+        name=name,
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=list(assembly.axis[number]),
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        range=low_high,
+        damping=assembly.damping[number],
+        # MuJoCo has no speed limit; those who read the model find ours here.
+        userdata=[assembly.speed[number]],
+    )
+    spec.add_actuator(
+        name=name,
+        target=name,
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        gainprm=[stiffness] + [0.0] * 9,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        biasprm=[0.0, -stiffness, 0.0] + [0.0] * 7,
+        ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        ctrlrange=low_high,
+        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        forcerange=[-effort, effort],
+    )
+
+
+def _add_thruster(
+    spec: mujoco.MjSpec, body: Any, name: str, part: Part, place: np.ndarray, turn: np.ndarray
+) -> None:
+    """A thruster as stock MuJoCo can have it: a filtered force at a site, linear in the command.
+
+    Our engines take lag and limits from here and thrust from the thruster's own curve, which
+    MuJoCo cannot hold; its gain is the curve's slope between the ends of the command's range.
+    """
+    thruster = part.thruster
+    assert thruster is not None
+    axis = turn @ np.asarray(thruster.axis)
+    body.add_site(name=name, pos=place + turn @ np.asarray(thruster.position))
+    low, high = thruster.range
+    ends = thruster_curve(thruster, np.array([low, high]))
+    lag = thruster.time_constant > 0
+    spec.add_actuator(
+        name=name.split("/")[0],
+        target=name,
+        trntype=mujoco.mjtTrn.mjTRN_SITE,
+        gear=[*axis, *(-thruster.torque_ratio * axis)],
+        dyntype=mujoco.mjtDyn.mjDYN_FILTEREXACT if lag else mujoco.mjtDyn.mjDYN_NONE,
+        dynprm=[thruster.time_constant] + [0.0] * 9,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        gainprm=[float((ends[1] - ends[0]) / (high - low))] + [0.0] * 9,
+        biastype=mujoco.mjtBias.mjBIAS_NONE,
+        ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        ctrlrange=[low, high],
+    )
+
+
+def _add_geoms(
+    body: Any, module: Module, part: Part, place: np.ndarray, turn: np.ndarray, world: World
+) -> None:
+    """One geom for each box; the first carries the part's mass and MuJoCo's ellipsoid."""
+    rgb = module.rgb if module.rgb is not None else _GREY
+    for k, box in enumerate(part.boxes):
+        geom = body.add_geom(
+            name=f"{module.name}/{part.name}" + (f"/{k}" if k else ""),
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[edge / 2 for edge in box.size],
+            pos=place + turn @ np.asarray(box.position),
+            quat=_quat(turn),
+            mass=part.mass if k == 0 else 0.0,
+            rgba=[*rgb, 1.0],
+            contype=int(part.contact and world.bed is not None and world.bed.contact == "mjx"),
+            conaffinity=0,
+        )
+        if k == 0 and drag_law(part, world) == "ellipsoid":
+            _make_ellipsoid(geom)
+    if part.ballast_mass > 0:
+        body.add_geom(
+            name=f"{module.name}/{part.name}/ballast",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[BALLAST_RADIUS, 0, 0],
+            pos=place + turn @ np.asarray(part.ballast_position),
+            mass=part.ballast_mass,
+            rgba=[*rgb, 0.0],
+            contype=0,
+            conaffinity=0,
+        )
