@@ -97,6 +97,12 @@ class Assembly:
         up = self.rotation[self.parent].swapaxes(1, 2)
         return turned(up, self.position - self.position[self.parent]), up @ self.rotation
 
+    @property
+    def point_part(self) -> np.ndarray:
+        """`[npoint]` parts whose corners the points are."""
+        touching = np.array([part.contact for part in self.layout.parts])[self.layout.kind]
+        return np.repeat(np.flatnonzero(touching), 8)
+
     @cached_property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """`[npoint]` body of each point that may touch the bed; `[npoint, 3]` body frame [m]."""

@@ -8,7 +8,7 @@ not from the bodies at hand: products with such numbers fold away while the step
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -33,6 +33,8 @@ from mjx_revolve.inputs.errors import InputError
 
 # What a row costs in a step beside its parts, in parts [-]; measured, alike under both drag laws.
 _ROW_COST = 5.0
+# Room for parts of the root that is tried where bodies are not known yet. A choice.
+_ROOT_PARTS = (2, 3, 4, 6, 8, 12)
 
 
 class Group(NamedTuple):
@@ -128,7 +130,8 @@ class Order(NamedTuple):
     """The rows of robots: which bodies and parts they hold, and how they hang together.
 
     Those of a robot stand in preorder, the child with the largest subtree last; all rows stand
-    robot after robot, the roots, which are no rows, not among them.
+    robot after robot, the roots, which are no rows, not among them. Piece 0 of a body is its first
+    row, or the root itself, and the riders are the further ones.
 
     Attributes:
         length: `[robots]` how many rows each has.
@@ -139,8 +142,9 @@ class Order(NamedTuple):
         slot: `[row]` where it stands in the stack.
         source: `[row]` where its parent stands.
         inner: `[row]` whether it has children.
-        first: `[nbody]` the first row of each body, counted through all robots; -1 without one.
-        chunk: `[npart]` which of its body's rows a part stands in.
+        first: `[nbody]` the first row of each body, counted through all robots; of a root, where
+            its first rider would stand, less one.
+        piece: `[npart]` which of its body's pieces a part stands in.
         rank: `[npart]` which of the parts there that obey its laws it is.
     """
 
@@ -153,17 +157,17 @@ class Order(NamedTuple):
     source: np.ndarray
     inner: np.ndarray
     first: np.ndarray
-    chunk: np.ndarray
+    piece: np.ndarray
     rank: np.ndarray
 
 
-def order_rows(assembly: Assembly, columns: Columns, room: Mapping[Laws, int]) -> Order:
+def order_rows(assembly: Assembly, columns: Columns, groups: Sequence[Group]) -> Order:
     """The rows of robots.
 
     Args:
         assembly: of the robots.
         columns: of the robots.
-        room: how many parts of each kind a row holds.
+        groups: how many parts of each kind a row and the root hold.
 
     Returns:
         The rows.
@@ -171,13 +175,17 @@ def order_rows(assembly: Assembly, columns: Columns, room: Mapping[Laws, int]) -
     nbody, parent = len(assembly.parent), assembly.parent.tolist()
     # How many parts before each one are on its body and obey its laws.
     rank = _ranks(columns.part_body * len(columns.laws) + columns.part_laws)
-    most = np.array([room.get(laws, nbody + len(rank)) for laws in columns.laws])
-    most = most[columns.part_laws]
-    below = np.array(parent)[columns.part_body] > 0  # a root has room for all of its parts
-    chunk = np.where(below, rank // most, 0)
-    rank = np.where(below, rank % most, rank)
+    # What no law acts on takes no room.
+    room = {group.laws: (group.parts, group.root_parts) for group in groups}
+    plenty = nbody + len(rank)
+    rooms = np.array([room.get(laws, (plenty, plenty)) for laws in columns.laws]).reshape(-1, 2)
+    most, at_root = rooms[columns.part_laws].T
+    below = np.array(parent)[columns.part_body] > 0
+    beyond = rank - np.where(below, most, at_root)  # what the first piece has room for
+    piece = np.where(beyond < 0, 0, 1 + beyond // most)
+    rank = np.where(beyond < 0, rank, beyond % most)
     pieces = np.ones(nbody, int)
-    np.maximum.at(pieces, columns.part_body, chunk + 1)
+    np.maximum.at(pieces, columns.part_body, piece + 1)
     own = pieces.tolist()
     size, children = list(own), [[] for _ in own]  # type: list[int], list[list[int]]
     for b in reversed(range(1, nbody)):
@@ -188,21 +196,22 @@ def order_rows(assembly: Assembly, columns: Columns, room: Mapping[Laws, int]) -
     start = 0
     for b in range(1, nbody):
         if not parent[b]:  # a root stands before its rows, in slot 0
-            spot, start = start, start + size[b] - 1
+            first[b], spot, start = start - 1, start + own[b] - 1, start + size[b] - 1
         else:
             spot = first[b] + own[b]
         left = sorted(reversed(children[b]), key=size.__getitem__)
         for child in left:
             first[child], spot = spot, spot + size[child]
             source[child], slot[child] = slot[b], slot[b] + (child != left[-1])
-    rows = np.flatnonzero(parent)
-    rows = rows[np.argsort(np.array(first)[rows])]  # the bodies in the order of their rows
-    which, piece = counted(pieces[rows])
-    body = rows[which]
+    bodies = np.arange(1, nbody)
+    bodies = bodies[np.argsort(np.array(first)[1:], kind="stable")]  # in the order of their rows
+    which, number = counted(pieces[bodies])
+    real = (np.array(parent)[bodies[which]] > 0) | (number > 0)  # all but the roots themselves
+    body, number = bodies[which][real], number[real]
     leaf = np.array([not below for below in children])[body]
-    base, rider = np.array(slot)[body], piece > 0
+    base, rider = np.array(slot)[body], number > 0
     # A rider is its body's last child where it has no other one.
-    last = leaf & (piece == pieces[body] - 1)
+    last = leaf & (number == pieces[body] - 1)
     robot = assembly.robot[body]
     length = np.bincount(robot, minlength=len(assembly.roots))
     return Order(
@@ -215,7 +224,7 @@ def order_rows(assembly: Assembly, columns: Columns, room: Mapping[Laws, int]) -
         source=np.where(rider, base, np.array(source)[body]),
         inner=~rider & ~(leaf & (pieces[body] == 1)),
         first=np.array(first),
-        chunk=chunk,
+        piece=piece,
         rank=rank,
     )
 
@@ -237,6 +246,7 @@ def fit_capacity(
     contact: bool = True,
     hinges: int = 0,
     rows: int = 0,
+    modules: int = 0,
 ) -> Capacity:
     """The smallest capacity for bodies of some types of modules, as large as some robots.
 
@@ -246,6 +256,8 @@ def fit_capacity(
         contact: whether they can touch the bed.
         hinges: room for at least so many hinges; for robots that are not known yet.
         rows: room for at least so many rows.
+        modules: room for all bodies of these types with at most so many modules and `hinges`
+            hinges, whatever their shape.
 
     Returns:
         The capacity.
@@ -259,50 +271,118 @@ def fit_capacity(
     columns, world = read_columns(assembly), robots[0].world
     carries = columns.parts.carried is not None
     sizes = _sizes(assembly, columns)
+    types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
+    types |= {kind.name: kind for kind in kinds}
     # Nothing acts on what neither floats nor drags nor carries nor pushes.
     every = [x for x in columns.laws if x[:2] != ("off", "off") or x.pushes or carries]
-    most = {laws: int(sizes.parts[laws].max()) for laws in every}
-    most_root = {laws: int(sizes.root_parts[laws].max()) for laws in every}
     near = contact and world.bed is not None
-    # The inertia box belongs to a body as a whole, and so does its submerged share: no riders.
-    least = max(1, *most.values()) if world.drag == "inertia_box" and most else 1
-    best: tuple[float, dict[Laws, int], int, int] | None = None
-    for limit in range(least, max(9, least + 1)):
-        room = {laws: min(limit, most[laws]) or 1 for laws in every}
-        order = order_rows(assembly, columns, room)
-        count = max(1, rows, hinges, int(order.length.max()))
-        slots = 1 + int(order.slot.max(initial=0))
-        cost = count * (_ROW_COST + sum(room.values()))
-        if best is None or cost < best[0]:
-            best = (cost, room, count, slots)
-    assert best is not None
-    _, room, count, slots = best
-    if rows or hinges:
-        # 2^n - 1 bodies are needed for n edges that do not lead to the largest subtree.
+    groups, order = _choose_groups(assembly, columns, sizes, every, bool(modules))
+    count = max(1, rows, hinges, int(order.length.max()))
+    slots = 1 + int(order.slot.max(initial=0))
+    thrusters = int(sizes.thrusters.max())
+    points, root_points = _count_points(assembly, order) if near else (0, 0)
+    if modules:
+        count = max(count, _most_rows(assembly, columns, groups, modules, hinges))
+        thrusters = (modules - 1) * any(kind.is_thruster for kind in types.values())
+        points = 8 * sum(group.parts for group in groups) if near else 0
+        root_points = 8 * sum(group.root_parts for group in groups) if near else 0
+    if rows or hinges or modules:
+        # 2^n - 2 rows are needed for n - 1 edges that do not lead to the largest subtree.
         slots = max(slots, int(np.log2(count + 2)))
     largest, pairs = int(sizes.hinges.max()), int(sizes.pairs.max())
-    if hinges > largest:
+    if hinges > largest or modules:
         pairs = hinges * (hinges - 1) // 2  # any two may share the core
     capacity = Capacity(
         hinges=max(largest, hinges),
-        thrusters=int(sizes.thrusters.max()),
+        thrusters=thrusters,
         pairs=pairs,
         rows=count,
         slots=slots,
-        groups=tuple(Group(laws, room[laws], max(1, most_root[laws])) for laws in every),
-        points=int(sizes.points.max()) if near else 0,
-        root_points=int(sizes.root_points.max()) if near else 0,
+        groups=groups,
+        points=points,
+        root_points=root_points,
         carries=carries,
         timestep=world.timestep,
         nothing=jax.tree.map(lambda x: x[-1:], columns.parts),
     )
-    types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
-    types |= {kind.name: kind for kind in kinds}
-    one = _pick_rows(assembly, columns, capacity, order_rows(assembly, columns, room))
+    one = _pick_rows(assembly, columns, capacity, order)
     known = list(types.values())
     return replace(
         capacity, root=_constants(one[0], known, False), row=_constants(one[1], known, True)
     )
+
+
+def _choose_groups(
+    assembly: Assembly, columns: Columns, sizes: _Sizes, every: Sequence[Laws], riding: bool
+) -> tuple[tuple[Group, ...], Order]:
+    """Room for parts with which a step of these robots costs least, and their rows.
+
+    `riding` says whether the root's parts may overflow into riders, too.
+    """
+    most = {laws: int(sizes.parts[laws].max()) for laws in every}
+    most_root = {laws: int(sizes.root_parts[laws].max()) for laws in every}
+    # The inertia box belongs to a body as a whole, and so does its submerged share: no riders.
+    whole = assembly.world.drag == "inertia_box"
+    least = max(1, *most.values()) if whole and most else 1
+    widest = max(1, *most_root.values()) if most_root else 1
+    on_root = [widest]
+    if riding and not whole:
+        on_root = [n for n in _ROOT_PARTS if n < widest] + on_root
+    best: tuple[float, tuple[Group, ...], Order] | None = None
+    for limit in range(least, max(9, least + 1)):
+        for root_limit in on_root:
+            groups = tuple(
+                Group(laws, min(limit, most[laws]) or 1, max(1, min(root_limit, most_root[laws])))
+                for laws in every
+            )
+            order = order_rows(assembly, columns, groups)
+            # A chunk of robots is as slow as its largest; one robot alone as it is itself.
+            count = (order.length.max() + order.length.mean()) / 2 if riding else order.length.max()
+            cost = max(1, count) * (_ROW_COST + sum(group.parts for group in groups))
+            cost += sum(group.root_parts for group in groups) * riding
+            if best is None or cost < best[0]:
+                best = (cost, groups, order)
+    assert best is not None
+    return best[1], best[2]
+
+
+def _most_rows(
+    assembly: Assembly, columns: Columns, groups: Sequence[Group], modules: int, hinges: int
+) -> int:
+    """The most rows of bodies of the robots' types of modules, with at most so many of them."""
+    all_modules = [module for body in assembly.morphologies for module in body.modules]
+    core, turns, rigid = (
+        [m.parent < 0 for m in all_modules],
+        [m.kind.hinge is not None for m in all_modules],
+        [m.parent >= 0 and m.kind.hinge is None for m in all_modules],
+    )
+    found = 0
+    for count in range(min(hinges, modules - 1) + 1):
+        rows = count
+        for group in groups:
+            held = columns.part_laws == columns.laws.index(group.laws)
+            parts = np.bincount(assembly.layout.module[held], minlength=len(all_modules))
+            most = [max((int(parts[k]) for k in np.flatnonzero(x)), default=0)
+                    for x in (core, turns, rigid)]  # fmt: skip
+            total = most[0] + count * most[1] + (modules - 1 - count) * most[2]
+            # Each hinge's body has a part that fills no rider; so has the root, or it is full.
+            spare = total - count * (most[1] > 1)
+            rows += max((spare - 1) // group.parts, -((group.root_parts - spare) // group.parts), 0)
+        found = max(found, rows)
+    return found
+
+
+def _count_points(assembly: Assembly, order: Order) -> tuple[int, int]:
+    """The most contact points of a row, and of a root."""
+    part = assembly.point_part
+    body = assembly.fluid.body[part]
+    most, at_root = 0, 0
+    if len(part):
+        first = (order.piece[part] == 0) & (assembly.parent[body] == 0)
+        place = body * (1 + int(order.piece.max())) + order.piece[part]
+        at_root = int(np.bincount(place[first], minlength=1).max())
+        most = int(np.bincount(place[~first], minlength=1).max())
+    return most, at_root
 
 
 def resize(capacity: Capacity, **changes: Any) -> Capacity:
@@ -394,7 +474,8 @@ def _pick_rows(
 ) -> tuple[Level, Level]:
     """Roots `[1, R]` and rows `[rows, 1, R]` of R robots, all of their numbers."""
     count, rows = len(assembly.roots), capacity.rows
-    whose, on_root = assembly.robot[columns.part_body], assembly.parent[columns.part_body] == 0
+    whose = assembly.robot[columns.part_body]
+    on_root = (assembly.parent[columns.part_body] == 0) & (order.piece == 0)
     body = np.zeros((rows, count), int)
     body[order.place, order.robot] = np.where(order.rider, 0, order.body)
     parts, root_parts = {}, {}
@@ -405,7 +486,7 @@ def _pick_rows(
         # Past the end stands the part that does nothing.
         index = np.full((rows, group.parts, count), len(whose))
         k = np.flatnonzero(ours & ~on_root)
-        row = order.place[order.first[columns.part_body[k]] + order.chunk[k]]
+        row = order.place[order.first[columns.part_body[k]] + order.piece[k]]
         index[row, order.rank[k], whose[k]] = k
         parts[group.laws] = index
         index = np.full((group.root_parts, count), len(whose))
@@ -415,12 +496,13 @@ def _pick_rows(
     points = root_points = None
     if capacity.points or capacity.root_points:
         held = columns.point_body
-        rank = _ranks(held)
-        owner, at_root = assembly.robot[held], assembly.parent[held] == 0
+        piece = order.piece[assembly.point_part]
+        rank = _ranks(held * (1 + int(piece.max(initial=0))) + piece)
+        owner, at_root = assembly.robot[held], (assembly.parent[held] == 0) & (piece == 0)
         if capacity.points:
             points = np.full((rows, capacity.points, count), len(held))
             k = np.flatnonzero(~at_root)
-            points[order.place[order.first[held[k]]], rank[k], owner[k]] = k
+            points[order.place[order.first[held[k]] + piece[k]], rank[k], owner[k]] = k
         if capacity.root_points:
             root_points = np.full((capacity.root_points, count), len(held))
             k = np.flatnonzero(at_root)
@@ -471,7 +553,7 @@ def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.flo
     assembly = assemble_all(list(unique.values()))
     columns = read_columns(assembly)
     _check_fit(assembly, columns, capacity)
-    order = order_rows(assembly, columns, {g.laws: g.parts for g in capacity.groups})
+    order = order_rows(assembly, columns, capacity.groups)
     _check_rows(assembly, order, capacity)
     root, level = _pick_rows(assembly, columns, capacity, order)
     names = [str(body.name) for body in assembly.morphologies]
@@ -519,8 +601,6 @@ class _Sizes(NamedTuple):
     hinges: np.ndarray
     thrusters: np.ndarray
     pairs: np.ndarray
-    points: np.ndarray
-    root_points: np.ndarray
     parts: dict[Laws, np.ndarray]
     root_parts: dict[Laws, np.ndarray]
 
@@ -539,13 +619,10 @@ def _sizes(assembly: Assembly, columns: Columns) -> _Sizes:
     by_laws = {
         laws: most(columns.part_body[columns.part_laws == k]) for k, laws in enumerate(columns.laws)
     }
-    root_points, points = most(columns.point_body)
     return _Sizes(
         hinges=np.bincount(assembly.robot[1:], minlength=robots) - 1,
         thrusters=np.bincount(assembly.layout.body[assembly.thruster_row], minlength=robots),
         pairs=np.array([len(body.hinge_neighbours()) for body in assembly.morphologies]),
-        points=points,
-        root_points=root_points,
         parts={laws: x[1] for laws, x in by_laws.items()},
         root_parts={laws: x[0] for laws, x in by_laws.items()},
     )
@@ -554,23 +631,14 @@ def _sizes(assembly: Assembly, columns: Columns) -> _Sizes:
 def _check_fit(assembly: Assembly, columns: Columns, capacity: Capacity) -> None:
     """Refuses robots that are larger than there is room for."""
     found = _sizes(assembly, columns)
-    room = {group.laws: group for group in capacity.groups}
+    room = {group.laws for group in capacity.groups}
     sizes = [
         ("hinges", found.hinges, capacity.hinges),
         ("thrusters", found.thrusters, capacity.thrusters),
         ("pairs of neighbouring hinges", found.pairs, capacity.pairs),
     ]
-    if capacity.points or capacity.root_points:
-        sizes += [
-            ("contact points in a body", found.points, capacity.points),
-            ("contact points on the core's body", found.root_points, capacity.root_points),
-        ]
     for laws in columns.laws:
-        if laws in room:
-            sizes.append(
-                ("parts on the core's body", found.root_parts[laws], room[laws].root_parts)
-            )
-        elif laws[:2] != ("off", "off") or laws.pushes:
+        if laws not in room and (laws[:2] != ("off", "off") or laws.pushes):
             part = int(np.argmax(columns.part_laws == columns.laws.index(laws)))
             name = assembly.morphologies[assembly.layout.body[part]].name
             known = [tuple(x) for x in room]
@@ -591,6 +659,12 @@ def _check_rows(assembly: Assembly, order: Order, capacity: Capacity) -> None:
     """Refuses robots that need more rows, or a deeper stack, than there is."""
     deep = np.zeros(len(order.length), int)
     np.maximum.at(deep, order.robot, order.slot)
+    points, root_points = _count_points(assembly, order) if capacity.root_points else (0, 0)
+    if points > capacity.points or root_points > capacity.root_points:
+        raise InputError(
+            f"robots: expected at most {capacity.points} contact points in a row and "
+            f"{capacity.root_points} at the core; found {points} and {root_points}"
+        )
     wrong = (order.length > capacity.rows) | (deep >= capacity.slots)
     if np.any(wrong):
         k = int(np.argmax(wrong))

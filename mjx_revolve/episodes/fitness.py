@@ -322,14 +322,6 @@ class MixedFitness:
                 )
         return bodies
 
-    def misfit(self, robot: Robot) -> str | None:
-        """Why there is no room for a body, in one line; None where there is."""
-        try:
-            self.pack([robot])
-        except InputError as error:
-            return str(error)
-        return None
-
 
 # ------------------------------------------------------------------ making them
 
@@ -370,6 +362,7 @@ def make_mixed_fitness(
     examples: Sequence[Morphology],
     hinges: int = 0,
     rows: int = 0,
+    modules: int = 0,
     kinds: Sequence[ModuleType] = (),
     **overrides: Any,
 ) -> MixedFitness:
@@ -381,6 +374,8 @@ def make_mixed_fitness(
             and the largest of them sets the size.
         hinges: most hinges that a body may have, if more than the examples'.
         rows: most rows of tables that a body may need (see `engine.rows`), likewise.
+        modules: most modules that a body may have, likewise: there is room for all bodies of these
+            types with so many modules and hinges.
         kinds: types of modules that bodies may be made of, beside those of the examples.
         **overrides: as in `make_fitness`.
 
@@ -402,12 +397,25 @@ def make_mixed_fitness(
         check_timestep(robot)
     if not robots:
         raise InputError("examples: expected at least one morphology; found none")
-    reach = max(farthest(config.task, world, figure_of(robot)) for robot in robots)
+    figures = [figure_of(robot) for robot in robots]
+    if modules:  # what will come is no longer than this, and sinks only if one of its types does
+        types = {m.kind.name: m.kind for robot in robots for m in robot.morphology.modules}
+        types |= {kind.name: kind for kind in kinds}
+        longest = modules * max(_diagonal(kind) for kind in types.values())
+        heavy = any(world.density * kind.volume < kind.mass / 2 for kind in types.values())
+        sinks = world.buoyancy == "off" or (heavy and config.trim != "neutral")
+        figures.append(figures[0]._replace(length=longest, sinks=sinks))
+    reach = max(farthest(config.task, world, figure) for figure in figures)
     touches = may_touch_bed(task, config.task, world, reach)
-    capacity = fit_capacity(robots, kinds, touches, hinges, rows)
+    capacity = fit_capacity(robots, kinds, touches, hinges, rows, modules)
     example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
     controller = _find_controller(config, capacity.plant, example)
     return MixedFitness(Setup(config, world, task, controller, capacity=capacity), touches)
+
+
+def _diagonal(kind: ModuleType) -> float:
+    """How long a module can make a body [m]: no less than its boxes, one behind the other."""
+    return sum(float(np.linalg.norm(box.size)) for part in kind.parts for box in part.boxes)
 
 
 def _read(config: Any, overrides: dict[str, Any]) -> Config:

@@ -8,7 +8,7 @@ time, a chunk holds one body, which is the faster way; else bodies share chunks.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -36,8 +36,7 @@ from mjx_revolve.genotypes.genotype import Genotype, Space, make_space
 from mjx_revolve.genotypes.kinds import make_genotype
 from mjx_revolve.inputs.errors import InputError
 
-# Random bodies that say how much room the tables need. A choice: bodies that need more are refused
-# while they are drawn, like those with too many modules.
+# Random bodies by which it is chosen how many parts a row of the tables holds. A choice.
 _EXAMPLES = 64
 # Compiled bodies that are remembered. A choice: some megabytes.
 _REMEMBERED = 512
@@ -180,23 +179,19 @@ def make_body_fitness(config: Config) -> BodyFitness:
     try:
         space = make_space(bodies, modules)
         seeds = tuple(_load_seed(path, modules, config, space) for path in bodies.seeds)
-        free = make_genotype(bodies.genotype, space, bodies.params, config.source)
-        _check_seeds(bodies, free)
-        examples = [*seeds, *_examples(free)]
+        genotype = make_genotype(bodies.genotype, space, bodies.params, config.source)
+        _check_seeds(bodies, genotype)
+        examples = [*seeds, *_examples(genotype)]
         kinds = [modules[name] for name in (bodies.core, *bodies.modules)]
-        mixed = make_mixed_fitness(config, examples, hinges=bodies.max_hinges, kinds=kinds)
+        mixed = make_mixed_fitness(
+            config, examples, bodies.max_hinges, modules=bodies.max_modules, kinds=kinds
+        )
         brains = make_brains(bodies.brains, mixed.setup.controller)
     except InputError as error:
         text = str(error)
         place = "" if text.startswith(config.source) else f"{config.source}: "
         raise InputError(place + text) from None
 
-    def accepts(body: Morphology) -> bool:
-        return mixed.misfit(mixed.build(body)) is None
-
-    genotype = make_genotype(
-        bodies.genotype, replace(space, accepts=accepts), bodies.params, config.source
-    )
     return BodyFitness(config, genotype, mixed, brains, seeds)
 
 
