@@ -7,11 +7,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.body.morphology import Morphology
-
-# Of the descriptors that have one.
-_UNITS = {"mass": "kg", "volume": "m3", "box_volume": "m3"}
-_UNITS |= dict.fromkeys(("extent_x", "extent_y", "extent_z", "length"), "m")
 
 
 def align(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> list[str]:
@@ -117,8 +114,7 @@ def summary(morphology: Morphology, density: float, gravity: float) -> list[str]
         ("overlap at rest", f"{first} and {second}", "") for first, second in morphology.overlaps
     ]
     descriptors = [
-        (f"  {key}", f"{value:.6g}", _UNITS.get(key, ""))
-        for key, value in morphology.descriptors.items()
+        (f"  {key}", f"{value:.6g}", UNITS[key]) for key, value in morphology.descriptors.items()
     ]
     return [*align(rows, left=(0, 2)), "", "descriptors", *align(descriptors, left=(0, 2))]
 

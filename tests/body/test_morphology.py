@@ -14,6 +14,7 @@ import yaml
 
 from laboratory import ROOT
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
+from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.body.morphology import (
     MAX_MODULES,
     Morphology,
@@ -747,6 +748,61 @@ def test_symmetry_needs_a_mirror_image(tmp_path):
     assert read(tmp_path, text % "").descriptors["symmetry"] == 0
     assert read(tmp_path, text % ", 3: {type: FixedBrick}").descriptors["symmetry"] == 1
     assert read(tmp_path, text % ", 3: {type: ActiveHinge}").descriptors["symmetry"] == 0
+
+
+# Bodies by their children, and what counting by hand says of them.
+COUNTED = {
+    # Core, hinge, brick, hinge: m = 4.
+    "a chain": (
+        "1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: "
+        "{1: {type: ActiveHinge}}}}}",
+        {"absolute_size": 4, "extensiveness": 2, "length_of_limbs": 2 / 2, "num_limbs": 1,
+         "limbs": 1 / 3, "active_hinges_count": 1, "joints": 1 / 2, "branching_modules_count": 0,
+         "branching": 0, "width": 1, "height": 4, "z_depth": 1, "base_density": 3 / 4,
+         "height_base_ratio": 1 / 2, "bottom_layer": 0, "vertical_symmetry": 0},
+    ),
+    # A brick with bricks on all of its slots: a T in front of the core, m = 5.
+    "a branching brick": (
+        "1: {type: FixedBrick, children: {1: {type: FixedBrick}, 2: {type: FixedBrick}, "
+        "3: {type: FixedBrick}}}",
+        {"absolute_size": 5, "branching_modules_count": 1, "branching": 1 / 1, "num_limbs": 3,
+         "limbs": 3 / 4, "extensiveness": 0, "length_of_limbs": 0, "width": 3, "height": 3,
+         "z_depth": 1, "base_density": 4 / 9, "height_base_ratio": 1 / 3, "symmetry": 1},
+    ),
+    # The same brick turned on its side: its left goes up and its right down.
+    "above and below": (
+        "1: {type: FixedBrick, orientation: 90, children: {2: {type: FixedBrick}, "
+        "3: {type: FixedBrick}}}",
+        {"absolute_size": 4, "width": 1, "height": 2, "z_depth": 3, "bottom_layer": -1,
+         "base_density": 1 / 2, "height_base_ratio": 3 / 2**0.5, "vertical_symmetry": 1,
+         "branching_modules_count": 0},
+    ),
+    # Of three modules off the xy plane, two have an image: the third is a hinge on one of them.
+    "more below": (
+        "1: {type: FixedBrick, orientation: 90, children: {2: {type: FixedBrick, children: "
+        "{1: {type: ActiveHinge}}}, 3: {type: FixedBrick}}}",
+        {"vertical_symmetry": 2 / 3, "z_depth": 4, "extensiveness": 1},
+    ),
+    # Sensors: no size, no cells, and no burden for a hinge.
+    "sensors": (
+        "1: {type: ActiveHinge, children: {1: {type: TouchSensor}}}, 2: {type: TouchSensor}",
+        {"num_modules": 4, "num_sensors": 2, "absolute_size": 2, "active_hinges_count": 0,
+         "joints": 0, "extensiveness": 0, "num_limbs": 1, "width": 1, "height": 2,
+         "base_density": 1 / 2, "sensors": 2 / 4},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_descriptors_counted_by_hand(tmp_path, name):
+    children, expected = COUNTED[name]
+    found = read(tmp_path, f"body: {{type: Core, children: {{{children}}}}}").descriptors
+    assert {key: found[key] for key in expected} == pytest.approx(expected)
+
+
+def test_every_descriptor_has_a_unit(spider):
+    assert list(UNITS) == list(spider.descriptors)
+    assert all(UNITS.values())
 
 
 # ------------------------------------------------------------------------- wrong files
