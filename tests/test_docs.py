@@ -121,6 +121,20 @@ def test_every_file_stands_in_its_room_behind_those_that_it_imports(architecture
             assert later == set(), f"{room}/{name}.py imports from files listed behind it"
 
 
+def test_the_tables_of_measures_are_the_codes():
+    """Every descriptor, measure and number of a gait in its order, with its unit."""
+    from mjx_revolve.body import descriptors
+    from mjx_revolve.control import gait
+    from mjx_revolve.episodes.measure_table import MEASURES
+
+    text = (ROOT / "docs" / "measures.md").read_text(encoding="utf-8")
+    found = re.findall(r"^\| `(\w+)` \| ([^|]+?) \|", text, re.MULTILINE)
+    units = {name: measure.unit for name, measure in MEASURES.items()}
+    assert found == [*(descriptors.UNITS | units | gait.UNITS).items()]
+    said = {*re.findall(r"\w+", descriptors.describe.__doc__)}
+    assert {*descriptors.UNITS} <= said
+
+
 @pytest.mark.parametrize(
     "room", ["inputs", "body"], ids=lambda room: f"{room} without JAX and MuJoCo"
 )

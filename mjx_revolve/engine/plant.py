@@ -27,6 +27,7 @@ class Figure(NamedTuple):
         lowest: how far the rest pose reaches below the core's centre [m].
         radius: how far it reaches from the core's vertical [m].
         sinks: whether the water carries less than half of its weight.
+        num_hinges: how many hinges it has.
     """
 
     length: Any
@@ -34,6 +35,7 @@ class Figure(NamedTuple):
     lowest: Any
     radius: Any
     sinks: Any
+    num_hinges: Any
 
 
 def figure_of(robot: Robot) -> Figure:
@@ -45,6 +47,7 @@ def figure_of(robot: Robot) -> Figure:
         lowest=body.lowest,
         radius=body.radius,
         sinks=world.buoyancy == "off" or world.density * body.volume < body.mass / 2,
+        num_hinges=body.num_hinges,
     )
 
 

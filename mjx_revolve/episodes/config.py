@@ -7,6 +7,7 @@ paths; `dump_config` writes the resolved values back, so that a run folder docum
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +19,7 @@ from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_
 
 from mjx_revolve.episodes.bodies_config import BodiesConfig
 from mjx_revolve.episodes.config_paths import resolve_paths
+from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.episodes.settings import Section, Settings, one_of
 from mjx_revolve.inputs.complaints import describe, find_problems, refuse
 from mjx_revolve.inputs.errors import InputError, load_yaml
@@ -27,6 +29,7 @@ from mjx_revolve.inputs.schema import (
     MisfitError,
     NonNegative,
     Positive,
+    Row,
     Vector,
     Whole,
     show,
@@ -44,6 +47,14 @@ TASKS = {
     "hold_depth": (),
     "crawl": (),
 }
+
+
+def _check_measure(name: str) -> str:
+    if name not in MEASURES:
+        near = difflib.get_close_matches(name, MEASURES, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise MisfitError("", f"one of {', '.join(MEASURES)}", show(name) + hint)
+    return name
 
 
 def _check_world(value: str | dict[str, Any]) -> str | dict[str, Any]:
@@ -123,6 +134,8 @@ class TaskConfig(Section):
     """Standard deviation of the start's place, along each axis [m]."""
     current_std: Annotated[NonNegative, Unit("m/s")] = 0.0
     """Standard deviation of an extra horizontal current, drawn for each episode [m/s]."""
+    measures: Row[Annotated[str, AfterValidator(_check_measure)]] = ()
+    """What is measured beside what always is, names of `measure_table.MEASURES`."""
     params: dict[str, Any] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 

@@ -106,7 +106,7 @@ class Setup:
             key: draws the episodes' starts and water, the same for every individual.
 
         Returns:
-            `[P]` scores and `[P]` measures (see `tasks.measure`), means over the episodes.
+            `[P]` scores and `[P]` measures (see `measures.measure`), means over the episodes.
 
         Raises:
             InputError: the population has another shape, there are no genes to evolve, or the key

@@ -18,7 +18,8 @@ import numpy as np
 
 from mjx_revolve.engine.plant import Figure
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.tasks import Task, Track, measure
+from mjx_revolve.episodes.measures import measure
+from mjx_revolve.episodes.tasks import Task, Track
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
@@ -45,7 +46,7 @@ class Scores(NamedTuple):
     Attributes:
         score: `[lanes]`, higher is better.
         sane: `[lanes]` whether the rollout did not blow up; if it did, its score means nothing.
-        measures: `[lanes]` each, see `tasks.measure`.
+        measures: `[lanes]` each, see `measures.measure`.
     """
 
     score: jax.Array
@@ -107,7 +108,7 @@ def judge_tracks(
         figure: of the bodies, `[lanes]` or one.
 
     Returns:
-        `[lanes]` scores, and `[lanes]` measures (see `tasks.measure`).
+        `[lanes]` scores, and `[lanes]` measures (see `measures.measure`).
     """
     first = first_counted(settings, world.timestep)
     kept = {name: x[first:] for name, x in recorded.items()}
@@ -122,9 +123,10 @@ def judge_tracks(
         length=figure.length,
         weight=figure.weight,
         surface_height=world.surface_height,
+        num_hinges=figure.num_hinges,
         **kept,
     )
-    measures = measure(track)
+    measures = measure(track, settings.measures)
     return task.score(track, settings) - settings.energy_weight * measures["energy_j"], measures
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.plant import Figure
+from mjx_revolve.episodes.measure_table import records_of
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.own_code import call_own, load_own, parse_own, short_name
 from mjx_revolve.numerics.spatial import safe_norm
@@ -32,7 +33,7 @@ RECORDS = ("core", "joints", "contacts", "forces")
     jax.tree_util.register_dataclass,
     data_fields=[
         "position", "clearance", "energy", "start_height", "length", "weight", "surface_height",
-        "quat", "velocity", "spin", "angle", "speed", "bed_force", "water_force",
+        "num_hinges", "quat", "velocity", "spin", "angle", "speed", "bed_force", "water_force",
     ],
     meta_fields=["interval"],
 )  # fmt: skip
@@ -49,6 +50,7 @@ class Track:
         length: body length, the robot's largest extent at rest [m].
         weight: of the robot in air [N].
         surface_height: [m].
+        num_hinges: of the robot; a batch of different bodies has rows for more.
         quat: `[S, 4, lanes]` of the core, world from body (w, x, y, z); None unless "core" is
             recorded.
         velocity: `[S, 3, lanes]` of the core, world frame [m/s], likewise.
@@ -70,6 +72,7 @@ class Track:
     length: float
     weight: float
     surface_height: jax.Array | float
+    num_hinges: jax.Array | float = 0
     quat: jax.Array | None = None
     velocity: jax.Array | None = None
     spin: jax.Array | None = None
@@ -205,7 +208,7 @@ TASKS: Mapping[str, Task] = {
 
 
 def find_task(settings: Any, source: str = "config") -> Task:
-    """The task that a configuration names.
+    """The task that a configuration names, recording what its `measures` need, too.
 
     Args:
         settings: a `config.TaskConfig`. Its `type` is a name in `TASKS`, or FILE.py:NAME for one of
@@ -222,10 +225,12 @@ def find_task(settings: Any, source: str = "config") -> Task:
         InputError: the file or the name is missing, or it does not score a track; one line says
             where.
     """
-    if settings.type in TASKS:
-        return TASKS[settings.type]
     name = settings.type
-    task = _load_task(name, f"{source}: task.type")
+    task = TASKS[name] if name in TASKS else _load_task(name, f"{source}: task.type")
+    records = dict.fromkeys((*task.records, *records_of(settings.measures)))
+    task = replace(task, records=tuple(records))
+    if name in TASKS:
+        return task
     found = call_own(
         name,
         f"{short_name(name)} to score a track",
@@ -275,6 +280,7 @@ def _example_track(records: tuple[str, ...]) -> Any:
         length=0.5,
         weight=1.0,
         surface_height=0.0,
+        num_hinges=_HINGES,
         **more,
     )
 
@@ -292,32 +298,3 @@ def score_unit(name: str) -> str:
         return TASKS[name].unit if name in TASKS else _load_task(name, "task.type").unit
     except InputError:
         return ""
-
-
-def measure(track: Track) -> dict[str, jax.Array]:
-    """What is worth knowing of an episode beside its score.
-
-    Args:
-        track: the episode.
-
-    Returns:
-        `[lanes]` each: `speed_m_s` net speed [m/s], `speed_bl_s` the same in body lengths [1/s],
-        `straightness` net distance over path length [-], `energy_j` servo work [J],
-        `cost_of_transport` energy over weight in air times net distance [-], `depth_m` mean depth
-        of the core [m], `depth_error_m` root mean square distance from the start's depth [m].
-    """
-    moved = jnp.diff(track.position, axis=0)
-    net = safe_norm(tuple(jnp.sum(moved, 0)))
-    path = jnp.sum(safe_norm(tuple(moved[:, i] for i in range(3))), 0)
-    energy = jnp.sum(track.energy[1:], 0)
-    error = track.position[:, 2] - track.start_height
-    return {
-        "speed_m_s": net / track.duration,
-        "speed_bl_s": net / (track.duration * track.length),
-        "straightness": net / jnp.maximum(path, 1e-9),
-        "energy_j": energy,
-        # A robot that stays where it is has no cost of transport; a millimetre bounds the number.
-        "cost_of_transport": energy / (track.weight * jnp.maximum(net, 1e-3)),
-        "depth_m": jnp.mean(track.surface_height - track.position[:, 2], 0),
-        "depth_error_m": jnp.sqrt(jnp.mean(error * error, 0) + 1e-12),
-    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,18 +15,28 @@ from mjx_revolve.inputs.files import with_path
 
 
 def append_metrics(path: Path, row: Mapping[str, float]) -> None:
-    """Adds a line of figures by column, the same columns every time; the first brings a header."""
-    new = not path.exists() or path.stat().st_size == 0
+    """Adds a line of figures by column; the first line brings the columns, which then stay."""
     text = io.StringIO()
     writer = csv.writer(text)
-    if new:
-        writer.writerow(row)
-    writer.writerow(_number(value) for value in row.values())
+    columns = _columns(path)
+    if not columns:
+        columns = list(row)
+        writer.writerow(columns)
+    # A run that another version began may know other measures.
+    writer.writerow(_number(row.get(name, math.nan)) for name in columns)
     try:
         with open(path, "ab") as file:
             file.write(text.getvalue().encode())
     except OSError as error:
         raise with_path(error, path) from None
+
+
+def _columns(path: Path) -> list[str]:
+    """The columns of a metrics file; none where there is no file yet."""
+    if not path.exists():
+        return []
+    with open(path, encoding="utf-8", newline="") as file:
+        return next(csv.reader(file), [])
 
 
 def _number(value: float) -> str:

@@ -133,7 +133,7 @@ def analyse_motion(
     first = max(min(int(np.searchsorted(time, counted_from - 1e-6)), count - 2), 0)
     away = np.linalg.norm(path - path[first], axis=1)
     seconds, distance = float(time[-1] - time[first]), float(away[-1])
-    # A millimetre bounds the cost where the robot stays, as in `tasks.measure`.
+    # A millimetre bounds the cost where the robot stays, as in `measures.measure`.
     costs = (energy - energy[first]) / (weight * np.maximum(away, 1e-3))
     far = away > _NEAR * max(float(away[first:].max()), 1e-3)
     return Motion(

@@ -18,22 +18,15 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.view.motion import speed_over
 
 # Okabe and Ito's palette (2008), which all readers can tell apart, and its neighbours.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#3b3b3b")
 _BLUE, _DEEP, _ORANGE, _GREY = COLORS[0], "#0b3c5d", COLORS[1], "#6b7680"
 _WATER = "#eaf3f9"
-# Axis labels of the measures that the tasks report; others are shown by their name.
-LABELS = {
-    "speed_bl_s": "speed (body lengths/s)",
-    "speed_m_s": "speed (m/s)",
-    "straightness": "straightness (–)",
-    "energy_j": "energy (J)",
-    "depth_m": "depth (m)",
-    "cost_of_transport": "cost of transport (–)",
-    "depth_error_m": "depth error (m)",
-}
+# Axis labels of the measures; others are shown by their name.
+LABELS = {name: f"{m.words} ({m.unit.replace('-', '–')})" for name, m in MEASURES.items()}
 WIDE = 9.0  # of most figures [inches]
 _FIGURES = {
     "generation", "evaluations", "best", "mean", "std", "median", "lower_quartile",

@@ -13,6 +13,7 @@ import pytest
 from laboratory import WATER, at_rest, body, elbow_robot, march, random_states, read, world
 from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg
+from mjx_revolve.control.gait import UNITS, describe_gait
 from mjx_revolve.control.kinds import CONTROLLERS
 from mjx_revolve.control.sense import Sense
 from mjx_revolve.control.sine import make_sine
@@ -97,6 +98,74 @@ def test_bound_controllers_keep_what_they_were_given():
     bound = bind_genes(controller, genes)
     assert bound.controller is controller
     assert bound.genes is genes
+
+
+# ------------------------------------------------------------------------- descriptions
+
+
+def described(robot, genes, **settings):
+    return describe_gait(plant_of(robot), ControllerConfig(**settings), genes)
+
+
+def test_a_sines_gait():
+    """Two of eight hinges swing, a quarter of a turn apart, by sin .5 and sin .3 of their range."""
+    robot = robot_of("spider")
+    genes = np.zeros(25)
+    genes[0], genes[8 + 3], genes[-1] = 0.5, 0.3, np.pi / 6  # u of one, v of another, f = 1.5 Hz
+    a, b = np.sin([0.5, 0.3]) * np.pi / 4
+    assert described(robot, genes, type="sine") == pytest.approx(
+        {
+            "mean_period": 1 / 1.5,
+            "spread_period": 0.0,
+            "mean_phase_offset": np.pi / 4,
+            "spread_phase_offset": np.sqrt(np.log(2)),  # R = cos(π/4)
+            "mean_amplitude": (a + b) / 2,
+            "spread_amplitude": (a - b) / 2,
+        },
+        rel=1e-5,
+    )
+
+
+def test_an_uncoupled_cpgs_gait():
+    """x = sin(w t), half of it backwards; w = 2π f_max sin(gene)."""
+    robot = robot_of("spider")
+    genes = np.zeros(18)
+    genes[:2], genes[2] = np.pi / 6, -np.pi / 2  # 1 Hz, 1 Hz and 2 Hz backwards
+    found = described(robot, genes, type="cpg", amplitude=0.5)
+    assert found["mean_period"] == pytest.approx((1 + 1 + 1 / 2) / 3, rel=1e-5)
+    assert found["spread_period"] == pytest.approx(np.std([1, 1, 0.5]), rel=1e-5)
+    assert found["mean_phase_offset"] == pytest.approx(0.0, abs=1e-5)
+    # Phases 0, 0 and π: R = 1/3.
+    assert found["spread_phase_offset"] == pytest.approx(np.sqrt(2 * np.log(3)), rel=1e-5)
+    assert found["mean_amplitude"] == pytest.approx(0.5 * np.pi / 4 * np.tanh(1), rel=1e-5)
+    assert found["spread_amplitude"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_two_coupled_oscillators_gait():
+    """In p = x1 + i x2: p = A (exp(i α t) - exp(-i β t)), β - α = c, αβ = w², |A| = √2 w/(α + β).
+
+    The faster counts: x1 = |A| sin(β t - π/4), x2 = |A| sin(β t + π/4).
+    """
+    robot = elbow_robot(world())
+    w, c = 2 * np.pi * 2 * np.sin(0.5), np.pi * 2 * np.sin(0.4)
+    both = np.sqrt(c**2 + 4 * w**2)
+    found = described(robot, [0.5, 0.5, 0.4], type="cpg")
+    assert found["mean_period"] == pytest.approx(4 * np.pi / (both + c), rel=1e-5)
+    assert found["spread_period"] == pytest.approx(0.0, abs=1e-6)
+    assert found["mean_phase_offset"] == pytest.approx(0.0, abs=1e-5)
+    assert found["spread_phase_offset"] == pytest.approx(np.sqrt(np.log(2)), rel=1e-5)
+    size = np.pi / 4 * np.tanh(np.sqrt(2) * w / both)
+    assert found["mean_amplitude"] == pytest.approx(size, rel=1e-5)
+
+
+def test_what_does_not_swing_has_no_gait():
+    robot = robot_of("spider")
+    for kind, count in (("sine", 25), ("cpg", 18)):
+        found = described(robot, np.zeros(count), type=kind)
+        assert list(found) == list(UNITS) and not any(found.values())
+    assert described(robot, np.zeros(64), type="feedback") == {}
+    assert not any(described(robot_of("core"), np.zeros(1), type="sine").values())
+    assert not any(described(robot_of("core"), np.zeros(0), type="cpg").values())
 
 
 # ------------------------------------------------------------------------- targets

@@ -12,7 +12,7 @@ import pytest
 from laboratory import QUICK, ROOT
 from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.fitness import WORST
-from mjx_revolve.episodes.tasks import TASKS, Track, measure
+from mjx_revolve.episodes.tasks import TASKS, Track
 
 KEY = jax.random.key(7)
 # The smallest robot with joints: compiles fast.
@@ -184,17 +184,3 @@ SETTINGS = SimpleNamespace(direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, targe
 )
 def test_tasks_with_known_scores(task, given, score):
     assert float(TASKS[task].score(given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
-
-
-def test_measures_with_known_values():
-    found = {k: float(v[0]) for k, v in measure(track([0, 2, 1, 3], z=[1, 1, 1, 1])).items()}
-    expected = {
-        "speed_m_s": 1.0,
-        "speed_bl_s": 2.0,
-        "straightness": 3 / 5,
-        "energy_j": 3.0,
-        "cost_of_transport": 3 / (2 * 3),
-        "depth_m": 2.0,
-        "depth_error_m": 1.0,
-    }
-    assert found == pytest.approx(expected, rel=1e-5)

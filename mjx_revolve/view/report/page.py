@@ -293,7 +293,10 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
         heading += f" ({name})" if len({m.name for _, m in found}) > 1 else ""
         rows, foot = tables.count_modules(morphology)
         modules = tables.list_modules(morphology)
-        entries.append({"heading": heading, "rows": rows, "foot": foot, "modules": modules})
+        entries.append({
+            "heading": heading, "rows": rows, "foot": foot, "modules": modules,
+            "descriptors": tables.list_descriptors(morphology),
+        })  # fmt: skip
     return sections.robots(entries)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.view.plots import LABELS
@@ -206,6 +207,14 @@ def count_modules(morphology: Morphology) -> tuple[list[list[Any]], list[Any]]:
     foot = ["all", morphology.num_modules, "", f"{1e3 * morphology.mass:.4g}", "",
             f"{1e6 * morphology.volume:.4g}", extent]  # fmt: skip
     return rows, foot
+
+
+def list_descriptors(morphology: Morphology) -> list[list[str]]:
+    """Rows of a robot's descriptors: name, value, unit."""
+    return [
+        [name.replace("_", " "), format_number(value, 4), UNITS[name].replace("-", _NONE)]
+        for name, value in morphology.descriptors.items()
+    ]
 
 
 def list_modules(morphology: Morphology) -> list[list[Any]]:

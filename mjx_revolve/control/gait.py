@@ -1,0 +1,102 @@
+"""What a controller's genes say of the gait before anything moves: periods, phases, amplitudes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.control.kinds import find_controller
+from mjx_revolve.engine.plant import Plant
+
+# Angular frequencies nearer than this, as a share of the fastest, are the same one; a choice.
+_SAME_RATE = 1e-5
+# Sines are as large as each other within this share, for each rad/s between them; a choice.
+_SAME_SIZE = 1e-4
+
+UNITS: dict[str, str] = {
+    f"{name}_{of}": unit
+    for of, unit in (("period", "s"), ("phase_offset", "rad"), ("amplitude", "rad"))
+    for name in ("mean", "spread")
+}
+"""All that `describe_gait` gives, in its order, with units."""
+
+
+def describe_gait(plant: Plant, settings: Any, genes: Any) -> dict[str, float]:
+    """Periods, phases and amplitudes of the hinges' targets, after Revolve's brain descriptors.
+
+    Revolve (`measure_brain.py`) takes medians, over the parameters' ranges, and squashed standard
+    deviations; here they are means and standard deviations in the parameters' own units, of phases
+    the circular ones: √(-2 ln R), R the length of the mean of exp(i φ). Its recurrence, reach of
+    sensors and synaptic reception are of neural networks, which these controllers are not.
+
+    Each hinge's target is taken for a sin(2π t / T + φ) about its middle. `sine`: its first
+    harmonic; the period is common. `cpg`: its oscillators are coupled linearly, so that each x is a
+    sum of sines whose frequencies are the system matrix's; the greatest of them counts (of equal
+    ones the fastest), with the amplitude that tanh leaves of it. Hinges whose target keeps still do
+    not count.
+
+    Args:
+        plant: of one robot, from `plant_of`.
+        settings: a `config.ControllerConfig`.
+        genes: `[num_genes]` of one individual.
+
+    Returns:
+        mean_period, spread_period [s], mean_phase_offset (-π to π), spread_phase_offset,
+        mean_amplitude, spread_amplitude [rad]: all 0 where nothing moves. Empty for other types of
+        controllers, which have no such parameters.
+    """
+    if settings.type not in _WAVES:
+        return {}
+    still = dict.fromkeys(UNITS, 0.0)
+    if not plant.num_hinges:
+        return still
+    controller = find_controller(plant, settings)
+    parameters = controller.decode(jnp.asarray(genes, float)[:, None], plant)
+    rate, amplitude, phase = _WAVES[settings.type](parameters, plant.num_hinge_rows)
+    moves = (amplitude > 1e-9) & (rate > 1e-9)
+    if not moves.any():
+        return still
+    period, amplitude, phase = 2 * np.pi / rate[moves], amplitude[moves], phase[moves]
+    mean = np.exp(1j * phase).mean()
+    spread = np.sqrt(2 * np.log(1 / np.clip(abs(mean), 1e-3, 1.0)))
+    found = (period.mean(), period.std(), np.angle(mean), spread, amplitude.mean(), amplitude.std())
+    return dict(zip(UNITS, map(float, found), strict=True))
+
+
+_Waves = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _sine_waves(parameters: Any, hinges: int) -> _Waves:
+    """Angular frequency, amplitude and phase of each hinge's first harmonic, `[hinges]`."""
+    (u, v), rate = parameters[0][0], np.asarray(parameters[2], float).item()
+    wave = np.asarray(u, float)[:hinges, 0] + 1j * np.asarray(v, float)[:hinges, 0]
+    return np.full(hinges, rate), np.abs(wave), np.angle(wave)
+
+
+def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
+    """The same of the greatest sine of each oscillator, `[hinges]`."""
+    w, coupling, reach, _, _ = parameters
+    matrix = np.zeros((2 * hinges, 2 * hinges))
+    for j, column in coupling.items():
+        matrix[:hinges, j] = np.asarray(column, float)[:, 0]
+    rates = np.asarray(w, float)[:, 0]
+    matrix[:hinges, hinges:], matrix[hinges:, :hinges] = np.diag(rates), -np.diag(rates)
+    # The matrix M is antisymmetric, so i M is Hermitian and (x, y) = Σ V exp(-i λ t) V* (0, 1).
+    turns, modes = np.linalg.eigh(1j * matrix)
+    start = np.concatenate([np.zeros(hinges), np.ones(hinges)])
+    parts = modes[:hinges] * (modes.conj().T @ start)
+    # What oscillates at one frequency is one sine; of each pair ±λ, one half tells all.
+    near = _SAME_RATE * max(np.abs(turns).max(), 1e-9)
+    same = np.abs(turns[:, None] - turns) < near
+    parts = np.where(turns < -near, 2 * parts @ same, 0)
+    # Equal oscillators that are coupled have pairs of equal sines: then the faster.
+    best = (np.abs(parts) * (1 - _SAME_SIZE * turns)).argmax(1)
+    wave = parts[np.arange(hinges), best]
+    # Re(z exp(i ω t)) = |z| sin(ω t + arg z + π/2).
+    size = np.tanh(np.abs(wave)) * np.abs(np.asarray(reach, float)[:, 0])
+    return -turns[best], size, np.angle(1j * wave)
+
+
+_WAVES = {"sine": _sine_waves, "cpg": _cpg_waves}

@@ -1,0 +1,54 @@
+"""The measures of an episode by name: what they are called in texts, their units, what they need.
+
+Their formulas are in `measures.py`; this table is apart from them, so that a configuration can be
+checked without JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+
+class Measure(NamedTuple):
+    """What is said of a measure.
+
+    Attributes:
+        words: its name in texts.
+        unit: of its values; "-" for a pure number.
+        record: what of a track it is made of, of `tasks.RECORDS`; "" for what all tracks have, so
+            that it is always there. Others are there where `task.measures` names them.
+    """
+
+    words: str
+    unit: str
+    record: str = ""
+
+
+MEASURES: dict[str, Measure] = {
+    "speed_bl_s": Measure("speed", "body lengths/s"),
+    "speed_m_s": Measure("speed", "m/s"),
+    "path_speed_m_s": Measure("speed along the path", "m/s"),
+    "displacement_m": Measure("displacement", "m"),
+    "path_length_m": Measure("path length", "m"),
+    "straightness": Measure("straightness", "-"),
+    "energy_j": Measure("energy", "J"),
+    "cost_of_transport": Measure("cost of transport", "-"),
+    "depth_m": Measure("depth", "m"),
+    "depth_error_m": Measure("depth error", "m"),
+    "gait_frequency_hz": Measure("gait frequency", "Hz", "joints"),
+    "gait_phase_spread_rad": Measure("spread of gait phases", "rad", "joints"),
+    "gait_phase_lag_rad": Measure("gait phase lag", "rad", "joints"),
+    "joint_amplitude_rad": Measure("joint amplitude", "rad", "joints"),
+    "turn_rate_rad_s": Measure("turn rate", "rad/s", "core"),
+    "tilt_rad": Measure("tilt", "rad", "core"),
+    "balance": Measure("balance", "-", "core"),
+    "bed_contact": Measure("time on the bed", "-", "contacts"),
+    "bed_force_n": Measure("force of the bed", "N", "contacts"),
+}
+"""All measures, in the order of reports."""
+
+
+def records_of(names: Iterable[str]) -> tuple[str, ...]:
+    """What a track has to record for some measures, each once."""
+    return tuple(sorted({MEASURES[name].record for name in names} - {""}))
