@@ -50,6 +50,8 @@ def settings_hash(config: Config) -> str:
         data[section]["type"] = content_name(data[section]["type"])
         if not data[section]["params"]:  # as runs have it from before there were any
             del data[section]["params"]
+    if not data["task"]["measures"]:  # likewise
+        del data["task"]["measures"]
     if data["bodies"] is None:
         del data["bodies"]
     else:

@@ -18,13 +18,13 @@ def append_metrics(path: Path, row: Mapping[str, float]) -> None:
     """Adds a line of figures by column; the first line brings the columns, which then stay."""
     text = io.StringIO()
     writer = csv.writer(text)
-    columns = _columns(path)
-    if not columns:
-        columns = list(row)
-        writer.writerow(columns)
-    # A run that another version began may know other measures.
-    writer.writerow(_number(row.get(name, math.nan)) for name in columns)
     try:
+        columns = _columns(path)
+        if not columns:
+            columns = list(row)
+            writer.writerow(columns)
+        # A run that another version began may know other measures.
+        writer.writerow(_number(row.get(name, math.nan)) for name in columns)
         with open(path, "ab") as file:
             file.write(text.getvalue().encode())
     except OSError as error:

@@ -129,6 +129,15 @@ def test_metrics_are_rfc_4180_at_any_time(run):
     assert np.array_equal(read["best, so far"].astype(np.float32), np.float32([0.1, 0.2]))
 
 
+def test_metrics_keep_the_columns_that_a_run_began_with(run):
+    """An older version's run, resumed by one that measures more, less, and in another order."""
+    run.append_metrics({"generation": 1, "best": 2.0, "old": 3.0})
+    run.append_metrics({"new": 4.0, "best": 5.0, "generation": 2})
+    read = run.load_metrics()
+    assert list(read) == ["generation", "best", "old"]
+    assert read["best"].tolist() == [2, 5] and np.isnan(read["old"][1])
+
+
 def test_pandas_reads_metrics(run):
     pandas = pytest.importorskip("pandas")
     run.append_metrics({"generation": 1, "best": float("nan")})

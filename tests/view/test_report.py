@@ -522,13 +522,18 @@ def test_modules_are_counted_and_weighed():
     elbow = read(ELBOW)
     rows, foot = tables.count_modules(elbow)
     modules = tables.list_modules(elbow)
+    descriptors = tables.list_descriptors(elbow)
     robot = {"heading": "elbow", "rows": rows, "foot": foot, "modules": modules}
+    robot["descriptors"] = descriptors
     page = report_page.sections.robots([robot])
     assert '<td class="left">FixedBrick</td><td>2</td><td>10.2</td><td>20.4</td>' in page
     assert f"<td>{1e3 * elbow.mass:.4g}</td>" in page
     assert "41 × 41 × 35.5" in page
     assert [row[1] for row in modules] == [module.name for module in elbow.modules]
     assert all(f'<td class="left">{module.name}</td>' in page for module in elbow.modules)
+    assert len(descriptors) == len(elbow.descriptors)
+    assert ["absolute size", f"{elbow.num_modules}", "modules"] in descriptors
+    assert '<td class="left">absolute size</td>' in page
 
 
 def test_the_commands_give_the_same_settings(lab, copy):

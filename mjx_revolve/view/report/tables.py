@@ -174,8 +174,9 @@ def measures_table(record: RunRecord, replay: Replay) -> list[tuple[str, str, st
     """Rows of a champion's score and measures: in its episode, and over all fresh starts."""
     unit = f" ({record.unit})" if record.unit else ""
     return [(f"score{unit}", format_number(replay.score), _score(record))] + [
-        (_label(name), format_number(value), format_number(_measure(record, name)))
-        for name, value in replay.measures.items()
+        (_label(name), format_number(replay.measures[name]), format_number(_measure(record, name)))
+        for name in LABELS
+        if name in replay.measures
     ]
 
 
