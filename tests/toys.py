@@ -146,7 +146,7 @@ class BodyToy(BodyFitness):
 
     block_size = 8
 
-    def evaluate(self, bodies, which, genes, key):
+    def evaluate(self, genes, which, bodies, key):
         hinges = np.array([body.num_hinges for body in bodies])[np.asarray(which)]
         own = np.zeros(np.shape(genes), bool)
         for row, k in enumerate(np.asarray(which)):

@@ -135,15 +135,21 @@ class BodyFitness:
         own = self.mixed.controller_of(robot)
         return lay_out_genes(own, self.mixed.setup.controller, plant_of(robot))
 
+    def example_block(self) -> tuple[Any, ...]:
+        """A block to compile for."""
+        body = self.genotype.develop(self.genotype.random(np.random.default_rng(0)))
+        size = self.block_size or self.config.evolution.population_size
+        return np.zeros((size, self.num_genes), np.float32), np.zeros(size, np.int32), [body]
+
     def evaluate(
-        self, bodies: Sequence[Morphology], which: np.ndarray, genes: np.ndarray, key: jax.Array
+        self, genes: np.ndarray, which: np.ndarray, bodies: Sequence[Morphology], key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Scores a block.
 
         Args:
-            bodies: not trimmed; just one where each block holds one.
-            which: `[P]` the body of each individual.
             genes: `[P, num_genes]`.
+            which: `[P]` the body of each individual.
+            bodies: not trimmed; just one where each block holds one.
             key: draws the episodes' starts and water.
 
         Returns:

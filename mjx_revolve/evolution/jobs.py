@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.evolution.blocks import Block, Scored
 
+# The real fitness, of one body's genes, and of bodies that evolve.
 MAKE_FITNESS = "mjx_revolve.episodes.fitness:make_fitness"
+MAKE_BODY_FITNESS = "mjx_revolve.evolution.body_fitness:make_body_fitness"
 # How often a block is tried before it is given up (a choice).
 TRIES = 3
 
@@ -77,6 +79,11 @@ class Job:
     limits: Limits
 
 
+def choose_fitness(config: Config) -> str:
+    """The name of the function that makes the real fitness of a configuration."""
+    return MAKE_FITNESS if config.bodies is None else MAKE_BODY_FITNESS
+
+
 def make_job(config: Config, make_fitness: Callable | None) -> Job:
     """A job.
 
@@ -87,7 +94,7 @@ def make_job(config: Config, make_fitness: Callable | None) -> Job:
     Raises:
         ValueError: the function cannot be imported by its name.
     """
-    make = MAKE_FITNESS
+    make = choose_fitness(config)
     if make_fitness is not None:
         make = f"{make_fitness.__module__}:{make_fitness.__qualname__}"
         if make_fitness.__module__ == "__main__" or "<" in make:

@@ -179,7 +179,7 @@ def evaluate(
         # The last block is filled up with its own first row: one shape, one program.
         full = np.concatenate([part, np.full(size - len(part), part[0])])
         bodies, which = np.unique(owner[full], return_inverse=True)
-        blocks.append(([individuals[k].body for k in bodies], which.astype(np.int32), rows[full]))
+        blocks.append((rows[full], which.astype(np.int32), [individuals[k].body for k in bodies]))
     scores = np.full(len(rows), np.nan, np.float32)
     measures: dict[str, np.ndarray] = {}
     for part, (found, figures) in zip(cut, pool.score(blocks, key), strict=True):

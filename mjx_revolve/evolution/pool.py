@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from mjx_revolve.evolution.jobs import MAKE_FITNESS, Job, WorkerError, make_job
+from mjx_revolve.evolution.jobs import Job, WorkerError, choose_fitness, make_job
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 
@@ -194,7 +194,12 @@ def choose_workers(config: Config) -> int:
     block = block_size(config.task.trials)
     if block is None:
         return 1
-    return min(runtime.usable_cores(), -(-config.evolution.population_size // block))
+    blocks = -(-config.evolution.population_size // block)
+    if config.bodies is not None:
+        count = config.bodies.selection.offspring or config.evolution.population_size
+        tried = config.bodies.learning.population_size
+        blocks = -(-count * tried // block)
+    return min(runtime.usable_cores(), blocks)
 
 
 def make_pool(
@@ -232,7 +237,7 @@ def make_pool(
     if workers is None:
         workers = 1 if make_fitness else choose_workers(config)
     if workers == 1 and cluster is None:
-        fitness = (make_fitness or pkgutil.resolve_name(MAKE_FITNESS))(config)
+        fitness = (make_fitness or pkgutil.resolve_name(choose_fitness(config)))(config)
         return Pool(fitness, choose_block(fitness))
     _expect_cpu("--cluster" if cluster else "--workers")
     job = make_job(config, make_fitness)

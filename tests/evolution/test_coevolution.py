@@ -110,8 +110,8 @@ def test_blocks_hold_one_body_where_many_brains_are_tried(folder):
         watch(pool.fitness, seen)
         live(pool, None, strangers(config, pool), jax.random.key(0))
         assert pool.fitness.alone == alone
-        assert {len(genes) for _, _, genes, _ in seen} == {8}
-        assert all(len(bodies) == 1 for bodies, *_ in seen) == alone
+        assert {len(genes) for genes, *_ in seen} == {8}
+        assert all(len(bodies) == 1 for _, _, bodies, _ in seen) == alone
         assert len(seen) == (6 * -(-size // 8) if alone else -(-6 * size // 8))
 
 
@@ -119,8 +119,8 @@ def test_those_that_fail_have_no_score(folder):
     config, pool = start(folder, {"learning": {"population_size": 4, "generations": 2}})
     inner = pool.fitness.evaluate
 
-    def fail(bodies, which, genes, key):
-        scores, measures = inner(bodies, which, genes, key)
+    def fail(genes, which, bodies, key):
+        scores, measures = inner(genes, which, bodies, key)
         lost = np.array([body.num_hinges < 3 for body in bodies])[which]
         return np.where(lost, pool.fitness.worst_score, scores), measures
 
