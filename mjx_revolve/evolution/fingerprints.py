@@ -58,8 +58,6 @@ def settings_hash(config: Config) -> str:
         bodies = data["bodies"]
         bodies["genotype"] = content_name(bodies["genotype"])
         bodies["seeds"] = [hash_text(Path(path).read_text("utf-8")) for path in bodies["seeds"]]
-    if not data["task"]["measures"]:  # likewise
-        del data["task"]["measures"]
     data["world"]["name"] = Path(data["world"]["name"]).name
     return hash_text(json.dumps(data, sort_keys=True, default=str))
 
