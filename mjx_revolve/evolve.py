@@ -3,8 +3,8 @@
     python -m mjx_revolve.evolve lake_swim [--seed N] [--out DIR]
     python -m mjx_revolve.evolve --resume DIR
 
-The population is spread over this host's cores, and over several hosts where `--hosts` says so (see
-`mjx_revolve.evolution.pool` and `mjx_revolve.evolution.hosts`); results do not depend on it.
+The population is spread over this machine's cores, or over the workers of a Dask cluster with
+`--cluster` (see `mjx_revolve.evolution.pool`); results do not depend on it.
 
 Heavy imports stand inside functions: thread settings must be made before NumPy and JAX are loaded,
 and `--help` is there at once.
@@ -20,9 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mjx_revolve.evolution.crew import WorkerError
 from mjx_revolve.evolution.interrupts import Interrupts
-from mjx_revolve.evolution.place import Place, read_place
+from mjx_revolve.evolution.jobs import WorkerError
 from mjx_revolve.inputs.commands import (
     Parser,
     describe_refusal,
@@ -56,10 +55,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--set", action="append", default=[], metavar="KEY.PATH=VALUE", dest="settings",
         help="replace one value of the configuration; may be repeated")  # fmt: skip
     add("--workers", type=whole(1), metavar="N",
-        help="processes on this host (default: its cores)")  # fmt: skip
-    add("--hosts", type=whole(1), metavar="N", help="run this same command on N hosts")
-    add("--coordinator", metavar="HOST:PORT", help="where host 0 listens")
-    add("--host-index", metavar="I", help="of this host (default: the launcher's)")
+        help="processes on this machine (default: its cores)")  # fmt: skip
+    add("--cluster", metavar="SCHEDULER",
+        help="a Dask scheduler's address, or its scheduler file: its workers score")  # fmt: skip
     return parser
 
 
@@ -73,44 +71,27 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
 
     Returns:
         The exit code: 0 when the run is finished, 130 or 143 when it was interrupted, 1 when the
-        disk refused a file or a worker failed.
+        disk refused a file or no worker was left.
 
     Raises:
         InputError: the arguments, the configuration or the run folder are wrong.
     """
     arguments = _parser().parse_args(argv)
-    place = read_place(arguments.hosts, arguments.coordinator, arguments.host_index)
+    if arguments.cluster is not None and arguments.workers is not None:
+        raise InputError("--cluster: expected no --workers beside it; found both")
     if arguments.seed is not None:
         arguments.settings.append(f"evolution.seed={arguments.seed}")
     runtime.prepare_process()
     try:
-        if place is not None and place.index > 0:
-            return _serve(arguments, make_fitness, place)
         with contextlib.ExitStack() as open_pools:
-            return _lead(arguments, make_fitness, place, open_pools)
+            return _lead(arguments, make_fitness, open_pools)
     except WorkerError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
 
 
-def _serve(arguments: argparse.Namespace, make_fitness: Callable | None, place: Place) -> int:
-    """A part of another host's run."""
-    from mjx_revolve.evolution.hosts import load_served_config, serve, start_crew
-    from mjx_revolve.evolution.messages import format_address
-
-    config = load_served_config(arguments.config, arguments.resume, arguments.settings)
-    crew = start_crew(config, make_fitness, arguments.workers, place)
-    count = "1 worker" if len(crew.workers) == 1 else f"{len(crew.workers)} workers"
-    leader = format_address(place.address)
-    print(f"host {place.index} of {place.hosts}: {count} for the leader at {leader}", flush=True)
-    return serve(crew)
-
-
 def _lead(
-    arguments: argparse.Namespace,
-    make_fitness: Callable | None,
-    place: Place | None,
-    open_pools: contextlib.ExitStack,
+    arguments: argparse.Namespace, make_fitness: Callable | None, open_pools: contextlib.ExitStack
 ) -> int:
     """A whole run; `open_pools` ends its workers."""
     from mjx_revolve.evolution.start import begin_run, continue_run
@@ -118,7 +99,8 @@ def _lead(
     def make(config: Config) -> Pool:
         from mjx_revolve.evolution.pool import make_pool
 
-        return open_pools.enter_context(make_pool(config, arguments.workers, make_fitness, place))
+        workers, cluster = arguments.workers, arguments.cluster
+        return open_pools.enter_context(make_pool(config, workers, make_fitness, cluster))
 
     path, folder, settings = arguments.config, arguments.resume, arguments.settings
     if path is None and folder is None:
@@ -227,9 +209,10 @@ def _describe(start: Start) -> str:
     device = jax.devices()[0].device_kind
     if device == "cpu":
         device = f"cpu with {runtime.usable_cores()} cores"
-    if fitness.workers > 1:
+    if fitness.place:
+        device = f"workers at {fitness.place}"
+    elif fitness.workers > 1:
         device += f", {fitness.workers} workers"
-        device += f" on {len(fitness.hosts)} hosts" if len(fitness.hosts) > 1 else ""
     return (
         f"{body}{fitness.num_genes} genes | {config.task.name} in {Path(config.world_name).stem} | "
         f"{evolution.strategy} {evolution.population_size} x {evolution.generations}, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -72,26 +73,23 @@ def make_slow(config):
     return SlowToy()
 
 
-class TroubledToy(Toy):
-    """Gets into trouble once: $TOY_TROUBLE is `kill`, `stop`, `raise` or `exit`, then `:FILE`.
-
-    The file says that it has happened already.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
+class TroubledToy(SlowToy):
+    """Does once what the file $TOY_TROUBLE says, if there is one; dies of a gene above 100."""
 
     def evaluate(self, population, key):
-        self.count += 1
-        kind, _, path = os.environ["TOY_TROUBLE"].partition(":")
-        if self.count == 8 and not Path(path).exists():
-            Path(path).write_text(str(os.getpid()))
-            match kind:
+        if np.max(population) > 100:
+            os.kill(os.getpid(), signal.SIGKILL)
+        order = Path(os.environ["TOY_TROUBLE"])
+        mine = order.with_suffix(f".{os.getpid()}")
+        with contextlib.suppress(FileNotFoundError):
+            order.rename(mine)  # for one worker only
+            match mine.read_text():
                 case "kill":
                     os.kill(os.getpid(), signal.SIGKILL)
                 case "stop":
                     os.kill(os.getpid(), signal.SIGSTOP)
+                case "hang":
+                    time.sleep(3600)
                 case "raise":
                     raise FloatingPointError("all is lost\nreally")
                 case "exit":
@@ -102,6 +100,23 @@ class TroubledToy(Toy):
 
 def make_troubled(config):
     return TroubledToy()
+
+
+class Weights:
+    """Bodies that are told apart: scores depend on what each of them weighs."""
+
+    num_genes = 2
+
+    def example_block(self):
+        return [1.0, 1.0], np.zeros((2, 2), np.float32)
+
+    def evaluate(self, weights, genes, key):
+        scores = jnp.asarray(weights) * jnp.sum(genes, 1) + jax.random.normal(key)
+        return scores, {"weight": jnp.asarray(weights)}
+
+
+def make_weights(config):
+    return Weights()
 
 
 def make_broken(config):

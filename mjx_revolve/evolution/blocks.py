@@ -1,11 +1,12 @@
 """Where a population is evaluated: it is cut into blocks, and somebody scores them.
 
-A `Workplace` turns blocks into scores. Here is the simplest one, this process; `leader.Leader` is
-the other one: processes on one host or on several. A cluster's own scheduler would be a third.
+A `Workplace` turns blocks into scores. Here is the simplest one, this process; the others are
+`processes.Processes`, on this machine, and `cluster.Cluster`, on many.
 
-All blocks have one shape, that of one chunk of `xla.LANES` lanes, so that each is one run of the
-same compiled program wherever it is scored: that is why scores do not depend, to the last bit, on
-how many workers there are nor on who scores what.
+A block is a tuple of what `fitness.evaluate` takes before the key: `(genes,)` where all have one
+body. All blocks of genes have one shape, that of one chunk of `xla.LANES` lanes, so that each is
+one run of the same compiled program wherever it is scored: that is why scores do not depend, to the
+last bit, on how many workers there are nor on who scores what.
 """
 
 from __future__ import annotations
@@ -19,61 +20,81 @@ import numpy as np
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.numerics.xla import LANES, on_cpu
 
-Scored = tuple[list[np.ndarray], list[str]]
+Block = tuple[Any, ...]
+"""What `fitness.evaluate` takes before the key; the first of them has one entry per individual."""
+Scored = tuple[np.ndarray, dict[str, np.ndarray]]
+"""`[rows]` scores and measures of a block, float32."""
 
 
 class Workplace(Protocol):
     """Whoever scores blocks."""
 
     @property
-    def hosts(self) -> list[dict[str, Any]]:
-        """Who is at work: `node`, `cpu`, `xla_flags`, number of `workers`; empty: this process."""
+    def place(self) -> str:
+        """The address of a cluster; nothing on this machine."""
 
-    def score(self, blocks: Sequence[np.ndarray], key: jax.Array) -> Scored:
+    @property
+    def workers(self) -> int:
+        """How many processes score."""
+
+    def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored | str]:
         """Scores blocks.
 
         Args:
-            blocks: `[rows, genes]` float32 each, of one shape.
+            blocks: the blocks.
             key: draws the episodes' starts.
 
         Returns:
-            `[1 + measures, rows]` float32 scores and measures of each block; the measures' names.
+            The scores of each, or in words why nobody could score it.
         """
 
-    def close(self, reason: str | None = None) -> None:
-        """Ends the work; `reason` says why, if it is not that all is done."""
+    def close(self) -> None:
+        """Ends the work."""
 
 
 class ThisProcess:
     """Scores blocks here, one after the other: two at once can lock XLA's CPU back end up."""
 
+    place = ""
+    workers = 1
+
     def __init__(self, fitness: Any) -> None:
         self.fitness = fitness
-        self.hosts: list[dict[str, Any]] = []
 
-    def score(self, blocks: Sequence[np.ndarray], key: jax.Array) -> Scored:
+    def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored | str]:
         """See `Workplace`."""
-        scored = [evaluate_block(self.fitness, block, key) for block in blocks]
-        return [rows for rows, _ in scored], scored[-1][1]
+        return [evaluate_block(self.fitness, block, key) for block in blocks]
 
-    def close(self, reason: str | None = None) -> None:
+    def close(self) -> None:
         """There is nobody to send home."""
 
 
-def evaluate_block(fitness: Any, block: np.ndarray, key: jax.Array) -> tuple[np.ndarray, list[str]]:
+def evaluate_block(fitness: Any, block: Block, key: jax.Array) -> Scored:
     """Scores one block.
 
     Args:
         fitness: the fitness.
-        block: `[rows, genes]` float32.
+        block: what it takes before the key; arrays become JAX's.
         key: draws the episodes' starts.
 
     Returns:
-        `[1 + measures, rows]` float32 scores and measures, and the measures' names.
+        Scores and measures.
     """
-    scores, measures = fitness.evaluate(jax.numpy.asarray(block), key)
-    rows = [np.asarray(values, np.float32) for values in (scores, *measures.values())]
-    return np.stack(rows), list(measures)
+    arguments = [jax.numpy.asarray(x) if isinstance(x, np.ndarray) else x for x in block]
+    scores, measures = fitness.evaluate(*arguments, key)
+    return np.asarray(scores, np.float32), {
+        name: np.asarray(values, np.float32) for name, values in measures.items()
+    }
+
+
+def key_as_data(key: jax.Array) -> tuple[np.ndarray, str]:
+    """A key as what another process can be sent: numbers, and the kind of key."""
+    return np.asarray(jax.random.key_data(key)), str(jax.random.key_impl(key))
+
+
+def key_from_data(data: tuple[np.ndarray, str]) -> jax.Array:
+    """The inverse of `key_as_data`."""
+    return jax.random.wrap_key_data(jax.numpy.asarray(data[0]), impl=data[1])
 
 
 def split_blocks(population: np.ndarray, size: int) -> list[np.ndarray]:
@@ -103,3 +124,10 @@ def choose_block(fitness: Any) -> int | None:
     own = getattr(fitness, "block_size", None)
     config: Config | None = getattr(fitness, "config", None)
     return own if own or config is None else block_size(config.task.trials)
+
+
+def example_block(fitness: Any, population_size: int) -> Block:
+    """A block to compile for: the fitness's own `example_block()`, or genes of zero."""
+    if hasattr(fitness, "example_block"):
+        return fitness.example_block()
+    return (np.zeros((choose_block(fitness) or population_size, fitness.num_genes), np.float32),)

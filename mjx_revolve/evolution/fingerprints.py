@@ -72,10 +72,20 @@ def program_versions() -> dict[str, str]:
     return {"mjx_revolve": runtime.source_hash(), **versions}
 
 
-def identify(config: Config, fitness: Any) -> dict[str, Any]:
-    """What a worker must have in common with its leader: program, settings, robot and world."""
-    return {
-        "versions": program_versions(),
-        "settings_hash": settings_hash(config),
-        "model_hash": model_hash(fitness),
+def identify(fitness: Any) -> dict[str, Any]:
+    """What a worker must have in common with its leader: program, precision, robot and world."""
+    import jax
+
+    return program_versions() | {
+        "precision": str(jax.numpy.zeros(()).dtype),
+        "device": jax.default_backend(),
+        "robot and world": model_hash(fitness),
     }
+
+
+def find_difference(expected: dict[str, Any], found: dict[str, Any]) -> str:
+    """In what a worker differs from its leader, in words; nothing: in nothing that matters."""
+    for name, value in expected.items():
+        if found.get(name) != value:
+            return f"{name}: expected {value} as the run has it; found {found.get(name)}"
+    return ""

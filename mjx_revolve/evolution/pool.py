@@ -1,4 +1,4 @@
-"""A fitness spread over cores and hosts: the same scores, sooner.
+"""A fitness spread over cores, or the machines of a cluster: the same scores, sooner.
 
     with make_pool("configs/lake_swim.yaml") as fitness:
         scores, measures = fitness.evaluate(population, key)
@@ -9,16 +9,15 @@ workers start while the rest is.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import pkgutil
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from mjx_revolve.evolution.crew import MAKE_FITNESS, Crew, make_job
-from mjx_revolve.evolution.place import Place, alone
+from mjx_revolve.evolution.jobs import MAKE_FITNESS, Job, WorkerError, make_job
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 
@@ -27,8 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.blocks import Workplace
-    from mjx_revolve.evolution.leader import Leader, Limits
+    from mjx_revolve.evolution.blocks import Block, Scored, Workplace
 
 _log = logging.getLogger(__name__)
 
@@ -39,26 +37,32 @@ class Pool:
     Attributes:
         fitness: this process's own, for replays, and for scores if there are no workers.
         block: individuals in a block; None: the whole population, whatever its size.
-        hosts: who scores; see `blocks.Workplace`.
-        workers: how many processes score, on all hosts.
+        folder: where blocks that had to be given up are kept.
     """
 
-    def __init__(self, fitness: Any, block: int | None, workplace: Workplace | None = None) -> None:
+    def __init__(
+        self,
+        fitness: Any,
+        block: int | None,
+        workplace: Workplace | None = None,
+        job: Job | None = None,
+    ) -> None:
         """Opens a pool.
 
         Args:
             fitness: this process's own.
             block: individuals in a block; None: the whole population, whatever its size.
             workplace: scores blocks, and is closed with the pool; None: this process.
+            job: what it does.
         """
         from mjx_revolve.evolution.blocks import ThisProcess
 
         self.fitness = fitness
         self.block = block
+        self.folder = Path(tempfile.gettempdir()) / "mjx_revolve"
         self._workplace: Workplace = workplace or ThisProcess(fitness)
+        self._job = job
         self._closed = False
-        self.hosts = self._workplace.hosts
-        self.workers: int = sum(host["workers"] for host in self.hosts) or 1
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.fitness, name)
@@ -67,6 +71,16 @@ class Pool:
     def num_genes(self) -> int:
         """Length of an individual's genes."""
         return self.fitness.num_genes
+
+    @property
+    def workers(self) -> int:
+        """How many processes score."""
+        return self._workplace.workers
+
+    @property
+    def place(self) -> str:
+        """The address of the cluster; nothing on this machine."""
+        return self._workplace.place
 
     def __call__(self, population: Any, key: jax.Array) -> np.ndarray:
         """Scores a population: `[P]`; see `evaluate`."""
@@ -80,47 +94,85 @@ class Pool:
             key: draws the episodes' starts, the same for every individual.
 
         Returns:
-            `[P]` scores and `[P]` measures, float32.
+            `[P]` scores and `[P]` measures, float32; see `score` for NaN.
 
         Raises:
-            WorkerError: a worker died, failed or hangs; the pool is closed.
+            WorkerError: see `score`.
             InputError: the population has another shape.
         """
         import numpy as np
 
         from mjx_revolve.evolution.blocks import split_blocks
 
-        if self._closed:
-            raise RuntimeError("expected an open pool; found it closed")
         population = np.asarray(population, np.float32)
         if population.ndim != 2 or population.shape[1] != self.num_genes or len(population) < 1:
             raise InputError(
                 f"population: expected [P, {self.num_genes}]; found {list(population.shape)}"
             )
         blocks = split_blocks(population, self.block or len(population))
+        scores, measures = zip(*self.score([(block,) for block in blocks], key), strict=True)
+        size = len(population)
+        return np.concatenate(scores)[:size], {
+            name: np.concatenate([each[name] for each in measures])[:size] for name in measures[0]
+        }
+
+    def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored]:
+        """Scores blocks, whatever the fitness takes.
+
+        Args:
+            blocks: arguments of `fitness.evaluate` before the key, which can be pickled; the first
+                has one entry per individual.
+            key: draws the episodes' starts, the same for every individual.
+
+        Returns:
+            `[rows]` scores and measures of each. Those of a block that brings down worker after
+            worker are NaN; the log names the file from which it can be scored again.
+
+        Raises:
+            WorkerError: no worker is left, or not one block could be scored; the pool is closed.
+        """
+        import numpy as np
+
+        if self._closed:
+            raise RuntimeError("expected an open pool; found it closed")
         try:
-            results, names = self._workplace.score(blocks, key)
-        except BaseException as error:
-            # Interrupted anywhere: what the workers are at, and how far a message has come, is
-            # unknown.
-            self.close(_reason(error))
+            results = self._workplace.score(blocks, key)
+            names = [tuple(result[1]) for result in results if not isinstance(result, str)]
+            if not names:
+                raise WorkerError(f"expected scores; every block failed: {results[0]}")
+        except BaseException:
+            # Interrupted anywhere: what the workers are at is unknown.
+            self.close()
             raise
-        rows = np.concatenate(results, 1)[:, : len(population)]
-        return rows[0].copy(), dict(zip(names, rows[1:], strict=True))
+        whole: list[Scored] = []
+        for block, result in zip(blocks, results, strict=True):
+            if isinstance(result, str):
+                self._report(block, key, result)
+                nothing = np.full(len(block[0]), np.nan, np.float32)
+                result = nothing, dict.fromkeys(names[0], nothing)
+            whole.append(result)
+        return whole
+
+    def _report(self, block: Block, key: jax.Array, reason: str) -> None:
+        """Says what became of a block that was given up, and keeps it."""
+        from mjx_revolve.evolution.lost import save_lost
+
+        assert self._job is not None  # without workers no block is given up
+        path = save_lost(self.folder, self._job, block, key)
+        _log.warning(
+            "%d individuals count as failed, because their workers do (%s); to see why: "
+            "python -m mjx_revolve.evolution.lost %s", len(block[0]), reason, path,
+        )  # fmt: skip
 
     def describe(self) -> dict[str, Any]:
         """Who scores, for `run.json`."""
-        hosts = [{k: v for k, v in host.items() if k != "xla_flags"} for host in self.hosts]
-        return {"count": self.workers, "block": self.block} | ({"hosts": hosts} if hosts else {})
+        known = {"count": self.workers, "block": self.block}
+        return known | ({"cluster": self.place} if self.place else {})
 
-    def close(self, reason: str | None = None) -> None:
-        """Ends the workers.
-
-        Args:
-            reason: why, if it is not that all is done; workers of other hosts print it.
-        """
+    def close(self) -> None:
+        """Ends the workers."""
         if not self._closed:
-            self._workplace.close(reason)
+            self._workplace.close()
         self._closed = True
 
     def __enter__(self) -> Pool:
@@ -132,12 +184,7 @@ class Pool:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.close(None if error is None else _reason(error))
-
-
-def _reason(error: BaseException) -> str:
-    """An error in one line."""
-    return str(error).partition("\n")[0] or type(error).__name__
+        self.close()
 
 
 def choose_workers(config: Config) -> int:
@@ -154,44 +201,57 @@ def make_pool(
     config: Config | str | Path,
     workers: int | None = None,
     make_fitness: Callable[[Config], Any] | None = None,
-    place: Place | None = None,
-    limits: Limits | None = None,
+    cluster: str | None = None,
 ) -> Pool:
-    """Builds a fitness and starts the workers that share its work.
+    """Builds a fitness and starts the workers that share its work, or finds them.
 
     Args:
         config: the configuration, or the path of its file.
-        workers: how many processes are to score on this host; None: one for each core on a CPU, and
-            this one alone on an accelerator. With 1, this process does it itself.
+        workers: how many processes are to score on this machine; None: one for each core on a CPU,
+            and this one alone on an accelerator. With 1, this process does it itself.
         make_fitness: makes the fitness, here and in each worker: a function that can be imported by
-            its name. It is any object with `num_genes` and `evaluate`; `block_size` says how many
-            individuals it takes at a time. None: the real one. By default another one has no
-            workers.
-        place: this host's place among several.
-        limits: how long to wait for workers.
+            its name. It is any object with `evaluate`, and `num_genes` where that takes genes alone
+            or `example_block()`, a block to compile for; `block_size` says how many individuals it
+            takes at a time. None: the real one. By default another one has no workers.
+        cluster: a Dask scheduler's address, or the path of its scheduler file: its workers do it.
 
     Returns:
         The pool; to be closed, or used in a `with`.
 
     Raises:
-        InputError: the configuration is wrong, or one of the workers has another.
-        WorkerError: workers cannot be started, or one died or never came.
+        InputError: the configuration is wrong, or there is no scheduler.
+        WorkerError: workers cannot be started.
     """
     cache = runtime.prepare_process()
     from mjx_revolve.episodes.config import load_config
     from mjx_revolve.evolution.blocks import choose_block
+    from mjx_revolve.evolution.fingerprints import identify
 
     if isinstance(config, str | Path):
         config = load_config(config)
     if workers is None:
-        workers = 1 if make_fitness else runtime.usable_cores() if place else choose_workers(config)
-    if workers == 1 and place is None:
+        workers = 1 if make_fitness else choose_workers(config)
+    if workers == 1 and cluster is None:
         fitness = (make_fitness or pkgutil.resolve_name(MAKE_FITNESS))(config)
         return Pool(fitness, choose_block(fitness))
-    _expect_cpu("--hosts" if place else "--workers")
-    fitness, leader = _start_workers(config, workers, make_fitness, place or alone(), limits, cache)
-    _note_differences(leader.hosts)
-    return Pool(fitness, choose_block(fitness) or config.evolution.population_size, leader)
+    _expect_cpu("--cluster" if cluster else "--workers")
+    job = make_job(config, make_fitness)
+    crew: Cluster | Processes
+    if cluster:
+        from mjx_revolve.evolution.cluster import Cluster
+
+        crew = Cluster(cluster, job)
+    else:
+        from mjx_revolve.evolution.processes import Processes
+
+        crew = Processes(workers, job, cache)
+    try:
+        fitness = pkgutil.resolve_name(job.make)(config)
+        crew.identity = identify(fitness)
+    except BaseException:
+        crew.close()
+        raise
+    return Pool(fitness, choose_block(fitness) or config.evolution.population_size, crew, job)
 
 
 def _expect_cpu(option: str) -> None:
@@ -202,45 +262,3 @@ def _expect_cpu(option: str) -> None:
             f"{option}: expected JAX to run on the CPU (JAX_PLATFORMS=cpu), where work is spread "
             f"over cores; found {jax.default_backend()}, which takes the whole population"
         )
-
-
-def _start_workers(
-    config: Config,
-    workers: int,
-    make_fitness: Callable[[Config], Any] | None,
-    place: Place,
-    limits: Limits | None,
-    cache: Path | None,
-) -> tuple[Any, Leader]:
-    """Starts this host's workers, builds the fitness meanwhile, and waits for all to report."""
-    from mjx_revolve.evolution import leader
-
-    limits = limits or leader.LIMITS
-    with contextlib.ExitStack() as undo:
-        listener = undo.enter_context(place.listen())
-        job = make_job(config, make_fitness, place.seen_from_here(listener), cache, limits.start)
-        crew = Crew(workers, job)
-        undo.callback(crew.close, 0.0)
-        from mjx_revolve.evolution.blocks import choose_block
-        from mjx_revolve.evolution.fingerprints import identify
-
-        fitness = pkgutil.resolve_name(job["make"])(config)
-        identity = identify(config, fitness)
-        lead = leader.Leader(listener, crew, place.secret, identity, place.hosts, limits)
-        undo.pop_all()
-    try:
-        lead.gather(choose_block(fitness) or config.evolution.population_size, fitness.num_genes)
-    except BaseException as error:
-        lead.close(_reason(error))
-        raise
-    return fitness, lead
-
-
-def _note_differences(hosts: list[dict[str, Any]]) -> None:
-    for name, what in (("cpu", "CPUs"), ("xla_flags", "XLA_FLAGS")):
-        found = sorted({host[name] for host in hosts})
-        if len(found) > 1:
-            _log.warning(
-                "the hosts have different %s (%s): the last bits of scores may depend on which "
-                "host computes them", what, "; ".join(found),
-            )  # fmt: skip

@@ -6,9 +6,9 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from mjx_revolve.evolution.crew import WorkerError
 from mjx_revolve.evolution.fingerprints import model_hash, settings_hash
 from mjx_revolve.evolution.interrupts import Interrupts
+from mjx_revolve.evolution.jobs import WorkerError
 from mjx_revolve.evolution.loop import (
     Champion,
     Search,
@@ -34,6 +34,7 @@ def write_start(start: Start) -> None:
         resumption = {"time": timestamp(), "generation": done, "argv": sys.argv}
         resumed = [*run.info.get("resumed", []), resumption]
         run.update_info(resumed=resumed, finished=None, champion=None)
+    start.fitness.folder = run.folder / "lost"
     run.update_info(workers=start.fitness.describe())
     # The champion's body is the same for all, so it is there from the start.
     robot = getattr(start.fitness, "robot", None)
@@ -43,7 +44,7 @@ def write_start(start: Start) -> None:
 
 
 def run_generations(start: Start, interrupts: Interrupts) -> Search:
-    """All generations, or as many as there are before an interrupt or a worker's death.
+    """All generations, or as many as there are before an interrupt or the loss of all workers.
 
     Args:
         start: the run.
@@ -53,7 +54,7 @@ def run_generations(start: Start, interrupts: Interrupts) -> Search:
         The search, which is saved.
 
     Raises:
-        WorkerError: a worker died or hangs; what was done until then is saved.
+        WorkerError: nobody is left to score; what was done until then is saved.
         OSError: the disk is full.
     """
     run, evolution, fitness = start.run, start.config.evolution, start.fitness

@@ -15,9 +15,14 @@ import platform
 import subprocess
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there, each process compiles
+    fcntl = None  # type: ignore[assignment]
 
 # CMA-ES's eigendecomposition gives other bits with other numbers of BLAS threads.
 _THREAD_SETTINGS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -88,6 +93,34 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
         pin_process([core])
         jax.devices()
         pin_process(cores)
+
+
+@contextlib.contextmanager
+def one_compiles(program: str) -> Iterator[None]:
+    """Lets one process of a host in first, and those that come meanwhile when that one is done.
+
+    The others then read from the compilation cache what it compiled; doing it at the same time
+    would take all of them longer. Without a cache nobody waits.
+
+    Args:
+        program: a fingerprint of what is compiled.
+    """
+    import jax
+
+    config: Any = jax.config
+    folder = config.jax_compilation_cache_dir
+    if not folder or fcntl is None:
+        yield
+        return
+    # Few names, so that they do not pile up; two programs of one name wait for each other.
+    with open(Path(folder) / f".compiling-{program[:2]}", "ab") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            fcntl.flock(lock, fcntl.LOCK_SH)
+        except OSError:  # a file system without locks
+            pass
+        yield
 
 
 def pin_process(cores: Sequence[int]) -> None:

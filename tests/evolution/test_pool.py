@@ -1,4 +1,4 @@
-"""Workers: the same bits whatever their number, and a clear end whatever happens to them."""
+"""Workers: the same bits whatever their number, and whatever happens to them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -22,30 +21,19 @@ import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.evolution import leader, messages, runs
+from mjx_revolve.evolution import jobs, runs
 from mjx_revolve.evolution.blocks import block_size, split_blocks
-from mjx_revolve.evolution.crew import Crew, WorkerError
-from mjx_revolve.evolution.fingerprints import program_versions
-from mjx_revolve.evolution.leader import Leader, Limits
+from mjx_revolve.evolution.jobs import Limits, WorkerError, make_job, open_job
 from mjx_revolve.evolution.loop import choose_champion, evolve
-from mjx_revolve.evolution.messages import Channel, SecretError
-from mjx_revolve.evolution.place import RANKS, read_place
+from mjx_revolve.evolution.lost import save_lost, score_lost
 from mjx_revolve.evolution.pool import Pool, make_pool
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics import runtime
 from toys import CLOCK
 
-SECRET = "correct horse"
 KEY = jax.random.key(1)
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="lists processes by /proc")
-
-
-@pytest.fixture(autouse=True)
-def nobody_is_left():
-    """No test leaves a worker process behind."""
-    before = workers_of(os.getpid())
-    yield
-    assert workers_of(os.getpid()) == before
 
 
 @pytest.fixture(autouse=True)
@@ -79,7 +67,7 @@ def workers_of(pid):
                 if (
                     int(parent) == pid
                     and state != "Z"
-                    and b"mjx_revolve.evolution.worker" in command_line
+                    and b"mjx_revolve.evolution.processes" in command_line
                 ):
                     found.append(int(entry.name))
     return sorted(found)
@@ -211,13 +199,9 @@ def test_each_worker_has_a_core_of_its_own(crowd):
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) > 3:
         pytest.skip("fewer workers than cores are not pinned")
-    processes = [worker.process for worker in pool._workplace._crew.workers]
+    processes = [worker.process for worker in pool._workplace._workers]
     expected = [{cores[i % len(cores)]} for i in range(3)]
-    pool(np.zeros((2, 5)), jax.random.key(0))
-    deadline = time.monotonic() + 30  # until the last one's first block is done
-    while (found := [os.sched_getaffinity(p.pid) for p in processes]) != expected:
-        assert time.monotonic() < deadline, found
-        time.sleep(0.05)
+    wait_for(lambda: [os.sched_getaffinity(p.pid) for p in processes] == expected)
     for process, core in zip(processes, expected, strict=True):
         threads = [int(name) for name in os.listdir(f"/proc/{process.pid}/task")]
         assert all(os.sched_getaffinity(thread) == core for thread in threads)
@@ -225,10 +209,12 @@ def test_each_worker_has_a_core_of_its_own(crowd):
 
 def test_workers_ignore_interrupts(crowd):
     _, pool = crowd
-    for worker in pool._workplace._crew.workers:
+    for worker in pool._workplace._workers:
         worker.process.send_signal(signal.SIGINT)
         worker.process.send_signal(signal.SIGTERM)
+    before = workers_of(os.getpid())
     assert len(pool(np.zeros((12, 5)), jax.random.key(0))) == 12
+    assert workers_of(os.getpid()) == before
 
 
 def test_functions_without_a_name_cannot_have_workers(tmp_path):
@@ -236,76 +222,214 @@ def test_functions_without_a_name_cannot_have_workers(tmp_path):
         make_pool(toy_config(tmp_path), 2, lambda config: toys.Toy())
 
 
+def test_blocks_of_bodies(tmp_path):
+    """Whatever `evaluate` takes before the key; the same function in one process as in two."""
+    config = toy_config(tmp_path)
+    rng = np.random.default_rng(0)
+    blocks = [([1.0 * i, 2.0], rng.normal(size=(2, 2)).astype(np.float32)) for i in range(5)]
+    with make_pool(config, 2, toys.make_weights) as pool:
+        found = pool.score(blocks, KEY)
+    expected = Pool(toys.Weights(), 2).score(blocks, KEY)
+    for (scores, measures), (same, also) in zip(found, expected, strict=True):
+        assert scores.tobytes() == same.tobytes() and np.ptp(scores) > 0
+        assert measures["weight"].tolist() == also["weight"].tolist()
+    assert [m["weight"].tolist() for _, m in found] == [[1.0 * i, 2.0] for i in range(5)]
+
+
+# --- jobs ---
+
+
+def test_a_job_takes_robot_and_code_along(tmp_path):
+    """So that workers elsewhere, and those that replace others, see what the run began with."""
+    (tmp_path / "mine.py").write_text("def stay(track, settings):\n    return track.time[0]\n")
+    config = load_config(
+        toys.write_config(tmp_path / "toy.yaml"), [f"task.type={tmp_path / 'mine.py'}:stay"]
+    )
+    job = make_job(config, read_back)
+    for name in ("mine.py", "robot.yaml"):
+        (tmp_path / name).unlink()
+    assert open_job(job) == ("id: robot\n", "def stay(track, settings):")
+
+
+def read_back(config):
+    path, _, function = config.task.type.rpartition(":")
+    assert function == "stay"
+    return Path(config.morphology).read_text(), Path(path).read_text().splitlines()[0]
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """JAX's compilation cache."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_one_compiles_and_the_others_wait(cache):
+    entered, first_may_go = [], threading.Event()
+    together = threading.Barrier(2, timeout=20)
+
+    def first():
+        with runtime.one_compiles("program"):
+            entered.append("first")
+            assert first_may_go.wait(20)
+            entered.append("first is done")
+
+    def other():
+        with runtime.one_compiles("program"):
+            entered.append("other")
+            together.wait()  # both are inside at once
+
+    threads = [threading.Thread(target=first)]
+    threads[0].start()
+    wait_for(lambda: entered)
+    threads += [threading.Thread(target=other) for _ in range(2)]
+    for thread in threads[1:]:
+        thread.start()
+    time.sleep(0.2)
+    first_may_go.set()
+    for thread in threads:
+        thread.join(20)
+    assert entered == ["first", "first is done", "other", "other"]
+    assert not together.broken
+
+
 # --- trouble ---
 
 
-def test_a_run_is_the_same_with_any_number_of_workers(folder, capsys):
-    for count in (1, 2):
-        assert run_main("toy.yaml", "--out", f"run{count}", "--workers", count) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert " cores, 2 workers | " in next(line for line in lines if line.endswith("run2"))
-    assert differences(folder / "run1", folder / "run2") == []
-    info = json.loads((folder / "run2" / "run.json").read_text())["workers"]
-    assert (info["count"], info["block"]) == (2, 4)
-    assert info["hosts"][0]["workers"] == 2
-    host = runs.Run(folder / "run2").load_checkpoint().meta["host"]
-    assert host == runs.Run(folder / "run1").load_checkpoint().meta["host"]
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory):
+    """Two workers, and a file that says what happens to one of them."""
+    folder = tmp_path_factory.mktemp("troubled")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in XLA_FLAGS.items():
+            patch.setenv(name, value)
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+        patch.setenv("TOY_TROUBLE", str(folder / "order"))
+        patch.setattr(jobs, "LIMITS", Limits(block=4.0))
+        with make_pool(toy_config(folder), 2, toys.make_troubled) as pool:
+            pool.folder = folder / "lost"
+            pool(np.zeros((12, 5)), KEY)
+            yield pool, folder / "order"
 
 
 @needs_proc
 @pytest.mark.parametrize(
     ("kind", "how"),
     [
-        ("kill", r"died \(killed by SIGKILL\)"),
-        ("stop", r"hangs \(no answer for \d s\)"),
-        ("raise", r"failed \(FloatingPointError: all is lost\)"),
-        ("exit", r"died \(exit code 3: out of luck\)"),
+        ("kill", "killed by SIGKILL"),
+        ("stop", r"no answer for \d s"),
+        ("exit", "exit code 3: out of luck"),
+        ("raise", None),
     ],
 )
-def test_trouble_costs_one_generation(folder, kind, how, capsys, monkeypatch):
-    monkeypatch.setenv("TOY_TROUBLE", f"{kind}:{folder / 'trouble'}")
-    monkeypatch.setattr(leader, "LIMITS", Limits(later=2.0))
-    assert run_main("toy.yaml", "--out", "whole") == 0
-    capsys.readouterr()
+def test_a_lost_worker_is_replaced_and_costs_nothing(troubled, kind, how, caplog):
+    pool, order = troubled
+    before = workers_of(os.getpid())
+    order.write_text(kind)
+    population = np.random.default_rng(3).normal(size=(22, 5)).astype(np.float32)
+    scores, measures = pool.evaluate(population, KEY)
+    alone, alone_measures = Pool(toys.Toy(), 4).evaluate(population, KEY)
+    assert scores.tobytes() == alone.tobytes()
+    assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
+    hit = int(next(order.parent.glob("order.*")).suffix[1:])
+    order.with_suffix(f".{hit}").unlink()
+    assert hit in before and is_alive(hit) == (kind == "raise")
+    after = workers_of(os.getpid())
+    assert len(after) == 2 and (hit in after) == (kind == "raise")
+    said = [record.getMessage() for record in caplog.records]
+    if how is None:
+        assert said == []
+    else:
+        assert len(said) == 1 and re.fullmatch(rf"a worker is replaced \({how}\)", said[0]), said
+
+
+def test_a_block_that_kills_scores_worst_and_is_named(troubled, caplog):
+    pool, _ = troubled
+    population = np.random.default_rng(4).normal(size=(10, 5)).astype(np.float32)
+    population[5] = 200.0
+    scores, measures = pool.evaluate(population, KEY)
+    alone, _ = Pool(toys.Toy(), 4).evaluate(population, KEY)
+    assert np.isnan(scores[4:8]).all() and np.isnan(measures["distance_m"][4:8]).all()
+    rest = [0, 1, 2, 3, 8, 9]
+    assert scores[rest].tobytes() == alone[rest].tobytes()
+    said = [record.getMessage() for record in caplog.records]
+    assert said[:-1] == 3 * ["a worker is replaced (killed by SIGKILL)"]
+    path = re.fullmatch(
+        r"4 individuals count as failed, because their workers do \(killed by SIGKILL\); to see "
+        r"why: python -m mjx_revolve.evolution.lost (.+)", said[-1],
+    )[1]  # fmt: skip
+    assert Path(path).parent == pool.folder
+    done = subprocess.run(
+        [sys.executable, "-m", "mjx_revolve.evolution.lost", path], cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}", "TOY_TROUBLE": "no"},
+    )  # fmt: skip
+    assert done.returncode == -signal.SIGKILL
+
+
+def test_a_lost_block_can_be_scored_again(tmp_path):
+    job = make_job(toy_config(tmp_path), toys.make_toy)
+    block = (np.random.default_rng(0).normal(size=(4, 5)).astype(np.float32),)
+    scores, _ = score_lost(save_lost(tmp_path / "lost", job, block, KEY))
+    assert scores.tobytes() == Pool(toys.Toy(), 4)(block[0], KEY).tobytes()
+
+
+def test_a_run_goes_on_when_workers_are_killed(folder, capsys, monkeypatch):
+    """At any moment; the same bits as in this process alone."""
+    monkeypatch.setenv("TOY_TROUBLE", str(folder / "order"))
+    more = ("--set", "evolution.generations=150")
+    killed = []
+
+    def kill():
+        wait_for((folder / "run" / "metrics.csv").exists, 60)
+        victim = workers_of(os.getpid())[0]
+        os.kill(victim, signal.SIGKILL)
+        killed.append(victim)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
     argv = ("toy.yaml", "--out", "run", "--workers", 2)
-    began = time.monotonic()
-    assert run_main(*argv, make_fitness=toys.make_troubled) == 1
-    assert time.monotonic() - began < 40
-    assert not is_alive(int((folder / "trouble").read_text()))
-    error, resume = capsys.readouterr().err.splitlines()
-    found = re.fullmatch(rf"error: worker [12] of 2 {how}; generation (\d) is saved", error)
-    assert found, error
-    done = int(found[1])
-    assert re.fullmatch(r"resume: \S*python\S* -m mjx_revolve.evolve --resume run", resume)
-    assert (folder / "run" / "checkpoints" / f"generation_{done:06d}.npz").exists()
-    assert "not yet judged" in (folder / "run" / "champion" / "genes.yaml").read_text()
-    assert len(runs.load_metrics(folder / "run" / "metrics.csv")["best"]) == done
-    more = ("--workers", 3) if kind == "kill" else ()
-    assert run_main("--resume", "run", *more) == 0
+    assert run_main(*argv, *more, make_fitness=toys.make_troubled) == 0
+    killer.join()
+    shown = capsys.readouterr()
+    assert len(killed) == 1 and "a worker is replaced (killed by SIGKILL)" in shown.err
+    assert " cores, 2 workers | " in next(x for x in shown.out.splitlines() if x.endswith("run"))
+    assert run_main("toy.yaml", "--out", "whole", *more) == 0
     assert differences(folder / "run", folder / "whole") == []
-
-
-def test_trouble_in_the_first_generation(folder, capsys, monkeypatch):
-    monkeypatch.setenv("TOY_TROUBLE", f"kill:{folder / 'trouble'}")
-    size = ("--set", "evolution.population_size=80")
-    argv = ("toy.yaml", "--out", "run", *size, "--workers", 2)
-    assert run_main(*argv, make_fitness=toys.make_troubled) == 1
-    err = capsys.readouterr().err
-    assert "died (killed by SIGKILL); the start, before any generation, is saved\nresume: " in err
-    assert run_main("--resume", "run") == 0
-    assert run_main("toy.yaml", "--out", "whole", *size) == 0
-    assert differences(folder / "run", folder / "whole") == []
+    info = json.loads((folder / "run" / "run.json").read_text())["workers"]
+    assert info == {"count": 2, "block": 4}
+    host = runs.Run(folder / "run").load_checkpoint().meta["host"]
+    assert host == runs.Run(folder / "whole").load_checkpoint().meta["host"]
 
 
 def test_workers_that_cannot_be_built(folder, capsys, monkeypatch):
     monkeypatch.setenv("TOY_LEADER", str(os.getpid()))
     argv = ("toy.yaml", "--out", "run", "--workers", 2)
     assert run_main(*argv, make_fitness=toys.make_broken) == 1
-    err = capsys.readouterr().err
+    lines = capsys.readouterr().err.splitlines()
+    why = r"\(RuntimeError: no such luck\)"
+    assert re.fullmatch(rf"note: the run goes on with fewer workers, 1 {why}", lines[0])
     assert re.fullmatch(
-        r"error: worker [12] of 2 ended \(exit code 1: RuntimeError: no such luck\)\n", err
+        rf"error: no worker can be started {why}; the start, before any generation, is saved",
+        lines[1],
     )
-    assert not (folder / "run").exists()
+    assert re.fullmatch(r"resume: \S*python\S* -m mjx_revolve.evolve --resume run", lines[2])
+    assert run_main("--resume", "run") == 0
+    assert run_main("toy.yaml", "--out", "whole") == 0
+    assert differences(folder / "run", folder / "whole") == []
+
+
+def test_workers_of_another_program_score_nothing(tmp_path, caplog):
+    """As when somebody edits the package or the world's file while the run goes on."""
+    with make_pool(toy_config(tmp_path), 2, toys.make_toy) as pool:
+        pool._workplace.identity |= {"mjx_revolve": "abc"}
+        found = r"mjx_revolve: expected abc as the run has it; found \w+"
+        with pytest.raises(WorkerError, match=rf"no worker can be started \({found}\)"):
+            pool(np.zeros((8, 5)), KEY)
+    with pytest.raises(RuntimeError, match="expected an open pool"):
+        pool(np.zeros((8, 5)), KEY)
+    assert len(caplog.records) == 1
 
 
 SCRIPT = """
@@ -362,343 +486,15 @@ def test_ctrl_c_finishes_the_generation(folder):
 
 
 @needs_proc
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT], ids=["kill", "two-interrupts"])
-def test_workers_do_not_outlive_their_leader(folder, number):
+def test_workers_do_not_outlive_their_leader(folder):
     process = start(folder, *LONG)
     read_until(process, "generation 1/")
     workers = workers_of(process.pid)
     assert len(workers) == 2
-    process.send_signal(number)
-    if number == signal.SIGINT:
-        time.sleep(0.01)
-        process.send_signal(number)
+    os.kill(workers[0], signal.SIGSTOP)  # it is not asked
+    process.kill()
     process.communicate(timeout=30)
     wait_for(lambda: not any(map(is_alive, workers)))
-
-
-# --- the leader, with workers that are threads of this process ---
-
-
-class FakeWorker(threading.Thread):
-    """Speaks as a worker does; `act(channel, order, block)` is what it does with a block."""
-
-    def __init__(self, address, secret=SECRET, act=None, **hello):
-        super().__init__(daemon=True)
-        self.address, self.secret, self.act = address, secret, act or answer
-        self.hello = HELLO | hello
-        self.seen, self.outcome = [], None
-        self.start()
-
-    def run(self):
-        try:
-            channel = Channel(socket.create_connection(self.address), 20.0)
-            channel.prove_secret(self.secret.encode(), leads=False)
-            channel.send_message(self.hello)
-            reply, block = channel.receive_message()
-            while reply["type"] == "block":
-                self.seen.append(reply["block"])
-                self.act(channel, reply, block)
-                reply, block = channel.receive_message()
-            self.outcome = reply
-            channel.close()
-        except (OSError, EOFError) as error:
-            self.outcome = error
-
-
-def answer(channel, order, block):
-    scores = np.stack([block.sum(1), block.min(1)])
-    channel.send_message({"type": "scores", "measures": ["least"]}, scores)
-
-
-IDENTITY = {"versions": program_versions(), "settings_hash": "s", "model_hash": "m"}
-HELLO = IDENTITY | {
-    "type": "hello", "protocol": messages.PROTOCOL, "host": 1, "hosts": 2, "worker": 0,
-    "workers": 1, "node": "node7", "cpu": "a cpu", "xla_flags": "", "cached": False,
-}  # fmt: skip
-
-
-@pytest.fixture
-def lead():
-    """Makes a leader without workers of its own, and closes it."""
-    made = []
-
-    def make(hosts=2, **limits):
-        listener = socket.create_server(("127.0.0.1", 0))
-        address = listener.getsockname()
-        limits = Limits(**{"start": 5.0} | limits)
-        made.append(Leader(listener, Crew(0, {}), SECRET.encode(), IDENTITY, hosts, limits))
-        return made[-1], address
-
-    yield make
-    for one in made:
-        one.close("the test is over")
-
-
-def gather(one):
-    one.gather(4, 5)
-
-
-def blocks_of(count):
-    return [np.full((4, 5), i, np.float32) for i in range(count)]
-
-
-def test_whoever_is_free_gets_the_next_block(lead):
-    one, address = lead()
-
-    def slow(channel, order, block):
-        time.sleep(0.15)
-        answer(channel, order, block)
-
-    workers = [
-        FakeWorker(address, act=act, worker=i, workers=2) for i, act in [(0, slow), (1, None)]
-    ]
-    gather(one)
-    for _ in range(2):
-        results, names = one.score(blocks_of(12), KEY)
-        assert [result[0].tolist() for result in results] == [[5.0 * i] * 4 for i in range(12)]
-        assert names == ["least"]
-    assert len(workers[0].seen) < 8 < len(workers[1].seen)
-    assert len(workers[0].seen) + len(workers[1].seen) == 24 + 2  # each warmed up
-    one.close()
-    for worker in workers:
-        worker.join(5.0)
-        assert worker.outcome == {"type": "stop", "reason": ""}
-
-
-def test_where_there_is_a_cache_one_compiles_for_all(lead):
-    one, address = lead()
-    order = []
-
-    def note(name):
-        def act(channel, message, block):
-            order.append(name)
-            answer(channel, message, block)
-
-        return act
-
-    for i in (1, 0):
-        FakeWorker(address, act=note(i), worker=i, workers=2, cached=True)
-    gather(one)
-
-    def both_score():
-        one.score(blocks_of(6), KEY)
-        return order.count(1) > 1
-
-    wait_for(both_score)
-    assert order[0] == 0
-
-
-@pytest.mark.parametrize(
-    ("hello", "message"),
-    [
-        ({"versions": IDENTITY["versions"] | {"jaxlib": "0.1"}},
-         rf"host 1 \(node7\): jaxlib: expected the leader's version {jax.lib.__version__}; "
-         "found 0.1"),
-        ({"versions": IDENTITY["versions"] | {"mjx_revolve": "abc"}},
-         r"host 1 \(node7\): mjx_revolve: expected the leader's source \w+; found abc"),
-        ({"settings_hash": "x"}, r"host 1 \(node7\): expected the leader's configuration \(the same"
-         r" command line and the same files on each host\); found another"),
-        ({"model_hash": "x"}, r"host 1 \(node7\): expected the leader's robot and world"),
-        ({"hosts": 3}, r"host 1 \(node7\): --hosts: expected 2 as on host 0; found 3"),
-        ({"protocol": 99}, "expected workers of the leader's version of mjx_revolve"),
-        ({"host": 5}, r"host 5 \(node7\): --host-index: expected 0 to 1; found 5"),
-    ],
-)  # fmt: skip
-def test_workers_of_another_run_are_refused_on_both_sides(lead, hello, message):
-    one, address = lead()
-    worker = FakeWorker(address, **hello)
-    with pytest.raises(InputError, match=message) as caught:
-        gather(one)
-    worker.join(5.0)
-    assert worker.outcome == {"type": "refused", "reason": str(caught.value)}
-    assert "\n" not in str(caught.value)
-
-
-def test_an_index_twice(lead):
-    one, address = lead(hosts=3)
-    for _ in range(2):
-        FakeWorker(address, hosts=3)
-    with pytest.raises(InputError, match="--host-index: expected each host once; found 1 twice"):
-        gather(one)
-
-
-def test_strangers_are_noted_and_change_nothing(lead, caplog, monkeypatch):
-    monkeypatch.setattr(leader, "_HANDSHAKE", 0.3)
-    one, address = lead()
-    liar = FakeWorker(address, secret="another one")
-    wait_for(lambda: one._attend() or not liar.is_alive())
-    with socket.create_connection(address) as silent, socket.create_connection(address) as loud:
-        loud.sendall(b"GET / HTTP/1.1\r\n" + 100 * b"\r\n")
-        worker = FakeWorker(address)
-        gather(one)
-        assert silent.fileno() and one.score(blocks_of(2), KEY)
-    said = [record.getMessage() for record in caplog.records]
-    assert "refused a connection from 127.0.0.1: it has another MJX_REVOLVE_SECRET" in said
-    assert said.count("refused a connection from 127.0.0.1: no worker of ours") == 2
-    assert len(said) == 3
-    assert isinstance(liar.outcome, SecretError)
-    assert worker.outcome is None
-
-
-def test_a_leader_must_know_the_secret_too():
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        ours = socket.create_connection(listener.getsockname())
-        theirs, _ = listener.accept()
-    with Channel(theirs, 5.0) as impostor, Channel(ours, 5.0) as worker:
-        for _ in ("a number", "a proof"):
-            impostor.send_bytes(bytes(32))
-        with pytest.raises(SecretError):
-            worker.prove_secret(SECRET.encode(), leads=False)
-
-
-@pytest.mark.parametrize(
-    ("count", "missing"),
-    [(0, "host 1, host 2 missing"), (1, "2 of 3 workers of host 1, host 2 missing")],
-)
-def test_hosts_that_do_not_come(lead, count, missing):
-    one, address = lead(hosts=3, start=0.6)
-    for i in range(count):
-        FakeWorker(address, worker=i, workers=3, hosts=3)
-    with pytest.raises(WorkerError, match=f"expected all workers within 1 s; found {missing}"):
-        gather(one)
-
-
-@pytest.mark.parametrize(
-    ("act", "message"),
-    [
-        (lambda channel, order, block: time.sleep(9), r"hangs \(no answer for \d s\)"),
-        (lambda channel, order, block: channel.close(), r"died \(its connection closed\)"),
-        (lambda channel, order, block: os.write(channel.fileno(), b"\0\0"),
-         "hangs in the middle of"),
-        (lambda channel, order, block: os.write(channel.fileno(), 8 * b"\x7f"),
-         r"died \(bad message length\)"),
-        (lambda channel, order, block: channel.send_bytes(b"hello"), r"died \(expected one of our"),
-        (lambda channel, order, block: channel.send_message({"type": "failed", "reason": "no"}),
-         r"failed \(no\)"),
-    ],
-)  # fmt: skip
-def test_whatever_a_worker_does_the_leader_goes_on(lead, act, message, monkeypatch):
-    monkeypatch.setattr(leader, "_MESSAGE", 0.5)
-    one, address = lead(later=1.0, factor=2.0)
-    FakeWorker(address, act=lambda *args: (answer if args[1]["block"] == 0 else act)(*args))
-    gather(one)
-    with pytest.raises(WorkerError, match=rf"worker 1 of 1 of host 1 \(node7\) {message}"):
-        one.score(blocks_of(2), KEY)
-
-
-def test_a_slow_block_is_no_hang(lead):
-    one, address = lead(later=0.3, factor=50.0)
-
-    def act(channel, order, block):
-        time.sleep({0: 0.6, 9: 0.8}.get(order["block"], 0.1))
-        answer(channel, order, block)
-
-    FakeWorker(address, act=act)
-    gather(one)
-    assert len(one.score(blocks_of(9), KEY)[0]) == 9
-
-
-# --- several hosts ---
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        return found.getsockname()[1]
-
-
-def on_hosts(port, index, hosts=2):
-    return ("--hosts", hosts, "--coordinator", f"localhost:{port}", "--host-index", index)
-
-
-@needs_proc
-def test_two_hosts_are_one_run(folder):
-    port = free_port()
-    more = {"MJX_REVOLVE_SECRET": SECRET}
-    helper = start(folder, "toy.yaml", "--workers", 2, *on_hosts(port, 1), **more)
-    head = start(folder, "toy.yaml", "--out", "run", "--workers", 1, *on_hosts(port, 0), **more)
-    out, _ = head.communicate(timeout=60)
-    told, _ = helper.communicate(timeout=10)
-    assert (head.returncode, helper.returncode) == (0, 0), out + told
-    assert f"host 1 of 2: 2 workers for the leader at localhost:{port}\n" == told
-    assert " cores, 3 workers on 2 hosts | run\n" in out
-    assert run_main("toy.yaml", "--out", "whole") == 0
-    assert differences(folder / "run", folder / "whole") == []
-
-
-@needs_proc
-def test_a_host_that_is_lost_ends_the_run_everywhere(folder):
-    port = free_port()
-    more = {"MJX_REVOLVE_SECRET": SECRET}
-    helper = start(folder, *LONG[:1], "--workers", 2, *on_hosts(port, 1), *LONG[-2:], **more)
-    head = start(folder, *LONG, *on_hosts(port, 0), **more)
-    read_until(head, "generation 1/")
-    one, two = workers_of(helper.pid)
-    os.kill(one, signal.SIGKILL)
-    out, _ = head.communicate(timeout=30)
-    told, _ = helper.communicate(timeout=30)
-    assert (head.returncode, helper.returncode) == (1, 1), out + told
-    assert re.search(
-        r"error: worker [12] of 2 of host 1 \(.+\) died \(.*\); generation \d+ is saved\nresume: ",
-        out,
-    )
-    assert re.search(r"error: worker [12] of 2 died \(killed by SIGKILL\)\n$", told)
-    assert not is_alive(two)
-
-
-@needs_proc
-def test_a_lost_leader_is_noticed(folder):
-    port = free_port()
-    more = {"MJX_REVOLVE_SECRET": SECRET}
-    helper = start(folder, *LONG[:1], "--workers", 1, *on_hosts(port, 1), *LONG[-2:], **more)
-    head = start(folder, *LONG, *on_hosts(port, 0), **more)
-    read_until(head, "generation 1/")
-    head.kill()
-    head.communicate(timeout=10)
-    told, _ = helper.communicate(timeout=30)
-    assert helper.returncode == 1
-    assert re.search(rf"error: the leader at localhost:{port} is gone", told)
-
-
-def test_a_host_with_another_configuration(folder, capsys, monkeypatch):
-    """The leader lives here."""
-    port = free_port()
-    monkeypatch.setenv("MJX_REVOLVE_SECRET", SECRET)
-    other = start(folder, "toy.yaml", "--workers", 1, "--seed", 9, *on_hosts(port, 1))
-    assert run_main("toy.yaml", "--out", "run", "--workers", 1, *on_hosts(port, 0)) == 2
-    error = capsys.readouterr().err
-    assert re.fullmatch(r"error: host 1 \(.+\): expected the leader's configuration .+\n", error)
-    told, _ = other.communicate(timeout=30)
-    assert other.returncode == 2
-    assert told.splitlines()[1:] == [error.strip()]
-    assert not (folder / "run").exists()
-
-
-def test_a_host_with_another_secret(folder, lead):
-    one, address = lead()
-    monkey = {"MJX_REVOLVE_SECRET": "another one"}
-    liar = start(folder, "toy.yaml", "--workers", 2, *on_hosts(address[1], 1), **monkey)
-
-    def refused():
-        one._attend()
-        return liar.poll() is not None
-
-    wait_for(refused, 30.0)
-    told, _ = liar.communicate()
-    assert liar.returncode == 2
-    assert told.splitlines()[1:] == [
-        f"error: MJX_REVOLVE_SECRET: expected the secret of the leader at localhost:{address[1]}; "
-        "found another"
-    ]
-
-
-def test_a_launcher_tells_the_index():
-    for name in ("SLURM_PROCID", "OMPI_COMM_WORLD_RANK", "PMI_RANK"):
-        place = read_place(3, "node1:7777", None, {name: "2", "MJX_REVOLVE_SECRET": SECRET})
-        assert (place.hosts, place.index, place.address) == (3, 2, ("node1", 7777))
-        assert SECRET not in repr(place)
-    environment = {"SLURM_PROCID": "2", "MJX_REVOLVE_SECRET": SECRET}
-    place = read_place(3, "[::1]:80", "1", environment)
-    assert (place.index, place.address) == (1, ("::1", 80))
 
 
 @pytest.mark.parametrize(
@@ -707,63 +503,15 @@ def test_a_launcher_tells_the_index():
         (["--workers", "0"], "--workers: expected a whole number >= 1; found '0'"),
         (["--workers", "two"], "--workers: expected a whole number >= 1; found 'two'"),
         (["--workers", "1.5"], "--workers: expected a whole number >= 1; found '1.5'"),
-        (["--hosts", "2"], "--hosts: expected --coordinator HOST:PORT beside it; found none"),
-        (["--hosts", "0", "--coordinator", "a:1"], "--hosts: expected a whole number >= 1"),
-        (["--coordinator", "a:1"], "--coordinator a:1: expected --hosts N beside it; found none"),
-        (["--host-index", "1"], "--host-index 1: expected --hosts N beside it; found none"),
-        (["--hosts", "2", "--coordinator", "node1"],
-         "--coordinator: expected HOST:PORT; found 'node1'"),
-        (["--hosts", "2", "--coordinator", "node1:70000"], "--coordinator: expected HOST:PORT"),
-        (["--hosts", "2", "--coordinator", "node1:77"],
-         "--host-index: expected a number from 0 to 1, or one of SLURM_PROCID, "
-         "OMPI_COMM_WORLD_RANK, PMI_RANK in the environment; found none"),
-        ([*on_hosts(77, 2)], "--host-index: expected a whole number from 0 to 1; found '2'"),
-        (["--resume", "none", *on_hosts(77, 1)],
-         "--resume none: expected the run folder, or CONFIG beside it, on each host; found nei"),
-        (["none.yaml", *on_hosts(77, 1)], "none.yaml: expected a file; found none"),
-        ([*on_hosts(77, 1)], "expected a CONFIG, or --resume DIR; found neither"),
+        (["--workers", "2", "--cluster", "x"], "--cluster: expected no --workers beside it; foun"),
     ],
-)  # fmt: skip
-def test_wrong_arguments_are_one_line(folder, argv, message, capsys, monkeypatch):
-    monkeypatch.setenv("MJX_REVOLVE_SECRET", SECRET)
-    for name in RANKS:
-        monkeypatch.delenv(name, raising=False)
-    config = (
-        [] if {"none.yaml", "--resume"} & set(argv) or argv == [*on_hosts(77, 1)] else ["toy.yaml"]
-    )
-    assert run_main(*config, *argv) == 2
+)
+def test_wrong_arguments_are_one_line(folder, argv, message, capsys):
+    assert run_main("toy.yaml", *argv) == 2
     err = capsys.readouterr().err
     assert err.startswith("error: " + message)
     assert err.count("\n") == 1
     assert not (folder / "runs").exists()
-
-
-@pytest.mark.parametrize(("secret", "found"), [("", "none"), ("short", "a shorter one")])
-def test_several_hosts_need_a_secret(folder, secret, found, capsys, monkeypatch):
-    monkeypatch.setenv("MJX_REVOLVE_SECRET", secret)
-    assert run_main("toy.yaml", *on_hosts(77, 0)) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("error: MJX_REVOLVE_SECRET: expected a secret of 8 or more characters")
-    assert err.endswith(f"found {found}\n")
-
-
-def test_a_port_that_is_taken(folder, capsys, monkeypatch):
-    monkeypatch.setenv("MJX_REVOLVE_SECRET", SECRET)
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        argv = ("toy.yaml", "--workers", 1, *on_hosts(port, 0))
-        assert run_main(*argv) == 2
-    assert capsys.readouterr().err == (
-        f"error: --coordinator localhost:{port}: expected a free port of this host; found: Address "
-        "already in use\n"
-    )
-
-
-def test_a_leader_that_never_listens(monkeypatch):
-    from mjx_revolve.evolution import worker
-
-    with pytest.raises(InputError, match=r"--coordinator 127.0.0.1:\d+: expected the run's leader"):
-        worker._connect(("127.0.0.1", free_port()), 0.3)
 
 
 def test_an_accelerator_takes_the_whole_population(tmp_path, monkeypatch):
@@ -773,33 +521,32 @@ def test_an_accelerator_takes_the_whole_population(tmp_path, monkeypatch):
         make_pool(toy_config(tmp_path), 2, toys.make_toy)
 
 
-def test_workers_are_not_started_by_hand():
-    done = subprocess.run(
-        [sys.executable, "-m", "mjx_revolve.evolution.worker"], cwd=ROOT, stdin=subprocess.DEVNULL,
-        capture_output=True, text=True, timeout=30,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr == "error: expected to be started by mjx_revolve.evolve\n"
+# --- a real robot ---
 
-
-# --- the real robot ---
+ROBOT = """
+id: knee
+body:
+  id: core
+  type: Core
+  children:
+    1: {id: knee, type: ActiveHinge, children: {1: {id: foot, type: FixedBrick}}}
+"""
 
 
 @pytest.mark.slow
-def test_the_spider_does_not_depend_on_its_workers(tmp_path):
-    """70 individuals of 3 episodes: four blocks of 21, the last of which is padded."""
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
-    for name in ("JAX_COMPILATION_CACHE_DIR", *XLA_FLAGS):  # as users run it
-        environment.pop(name)
+def test_a_robot_does_not_depend_on_its_workers(tmp_path, monkeypatch):
+    """10 individuals of 16 episodes: three blocks of 4, the last of which is padded."""
+    (tmp_path / "cache").mkdir()
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    path = toys.write_config(tmp_path / "knee.yaml", population_size=10)
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    config = load_config(path, ["task.trials=16", "task.duration=0.2", "task.settle=0.05"])
+    found = []
     for count in (2, 1):
-        settings = ("population_size=70", "generations=2")
-        argv = [f"--set=evolution.{setting}" for setting in settings]
-        argv += ["--set=task.trials=3", "--set=task.duration=1", f"--workers={count}"]
-        done = subprocess.run(
-            [sys.executable, "-m", "mjx_revolve.evolve", "configs/smoke.yaml", *argv,
-             "--out", str(tmp_path / str(count))],
-            cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        assert done.stderr == ""
-    assert differences(tmp_path / "1", tmp_path / "2") == []
+        with make_pool(config, count) as pool:
+            genes = np.random.default_rng(0).normal(size=(10, pool.num_genes)).astype(np.float32)
+            found.append(pool.evaluate(genes, KEY))
+    (scores, measures), (alone, alone_measures) = found
+    assert scores.tobytes() == alone.tobytes() and np.ptp(scores) > 0
+    for name, values in measures.items():
+        assert values.tobytes() == alone_measures[name].tobytes()

@@ -1,0 +1,275 @@
+"""Workers of a Dask cluster, on any number of machines: blocks as tasks.
+
+Dask carries tasks and scores, has TLS, restarts workers that die, and lets them join and leave at
+any time. A worker gets blocks once it has opened the job, which it keeps, and was found to have the
+same program. A worker that is lost takes the block that it was at with it, as on one machine
+(`jobs.share_out`): Dask is told who is to score what, so that no block is blamed for another's
+deed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import functools
+import logging
+import os
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from mjx_revolve.evolution.fingerprints import find_difference
+from mjx_revolve.evolution.jobs import (
+    Job,
+    News,
+    WorkerError,
+    compile_job,
+    describe_error,
+    open_job,
+    share_out,
+)
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics import runtime
+
+if TYPE_CHECKING:
+    import jax
+
+    from mjx_revolve.evolution.blocks import Block, Scored
+
+# Between two looks at who is there [s].
+_TICK = 1.0
+# What fetching a block's scores may take [s].
+_FETCH = 10.0
+# Blocks at a worker: one that it scores, and the next, so that it does not wait for mail.
+_AT_ONCE = 2
+_log = logging.getLogger(__name__)
+
+
+# ------------------------------------------------------------------ in Dask's workers
+
+# XLA's CPU back end can lock up when two threads run programs at once.
+_ALONE = threading.Lock()
+
+
+@contextlib.contextmanager
+def _watched(seconds: float) -> Iterator[None]:
+    """Nothing else runs meanwhile; a process that hangs ends, and its nanny starts another."""
+    with _ALONE:
+        faulthandler.dump_traceback_later(seconds, exit=True)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+
+@functools.lru_cache(maxsize=4)
+def _open(job: Job) -> tuple[Any, deque[float]]:
+    os.environ["JAX_PLATFORMS"] = "cpu"  # before JAX is imported
+    cache, cores = runtime.prepare_process(), runtime.list_cores()
+    # Any core: so that XLA has one thread, as there is a process for each.
+    runtime.prepare_worker(cores[0] if cores else None, str(cache) if cache else None)
+    fitness = open_job(job)
+    compile_job(job, fitness)
+    return fitness, deque(maxlen=101)
+
+
+def prepare(job: Job) -> tuple[dict[str, Any], dict[str, str]]:
+    """Opens a job and compiles its fitness, once per process.
+
+    Returns:
+        See `fingerprints.identify`; and on what the last bits of scores may depend, besides.
+    """
+    from mjx_revolve.evolution.fingerprints import identify
+
+    with _watched(job.limits.ready):
+        identity = identify(_open(job)[0])
+    return identity, {"CPUs": runtime.cpu_model(), "XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
+
+
+def score(job: Job, block: Block, key: tuple[Any, str]) -> Scored:
+    """Scores a block."""
+    from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
+
+    fitness, times = _open(job)
+    with _watched(job.limits.patience(times)):
+        began = time.perf_counter()
+        result = evaluate_block(fitness, block, key_from_data(key))
+        times.append(time.perf_counter() - began)
+    return result
+
+
+# ------------------------------------------------------------------ in the leader
+
+
+@dataclass(eq=False)
+class _Worker:
+    """A worker of the cluster.
+
+    Attributes:
+        address: where it is.
+        opening: the future that opens the job; None: it has.
+        refused: why it gets no blocks; nothing: it does.
+        blocks: number and future of those that it has, oldest first.
+    """
+
+    address: str
+    opening: Any
+    refused: str = ""
+    blocks: list[tuple[int, Any]] = field(default_factory=list)
+
+
+class Cluster:
+    """The workers of a Dask scheduler; a `blocks.Workplace`. Whoever makes one closes it.
+
+    Attributes:
+        place: the scheduler's address, or the path of its scheduler file.
+        identity: what workers must have in common with this process; see `fingerprints.identify`.
+    """
+
+    def __init__(self, place: str, job: Job) -> None:
+        """Finds the scheduler.
+
+        Args:
+            place: its address, or the path of its scheduler file.
+            job: what to score.
+
+        Raises:
+            InputError: there is none, or Dask is not installed.
+        """
+        try:
+            import distributed
+        except ImportError:
+            raise InputError(
+                "--cluster: expected Dask (pip install 'mjx_revolve[cluster]'); found none"
+            ) from None
+        is_file = place.endswith(".json") or os.path.isfile(place)
+        if is_file and not os.path.isfile(place):  # Dask would wait for it
+            raise InputError(f"--cluster: expected a scheduler file; found none at {place}")
+        try:
+            known = {"scheduler_file" if is_file else "address": place}
+            self._client = distributed.Client(**known, set_as_default=False)
+        except Exception as error:  # about addresses, files and TLS Dask complains in any way
+            raise InputError(
+                f"--cluster {place}: expected a Dask scheduler; found {describe_error(error)}"
+            ) from None
+        self.place = place
+        self.identity: dict[str, Any] = {}
+        self._job = job
+        self._workers: dict[str, _Worker] = {}
+        self._facts: dict[str, set[str]] = {}
+        self._done: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._next_look = 0.0
+        self._deserted = False
+
+    @property
+    def workers(self) -> int:
+        """How many processes score."""
+        return len(self._fit())
+
+    def _fit(self) -> list[_Worker]:
+        return [w for w in self._workers.values() if w.opening is None and not w.refused]
+
+    def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored | str]:
+        """See `blocks.Workplace`.
+
+        Raises:
+            WorkerError: the scheduler is lost, or has had no workers but those of another program.
+        """
+        return share_out(self, blocks, key)
+
+    def free(self) -> list[_Worker]:
+        """See `jobs.Crew`; one that has room for two blocks stands there twice."""
+        return [w for k in range(_AT_ONCE) for w in self._fit() if len(w.blocks) <= k]
+
+    def send(self, worker: _Worker, number: int, block: Block, key: tuple[Any, str]) -> None:
+        """See `jobs.Crew`."""
+        worker.blocks.append((number, self._submit(worker.address, score, block, key)))
+
+    def _submit(self, address: str, function: Any, *arguments: Any) -> Any:
+        future = self._client.submit(function, self._job, *arguments, workers=[address], pure=False)
+        future.add_done_callback(self._done.put)
+        return future
+
+    def attend(self) -> News:
+        """See `jobs.Crew`."""
+        news = self._look() if time.monotonic() >= self._next_look else []
+        with contextlib.suppress(queue.Empty):
+            done = self._done.get(timeout=max(0.0, self._next_look - time.monotonic()))
+            for worker in list(self._workers.values()):
+                if worker.opening is done:
+                    self._admit(worker)
+                for entry in list(worker.blocks):
+                    if entry[1] is done:
+                        worker.blocks.remove(entry)
+                        news.append((entry[0], self._fetch(worker, done)))
+        return news
+
+    def _look(self) -> News:
+        """Who has come; who has gone, and with which blocks."""
+        self._next_look = time.monotonic() + _TICK
+        while self._client.status == "connecting":  # it gives up after a while
+            time.sleep(0.1)
+        try:
+            there = self._client.nthreads()
+        except Exception:  # of any kind, where the connection breaks
+            if self._client.status in ("connecting", "running"):
+                return []
+            raise WorkerError(f"the scheduler at {self.place} is lost") from None
+        news: News = []
+        for address in [address for address in self._workers if address not in there]:
+            worker = self._workers.pop(address)
+            _log.warning("the worker at %s is gone", address)
+            # It was at the oldest.
+            for place, (number, _) in enumerate(worker.blocks):
+                news.append((number, None if place else f"the worker at {address} is gone"))
+        if not there and not self._deserted:
+            _log.warning("waiting for workers at %s", self.place)
+        self._deserted = not there
+        for address in there:
+            if address not in self._workers:
+                self._workers[address] = _Worker(address, self._submit(address, prepare))
+        return news
+
+    def _admit(self, worker: _Worker) -> None:
+        """Takes in a worker that has opened the job, if it is one of this run's."""
+        opening, worker.opening = worker.opening, None
+        if opening.status not in ("finished", "error"):  # the connection broke meanwhile
+            del self._workers[worker.address]
+            return
+        try:
+            identity, facts = opening.result(timeout=_FETCH)
+            worker.refused = find_difference(self.identity, identity)
+        except Exception as error:
+            worker.refused = describe_error(error)
+        if worker.refused:
+            words = f"the worker at {worker.address} is refused: {worker.refused}"
+            if not self._facts and all(w.refused for w in self._workers.values()):
+                raise WorkerError(words)  # there never was another
+            _log.warning("%s", words)
+            return
+        for what, value in facts.items():
+            known = self._facts.setdefault(what, set())
+            if known and value not in known:
+                _log.warning(
+                    "the workers have different %s (%s): the last bits of scores may depend on "
+                    "which of them computes them", what, "; ".join(sorted(known | {value})),
+                )  # fmt: skip
+            known.add(value)
+
+    def _fetch(self, worker: _Worker, future: Any) -> Scored | str | None:
+        if future.status not in ("finished", "error"):  # the connection broke meanwhile
+            return None
+        try:
+            return future.result(timeout=_FETCH)
+        except Exception as error:
+            return f"{describe_error(error)} at {worker.address}"
+
+    def close(self) -> None:
+        """Leaves; the workers stay for others."""
+        self._workers.clear()
+        with contextlib.suppress(Exception):  # the scheduler may be lost
+            self._client.close(timeout=_FETCH)

@@ -1,0 +1,302 @@
+"""Workers of this machine: processes that score blocks, watched, and replaced when they are lost.
+
+They are plain processes that run `serve`, not forks: JAX's threads do not survive a fork, and a
+script that uses a pool needs no `if __name__ == "__main__"`. What to do, blocks and scores pass
+through a pipe, pickled. A second pipe, standard input, ends when the process that started them
+does, even by kill -9; they end with it. Interrupts are that one's affair: workers ignore them, so
+that the generation under way can be finished.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, NoReturn
+
+from mjx_revolve.evolution.fingerprints import find_difference
+from mjx_revolve.evolution.jobs import (
+    TRIES,
+    Job,
+    News,
+    WorkerError,
+    compile_job,
+    describe_error,
+    open_job,
+    share_out,
+)
+from mjx_revolve.numerics import runtime
+
+if TYPE_CHECKING:
+    import jax
+
+    from mjx_revolve.evolution.blocks import Block, Scored
+
+# What a worker runs: it finds modules where this process finds them.
+_PROGRAM = (
+    "import sys; sys.path[:] = sys.argv[2:]; "
+    "from mjx_revolve.evolution.processes import serve; serve(int(sys.argv[1]))"
+)
+# How often the leader looks for what sends no news: time that passed [s].
+_TICK = 0.25
+# How much of a worker's last words is looked at [bytes].
+_TAIL = 4096
+_log = logging.getLogger(__name__)
+
+
+# ------------------------------------------------------------------ in the worker
+
+
+def serve(descriptor: int) -> NoReturn:
+    """Scores blocks until the pipe is closed, and ends the process.
+
+    Args:
+        descriptor: of its end of the pipe.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with contextlib.suppress(EOFError, OSError):
+        _work(Connection(descriptor))
+    # JAX's own farewell takes a tenth of a second, and there is nothing to bid farewell to.
+    sys.stderr.flush()
+    os._exit(0)
+
+
+def _end_with_parent() -> NoReturn:
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+def _work(channel: Connection) -> None:
+    job, core, cache = channel.recv()
+    try:
+        runtime.prepare_worker(core, cache)
+        from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
+        from mjx_revolve.evolution.fingerprints import identify
+
+        fitness = open_job(job)
+        compile_job(job, fitness)
+        if core is not None:
+            runtime.pin_process([core])
+        channel.send(identify(fitness))
+    except Exception as error:
+        channel.send(describe_error(error))
+        return
+    while True:
+        block, key = channel.recv()
+        try:
+            channel.send(evaluate_block(fitness, block, key_from_data(key)))
+        except Exception as error:
+            channel.send(describe_error(error))
+
+
+# ------------------------------------------------------------------ in the leader
+
+
+class _Worker:
+    """A worker process.
+
+    Attributes:
+        process: the process.
+        channel: the pipe to it.
+        core: where it is pinned to; None: nowhere.
+        ready: whether it has opened the job.
+        block: the number of the block that it scores; None: it is free.
+        age: how long it has been at that, as far as the leader watched [s].
+    """
+
+    def __init__(self, job: Job, core: int | None, cache: Path | None) -> None:
+        self.core = core
+        self.ready = False
+        self.block: int | None = None
+        self.age = 0.0
+        # Appending, so that reading in between does not move the place of writing.
+        self._log: IO[bytes] = tempfile.TemporaryFile("a+b")  # noqa: SIM115  (kept open)
+        self.channel, theirs = Pipe()
+        try:
+            # A group of its own: Ctrl-C and Ctrl-Z at the terminal reach only who leads.
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", _PROGRAM, str(theirs.fileno()), *sys.path],
+                stdin=subprocess.PIPE, stdout=self._log, stderr=self._log,
+                pass_fds=[theirs.fileno()], process_group=0,
+            )  # fmt: skip
+        except OSError:
+            self.channel.close()
+            self._log.close()
+            raise
+        finally:
+            theirs.close()
+        self.tell(job, core, str(cache) if cache else None)
+
+    def tell(self, *message: Any) -> None:
+        """Sends a message."""
+        with contextlib.suppress(OSError):  # it has died: whoever listens to it will find out
+            self.channel.send(message)
+
+    def describe_end(self) -> str:
+        """How it ended, in words, waiting a little for it to do so."""
+        try:
+            code = self.process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            return "its pipe closed"
+        if code < 0:
+            with contextlib.suppress(ValueError):
+                return f"killed by {signal.Signals(-code).name}"
+        self._log.seek(0, os.SEEK_END)
+        self._log.seek(max(0, self._log.tell() - _TAIL))
+        lines = self._log.read().decode(errors="replace").split("\n")
+        words = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return f"exit code {code}" + (f": {words}" if words else "")
+
+    def end(self) -> None:
+        """Kills it, if need be; a stopped process, too."""
+        self.process.kill()
+        self.process.wait()
+        self.channel.close()
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self._log.close()
+
+
+class Processes:
+    """The workers of this machine; a `blocks.Workplace`. Whoever makes one closes it.
+
+    Attributes:
+        identity: what workers must have in common with this process; see `fingerprints.identify`.
+    """
+
+    place = ""
+
+    def __init__(self, count: int, job: Job, cache: Path | None) -> None:
+        """Starts them.
+
+        Args:
+            count: how many. When they are at least as many as there are cores, each is pinned to a
+                core; fewer are left to the system, so that several such runs on one host do not
+                crowd on the same cores.
+            job: what to score.
+            cache: the compilation cache's folder.
+
+        Raises:
+            WorkerError: the system refuses to start so many.
+        """
+        self.identity: dict[str, Any] = {}
+        self._job, self._cache = job, cache
+        self._times: deque[float] = deque(maxlen=101)
+        self._false_starts = 0
+        self._workers: list[_Worker] = []
+        cores = runtime.list_cores()
+        pinned = bool(cores) and count >= len(cores)
+        try:
+            for index in range(count):
+                core = cores[index % len(cores)] if pinned else None
+                self._workers.append(_Worker(job, core, cache))
+        except BaseException as error:
+            begun = len(self._workers)
+            self.close()
+            if not isinstance(error, OSError):
+                raise
+            raise WorkerError(
+                f"expected to start {count} workers; found after {begun}: {error.strerror or error}"
+            ) from None
+
+    @property
+    def workers(self) -> int:
+        """How many there are."""
+        return len(self._workers)
+
+    def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored | str]:
+        """See `blocks.Workplace`.
+
+        Raises:
+            WorkerError: no worker is left, and none can be started.
+        """
+        return share_out(self, blocks, key)
+
+    def free(self) -> list[_Worker]:
+        """See `jobs.Crew`."""
+        return [w for w in self._workers if w.ready and w.block is None]
+
+    def send(self, worker: _Worker, number: int, block: Block, key: tuple[Any, str]) -> None:
+        """See `jobs.Crew`."""
+        worker.block, worker.age = number, 0.0
+        worker.tell(block, key)
+
+    def attend(self) -> News:
+        """See `jobs.Crew`."""
+        began = time.monotonic()
+        heard = wait([worker.channel for worker in self._workers], _TICK)
+        # Not more, even if this process was itself stopped meanwhile: nobody else is to blame.
+        waited = min(time.monotonic() - began, 2 * _TICK)
+        news: News = []
+        for worker in list(self._workers):
+            idle = worker.ready and worker.block is None
+            worker.age += 0.0 if idle else waited
+            limits = self._job.limits
+            limit = limits.patience(self._times) if worker.ready else limits.ready
+            try:
+                if worker.channel in heard:
+                    news += self._take(worker, worker.channel.recv())
+                elif worker.age > limit:
+                    news += self._replace(worker, f"no answer for {worker.age:.0f} s")
+            except (EOFError, OSError):
+                news += self._replace(worker, worker.describe_end())
+        return news
+
+    def _take(self, worker: _Worker, message: Any) -> News:
+        """A worker's scores, or what it says once it is ready or cannot be."""
+        if worker.ready:
+            assert worker.block is not None
+            number, worker.block = worker.block, None
+            self._times.append(worker.age)
+            return [(number, message)]
+        if isinstance(message, dict):
+            message = find_difference(self.identity, message)
+        if message:
+            self._dismiss(worker, message)
+        worker.ready, self._false_starts = True, 0
+        return []
+
+    def _replace(self, worker: _Worker, how: str) -> News:
+        """Starts another worker for one that died or hangs."""
+        worker.end()
+        self._false_starts += not worker.ready
+        if not worker.ready and self._false_starts >= TRIES:
+            self._dismiss(worker, how)
+            return []
+        _log.warning("a worker is replaced (%s)", how)
+        try:
+            another = _Worker(self._job, worker.core, self._cache)
+        except OSError as error:
+            self._dismiss(worker, describe_error(error))
+        else:
+            self._workers[self._workers.index(worker)] = another
+        return [] if worker.block is None else [(worker.block, how)]
+
+    def _dismiss(self, worker: _Worker, why: str) -> None:
+        """Does without a worker, as long as there are others."""
+        worker.end()
+        self._workers.remove(worker)
+        if not self._workers:
+            raise WorkerError(f"no worker can be started ({why})")
+        _log.warning("the run goes on with fewer workers, %d (%s)", len(self._workers), why)
+
+    def close(self) -> None:
+        """Ends them."""
+        for worker in self._workers:  # all at once, rather than one after the other
+            worker.process.kill()
+        while self._workers:
+            self._workers.pop().end()

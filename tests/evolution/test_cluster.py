@@ -1,0 +1,243 @@
+"""A Dask cluster: a real scheduler and real workers on the loopback, which come, go, die and hang.
+
+The tests share them, in the order in which they stand here.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import toys
+from laboratory import ROOT, XLA_FLAGS
+from mjx_revolve import evolve as command
+from mjx_revolve.episodes.config import load_config
+from mjx_revolve.evolution import jobs, runs
+from mjx_revolve.evolution.jobs import Limits, WorkerError
+from mjx_revolve.evolution.pool import Pool, make_pool
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from toys import CLOCK
+
+distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
+dask = pytest.importorskip("dask")
+KEY = jax.random.key(1)
+
+
+def wait_for(condition, seconds=300.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+class Dask:
+    """A scheduler, and workers with a nanny each; processes of the system."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.file = folder / "scheduler.json"
+        self.log = open(folder / "dask.log", "w+")  # noqa: SIM115
+        self.processes = []
+        ports = ("--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0")
+        self.scheduler = self.start("dask_scheduler", *ports)
+        wait_for(self.file.exists)
+
+    def start(self, program, *argv, package=ROOT):
+        path = f"{package}{os.pathsep}{ROOT / 'tests'}"
+        environment = os.environ | {"PYTHONPATH": path, "TOY_TROUBLE": str(self.folder / "order")}
+        environment |= XLA_FLAGS | {"JAX_COMPILATION_CACHE_DIR": ""}
+        module = f"distributed.cli.{program}"
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, "--scheduler-file", str(self.file), *argv],
+            cwd=self.folder, env=environment, stdout=self.log, stderr=self.log,
+        )  # fmt: skip
+        self.processes.append(process)
+        return process
+
+    def add_worker(self, **more):
+        self.start("dask_worker", "--nthreads", "1", "--no-dashboard", **more)
+
+    def close(self):
+        for process in reversed(self.processes):
+            process.terminate()  # a killed nanny would leave its worker behind
+        for process in self.processes:
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self.log.close()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    one = Dask(tmp_path_factory.mktemp("cluster"))
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    return load_config(toys.write_config(tmp_path_factory.mktemp("config") / "toy.yaml"))
+
+
+@pytest.fixture(scope="module")
+def pool(cluster, config):
+    """One worker to begin with."""
+    cluster.add_worker()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TOY_TROUBLE", str(cluster.folder / "order"))
+        patch.setattr(jobs, "LIMITS", Limits(block=4.0))
+        with make_pool(config, None, toys.make_troubled, str(cluster.file)) as pool:
+            pool.folder = cluster.folder / "lost"
+            yield pool
+
+
+def check_scores(pool, seed, size=22):
+    """The same bits as in this process."""
+    population = np.random.default_rng(seed).normal(size=(size, 5)).astype(np.float32)
+    scores, measures = pool.evaluate(population, KEY)
+    alone, alone_measures = Pool(toys.Toy(), 4).evaluate(population, KEY)
+    assert scores.tobytes() == alone.tobytes()
+    assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
+
+
+def said(caplog):
+    return [r.getMessage() for r in caplog.records if r.name.startswith("mjx_revolve")]
+
+
+def test_workers_may_join_at_any_time(cluster, pool, caplog):
+    check_scores(pool, 1)
+    assert pool.workers == 1 and len(pool._workplace._workers) == 1
+    cluster.add_worker()
+    wait_for(lambda: pool._workplace.attend() or pool.workers == 2)
+    check_scores(pool, 2)
+    assert pool.describe() == {"count": 2, "block": 4, "cluster": str(cluster.file)}
+    assert [line for line in said(caplog) if "waiting" not in line] == []
+
+
+@pytest.mark.parametrize("kind", ["kill", "hang", "raise"])
+def test_a_lost_worker_costs_nothing(cluster, pool, kind, caplog):
+    before = {*pool._workplace._workers}
+    (cluster.folder / "order").write_text(kind)
+    check_scores(pool, 3)
+    assert not (cluster.folder / "order").exists()
+    gone = before - {*pool._workplace._workers}
+    assert len(gone) == (kind != "raise")
+    assert [line for line in said(caplog) if "waiting" not in line] == [
+        f"the worker at {address} is gone" for address in gone
+    ]
+
+
+def test_a_block_that_kills_scores_worst_and_is_named(pool, caplog):
+    population = np.random.default_rng(4).normal(size=(10, 5)).astype(np.float32)
+    population[5] = 200.0
+    scores, _ = pool.evaluate(population, KEY)
+    alone, _ = Pool(toys.Toy(), 4).evaluate(population, KEY)
+    assert np.isnan(scores[4:8]).all()
+    rest = [0, 1, 2, 3, 8, 9]
+    assert scores[rest].tobytes() == alone[rest].tobytes()
+    assert sum("is gone" in line for line in said(caplog)[:-1]) == 3
+    path = Path(said(caplog)[-1].rpartition(" ")[2])
+    assert said(caplog)[-1].startswith("4 individuals count as failed, because their workers do")
+    assert path.parent == pool.folder and path.is_file()
+
+
+def test_workers_of_another_source_are_refused(cluster, pool, config, caplog, tmp_path):
+    shutil.copytree(ROOT / "mjx_revolve", tmp_path / "mjx_revolve")
+    with open(tmp_path / "mjx_revolve" / "water" / "drag.py", "a") as file:
+        file.write("\n# Another law.\n")
+    known = {*pool._workplace._workers}
+    cluster.add_worker(package=tmp_path)
+
+    def refused():
+        pool._workplace.attend()
+        return [w for w in pool._workplace._workers.values() if w.refused]
+
+    wait_for(refused)
+    (worker,) = refused()
+    assert worker.address not in known
+    ours = pool._workplace.identity["mjx_revolve"]
+    (line,) = [line for line in said(caplog) if "refused" in line]
+    assert line.startswith(
+        f"the worker at {worker.address} is refused: mjx_revolve: expected {ours} as the run has "
+        "it; found "
+    )
+    check_scores(pool, 5)
+    assert worker.blocks == []
+
+
+def test_a_lost_scheduler_ends_the_run_which_goes_on_elsewhere(
+    cluster, pool, config, capsys, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TOY_TROUBLE", str(tmp_path / "none"))
+    toys.write_config(tmp_path / "toy.yaml", population_size=10, generations=5000)
+
+    def run(*argv):
+        return run_command(
+            lambda argv: command.main(argv, toys.make_troubled), [str(word) for word in argv]
+        )
+
+    def kill():
+        wait_for((tmp_path / "run" / "metrics.csv").exists)
+        cluster.scheduler.kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with dask.config.set({"distributed.comm.timeouts.connect": "2s"}):
+        assert run("toy.yaml", "--out", "run", "--cluster", cluster.file) == 1
+        killer.join()
+        error, resume = [
+            line for line in capsys.readouterr().err.splitlines()
+            if line.startswith(("error: ", "resume: "))
+        ]  # fmt: skip
+        assert error.startswith(f"error: the scheduler at {cluster.file} is lost; generation ")
+        assert error.endswith(" is saved")
+        done = int(error.split()[-3])
+        assert resume.endswith(" -m mjx_revolve.evolve --resume run")
+        more = ("--set", f"evolution.generations={done + 3}")
+        assert run("--resume", "run", "--workers", 1, *more) == 0
+        assert run("toy.yaml", "--out", "whole", "--workers", 1, *more) == 0
+        one, other = (
+            runs.Run(tmp_path / name).load_checkpoint().arrays for name in ("run", "whole")
+        )
+        assert one.keys() == other.keys()
+        for name in one.keys() - set(CLOCK):
+            assert one[name].tobytes() == other[name].tobytes(), name
+        # There is nobody at that address any more.
+        with pytest.raises(InputError, match=f"--cluster {cluster.file}: expected a Dask schedule"):
+            make_pool(config, None, toys.make_toy, str(cluster.file))
+    with pytest.raises(WorkerError, match="is lost"):
+        check_scores(pool, 7)
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("none.json", "--cluster: expected a scheduler file; found none at none.json"),
+        ("nonsense://a:1", "--cluster nonsense://a:1: expected a Dask scheduler; found "),
+    ],
+)
+def test_places_without_a_scheduler_are_one_line(config, place, message):
+    with pytest.raises(InputError, match=message) as caught:
+        make_pool(config, None, toys.make_toy, place)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_dask_it_says_what_to_install(config, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(
+        InputError, match=r"--cluster: expected Dask \(pip install 'mjx_revolve\[cl"
+    ):
+        make_pool(config, None, toys.make_toy, "tcp://127.0.0.1:1")
