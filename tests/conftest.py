@@ -52,7 +52,7 @@ def fresh_traces():
 _LONGEST = (
     "test_tutorial", "test_rollout", "test_step", "test_many_bodies", "test_fitness",
     "test_experiments", "test_end_to_end", "test_pool", "test_mjx_contact", "test_evolve",
-    "test_loop", "test_dynamics", "test_wheel",
+    "test_loop", "test_dynamics", "test_wheel", "test_cluster",
 )  # fmt: skip
 
 

@@ -65,7 +65,7 @@ def make_toy(config):
 
 class SlowToy(Toy):
     def evaluate(self, population, key):
-        time.sleep(0.02)
+        time.sleep(0.05)
         return super().evaluate(population, key)
 
 

@@ -2,9 +2,8 @@
 
 Dask carries tasks and scores, has TLS, restarts workers that die, and lets them join and leave at
 any time. A worker gets blocks once it has opened the job, which it keeps, and was found to have the
-same program. A worker that is lost takes the block that it was at with it, as on one machine
-(`jobs.share_out`): Dask is told who is to score what, so that no block is blamed for another's
-deed.
+same program. When one is lost, its blocks are scored again, as on one machine (`jobs.share_out`);
+Dask is told who is to score what, so that no block is blamed for another's deed.
 """
 
 from __future__ import annotations
@@ -113,7 +112,7 @@ class _Worker:
         address: where it is.
         opening: the future that opens the job; None: it has.
         refused: why it gets no blocks; nothing: it does.
-        blocks: number and future of those that it has, oldest first.
+        blocks: number and future of those that it has.
     """
 
     address: str
@@ -163,6 +162,7 @@ class Cluster:
         self._facts: dict[str, set[str]] = {}
         self._done: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._next_look = 0.0
+        self._at_once = _AT_ONCE
         self._deserted = False
 
     @property
@@ -179,20 +179,34 @@ class Cluster:
         Raises:
             WorkerError: the scheduler is lost, or has had no workers but those of another program.
         """
+        self._at_once = _AT_ONCE
         return share_out(self, blocks, key)
 
     def free(self) -> list[_Worker]:
         """See `jobs.Crew`; one that has room for two blocks stands there twice."""
-        return [w for k in range(_AT_ONCE) for w in self._fit() if len(w.blocks) <= k]
+        return [w for k in range(self._at_once) for w in self._fit() if len(w.blocks) <= k]
 
     def send(self, worker: _Worker, number: int, block: Block, key: tuple[Any, str]) -> None:
         """See `jobs.Crew`."""
         worker.blocks.append((number, self._submit(worker.address, score, block, key)))
 
     def _submit(self, address: str, function: Any, *arguments: Any) -> Any:
-        future = self._client.submit(function, self._job, *arguments, workers=[address], pure=False)
+        with self._lost_if_closed():
+            future = self._client.submit(
+                function, self._job, *arguments, workers=[address], pure=False
+            )
         future.add_done_callback(self._done.put)
         return future
+
+    @contextlib.contextmanager
+    def _lost_if_closed(self) -> Iterator[None]:
+        """Turns what Dask complains of, once it has given the scheduler up, into our error."""
+        try:
+            yield
+        except Exception:  # of any kind, where the connection breaks
+            if self._client.status not in ("connecting", "running"):
+                raise WorkerError(f"the scheduler at {self.place} is lost") from None
+            raise
 
     def attend(self) -> News:
         """See `jobs.Crew`."""
@@ -213,19 +227,19 @@ class Cluster:
         self._next_look = time.monotonic() + _TICK
         while self._client.status == "connecting":  # it gives up after a while
             time.sleep(0.1)
-        try:
+        there: dict[str, int] | None = None
+        with contextlib.suppress(OSError), self._lost_if_closed():
             there = self._client.nthreads()
-        except Exception:  # of any kind, where the connection breaks
-            if self._client.status in ("connecting", "running"):
-                return []
-            raise WorkerError(f"the scheduler at {self.place} is lost") from None
+        if there is None:  # it tries to reach the scheduler again
+            return []
         news: News = []
         for address in [address for address in self._workers if address not in there]:
             worker = self._workers.pop(address)
             _log.warning("the worker at %s is gone", address)
-            # It was at the oldest.
-            for place, (number, _) in enumerate(worker.blocks):
-                news.append((number, None if place else f"the worker at {address} is gone"))
+            # Of two, one is innocent: from here on they get one at a time.
+            self._at_once = 1
+            how = f"the worker at {address} is gone" if len(worker.blocks) == 1 else None
+            news += [(number, how) for number, _ in worker.blocks]
         if not there and not self._deserted:
             _log.warning("waiting for workers at %s", self.place)
         self._deserted = not there
