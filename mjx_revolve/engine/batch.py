@@ -398,14 +398,16 @@ def resize(capacity: Capacity, **changes: Any) -> Capacity:
     """
     found = replace(capacity, **changes)
 
-    def counted(level: Level, count: Callable[[Group], int]) -> Level:
+    def sized(level: Level, count: Callable[[Group], int], points: int) -> Level:
         pairs = zip(level.parts, found.groups, strict=True)
-        return replace(level, parts=tuple(replace(p, count=count(g)) for p, g in pairs))
+        parts = tuple(replace(p, count=count(g)) for p, g in pairs)
+        touching = level.points and replace(level.points, count=points)
+        return replace(level, parts=parts, points=touching)
 
     return replace(
         found,
-        row=counted(found.row, lambda group: group.parts),
-        root=counted(found.root, lambda group: group.root_parts),
+        row=sized(found.row, lambda group: group.parts, found.points),
+        root=sized(found.root, lambda group: group.root_parts, found.root_points),
     )
 
 

@@ -18,7 +18,7 @@ from experiments.random_bodies import random_body
 from laboratory import QUICK, ROOT, WATER, accelerate, body, march, random_states, read, world
 from mjx_revolve import MODULES, load_config, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.control.controller import gene_places
-from mjx_revolve.engine.batch import fit_capacity, order_rows, pack_bodies, resize
+from mjx_revolve.engine.batch import Group, fit_capacity, order_rows, pack_bodies, resize
 from mjx_revolve.engine.columns import read_columns
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.rows import Rows
@@ -111,11 +111,12 @@ def test_accelerations_are_those_of_each_body_alone(name):
 
 
 @pytest.mark.slow
-def test_more_padding_and_more_riders_change_nothing():
+@pytest.mark.parametrize("name", ["default", "contact"])
+def test_more_padding_and_more_riders_change_nothing(name):
     """More rows, a deeper stack, a larger root, and bodies cut into more or fewer rows."""
-    robots = zoo("default")
+    robots = zoo(name)
     capacity = fit_capacity(robots)
-    arrays, _ = states(robots, capacity, 2, 0.0)
+    arrays, _ = states(robots, capacity, 2, 4.95 if name == "contact" else 0.0)
     found = mixed_acceleration(robots, capacity, 2, arrays)
     scale = np.abs(found).max(0)
     groups = tuple(g._replace(root_parts=g.root_parts + 2) for g in capacity.groups)
@@ -128,11 +129,13 @@ def test_more_padding_and_more_riders_change_nothing():
     )
     again = mixed_acceleration(robots, padded, 2, arrays)
     assert np.all(np.abs(again - found).max(0) < 1e-11 * scale)
-    groups = tuple(g._replace(parts=1) for g in capacity.groups)
-    single = resize(capacity, rows=40, slots=5, groups=groups)
-    room = {g.laws: 1 for g in groups}
-    order = order_rows(robots[0].assembly, read_columns(robots[0].assembly), room)
-    assert order.length[0] > capacity.rows
+    # One part in each row, and one on the root, which then has riders of its own.
+    groups = tuple(g._replace(parts=1, root_parts=1) for g in capacity.groups)
+    points = dict.fromkeys(("points", "root_points"), 8 if capacity.points else 0)
+    single = resize(capacity, rows=40, slots=5, groups=groups, **points)
+    order = order_rows(robots[0].assembly, read_columns(robots[0].assembly), groups)
+    assert order.length[0] == len(robots[0].fluid.volume) - 1
+    assert np.sum(order.rider & (order.body == 1)) > 0
     again = mixed_acceleration(robots, single, 2, arrays)
     assert np.all(np.abs(again - found).max(0) < 1e-9 * scale)
 
@@ -144,14 +147,29 @@ def test_a_short_stack_holds_any_tree():
         robot = build_robot(random_body(seed, 2 + seed, 3), tank)
         assembly = robot.assembly
         columns = read_columns(assembly)
-        for parts in (1, 2, 5):
-            rows = order_rows(assembly, columns, dict.fromkeys(columns.laws, parts))
+        for parts, root in ((1, 99), (2, 99), (5, 99), (2, 1), (3, 4)):
+            groups = [Group(laws, parts, root) for laws in columns.laws]
+            rows = order_rows(assembly, columns, groups)
             assert 2 ** (rows.slot.max() + 1) - 1 <= rows.length[0] + 1 == len(rows.slot) + 1
             stack = {0: 1}  # the root
             each = zip(rows.body, rows.rider, rows.source, rows.slot, strict=True)
             for own, rider, source, slot in each:
                 assert stack[source] == (own if rider else assembly.parent[own])
                 stack[slot] = None if rider else own
+
+
+def test_room_for_all_bodies_of_so_many_modules():
+    """Whatever their shape; and no more than a few rows that none of them needs."""
+    tank = world(**WATER, bed=BED)
+    few = [build_robot(random_body(seed, 4, 4), tank) for seed in range(6)]
+    capacity = fit_capacity(few, hinges=7, modules=15)
+    # Chains of hinges, stars of bricks, and what lies between them.
+    bodies = [random_body(seed, hinges, 14 - hinges) for hinges in range(8) for seed in range(12)]
+    bodies += [random_body(0, hinges, bricks) for hinges in (1, 3) for bricks in (0, 2)]
+    packed = pack_bodies([build_robot(body, tank) for body in bodies], capacity)
+    assert packed.count.max() <= capacity.rows <= packed.count.max() + 4
+    with pytest.raises(InputError, match="expected at most 7 hinges; found 8"):
+        pack_bodies([build_robot(random_body(0, 8, 0), tank)], capacity)
 
 
 @pytest.mark.slow
