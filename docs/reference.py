@@ -24,7 +24,9 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PACKAGE = "mjx_revolve"
 # The order in which a user meets the pages; those not named here follow.
-FIRST = ("tutorial", "viewer", "replay", "report", "interchange", "physics", "parallel")
+FIRST = (
+    "tutorial", "evolution", "viewer", "replay", "report", "interchange", "physics", "parallel",
+)  # fmt: skip
 # The package's rooms in reading order: each imports only from itself and from those before it.
 ROOMS = (
     "inputs", "numerics", "body", "genotypes", "water", "engine", "control", "episodes",
