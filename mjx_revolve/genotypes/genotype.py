@@ -19,6 +19,8 @@ SLACK = 1 + 1e-9
 # said that there are none. Choices: most bounds let every second or third pass.
 TRIES = 50
 _RANDOM_TRIES = 300
+# Genomes whose bodies are remembered: a choice, those of some generations.
+_REMEMBERED = 1000
 
 
 class Genotype(NamedTuple):
@@ -169,6 +171,30 @@ def make_space(
 
 
 # ------------------------------------------------------------------------- what genotypes share
+
+
+def remember(develop: Callable[[Any], Morphology]) -> Callable[[Any], Morphology]:
+    """The same function, which knows the bodies of the genomes that it was last asked for.
+
+    Who varies a genome develops it to see whether it is in the space; so will who asked for it.
+
+    Args:
+        develop: genome → body.
+
+    Returns:
+        The function.
+    """
+    known: dict[int, tuple[Any, Morphology]] = {}
+
+    def look_up(genome: Any) -> Morphology:
+        # Genomes need have no hash. They are kept, so that no other comes to have their id.
+        if id(genome) not in known:
+            if len(known) >= _REMEMBERED:
+                known.clear()
+            known[id(genome)] = genome, develop(genome)
+        return known[id(genome)][1]
+
+    return look_up
 
 
 def draw_within(

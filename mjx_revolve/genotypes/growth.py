@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.body.boxes import boxes_overlap
-from mjx_revolve.body.module_types import ModuleType, Part
+from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.placement import OVERLAP_TOLERANCE, Module, attach, frozen
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.genotypes.genotype import SLACK, Space
@@ -62,9 +62,11 @@ class Growth:
         self._mass = 0.0
         self._children: list[list[int]] = []
         self._paths: list[tuple[int, ...]] = []
-        self._boxes: list[_Boxes] = []
-        self._low = self._high = _ORIGIN[0]
-        self._take(first, (), _place_boxes(first.kind, first.position, first.rotation))
+        # Main boxes, with the module and which of its boxes it is, and all modules' boxes.
+        self._mains: list[tuple[float, float, float, float, float, float, int, int]] = []
+        self._shapes: list[_Shape] = []
+        self._low = self._high = [0.0, 0.0, 0.0]
+        self._take(first, (), _shape(_Same(first.kind), first.rotation.tobytes()))
 
     @property
     def is_full(self) -> bool:
@@ -75,6 +77,10 @@ class Growth:
         """Index of the module at a slot; None where it is free."""
         found = (i for i in self._children[parent] if self.modules[i].slot == slot)
         return next(found, None)
+
+    def direction(self, index: int, slot: int) -> list[float]:
+        """Where one of a module's slots looks: a unit vector, core frame."""
+        return self._shapes[index].ways[slot]
 
     def attach(
         self,
@@ -105,12 +111,13 @@ class Growth:
         if space.max_mass is not None and self._mass + kind.mass > space.max_mass * SLACK:
             return None
         position, rotation = attach(above, above.kind.slots[slot], kind, orientation)
-        boxes = _place_boxes(kind, position, rotation)
+        shape, place = _shape(_Same(kind), rotation.tobytes()), position.tolist()
         if space.max_length is not None:
-            extent = np.maximum(self._high, boxes.high) - np.minimum(self._low, boxes.low)
-            if extent.max() > space.max_length * SLACK:
+            low, high = self._reach(shape, place)
+            extent = max(b - a for a, b in zip(low, high, strict=True))
+            if extent > space.max_length * SLACK:
                 return None
-        if any(k != parent and _overlap(boxes, other) for k, other in enumerate(self._boxes)):
+        if self._hits(shape, place, parent):
             return None
         path = (*self._paths[parent], slot)
         own: Any = (self._free_name(kind, path), None, {})
@@ -121,7 +128,7 @@ class Growth:
         module = Module(
             name, kind.name, parent, slot, orientation, rgb, position, rotation, kind, params
         )
-        self._take(module, path, boxes)
+        self._take(module, path, shape)
         return index
 
     def _free_name(self, kind: ModuleType, path: tuple[int, ...]) -> str:
@@ -132,16 +139,48 @@ class Growth:
             name, count = f"{stem}_{count}", count + 1
         return name
 
-    def _take(self, module: Module, path: tuple[int, ...], boxes: _Boxes) -> None:
+    def _take(self, module: Module, path: tuple[int, ...], shape: _Shape) -> None:
+        """Adds a module that there is room for."""
+        index, place = len(self.modules), module.position.tolist()
+        self._mains += [
+            (*(a + b for a, b in zip(place, center, strict=True)), *reach, index, k)
+            for k, (center, reach) in enumerate(shape.mains)
+        ]
+        self._low, self._high = self._reach(shape, place)
         self.modules.append(module)
         self._names.add(module.name)
         self._children.append([])
         self._paths.append(path)
-        self._boxes.append(boxes)
+        self._shapes.append(shape)
         self.num_hinges += module.kind.hinge is not None
         self._mass += module.kind.mass
-        self._low = np.minimum(self._low, boxes.low)
-        self._high = np.maximum(self._high, boxes.high)
+
+    def _reach(self, shape: _Shape, place: list[float]) -> tuple[list[float], list[float]]:
+        """Lowest and highest corner of the body with another module, core frame [m]."""
+        low = [min(a, b + c) for a, b, c in zip(self._low, place, shape.low, strict=True)]
+        high = [max(a, b + c) for a, b, c in zip(self._high, place, shape.high, strict=True)]
+        return low, high
+
+    def _hits(self, shape: _Shape, place: list[float], parent: int) -> bool:
+        """Whether a module would overlap with another one than its parent."""
+        for number, (center, (u, v, w)) in enumerate(shape.mains):
+            x, y, z = (a + b for a, b in zip(place, center, strict=True))
+            for a, b, c, d, e, f, index, k in self._mains:
+                if (
+                    abs(x - a) - u - d < -_HAIR
+                    and abs(y - b) - v - e < -_HAIR
+                    and abs(z - c) - w - f < -_HAIR
+                    and index != parent
+                ):
+                    # Boxes along the core's axes fill what they reach; others need a closer look.
+                    other = self._shapes[index]
+                    if shape.is_level and other.is_level:
+                        return True
+                    one = np.array([[x, y, z]]), shape.rotation[None], shape.half[[number]]
+                    two = np.array([[a, b, c]]), other.rotation[None], other.half[[k]]
+                    if boxes_overlap(*one, *two)[0]:
+                        return True
+        return False
 
     def finish(self, name: str) -> Morphology:
         """The body as it is, modules depth first.
@@ -158,94 +197,72 @@ class Growth:
             order.append(stack.pop())
             stack.extend(reversed(self._children[order[-1]]))
         place = {index: k for k, index in enumerate(order)} | {-1: -1}
-        modules = (self.modules[index] for index in order)
-        return Morphology(name, tuple(replace(m, parent=place[m.parent]) for m in modules))
+        found = []
+        for module in (self.modules[index] for index in order):
+            parent = place[module.parent]
+            found.append(module if parent == module.parent else replace(module, parent=parent))
+        return Morphology(name, tuple(found))
 
 
 # ------------------------------------------------------------------------- boxes
 
 
-class _Boxes(NamedTuple):
-    """A module's boxes in their place.
+class _Shape(NamedTuple):
+    """A module's boxes and slots as they are turned, from its place on.
 
     Attributes:
-        center: of each part's main box, core frame [m].
-        reach: of each, how far it reaches along the core's axes [m].
+        mains: of each part's main box, shrunk: its centre and how far it reaches along the core's
+            axes [m].
         half: `[npart, 3]` their half edges, module frame [m].
         rotation: `[3, 3]` core frame from module frame.
         is_level: whether the boxes lie along the core's axes.
-        low: `[3]` lowest corner of all boxes, core frame [m].
-        high: `[3]` highest corner.
+        low: lowest corner of all boxes, core's axes [m].
+        high: highest corner.
+        ways: directions of the slots, core's axes.
     """
 
-    center: list[list[float]]
-    reach: list[list[float]]
+    mains: list[tuple[list[float], list[float]]]
     half: np.ndarray
     rotation: np.ndarray
     is_level: bool
-    low: np.ndarray
-    high: np.ndarray
-
-
-@lru_cache(maxsize=4096)
-def _shape(parts: _Same) -> tuple[np.ndarray, ...]:
-    """Main boxes, centre and shrunk half edges, then all boxes likewise, module frame [m]."""
-    mains = [(part.position, part.boxes[0].size) for part in parts.value]
-    center = np.array([position for position, _ in mains])
-    half = np.array([size for _, size in mains]) / 2
-    boxes = [(part.position, box) for part in parts.value for box in part.boxes]
-    middle = np.array([np.add(position, box.position) for position, box in boxes])
-    return (
-        center,
-        half - np.minimum(OVERLAP_TOLERANCE, half / 2),
-        middle,
-        np.array([box.size for _, box in boxes]) / 2,
-    )
+    low: list[float]
+    high: list[float]
+    ways: dict[int, list[float]]
 
 
 class _Same:
-    """A value that is told apart from others by what it is, not by what is in it."""
+    """A type of module, told apart from others by which it is, not by what is in it."""
 
-    def __init__(self, value: tuple[Part, ...]) -> None:
-        self.value = value
+    def __init__(self, kind: ModuleType) -> None:
+        self.kind = kind
 
     def __hash__(self) -> int:
-        return id(self.value)
+        return id(self.kind)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.value is other.value
+        return isinstance(other, _Same) and self.kind is other.kind
 
 
-def _place_boxes(kind: ModuleType, position: np.ndarray, rotation: np.ndarray) -> _Boxes:
-    """A module's boxes in their place."""
-    center, half, middle, whole = _shape(_Same(kind.parts))
-    turn = np.abs(rotation)
-    middle, whole = position + middle @ rotation.T, whole @ turn.T
-    return _Boxes(
-        center=(position + center @ rotation.T).tolist(),
-        reach=(half @ turn.T).tolist(),
+@lru_cache(maxsize=4096)
+def _shape(same: _Same, turn: bytes) -> _Shape:
+    """A type's boxes and slots, turned; there are few turns."""
+    parts = same.kind.parts
+    rotation = frozen(np.frombuffer(turn).reshape(3, 3))
+    reach = np.abs(rotation).T
+    center = np.array([part.position for part in parts])
+    half = np.array([part.boxes[0].size for part in parts]) / 2
+    half = half - np.minimum(OVERLAP_TOLERANCE, half / 2)
+    boxes = [(part.position, box) for part in parts for box in part.boxes]
+    middle = np.array([np.add(place, box.position) for place, box in boxes]) @ rotation.T
+    whole = np.array([box.size for _, box in boxes]) / 2 @ reach
+    mains = zip((center @ rotation.T).tolist(), (half @ reach).tolist(), strict=True)
+    slots = same.kind.slots.items()
+    return _Shape(
+        mains=[*mains],
         half=half,
         rotation=rotation,
-        is_level=bool(turn.sum() < 3 + _HAIR),
-        low=(middle - whole).min(axis=0),
-        high=(middle + whole).max(axis=0),
+        is_level=bool(reach.sum() < 3 + _HAIR),
+        low=(middle - whole).min(axis=0).tolist(),
+        high=(middle + whole).max(axis=0).tolist(),
+        ways={number: (rotation @ slot.direction).tolist() for number, slot in slots},
     )
-
-
-def _overlap(one: _Boxes, other: _Boxes) -> bool:
-    """Whether main boxes of two modules overlap."""
-    for i, ((x, y, z), (u, v, w)) in enumerate(zip(one.center, one.reach, strict=True)):
-        for j, ((a, b, c), (d, e, f)) in enumerate(zip(other.center, other.reach, strict=True)):
-            if abs(x - a) - u - d < -_HAIR and abs(y - b) - v - e < -_HAIR:
-                if abs(z - c) - w - f >= -_HAIR:
-                    continue
-                # Boxes along the core's axes fill what they reach; others need a closer look.
-                if one.is_level and other.is_level:
-                    return True
-                sides = [
-                    (np.array([side.center[k]]), side.rotation[None], side.half[k : k + 1])
-                    for side, k in ((one, i), (other, j))
-                ]
-                if boxes_overlap(*sides[0], *sides[1])[0]:
-                    return True
-    return False

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import re
+from dataclasses import fields, replace
+from itertools import pairwise
 from statistics import median
 
 import numpy as np
 import pytest
+import yaml
 
 from laboratory import ROOT, WILD
 from mjx_revolve.body.catalogue import MODULES, load_modules
@@ -17,6 +20,9 @@ from mjx_revolve.body.placement import find_overlaps
 from mjx_revolve.episodes import bodies_config
 from mjx_revolve.genotypes.genotype import TRIES, Space, accept_all, make_space
 from mjx_revolve.genotypes.kinds import GENOTYPES, make_genotype
+from mjx_revolve.genotypes.network import NetworkSettings
+from mjx_revolve.genotypes.plasticoding import PlasticodingSettings
+from mjx_revolve.genotypes.tree import TreeSettings
 from mjx_revolve.inputs.errors import InputError
 
 ROBOTS = [*sorted((ROOT / "morphologies").glob("*.yaml")), *WILD]
@@ -36,7 +42,7 @@ SPACES = {
     ),
 }  # fmt: skip
 # Genomes of each kind in each space; with mutants and children three times as many bodies.
-COUNT = 150
+COUNT = 120
 
 pairs = pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
 kinds = pytest.mark.parametrize("name", GENOTYPES)
@@ -168,12 +174,13 @@ def test_sizes_reach_from_end_to_end(families, name):
 def test_mutation_is_local_and_does_something(families, name):
     """Half of the mutants differ by two modules at most, in number and in place."""
     genotype, parents, mutants, _ = families(name, SPACES["bricks and hinges"])
-    pairs = [(genotype.develop(a), genotype.develop(b)) for a, b in zip(parents, mutants)]  # noqa: B905
+    lines = [*zip(parents, mutants, strict=True)]
+    pairs = [(genotype.develop(a), genotype.develop(b)) for a, b in lines]
     assert median(abs(a.num_modules - b.num_modules) for a, b in pairs) <= 2
     changes = [distance(a, b) for a, b in pairs]
     assert median(changes) <= 2
     assert np.mean([change > 0 for change in changes]) > 0.2
-    assert sum(a != b for a, b in zip(parents, mutants)) > 0.9 * COUNT  # noqa: B905
+    assert sum(a != b for a, b in lines) > 0.9 * COUNT
 
 
 @kinds
@@ -200,7 +207,7 @@ def test_modules_that_stay_in_their_place_keep_their_names(families, name):
             if path in names and places(before)[path] == places(after)[path]:
                 kept += names[path] == module.name
                 lost += names[path] != module.name
-    assert kept > 1000 and lost < 0.02 * kept
+    assert kept > 500 and lost < 0.02 * kept
 
 
 # ------------------------------------------------------------------------- bounds
@@ -329,7 +336,10 @@ def test_any_robot_can_be_adopted(name, path):
     mutants = [genotype.develop(genotype.mutate(rng, genome)) for _ in range(30)]
     assert {m.name for m in mutants} == {body.name}
     assert median(distance(mutant, body) for mutant in mutants) <= 4
-    assert sum(mutant != grown for mutant in mutants) >= 10
+    heirs = [genome]
+    while genotype.develop(heirs[-1]).modules == body.modules and len(heirs) < 200:
+        heirs.append(genotype.mutate(rng, heirs[-1]))
+    assert len(heirs) < 200
     # Most joints are still known by their names.
     joints = {body.modules[i].name for i in body.hinges}
     shares = [len(joints & {m.name for m in mutant.modules}) for mutant in mutants]
@@ -351,7 +361,7 @@ def test_what_is_not_adopted(name):
 
 
 def test_configurations_know_all_genotypes():
-    assert {*GENOTYPES} <= {*bodies_config.GENOTYPES}
+    assert tuple(GENOTYPES) == bodies_config.GENOTYPES
 
 
 @kinds
@@ -388,3 +398,88 @@ def test_unknown_genotypes_are_refused():
         f"test.yaml: bodies.genotype: expected one of {', '.join(GENOTYPES)}, or "
         "FILE.py:FUNCTION; found 'three'"
     )
+
+
+# ------------------------------------------------------------------------- users' own
+
+PAGE = (ROOT / "docs" / "evolution.md").read_text(encoding="utf-8")
+
+
+def block(language):
+    """The page's first block of a language."""
+    return PAGE.split(f"```{language}\n", 1)[1].split("```", 1)[0]
+
+
+@pytest.fixture
+def worms(tmp_path):
+    (tmp_path / "worms.py").write_text(block("python"))
+    return f"{tmp_path}/worms.py:worm"
+
+
+def test_the_pages_own_genotype_works(worms):
+    space = SPACES["bricks and hinges"]
+    genotype = make_genotype(worms, space, {"name": "wurm"}, "test.yaml")
+    rng = np.random.default_rng(0)
+    genomes = [genotype.random(rng) for _ in range(50)]
+    for a, b in pairwise(genomes):
+        body = genotype.develop(genotype.mutate(rng, genotype.cross(rng, a, b)))
+        assert space.refuses(body) is None
+        assert (body.name, body.num_hinges + 1) == ("wurm", body.num_modules)
+
+
+def test_the_pages_configuration_is_one():
+    settings = bodies_config.BodiesConfig.model_validate(yaml.safe_load(block("yaml")))
+    space = make_space(settings, MODULES)
+    assert space.modules == ("FixedBrick", "ActiveHinge", "TouchSensor", "Fin")
+    for name in GENOTYPES:
+        body = make(name, space).develop(make(name, space).random(np.random.default_rng(0)))
+        assert space.refuses(body) is None
+
+
+@pytest.mark.parametrize("kind", [TreeSettings, PlasticodingSettings, NetworkSettings])
+def test_the_page_has_all_settings_with_their_defaults(kind):
+    said = {}
+    for line in PAGE.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if line.startswith("| `") and len(cells) == 3:
+            names = re.findall(r"`(\w+)`", cells[0])
+            values = [yaml.safe_load(value) for value in cells[1].split(",")]
+            values *= len(names) // len(values)
+            for name, value in zip(names, values, strict=True):
+                said.setdefault(name, set()).add(value)
+    for field in fields(kind):
+        assert getattr(kind(), field.name) in said[field.name], field.name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("return Genotype(", "return (lambda *a, **k: 3)(", "worm: expected a Genotype; found int"),
+        ("1 - bits[k]", "1 / 0", "line 15: expected worm to mutate; found ZeroDiv"),
+        ("space.max_modules - 1", "99", "worms.py: worm: develop: expected 2 to 6 modules; found"),
+        ("to_plain=list", "to_plain=set", "worm: to_plain: expected what JSON can hold; found: "),
+        ("from_plain=list", "from_plain=lambda x: [0]", "worm: to_plain, from_plain: expected a g"),
+        ("return make_", "return 3 or make_", "worm: develop: expected a Morphology; found int"),
+        ("def worm", "def wurm", "bodies.genotype: expected a function worm in"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_ones_own_are_one_line(tmp_path, old, new, message):
+    assert block("python").count(old) == 1
+    (tmp_path / "worms.py").write_text(block("python").replace(old, new))
+    space = replace(SPACES["bricks and hinges"], max_modules=6, max_hinges=90)
+    with pytest.raises(InputError) as error:
+        make(f"{tmp_path}/worms.py:worm", space)
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_mistakes_that_show_later_are_one_line_too(tmp_path):
+    """The first children are short enough; what comes in a run is looked at as well."""
+    text = block("python").replace("length = int(", "length = 20 if rng.random() < 0.01 else int(")
+    (tmp_path / "worms.py").write_text(text)
+    genotype = make(f"{tmp_path}/worms.py:worm", SPACES["bricks and hinges"])
+    rng = np.random.default_rng(0)
+    with pytest.raises(InputError, match=r"worms.py: worm: develop: expected 2 to 16 modules; fou"):
+        for _ in range(1000):
+            genotype.develop(genotype.random(rng))
+    with pytest.raises(InputError, match=r"worms.py: line 14: expected worm to mutate; found Type"):
+        genotype.mutate(rng, None)

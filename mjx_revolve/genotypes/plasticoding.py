@@ -1,0 +1,454 @@
+"""Plasticoding: Revolve's L-system, whose sentences are drawn into bodies.
+
+A genome is a grammar with one rule for each letter that stands for a module. The sentence begins as
+the core's letter, C; in each iteration every such letter gives way to its rule. Then the sentence
+is drawn like a turtle: `addr`, `addf` and `addl` say where the next module is mounted, a module's
+letter mounts it there and moves on to it, `mover`, `movef` and `movel` move on to a module that is
+mounted there, and `moveb` moves back the way that was come. On a module with a single slot all
+sides are that slot; where right, front and left of a core are taken, its back comes next. What
+overlaps or exceeds a bound is left out.
+
+Letters, rules, mutation and crossover are those of Revolve (github.com/ci-group/revolve,
+`pyrevolve/genotype/plasticoding`): random grammars of groups of mounting, module and moving; one
+letter added, deleted, or exchanged with another one of its rule; and rules from either parent. A
+joint's letter has two orientations: AJ1 bends up and down, AJ2 from side to side. Four things
+differ. Brains are evolved beside bodies, so the letters for their edges are missing. Modules that
+overlap are found by their shapes and not on a grid. Sensors count among the modules. And a genome
+may begin with a body of its own, its seed: a module's name with `#` before it is a letter that
+stands for that module of the seed in its place, so that a rule can spell any body out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Unit
+
+from mjx_revolve.body.module_types import ModuleType
+from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.body.tree import Morphology
+from mjx_revolve.genotypes.genotype import (
+    Genotype,
+    Space,
+    check_within,
+    draw_within,
+    remember,
+    vary_within,
+)
+from mjx_revolve.genotypes.growth import Growth
+from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.schema import (
+    MisfitError,
+    NonNegative,
+    Row,
+    Switch,
+    Text,
+    Whole,
+    checked,
+    read,
+)
+
+CORE = "C"
+# The sides of a module: Revolve's slots of core and brick.
+_SIDES = {"r": 2, "f": 1, "l": 3}
+MOUNTING = {f"add{side}": slot for side, slot in _SIDES.items()}
+MOVING: dict[str, int | None] = {f"move{side}": slot for side, slot in _SIDES.items()} | {
+    "moveb": None
+}
+# Letters of a level and of an upright module. Revolve's are AJ1, AJ2, B, BV and ST.
+_LETTERS = {
+    "ActiveHinge": ("AJ1", "AJ2"),
+    "FixedBrick": ("B", "BV"),
+    "TouchSensor": ("ST",),
+    "Fin": ("F", "FV"),
+    "Thruster": ("T",),
+    "LiftThruster": ("LT", "LTV"),
+}
+# Letters that are read at most while a sentence is made: a choice, a hundred times those of a body.
+_MOST_LETTERS = 3000
+
+
+class Letter(NamedTuple):
+    """What a letter stands for that means a module.
+
+    Attributes:
+        kind: its type.
+        upright: whether it stands across the level in which the core lies.
+    """
+
+    kind: ModuleType
+    upright: bool
+
+
+class Grammar(NamedTuple):
+    """A genome.
+
+    Attributes:
+        name: of the body.
+        rules: what gives way to what: letters by letter; the core's begins with the core.
+        seed: the body whose modules its letters with a `#` name; None: there is none.
+    """
+
+    name: str
+    rules: Mapping[str, tuple[str, ...]]
+    seed: Morphology | None = None
+
+
+_Rate = Annotated[NonNegative, Unit("-")]
+
+
+@checked
+class PlasticodingSettings:
+    """How grammars begin, how they grow and how they vary.
+
+    Attributes:
+        iterations: how often letters give way to their rules.
+        groups: most groups of three letters in a rule of a random grammar.
+        max_rule: most letters of a rule to which another one may be added.
+        upright: whether bricks, fins and the like may stand upright, too.
+        add: how often a letter is added, relative to the other two mutations.
+        delete: how often one is deleted.
+        swap: how often two are exchanged.
+
+    Raises:
+        InputError: a number is out of range, or no mutation can be drawn.
+    """
+
+    # Revolve's, but for `max_rule`, a choice.
+    iterations: Annotated[Whole, Ge(1)] = 3
+    groups: Annotated[Whole, Ge(1)] = 3
+    max_rule: Annotated[Whole, Ge(1)] = 40
+    upright: Switch = True
+    add: _Rate = 1.0
+    delete: _Rate = 1.0
+    swap: _Rate = 1.0
+
+    def __post_init__(self) -> None:
+        """Checks that something can happen."""
+        if not any((self.add, self.delete, self.swap)):
+            raise MisfitError("", "a number > 0 among add, delete and swap", "all of them 0")
+
+
+def make_plasticoding(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
+    """Revolve's L-system.
+
+    Args:
+        space: the bodies that there may be.
+        params: fields of `PlasticodingSettings`.
+        place: where they were given, for messages.
+
+    Returns:
+        The genotype; its genomes are grammars.
+
+    Raises:
+        InputError: a parameter is wrong.
+    """
+    settings = read(PlasticodingSettings, dict(params), f"{place}.params")
+    letters = make_alphabet(space, settings.upright)
+    names = [*letters]
+
+    @remember
+    def develop(grammar: Grammar) -> Morphology:
+        sentence = expand(grammar.rules, settings.iterations)
+        return draw_sentence(sentence, letters, space, grammar.name, grammar.seed)
+
+    def adopt(body: Morphology) -> Grammar:
+        check_within(space, body)
+        body = replace(body, brain=None, path=None)
+        spelled = (CORE, *(f"#{module.name}" for module in body.modules[1:]))
+        return Grammar(body.name, {CORE: spelled} | dict.fromkeys(names, ()), body)
+
+    def from_plain(plain: Any) -> Grammar:
+        grammar = _read(plain, names, space)
+        check_within(space, develop(grammar))
+        return grammar
+
+    def random(rng: np.random.Generator) -> Grammar:
+        return Grammar("robot", _draw_rules(rng, names, settings.groups))
+
+    return Genotype(
+        name="plasticoding",
+        random=lambda rng: draw_within(space, develop, lambda: random(rng), place),
+        mutate=lambda rng, grammar: vary_within(
+            space, develop, lambda: _mutate(rng, grammar, names, settings), grammar
+        ),
+        cross=lambda rng, a, b: vary_within(space, develop, lambda: _cross(rng, a, b), a),
+        develop=develop,
+        adopt=adopt,
+        to_plain=_to_plain,
+        from_plain=from_plain,
+    )
+
+
+def make_alphabet(space: Space, upright: bool = True) -> dict[str, Letter]:
+    """The letters that stand for modules, beside the core's.
+
+    Args:
+        space: whose types of modules they are.
+        upright: whether others than joints have a letter for standing upright, too.
+
+    Returns:
+        What they stand for: Revolve's letters where it has any, F for a fin, T and LT for the
+        thrusters; types of users' own have their names, with 1 and 2 behind it for joints.
+    """
+    found = {}
+    for kind in space.kinds:
+        hinge = kind.hinge is not None
+        own = (f"{kind.name}1", f"{kind.name}2") if hinge else (kind.name, f"{kind.name}V")
+        names = _LETTERS.get(kind.name, own)
+        for k, name in enumerate(names if hinge or upright else names[:1]):
+            found[name] = Letter(kind, upright=k == 1)
+    return found
+
+
+# ------------------------------------------------------------------------- development
+
+
+def expand(rules: Mapping[str, tuple[str, ...]], iterations: int) -> Iterator[str]:
+    """The letters of a sentence, one after the other.
+
+    Args:
+        rules: letters by letter; a letter without a rule stays.
+        iterations: how often letters give way to their rules, the core's first.
+
+    Yields:
+        Its letters, until `_MOST_LETTERS` were read in rules and sentence.
+    """
+    stack = [iter((CORE,))]
+    for _ in range(_MOST_LETTERS):
+        letter = next(stack[-1], None)
+        if letter is None:
+            stack.pop()
+            if not stack:
+                return
+        elif len(stack) <= iterations and letter in rules:
+            stack.append(iter(rules[letter]))
+        else:
+            yield letter
+
+
+def draw_sentence(
+    sentence: Iterable[str],
+    letters: Mapping[str, Letter],
+    space: Space,
+    name: str = "robot",
+    seed: Morphology | None = None,
+) -> Morphology:
+    """The body that a sentence draws.
+
+    Args:
+        sentence: its letters.
+        letters: what they stand for.
+        space: whose upper bounds are kept.
+        name: of the body.
+        seed: whose core it begins with, and whose modules letters with a `#` name.
+
+    Returns:
+        The body.
+    """
+    turtle = _Turtle(Growth(space, seed), seed)
+    for letter in sentence:
+        if turtle.growth.is_full:
+            break
+        if letter in MOUNTING:
+            turtle.side = MOUNTING[letter]
+        elif letter in MOVING:
+            turtle.move(MOVING[letter])
+        elif letter in letters:
+            turtle.mount(letters[letter])
+        elif letter.startswith("#"):
+            turtle.spell(letter[1:])
+    return turtle.growth.finish(name)
+
+
+class _Turtle:
+    """Where a sentence is drawn.
+
+    Attributes:
+        growth: the body so far.
+        side: the slot at which the next module is mounted; None: it is not.
+    """
+
+    def __init__(self, growth: Growth, seed: Morphology | None) -> None:
+        self.growth = growth
+        self.side: int | None = None
+        self._here = 0
+        self._back: list[int] = []
+        self._upright = [False]
+        # The seed's modules and whose they are, by name, and where those are that were drawn.
+        modules = seed.modules if seed else ()
+        self._seed = {m.name: (m, modules[m.parent].name) for m in modules[1:]}
+        self._drawn = {m.name: 0 for m in modules[:1]}
+
+    def _slot(self, side: int) -> int | None:
+        """The slot that is meant by a side."""
+        slots = self.growth.modules[self._here].kind.slots
+        if len(slots) == 1:
+            return next(iter(slots))
+        return side if side in slots else None
+
+    def move(self, side: int | None) -> None:
+        """To the module at a side; None: back."""
+        if side is None:
+            if self._back:
+                self._here = self._back.pop()
+            return
+        slot = self._slot(side)
+        index = None if slot is None else self.growth.child(self._here, slot)
+        if index is not None:
+            self._enter(index)
+
+    def _enter(self, index: int) -> None:
+        """On to a module, if it can carry any."""
+        if self.growth.modules[index].kind.slots:
+            self._back.append(self._here)
+            self._here = index
+
+    def mount(self, letter: Letter) -> None:
+        """A module at the side that was said, or behind those at all sides."""
+        if self.side is None:
+            return
+        slot = self._slot(self.side)
+        free = [
+            number
+            for number in self.growth.modules[self._here].kind.slots
+            if self.growth.child(self._here, number) is None
+        ]
+        if slot not in free:
+            if not free or any(number in _SIDES.values() for number in free):
+                return
+            slot = free[0]
+        upright = self._upright[self._here]
+        turn = 0.0 if letter.upright == upright else 90.0 if letter.upright else 270.0
+        index = self.growth.attach(self._here, slot, letter.kind, turn)
+        if index is not None:
+            self.side = None
+            self._upright.append(letter.upright)
+            self._enter(index)
+
+    def spell(self, name: str) -> None:
+        """The seed's module in its place, if what carries it is there."""
+        module, parent = self._seed[name]
+        if name not in self._drawn and parent in self._drawn:
+            above = self._drawn[parent]
+            turn = module.orientation
+            index = self.growth.attach(above, module.slot, module.kind, turn, like=module)
+            if index is not None:
+                self._drawn[name] = index
+                self._upright.append(self._upright[above] != (turn % 180.0 == 90.0))
+        if name in self._drawn:
+            way = [self._drawn[name]]
+            while way[-1] > 0:
+                way.append(self.growth.modules[way[-1]].parent)
+            if not module.kind.slots:
+                way.pop(0)
+            self._here, *back = way
+            self._back = back[::-1]
+
+
+# ------------------------------------------------------------------------- variation
+
+
+def _draw_rules(
+    rng: np.random.Generator, names: Sequence[str], groups: int
+) -> dict[str, tuple[str, ...]]:
+    """Random rules: groups of mounting, module and moving, as many in each."""
+    count = int(rng.integers(1, groups + 1))
+    kinds = (tuple(MOUNTING), names, tuple(MOVING))
+    rules = {}
+    for letter in (CORE, *names):
+        rule = [kind[int(rng.integers(len(kind)))] for _ in range(count) for kind in kinds]
+        rules[letter] = (CORE, *rule) if letter == CORE else tuple(rule)
+    return rules
+
+
+def _mutate(
+    rng: np.random.Generator, grammar: Grammar, names: Sequence[str], settings: PlasticodingSettings
+) -> Grammar | None:
+    """One letter added, deleted or exchanged in a rule that is used; None where that cannot be."""
+    used = _used(grammar.rules)
+    letter = used[int(rng.integers(len(used)))]
+    rule = [*grammar.rules[letter]]
+    first = int(letter == CORE)  # the core's letter stays at the beginning of its rule
+    drawn = rng.random() * (settings.add + settings.delete + settings.swap)
+    if drawn < settings.add:
+        if len(rule) - first >= settings.max_rule:
+            return None
+        kinds = (names, tuple(MOUNTING), tuple(MOVING))
+        kind = kinds[rng.integers(len(kinds))]
+        new = kind[int(rng.integers(len(kind)))]
+        rule.insert(int(rng.integers(first, len(rule) + 1)), new)
+    elif drawn < settings.add + settings.delete:
+        if len(rule) <= first:
+            return None
+        del rule[int(rng.integers(first, len(rule)))]
+    else:
+        if len(rule) <= first:
+            return None
+        i, k = (int(place) for place in rng.integers(first, len(rule), 2))
+        if rule[i] == rule[k]:
+            return None
+        rule[i], rule[k] = rule[k], rule[i]
+    return grammar._replace(rules={**grammar.rules, letter: tuple(rule)})
+
+
+def _used(rules: Mapping[str, tuple[str, ...]]) -> list[str]:
+    """The letters whose rules a sentence can come to."""
+    found = [CORE]
+    for letter in found:
+        found += [new for new in dict.fromkeys(rules[letter]) if new in rules and new not in found]
+    return found
+
+
+def _cross(rng: np.random.Generator, a: Grammar, b: Grammar) -> Grammar:
+    """The rules of either parent; the seed comes with the core's."""
+    givers = {letter: (a, b)[rng.integers(2)] for letter in a.rules}
+    rules = {letter: giver.rules[letter] for letter, giver in givers.items()}
+    return Grammar(a.name, rules, givers[CORE].seed)
+
+
+# ------------------------------------------------------------------------- saving
+
+
+@checked
+class _Plain:
+    """A grammar as JSON holds it."""
+
+    name: Text
+    rules: dict[Text, Row[Text]]
+    seed: dict[Text, Any] | None = None
+
+
+def _to_plain(grammar: Grammar) -> dict[str, Any]:
+    return {
+        "name": grammar.name,
+        "rules": {letter: list(rule) for letter, rule in grammar.rules.items()},
+        "seed": None if grammar.seed is None else grammar.seed.to_mapping(),
+    }
+
+
+def _read(plain: Any, names: Sequence[str], space: Space) -> Grammar:
+    """A grammar that `_to_plain` made plain."""
+    found = read(_Plain, plain, "genome")
+    seed = None
+    if found.seed is not None:
+        seed = make_morphology(found.seed, space.catalogue, source="genome.seed")
+    spelled = {f"#{module.name}" for module in seed.modules[1:]} if seed else set()
+    known = {*names, *MOUNTING, *MOVING}
+    for letter in (CORE, *names):
+        if letter not in found.rules:
+            raise InputError(f"genome.rules: expected one for {letter}; found none")
+    for letter, rule in found.rules.items():
+        place = f"genome.rules.{letter}"
+        if letter not in (CORE, *names):
+            raise InputError(f"{place}: expected a letter of {', '.join((CORE, *names))}")
+        rest = rule[1:] if letter == CORE else rule
+        if letter == CORE and rule[:1] != (CORE,):
+            raise InputError(f"{place}: expected {CORE} at its beginning; found {show(rule)}")
+        strange = {*rest} - known - (spelled if letter == CORE else set())
+        if strange:
+            raise InputError(f"{place}: expected known letters; found {show(min(strange))}")
+    return Grammar(found.name, {letter: found.rules[letter] for letter in (CORE, *names)}, seed)
