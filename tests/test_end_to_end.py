@@ -23,7 +23,7 @@ def command(name, *arguments, check=True):
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=1800,  # a guard against hanging, on a busy machine too
     )
     if check:
         assert run.returncode == 0, run.stderr
