@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
+import os
+import shutil
+import tempfile
+
+# One cache of compiled programs for the session: its workers, the commands that tests run, and the
+# processes that they start, compile a program once, and the user's own cache stays as it is. XLA's
+# flags are part of a program's name there. Set before JAX is loaded, which reads it then.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="mjx_revolve_tests_")
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+
 import jax
 import pytest
 
 from laboratory import WATER, arm_robot, body, elbow_robot, world
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.water.world import load_world
+
+# A trace makes millions of small objects of which few are garbage: a tenth of its time.
+gc.set_threshold(200_000, 20, 20)
 
 
 @pytest.fixture(scope="session")
@@ -47,12 +63,14 @@ def fresh_traces():
     jax.clear_caches()
 
 
-# Files are dealt out whole, in this order: those that take a minute or more go first, so that no
-# worker is left alone with one at the end.
+# Files are dealt out whole, in this order: those that take half a minute or more go first, so that
+# no worker is left alone with one at the end.
 _LONGEST = (
-    "test_tutorial", "test_rollout", "test_step", "test_many_bodies", "test_fitness",
-    "test_experiments", "test_end_to_end", "test_pool", "test_mjx_contact", "test_evolve",
-    "test_loop", "test_dynamics", "test_wheel", "test_cluster",
+    "test_many_bodies", "test_mjx_contact", "test_tutorial", "test_experiments", "test_pool",
+    "test_end_to_end", "test_dynamics", "test_step", "test_rollout", "test_fitness", "test_evolve",
+    "test_contact", "test_own_code", "test_docs", "test_thrust_step", "test_loop", "test_report",
+    "test_replay", "test_viewer", "test_wheel", "test_swim_picture", "test_tasks",
+    "test_cluster", "test_coevolution", "test_genotypes",
 )  # fmt: skip
 
 

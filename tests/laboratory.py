@@ -113,6 +113,9 @@ XLA_FLAGS = {
 _compile_quickly()
 QUICK = _CHEAP if on_cpu() else None
 USUAL = _USUAL if on_cpu() else None  # as users compile
+# A derivative is all calls of small functions; inlined into one another, they take XLA 7 times as
+# long. Its numbers are then compared with differences of a program that was compiled otherwise.
+SLOPE = _CHEAP | {"xla_disable_hlo_passes": "call-inliner"} if on_cpu() else None
 
 
 @lru_cache(maxsize=64)
@@ -198,8 +201,10 @@ def march(
     return (dt * every * np.arange(1, records + 1), *kept)
 
 
-# Two small bodies without symmetry. The arm has two crooked limbs of different length: five moving
-# bodies, four hinges about two axes. The elbow is one limb of two hinges.
+# Small bodies without symmetry. The arm has two crooked limbs of different length: five moving
+# bodies, four hinges about two axes. The elbow is one limb of two hinges. The oar has one hinge:
+# what has joints compiles no sooner than this.
+OAR = "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: {type: FixedBrick}}}}}"
 _ARM = """
 id: arm
 body:
@@ -258,3 +263,8 @@ def arm_robot(tank: World) -> Robot:
 def elbow_robot(tank: World) -> Robot:
     """The elbow in a world."""
     return build_robot(read(_ELBOW), tank)
+
+
+def oar_robot(tank: World) -> Robot:
+    """The oar in a world."""
+    return build_robot(read(OAR), tank)

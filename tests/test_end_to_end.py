@@ -6,21 +6,24 @@ import csv
 import subprocess
 import sys
 
+import av
 import numpy as np
 import pytest
 import yaml
 
-from laboratory import ROOT
+from laboratory import OAR, ROOT
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.film.opengl import find_opengl
 from toys import CLOCK
 
 
-def evolve(*arguments, check=True):
+def command(name, *arguments, check=True):
     run = subprocess.run(
-        [sys.executable, "-m", "mjx_revolve.evolve", *map(str, arguments)],
+        [sys.executable, "-m", f"mjx_revolve.{name}", *map(str, arguments)],
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=1800,  # a guard against hanging, on a busy machine too
     )
     if check:
         assert run.returncode == 0, run.stderr
@@ -40,34 +43,79 @@ def champion(folder):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def small(tmp_path_factory):
+    """`evolve` of the smoke configuration's task, for the robot that compiles soonest."""
+    path = tmp_path_factory.mktemp("robot") / "oar.yaml"
+    path.write_text(OAR)
+
+    def evolve(folder, generations, *more):
+        settings = (f"morphology={path}", f"evolution.generations={generations}")
+        sets = [word for setting in settings for word in ("--set", setting)]
+        command("evolve", "configs/smoke.yaml", "--out", folder, *sets, *more)
+        return folder
+
+    return evolve
+
+
+@pytest.fixture(scope="module")
+def whole(small, tmp_path_factory):
     """The folder of a run of four generations, from seed 0."""
-    folder = tmp_path_factory.mktemp("runs") / "whole"
-    evolve("configs/smoke.yaml", "--out", folder, "--set", "evolution.generations=4")
+    return small(tmp_path_factory.mktemp("runs") / "whole", 4)
+
+
+def check_files(folder):
+    for name in ("config.yaml", "run.json", "fitness.png", "trajectory.png", "swim.png"):
+        assert (folder / name).stat().st_size > 0
+    for name in ("morphology.yaml", "robot.xml"):
+        assert (folder / "champion" / name).stat().st_size > 0
+
+
+def test_a_run_leaves_all_that_the_readme_promises(whole):
+    assert len(metrics(whole)) == 4
+    assert np.all(np.isfinite(champion(whole)))
+    check_files(whole)
+
+
+@pytest.mark.slow
+def test_a_stopped_run_resumed_equals_one_never_stopped(small, whole, tmp_path):
+    parts = small(tmp_path / "parts", 2)
+    command("evolve", "--resume", parts, "--set", "evolution.generations=4")
+    assert metrics(parts) == metrics(whole)
+    np.testing.assert_array_equal(champion(parts), champion(whole))
+
+
+@pytest.mark.slow
+def test_another_seed_is_another_run(small, whole, tmp_path):
+    other = small(tmp_path / "other", 1, "--seed", 1)
+    assert len(metrics(other)) == 1
+    assert metrics(other) != metrics(whole)[:1]
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory):
+    """The folder of the shipped run, as it is."""
+    folder = tmp_path_factory.mktemp("runs") / "smoke"
+    command("evolve", "configs/smoke.yaml", "--out", folder)
     return folder
 
 
 @pytest.mark.slow
-def test_a_stopped_run_resumed_equals_one_never_stopped(whole, tmp_path):
-    parts = tmp_path / "parts"
-    evolve("configs/smoke.yaml", "--out", parts, "--set", "evolution.generations=2")
-    evolve("--resume", parts, "--set", "evolution.generations=4")
-    assert metrics(parts) == metrics(whole)
-    assert len(metrics(whole)) == 4
-    np.testing.assert_array_equal(champion(parts), champion(whole))
-    for name in ("config.yaml", "run.json", "fitness.png", "trajectory.png", "swim.png"):
-        assert (whole / name).stat().st_size > 0
-    for name in ("morphology.yaml", "robot.xml"):
-        assert (whole / "champion" / name).stat().st_size > 0
+def test_the_shipped_smoke_run(smoke):
+    assert len(metrics(smoke)) == 3
+    check_files(smoke)
 
 
 @pytest.mark.slow
-def test_another_seed_is_another_run(whole, tmp_path):
-    other = tmp_path / "other"
-    generations = "evolution.generations=1"
-    evolve("configs/smoke.yaml", "--out", other, "--seed", 1, "--set", generations)
-    assert len(metrics(other)) == 1
-    assert metrics(other) != metrics(whole)[:1]
+def test_the_film_of_a_run(smoke):
+    try:
+        find_opengl()
+    except InputError as error:
+        pytest.skip(str(error))
+    command("replay", smoke, "--size", "320x240")
+    with av.open(smoke / "swim.mp4") as film:
+        assert sum(1 for _ in film.decode(video=0)) == 30
+    assert (smoke / "swim.gif").stat().st_size < 8e6
+    assert (smoke / "viewer.html").stat().st_size < 5e6
 
 
 @pytest.mark.parametrize(
@@ -98,7 +146,7 @@ def test_another_seed_is_another_run(whole, tmp_path):
     ],
 )
 def test_wrong_input_is_one_line_and_code_2(arguments, message):
-    run = evolve(*arguments, check=False)
+    run = command("evolve", *arguments, check=False)
     assert run.returncode == 2
     assert run.stderr.count("\n") == 1
     assert run.stderr.startswith("error: ") and message in run.stderr

@@ -338,6 +338,7 @@ def read_until(process, words):
     raise AssertionError("".join(lines))
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_says_how_to_go_on(folder):
     process = start(folder, "toy.yaml", "--out", "run", "--set", "evolution.generations=2000")
     read_until(process, "generation 50/")

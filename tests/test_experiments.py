@@ -208,7 +208,9 @@ def test_every_row_of_the_benchmark_can_be_made():
 
 
 @pytest.mark.slow
-def test_a_quick_benchmark_runs_and_keeps_its_numbers(tmp_path, capsys):
+def test_a_quick_benchmark_runs_and_keeps_its_numbers(tmp_path, capsys, monkeypatch):
+    # What its rows measure is not looked at: the older emitters take half of the time to compile.
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
     assert bench.main(["--quick", "--rounds", "2", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "times the best of C" in printed

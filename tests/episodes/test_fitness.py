@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK, ROOT
+from laboratory import QUICK, ROOT, SLOPE
 from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.fitness import WORST
 from mjx_revolve.episodes.tasks import TASKS, Track
@@ -127,7 +127,7 @@ def test_under_jit_and_vmap(fitness, population, scores):
 def test_gradient_points_uphill(settings):
     short = make_fitness(settings, **{"task.duration": 0.6, "task.trials": 1})
     genes = 0.3 * jnp.ones((1, short.num_genes))
-    slope = jax.jit(jax.grad(lambda g: short(g, KEY)[0]), compiler_options=QUICK)(genes)
+    slope = jax.jit(jax.grad(lambda g: short(g, KEY)[0]), compiler_options=SLOPE)(genes)
     assert np.all(np.isfinite(slope)) and np.any(np.asarray(slope) != 0)
     step = 0.02 * slope / jnp.linalg.norm(slope)
     up, down = float(short(genes + step, KEY)[0]), float(short(genes - step, KEY)[0])

@@ -11,7 +11,18 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from laboratory import QUICK, USUAL, WATER, body, elbow_robot, march, read, world
+from laboratory import (
+    QUICK,
+    SLOPE,
+    USUAL,
+    WATER,
+    body,
+    elbow_robot,
+    march,
+    oar_robot,
+    read,
+    world,
+)
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg
@@ -117,7 +128,7 @@ def test_a_controller_in_a_vacuum_and_for_one_step(arm):
         assert trajectory.qpos.shape[0] == steps and np.all(np.isfinite(trajectory.qpos))
 
 
-@pytest.mark.parametrize("make", [make_cpg, make_sine])
+@pytest.mark.parametrize("make", [make_cpg, pytest.param(make_sine, marks=pytest.mark.slow)])
 def test_a_controller_with_its_genes(elbow, make):
     """Played from its genes, without rows of controls (XLA:CPU has aborted over such a rollout)."""
     controller = make(elbow)
@@ -203,9 +214,10 @@ def test_simulate_is_the_population_step_with_one_lane(elbow):
 
 
 @pytest.mark.slow
-def test_mjx_behind_the_same_call(elbow):
-    ours = simulate(elbow, [0.3, -0.2], SPAN)
-    mjx = simulate(elbow, [0.3, -0.2], SPAN, engine="mjx")
+def test_mjx_behind_the_same_call():
+    oar = oar_robot(world(**WATER))
+    ours = simulate(oar, [0.3], SPAN)
+    mjx = simulate(oar, [0.3], SPAN, engine="mjx")
     assert np.asarray(mjx.qpos) == pytest.approx(np.asarray(ours.qpos), abs=1e-4)
     assert np.asarray(mjx.xpos) == pytest.approx(np.asarray(ours.xpos), abs=1e-4)
     assert np.array_equal(mjx.ctrl, ours.ctrl)
@@ -258,8 +270,8 @@ def test_wrong_genes(elbow):
 # ------------------------------------------------------------------------- transformations
 
 
-def check_gradient(robot, inputs, steps):
-    """In float64 against central differences of a program that is compiled as users' are."""
+def check_gradient(robot, inputs, steps, compiled=QUICK):
+    """In float64 against central differences of the undifferentiated program."""
 
     def end(inputs):
         trajectory = simulate(
@@ -273,8 +285,8 @@ def check_gradient(robot, inputs, steps):
 
     with jax.enable_x64(True):
         inputs = jax.tree.map(jnp.asarray, inputs)
-        slope = jax.jit(jax.grad(end), compiler_options=QUICK)
-        value = jax.jit(end, compiler_options=USUAL)
+        slope = jax.jit(jax.grad(end), compiler_options=SLOPE)
+        value = jax.jit(end, compiler_options=compiled)
         flat, build = ravel_pytree(inputs)
         found = np.asarray(ravel_pytree(slope(inputs))[0])
         for k in range(len(flat)):
@@ -286,7 +298,7 @@ def check_gradient(robot, inputs, steps):
 
 @pytest.mark.slow
 def test_gradient_through_a_rollout():
-    """In start, speed and current, while a core drops through the surface."""
+    """In start, speed and current, while a core drops through the surface, as users compile it."""
     robot = build_robot(body("core"), world(**WATER))
     inputs = {
         "ctrl": np.zeros(0),
@@ -294,19 +306,13 @@ def test_gradient_through_a_rollout():
         "qvel": np.array([0.1, -0.05, -0.5, 0.1, 0.2, 0.1]),
         "current": 0.1,
     }
-    check_gradient(robot, inputs, 40)
+    check_gradient(robot, inputs, 40, USUAL)
 
 
 @pytest.mark.slow
 def test_gradient_through_a_rollout_of_a_jointed_body():
     """In a joint's target and speed too; half out of the water."""
-    robot = build_robot(
-        read(
-            "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: "
-            "{type: FixedBrick}}}}}"
-        ),
-        world(**WATER),
-    )
+    robot = oar_robot(world(**WATER))
     inputs = {
         "ctrl": np.array([0.03]),
         "height": -0.005,

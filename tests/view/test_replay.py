@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from laboratory import ROOT, body
+from laboratory import body
 from mjx_revolve import replay
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
@@ -653,16 +653,3 @@ def test_a_lost_robot_is_named(episode, command, way, tmp_path, capsys, monkeypa
     assert "not finite from 0.505 s on" in capsys.readouterr().err
     with Image.open(out) as gif:
         assert gif.n_frames == 2
-
-
-@pytest.mark.slow
-def test_a_run_from_end_to_end(way, tmp_path):
-    from mjx_revolve import evolve
-
-    run = tmp_path / "run"
-    config = ROOT / "configs" / "smoke.yaml"
-    assert run_command(evolve.main, [str(config), "--out", str(run)]) == 0
-    assert run_command(replay.main, [str(run), "--size", "320x240"]) == 0
-    _, _, _, pictures = read_mp4(run / "swim.mp4")
-    assert len(pictures) == 30
-    assert (run / "swim.gif").stat().st_size < 8e6 and (run / "viewer.html").stat().st_size < 5e6

@@ -49,9 +49,11 @@ def words(figure):
     return [text.get_text() for text in texts if text.get_visible()]
 
 
-@pytest.fixture(scope="module")
-def figure(elbow):
-    return plot_swim(elbow, swim(elbow))
+def words_of(robot, trajectory, **more):
+    """Every text of the page, whose robot is not painted: that takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mjx_revolve.view.swim_picture.draw_pose", lambda *_: None)
+        return words(plot_swim(robot, trajectory, **more))
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +86,8 @@ def test_parts_stand_where_mujoco_has_them(elbow):
 # ------------------------------------------------------------------ the page
 
 
-def test_the_page_says_how_fast_and_how_far(elbow, figure):
-    said = " | ".join(words(figure))
+def test_the_page_says_how_fast_and_how_far(elbow):
+    said = " | ".join(words_of(elbow, swim(elbow)))
     net = SPEED * (TIME[-1] - TIME[0])
     assert f"elbow: {SPEED / elbow.morphology.length:.2g} body lengths/s (0.05 m/s)" in said
     assert f"{net:.2g} m ({net / elbow.morphology.length:.2g} body lengths) in 5.98 s" in said
@@ -94,27 +96,25 @@ def test_the_page_says_how_fast_and_how_far(elbow, figure):
     assert "water surface" not in said
 
 
-@pytest.mark.slow
 def test_getting_under_way_does_not_count(small):
     """Twice as fast after two seconds: the page says how fast from then on, as the scores do."""
     late = swim(small)
     late.qpos[:, 0] += SPEED * np.maximum(TIME - 2.0, 0)
-    said = " | ".join(words(plot_swim(small, late, counted_from=2.0)))
+    said = " | ".join(words_of(small, late, counted_from=2.0))
     assert f"core: {2 * SPEED / small.morphology.length:.2g} body lengths/s (0.1 m/s)" in said
     assert "0.4 m" in said and "in 4 s, after the first 2 s" in said
 
 
-@pytest.mark.slow
 def test_the_surface_is_named_where_it_is_in_sight(small):
-    said = words(plot_swim(small, swim(small, depth=0.02)))
+    said = words_of(small, swim(small, depth=0.02))
     assert "water surface" in said
     assert not any("depth" in word for word in said)
 
 
 @pytest.mark.slow
 def test_the_picture_is_whole_and_always_the_same(small):
-    assert draw(small, swim(small)).shape == (900, 1600, 3)
     first, second = (figure_png(plot_swim(small, swim(small))) for _ in range(2))
+    assert matplotlib.image.imread(io.BytesIO(first)).shape[:2] == (900, 1600)
     assert first == second
 
 
@@ -136,10 +136,9 @@ def test_the_robot_is_inside_the_frame_whichever_way_it_swims(small, heading):
     assert columns.max() - columns.min() > 300
 
 
-@pytest.mark.slow
 def test_a_robot_that_stays_is_drawn_once(small):
     still = swim(small, speed=0.0)
-    said = words(plot_swim(small, still))
+    said = words_of(small, still)
     # The last pose alone, and how deep; the strip says when with a sign or two decimals.
     assert [w for w in said if w[0].isdigit() and "depth" in w] == ["6 s\ndepth 1.00 m"]
     assert "core: 0 body lengths/s (0 m/s)" in said
@@ -150,11 +149,11 @@ def test_rows_after_the_first_that_is_not_finite_are_left_out(small):
     broken = swim(small)
     broken.qpos[150:] = np.nan
     short = trajectory(small, TIME[:150], broken.qpos[:150])
-    assert words(plot_swim(small, broken)) == words(plot_swim(small, short))
+    assert words_of(small, broken) == words_of(small, short)
 
 
 def test_a_single_row_is_a_portrait(elbow):
-    said = words(plot_swim(elbow, trajectory(elbow, TIME[:1], swim(elbow).qpos[:1])))
+    said = words_of(elbow, trajectory(elbow, TIME[:1], swim(elbow).qpos[:1]))
     assert "elbow" in said  # a name without a speed
 
 
