@@ -316,27 +316,27 @@ class ModuleType:
                 f"{moving:g} kg in {len(self.parts) - 1} moving parts",
             )
 
-    @property
+    @cached_property
     def mass(self) -> float:
         """Mass of all parts, ballast included [kg]."""
         return sum(part.total_mass for part in self.parts)
 
-    @property
+    @cached_property
     def is_fin(self) -> bool:
         """Whether a part of it is a plate with Gazebo's LiftDrag."""
         return any(part.lift_drag is not None for part in self.parts)
 
-    @property
+    @cached_property
     def is_thruster(self) -> bool:
         """Whether a part of it is a thruster."""
         return any(part.thruster is not None for part in self.parts)
 
-    @property
+    @cached_property
     def volume(self) -> float:
         """Displaced volume of all parts, electronics and ballast included [m³]."""
         return sum(part.total_volume for part in self.parts)
 
-    @property
+    @cached_property
     def box_volume(self) -> float:
         """Sum of all boxes' volumes [m³]."""
         return sum(part.box_volume for part in self.parts)
