@@ -15,7 +15,8 @@ from mjx_revolve.body.placement import Layout, pairs_within, turned
 # further apart.
 _DISTANCES = np.array([-2e-3, -1e-3, 0.0, 1e-3, 2e-3])
 # Points along each edge of a face; an exposed share is known to about one in this many.
-_POINTS = 24  # a multiple of 8, at most 32: a row of them is a number
+_POINTS = 24  # at most 31: a row of them is a number
+_BITS = 1 << np.arange(_POINTS + 1, dtype=np.uint32)
 # For each axis of a part, the two others.
 _BESIDE = ((1, 2), (0, 2), (0, 1))
 # A hair of slack [m], so that flush neighbours count whatever the rounding.
@@ -26,11 +27,10 @@ def exposed_shares(parts: Layout) -> np.ndarray:
     """The share of each part's faces that no other part covers, at rest.
 
     A choice: the pose at rest stands for all poses; a bent hinge opens a little more. Opposite
-    faces are averaged, as drag and added mass are the same in both directions. `Morphology.exposed`
-    keeps them.
+    faces are averaged, as drag and added mass are the same in both directions.
 
     Args:
-        parts: of the robot, `Morphology.layout`.
+        parts: of one body, `Morphology.layout`, or of several.
 
     Returns:
         `[npart, 3]` exposed share of the silhouette along each part's x, y and z axes [-], parts of
@@ -39,34 +39,33 @@ def exposed_shares(parts: Layout) -> np.ndarray:
     part, box, center, turn = _near(parts)
     # Boxes that stand square to a face cover a rectangle of it: each axis tells on its own.
     square = (np.abs(turn - np.round(turn)) < 1e-9).all(axis=(1, 2))
-    reach = turned(np.abs(turn), parts.box_half[box] + _SLACK)[:, None]
-    ticks = ((np.arange(_POINTS) + 0.5) / _POINTS)[:, None]
-    grid = parts.low[:, None] + ticks * (parts.high - parts.low)[:, None]  # [npart, points, 3]
+    reach = turned(np.abs(turn), parts.box_half[box]) + _SLACK
     own = parts.box_part
-    solid = np.abs(grid[own] - parts.box_position[:, None]) <= parts.box_half[:, None]
-    silhouette = np.bitwise_or.reduceat(_crossed(solid), parts.main)  # [npart, 3, points]
-    # Faces are numbered by part, side and axis.
-    sides = np.stack([parts.low, parts.high], 1)  # [npart, 2, 3]
-    heights = sides[:, :, None] + (np.array([[-1], [1]]) * _DISTANCES)[..., None]
-    before = (np.abs(heights[part] - center[:, None, None]) <= reach[:, None]).any(2)
-    covered = np.zeros((len(sides), 2, 3, _POINTS), np.uint32)
-    within = _crossed(np.abs(grid[part] - center[:, None]) <= reach)
+    solid = _spans(parts, own, parts.box_position, parts.box_half)
+    silhouette = np.stack([_rectangles(solid[:, a], solid[:, b]) for a, b in _BESIDE], 1)
+    silhouette = np.bitwise_or.reduceat(silhouette, parts.main)  # [npart, 3, points]
+    heights = np.stack([parts.low, parts.high], 1)[:, :, None]  # [npart, 2, distances, 3]
+    heights = heights + (np.array([[-1], [1]]) * _DISTANCES)[..., None]
+    before = (np.abs(heights[part] - center[:, None, None]) <= reach[:, None, None]).any(2)
     side, axis, pair = np.nonzero((before & square[:, None, None]).transpose(1, 2, 0))
-    if len(pair):  # pairs of a part, a side and an axis stand together, as pairs of a part do
-        number = (part[pair] * 2 + side) * 3 + axis
-        start = np.flatnonzero(np.append(True, np.diff(number)))
-        found = np.bitwise_or.reduceat(within[pair, axis], start)
-        covered.reshape(-1, _POINTS)[number[start]] = found
-    for k, side, axis in np.ndindex(len(part), 2, 3) if not square.all() else ():
-        if square[k]:
-            continue
-        beside = _BESIDE[axis]
-        face = np.empty((len(_DISTANCES), _POINTS, _POINTS, 3))
-        face[..., axis] = heights[part[k], side, :, axis, None, None]
-        face[..., beside[0]] = grid[part[k], :, None, beside[0]]
-        face[..., beside[1]] = grid[part[k], None, :, beside[1]]
-        inside = np.abs((face - center[k]) @ turn[k]) <= parts.box_half[box[k]] + _SLACK
-        covered[part[k], side, axis] |= _packed(inside.all(axis=-1).any(axis=0))
+    covered = np.zeros((len(parts.low), 2, 3, _POINTS), np.uint32)
+    if len(pair):  # those of a part, a side and an axis stand together, as those of a part do
+        within = _spans(parts, part, center, reach)
+        beside = np.array(_BESIDE)[axis]
+        hits = _rectangles(within[pair, beside[:, 0]], within[pair, beside[:, 1]])
+        face = (part[pair] * 2 + side) * 3 + axis
+        start = np.flatnonzero(np.append(True, np.diff(face)))
+        covered.reshape(-1, _POINTS)[face[start]] = np.bitwise_or.reduceat(hits, start)
+    for k in np.flatnonzero(~square):
+        low, high = parts.low[part[k]], parts.high[part[k]]
+        grid = low + ((np.arange(_POINTS) + 0.5) / _POINTS)[:, None] * (high - low)
+        for side, axis in np.ndindex(2, 3):
+            one, two = _BESIDE[axis]
+            points = np.empty((len(_DISTANCES), _POINTS, _POINTS, 3))
+            points[..., axis] = heights[part[k], side, :, axis, None, None]
+            points[..., one], points[..., two] = grid[:, None, one], grid[:, two]
+            inside = np.abs((points - center[k]) @ turn[k]) <= parts.box_half[box[k]] + _SLACK
+            covered[part[k], side, axis] |= inside.all(axis=-1).any(axis=0) @ _BITS[:-1]
     hidden = np.bitwise_count(covered & silhouette[:, None]).sum(axis=-1)
     whole = np.maximum(np.bitwise_count(silhouette).sum(axis=-1), 1)
     return 1 - hidden.sum(axis=1) / (2 * whole)
@@ -95,21 +94,25 @@ def _near(parts: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     return part, box, center, back @ parts.rotation[parts.box_part[box]]
 
 
-def _crossed(inside: np.ndarray) -> np.ndarray:
-    """`[n, 3, points]` points of the faces across each axis that are inside along both others.
+def _spans(parts: Layout, part: np.ndarray, center: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Which points along each edge of parts some boxes reach.
 
     Args:
-        inside: `[n, points, 3]` along each axis; bits of the result are the points along the second
-            of the two.
+        parts: all of them.
+        part: `[n]` which.
+        center: `[n, 3]` of a box, part frame [m].
+        reach: `[n, 3]` of it from there along the part's axes [m].
+
+    Returns:
+        `[n, 3]` points as bits.
     """
-    bits = _packed(inside.swapaxes(1, 2))
-    rows = [inside[:, :, a] * bits[:, b, None] for a, b in _BESIDE]
-    return np.stack(rows, 1)
+    low = parts.low[part]
+    step = (parts.high[part] - low) / _POINTS
+    first = np.ceil((center - reach - low) / step - 0.5).clip(0, _POINTS).astype(np.uint32)
+    stop = np.floor((center + reach - low) / step + 0.5).clip(0, _POINTS).astype(np.uint32)
+    return np.where(first < stop, _BITS[stop] - _BITS[first], 0)
 
 
-def _packed(inside: np.ndarray) -> np.ndarray:
-    """`[..., points]` truth values as bits."""
-    found = np.zeros((*inside.shape[:-1], 4), np.uint8)
-    found[..., : _POINTS // 8] = np.packbits(inside, axis=-1, bitorder="little")
-    bits: np.ndarray = found.view("<u4")[..., 0]
-    return bits
+def _rectangles(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """`[n, points]` the points of `[n]` rows and `[n]` columns, bits are the columns."""
+    return (rows[:, None] >> np.arange(_POINTS, dtype=np.uint32) & 1) * columns[:, None]

@@ -252,7 +252,9 @@ def _read_children(item: dict[str, Any], place: str, module: Module) -> dict[int
         return {}
     place = f"{place}.children"
     found: dict[int, Any] = {}
-    for key, child in read(_Children, children, place).items():
+    if not isinstance(children, dict):
+        children = read(_Children, children, place)
+    for key, child in children.items():
         number = read_slot(key, module.kind, place)
         if number in found:
             raise InputError(f"{place}: expected each slot once; found slot {number} twice")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.body.boxes import boxes_overlap, quarter_turn
-from mjx_revolve.body.module_types import ModuleType, Part, Slot, Vector
+from mjx_revolve.body.module_types import ModuleType, Mount, Part, Slot
 from mjx_revolve.inputs.errors import InputError
 
 # Boxes are shrunk by this much at each face [m] before they are tested for overlap, thin ones by
@@ -92,12 +92,14 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=4096)
-def _turn(up: Vector, direction: Vector, outward: Vector, quarter: int) -> np.ndarray:
-    """`[3, 3]` parent's frame from child's frame, for a slot, a mount and quarter turns."""
-    toward, above, away, z = map(np.array, (direction, up, outward, (0.0, 0.0, 1.0)))
+def _joint(slot: Slot, mount: Mount, quarter: int) -> tuple[np.ndarray, np.ndarray]:
+    """`[3]` position and `[3, 3]` rotation of a child in its parent's frame, by quarter turns."""
+    toward, above = np.array(slot.direction), np.array(slot.up)
+    away, z = np.array(mount.outward), np.array([0.0, 0.0, 1.0])
     target = np.column_stack([toward, np.cross(above, toward), above])
     source = np.column_stack([away, np.cross(z, away), z])
-    return frozen(quarter_turn(toward, quarter) @ target @ source.T)
+    turn = quarter_turn(toward, quarter) @ target @ source.T
+    return np.array(slot.position) - turn @ mount.position, turn
 
 
 def attach(
@@ -119,10 +121,9 @@ def attach(
     """
     mount = kind.mount
     assert mount is not None  # a core is never a child
-    quarter = round(orientation / 90) % 4
-    rotation = parent.rotation @ _turn(slot.up, slot.direction, mount.outward, quarter)
-    position = parent.position + parent.rotation @ slot.position - rotation @ mount.position
-    return frozen(position), frozen(rotation)
+    offset, turn = _joint(slot, mount, round(orientation / 90) % 4)
+    position = parent.position + parent.rotation @ offset
+    return frozen(position), frozen(parent.rotation @ turn)
 
 
 # ------------------------------------------------------------------------- all parts together
@@ -206,6 +207,39 @@ def pairs_within(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.
     return one, start[one] + rank
 
 
+class _Parts(NamedTuple):
+    """The first fields of a `Layout`."""
+
+    parts: tuple[Part, ...]
+    kind: np.ndarray
+    body: np.ndarray
+    module: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+
+
+def _place_parts(bodies: Sequence[Sequence[Module]]) -> _Parts:
+    """Where the parts of some bodies lie at rest."""
+    modules = [m for body in bodies for m in body]
+    listed = [part for m in modules for part in m.kind.parts]
+    # Most modules share their type, and so its parts: what follows from a part is read once.
+    given = {id(part): part for part in listed}
+    number = {key: k for k, key in enumerate(given)}
+    kind = np.array([number[id(part)] for part in listed])
+    module = counted(np.array([len(m.kind.parts) for m in modules]))[0]
+    rotation = np.array([m.rotation for m in modules])[module]
+    origin = np.array([m.position for m in modules])[module]
+    local = np.array([part.position for part in given.values()])[kind]
+    return _Parts(
+        parts=tuple(given.values()),
+        kind=kind,
+        body=counted(np.array([len(body) for body in bodies]))[0][module],
+        module=module,
+        position=origin + turned(rotation, local),
+        rotation=rotation,
+    )
+
+
 def lay_out(*bodies: Sequence[Module]) -> Layout:
     """Where all parts and boxes lie at rest.
 
@@ -215,28 +249,15 @@ def lay_out(*bodies: Sequence[Module]) -> Layout:
     Returns:
         The layout.
     """
-    modules = [m for body in bodies for m in body]
-    listed = [part for m in modules for part in m.kind.parts]
-    # Most modules share their type, and so its parts: what follows from a part is read once.
-    number: dict[int, int] = {}
-    kind = np.array([number.setdefault(id(part), len(number)) for part in listed])
-    given = {id(part): part for part in listed}
-    parts = tuple(given[key] for key in number)
+    placed = _place_parts(bodies)
+    parts, kind = placed.parts, placed.kind
     boxes = [box for part in parts for box in part.boxes]
     size = np.array([len(part.boxes) for part in parts])
     bounds = np.array([part.bounds for part in parts])
-    module = counted(np.array([len(m.kind.parts) for m in modules]))[0]
-    rotation = np.array([m.rotation for m in modules])[module]
-    origin = np.array([m.position for m in modules])[module]
     box_part, rank = counted(size[kind])
     box = (np.cumsum(size) - size)[kind[box_part]] + rank
     return Layout(
-        parts=parts,
-        kind=kind,
-        body=np.repeat(np.arange(len(bodies)), [len(body) for body in bodies])[module],
-        module=module,
-        position=origin + turned(rotation, np.array([part.position for part in parts])[kind]),
-        rotation=rotation,
+        *placed,
         low=bounds[kind, 0],
         high=bounds[kind, 1],
         main=np.cumsum(size[kind]) - size[kind],
@@ -261,21 +282,17 @@ def find_overlaps(
     Returns:
         pairs of indices, in order.
     """
-    all_parts = lay_out(modules)
+    all_parts = _place_parts([modules])
     center, turn = all_parts.position, all_parts.rotation
-    half = all_parts.box_half[all_parts.main]
+    half = np.array([part.boxes[0].size for part in all_parts.parts])[all_parts.kind] / 2
     half = half - np.minimum(OVERLAP_TOLERANCE, half / 2)
     reach = turned(np.abs(turn), half)
-    rows = np.arange(len(center))
-    if moved is not None:
-        rows = rows[np.isin(all_parts.module, list(moved))]
+    compared = np.full(len(modules), moved is None)
+    compared[list(moved or ())] = True
+    rows = np.flatnonzero(compared[all_parts.module])
     # Few boxes are so near that the core's axes do not tell them apart.
-    near = np.ones((len(rows), len(center)), bool)
-    for axis in range(3):
-        low, high = (center + sign * reach for sign in (-1, 1))
-        near &= low[rows, None, axis] < high[None, :, axis]
-        near &= low[None, :, axis] < high[rows, None, axis]
-    first, second = np.nonzero(near)
+    gap = np.abs(center[rows, None] - center) - reach[rows, None] - reach
+    first, second = np.nonzero((gap < 0).all(-1))
     first = rows[first]
     a, b = all_parts.module[first], all_parts.module[second]
     parent = np.array([m.parent for m in modules])

@@ -7,6 +7,7 @@ The core's frame is the robot's: at the origin, unturned. All positions are in t
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,8 +17,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.descriptors import describe
-from mjx_revolve.body.exposure import exposed_shares
 from mjx_revolve.body.module_types import Part, Vector
 from mjx_revolve.body.placement import Layout, Module, frozen, lay_out, same
 from mjx_revolve.inputs.errors import InputError, SafeLoader
@@ -61,6 +62,19 @@ class Morphology:
             f"Morphology({self.name!r}: {self.num_modules} modules, {self.num_hinges} hinges, "
             f"{self.mass:.4g} kg)"
         )
+
+    def __reduce__(self) -> Any:
+        """Small and quick to send to other processes; the catalogue's types go by name."""
+        kinds = {id(module.kind): module.kind for module in self.modules}
+        number = {key: k for k, key in enumerate(kinds)}
+        rows = [
+            (m.name, m.type, m.parent, m.slot, m.orientation, m.rgb, number[id(m.kind)], m.params)
+            for m in self.modules
+        ]
+        named = [k.name if MODULES.get(k.name) is k else k for k in kinds.values()]
+        place = np.concatenate([x for m in self.modules for x in (m.position, *m.rotation)])
+        head = (self.name, self.brain, self.path, self.overlaps)
+        return _unpack, (*head, rows, named, place.tobytes())
 
     @property
     def num_modules(self) -> int:
@@ -142,43 +156,24 @@ class Morphology:
         Returns:
             pairs (i, j), i < j, of positions in `hinges`, in order.
         """
-        number = {index: k for k, index in enumerate(self.hinges)}
+        count = 0
         carries: list[int] = []  # the hinge that moves a module's children, -1 for the core's body
         joined: dict[int, list[int]] = {}
-        for index, module in enumerate(self.modules):
+        for module in self.modules:
             body = carries[module.parent] if module.parent >= 0 else -1
-            if index in number:
-                joined.setdefault(body, []).append(number[index])
-                body = number[index]
-                joined.setdefault(body, []).append(body)
+            if module.kind.hinge is not None:
+                joined.setdefault(body, []).append(count)
+                body, count = count, count + 1
+                joined[body] = [body]
             carries.append(body)
-        pairs = {(min(i, j), max(i, j)) for group in joined.values() for i in group for j in group}
-        return tuple(sorted((i, j) for i, j in pairs if i < j))
+        # A body's own hinge has the lowest number of those that it joins.
+        pairs = (pair for group in joined.values() for pair in itertools.combinations(group, 2))
+        return tuple(sorted(pairs))
 
     @cached_property
     def layout(self) -> Layout:
         """All parts and boxes at rest as arrays."""
         return lay_out(self.modules)
-
-    @cached_property
-    def corners(self) -> np.ndarray:
-        """`[8 npart, 3]` corners of the boxes around each part at rest, core frame [m]."""
-        return frozen(self.layout.core_corners().reshape(-1, 3))
-
-    @property
-    def lowest(self) -> float:
-        """How far the corners reach below the core's centre at rest [m]."""
-        return float(-self.corners[:, 2].min())
-
-    @property
-    def radius(self) -> float:
-        """How far the corners reach from the core's vertical at rest [m]."""
-        return float(np.linalg.norm(self.corners[:, :2], axis=1).max())
-
-    @cached_property
-    def exposed(self) -> np.ndarray:
-        """`[npart, 3]` share of each part's faces that the water reaches; `exposed_shares`."""
-        return frozen(exposed_shares(self.layout))
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -230,6 +225,25 @@ class Morphology:
     def save(self, path: str | Path) -> None:
         """Writes the morphology; see `save_morphology`."""
         save_morphology(self, path)
+
+
+def _unpack(
+    name: str,
+    brain: Any,
+    path: str | None,
+    overlaps: tuple[tuple[str, str], ...],
+    rows: list[Any],
+    named: list[Any],
+    place: bytes,
+) -> Morphology:
+    """What `Morphology.__reduce__` has packed."""
+    kinds = [MODULES[kind] if isinstance(kind, str) else kind for kind in named]
+    places = np.frombuffer(place).reshape(-1, 4, 3)
+    modules = [
+        Module(own, type, parent, slot, turn, rgb, at[0], at[1:], kinds[kind], params)
+        for (own, type, parent, slot, turn, rgb, kind, params), at in zip(rows, places, strict=True)
+    ]
+    return Morphology(name, tuple(modules), brain, path, overlaps)
 
 
 class _Dumper(yaml.SafeDumper):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -187,7 +188,8 @@ def order_rows(assembly: Assembly, columns: Columns, groups: Sequence[Group]) ->
     pieces = np.ones(nbody, int)
     np.maximum.at(pieces, columns.part_body, piece + 1)
     own = pieces.tolist()
-    size, children = list(own), [[] for _ in own]  # type: list[int], list[list[int]]
+    size = list(own)
+    children: list[list[int]] = [[] for _ in own]
     for b in reversed(range(1, nbody)):
         if parent[b]:
             size[parent[b]] += size[b]
@@ -265,8 +267,6 @@ def fit_capacity(
     Raises:
         InputError: there are no robots.
     """
-    if not robots:
-        raise InputError("robots: expected at least one; found none")
     assembly = assemble_all(robots)
     columns, world = read_columns(assembly), robots[0].world
     carries = columns.parts.carried is not None
@@ -510,7 +510,7 @@ def _pick_rows(
             k = np.flatnonzero(at_root)
             root_points[rank[k], owner[k]] = k
     alike = _alike(columns, capacity.nothing)
-    finish = lambda x: np.expand_dims(x, -2)  # noqa: E731
+    finish = lambda x: x[..., None, :]  # noqa: E731
     root = pick_level(alike, assembly.roots, root_parts, root_points, True, 1, finish)
     level = pick_level(alike, body, parts, points, False, 1, finish)
     return root, level
@@ -585,7 +585,9 @@ def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.flo
 
 def assemble_all(robots: Sequence[Robot]) -> Assembly:
     """Robots of one world, one behind the other."""
-    [first, *rest] = robots
+    if not robots:
+        raise InputError("robots: expected at least one; found none")
+    first, *rest = robots
     if not rest:
         return first.assembly
     for robot in rest:
@@ -685,23 +687,26 @@ def _leave_out(level: Level, constant: Level, names: list[str], real: Any) -> Le
         names: of the robots.
         real: `[rows, 1, R]` which rows have a hinge; in others it may be anything.
     """
+    blank = lambda x: x is None  # noqa: E731
 
-    def compare(path: Any, same: Any, x: Any) -> Any:
+    def compare(where: Any, same: Any, x: Any) -> Any:
         if same is None or x is None:
             return x
-        wrong = np.float32(x) != np.float32(same)
-        place = jax.tree_util.keystr(path).lstrip(".")
-        if place.startswith("hinges"):
-            wrong &= real
+        wrong = (np.float32(x) != np.float32(same)) & where
         if np.any(wrong):
+            leaves = jax.tree_util.tree_flatten_with_path(level)[0]
+            place = next(jax.tree_util.keystr(path) for path, leaf in leaves if leaf is x)
             which = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
             raise InputError(
-                f"robot {names[which[-1]]!r}: {place}: expected {same:g}, as in all bodies of the "
-                f"types of modules that there is room for; found {float(x[which]):g}"
+                f"robot {names[which[-1]]!r}: {place.lstrip('.')}: expected {same:g}, as in all "
+                "bodies of the types of modules that there is room for; found "
+                f"{float(x[which]):g}"
             )
         return None
 
-    return jax.tree_util.tree_map_with_path(compare, constant, level, is_leaf=lambda x: x is None)
+    hinges = jax.tree.map(partial(compare, real), constant.hinges, level.hinges, is_leaf=blank)
+    bare = replace(constant, hinges=None), replace(level, hinges=None)
+    return replace(jax.tree.map(partial(compare, True), *bare, is_leaf=blank), hinges=hinges)
 
 
 def _hang(assembly: Assembly, order: Order, capacity: Capacity) -> dict[str, np.ndarray]:
@@ -740,7 +745,7 @@ def _wire(assembly: Assembly, row: np.ndarray, capacity: Capacity) -> Plant:
     low, high = np.zeros((2, n, robots))
     place = np.zeros((n, 3, robots))
     source = np.full((n, robots), capacity.hinges + capacity.thrusters)
-    low[k, robot], high[k, robot], place[k, :, robot] = read_actuators(assembly)
+    low[k, robot], high[k, robot], place[k, :, robot] = read_actuators(assembly.morphologies)
     source[k, robot] = np.concatenate([hinge, capacity.hinges + rank])
     first, second = np.full((2, capacity.pairs, robots), n)
     for r, body in enumerate(assembly.morphologies):

@@ -14,7 +14,7 @@ import jax
 import mujoco
 import numpy as np
 
-from mjx_revolve.body.placement import counted, pairs_within, turned
+from mjx_revolve.body.placement import counted, turned
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.fluid_table import drag_law
 from mjx_revolve.engine.level import (
@@ -223,32 +223,35 @@ def _base_inertias(assembly: Assembly) -> np.ndarray:
     Bodies and the water that they carry, at rest; `[nbody]` [kg·m²].
     """
     table, layout, density = assembly.fluid, assembly.layout, assembly.world.density
-    count = len(assembly.parent)
-    axis = turned(assembly.rotation, assembly.axis)
+    turn, place = assembly.rotation, assembly.position
 
-    def about(
-        owner: np.ndarray, center: np.ndarray, axes: np.ndarray, mass: Any, inertia: Any
-    ) -> np.ndarray:
-        """Of things on bodies: `[n, 3]` masses and `[n, 3, 3]` inertias along their axes."""
-        hinge, thing = pairs_within(assembly.robot, assembly.robot[owner])
-        moves = (owner[thing] >= hinge) & (owner[thing] < assembly.end[hinge])
-        hinge, thing = hinge[~moves], thing[~moves]
-        arm = np.cross(axis[hinge], center[thing] - assembly.position[hinge])
-        back = axes[thing].swapaxes(1, 2)
-        swing, turn = turned(back, arm), turned(back, axis[hinge])
-        found = np.sum(mass[thing] * swing**2 + turn * turned(inertia[thing], turn), 1)
-        return np.bincount(hinge, found, count)
+    def seen(center: np.ndarray, linear: np.ndarray, angular: np.ndarray) -> np.ndarray:
+        """`[n, 3, 3, 3]` spatial inertias about the core's origin: angular, cross, linear."""
+        x = _skews(center)
+        cross = x @ linear
+        return np.stack([angular - cross @ x, cross, linear], 1)
 
-    bodies = np.arange(1, count)
-    center = assembly.position + turned(assembly.rotation, assembly.center)
-    mass = np.repeat(assembly.mass[1:, None], 3, 1)
-    total = about(bodies, center[1:], assembly.rotation[1:], mass, assembly.inertia[1:])
-    if not (np.any(table.carried_mass) or np.any(table.carried_inertia)):
-        return total
-    inertia = density * table.carried_inertia[:, None] * np.eye(3)
-    carried = density * table.carried_mass
-    # Parts are sorted by robots, as bodies are.
-    return total + about(table.body, layout.position, layout.rotation, carried, inertia)
+    unit = np.eye(3)
+    inertia = turn @ assembly.inertia @ turn.swapaxes(1, 2)
+    center = place + turned(turn, assembly.center)
+    found = seen(center, assembly.mass[:, None, None] * unit, inertia)
+    if np.any(table.carried_mass) or np.any(table.carried_inertia):
+        axes = layout.rotation
+        along = [
+            (axes * (density * x)[:, None]) @ axes.swapaxes(1, 2)
+            for x in (table.carried_mass, table.carried_inertia)
+        ]
+        np.add.at(found, table.body, seen(layout.position, *along))
+    # A subtree is a run of bodies.
+    runs = np.stack([np.arange(len(found)), assembly.end], 1).ravel()
+    below = np.add.reduceat(np.append(found, found[:1], 0), runs)[::2]
+    angular, cross, linear = (below[assembly.roots[assembly.robot]] - below).swapaxes(0, 1)
+    spin = turned(turn, assembly.axis)
+    # How the core's origin would move.
+    pace = np.cross(place, spin)
+    return np.sum(
+        spin * (turned(angular, spin) + 2 * turned(cross, pace)) + pace * turned(linear, pace), 1
+    )
 
 
 def _read_bodies(assembly: Assembly, frame: np.ndarray) -> tuple[Any, ...]:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import turned
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.robot import Robot
@@ -173,7 +174,7 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
     Returns:
         Its table, `[n, 1]`.
     """
-    body, (low, high, place) = robot.morphology, read_actuators(robot.assembly)
+    body, (low, high, place) = robot.morphology, read_actuators([robot.morphology])
     source = np.array(range(len(low)) if order is None else order, np.int32)
     row = np.argsort(source)
     names = tuple(
@@ -197,19 +198,27 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
     )
 
 
-def read_actuators(assembly: Assembly) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Hinges of all robots, then thrusters of all: their least and greatest commands and places.
+def read_actuators(
+    bodies: Sequence[Morphology],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Hinges of all bodies, then thrusters of all: their least and greatest commands and places.
 
     Args:
-        assembly: of the robots.
+        bodies: of the robots.
 
     Returns:
         `[n]` and `[n]` ends of the range [rad] or [-], and `[n, 3]` places at rest, core frame [m].
     """
-    layout, rows, moved = assembly.layout, assembly.thruster_row, assembly.moved
-    jets = [part.thruster for part in assembly.thruster_part if part.thruster is not None]
-    at = np.array([jet.position for jet in jets], float).reshape(-1, 3)
-    thrusters = layout.position[rows] + turned(layout.rotation[rows], at)
-    ranges = np.array([jet.range for jet in jets], float).reshape(-1, 2)
-    low, high = np.concatenate([assembly.range[moved], ranges]).T
-    return low, high, np.concatenate([assembly.position[moved], thrusters])
+    modules = [module for body in bodies for module in body.modules]
+    hinges = [(m, m.kind.hinge) for m in modules if m.kind.hinge is not None]
+    thrusters = [
+        (m, p, p.thruster) for m in modules for p in m.kind.parts if p.thruster is not None
+    ]
+    carriers = [*(m for m, _ in hinges), *(m for m, _, _ in thrusters)]
+    local = [hinge.anchor for _, hinge in hinges]
+    local += [tuple(np.add(part.position, jet.position)) for _, part, jet in thrusters]
+    ranges = [*(hinge.range for _, hinge in hinges), *(jet.range for *_, jet in thrusters)]
+    origin = np.array([m.position for m in carriers]).reshape(-1, 3)
+    rotation = np.array([m.rotation for m in carriers]).reshape(-1, 3, 3)
+    low, high = np.array(ranges).reshape(-1, 2).T
+    return low, high, origin + turned(rotation, np.array(local).reshape(-1, 3))

@@ -248,7 +248,7 @@ class MixedFitness:
         """The controller of one body alone, whose genes are named after its own joints."""
         return _find_controller(self.config, plant_of(robot))
 
-    def pad_genes(self, genes: Any, robot: Robot) -> jax.Array:
+    def pad_genes(self, genes: Any, robot: Robot) -> Any:
         """The genes of one body's own controller as this fitness takes them.
 
         Args:
@@ -256,17 +256,24 @@ class MixedFitness:
             robot: whose they are.
 
         Returns:
-            `[..., num_genes]`: what belongs to joints that the body lacks is 0.
+            `[..., num_genes]`: what belongs to joints that the body lacks is 0. Of JAX's arrays one
+            of JAX's, of others one of NumPy's.
         """
-        genes, places = jnp.asarray(genes), self._places(robot)
+        genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
+        places = self._places(robot)
         if genes.shape[-1] != len(places):
             raise InputError(f"genes: expected [..., {len(places)}]; found {list(genes.shape)}")
-        wide = jnp.zeros((*genes.shape[:-1], self.num_genes), genes.dtype)
-        return wide.at[..., places].set(genes)
+        shape = (*genes.shape[:-1], self.num_genes)
+        if isinstance(genes, jax.Array):
+            return jnp.zeros(shape, genes.dtype).at[..., places].set(genes)
+        wide = np.zeros(shape, genes.dtype)
+        wide[..., places] = genes
+        return wide
 
-    def own_genes(self, genes: Any, robot: Robot) -> jax.Array:
+    def own_genes(self, genes: Any, robot: Robot) -> Any:
         """The way back: those of `[..., num_genes]` that a body's own controller takes."""
-        return jnp.asarray(genes)[..., self._places(robot)]
+        genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
+        return genes[..., self._places(robot)]
 
     def _places(self, robot: Robot) -> np.ndarray:
         return gene_places(self.controller_of(robot), self.setup.controller)

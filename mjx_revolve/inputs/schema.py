@@ -132,7 +132,13 @@ def checked(kind: type[T]) -> type[T]:
             problems = find_problems(error, made, given)
             raise refuse(problems, lambda _: f"{label}{name}: ") from None
 
+    def __getstate__(self: Any) -> dict[str, Any]:  # noqa: N807
+        """Its fields: what follows from them is found again by whoever unpickles it."""
+        return {name: self.__dict__[name] for name in names}
+
+    names = [field.name for field in dataclasses.fields(made)]
     made.__init__ = functools.wraps(made.__init__)(__init__)
+    made.__getstate__ = __getstate__
     return made
 
 

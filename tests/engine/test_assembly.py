@@ -21,6 +21,7 @@ from mjx_revolve.engine.assembly import assemble
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.columns import read_columns
 from mjx_revolve.engine.mujoco_model import compile_model
+from mjx_revolve.engine.plant import figure_of
 from mjx_revolve.inputs.errors import InputError
 
 # Fins, thrusters before and behind hinges, a point ballast, a plate that is its own body.
@@ -163,6 +164,17 @@ def test_robots_side_by_side_have_the_bits_that_each_has_alone():
         alone = jax.tree.leaves(pack_bodies([robot], capacity, np.float64))
         for one, many in zip(alone, jax.tree.leaves(packed), strict=True):
             assert np.array_equal(one[..., 0], many[..., k])
+
+
+def test_figures_are_those_of_the_body_at_rest():
+    for robot in robots():
+        figure, corners = figure_of(robot), robot.morphology.layout.core_corners().reshape(-1, 3)
+        assert figure.length == pytest.approx(robot.morphology.length)
+        assert figure.weight == pytest.approx(9.81 * robot.morphology.mass, rel=1e-3)
+        assert figure.lowest == pytest.approx(-corners[:, 2].min())
+        assert figure.radius == pytest.approx(np.linalg.norm(corners[:, :2], axis=1).max())
+        heavy = robot.morphology.mass / 2 > robot.world.density * robot.morphology.volume
+        assert figure.sinks is heavy
 
 
 def test_nothing_is_compiled_before_somebody_asks(monkeypatch):
