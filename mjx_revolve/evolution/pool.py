@@ -166,8 +166,9 @@ class Pool:
 
     def describe(self) -> dict[str, Any]:
         """Who scores, for `run.json`."""
-        known = {"count": self.workers, "block": self.block}
-        return known | ({"cluster": self.place} if self.place else {})
+        # Workers of a cluster come and go.
+        who = {"cluster": self.place} if self.place else {"count": self.workers}
+        return who | {"block": self.block}
 
     def close(self) -> None:
         """Ends the workers."""
