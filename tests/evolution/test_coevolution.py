@@ -104,7 +104,7 @@ def watch(fitness, seen):
 
 
 def test_blocks_hold_one_body_where_many_brains_are_tried(folder):
-    for size, alone in ((1, False), (3, False), (4, True), (20, True)):
+    for size, alone in ((1, False), (5, False), (6, True), (9, False), (20, True)):
         config, pool = start(folder, {"learning": {"population_size": size}})
         seen: list = []
         watch(pool.fitness, seen)
@@ -345,7 +345,7 @@ def test_a_run_cannot_become_another(folder, changed, capsys):
 
 def test_workers_change_nothing(folder):
     """The same bits from this process and from two others."""
-    toys.write_bodies_config(folder / "toy.yaml", {"learning": {"population_size": 4}})
+    toys.write_bodies_config(folder / "toy.yaml", {"learning": {"population_size": 6}})
     assert main("toy.yaml", "--out", "one", "--set", "evolution.generations=2") == 0
     argv = ("toy.yaml", "--out", "two", "--workers", "2", "--set", "evolution.generations=2")
     assert main(*argv) == 0
