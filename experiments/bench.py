@@ -139,7 +139,17 @@ GROUPS = (
             Row("ours, default water", "mixed", "default", population=256, each_core=True),
         ),
         1,
-        8.0,
+        12.0,
+    ),
+    Group(
+        "26 bodies of 4 to 16 hinges with 64 learners each, ellipsoid law",
+        (
+            Row("ours, ellipsoid law", "learners", "ellipsoid", population=26, each_core=True),
+            Row("MuJoCo C, threads, ellipsoid law", "threads", "ellipsoid", population=26),
+            Row("ours, default water", "learners", "default", population=26, each_core=True),
+        ),
+        1,
+        18.0,
     ),
     Group(
         "spider on the lake's bed",

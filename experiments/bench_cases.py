@@ -59,7 +59,7 @@ def _config(job: dict[str, Any]) -> Any:
     # Without gravity there is nothing to trim, a crawler had better sink, and a random body may
     # float already.
     lake = PHYSICS[job["physics"]]["name"] == "lake"
-    trimmed = lake and job["task"] != "crawl" and job["case"] != "mixed"
+    trimmed = lake and job["task"] != "crawl" and job["case"] not in ("mixed", "learners")
     return load_config(
         job["config"],
         overrides={
@@ -114,8 +114,11 @@ def _bodies(job: dict[str, Any]) -> list[Any]:
     return [random_body(k, 4 + k % 13, 6) for k in range(first, step * job["population"], step)]
 
 
-def make_mixed(job: dict[str, Any]) -> Case:
-    """Whole episodes of a population in which every individual has another body."""
+def make_mixed(job: dict[str, Any], learners: int = 0) -> Case:
+    """Whole episodes of a population in which every individual has another body.
+
+    With `learners`, every body has so many individuals of its own.
+    """
     import jax
 
     from mjx_revolve import make_mixed_fitness
@@ -123,11 +126,17 @@ def make_mixed(job: dict[str, Any]) -> Case:
     bodies = _bodies(job)
     fitness = make_mixed_fitness(_config(job), bodies, hinges=16)
     packed = fitness.pack([fitness.build(body) for body in bodies])
-    genes = jax.random.normal(jax.random.key(0), (job["population"], fitness.num_genes))
+    each = (len(bodies), learners) if learners else (len(bodies),)
+    genes = jax.random.normal(jax.random.key(0), (*each, fitness.num_genes))
     key = jax.random.key(1)
     steps = round(fitness.config.task.duration / fitness.world.timestep)
     run = lambda: jax.block_until_ready(fitness.evaluate(packed, genes, key))  # noqa: E731
-    return run, job["population"] * steps
+    return run, len(bodies) * max(learners, 1) * steps
+
+
+def make_learners(job: dict[str, Any]) -> Case:
+    """The same, 64 individuals to a body."""
+    return make_mixed(job, learners=64)
 
 
 def make_bare(job: dict[str, Any]) -> Case:
@@ -293,6 +302,7 @@ MAKERS: dict[str, Callable[[dict[str, Any]], Case]] = {
     "rollout": make_rollout,
     "batch": make_batch,
     "mixed": make_mixed,
+    "learners": make_learners,
     "threads": make_threads,
 }
 

@@ -98,7 +98,7 @@ class Capacity:
 
 
 class Bodies(NamedTuple):
-    """Robots side by side: leaves with the population on the last axis.
+    """Robots side by side: leaves with the population on the last axis, or one for all of it.
 
     Attributes:
         root: constants of the roots `[1, P]`, None where they are the capacity's.
@@ -125,6 +125,11 @@ class Bodies(NamedTuple):
     thrusters: Thrusters
     plant: Plant
     figure: Figure
+
+    @property
+    def alike(self) -> bool:
+        """Whether the tables hold one robot."""
+        return bool(self.slot.shape[-1] == 1)
 
 
 class Order(NamedTuple):

@@ -206,9 +206,7 @@ def _row(xs: Any) -> Any:
     return tuple(x[None] for x in xs)
 
 
-def move_bodies(
-    bodies: Bodies, state: State, located: bool, dt: float
-) -> tuple[Moving, Any, Any, Any]:
+def move_bodies(bodies: Bodies, state: State, located: bool, dt: float) -> tuple[Moving, Any, Any]:
     """Where all bodies are and how they move.
 
     Args:
@@ -218,8 +216,8 @@ def move_bodies(
         dt: of the step [s].
 
     Returns:
-        The root's motion, then of the bodies below it: motions, rotations (parent from child), and
-        the hinges' speeds half a step ahead.
+        The root's motion, then of the bodies below it: motions with rotations (parent from child),
+        and the hinges' speeds half a step ahead.
     """
     turn = tuple(_row(r) for r in quat_to_rows(state.quat))
     spin, velocity = _row(state.spin), matTvec(turn, _row(state.velocity))
@@ -240,10 +238,10 @@ def move_bodies(
         ahead = tuple(
             tuple(map(half, v, _row(a))) for v, a in ((spin, angular), (velocity, linear))
         )
-    turns = bodies.map(lambda level, angle: turn_hinges(level.hinges, angle), state.angle)
 
-    def move(level: Level, parent: Moving, turn: Mat, speed: Scalar, midway: Scalar) -> Any:
+    def move(level: Level, parent: Moving, angle: Scalar, speed: Scalar, midway: Scalar) -> Any:
         assert level.hinges is not None
+        turn = turn_hinges(level.hinges, angle)
         position, above = level.hinges.position, parent.motion
         spin, velocity = _child_rate(turn, position, (above.spin, above.velocity), speed)
         x_axis, y_axis, place = None, None, None
@@ -257,10 +255,10 @@ def move_bodies(
         ahead = parent.ahead and _child_rate(turn, position, parent.ahead, midway)
         motion = Motion(spin, velocity, matTvec(turn, above.up), height, x_axis, y_axis, place)
         found = Moving(motion, ahead)
-        return found, found
+        return found, (found, turn)
 
     root = Moving(motion, ahead)
-    return root, bodies.down(move, root, turns, state.speed, midway), turns, midway
+    return root, bodies.down(move, root, state.angle, state.speed, midway), midway
 
 
 def _is_located(bodies: Bodies, water: Water) -> bool:
@@ -311,7 +309,7 @@ def accelerate(
         hinges [rad/s²]; servo power, summed over the hinges without sign [W], `[lanes]`.
     """
     symmetric = not (bodies.carries and dt)
-    root, moved, turns, midway = move_bodies(bodies, state, _is_located(bodies, water), dt)
+    root, moved, midway = move_bodies(bodies, state, _is_located(bodies, water), dt)
 
     def own_of(level: Level, moving: Moving) -> Any:
         gravity = felt_gravity(bodies.world, water, moving.motion)
@@ -321,19 +319,18 @@ def accelerate(
         )  # fmt: skip
         return _flatten(block, bias, symmetric)
 
-    def hold(level: Level, angle: Scalar, speed: Scalar) -> tuple[Scalar, Scalar]:
+    def hold(hinges: Hinges, angle: Scalar, speed: Scalar) -> tuple[Scalar, Scalar]:
         """Torque on a hinge by itself, and what is implicit of it, with the armature."""
-        hinges = level.hinges
-        assert hinges is not None
         stop, stop_inertia = end_stop(hinges, angle, speed, dt)
         inertia = add(hinges.armature, add(mul(dt, hinges.damping), stop_inertia))
         return sub(stop, mul(hinges.damping, speed)), inertia
 
     def lift(level: Level, gathered: Any, *x: Any) -> tuple[Any, Any, Scalar]:
         """Tips to root: articulated inertias."""
-        moving, turn, (load, inertia), angle, speed, midway, target = x
+        (moving, turn), angle, speed, midway, target = x
         hinges, own = level.hinges, own_of(level, moving)
         assert hinges is not None
+        load, inertia = hold(hinges, angle, speed)
         block, bias = _unflatten(
             own if gathered is None else jax.tree.map(add, own, gathered), symmetric
         )
@@ -357,11 +354,10 @@ def accelerate(
         block, bias = to_parent(turn, hinges.position, left, bias, symmetric)
         return _flatten(block, bias, symmetric), released, jnp.abs(motor * speed)
 
-    held = bodies.map(hold, state.angle, state.speed)
     gathered, released, power = bodies.up(
         lift,
         (_flatten(_NO_BLOCK, _NO_BIAS, symmetric), 0.0),
-        moved, turns, held, state.angle, state.speed, midway, targets,
+        moved, state.angle, state.speed, midway, targets,
     )  # fmt: skip
     whole = own_of(bodies.root, root)
     if gathered is not None:
@@ -370,7 +366,7 @@ def accelerate(
 
     def release(level: Level, parent: Any, *x: Any) -> tuple[Any, Scalar]:
         """Root to tips: accelerations."""
-        moving, turn, midway, released = x
+        (moving, turn), midway, released = x
         assert level.hinges is not None
         up_angular, up_linear = parent
         coriolis = _coriolis(moving.swirling, midway)
@@ -381,7 +377,7 @@ def accelerate(
         hinge = mul(released.inverse, hinge)
         return ((a[0], a[1], add(a[2], hinge)), b), hinge
 
-    hinges = bodies.down(release, (angular, linear), moved, turns, midway, released)
+    hinges = bodies.down(release, (angular, linear), moved, midway, released)
     lanes, dtype = state.position[0].shape, state.position[0].dtype
     lane = lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), (1, *lanes))[0]  # noqa: E731
     return (

@@ -41,7 +41,8 @@ def push_of(bodies: Bodies, state: State, water: Water, thrusts: Any) -> tuple[V
     root, moved, *_ = move_bodies(bodies, relative, True, 0.0)
     world = bodies.world
 
-    def pushes(level: Level, gathered: Any, moving: Moving) -> tuple[Any, Any, Any]:
+    def pushes(level: Level, gathered: Any, moved: tuple[Moving, Any]) -> tuple[Any, Any, Any]:
+        moving, _ = moved
         motion = moving.motion
         gravity = felt_gravity(world, water, motion)
         outer = water_on_level(world, level, motion, moving.swirling, gravity, water, thrusts)
@@ -57,7 +58,7 @@ def push_of(bodies: Bodies, state: State, water: Water, thrusts: Any) -> tuple[V
 
     nothing = ((0.0,) * 3, (0.0,) * 3)
     _, _, below = bodies.up(pushes, ((), nothing), moved)
-    own = jax.tree.map(lambda x: x[0], pushes(bodies.root, None, root)[2])
+    own = jax.tree.map(lambda x: x[0], pushes(bodies.root, None, (root, None))[2])
     bed, wet = jax.tree.map(add, own, below)
     return bed, wet
 
@@ -81,7 +82,8 @@ def part_forces(
     root, moved, *_ = move_bodies(levels, relative, True, 0.0)
     lanes, count = state.position[0].shape[0], len(levels.robot.fluid.volume)
     found = [jnp.zeros((lanes, count, 3), state.position[0].dtype) for _ in range(3)]
-    for level, moving, groups in zip(levels.all, (root, *moved), levels.part_rows, strict=True):
+    found_moving = (root, *(moving for moving, _ in moved))
+    for level, moving, groups in zip(levels.all, found_moving, levels.part_rows, strict=True):
         motion = moving.motion
         gravity = felt_gravity(levels.world, water, motion)
         terms = forces_on_parts(levels.world, level, motion, gravity, water, thrusts)

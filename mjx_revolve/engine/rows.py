@@ -1,4 +1,4 @@
-"""Many different robots, row by row: how their step is traversed when trees differ lane by lane.
+"""Many robots, row by row: how their step is traversed when trees are not known in advance.
 
 Every robot is a root and a list of rows, padded to a stated number (`batch` makes them): a row is a
 moving body with a few of its parts; a body with more parts than a row holds gets riders, rows that
@@ -10,14 +10,20 @@ reached backwards, its own slot has gathered the sums of just its children (cf. 
 & Tarjan 1983, A data structure for dynamic trees).
 
 So the program, and the time to compile it, do not grow with the trees. The water's part is in the
-loops, too: that of all rows at once would not fit into the first-level cache.
+loops, too: that of all rows at once would not fit into the first-level cache. Loops end with the
+rows of the largest robot.
+
+Where all robots are alike, their tables hold that one body: constants are the same in all lanes,
+and a slot is an index. Where they differ, a slot is a weight of 0 or 1 for each place in the stack,
+lane by lane: XLA:CPU makes a branch of a choice between numbers in memory, and no vectors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,44 +32,74 @@ import numpy as np
 from mjx_revolve.engine.batch import Bodies, Capacity
 from mjx_revolve.engine.level import Level, Thrusters
 from mjx_revolve.numerics.spatial import Scalar
-from mjx_revolve.numerics.xla import share_once
+from mjx_revolve.numerics.xla import share_once, store
 from mjx_revolve.water.world import World
+
+
+class Ports(NamedTuple):
+    """Where rows stand in the stack: what is taken from there and put there.
+
+    Attributes:
+        own: slot of each row: `[rows]` int32 where all robots are alike, else `[rows, slots,
+            lanes]` 1 for the slot and 0 for others.
+        parent: that of its parent, likewise; the root's for padding.
+        to: where it adds up, likewise: its parent's; nowhere for padding.
+        inner: `[rows]` or `[rows, lanes]` 1 where a row has children, else 0.
+        apart: likewise, 1 where a row stands in another slot than its parent, else 0.
+    """
+
+    own: Any
+    parent: Any
+    to: Any
+    inner: Any
+    apart: Any
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["data"], meta_fields=["tree"])
+@dataclass(frozen=True)
+class Joined:
+    """Numbers `[1, lanes]` side by side: what is copied as a whole is copied fast.
+
+    Attributes:
+        data: `[n lanes]`, or those of all rows, `[rows, n lanes]`.
+        tree: how they hang together.
+    """
+
+    data: Any
+    tree: Any
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Different robots for the step; see `levels.Levels` for what the two have in common.
+    """Many robots for the step; see `levels.Levels` for what the two have in common.
 
     Attributes:
         world: around all of them.
         capacity: what the tables have room for.
         bodies: the tables.
+        lanes: how many robots stand side by side.
+        ports: of the rows.
+        table: constants of the rows.
+        count: how many rows to visit, a number or int32.
     """
 
     world: World
     capacity: Capacity
     bodies: Bodies
+    lanes: int
+    ports: Ports
+    table: _Table
+    count: Any
 
     @property
     def root(self) -> Level:
         """Constants of the roots, `[1, lanes]`."""
-        return self._constant(self.capacity.root, self.bodies.root)
-
-    @property
-    def rows(self) -> Level:
-        """Constants of the rows, `[rows, 1, lanes]`."""
-        return self._constant(self.capacity.row, self.bodies.rows)
-
-    @staticmethod
-    def _constant(constant: Level, varying: Level) -> Level:
-        """A level with the numbers that are the same in all robots put in their places."""
-        given = lambda c, x: jnp.asarray(x) if c is None and x is not None else c  # noqa: E731
-        return jax.tree.map(given, constant, varying, is_leaf=lambda x: x is None)
+        return _whole(self.capacity.root, self.bodies.root)
 
     @property
     def thrusters(self) -> Thrusters:
         """Of the robots, `[nthruster, lanes]`."""
-        return jax.tree.map(jnp.asarray, self.bodies.thrusters)
+        return self.bodies.thrusters
 
     @property
     def carries(self) -> bool:
@@ -80,7 +116,7 @@ class Rows:
     def spread(self, hinges: jax.Array) -> jax.Array:
         """`[nhinge, lanes]` in each robot's order to `[rows, 1, lanes]`; 0 for no hinge."""
         padded = jnp.concatenate([hinges, jnp.zeros_like(hinges[:1])])
-        return jnp.take_along_axis(padded, jnp.asarray(self.bodies.hinge), 0)[:, None]
+        return jnp.take_along_axis(padded, self.bodies.hinge, 0)[:, None]
 
     def split(self, rows: jax.Array) -> jax.Array:
         """`[rows, ...]` as the traversal has it."""
@@ -90,99 +126,221 @@ class Rows:
         """The way back from `spread`; 0 where a robot has fewer hinges than others."""
         rows = values[:, 0]
         padded = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
-        return jnp.take_along_axis(padded, jnp.asarray(self.bodies.row), 0)
+        return jnp.take_along_axis(padded, self.bodies.row, 0)
 
     # The traversal.
 
-    def map(self, fun: Callable[..., Any], *xs: Any) -> Any:
-        """What `fun` (level, a value of each of `xs`), element-wise, gives for all rows at once."""
-        return fun(self.rows, *xs)
-
     def down(self, fun: Callable[..., Any], root: Any, *xs: Any) -> Any:
         """From the roots to the tips; see `Levels.down`."""
-        root = self._wide(root)
+        first = self._join(root)
+        own, parent = self.ports.own, self.ports.parent
 
-        def visit(stack: list[Any], row: Any) -> tuple[list[Any], Any]:
-            source, own, level, x = row
-            value, keep = fun(level, _pick(stack, source), *x)
-            return _put(stack, own, self._wide(value)), self._wide(keep)
+        def visit(k: Scalar, above: Joined) -> tuple[Any, Any]:
+            return fun(self.table.row(k), self._part(above), *self._row(xs, k))
 
-        rows = (self.bodies.source, self.bodies.slot, self.rows, xs)
-        return _sweep(visit, [root] * self.capacity.slots, rows)[1]
+        def read(k: Scalar, stack: Any) -> Joined:
+            return replace(first, data=self._pick(stack, _at(parent, k)))
+
+        def write(k: Scalar, stack: Any, value: Any) -> Any:
+            return self._put(stack, _at(own, k), self._join(value).data)
+
+        return self._sweep(visit, read, write, self._stack(first.data))[1]
 
     def up(self, fun: Callable[..., Any], nothing: Any, *xs: Any) -> tuple[Any, Any, Any]:
         """From the tips to the roots; see `Levels.up`."""
-        empty, sums = self._wide(nothing)
+        empty, sums = map(self._join, nothing)
+        own, _, to, inner, apart = self.ports
 
-        def visit(carry: Any, row: Any) -> tuple[Any, Any]:
-            stack, sums = carry
-            source, own, inner, level, x = row
+        def visit(k: Scalar, gathered: Joined) -> tuple[Any, Any]:
+            value, keep, terms = fun(self.table.row(k), self._part(gathered), *self._row(xs, k))
+            return (value, terms), keep
+
+        def read(k: Scalar, carry: Any) -> Joined:
             # A slot that nobody has filled for this row holds what another row has left.
-            gathered = jax.tree.map(lambda v: jnp.where(inner, v, 0), _pick(stack, own))
-            value, keep, terms = fun(level, gathered, *x)
-            stack = _give(stack, own, source, self._wide(value))
-            return (stack, jax.tree.map(jnp.add, sums, terms)), self._wide(keep)
+            return replace(empty, data=self._pick(carry[0], _at(own, k), _at(inner, k)))
 
-        rows = (self.bodies.source, self.bodies.slot, self.bodies.inner, self.rows, xs)
-        carry = ([empty] * self.capacity.slots, sums)
-        (stack, sums), kept = _sweep(visit, carry, rows, reverse=True)
+        def write(k: Scalar, carry: Any, found: Any) -> Any:
+            stack, sums = carry
+            value, terms = (self._join(x).data for x in found)
+            # A row that stands in its parent's own slot leads to the largest subtree and comes
+            # first: it replaces what stands there, the sums that it has itself taken in.
+            return self._put(stack, _at(to, k), value, _at(apart, k)), sums + terms
+
+        carry = self._stack(empty.data), sums.data
+        (stack, found), kept = self._sweep(visit, read, write, carry, reverse=True)
         # Nobody has written into slot 0 where the root has no children.
-        return stack[0], kept, jax.tree.map(lambda x: x[0], sums)
+        gathered = self._part(replace(empty, data=stack[0]))
+        found = self._part(replace(sums, data=found))
+        return gathered, kept, jax.tree.map(lambda x: x[0], found)
 
-    def _wide(self, value: Any) -> Any:
-        """Every number of one row as an array `[1, lanes]`."""
-        lanes, dtype = self.bodies.slot.shape[-1], self.bodies.figure.length.dtype
-        return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), (1, lanes)), value)
+    def _sweep(self, visit: Any, read: Any, write: Any, carry: Any, reverse: bool = False) -> Any:
+        """A loop over rows.
+
+        Args:
+            visit: (row, what `read` gives) → (what `write` takes, what to keep).
+            read: (row, carry) → what the row is given.
+            write: (row, carry, what the row has made) → carry.
+            carry: before the first row.
+            reverse: from the last row to the first.
+
+        Returns:
+            The carry behind the last row, and what was kept.
+        """
+        visit = jax.jit(visit)  # so that it is traced once
+        zero = jnp.int32(0)
+        joined = jax.eval_shape(lambda x: self._join(visit(zero, read(zero, x))[1]), carry)
+        kept = replace(
+            joined, data=jnp.zeros((self.capacity.rows, *joined.data.shape), joined.data.dtype)
+        )
+        visit = share_once(visit)
+
+        def step(i: Scalar, found: tuple[Any, Any]) -> tuple[Any, Any]:
+            carry, kept = found
+            k = self.count - 1 - i if reverse else i
+            # A copy of what is read, as it is written over while others still want it.
+            value, keep = visit(k, jax.tree.map(store, read(k, carry)))
+            data = jax.lax.dynamic_update_index_in_dim(kept.data, self._join(keep).data, k, 0)
+            return write(k, carry, value), replace(kept, data=data)
+
+        carry, kept = jax.lax.fori_loop(0, self.count, step, (carry, kept))
+        if kept.tree.num_leaves == 1:
+            return carry, jax.tree.unflatten(kept.tree, [kept.data[:, None]])
+        return carry, kept
+
+    # Numbers of a row side by side.
+
+    def _join(self, value: Any) -> Joined:
+        leaves, tree = jax.tree.flatten(value)
+        dtype = self.table.data.dtype
+        wide = [jnp.broadcast_to(jnp.asarray(x, dtype), (1, self.lanes))[0] for x in leaves]
+        # What is still to be computed would be so number by number, behind a branch.
+        joined = store(jnp.concatenate([store(x) for x in wide])) if wide else jnp.zeros(0, dtype)
+        return Joined(joined, tree)
+
+    def _part(self, joined: Joined) -> Any:
+        rows = joined.data.reshape(-1, self.lanes)
+        return jax.tree.unflatten(joined.tree, [rows[k : k + 1] for k in range(len(rows))])
+
+    def _row(self, xs: Any, k: Scalar) -> Any:
+        """What belongs to a row of each of `xs`."""
+
+        def pick(x: Any) -> Any:
+            return (
+                self._part(replace(x, data=_at(x.data, k))) if isinstance(x, Joined) else _at(x, k)
+            )
+
+        return jax.tree.map(pick, xs, is_leaf=lambda x: isinstance(x, Joined))
+
+    # Where values wait for children or for a parent: rows of the stack, or a list `[n, lanes]`.
+
+    def _stack(self, first: jax.Array) -> Any:
+        if self.bodies.alike:
+            return jnp.broadcast_to(first, (self.capacity.slots, *first.shape))
+        return [first.reshape(-1, self.lanes)] * self.capacity.slots
+
+    def _pick(self, stack: Any, slot: Any, share: Any = 1.0) -> jax.Array:
+        """A share of what stands in a slot."""
+        if self.bodies.alike:
+            return share * _at(stack, slot)
+        found = slot[0] * stack[0]
+        for k in range(1, len(stack)):
+            found = found + slot[k] * stack[k]
+        return share * found
+
+    def _put(self, stack: Any, slot: Any, value: jax.Array, share: Any = 0.0) -> Any:
+        """The stack with a value in a slot, and a share of what stands there."""
+        if self.bodies.alike:
+            if not isinstance(share, float):
+                value = value + share * _at(stack, slot)
+            return jax.lax.dynamic_update_index_in_dim(stack, value, slot, 0)
+        value = value.reshape(-1, self.lanes)
+        return [(1 - slot[k] + slot[k] * share) * x + slot[k] * value for k, x in enumerate(stack)]
 
 
-def _pick(stack: list[Any], slot: Scalar) -> Any:
-    """What stands in a slot, lane by lane; anything where there is no such slot."""
-    found = stack[0]
-    for k in range(1, len(stack)):
-        found = jax.tree.map(lambda a, b, k=k: jnp.where(slot == k, b, a), found, stack[k])
-    return found
+class _Table(NamedTuple):
+    """Constants of rows side by side.
 
-
-def _put(stack: list[Any], slot: Scalar, value: Any) -> list[Any]:
-    """The stack with a value in a slot; unchanged where there is no such slot."""
-    return [
-        jax.tree.map(lambda a, b, k=k: jnp.where(slot == k, b, a), old, value)
-        for k, old in enumerate(stack)
-    ]
-
-
-def _give(stack: list[Any], own: Scalar, to: Scalar, value: Any) -> list[Any]:
-    """Adds a row's value to its parent's slot.
-
-    A row that stands in its parent's own slot leads to the largest subtree and comes first on the
-    way up: it replaces what stands there, the sums that it has itself taken in.
+    Attributes:
+        data: `[rows, n]` of floating-point type.
+        rest: `[rows, ...]` each, of other types.
+        shapes: in the order of the leaves, those of a row; None for what is not in `data`.
+        same: likewise, numbers that are the same in all rows; None for what is in `rest`.
+        tree: of all leaves.
     """
-    before = _pick(stack[:-1], to) if len(stack) > 1 else value
-    summed = jax.tree.map(lambda new, old: new + jnp.where(to == own, 0, old), value, before)
-    return _put(stack, to, summed)
+
+    data: jax.Array
+    rest: list[jax.Array]
+    shapes: list[Any]
+    same: list[Any]
+    tree: Any
+
+    @staticmethod
+    def of(level: Level) -> _Table:
+        """The table of `[rows, ...]` constants."""
+        leaves, tree = jax.tree.flatten(level)
+        arrays = [isinstance(x, jax.Array) for x in leaves]
+        pairs = list(zip(leaves, arrays, strict=True))
+        wide = [a and jnp.issubdtype(x.dtype, jnp.floating) for x, a in pairs]
+        chosen = [x.reshape(x.shape[0], -1) for x, w in zip(leaves, wide, strict=True) if w]
+        return _Table(
+            jnp.concatenate(chosen, 1),
+            [x for (x, a), w in zip(pairs, wide, strict=True) if a and not w],
+            [x.shape[1:] if w else None for x, w in zip(leaves, wide, strict=True)],
+            [None if a else x for x, a in pairs],
+            tree,
+        )
+
+    def row(self, k: Scalar) -> Level:
+        """The constants of a row."""
+        flat, start, rest, found = _at(self.data, k), 0, iter(self.rest), []
+        for shape, same in zip(self.shapes, self.same, strict=True):
+            if shape is not None:
+                size = int(np.prod(shape))
+                found.append(flat[start : start + size].reshape(shape))
+                start += size
+            else:
+                found.append(_at(next(rest), k) if same is None else same)
+        return jax.tree.unflatten(self.tree, found)
 
 
-def _sweep(
-    body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, reverse: bool = False
-) -> tuple[Any, Any]:
-    """A loop over rows.
+def make_rows(
+    world: World, capacity: Capacity, bodies: Bodies, lanes: int, steady: bool = False
+) -> Rows:
+    """Many robots for the step, from their tables.
 
     Args:
-        body: (carry, row) → (carry, what to keep of the row).
-        carry: before the first row.
-        rows: leaves `[rows, ...]`, or plain numbers that all rows share.
-        reverse: from the last row to the first.
+        world: around all of them.
+        capacity: what the tables have room for.
+        bodies: the tables, of as many robots as there are lanes, or of one that they all are.
+        lanes: how many robots stand side by side.
+        steady: whether padding is visited, too: derivatives ask for loops of known length.
 
     Returns:
-        The carry behind the last row, and what was kept, leaves `[rows, ...]`.
+        The robots.
     """
-    leaves, tree = jax.tree.flatten(rows)
-    moves = [isinstance(x, jax.Array | np.ndarray) for x in leaves]
+    bodies = jax.tree.map(jnp.asarray, bodies)
+    table = _Table.of(_whole(capacity.row, bodies.rows))
+    number = lambda x: x.astype(table.data.dtype)  # noqa: E731
+    own, to = bodies.slot, bodies.source
+    parent = jnp.maximum(to, 0)
+    inner, apart = number(bodies.inner), number(own != to)
+    count = capacity.rows if steady else jnp.max(bodies.count)
+    if bodies.alike:
+        own, parent, inner, apart = (x[:, 0] for x in (own, parent, inner, apart))
+        ports = Ports(own, parent, parent, inner, apart)
+    else:
+        each = jnp.arange(capacity.slots)[:, None]
+        own, parent, to = (number(x[:, None] == each) for x in (own, parent, to))
+        ports = Ports(own, parent, to, inner, apart)
+    return Rows(world, capacity, bodies, lanes, ports, table, count)
 
-    def visit(carry: Any, xs: Any) -> tuple[Any, Any]:
-        rest = iter(xs)
-        row = [next(rest) if moving else x for x, moving in zip(leaves, moves, strict=True)]
-        return body(carry, jax.tree.unflatten(tree, row))
 
-    moving = [x for x, moving in zip(leaves, moves, strict=True) if moving]
-    return jax.lax.scan(share_once(visit), carry, moving, reverse=reverse)
+def _whole(constant: Level, varying: Level) -> Level:
+    """A level with the numbers that are the same in all robots put in their places."""
+    given = lambda c, x: jnp.asarray(x) if c is None and x is not None else c  # noqa: E731
+    return jax.tree.map(given, constant, varying, is_leaf=lambda x: x is None)
+
+
+def _at(xs: jax.Array, k: Scalar) -> jax.Array:
+    """One row of many."""
+    return jax.lax.dynamic_index_in_dim(xs, k, 0, keepdims=False)

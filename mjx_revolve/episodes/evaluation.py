@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.engine.batch import Bodies, Capacity
 from mjx_revolve.engine.plant import Figure
-from mjx_revolve.engine.rows import Rows
+from mjx_revolve.engine.rows import make_rows
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.engine.step import make_step_engine
 from mjx_revolve.episodes.config import Config, TaskConfig
@@ -80,13 +80,14 @@ class Setup:
         steps = self.num_records * self.record_every
         return draw_starts(self.settings, self.world, key, steps)
 
-    def engine_of(self, bodies: Bodies | None) -> Engine:
-        """What steps the bodies."""
+    def engine_of(self, bodies: Bodies | None, lanes: int = 1, derived: bool = False) -> Engine:
+        """What steps the bodies, so many side by side, perhaps to be differentiated."""
         if bodies is None:
             assert self.engine is not None
             return self.engine
         assert self.capacity is not None
-        return make_step_engine(Rows(self.world, self.capacity, bodies), bodies.plant)
+        rows = make_rows(self.world, self.capacity, bodies, lanes, steady=derived)
+        return make_step_engine(rows, bodies.plant)
 
     def figure_of(self, bodies: Bodies | None) -> Figure:
         """The bodies' size."""
@@ -102,18 +103,25 @@ class Setup:
 
         Args:
             bodies: the tables of a body for each individual, or None for the one body.
-            population: `[P, num_genes]`.
+            population: `[P, num_genes]`; or `[B, P, num_genes]`, a population for each of the
+                bodies, whose chunks then hold one body: much faster.
             key: draws the episodes' starts and water, the same for every individual.
 
         Returns:
+<<<<<<< HEAD
             `[P]` scores and `[P]` measures (see `measures.measure`), means over the episodes.
+=======
+            Scores `[P]` or `[B, P]` and measures (see `tasks.measure`) likewise, means over the
+            episodes.
+>>>>>>> cf31c1c (Rows in loops that end with the body, copied as blocks; a chunk of one body has tables of one lane)
 
         Raises:
             InputError: the population has another shape, there are no genes to evolve, or the key
                 is none.
         """
         shape, count = jnp.shape(population), self.controller.num_genes
-        if len(shape) != 2 or shape[1] != count or shape[0] < 1:
+        ranks = (2,) if bodies is None else (2, 3)
+        if len(shape) not in ranks or shape[-1] != count or 0 in shape:
             raise InputError(f"population: expected [P, {count}]; found {list(shape)}")
         check_key(key)
         traced = any(isinstance(x, jax.core.Tracer) for x in (population, key))
@@ -126,14 +134,23 @@ class Setup:
         return jax.jit(self._evaluate, compiler_options=compiler_options())
 
     def _evaluate(self, bodies: Bodies | None, population: Any, key: jax.Array) -> Any:
-        trials = self.settings.trials
         starts = jax.tree.map(lambda x: x.astype(population.dtype), self.starts(key))
-        run = partial(self._episode, bodies, population, starts)
+        if population.ndim == 2:
+            return self._score(bodies, population, starts, bodies is None)
+        each = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), -1, 0)[..., None], bodies)
+        run = lambda own: self._score(own[0], own[1], starts, True)  # noqa: E731
+        return jax.lax.map(run, (each, population))
+
+    def _score(self, bodies: Any, population: jax.Array, starts: Starts, alike: bool) -> Any:
+        """Scores and measures of one population; `alike`: of one body."""
+        trials = self.settings.trials
+        run = partial(self._episode, bodies, alike, population, starts)
         return average_trials(over_chunks(run)(*list_episodes(len(population), trials)), trials)
 
     def _episode(
         self,
         bodies: Bodies | None,
+        alike: bool,
         population: jax.Array,
         starts: Starts,
         individual: jax.Array,
@@ -146,6 +163,7 @@ class Setup:
 
         Args:
             bodies: of all individuals, or None.
+            alike: whether they are one body's, which all individuals have.
             population: `[P, num_genes]`.
             starts: of all trials.
             individual: `[lanes]` whose episode each is.
@@ -155,10 +173,12 @@ class Setup:
             The scores.
         """
         world, controller, settings = self.world, self.controller, self.settings
-        bodies = jax.tree.map(lambda x: jnp.asarray(x)[..., individual], bodies)
+        own = (lambda x: x) if alike else (lambda x: x[..., individual])
+        bodies = jax.tree.map(lambda x: own(jnp.asarray(x)), bodies)
         starts = jax.tree.map(lambda x: x[..., trial], starts)
         root = start_pose(self.task, settings, world, self.figure_of(bodies), starts)
-        parameters = controller.decode(population[individual].T, self.engine_of(bodies).plant)
+        plant = self.engine_of(None).plant if bodies is None else bodies.plant
+        parameters = controller.decode(population[individual].T, plant)
         rows = None
         if starts.gusts is not None:
             rows = gusty_water(world, starts.gusts, starts.water)
@@ -166,7 +186,7 @@ class Setup:
             rows = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), rows)
 
         def run(derived: bool, bodies: Any, root: Any, parameters: Any, water: Any, rows: Any):
-            engine = self.engine_of(bodies)
+            engine = self.engine_of(bodies, root.shape[-1], derived)
             still = water_of(world) if water is None else water
             hinges = jnp.zeros((engine.plant.num_hinges, root.shape[-1]), root.dtype)
             qvel = jnp.concatenate([jnp.zeros_like(root[:6]), hinges])

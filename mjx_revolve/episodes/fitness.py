@@ -278,36 +278,47 @@ class MixedFitness:
     def _places(self, robot: Robot) -> np.ndarray:
         return gene_places(self.controller_of(robot), self.setup.controller)
 
-    def __call__(self, robots: Sequence[Robot] | Bodies, population: Any, key: jax.Array) -> Any:
+    def __call__(
+        self, robots: Robot | Sequence[Robot] | Bodies, population: Any, key: jax.Array
+    ) -> Any:
         """Scores a population; arguments as in `evaluate`."""
         return self.evaluate(robots, population, key)[0]
 
     def evaluate(
-        self, robots: Sequence[Robot] | Bodies, population: Any, key: jax.Array
+        self, robots: Robot | Sequence[Robot] | Bodies, population: Any, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Scores a population and says how it moved.
 
+        Bodies that come with populations of their own are stepped twice as fast as individuals of
+        different bodies side by side, if a population has 64 episodes or more (on a CPU).
+
         Args:
             robots: a body for each individual, from `build`; one object may stand there many
-                times. Or their tables, from `pack`.
-            population: `[P, num_genes]`.
+                times. One body for all of them. Or B bodies, each with a population of its own.
+                Or their tables, from `pack`.
+            population: `[P, num_genes]`; with a population for each body `[B, P, num_genes]`.
             key: draws the episodes' starts and water, the same for every individual.
 
         Returns:
-            `[P]` scores and `[P]` measures, as `Fitness.evaluate` has them.
+            Scores `[P]` or `[B, P]` and measures likewise, as `Fitness.evaluate` has them.
 
         Raises:
             InputError: the numbers of bodies and of individuals differ, a body does not fit or is
                 none, or the key is none.
         """
-        shape = jnp.shape(population)
-        if len(shape) != 2 or shape[1] != self.num_genes:
-            raise InputError(f"population: expected [P, {self.num_genes}]; found {list(shape)}")
-        if not isinstance(robots, Bodies):
-            if len(robots) != shape[0]:
-                raise InputError(f"robots: expected {shape[0]}, one each; found {len(robots)}")
-            robots = self.pack(robots)
-        return self.setup.evaluate(robots, population, key)
+        shape, n = jnp.shape(population), self.num_genes
+        if len(shape) not in (2, 3) or shape[-1] != n:
+            raise InputError(f"population: expected [P, {n}] or [B, P, {n}]; found {list(shape)}")
+        if isinstance(robots, Robot):
+            robots = self.pack([robots])
+        count = robots.count.shape[-1] if isinstance(robots, Bodies) else len(robots)
+        if len(shape) == 2 and isinstance(robots, Bodies) and count == 1:
+            scores, measures = self.setup.evaluate(robots, jnp.asarray(population)[None], key)
+            return scores[0], {name: x[0] for name, x in measures.items()}
+        if count != shape[0]:
+            raise InputError(f"robots: expected {shape[0]}, one each; found {count}")
+        bodies = robots if isinstance(robots, Bodies) else self.pack(robots)
+        return self.setup.evaluate(bodies, population, key)
 
     def pack(self, robots: Sequence[Robot]) -> Bodies:
         """Tables of the bodies, for many evaluations of the same ones."""

@@ -12,8 +12,9 @@ their sake; tests/test_xla.py notices if they lose their effect; results do not 
    out. Compiling such a function takes time that grows with the square of its length: so long
    steps are cut into several functions. The loop over time stays outside (`fused_scan`): inside, it
    would be a tenth faster, but LLVM takes twice as long, as it forgets all that it knows of it with
-   every inner loop that it turns, and XLA:CPU aborts over some ("All or none of the slices should
-   have an explicit index") where nothing else is around the function.
+   every inner loop that it turns. XLA:CPU aborts ("All or none of the slices should have an explicit
+   index") over such a function that has a parameter which nothing in it uses, as a loop of unknown
+   length leaves them: so what no result needs is left out.
 
 Both are plain identities to JAX: jit, vmap and grad go through them. On other back ends they are
 left out.
@@ -93,6 +94,11 @@ def share_once(fun: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *args: Graph(fun, args)(*args) if on_cpu() else fun(*args)
 
 
+def store(x: jax.Array) -> jax.Array:
+    """Makes XLA:CPU compute a value by itself, once, whoever uses it."""
+    return _never_inlined(x) if on_cpu() else x
+
+
 def small_call(fun: Callable[..., Any]) -> Callable[..., Any]:
     """Makes XLA:CPU compile `fun`, element-wise but for loops, as one function."""
 
@@ -161,6 +167,7 @@ class Graph:
         env = {v: self._number() for v in closed.jaxpr.invars}
         self._arguments = list(env.values())
         self._results = self._inline(closed.jaxpr, closed.consts, env)
+        self._operations = self._alive()
         self._stored = self._choose()
         self.size = len(self._stored)
 
@@ -257,6 +264,16 @@ class Graph:
                 self._operations.append(_Operation(eqn, inputs, outputs))
             env.update(zip(eqn.outvars, outputs, strict=True))
         return [read(v) for v in jaxpr.outvars]
+
+    def _alive(self) -> list[_Operation]:
+        """The operations without those that no result needs."""
+        needed = {v for v in self._results if isinstance(v, int)}
+        kept = []
+        for op in reversed(self._operations):
+            if needed.intersection(op.outputs):
+                needed.update(v for v in op.inputs if isinstance(v, int))
+                kept.append(op)
+        return kept[::-1]
 
     def _choose(self) -> dict[int, bool]:
         """Values to be stored, in order; False: a loop's, stored without our doing."""

@@ -21,7 +21,7 @@ from mjx_revolve.control.controller import gene_places
 from mjx_revolve.engine.batch import Group, fit_capacity, order_rows, pack_bodies, resize
 from mjx_revolve.engine.columns import read_columns
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.rows import Rows
+from mjx_revolve.engine.rows import make_rows
 from mjx_revolve.engine.step import acceleration, make_step_engine
 from mjx_revolve.episodes.rollout import roll_out
 from mjx_revolve.inputs.errors import InputError
@@ -79,17 +79,29 @@ def pack(robots, capacity, each):
     return jax.tree.map(jnp.asarray, bodies)
 
 
+@lru_cache(maxsize=8)
+def accelerator(tank, capacity):
+    """`step.acceleration` of packed bodies."""
+
+    def run(bodies, q, v, c):
+        rows = make_rows(tank, capacity, bodies, q.shape[-1])
+        return acceleration(rows, q, v, bodies.plant.arrange(c), water_of(tank))
+
+    return jax.jit(share_once(run), compiler_options=QUICK)
+
+
 def mixed_acceleration(robots, capacity, each, arrays):
     """`step.acceleration` of all robots side by side, in float64."""
-    tank = robots[0].world
     with jax.enable_x64(True):
-
-        def run(bodies, q, v, c):
-            rows = Rows(tank, capacity, bodies)
-            return acceleration(rows, q, v, bodies.plant.arrange(c), water_of(tank))
-
-        jitted = jax.jit(share_once(run), compiler_options=QUICK)
+        jitted = accelerator(robots[0].world, capacity)
         return np.asarray(jitted(pack(robots, capacity, each), *map(jnp.asarray, arrays)))
+
+
+def alike_acceleration(robot, capacity, arrays):
+    """The same of one robot in all lanes: a program for any body that there is room for."""
+    with jax.enable_x64(True):
+        jitted = accelerator(robot.world, capacity)
+        return np.asarray(jitted(pack([robot], capacity, 1), *map(jnp.asarray, arrays)))
 
 
 @pytest.mark.parametrize(
@@ -103,11 +115,13 @@ def test_accelerations_are_those_of_each_body_alone(name):
     arrays, own = states(robots, capacity, 4, depth)
     found = mixed_acceleration(robots, capacity, 4, arrays)
     for k, (robot, (q, v, c)) in enumerate(zip(robots, own, strict=True)):
-        here = found[:, 4 * k : 4 * k + 4]
+        lanes = slice(4 * k, 4 * k + 4)
+        alike = alike_acceleration(robot, capacity, [x[:, lanes] for x in arrays])
         expected = accelerate(robot, q, v, c)
         scale = np.abs(expected).max(0)
-        assert np.all(np.abs(here[: len(v)] - expected).max(0) < 1e-9 * scale), k
-        assert np.all(here[len(v) :] == 0)
+        for here in (found[:, lanes], alike):
+            assert np.all(np.abs(here[: len(v)] - expected).max(0) < 1e-9 * scale), k
+            assert np.all(here[len(v) :] == 0)
 
 
 @pytest.mark.slow
@@ -183,7 +197,8 @@ def test_a_trajectory_is_that_of_the_body_alone():
     with jax.enable_x64(True):
 
         def run(bodies, qpos, qvel, ctrl):
-            engine = make_step_engine(Rows(tank, capacity, bodies), bodies.plant)
+            rows = make_rows(tank, capacity, bodies, qpos.shape[-1])
+            engine = make_step_engine(rows, bodies.plant)
             asked = engine.plant.arrange(ctrl)
             return roll_out(
                 engine,
@@ -199,14 +214,19 @@ def test_a_trajectory_is_that_of_the_body_alone():
             )[1]
 
         jitted = jax.jit(run, compiler_options=QUICK)
-        kept = jitted(pack(robots, capacity, each), *map(jnp.asarray, (qpos, qvel, ctrl)))
-        q, v, work = map(np.asarray, kept)
+        start = [jnp.asarray(x) for x in (qpos, qvel, ctrl)]
+        mixed = jitted(pack(robots, capacity, each), *start)
+        alike = []
+        for k, robot in enumerate(robots):
+            here = slice(each * k, each * (k + 1))
+            alike.append(jitted(pack([robot], capacity, 1), *(x[:, here] for x in start)))
     for k, (robot, (q0, v0, c0)) in enumerate(zip(robots, own, strict=True)):
         _, q1, v1, work1 = march(robot, 0.5, q0, v0, c0, every=10)
         here = slice(each * k, each * (k + 1))
-        assert q[:, : len(q0), here] == pytest.approx(q1, abs=1e-7)
-        assert v[:, : len(v0), here] == pytest.approx(v1, abs=1e-5)
-        assert work[:, here] == pytest.approx(work1, abs=1e-8)
+        for q, v, work in ([np.asarray(x)[..., here] for x in mixed], map(np.asarray, alike[k])):
+            assert q[:, : len(q0)] == pytest.approx(q1, abs=1e-7)
+            assert v[:, : len(v0)] == pytest.approx(v1, abs=1e-5)
+            assert work == pytest.approx(work1, abs=1e-8)
 
 
 # ------------------------------------------------------------------------- scores
@@ -259,6 +279,32 @@ def test_scores_are_those_of_each_body_alone(config, fitness, tmp_path):
     # Nor on whether they all happen to have its body.
     snakes = fitness([robots[1]] * 5, swapped.at[1:].set(0.0), key)
     assert np.asarray(snakes)[0] == np.asarray(scores)[1]
+    assert np.asarray(fitness([robots[1]], swapped[:1], key))[0] == np.asarray(scores)[1]
+
+
+@pytest.mark.slow
+def test_a_body_with_a_population_of_its_own(config, fitness):
+    """One body for all, or several with as many individuals each: as if they were side by side."""
+    robots = [fitness.build(random_body(3, 6)), fitness.build(body("snake"))]
+    key, genes = jax.random.key(4), jax.random.normal(jax.random.key(5), (2, 3, fitness.num_genes))
+    scores, measures = fitness.evaluate(robots, genes, key)
+    assert scores.shape == measures["speed_m_s"].shape == (2, 3)
+    pick = [robots[k] for k in (0, 0, 0, 1, 1, 1)]
+    mixed, more = fitness.evaluate(pick, genes.reshape(6, -1), key)
+    assert np.ravel(scores) == pytest.approx(np.asarray(mixed), abs=1e-5)
+    assert np.std(mixed) > 1e-3
+    for name, values in more.items():
+        assert np.ravel(measures[name]) == pytest.approx(np.asarray(values), abs=1e-4), name
+    # One program for any body, and bits that do not depend on who is beside.
+    alone, _ = fitness.evaluate(robots[1], genes[1], key)
+    compiled = fitness.setup._jitted._cache_size()
+    assert np.array_equal(alone, scores[1])
+    again = fitness(robots[0], genes[0].at[1:].set(0.0), key)
+    assert fitness.setup._jitted._cache_size() == compiled
+    assert again[0] == scores[0, 0] and again[1] != scores[0, 1]
+    # Tables as well as robots.
+    assert np.array_equal(fitness(fitness.pack(robots), genes, key), scores)
+    assert np.array_equal(fitness(fitness.pack(robots[1:]), genes[1], key), alone)
 
 
 OWN = """
@@ -356,7 +402,11 @@ def test_what_it_cannot_do_is_refused_by_name(config, fitness):
         ),
         (
             lambda: fitness([], np.zeros((2, 3)), None),
-            f"population: expected [P, {fitness.num_genes}]; found [2, 3]",
+            f"population: expected [P, {fitness.num_genes}] or [B, P, {fitness.num_genes}]; found",
+        ),
+        (
+            lambda: fitness([fitness.build(body("snake"))], np.stack([zeros, zeros]), None),
+            "robots: expected 2, one each; found 1",
         ),
     ]
     for make, message in cases:
