@@ -13,8 +13,8 @@ their sake; tests/test_xla.py notices if they lose their effect; results do not 
    steps are cut into several functions. The loop over time stays outside (`fused_scan`): inside, it
    would be a tenth faster, but LLVM takes twice as long, as it forgets all that it knows of it with
    every inner loop that it turns. XLA:CPU aborts ("All or none of the slices should have an
-   explicit index") over such a function that has a parameter which nothing in it uses, as a loop of unknown
-   length leaves them: so what no result needs is left out.
+   explicit index") over such a function that has a parameter which nothing in it uses, as a loop
+   of unknown length leaves them: so what no result needs is left out.
 
 Both are plain identities to JAX: jit, vmap and grad go through them. On other back ends they are
 left out.
