@@ -10,19 +10,31 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-from experiments.common import ROOT
+import numpy as np
+
+from experiments.common import ROOT, shown
+from experiments.statistics import COVERAGE, difference, holm, interval, rank_test
 from experiments.studies import (
     BASE,
     Case,
+    Outcome,
+    by_case,
+    describe_runs,
+    fill,
     given_settings,
     make_plans,
     read_outcomes,
     run_study,
     study_parser,
+    write_csv,
 )
+from experiments.study_pictures import draw_curves, draw_dots, plot_bodies
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.plots import WIDE, figure_png, new_figure
 
 ROBOTS = ("spider", "gecko", "snake", "centipede", "fish")
 BRAINS = 64  # CMA-ES's population for one body: as many lanes as the step takes at a time, a choice
@@ -70,6 +82,98 @@ def make_cases(settings: Sequence[str] = ()) -> dict[str, Case]:
     }
 
 
+# --- the report -----------------------------------------------------------------------------------
+
+_INTRODUCTION = """# Co-evolution beside random search and hand-made bodies
+
+All swim in the lake and get equally many trials, in which the score is the net horizontal speed
+[body lengths/s]. Made by `python -m experiments.budgets`, which repeats it;
+`experiments/studies.yaml` has what all runs share. Champions are judged on sixteen fresh starts.
+"""
+
+
+def describe_difference(name: str, values: Sequence[float], others: Sequence[float]) -> str:
+    """Co-evolution beside another case.
+
+    Args:
+        name: of the other case.
+        values: scores of co-evolution's champions.
+        others: of the other case's.
+
+    Returns:
+        A row of a table in Markdown, but for its last cell.
+    """
+    found = difference(values, others)
+    zero = "no" if found.low > 0 or found.high < 0 else "yes"
+    return f"| `coevolution` − `{name}` | {found} | {zero if np.isfinite(found.low) else '–'} |"
+
+
+def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
+    """Writes `budgets.md`, its pictures and `budgets.csv`.
+
+    Args:
+        folder: where.
+        outcomes: of the finished runs.
+
+    Returns:
+        What was found, in lines.
+    """
+    known = make_cases()
+    cases = by_case(outcomes, known)
+    scores = {name: [o.champion["score"] for o in found] for name, found in cases.items()}
+    made = [name for name in cases if name in ROBOTS]
+    best = max(made, key=lambda name: interval(scores[name]).mean, default=None)
+    lines = []
+    if "coevolution" in cases:
+        ours = scores["coevolution"]
+        others = [name for name in ("random_search", best) if name in cases]
+        p = holm([rank_test(ours, scores[name]) for name in others])
+        lines = ["| | difference of means | holds 0 | p |", "|---|---|---|---|"]
+        lines += [
+            f"{describe_difference(name, ours, scores[name])} {value:.2g} |"
+            for name, value in zip(others, p, strict=True)
+        ]
+    fastest = max(outcomes, key=lambda o: o.champion["score"])
+    text = [
+        _INTRODUCTION,
+        *describe_runs(cases, known),
+        "",
+        *(
+            [f"The best hand-made body is the `{best}`, by its own scores here.", ""]
+            if best
+            else []
+        ),
+        *lines,
+        "",
+        f"The fastest of all: {fastest.champion['score']:.3g} body lengths/s, "
+        f"`{fastest.plan.case}`, seed {fastest.plan.seed}.",
+        "",
+        fill(
+            f"{COVERAGE} p is Mann's and Whitney's test, by permutations and Holm's correction. The "
+            "hand-made body is chosen by the scores that it is then judged by, which is in its favour. "
+            "The fish has a fin, which co-evolution has not."
+        ),
+        "",
+        "![scores over trials, and champions'](budgets.png)",
+        "",
+        "Left: the best score so far, on the starts that it was found on, which flatters."
+        " Right: champions.",
+        "",
+        "![champions' bodies](budgets_bodies.png)",
+    ]
+    figure = new_figure(WIDE + 3, 4.4)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    draw_curves(left, cases, "best score so far (body lengths/s)")
+    draw_dots(right, scores, "champions on fresh starts (body lengths/s)")
+    write_atomic(folder / "budgets.png", figure_png(figure))
+    bodies = plot_bodies({name: cases[name] for name in EVOLVED if name in cases} or cases)
+    write_atomic(folder / "budgets_bodies.png", figure_png(bodies))
+    rows = [{"case": o.plan.case, "seed": o.plan.seed, **o.champion} for o in outcomes]
+    write_csv(folder / "budgets.csv", rows)
+    write_atomic(folder / "budgets.md", ("\n".join(text) + "\n").encode())
+    return lines
+
+
 def main(argv: list[str] | None = None) -> int:
     """Runs the study, and reports it."""
     argv = sys.argv[1:] if argv is None else argv
@@ -78,7 +182,9 @@ def main(argv: list[str] | None = None) -> int:
     folder, plans = make_plans(make_cases(given_settings(options)), options, "budgets")
     if not options.report and (code := run_study(plans, "budgets", argv)):
         return code
-    read_outcomes(plans)
+    outcomes = read_outcomes(plans)
+    print("\n".join(write_report(folder, outcomes)))
+    print(f"{len(outcomes)} of {len(plans)} runs; written: budgets.md in {shown(folder)}")
     return 0
 
 

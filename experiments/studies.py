@@ -7,20 +7,24 @@ Runs that are finished are left alone, so a study is continued by starting it ag
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import json
 import os
 import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from experiments.common import ROOT, make_folder, make_parser, shown
+from experiments.statistics import interval
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.config import Config, load_config
@@ -29,6 +33,7 @@ from mjx_revolve.evolution.runs import Run, open_run
 from mjx_revolve.evolution.start import check_unchanged
 from mjx_revolve.inputs.commands import Parser, whole
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import write_atomic
 
 BASE = Path(__file__).with_name("studies.yaml")
 COMMAND = (sys.executable, "-m", "mjx_revolve.evolve")
@@ -346,3 +351,43 @@ def _read_outcome(plan: Plan, run: Run, add: Callable[[str, Figures], Figures]) 
 def _lines(path: Path) -> list[dict]:
     """JSON, a value per line."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list[Outcome]]:
+    """Outcomes by case, in the order of the cases; those without any are left out."""
+    found = {name: [o for o in outcomes if o.plan.case == name] for name in cases}
+    return {name: some for name, some in found.items() if some}
+
+
+def describe_runs(cases: Mapping[str, Sequence[Outcome]], known: Mapping[str, Case]) -> list[str]:
+    """A table in Markdown: what was run, how often, for how long, and the champions' scores.
+
+    Args:
+        cases: outcomes by case.
+        known: the cases by name.
+
+    Returns:
+        Its lines.
+    """
+    lines = ["| | what | seeds | trials each | s each | champions' score |", f"|{'---|' * 6}"]
+    for name, outcomes in cases.items():
+        tried = sorted({f"{int(o.metrics['evaluations'][-1]):,}" for o in outcomes})
+        seconds = np.mean([o.metrics["seconds"][-1] for o in outcomes])
+        score = interval([o.champion["score"] for o in outcomes])
+        cells = (known[name].words, str(len(outcomes)), " or ".join(tried), f"{seconds:.0f}")
+        lines.append(f"| `{name}` | {' | '.join(cells)} | {score} |")
+    return lines
+
+
+def fill(text: str) -> str:
+    """A paragraph of Markdown in lines of the width of our pages."""
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """Rows as CSV, whole or not at all; what a row lacks stays empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)))
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomic(path, text.getvalue().encode())
