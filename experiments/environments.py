@@ -197,8 +197,8 @@ _INTRODUCTION = """# Bodies evolved in four environments
 
 What becomes of bodies and gaits where the water is deep, shallow, or moves, and on the ground? Made
 by `python -m experiments.environments`, which repeats it; `experiments/studies.yaml` has what all
-runs have in common. All of it is simulated, in small runs: bodies were still improving when the
-runs ended, and other budgets may give other bodies.
+runs have in common. The runs are small (the last plot shows whether they were still improving), and
+all of it is simulated: larger budgets or other laws of the water may give other bodies.
 """
 _NOTES = """Speeds and gaits of champions are means over sixteen fresh starts; those of populations
 are as their last lives went, each with the best of its trials, so they flatter. The speed through

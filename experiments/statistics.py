@@ -5,12 +5,13 @@ A value is a seed's; individuals of one run are relatives and no further evidenc
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import combinations
 from math import comb
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import stats
 
 LEVEL = 0.95  # of intervals
@@ -63,12 +64,12 @@ class Comparison(NamedTuple):
     pairs: Mapping[tuple[str, str], float]
 
 
-def _finite(values: Sequence[float]) -> np.ndarray:
+def _finite(values: ArrayLike) -> np.ndarray:
     x = np.asarray(values, float)
     return x[np.isfinite(x)]
 
 
-def interval(values: Sequence[float]) -> Interval:
+def interval(values: ArrayLike) -> Interval:
     """Mean and its interval, a percentile bootstrap (Efron 1979).
 
     Args:
@@ -83,7 +84,7 @@ def interval(values: Sequence[float]) -> Interval:
     return Interval(float(x.mean()), *_bootstrap((x,), lambda x, axis: x.mean(axis)))
 
 
-def difference(values: Sequence[float], others: Sequence[float]) -> Interval:
+def difference(values: ArrayLike, others: ArrayLike) -> Interval:
     """Difference of two means and its interval, both groups resampled.
 
     Args:
@@ -114,7 +115,7 @@ def _bootstrap(samples: tuple, statistic: object) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
-def rank_test(values: Sequence[float], others: Sequence[float]) -> float:
+def rank_test(values: ArrayLike, others: ArrayLike) -> float:
     """Two-sided p of Mann's and Whitney's test.
 
     By permutations, so that it is exact for few values and bears equal ones.
@@ -138,7 +139,7 @@ def smallest_p(count: int, other: int, pairs: int = 1) -> float:
     return min(1.0, 2 * pairs / comb(count + other, count))
 
 
-def holm(p: Sequence[float]) -> list[float]:
+def holm(p: ArrayLike) -> list[float]:
     """Holm's correction for several tests (Scandinavian Journal of Statistics 6, 1979).
 
     Args:
@@ -147,15 +148,15 @@ def holm(p: Sequence[float]) -> list[float]:
     Returns:
         p of each, so that less than α of them is wrong with probability α at most over all tests.
     """
+    p = np.asarray(p, float)
     order = np.argsort(p, kind="stable")
-    found, highest = [0.0] * len(p), 0.0
-    for rank, k in enumerate(order.tolist()):
-        highest = max(highest, min(1.0, (len(p) - rank) * p[k]))
-        found[k] = highest
-    return found
+    corrected = np.maximum.accumulate(np.arange(len(p), 0, -1) * p[order])
+    found = np.empty_like(p)
+    found[order] = np.minimum(corrected, 1.0)
+    return found.tolist()
 
 
-def compare(groups: Mapping[str, Sequence[float]]) -> Comparison:
+def compare(groups: Mapping[str, ArrayLike]) -> Comparison:
     """Tests whether groups differ, and which.
 
     Args:

@@ -59,15 +59,13 @@ class Plan(NamedTuple):
         case: the name of its case.
         seed: its seed.
         folder: its run folder.
-        settings: what replaces values of the configuration.
-        base: the configuration's file.
+        settings: what replaces values of `BASE`.
     """
 
     case: str
     seed: int
     folder: Path
     settings: tuple[str, ...]
-    base: Path = BASE
 
     @property
     def name(self) -> str:
@@ -81,7 +79,7 @@ class Plan(NamedTuple):
         Raises:
             InputError: it is wrong.
         """
-        return load_config(self.base, [*self.settings, f"evolution.seed={self.seed}"])
+        return load_config(BASE, [*self.settings, f"evolution.seed={self.seed}"])
 
 
 class Outcome(NamedTuple):
@@ -143,7 +141,7 @@ def given_settings(options: argparse.Namespace) -> tuple[str, ...]:
 
 
 def make_plans(
-    cases: Mapping[str, Case], options: argparse.Namespace, name: str, base: Path = BASE
+    cases: Mapping[str, Case], options: argparse.Namespace, name: str
 ) -> tuple[Path, list[Plan]]:
     """The evolutions of a study, the first seeds of all cases first.
 
@@ -151,7 +149,6 @@ def make_plans(
         cases: what is compared.
         options: from `study_parser`.
         name: of the experiment's module.
-        base: the configuration that all have in common.
 
     Returns:
         The study's folder, and the plans.
@@ -162,7 +159,7 @@ def make_plans(
     folder = make_folder(options.out, name).resolve()
     given = given_settings(options)
     return folder, [
-        Plan(case, seed, folder / case / f"seed_{seed}", (*given, *cases[case].settings), base)
+        Plan(case, seed, folder / case / f"seed_{seed}", (*given, *cases[case].settings))
         for seed in range(options.seeds)
         for case in options.only
     ]
@@ -203,7 +200,7 @@ def next_command(plan: Plan) -> list[str] | None:
             return ["--resume", str(folder), "--set", f"evolution.generations={length}"]
         shutil.rmtree(folder)
     settings = [word for setting in plan.settings for word in ("--set", setting)]
-    new = [str(plan.base), "--seed", str(plan.seed), "--out", str(folder)]
+    new = [str(BASE), "--seed", str(plan.seed), "--out", str(folder)]
     return [*new, *settings]
 
 
