@@ -108,12 +108,8 @@ class Setup:
             key: draws the episodes' starts and water, the same for every individual.
 
         Returns:
-<<<<<<< HEAD
-            `[P]` scores and `[P]` measures (see `measures.measure`), means over the episodes.
-=======
-            Scores `[P]` or `[B, P]` and measures (see `tasks.measure`) likewise, means over the
+            Scores `[P]` or `[B, P]` and measures (see `measures.measure`) likewise, means over the
             episodes.
->>>>>>> cf31c1c (Rows in loops that end with the body, copied as blocks; a chunk of one body has tables of one lane)
 
         Raises:
             InputError: the population has another shape, there are no genes to evolve, or the key

@@ -38,7 +38,7 @@ from mjx_revolve.inputs.errors import InputError
 
 # Random bodies by which it is chosen how many parts a row of the tables holds. A choice.
 _EXAMPLES = 64
-# From which share of real individuals on a block is better filled up than shared: one body by itself
+# From which share of real individuals on a block is better filled up than shared: a body by itself
 # takes three quarters of the time, or less.
 _WORTH = 0.75
 # Compiled bodies that are remembered. A choice: some megabytes.

@@ -1,0 +1,300 @@
+"""Bodies and brains evolved in four environments, and how they differ: the thesis's question.
+
+``python -m experiments.environments [--seeds N] [--only NAME,...] [--generations N] [--report]``
+
+Each run is an ordinary run folder. Stopped by Ctrl-C, it goes on when it is started again; see
+`studies.py`. What all runs have in common stands in `studies.yaml`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from scipy import stats
+
+from experiments.common import shown
+from experiments.statistics import (
+    ALPHA,
+    COVERAGE,
+    Comparison,
+    compare,
+    interval,
+    smallest_p,
+)
+from experiments.studies import (
+    Case,
+    Figures,
+    Outcome,
+    by_case,
+    describe_runs,
+    fill,
+    make_plans,
+    read_outcomes,
+    run_study,
+    study_parser,
+    write_csv,
+)
+from experiments.study_pictures import draw_curves, plot_bodies, plot_dots
+from mjx_revolve.body.descriptors import UNITS
+from mjx_revolve.episodes.measure_table import MEASURES
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.plots import WIDE, figure_png, new_figure
+
+CURRENT = 0.05  # m/s along x, of `current`; about what a small swimmer can keep up with, a choice
+# A pond in which neither surface nor bed is further than 0.3 m from the start; both slope together
+# 2 m away. Choices, of a robot's size.
+_POND = "{kind: lake, height: -0.6, highest: 0.3, extent: 6.0}"
+
+ENVIRONMENTS: dict[str, Case] = {
+    "open_water": Case(
+        "deep, still water: `empty_underwater`, 2 m below the surface",
+        ("world=empty_underwater",),
+    ),
+    "shore": Case(
+        "a pond 0.6 m deep whose shore is 2 m away, halfway between surface and bed",
+        (f"world={{name: lake, bed: {_POND}}}", "task.depth=0.3"),
+    ),
+    "bed": Case(
+        "on the lake's bed; bodies are not trimmed, so they sink",
+        ("world=lake", "trim=none", "task.type=crawl"),
+    ),
+    "current": Case(
+        f"2 m below the lake's surface in a current of {CURRENT:g} m/s; progress against it counts",
+        (
+            f"world={{name: lake, current: [{CURRENT:g}, 0, 0]}}",
+            "task.type=directed_swim",
+            "task.direction=[-1, 0, 0]",
+        ),
+    ),
+}
+
+
+def through_water(case: str, figures: Figures) -> Figures:
+    """The score as a speed through the water: what the current takes is added.
+
+    Args:
+        case: the environment.
+        figures: of an individual.
+
+    Returns:
+        `water_speed_bl_s` [body lengths/s].
+    """
+    taken = CURRENT / figures["length"] if case == "current" else 0.0
+    return {"water_speed_bl_s": figures["score"] + taken}
+
+
+# --- the report -----------------------------------------------------------------------------------
+
+# What is compared: how they move, and what they are like. The CSV file has all other figures.
+_GAIT = (
+    "water_speed_bl_s", "gait_frequency_hz", "gait_phase_spread_rad", "joint_amplitude_rad",
+    "straightness", "energy_j", "cost_of_transport", "bed_contact",
+)  # fmt: skip
+_BODY = (
+    "num_modules", "num_hinges", "length", "limbs", "branching", "proportion", "symmetry",
+    "height_base_ratio",
+)  # fmt: skip
+FIGURES: dict[str, str] = {
+    "water_speed_bl_s": "speed through the water (body lengths/s)",
+    **{name: f"{MEASURES[name].words} ({MEASURES[name].unit})" for name in _GAIT[1:]},
+    **{name: f"{name.removeprefix('num_').replace('_', ' ')} ({UNITS[name]})" for name in _BODY},
+}
+"""What is compared, and what it is called, with its unit."""
+_WHOSE = {"champion": "champions", "population": "final populations"}
+
+
+class Compared(NamedTuple):
+    """A figure in all environments.
+
+    Attributes:
+        name: of the figure.
+        values: of the seeds, by environment.
+        p: of Kruskal's and Wallis's test, corrected over all figures of a table (see `_TESTS`).
+        comparison: the tests.
+    """
+
+    name: str
+    values: Mapping[str, Sequence[float]]
+    p: float
+    comparison: Comparison
+
+    @property
+    def differs(self) -> list[tuple[str, str]]:
+        """Environments that differ, the larger mean first."""
+        if self.p >= ALPHA:
+            return []
+        mean = {name: interval(values).mean for name, values in self.values.items()}
+        pairs = [pair for pair, p in self.comparison.pairs.items() if p < ALPHA]
+        return [(a, b) if mean[a] >= mean[b] else (b, a) for a, b in pairs]
+
+
+def compare_figures(cases: Mapping[str, Sequence[Outcome]], whose: str) -> list[Compared]:
+    """Compares environments, figure by figure.
+
+    Args:
+        cases: outcomes by environment.
+        whose: `champion` or `population`.
+
+    Returns:
+        The figures, in the order of the report.
+    """
+    tables = {
+        name: {case: [getattr(o, whose)[name] for o in found] for case, found in cases.items()}
+        for name in FIGURES
+    }
+    compared = {name: compare(values) for name, values in tables.items()}
+    corrected = stats.false_discovery_control([c.p for c in compared.values()])
+    return [
+        Compared(name, values, p, compared[name])
+        for (name, values), p in zip(tables.items(), corrected, strict=True)
+    ]
+
+
+def describe_differences(figures: Sequence[Compared], whose: str) -> list[str]:
+    """Sentences on figures that differ significantly, and on nothing else.
+
+    Args:
+        figures: from `compare_figures`.
+        whose: who they are of, in words.
+
+    Returns:
+        Lines of Markdown.
+    """
+    lines = []
+    for figure in figures:
+        mean = {name: interval(values).mean for name, values in figure.values.items()}
+        for larger in mean:
+            rest = [b for a, b in figure.differs if a == larger]
+            if rest:
+                others = ", ".join(f"`{name}` ({mean[name]:.3g})" for name in rest)
+                lines.append(
+                    f"- {FIGURES[figure.name]} of {whose}: larger in `{larger}` "
+                    f"({mean[larger]:.3g}) than in {others}"
+                )
+    return lines or [f"- No figure of {whose} tells two environments apart."]
+
+
+def tabulate(figures: Sequence[Compared]) -> list[str]:
+    """A table in Markdown: figures by environment, and whether these differ at all."""
+    names = list(figures[0].values)
+    lines = [
+        f"| | {' | '.join(f'`{name}`' for name in names)} | p |",
+        f"|---|{'---|' * len(names)}---|",
+    ]
+    for figure in figures:
+        cells = [str(interval(figure.values[name])) for name in names]
+        p = "< .001" if figure.p < 1e-3 else f"{figure.p:.3f}".removeprefix("0")
+        mark = f"**{p}**" if figure.p < ALPHA else p
+        lines.append(f"| {FIGURES[figure.name]} | {' | '.join(cells)} | {mark} |")
+    return lines
+
+
+_INTRODUCTION = """# Bodies evolved in four environments
+
+What becomes of bodies and gaits where the water is deep, shallow, or moves, and on the ground? Made
+by `python -m experiments.environments`, which repeats it; `experiments/studies.yaml` has what all
+runs have in common. The runs are small (the last plot shows whether they were still improving), and
+all of it is simulated: larger budgets or other laws of the water may give other bodies.
+"""
+_NOTES = """Speeds and gaits of champions are means over sixteen fresh starts; those of populations
+are as their last lives went, each with the best of its trials, so they flatter. The speed through
+the water is the score, which counts what the environment's task asks for, and what the current
+takes. `docs/measures.md` has the formulas, `environments.csv` all other figures."""
+
+
+_TESTS = f"""{COVERAGE} p in the tables is Kruskal's and Wallis's test over all environments; over
+the figures of a table it is corrected after Benjamini and Hochberg, so that one in twenty of those
+below {{alpha:.2g}} is expected to be there by chance. Pairs are tested by Mann's and Whitney's
+test, by permutations, with Holm's correction over the pairs of a figure; with so few seeds its p is
+{{least:.2g}} at the least. A difference is said in words only where both are below {{alpha:.2g}};
+that nothing is said of a figure does not mean that it is the same."""
+
+
+def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
+    """Writes `environments.md`, its pictures and `environments.csv`.
+
+    Args:
+        folder: where.
+        outcomes: of the finished runs.
+
+    Returns:
+        What was found, in lines.
+    """
+    cases = by_case(outcomes, ENVIRONMENTS)
+    compared = {whose: compare_figures(cases, whose) for whose in _WHOSE}
+    words = [
+        line
+        for whose, figures in compared.items()
+        for line in describe_differences(figures, _WHOSE[whose])
+    ]
+    counts = sorted(map(len, cases.values()))
+    pairs = len(cases) * (len(cases) - 1) // 2
+    least = smallest_p(counts[0], counts[min(1, len(counts) - 1)], max(1, pairs))
+    text = [
+        _INTRODUCTION,
+        *describe_runs(cases, ENVIRONMENTS),
+        "",
+        "## What differs",
+        "",
+        *words,
+        "",
+        fill(_TESTS.format(least=least, alpha=ALPHA)),
+        "",
+        "![champions' bodies](environments_bodies.png)",
+        "",
+        "## Champions",
+        "",
+        *tabulate(compared["champion"]),
+        "",
+        fill(_NOTES),
+        "",
+        "![figures of champions](environments_figures.png)",
+        "",
+        "## Final populations",
+        "",
+        "Each seed counts with the mean over its last population.",
+        "",
+        *tabulate(compared["population"]),
+        "",
+        "## How they got there",
+        "",
+        "The best score so far, on the starts that it was found on, which flatters.",
+        "",
+        "![learning curves](environments_curves.png)",
+    ]
+    curves = new_figure(WIDE, 4.2)
+    draw_curves(curves.subplots(), cases, "best score so far (body lengths/s)")
+    panels = {FIGURES[figure.name]: figure.values for figure in compared["champion"]}
+    pictures = {"bodies": plot_bodies(cases), "figures": plot_dots(panels), "curves": curves}
+    for name, picture in pictures.items():
+        write_atomic(folder / f"environments_{name}.png", figure_png(picture))
+    rows = [
+        {"environment": o.plan.case, "seed": o.plan.seed, "of": whose, **getattr(o, whose)}
+        for o in outcomes
+        for whose in _WHOSE
+    ]
+    write_csv(folder / "environments.csv", rows)
+    write_atomic(folder / "environments.md", ("\n".join(text) + "\n").encode())
+    return words
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the study, and reports it."""
+    argv = sys.argv[1:] if argv is None else argv
+    parser = study_parser("environments", "Bodies evolved in four environments.", ENVIRONMENTS)
+    options = parser.parse_args(argv)
+    folder, plans = make_plans(ENVIRONMENTS, options, "environments")
+    if not options.report and (code := run_study(plans, "environments", argv)):
+        return code
+    outcomes = read_outcomes(plans, through_water)
+    print("\n".join(write_report(folder, outcomes)))
+    print(f"{len(outcomes)} of {len(plans)} runs; written: environments.md in {shown(folder)}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main))

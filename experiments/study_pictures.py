@@ -1,0 +1,129 @@
+"""Plots of studies: curves over trials, a dot for each seed, champions' bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.statistics import interval
+from experiments.studies import Outcome
+from mjx_revolve.view.pieces import rest_scene
+from mjx_revolve.view.plots import COLORS, WIDE, dress, head, new_figure
+from mjx_revolve.view.raster import draw_scene, make_view
+
+Cases = Mapping[str, Sequence[Outcome]]
+_VIEW = make_view(-58.0, 30.0)
+_PIXELS = 260  # along the largest body; a choice, for small files
+
+
+def color_of(k: int) -> str:
+    """Of the k-th case, in all plots."""
+    return COLORS[k % len(COLORS)]
+
+
+def draw_curves(axes: Axes, cases: Cases, label: str) -> None:
+    """The best so far over trials: a thin line for each seed, a thick one for their mean.
+
+    Args:
+        axes: where.
+        cases: outcomes by case.
+        label: of the scores.
+    """
+    for k, (name, outcomes) in enumerate(cases.items()):
+        curves = [(o.metrics["evaluations"], o.metrics["champion"]) for o in outcomes]
+        for x, y in curves:
+            axes.plot(x, y, color=color_of(k), lw=0.7, alpha=0.35)
+        end = min(x[-1] for x, _ in curves)
+        grid = np.unique(np.concatenate([x for x, _ in curves]))
+        grid = grid[(grid <= end) & (grid >= max(x[0] for x, _ in curves))]
+        mean = np.mean([np.interp(grid, x, y) for x, y in curves], 0)
+        axes.plot(grid, mean, color=color_of(k), lw=2.2, label=f"{name} (n = {len(curves)})")
+    dress(axes)
+    axes.set(xlabel="trials", ylabel=label)
+    axes.legend(loc="best", fontsize="small", frameon=False)
+
+
+def draw_dots(axes: Axes, groups: Mapping[str, Sequence[float]], title: str) -> None:
+    """A dot for each seed, and beside it mean and interval.
+
+    Args:
+        axes: where.
+        groups: values by case.
+        title: of the axes.
+    """
+    for k, values in enumerate(groups.values()):
+        spread = np.linspace(-0.16, 0.16, len(values)) if len(values) > 1 else [0.0]
+        axes.plot(k - 0.1 + np.array(spread), values, ".", color=color_of(k), ms=6, alpha=0.7)
+        found = interval(values)
+        place = k + 0.25
+        axes.plot([place], [found.mean], "_", color=color_of(k), ms=9, mew=2)
+        if np.isfinite(found.low):
+            axes.plot([place, place], [found.low, found.high], color=color_of(k), lw=1.6)
+    dress(axes)
+    head(axes, title)
+    axes.set_xticks(range(len(groups)), [name.replace("_", "\n") for name in groups], fontsize=8)
+    axes.set_xlim(-0.5, len(groups) - 0.5)
+
+
+def plot_dots(panels: Mapping[str, Mapping[str, Sequence[float]]], columns: int = 3) -> Figure:
+    """Panels of `draw_dots`.
+
+    Args:
+        panels: groups by title.
+        columns: beside each other.
+
+    Returns:
+        The figure.
+    """
+    lines = -(-len(panels) // columns)
+    figure = new_figure(WIDE, 2.1 * lines)
+    grid = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axes, (title, groups) in zip(grid, panels.items(), strict=False):
+        draw_dots(axes, groups, title)
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def plot_bodies(cases: Cases) -> Figure:
+    """The champions at rest, with their scores, all in one scale: a line for each case.
+
+    Args:
+        cases: outcomes by case.
+
+    Returns:
+        The figure.
+    """
+    scenes = {name: [rest_scene(o.body) for o in found] for name, found in cases.items()}
+    corners = [s.corners.reshape(-1, 3) @ _VIEW[:2].T for row in scenes.values() for s in row]
+    wide, tall = 1.06 * np.max([np.ptp(points, axis=0) for points in corners], axis=0)
+    columns = max(map(len, scenes.values()))
+    figure = new_figure(WIDE, (WIDE / columns * tall / wide + 0.3) * len(cases))
+    grid = figure.subplots(len(cases), columns, squeeze=False)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for k, (line, (name, found)) in enumerate(zip(grid, cases.items(), strict=True)):
+        for axes, outcome, scene in zip(line, found, scenes[name], strict=False):
+            points = scene.corners.reshape(-1, 3) @ _VIEW[:2].T
+            low, high = points.min(0), points.max(0)
+            image, extent = draw_scene(scene, _VIEW, low, high, wide / _PIXELS)
+            axes.imshow(image, extent=extent, origin="lower", interpolation="bilinear")
+            x, y = (low + high) / 2
+            axes.set(xlim=(x - wide / 2, x + wide / 2), ylim=(y - tall / 2, y + tall / 2))
+            words = f"seed {outcome.plan.seed}: {outcome.champion['score']:.3g}"
+            axes.set_title(words, fontsize=7, color="#333333")
+        # Left of the line's first body.
+        line[0].text(
+            -0.02, 0.5, name.replace("_", " "), transform=line[0].transAxes, rotation=90,
+            ha="right", va="center", fontsize=10, color=color_of(k), fontweight="bold",
+        )  # fmt: skip
+    bar = 0.1 if wide < 0.8 else 0.2  # m
+    left, low = grid[-1][0].get_xlim()[0], grid[-1][0].get_ylim()[0]
+    grid[-1][0].plot([left, left + bar], [low, low], color="#333333", lw=3, clip_on=False)
+    grid[-1][0].text(
+        left + bar / 2, low + 0.02 * tall, f"{bar:g} m", fontsize=7, ha="center", va="bottom"
+    )
+    return figure
