@@ -1,4 +1,4 @@
-"""An episode to look at: a run's champion, or a morphology that is dropped into the water.
+"""An episode to look at: of a run's champion, of anybody who lived there, or of a morphology.
 
 Replays, reports and exports all start here, so that each shows the same swim: the first of the
 fresh starts on which the champion was judged.
@@ -6,6 +6,8 @@ fresh starts on which the champion was judged.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +18,14 @@ import numpy as np
 from mjx_revolve.body.morphology import load_morphology, trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.config import Config, load_config
-from mjx_revolve.episodes.fitness import Fitness, make_fitness
+from mjx_revolve.episodes.fitness import (
+    Fitness,
+    fit_body,
+    make_fitness,
+    make_mixed_fitness,
+    read_modules,
+)
+from mjx_revolve.episodes.lives import Life, find_lives
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import gusty_water
@@ -38,7 +47,8 @@ class Episode:
         title: a few words to head a picture.
         robot: the compiled robot; its world is `robot.world`.
         trajectory: what it did.
-        score: the champion's mean score over fresh starts, or None.
+        score: its mean score, or None.
+        starts: over which starts that is.
         score_unit: of the score, e.g. "body lengths/s"; "" without one.
         water: surface and current along the way, where they are not just the world's.
         genes: `[G]` or None without a controller.
@@ -50,6 +60,7 @@ class Episode:
     robot: Robot
     trajectory: Trajectory
     score: float | None = None
+    starts: str = "fresh starts"
     score_unit: str = ""
     water: Water | None = None
     genes: np.ndarray | None = None
@@ -62,8 +73,9 @@ def load_episode(
     world: str | None = None,
     duration: float | None = None,
     seed: int | None = None,
+    individual: int | None = None,
 ) -> Episode:
-    """Reads a champion, or a morphology, and lets it live.
+    """Reads a champion, an individual or a morphology, and lets it live.
 
     Args:
         path: a run folder, its `champion` folder, a `genes.yaml`, or a morphology. A morphology is
@@ -73,15 +85,20 @@ def load_episode(
             that it evolved in.
         duration: [s]; by default the task's, or 10.
         seed: draws another start than the first on which the champion was judged.
+        individual: number of one of those who lived in the run, in place of the champion, where
+            bodies have evolved.
 
     Returns:
         The episode.
 
     Raises:
-        InputError: there is no champion, a file holds something else, or a champion is to swim
-            in another world.
+        InputError: there is no champion or individual, a file holds something else, or it is to
+            swim in another world.
     """
     path = Path(path)
+    if individual is not None:
+        refuse_world(world)
+        return _individual(path, individual, duration, seed)
     if path.is_dir():
         return _champion(_genes_file(path), world, duration, seed)
     path = find_shipped(path, "morphologies")
@@ -123,10 +140,7 @@ def _genes_file(folder: Path) -> Path:
 
 
 def _champion(path: Path, world: str | None, duration: float | None, seed: int | None) -> Episode:
-    if world is not None:
-        raise InputError(
-            f"world: expected none: a champion swims in the world it evolved in; found {world!r}"
-        )
+    refuse_world(world)
     genes = load_genes(path)
     data = load_yaml(path)
     named = data.get("config", "../config.yaml")
@@ -151,7 +165,7 @@ def _champion(path: Path, world: str | None, duration: float | None, seed: int |
             f"{path}: genes: expected {fitness.num_genes}, as {source.name} has it; found "
             f"{len(genes)}"
         )
-    key = replay_key(config.evolution.seed) if seed is None else jax.random.key(seed)
+    key = _key(config, seed)
     score = data.get("score")
     folder = source.parent.absolute()
     return Episode(
@@ -164,6 +178,151 @@ def _champion(path: Path, world: str | None, duration: float | None, seed: int |
         genes=genes,
         fitness=fitness,
         folder=folder,
+    )
+
+
+def champion_number(folder: Path) -> int:
+    """The champion's number among the individuals of a run.
+
+    Raises:
+        InputError: there is no champion, or bodies did not evolve.
+    """
+    path = _genes_file(folder)
+    data = load_yaml(path)
+    found = data.get("individual") if isinstance(data, dict) else None
+    if isinstance(found, bool) or not isinstance(found, int):
+        raise InputError(
+            f"{path}: individual: expected the champion's number, as bodies have evolved; found "
+            f"{show(found)}"
+        )
+    return found
+
+
+def refuse_world(world: str | None) -> None:
+    """Refuses a world for those who swim in their own.
+
+    Raises:
+        InputError: there is one.
+    """
+    if world is not None:
+        raise InputError(
+            f"world: expected none: a champion swims in the world it evolved in; found {world!r}"
+        )
+
+
+def _key(config: Config, seed: int | None) -> jax.Array:
+    """What draws the start: by default the first one on which the champion was judged."""
+    return replay_key(config.evolution.seed) if seed is None else jax.random.key(seed)
+
+
+# --- individuals ----------------------------------------------------------------------------------
+
+
+def read_individuals(
+    path: str | Path, numbers: Sequence[int], duration: float | None = None
+) -> tuple[Config, list[Life]]:
+    """Reads some of those who lived in a run.
+
+    Args:
+        path: the run folder, or its `champion` folder.
+        numbers: whom.
+        duration: of their episodes [s]; by default the task's.
+
+    Returns:
+        The run's configuration and the lives.
+
+    Raises:
+        InputError: the run evolves no bodies, or one of them never lived.
+    """
+    folder = Path(path)
+    folder = folder if (folder / "config.yaml").is_file() else folder.parent
+    if not (folder / "config.yaml").is_file():
+        raise InputError(f"{path}: expected a run folder; found no config.yaml in it")
+    overrides = {} if duration is None else {"task.duration": float(duration)}
+    config = load_config(folder / "config.yaml", overrides=overrides)
+    if config.bodies is None:
+        raise InputError(
+            f"{folder}: expected a run in which bodies evolve, to show one of many; found one in "
+            "which only genes do"
+        )
+    return config, find_lives(folder, numbers)
+
+
+def _individual(path: Path, number: int, duration: float | None, seed: int | None) -> Episode:
+    config, (life,) = read_individuals(path, [number], duration)
+    fitness = fit_body(config, life.grow(read_modules(config)))
+    key, genes = _key(config, seed), _own_genes(life, fitness.num_genes)
+    trajectory, water = fitness.replay(genes, key), fitness.water(key)
+    return _episode(config, life, fitness.robot, trajectory, water, genes, fitness)
+
+
+def load_individuals(
+    path: str | Path,
+    numbers: Sequence[int],
+    duration: float | None = None,
+    seed: int | None = None,
+) -> list[Episode]:
+    """Lets many live at once: one compiled program serves all.
+
+    Args:
+        path: the run folder.
+        numbers: whose episodes.
+        duration: [s]; by default the task's.
+        seed: as for `load_episode`.
+
+    Returns:
+        Their episodes, up to rounding as `load_episode` has them, with fewer rows.
+
+    Raises:
+        InputError: as `load_episode`.
+    """
+    config, lives = read_individuals(path, numbers, duration)
+    modules, key = read_modules(config), _key(config, seed)
+    bodies = [life.grow(modules) for life in lives]
+    fitness = make_mixed_fitness(config, bodies)
+    robots = [fitness.build(body) for body in bodies]
+    genes = [
+        _own_genes(life, fitness.controller_of(robot).num_genes)
+        for life, robot in zip(lives, robots, strict=True)
+    ]
+    found = fitness.replay(robots, genes, key)
+    return [
+        _episode(config, life, robot, trajectory, fitness.water(key), own)
+        for life, robot, trajectory, own in zip(lives, robots, found, genes, strict=True)
+    ]
+
+
+def _own_genes(life: Life, count: int) -> np.ndarray:
+    """`[count]` what somebody has learnt."""
+    genes = life.genes
+    if genes is None or len(genes) != count:
+        found = "none: every trial of its life failed" if genes is None else str(len(genes))
+        raise InputError(f"individual {life.number}: genes: expected {count}; found {found}")
+    return genes
+
+
+def _episode(
+    config: Config,
+    life: Life,
+    robot: Robot,
+    trajectory: Trajectory,
+    water: Water | None,
+    genes: np.ndarray,
+    fitness: Fitness | None = None,
+) -> Episode:
+    """An individual's."""
+    return Episode(
+        title=f"individual {life.number}, generation {life.born}: "
+        f"{config.task.name.replace('_', ' ')}",
+        robot=robot,
+        trajectory=trajectory,
+        score=None if math.isnan(life.score) else life.score,
+        starts=f"generation {life.born}'s starts",
+        score_unit=score_unit(config.task.type),
+        water=water,
+        genes=genes,
+        fitness=fitness,
+        folder=Path(config.source).parent.absolute(),
     )
 
 

@@ -37,6 +37,8 @@ from mjx_revolve.numerics.xla import compiler_options, derived_by, over_chunks
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World
 
+_TRACE = 0.02  # between the rows of a trace [s]: enough for pictures that move
+
 
 @dataclass(frozen=True, eq=False)
 class Setup:
@@ -152,7 +154,75 @@ class Setup:
         individual: jax.Array,
         trial: jax.Array,
     ) -> Scores:
-        """Scores of one chunk of episodes.
+        """Scores of one chunk of episodes; see `_roll`."""
+        recorded, root, figure = self._roll(
+            bodies, alike, population, starts, individual, trial, self.record_every,
+            partial(make_recorder, task=self.task),
+        )  # fmt: skip
+        return score_episodes(self.task, self.settings, self.world, recorded, root[:3], figure)
+
+    @property
+    def trace_every(self) -> int:
+        """Timesteps between the rows of a trace: those of a track share them evenly."""
+        most = max(1, int(_TRACE / self.world.timestep + 1e-6))
+        return max(n for n in range(1, most + 1) if self.record_every % n == 0)
+
+    def trace(
+        self, bodies: Bodies, population: jax.Array, key: jax.Array, trial: int
+    ) -> tuple[float, dict[str, jax.Array]]:
+        """What many bodies do in one of a key's episodes.
+
+        Args:
+            bodies: of `[P]` individuals.
+            population: `[P, num_genes]`.
+            key: draws the start.
+            trial: which of the key's episodes.
+
+        Returns:
+            Time between rows [s], and `qpos`, `qvel`, `command` (of thrusters, behind their lag),
+            `ctrl` in the engine's order, `[T, n, P]` each, and `energy` since the last row `[T, P]`
+            [J].
+        """
+        every = self.trace_every
+        found = self._traced(bodies, population, key, jnp.full(len(population), trial, jnp.int32))
+        return every * self.world.timestep, found
+
+    @cached_property
+    def _traced(self) -> Any:
+        def make_record(engine: Engine) -> Any:
+            def record(state: Any, ctrl: jax.Array, energy: jax.Array, water: Water) -> Any:
+                qpos, qvel = engine.observe(state)
+                command = engine.command(state)
+                return {"qpos": qpos, "qvel": qvel, "ctrl": ctrl, "energy": energy,
+                        "command": command}  # fmt: skip
+
+            return record
+
+        def run(bodies: Bodies, population: jax.Array, key: jax.Array, trial: jax.Array) -> Any:
+            starts = jax.tree.map(lambda x: x.astype(population.dtype), self.starts(key))
+
+            def chunk(individual: jax.Array, trial: jax.Array) -> Any:
+                return self._roll(
+                    bodies, False, population, starts, individual, trial, self.trace_every,
+                    make_record,
+                )[0]  # fmt: skip
+
+            return over_chunks(chunk)(jnp.arange(len(population), dtype=jnp.int32), trial)
+
+        return jax.jit(run, compiler_options=compiler_options())
+
+    def _roll(
+        self,
+        bodies: Bodies | None,
+        alike: bool,
+        population: jax.Array,
+        starts: Starts,
+        individual: jax.Array,
+        trial: jax.Array,
+        every: int,
+        make_record: Callable[[Engine], Callable[..., dict[str, jax.Array]]],
+    ) -> tuple[dict[str, jax.Array], jax.Array, Figure]:
+        """What is recorded of one chunk of episodes.
 
         A chunk picks what is its own from what all chunks share, so that nothing is kept for each
         episode of a population but its scores.
@@ -164,9 +234,11 @@ class Setup:
             starts: of all trials.
             individual: `[lanes]` whose episode each is.
             trial: `[lanes]` which of that individual's.
+            every: timesteps between records, which share `record_every` evenly.
+            make_record: engine → what `rollout.roll_out` takes as `record`.
 
         Returns:
-            The scores.
+            Records, the cores' start poses `[7, lanes]`, and the bodies' sizes.
         """
         world, controller, settings = self.world, self.controller, self.settings
         own = (lambda x: x) if alike else (lambda x: x[..., individual])
@@ -190,12 +262,12 @@ class Setup:
                 engine,
                 lambda state, time, row, sense: controller.step(parameters, state, time, sense),
                 lambda time, row: flow_at(world, still if row is None else row)(time, None),
-                make_recorder(engine, self.task),
+                make_record(engine),
                 engine.init(jnp.concatenate([root, hinges]), qvel),
                 controller.init(parameters),
                 rows,
-                records=self.num_records,
-                every=self.record_every,
+                records=self.num_records * (self.record_every // every),
+                every=every,
                 timestep=world.timestep,
                 derived=derived,
             )
@@ -205,8 +277,7 @@ class Setup:
         if self.engine is None or self.engine.fuses:  # MJX's step is differentiated as it is
             episode = derived_by(episode, partial(run, True))
         recorded = episode(bodies, root, parameters, starts.water, rows)
-        figure = self.figure_of(bodies)
-        return score_episodes(self.task, settings, world, recorded, root[:3], figure)
+        return recorded, root, self.figure_of(bodies)
 
 
 def make_recorder(

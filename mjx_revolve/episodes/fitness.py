@@ -26,6 +26,7 @@ from mjx_revolve.control.controller import Controller, bind_genes, gene_places
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.batch import Bodies, Capacity, fit_capacity, pack_bodies
 from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.kinematics import body_positions
 from mjx_revolve.engine.plant import Plant, actuators_of, figure_of, plant_of
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.state import Engine
@@ -320,6 +321,40 @@ class MixedFitness:
         bodies = robots if isinstance(robots, Bodies) else self.pack(robots)
         return self.setup.evaluate(bodies, population, key)
 
+    def replay(
+        self, robots: Sequence[Robot], genes: Sequence[Any], key: jax.Array, trial: int = 0
+    ) -> list[Trajectory]:
+        """One episode of each of many bodies, from the same start.
+
+        Args:
+            robots: from `build`.
+            genes: of each, as its own controller has them.
+            key: as in `evaluate`.
+            trial: which of the key's episodes.
+
+        Returns:
+            Their trajectories, with a row about every 0.02 s.
+        """
+        population = jnp.stack(
+            [self.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
+        )
+        bodies = self.pack(robots)
+        step, traced = self.setup.trace(bodies, population, key, trial)
+        found = {name: np.asarray(x) for name, x in traced.items()}
+        source = np.asarray(bodies.plant.source)
+        return [
+            _own_trajectory(robot, self.capacity, step, source[:, lane], {
+                name: x[..., lane] for name, x in found.items()
+            })
+            for lane, robot in enumerate(robots)
+        ]  # fmt: skip
+
+    def water(self, key: jax.Array, trial: int = 0) -> Water | None:
+        """The water of one of a key's episodes; see `Fitness.water`."""
+        every = self.setup.trace_every
+        water = pick_water(self.world, self.setup.starts(key), trial)
+        return jax.tree.map(lambda x: x[every - 1 :: every] if jnp.ndim(x) else x, water)
+
     def pack(self, robots: Sequence[Robot]) -> Bodies:
         """Tables of the bodies, for many evaluations of the same ones."""
         for robot in robots:
@@ -341,6 +376,35 @@ class MixedFitness:
         return bodies
 
 
+def _own_trajectory(
+    robot: Robot, capacity: Capacity, step: float, source: np.ndarray, found: dict[str, np.ndarray]
+) -> Trajectory:
+    """A robot's part of what `Setup.trace` returns of many.
+
+    Args:
+        robot: whose.
+        capacity: of all.
+        step: between rows [s].
+        source: `[n]` which of its actuators each row of `ctrl` is.
+        found: `[T, ...]` each.
+    """
+    count, model = robot.num_hinges, robot.mj_model
+    rows = [*range(count), *range(capacity.hinges, capacity.hinges + robot.num_thrusters)]
+    ctrl = np.zeros((len(found["ctrl"]), model.nu))
+    for row, actuator in zip(rows, actuators_of(robot), strict=True):
+        ctrl[:, actuator] = found["ctrl"][:, np.flatnonzero(source == row)[0]]
+    qpos = found["qpos"][:, : 7 + count]
+    return Trajectory(
+        time=jnp.asarray(step * np.arange(1, len(qpos) + 1)),
+        qpos=jnp.asarray(qpos),
+        qvel=jnp.asarray(found["qvel"][:, : 6 + count]),
+        xpos=body_positions(robot, jnp.asarray(qpos)),
+        ctrl=jnp.asarray(ctrl),
+        power=jnp.asarray(found["energy"] / step),
+        command=jnp.asarray(found["command"][:, : robot.num_thrusters]),
+    )
+
+
 # ------------------------------------------------------------------ making them
 
 
@@ -359,13 +423,28 @@ def make_fitness(config: Config | str | Path | Mapping[str, Any], **overrides: A
         InputError: the configuration, the morphology or the world is wrong; the message says where.
     """
     config = _read(config, overrides)
-    modules = MODULES | load_modules(config.modules) if config.modules else MODULES
     if config.morphology is None:
         raise InputError(
             f"{config.source}: morphology: expected one, as this is the fitness of one body; found "
             "bodies that evolve (see make_mixed_fitness)"
         )
-    morphology = load_morphology(config.morphology, modules, config.allow_overlap)
+    modules = read_modules(config)
+    return fit_body(config, load_morphology(config.morphology, modules, config.allow_overlap))
+
+
+def fit_body(config: Config, morphology: Morphology) -> Fitness:
+    """The fitness of one body, whatever body the configuration names.
+
+    Args:
+        config: all but the body.
+        morphology: the body, not trimmed.
+
+    Returns:
+        The fitness function.
+
+    Raises:
+        InputError: as `make_fitness`.
+    """
     world, task = _place(config)
     robot = _build(config, world, morphology)
     figure = figure_of(robot)
@@ -434,6 +513,11 @@ def make_mixed_fitness(
 def _diagonal(kind: ModuleType) -> float:
     """How long a module can make a body [m]: no less than its boxes, one behind the other."""
     return sum(float(np.linalg.norm(box.size)) for part in kind.parts for box in part.boxes)
+
+
+def read_modules(config: Config) -> Mapping[str, ModuleType]:
+    """All types of modules of a configuration, by name and alias."""
+    return MODULES | load_modules(config.modules) if config.modules else MODULES
 
 
 def _read(config: Any, overrides: dict[str, Any]) -> Config:

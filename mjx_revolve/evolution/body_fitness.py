@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, load_morphology
 from mjx_revolve.engine.plant import plant_of
@@ -28,6 +27,7 @@ from mjx_revolve.episodes.fitness import (
     MixedFitness,
     make_fitness,
     make_mixed_fitness,
+    read_modules,
 )
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.evolution.blocks import block_size
@@ -164,11 +164,6 @@ class BodyFitness:
         if self.alone:
             return self.mixed.evaluate(robots[0], genes, key)
         return self.mixed.evaluate([robots[k] for k in which], genes, key)
-
-
-def read_modules(config: Config) -> Mapping[str, ModuleType]:
-    """All types of modules of a configuration, by name and alias."""
-    return MODULES | load_modules(config.modules) if config.modules else MODULES
 
 
 def make_body_fitness(config: Config) -> BodyFitness:

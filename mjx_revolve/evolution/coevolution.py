@@ -19,10 +19,11 @@ import jax
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.episodes.scoring import REPORT_EPISODES, REPORT_STREAM, replay_key
 from mjx_revolve.evolution import archive as archives
 from mjx_revolve.evolution.archive import Archive, make_archive
-from mjx_revolve.evolution.body_fitness import BodyFitness, read_modules
+from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.individuals import Individual, from_record, to_record
 from mjx_revolve.evolution.life import evaluate, live, make_learner
 from mjx_revolve.evolution.loop import (
@@ -392,6 +393,7 @@ def judge(config: Config, pool: Pool, search: BodySearch) -> Champion:
         measures={name: float(values.mean()) for name, values in measures.items()},
         key=replay_key(config.evolution.seed),
         body=winner.body,
+        individual=winner.number,
     )
 
 

@@ -95,6 +95,7 @@ class Champion:
         measures: mean of each measure over those keys.
         key: the first of those keys, to replay.
         body: the champion's, where bodies have evolved.
+        individual: its number there.
     """
 
     genes: np.ndarray
@@ -104,6 +105,7 @@ class Champion:
     measures: dict[str, float]
     key: jax.Array
     body: Morphology | None = None
+    individual: int | None = None
 
 
 def start_search(config: EvolutionConfig, strategy: Strategy) -> Search:

@@ -7,7 +7,7 @@
     individuals.jsonl  where bodies evolve: one line for each individual, as it was born and lived
     generations.jsonl  likewise: one line per generation: who is alive
     champion/          genes.yaml, morphology.yaml, robot.xml
-    fitness.png, trajectory.png
+    fitness.png, trajectory.png, swim.png, bodies.png
 
 Files appear whole or not at all: they are written beside their place, flushed to the disk, and
 moved there. Nothing here knows what the numbers mean.

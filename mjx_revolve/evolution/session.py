@@ -126,6 +126,8 @@ def finish_run(start: Start, search: Any, draw: Callable[[Champion], None]) -> C
         "task": config.task.name,
         "measures": champion.measures,
     }
+    if champion.individual is not None:
+        facts["individual"] = champion.individual
     start.run.save_champion(champion.genes, champion.body, final=True, **facts)
     draw(champion)
     start.run.update_info(finished=timestamp(), generations=search.generation, champion=facts)

@@ -81,7 +81,7 @@ read_seed = whole(0, _SEEDS - 1)
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds what `champion.load_episode` is to be told: path, duration, seed and world.
+    """Adds what `champion.load_episode` is to be told: path, duration, seed, individual and world.
 
     Args:
         parser: of a command that shows an episode.
@@ -93,7 +93,16 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         "--duration", type=read_seconds, metavar="S", help="[s] (default: the task's, or 10)"
     )
     parser.add_argument("--seed", type=read_seed, metavar="N", help="draws another start")
+    parser.add_argument(
+        "--individual", type=whole(0), metavar="N",
+        help="one of those who lived in the run, where bodies evolve (default: the champion)",
+    )  # fmt: skip
     parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
+
+
+def individual_name(number: int | None) -> str:
+    """What files of an individual are called, from its run folder on, but for their ending."""
+    return "" if number is None else f"individuals/{number}"
 
 
 def check_episode_path(path: str | Path) -> None:
