@@ -175,9 +175,11 @@ def _evolve(start: Start) -> int:
 
 def _draw(start: Start, champion: Champion, result: str, unit: str) -> None:
     """The run's pictures, as far as its fitness can replay the champion."""
+    from mjx_revolve.episodes.fitness import read_modules
     from mjx_revolve.view import plots
     from mjx_revolve.view.motion import counted_time
     from mjx_revolve.view.swim_picture import plot_swim
+    from mjx_revolve.view.thumbnails import plot_best
 
     run, fitness = start.run, start.fitness
     if start.config.bodies is not None:
@@ -185,6 +187,8 @@ def _draw(start: Start, champion: Champion, result: str, unit: str) -> None:
     title = f"{run.folder.name}: {result}"
     label = f"fitness ({unit})" if unit else "fitness"
     figures = {"fitness.png": plots.plot_fitness(run.load_metrics(), title, label)}
+    if start.config.bodies is not None:
+        figures["bodies.png"] = plot_best(run.folder, read_modules(start.config), title)
     if hasattr(fitness, "replay"):
         trajectory = fitness.replay(champion.genes, champion.key)
         robot = getattr(fitness, "robot", None)

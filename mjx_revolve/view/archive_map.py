@@ -8,6 +8,7 @@ from axis to axis.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +22,7 @@ from scipy.spatial import Voronoi
 from mjx_revolve.evolution.archive import Archive, best, filled, scale_points
 from mjx_revolve.view.plots import COLORS, LABELS, WIDE, head, new_figure
 
+_Addresses = Sequence[str | None]  # of each cell
 _COLOURS = "viridis"
 _ORANGE, _INK, _FRAME, _LINE = COLORS[1], "#333333", "#9aa5ad", "#e3e8eb"
 # Between the maps within a map, in cells of theirs.
@@ -32,7 +34,11 @@ _MOST_OUTLINES = 3000
 
 
 def plot_archive(
-    archive: Archive, label: str = "score", title: str = "", champion: int | None = None
+    archive: Archive,
+    label: str = "score",
+    title: str = "",
+    champion: int | None = None,
+    links: Mapping[int, str] | None = None,
 ) -> Figure:
     """Draws an archive.
 
@@ -41,6 +47,7 @@ def plot_archive(
         label: what the score measures, with its unit.
         title: a line above the picture.
         champion: id of the individual that is marked, if it is there; None: the best.
+        links: by id, where a click on an individual leads, in pictures that can have links (SVG).
 
     Returns:
         The figure. Cells in which nobody is are blank.
@@ -63,7 +70,9 @@ def plot_archive(
         draw = _draw_parallel
     axes = figure.add_subplot()
     axes.tick_params(colors=_INK, labelsize=9, length=3)
-    draw(axes, archive, colours, marked)
+    links = links or {}
+    addresses = [links.get(number) for number in archive.ids.tolist()]
+    draw(axes, archive, colours, marked, addresses)
     if cells.size:
         bar = figure.colorbar(colours, ax=figure.axes, aspect=30, pad=0.015, shrink=0.9)
         bar.set_label(label, fontsize=9)
@@ -91,15 +100,17 @@ def _words(archive: Archive, axis: int) -> str:
     return LABELS.get(name, name.replace("_", " "))
 
 
-def _mark(axes: Axes, x: float, y: float) -> None:
-    axes.plot(x, y, "*", color=_ORANGE, markeredgecolor="white", markersize=14,
-              markeredgewidth=1.0, zorder=5, clip_on=False)  # fmt: skip
+def _mark(axes: Axes, place: Sequence[float] | np.ndarray, address: str | None) -> None:
+    axes.plot(*place, "*", color=_ORANGE, markeredgecolor="white", markersize=14,
+              markeredgewidth=1.0, zorder=5, clip_on=False, url=address)  # fmt: skip
 
 
 # --- two axes -------------------------------------------------------------------------------------
 
 
-def _draw_map(axes: Axes, archive: Archive, colours: ScalarMappable, marked: int) -> None:
+def _draw_map(
+    axes: Axes, archive: Archive, colours: ScalarMappable, marked: int, addresses: _Addresses
+) -> None:
     """A polygon for each cell."""
     span = archive.highs - archive.lows
     if archive.shape:
@@ -112,14 +123,14 @@ def _draw_map(axes: Axes, archive: Archive, colours: ScalarMappable, marked: int
     few = len(polygons) < _MOST_OUTLINES
     axes.add_collection(
         PolyCollection(polygons, facecolors=faces, edgecolors=_LINE if few else "face",
-                       linewidths=0.5 if few else 0.2)
+                       linewidths=0.5 if few else 0.2, urls=addresses)
     )  # fmt: skip
     axes.set_xlim(archive.lows[0], archive.highs[0])
     axes.set_ylim(archive.lows[1], archive.highs[1])
     axes.set(xlabel=_words(archive, 0), ylabel=_words(archive, 1))
     axes.spines[:].set_color(_FRAME)
     if marked >= 0:
-        _mark(axes, *archive.centers[marked])
+        _mark(axes, archive.centers[marked], addresses[marked])
 
 
 def _polygons(centers: np.ndarray) -> list[np.ndarray]:
@@ -141,7 +152,9 @@ def _polygons(centers: np.ndarray) -> list[np.ndarray]:
 # --- three or four --------------------------------------------------------------------------------
 
 
-def _draw_nested(axes: Axes, archive: Archive, colours: ScalarMappable, marked: int) -> None:
+def _draw_nested(
+    axes: Axes, archive: Archive, colours: ScalarMappable, marked: int, addresses: _Addresses
+) -> None:
     """A map of the first two axes for each cell of the third, and of the fourth if there is one."""
     shape = (*archive.shape, 1)[:4]
     inner, outer = np.array(shape[:2]), np.array(shape[2:])
@@ -151,7 +164,8 @@ def _draw_nested(axes: Axes, archive: Archive, colours: ScalarMappable, marked: 
     cells = filled(archive)
     squares = [Rectangle(corner, 1.0, 1.0) for corner in corners[cells].tolist()]
     faces = colours.to_rgba(archive.scores[cells])
-    axes.add_collection(PatchCollection(squares, facecolors=faces, edgecolors="none"))
+    urls = [addresses[cell] for cell in cells]
+    axes.add_collection(PatchCollection(squares, facecolors=faces, edgecolors="none", urls=urls))
     maps = (np.indices(shape[2:]).reshape(2, -1).T * step).tolist()
     frames = [Rectangle(corner, *inner.tolist()) for corner in maps]
     axes.add_collection(
@@ -180,13 +194,15 @@ def _draw_nested(axes: Axes, archive: Archive, colours: ScalarMappable, marked: 
         far.tick_params(colors=_INK, labelsize=8, length=0)
         far.spines[:].set_visible(False)
     if marked >= 0:
-        _mark(axes, *(corners[marked] + 0.5))
+        _mark(axes, corners[marked] + 0.5, addresses[marked])
 
 
 # --- any number -----------------------------------------------------------------------------------
 
 
-def _draw_parallel(axes: Axes, archive: Archive, colours: ScalarMappable, marked: int) -> None:
+def _draw_parallel(
+    axes: Axes, archive: Archive, colours: ScalarMappable, marked: int, addresses: _Addresses
+) -> None:
     """A line for each individual, the best ones on top."""
     cells = filled(archive)
     cells = cells[np.argsort(archive.scores[cells])]
@@ -194,7 +210,8 @@ def _draw_parallel(axes: Axes, archive: Archive, colours: ScalarMappable, marked
     places = np.arange(len(archive.names))
     lines = [np.stack([places, row], axis=1) for row in heights[cells]]
     shades = colours.to_rgba(archive.scores[cells])
-    axes.add_collection(LineCollection(lines, colors=shades, linewidths=1.0, alpha=0.6))
+    urls = [addresses[cell] for cell in cells]
+    axes.add_collection(LineCollection(lines, colors=shades, linewidths=1.0, alpha=0.6, urls=urls))
     for place, (low, high) in enumerate(zip(archive.lows, archive.highs, strict=True)):
         axes.plot([place, place], [0.0, 1.0], color=_FRAME, linewidth=1.0, zorder=3)
         for height, value, side in ((0.0, low, "top"), (1.0, high, "bottom")):
@@ -209,4 +226,4 @@ def _draw_parallel(axes: Axes, archive: Archive, colours: ScalarMappable, marked
     axes.spines[:].set_visible(False)
     if marked >= 0:
         axes.plot(places, heights[marked], color=_ORANGE, linewidth=2.2, zorder=4)
-        _mark(axes, places[-1], heights[marked, -1])
+        _mark(axes, (places[-1], heights[marked, -1]), addresses[marked])

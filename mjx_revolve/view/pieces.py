@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import trimesh
 
+from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology
+from mjx_revolve.body.placement import Module
 from mjx_revolve.body.solids import part_mesh
 
 if TYPE_CHECKING:
@@ -21,7 +23,13 @@ _AXIS = (1.0, 0.47, 0.1)  # hinge axes are drawn as thin rods of this colour
 _ROD = (0.0011, 0.025)  # their radius and half length [m]
 _THRUST = (0.13, 0.66, 0.30)  # thrusts are drawn as arrows of this colour, along a command ahead
 _ARROW = (0.0011, 0.034, 0.0036, 0.010)  # shaft's radius and length, head's radius and length [m]
-_GREY = (0.62, 0.64, 0.68)  # modules without a colour of their own
+# Modules without a colour of their own, as evolution grows them, have one of these: those of the
+# shipped robots, and their neighbours.
+_COLORS = {
+    "core": (0.95, 0.42, 0.32), "hinge": (0.94, 0.92, 0.84), "sensor": (0.55, 0.42, 0.72),
+    "thruster": (0.38, 0.40, 0.45), "fin": (0.20, 0.65, 0.60), "brick": (0.93, 0.72, 0.26),
+}  # fmt: skip
+_MOST_DRAWN = 500  # types of modules whose meshes are remembered; some 100 kB each
 
 
 @dataclass(frozen=True)
@@ -60,26 +68,19 @@ class Piece:
 
 
 def make_pieces(morphology: Morphology) -> list[Piece]:
-    """All parts of a morphology in their file's colours, hinges' axes and thrusts.
+    """All parts of a morphology, hinges' axes and thrusts.
 
     Args:
-        morphology: the robot's modules.
+        morphology: the robot's modules; those without a colour have that of what they are for.
 
     Returns:
         The pieces, in the order of the modules and their parts.
     """
-    meshes: dict[Hashable, list[np.ndarray]] = {}
     pieces = []
     for number, module in enumerate(morphology.modules):
         kind = module.kind
-        drawn = tuple((p.name, p.boxes, p.volume, p.position, p.thruster) for p in kind.parts)
-        key = (kind.name, kind.hinge, drawn)
-        if key not in meshes:
-            meshes[key] = [
-                part_mesh(kind, part).triangles + np.asarray(part.position) for part in kind.parts
-            ]
-        rgb = np.clip(np.asarray(_GREY if module.rgb is None else module.rgb, float), 0.0, 1.0)
-        for k, triangles in enumerate(meshes[key]):
+        rgb = np.clip(np.asarray(module.rgb or _COLORS[_role(module)], float), 0.0, 1.0)
+        for k, triangles in enumerate(_triangles(kind)):
             shade = rgb * (_MOVING if kind.hinge is not None and k > 0 else 1.0)
             pieces.append(Piece(number, k, triangles, shade))
         if kind.hinge is not None:
@@ -95,6 +96,30 @@ def make_pieces(morphology: Morphology) -> list[Piece]:
                 arrow = arrow + np.asarray(part.position) + np.asarray(part.thruster.position)
                 pieces.append(Piece(number, k, arrow, np.array(_THRUST), mark=True))
     return pieces
+
+
+def _role(module: Module) -> str:
+    """What a module is for, as far as its colour goes."""
+    kind = module.kind
+    roles = {
+        "core": module.parent < 0, "hinge": kind.hinge is not None, "sensor": kind.sensor,
+        "thruster": kind.is_thruster, "fin": kind.is_fin,
+    }  # fmt: skip
+    return next((role for role, is_one in roles.items() if is_one), "brick")
+
+
+_DRAWN: dict[Hashable, list[np.ndarray]] = {}  # solving for a part's volume takes a while
+
+
+def _triangles(kind: ModuleType) -> list[np.ndarray]:
+    """The parts' meshes, module frame; the same arrays for all types that look alike."""
+    drawn = tuple((p.name, p.boxes, p.volume, p.position, p.thruster) for p in kind.parts)
+    key = (kind.name, kind.hinge, drawn)
+    if key not in _DRAWN:
+        if len(_DRAWN) >= _MOST_DRAWN:
+            _DRAWN.clear()
+        _DRAWN[key] = [part_mesh(kind, p).triangles + np.asarray(p.position) for p in kind.parts]
+    return _DRAWN[key]
 
 
 def mount_piece(robot: Robot, piece: Piece) -> tuple[int, np.ndarray, np.ndarray]:

@@ -33,6 +33,10 @@ _FIGURES = {
     "upper_quartile", "champion", "step_size", "failed", "restarts", "seconds",
     "evaluations_per_second",
 }  # fmt: skip
+# What is drawn of evolving bodies in place of the step size, the first that there is.
+_BODIES = {
+    "coverage": "share of the\narchive's cells", "mean_num_modules": "modules, mean\nof the living"
+}  # fmt: skip
 # A path is drawn in at most so many pieces, and a curve over time through so many points; the eye
 # sees no more.
 _PIECES, _POINTS = 300, 4000
@@ -128,7 +132,8 @@ def plot_fitness(
         label: what the fitness measures, with its unit.
 
     Returns:
-        The figure: fitness on top, below it a measure (the speed, if there) and the step size.
+        The figure: fitness on top, below it a measure (the speed, if there) and the step size, or
+        where bodies evolve how full the archive is, or how large they are.
     """
     generation = np.asarray(metrics["generation"])
     measures = [name for name in metrics if name not in _FIGURES]
@@ -160,6 +165,12 @@ def plot_fitness(
     if "step_size" in metrics:
         right = figure.add_subplot(grid[1, 1], sharex=top)
         _draw_step_size(right, generation, np.asarray(metrics["step_size"]), dot)
+    for name in _BODIES if right is None else ():
+        if name in metrics:
+            right = figure.add_subplot(grid[1, 1], sharex=top)
+            right.plot(generation, metrics[name], color=_GREY, linewidth=1.3, marker=dot)
+            right.set_ylabel(_BODIES[name], fontsize=9)
+            break
     for axes in (top, left, right):
         if axes is None:
             continue

@@ -1,0 +1,141 @@
+"""Who lived in a run in which bodies evolved: who was best, and who came of whom."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_revolve.episodes.lives import Life, read_generations, read_lives
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """All who were ever born.
+
+    Attributes:
+        lives: by number.
+        living: numbers of those who were alive after each generation.
+    """
+
+    lives: dict[int, Life]
+    living: dict[int, tuple[int, ...]]
+
+    @property
+    def last(self) -> int:
+        """The last generation; 0: there is none."""
+        return max(self.living, default=0)
+
+    def alive(self, generation: int) -> list[Life]:
+        """Who was alive after a generation, the best first, failures last."""
+        found = [self.lives[n] for n in self.living.get(generation, ()) if n in self.lives]
+        return sorted(found, key=_rank)
+
+    def figures(self, generation: int, name: str) -> np.ndarray:
+        """`[N]` a figure of those who were alive after a generation, the best first."""
+        return np.array([life.figures.get(name, math.nan) for life in self.alive(generation)])
+
+    def best(self) -> Life | None:
+        """The best of all times, of equals the oldest; None: nobody has a score."""
+        known = [life for life in self.lives.values() if not math.isnan(life.score)]
+        return min(known, key=_rank, default=None)
+
+    def line(self, number: int) -> list[Life]:
+        """An individual and those whose body it has, in the end: the oldest first."""
+        found: list[Life] = []
+        life = self.lives.get(number)
+        while life is not None:
+            found.append(life)
+            life = self.lives.get(life.parents[0]) if life.parents else None
+        return found[::-1]
+
+
+def _rank(life: Life) -> tuple[float, int]:
+    return math.inf if math.isnan(life.score) else -life.score, life.number
+
+
+def read_population(folder: Path) -> tuple[Population, list[str]]:
+    """Reads who lived in a run.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        The population, and a line about each thing that is wrong. Where it is not known who was
+        alive, those count who were born in a generation.
+    """
+    lives, problems = read_lives(folder)
+    living, more = read_generations(folder)
+    problems += more
+    if lives and not living:
+        problems.append("generations.jsonl: nobody knows who was alive: the new-born stand in")
+        for life in lives.values():
+            living[life.born] = (*living.get(life.born, ()), life.number)
+    lost = {number for numbers in living.values() for number in numbers} - set(lives)
+    if lost:
+        problems.append(f"individuals.jsonl lacks {len(lost)} of those who were alive")
+    return Population(lives, living), problems
+
+
+class Kin(NamedTuple):
+    """A step of a line of descent.
+
+    Attributes:
+        life: who.
+        mate: the second parent, if there is one.
+        skipped: ancestors between this one and the one before.
+    """
+
+    life: Life
+    mate: Life | None
+    skipped: int
+
+
+def trace_family(population: Population, number: int, most: int = 8) -> list[Kin]:
+    """The line of descent of an individual, by the parents that gave it its body.
+
+    Args:
+        population: in which it lived.
+        number: whose line.
+        most: steps; of a longer line those stay that gained most over their parent.
+
+    Returns:
+        The steps, the oldest first.
+    """
+    line = population.line(number)
+    scores = np.array([life.score for life in line])
+    gains = np.nan_to_num(np.diff(scores, prepend=np.nan), nan=-math.inf, neginf=-math.inf)
+    gains[[0, -1]] = math.inf
+    kept = np.sort(np.argsort(-gains, kind="stable")[: max(most, 2)])
+    found = []
+    for place, before in zip(kept, [-1, *kept], strict=False):
+        life = line[place]
+        mate = population.lives.get(life.parents[1]) if len(life.parents) > 1 else None
+        found.append(Kin(life, mate, int(place - before - 1)))
+    return found
+
+
+def pick_ancestors(population: Population, number: int, count: int) -> list[Life]:
+    """An individual and some of its ancestors, at equal distances in its line.
+
+    Args:
+        population: in which it lived.
+        number: whose ancestors.
+        count: how many of them; all, where there are fewer.
+
+    Returns:
+        The oldest one first, the individual last.
+    """
+    line = population.line(number)
+    places = np.linspace(0, len(line) - 1, min(count + 1, len(line)))
+    return [line[k] for k in np.round(places).astype(int)]
+
+
+def pick_generations(generations: Sequence[int], count: int) -> list[int]:
+    """Some of the generations at equal distances, the last one among them, the first one first."""
+    places = np.linspace(0, len(generations) - 1, min(count, len(generations)))
+    return [generations[k] for k in np.round(places).astype(int)]
