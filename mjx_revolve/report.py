@@ -32,7 +32,25 @@ def _parser() -> argparse.ArgumentParser:
         "--every-champion", action="store_true",
         help="show each run's champion in full, not only the best of each configuration",
     )  # fmt: skip
+    parser.add_argument(
+        "--individuals", type=_read_individuals, metavar="WHO",
+        help="where bodies evolve: pages on which they swim, RUN/individuals/N.html, to which the "
+        "report leads: best (of the last generation, and the champion's family), archive (all who "
+        "live there), or numbers such as 17,42; a minute or two",
+    )  # fmt: skip
     return parser
+
+
+def _read_individuals(text: str) -> str | list[int]:
+    """Reads whose pages are asked for."""
+    if text in ("best", "archive"):
+        return text
+    numbers = text.split(",")
+    if not all(n.isascii() and n.isdigit() and len(n) < 10 for n in numbers):
+        raise argparse.ArgumentTypeError(
+            f"expected best, archive, or numbers such as 17,42; found {text!r}"
+        )
+    return [int(n) for n in numbers]
 
 
 def _named_file(out: str) -> Path:
@@ -70,6 +88,7 @@ def main(argv: list[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     runtime.prepare_process()
+    from mjx_revolve.view.report.bodies import INDIVIDUALS, choose_individuals, write_pages
     from mjx_revolve.view.report.data import read_runs
     from mjx_revolve.view.report.page import GENERATOR, make_report
 
@@ -81,7 +100,15 @@ def main(argv: list[str] | None = None) -> int:
     else:
         folder = Path(records[0].label)
         path = _usual_file(folder if folder.is_dir() else records[0].folder, GENERATOR)
-    page = make_report(records, lost, arguments.every_champion).encode()
+    which = arguments.individuals
+    if which is not None and len(records) > 1 and not isinstance(which, str):
+        raise InputError(f"--individuals: expected numbers of one run; found {len(records)} runs")
+    for record, numbers in [
+        (record, choose_individuals(record, which)) for record in records if which is not None
+    ]:
+        written = write_pages(record, numbers)
+        print(f"{record.label}/{INDIVIDUALS}: {len(numbers)} pages, {written} of them new")
+    page = make_report(records, lost, arguments.every_champion, path.parent).encode()
     for line in lost:
         print(f"warning: nothing could be read: {line}", file=sys.stderr)
     for record in records:

@@ -28,6 +28,7 @@ _COLORS = {
 # Three quarters of a kind's arrows are shorter than the first of these shares of the body's length,
 # and all are shorter than the second; of a small body, than these lengths [m].
 _ARROW, _LONGEST = (0.3, 0.1), (0.65, 0.22)
+_LEFT_OUT = "left out here; python -m mjx_revolve.viewer RUN --individual N has them"
 # Forces below this are rounding [N].
 _NOTHING = 1e-5
 # A bed that is further below than this is lost in the water's haze [m].
@@ -36,11 +37,12 @@ _SIGHT = 25.0
 _RADIUS = np.concatenate([[0.0], np.geomspace(0.1, 1500.0, 109)])
 
 
-def page_data(episode: Episode) -> dict[str, Any]:
+def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
     """What the page's scripts read, as plain values for JSON.
 
     Args:
         episode: what to show.
+        forces: whether the page has arrows of forces, which take seconds to compile.
 
     Returns:
         Arrays are packed: base64 of little-endian float32 as `f32`, or of int16 as `i16` with a
@@ -53,15 +55,16 @@ def page_data(episode: Episode) -> dict[str, Any]:
     robot, trajectory = episode.robot, episode.trajectory
     world, length = robot.world, robot.morphology.length
     water: Water = water_of(world) if episode.water is None else episode.water
-    forces = module_forces(robot, trajectory, _stride(np.asarray(trajectory.time, float)), water)
-    time, qpos = forces.time, np.asarray(trajectory.qpos, float)[forces.rows]
+    every = _stride(np.asarray(trajectory.time, float))
+    rows = np.arange(0, len(trajectory.time), every)
+    time, qpos = (np.asarray(x, float)[rows] for x in (trajectory.time, trajectory.qpos))
+    poses = pose_robot(robot, qpos)
     step = float(time[-1] - time[0]) / max(len(time) - 1, 1) or world.timestep
     period = stroke_period(time, qpos[:, 7:])
     weight = robot.fluid.volume / robot.fluid.volume.sum()
-    center = smooth_path(time, np.einsum("spi,p->si", forces.place, weight), period)
-    now = water_at(robot, forces.rows, time, len(trajectory.time), water)
-    poses = pose_robot(robot, qpos)
-    low = float((forces.place[..., 2] - np.linalg.norm(robot.fluid.half_size, axis=1)).min())
+    center = smooth_path(time, np.einsum("spi,p->si", poses.parts, weight), period)
+    now = water_at(robot, rows, time, len(trajectory.time), water)
+    low = float((poses.parts[..., 2] - np.linalg.norm(robot.fluid.half_size, axis=1)).min())
     surface = _first(water.surface_height)
     net = qpos[-1, :2] - qpos[0, :2]
     moved = float(np.linalg.norm(net)) > 0.05 * length
@@ -83,8 +86,10 @@ def page_data(episode: Episode) -> dict[str, Any]:
             "quaternion": _i16(poses.quaternion[:, 1:]),
         },
         "anchors": _anchors(robot),
-        "forces": {
-            name: _arrows(color, sum_modules(robot, getattr(forces, name)), length)
+        "forces": _forces(episode, every, water)
+        if forces
+        else {
+            name: {"color": color, "scale": 0, "force": _i16(np.zeros(0)), "why": _LEFT_OUT}
             for name, color in _COLORS.items()
         },
         "world": {
@@ -94,6 +99,16 @@ def page_data(episode: Episode) -> dict[str, Any]:
         },
         "floor": low - 0.1 * length,  # below the robot: where the grid is drawn
         "deepest": max(1.3 * (surface - float(qpos[:, 2].min())), surface - low, 1.5 * length),
+    }
+
+
+def _forces(episode: Episode, every: int, water: Water) -> dict[str, Any]:
+    """The arrows of all kinds of forces."""
+    robot, length = episode.robot, episode.robot.morphology.length
+    found = module_forces(robot, episode.trajectory, every, water)
+    return {
+        name: _arrows(color, sum_modules(robot, getattr(found, name)), length)
+        for name, color in _COLORS.items()
     }
 
 

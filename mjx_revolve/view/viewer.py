@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _PAGE = Path(__file__).parent / "viewer_page"
 
 
-def write_viewer(episode: Episode, path: str | Path) -> None:
+def write_viewer(episode: Episode, path: str | Path, forces: bool = True) -> None:
     """Writes the replay of an episode as one HTML file.
 
     The file appears whole or not at all.
@@ -27,19 +27,21 @@ def write_viewer(episode: Episode, path: str | Path) -> None:
     Args:
         episode: what to show; rows after the first that is not finite are left out.
         path: of the file, which ends in `.html`; its folder is made if need be.
+        forces: see `make_page`.
 
     Raises:
         InputError: `path` has another ending, or the episode has no finite row.
         OSError: the file cannot be written.
     """
-    write_atomic(check_name(path, PAGES), make_page(episode).encode())
+    write_atomic(check_name(path, PAGES), make_page(episode, forces).encode())
 
 
-def make_page(episode: Episode) -> str:
+def make_page(episode: Episode, forces: bool = True) -> str:
     """The replay of an episode as the text of an HTML file.
 
     Args:
         episode: what to show.
+        forces: whether it has arrows of forces, which take seconds to compile.
 
     Returns:
         The page.
@@ -58,7 +60,7 @@ def make_page(episode: Episode) -> str:
     return pages.get_template("page.html").render(
         title=episode.title,
         subtitle=_subtitle(episode),
-        data=page_data(episode),
+        data=page_data(episode, forces),
         file=lambda name: (_PAGE / name).read_text(encoding="utf-8"),
     )
 
@@ -68,7 +70,7 @@ def _subtitle(episode: Episode) -> str:
     body, world = episode.robot.morphology, episode.robot.world
     words = []
     if episode.score is not None:
-        words.append(f"{episode.score:.3g} {episode.score_unit} over fresh starts")
+        words.append(f"{episode.score:.3g} {episode.score_unit} over {episode.starts}")
     counts = {
         "module": body.num_modules, "hinge": body.num_hinges, "thruster": body.num_thrusters,
     }  # fmt: skip

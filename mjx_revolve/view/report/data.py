@@ -21,9 +21,11 @@ from pydantic import BaseModel
 import mjx_revolve
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import Config, make_config
+from mjx_revolve.episodes.lives import GENERATIONS, INDIVIDUALS
 from mjx_revolve.evolution.checkpoints import DamageError, read_checkpoint
 from mjx_revolve.evolution.runs import Run
 from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.view.population import read_population
 from mjx_revolve.view.report.record import Problem, RunRecord
 
 # Whose version decides what a replay gives.
@@ -55,6 +57,7 @@ def read_run(folder: str | Path) -> RunRecord:
     record.metrics, problems = read_metrics(record.folder / "metrics.csv")
     for problem in problems:
         record.note(problem.kind, problem.text)
+    _read_population(record)
     _read_champion(record)
     _check_end(record)
     _check_versions(record)
@@ -215,12 +218,30 @@ def read_metrics(path: Path) -> tuple[dict[str, np.ndarray], list[Problem]]:
     return dict(zip(header, table.T, strict=True)), problems
 
 
+# --- who lived ------------------------------------------------------------------------------------
+
+
+def _read_population(record: RunRecord) -> None:
+    """All who lived in a run in which bodies evolved."""
+    if not record.settings.get("bodies") and not (record.folder / INDIVIDUALS).is_file():
+        return
+    record.population, problems = read_population(record.folder)
+    for problem in problems:
+        record.note("damaged", problem)
+    if not record.population.lives:
+        record.note("missing", f"{INDIVIDUALS} has nobody: neither bodies nor families")
+
+
 # --- the champion ---------------------------------------------------------------------------------
 
 
 def _read_champion(record: RunRecord) -> None:
     """The champion; where there is none, the best that a checkpoint remembers."""
     elite, origin = _read_checkpoints(record)
+    best = record.population.best() if record.population is not None else None
+    if best is not None:
+        with record.noting_damage():
+            elite, origin = best.genes, f"{INDIVIDUALS}, number {best.number}"
     path = record.folder / "champion" / "genes.yaml"
     if not path.is_file():
         record.note("missing", "champion/genes.yaml is missing")
@@ -237,16 +258,23 @@ def _read_champion(record: RunRecord) -> None:
     if record.genes is None and elite is not None:
         record.genes = elite
         record.stand_in = f"best individual in {origin}"
+        if best is not None:
+            record.champion["individual"] = best.number
         record.note("missing", f"the champion shown is the {record.stand_in}")
 
 
 def _read_checkpoints(record: RunRecord) -> tuple[np.ndarray | None, str]:
-    """The best individual of the newest checkpoint that is whole; every damaged one is named."""
+    """The best individual of the newest checkpoint that is whole; every damaged one is named.
+
+    Where bodies evolve, none: genes alone are of no use.
+    """
     found: tuple[np.ndarray | None, str] = (None, "")
     paths = Run(record.folder).checkpoints()
     for path in paths:
         try:
             arrays = read_checkpoint(path).arrays
+            if record.population is not None:
+                continue
             elites, scores = arrays["elites"], arrays["elite_scores"]
         except (DamageError, KeyError) as error:
             record.note("damaged", f"checkpoints/{path.name}: {error}")
@@ -271,6 +299,9 @@ def _check_end(record: RunRecord) -> None:
     if record.metrics and reached > record.generations:
         record.note("damaged", f"metrics.csv ends at generation {record.generations}, but the run "
                     f"reached {reached}")  # fmt: skip
+    if record.population is not None and record.population.last < reached:
+        record.note("damaged", f"{GENERATIONS} ends at generation {record.population.last}, but "
+                    f"the run reached {reached}")  # fmt: skip
     if record.info and "finished" not in record.info:
         done = f"{max(record.generations, newest)}"
         done += f" of {planned}" if isinstance(planned, int) else ""

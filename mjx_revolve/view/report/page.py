@@ -9,22 +9,27 @@ import base64
 import datetime
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 from PIL import Image
 
 from mjx_revolve import __version__
 from mjx_revolve.body.morphology import Morphology, load_morphology
-from mjx_revolve.episodes.fitness import make_fitness
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.fitness import fit_body, make_fitness, read_modules
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.evolution.fingerprints import model_hash
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.plots import COLORS, figure_svg, plot_fitness, plot_way
 from mjx_revolve.view.report import champion_pictures, run_pictures, tables
+from mjx_revolve.view.report.bodies import anchor, inline_svg, show_population, viewer_command
 from mjx_revolve.view.report.champion import Replay, replay_champion
 from mjx_revolve.view.report.groups import Group, group_runs
 from mjx_revolve.view.report.record import RunRecord
@@ -43,6 +48,9 @@ def _make_templates() -> jinja2.Environment:
     templates.filters["digits"] = tables.format_number
     templates.filters["letter"] = run_pictures.letter
     templates.filters["color"] = lambda index: COLORS[index % len(COLORS)]
+    templates.filters["png"] = lambda data: _source(data, "png")
+    templates.filters["svg"] = lambda data: _source(data, "svg+xml")
+    templates.filters["inline"] = lambda data: Markup(inline_svg(data))
     templates.globals["episodes"] = REPORT_EPISODES
     return templates
 
@@ -53,7 +61,10 @@ sections: Any = _TEMPLATES.get_template("sections.html").module
 
 
 def make_report(
-    records: Sequence[RunRecord], lost: Sequence[str] = (), every_champion: bool = False
+    records: Sequence[RunRecord],
+    lost: Sequence[str] = (),
+    every_champion: bool = False,
+    at: str | Path = ".",
 ) -> str:
     """Makes the page.
 
@@ -61,6 +72,7 @@ def make_report(
         records: the runs, from `read_run`; problems that show only now are added to theirs.
         lost: lines about folders of which nothing could be read.
         every_champion: whether each run's champion is shown in full.
+        at: the folder that the page goes to, where links to other files start.
 
     Returns:
         A complete HTML document that needs no other file.
@@ -70,6 +82,7 @@ def make_report(
     first, single = records[0], len(records) == 1
     if single:
         robot = f"{robots[0][1].name}: " if robots else ""
+        robot = robot if first.population is None else "evolved bodies: "
         title = f"{robot}{first.task.replace('_', ' ') or 'evolution'} ({Path(first.label).name})"
     else:
         title = f"{len(records)} runs"
@@ -77,6 +90,7 @@ def make_report(
     content = [
         ("results", "Results", _results(groups)),
         ("convergence", "Convergence", _convergence(groups)),
+        *_populations(groups, every_champion, Path(at)),
         ("champions", "Champions side by side", _side_by_side(groups, replays)),
         *_champions(groups, replays, every_champion),
         ("robot", "Robot", _robots(robots)),
@@ -110,6 +124,30 @@ def make_page(title: str, words: str, lead: str, content: Sequence[tuple[str, st
     )  # fmt: skip
 
 
+# --- who lived ------------------------------------------------------------------------------------
+
+
+def _populations(groups: Sequence[Group], every: bool, at: Path) -> list[tuple[str, str, str]]:
+    """A section about the bodies of each run that is shown in full."""
+    found = []
+    for k, group in enumerate(groups):
+        best = group.best()
+        for record in group.records:
+            if record.population is None or not (record is best or every):
+                continue
+            heading = "Bodies"
+            if len(groups) > 1:
+                heading += f" of {run_pictures.letter(k)}, {group.name}"
+            if len(group.records) > 1:
+                heading += f": {'the best, ' if record is best else ''}seed {record.seed}"
+            shown = show_population(record, at)
+            content = sections.population(
+                shown, partial(anchor, record), partial(viewer_command, record)
+            )
+            found.append((f"bodies-{k}-{record.seed}", heading, content))
+    return found
+
+
 # --- what the champions do ------------------------------------------------------------------------
 
 
@@ -125,10 +163,13 @@ def _replay(
             if record.config is None:
                 continue
             try:
+                if record.population is not None:
+                    fitness = fit_body(record.config, _champions_body(record, record.config))
                 # The seed is all that differs within a group, and the fitness does not know it.
                 fitness = make_fitness(record.config) if fitness is None else fitness
                 known = record.info.get("model_hash")
-                if isinstance(known, str) and known != model_hash(fitness):
+                alike = record.population is not None or not isinstance(known, str)
+                if not alike and known != model_hash(fitness):
                     record.note("version", "the robot or its world is built differently by this "
                                 "version than when it evolved: the replay may differ")  # fmt: skip
                 if record.genes is not None:
@@ -140,6 +181,17 @@ def _replay(
         else:
             robots += _robot_alone(group)
     return replays, robots
+
+
+def _champions_body(record: RunRecord, config: Config) -> Morphology:
+    """The body of a champion, not trimmed."""
+    modules, path = read_modules(config), record.folder / "champion" / "morphology.yaml"
+    number = record.individual
+    if record.population is not None and record.stand_in and number is not None:
+        body = record.population.lives[number].grow(modules)
+    else:
+        body = load_morphology(path, modules, allow_overlap=True)
+    return body if number is None else replace(body, name=f"individual {number}")
 
 
 def _robot_alone(group: Group) -> list[tuple[str, Morphology]]:
@@ -256,6 +308,8 @@ def _convergence(groups: Sequence[Group]) -> str:
             "name": group.name,
             "index": styles[group.name] if len(groups) > 1 else None,
             "label": record.label,
+            "below": "how far the search spreads" if record.population is None
+            else "how full the archive is, or how large the living are",
             "band": "quartiles" if quartiles else "mean and standard deviation",
             "seeds": _svg(run_pictures.plot_seeds(group)) if several else None,
             "fitness": None if several else _svg(plot_fitness(record.metrics, "", label)),

@@ -15,6 +15,7 @@ from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.view.population import Population
 
 # Kinds of problems, gravest first, and what they make of the run.
 KINDS = {
@@ -52,7 +53,8 @@ class RunRecord:
         config: the same, checked; None where it cannot be used.
         metrics: columns of `metrics.csv`, `[T]` each, one row per generation; empty without any.
         genes: `[G]` of the champion; None without one.
-        champion: facts about it: score, score_std, origin, final, measures.
+        population: all who lived, where bodies have evolved; else None.
+        champion: facts about it: score, score_std, origin, final, measures, individual.
         stand_in: where the genes are from, if they are not the champion's own.
         problems: what is missing, damaged or otherwise to be known.
     """
@@ -64,6 +66,7 @@ class RunRecord:
     config: Config | None = None
     metrics: dict[str, np.ndarray] = field(default_factory=dict)
     genes: np.ndarray | None = None
+    population: Population | None = None
     champion: dict[str, Any] = field(default_factory=dict)
     stand_in: str = ""
     problems: list[Problem] = field(default_factory=list)
@@ -114,6 +117,13 @@ class RunRecord:
     def generations(self) -> int:
         """How many generations the metrics have."""
         return int(self.metrics["generation"][-1]) if self.metrics else 0
+
+    @property
+    def individual(self) -> int | None:
+        """The champion's number, where bodies have evolved and it is known."""
+        found = self.champion.get("individual")
+        known = {} if self.population is None else self.population.lives
+        return found if isinstance(found, int) and found in known else None
 
     @property
     def is_finished(self) -> bool:

@@ -165,7 +165,7 @@ function start() {
     shown[name](button.getAttribute("aria-pressed") === "true");
     if (name in data.forces && data.forces[name].scale === 0) {
       button.disabled = true;
-      button.title = `no ${name} in this episode`;
+      button.title = data.forces[name].why ?? `no ${name} in this episode`;
     }
   }
   byId("grid").title = `level lines, ${gridStep} m apart (G)`;
