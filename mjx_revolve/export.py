@@ -18,6 +18,7 @@ from mjx_revolve.inputs.commands import (
     add_episode_arguments,
     check_episode_path,
     check_place,
+    individual_name,
     read_path,
     run_command,
 )
@@ -47,8 +48,8 @@ def _parser() -> argparse.ArgumentParser:
         "--out",
         type=read_path,
         metavar="DIR",
-        help="all formats into this folder (default: export in the run folder, or "
-        "MORPHOLOGY_export here)",
+        help="all formats into this folder (default: export in the run folder, individuals/N there "
+        "of an individual, or MORPHOLOGY_export here)",
     )
     parser.add_argument(
         "--meshes",
@@ -108,11 +109,14 @@ def main(argv: list[str] | None = None) -> int:
 
     if arguments.mcap is not None:
         check_rosbags()
-    episode = load_episode(arguments.path, arguments.world, arguments.duration, arguments.seed)
+    episode = load_episode(
+        arguments.path, arguments.world, arguments.duration, arguments.seed, arguments.individual
+    )
     if not files:  # never over what is there
         folder = Path(f"{Path(episode.robot.morphology.name).name}_export")
         if episode.folder is not None:
-            folder = Path(os.path.normpath(episode.folder / "export"))
+            name = individual_name(arguments.individual) or "export"
+            folder = Path(os.path.normpath(episode.folder / name))
         if folder.exists():
             raise InputError(
                 f"{folder}: expected no such folder yet; name it with --out to replace it"

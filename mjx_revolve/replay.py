@@ -1,7 +1,8 @@
 """Command line: a film of a champion, or of a morphology in the water.
 
 ``python -m mjx_revolve.replay runs/mine`` writes `swim.mp4`, `swim.gif` and `viewer.html` into
-the run folder. Films are drawn by MuJoCo, with a screen or without; see `docs/replay.md`.
+the run folder, with `--ancestors 5` a film of the champion and those it comes of. MuJoCo draws,
+with a screen or without; see `docs/replay.md`.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mjx_revolve.inputs.commands import (
     Parser,
     add_episode_arguments,
     check_episode_path,
     check_place,
+    individual_name,
     read_path,
     run_command,
     whole,
@@ -24,9 +27,14 @@ from mjx_revolve.inputs.commands import (
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.film.opengl import check_screen, find_opengl
 
-_KINDS = (".mp4", ".gif", ".html")
+if TYPE_CHECKING:
+    from mjx_revolve.view.film.film import Film
+
+_KINDS: tuple[str, ...] = (".mp4", ".gif", ".html")
 _SMALLEST, _LARGEST = (64, 64), (3840, 2160)  # pixels
 _MOST_FPS = 120
+_MOST_ANCESTORS = 30
+_EACH = 5.0  # of each in a film of ancestors, where no duration is given [s]
 _VIEW_FPS = 60  # in MuJoCo's viewer
 
 
@@ -56,6 +64,13 @@ def _parser() -> Parser:
         default=30,
         metavar="N",
         help="frames per second (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--ancestors",
+        type=whole(1, _MOST_ANCESTORS),
+        metavar="N",
+        help="a film, ancestors.mp4, of so many ancestors and the champion, or the individual, one "
+        "after the other, the oldest first",
     )
     parser.add_argument(
         "--html", action="store_true", help="only the page for a browser; needs no OpenGL"
@@ -143,6 +158,10 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     path, out, view = Path(arguments.path), arguments.out, arguments.view
     kinds = (".html",) if arguments.html else _KINDS
+    if arguments.ancestors is not None:
+        kinds = (".mp4", ".gif")
+        if view or arguments.html:
+            raise InputError("--ancestors: expected neither --view nor --html: it makes a film")
     paths = None if out is None else _named_paths(out, kinds)
     folder = _run_folder(path)
     if view:
@@ -150,7 +169,10 @@ def main(argv: list[str] | None = None) -> int:
             raise InputError("--view: expected neither --out nor --html: it writes nothing")
         check_screen()
     elif paths is None and folder is not None:
-        paths = _usual_paths(folder, "swim", kinds)
+        name = individual_name(arguments.individual) or "swim"
+        if arguments.ancestors is not None:
+            name, kinds = f"{name}-ancestors".removeprefix("swim-"), kinds[:1]
+        paths = _usual_paths(folder, name, kinds)
     check_episode_path(path)
     # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
     films = not view and set(kinds if paths is None else paths) != {".html"}
@@ -161,7 +183,11 @@ def main(argv: list[str] | None = None) -> int:
     prepare_process()
     from mjx_revolve.episodes.champion import load_episode
 
-    episode = load_episode(path, arguments.world, arguments.duration, arguments.seed)
+    if arguments.ancestors is not None:
+        return _film_ancestors(arguments, folder, opengl, paths or {})
+    episode = load_episode(
+        path, arguments.world, arguments.duration, arguments.seed, arguments.individual
+    )
     if paths is None:
         paths = {} if view else _usual_paths(Path(), str(episode.robot.morphology.name), kinds)
     if view or films:
@@ -170,24 +196,64 @@ def main(argv: list[str] | None = None) -> int:
         from mjx_revolve.view.film.video import write_film
 
         film = make_film(episode, arguments.size, _VIEW_FPS if view else arguments.fps)
-        if film.lost is not None:
-            print(
-                f"note: the trajectory is not finite from {film.lost:.4g} s on; shown up to there",
-                file=sys.stderr,
-            )
+        _warn(film)
         if view:
             show_film(film)
         else:
             write_film(film, opengl, paths.get(".mp4"), paths.get(".gif"))
-        length = f"{len(film.time) / film.fps:.3g} s"
-        _say(paths, ".mp4", f"{length}, {film.size[0]} x {film.size[1]}, {film.fps} frames/s")
-        _say(paths, ".gif", length)
+        _say_film(paths, [film])
     if ".html" in paths:
         from mjx_revolve.view.viewer import write_viewer
 
         write_viewer(episode, paths[".html"])
         _say(paths, ".html", "open it in a browser")
     return 0
+
+
+def _film_ancestors(
+    arguments: argparse.Namespace, folder: Path | None, opengl: str, paths: dict[str, Path]
+) -> int:
+    """Films an individual and its ancestors, one after the other."""
+    from mjx_revolve.episodes.champion import champion_number, load_individuals, refuse_world
+    from mjx_revolve.view.course import cut_episode
+    from mjx_revolve.view.film.film import make_film
+    from mjx_revolve.view.film.video import write_film
+    from mjx_revolve.view.population import pick_ancestors, read_population
+
+    refuse_world(arguments.world)
+    if folder is None:
+        raise InputError(f"{arguments.path}: expected a run folder, for --ancestors; found none")
+    number = arguments.individual
+    number = champion_number(folder) if number is None else number
+    family = pick_ancestors(read_population(folder)[0], number, arguments.ancestors)
+    numbers = [life.number for life in family] or [number]
+    films = []
+    for episode in load_individuals(folder, numbers, arguments.duration, arguments.seed):
+        if arguments.duration is None:
+            episode = cut_episode(episode, _EACH)
+        films.append(make_film(episode, arguments.size, arguments.fps))
+        _warn(films[-1])
+    write_film(films, opengl, paths.get(".mp4"), paths.get(".gif"))
+    _say_film(paths, films)
+    return 0
+
+
+def _warn(film: Film) -> None:
+    """Says what is not shown."""
+    if film.lost is not None:
+        print(
+            f"note: the trajectory is not finite from {film.lost:.4g} s on; shown up to there",
+            file=sys.stderr,
+        )
+
+
+def _say_film(paths: dict[str, Path], films: Sequence[Film]) -> None:
+    """Says what was written of films in one file."""
+    film, frames = films[0], sum(len(film.time) for film in films)
+    length = f"{frames / film.fps:.3g} s"
+    length += f", {len(films)} robots" if len(films) > 1 else ""
+    _say(paths, ".mp4", f"{length}, {film.size[0]} x {film.size[1]}, {film.fps} frames/s")
+    _say(paths, ".gif", length)
 
 
 def _say(paths: dict[str, Path], kind: str, words: str) -> None:

@@ -14,6 +14,7 @@ from mjx_revolve.inputs.commands import (
     add_episode_arguments,
     check_episode_path,
     check_place,
+    individual_name,
     read_path,
     run_command,
 )
@@ -44,8 +45,8 @@ def main(argv: list[str] | None = None) -> int:
         "--out",
         type=read_path,
         metavar="FILE.html",
-        help="default: viewer.html in the run folder, or the morphology's name in the current "
-        "folder",
+        help="default: viewer.html in the run folder (of an individual, individuals/N.html there), "
+        "or the morphology's name in the current folder",
     )
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
@@ -56,17 +57,20 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
-    episode = load_episode(arguments.path, arguments.world, arguments.duration, arguments.seed)
-    out = arguments.out or _usual_path(episode.folder, episode.robot.morphology.name)
+    episode = load_episode(
+        arguments.path, arguments.world, arguments.duration, arguments.seed, arguments.individual
+    )
+    name = individual_name(arguments.individual) or "viewer"
+    out = arguments.out or _usual_path(episode.folder, name, episode.robot.morphology.name)
     write_viewer(episode, out)
     size = Path(out).stat().st_size / 1e6
     print(f"{out}: {episode.trajectory.time[-1]:.4g} s, {size:.2f} MB; open it in a browser")
     return 0
 
 
-def _usual_path(folder: Path | None, name: str) -> Path:
+def _usual_path(folder: Path | None, inside: str, name: str) -> Path:
     """Where a page goes that was given no name: never over a file that is there."""
-    path = Path(os.path.normpath(folder / "viewer.html")) if folder else Path(f"{name}.html")
+    path = Path(os.path.normpath(folder / f"{inside}.html")) if folder else Path(f"{name}.html")
     if path.exists():
         raise InputError(f"{path}: expected no such file yet; name it with --out to replace it")
     return path

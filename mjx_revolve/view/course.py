@@ -61,6 +61,16 @@ def finite_part(episode: Episode) -> tuple[Episode, float | None]:
     return replace(episode, trajectory=trajectory, water=water), float(rows.time[count])
 
 
+def cut_episode(episode: Episode, seconds: float) -> Episode:
+    """An episode's first seconds."""
+    time = np.asarray(episode.trajectory.time)
+    count = max(1, int(np.searchsorted(time, seconds * (1 + 1e-6), side="right")))
+    rows, water = jax.tree.map(
+        lambda x: x[:count] if np.ndim(x) else x, (episode.trajectory, episode.water)
+    )
+    return replace(episode, trajectory=rows, water=water)
+
+
 def pose_robot(robot: Robot, qpos: np.ndarray) -> Poses:
     """Where a robot's bodies and parts are.
 

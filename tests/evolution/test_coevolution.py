@@ -10,6 +10,7 @@ import pytest
 import toys
 from mjx_revolve import evolve as command
 from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.episodes.champion import champion_number
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import coevolution, runs
 from mjx_revolve.evolution.individuals import from_record, to_record
@@ -332,6 +333,9 @@ def test_what_is_in_a_run_folder(folder, capsys):
         assert float(row["num_hinges"]) == person["descriptors"]["num_hinges"]
     body = load_morphology(run_folder / "champion" / "morphology.yaml")
     assert body.num_hinges == 3
+    champion = people[champion_number(run_folder)]
+    assert champion["body"] == json.loads(json.dumps(body.to_mapping()))
+    assert (run_folder / "bodies.png").read_bytes().startswith(b"\x89PNG")
     table = runs.Run(run_folder).load_metrics()
     assert table["coverage"][-1] == pytest.approx(len(rows) / 28)
 

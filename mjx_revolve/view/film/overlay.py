@@ -148,7 +148,7 @@ def _make_captions(film: Film) -> Callable[[np.ndarray, int], np.ndarray]:
     score = ""
     if episode.score is not None:
         score = f"score {episode.score:.3g} {episode.score_unit}".rstrip()
-        score += ", mean over fresh starts"
+        score += f", mean over {episode.starts}"
 
     def caption(picture: np.ndarray, frame: int) -> np.ndarray:
         image = Image.fromarray(picture)

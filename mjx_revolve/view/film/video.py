@@ -31,14 +31,17 @@ _MAIN = 150
 
 
 def write_film(
-    film: Film, opengl: str, mp4: str | Path | None = None, gif: str | Path | None = None
+    film: Film | Sequence[Film],
+    opengl: str,
+    mp4: str | Path | None = None,
+    gif: str | Path | None = None,
 ) -> None:
     """Draws a film once and writes it as MP4, as GIF, or as both.
 
     Files appear whole or not at all. On a terminal a bar shows how far it is.
 
     Args:
-        film: from `film.make_film`.
+        film: from `film.make_film`; or several of one size, to be shown one after the other.
         opengl: from `opengl.find_opengl`.
         mp4: where to write the MP4 (H.264), or None.
         gif: where to write the GIF, or None.
@@ -46,12 +49,14 @@ def write_film(
     Raises:
         OSError: a file cannot be written.
     """
-    count = len(film.time)
-    every = gif_stride(film.fps, count)
+    films = [film] if isinstance(film, Film) else list(film)
+    (size,), (fps,) = {film.size for film in films}, {film.fps for film in films}
+    count = sum(len(film.time) for film in films)
+    every = gif_stride(fps, count)
     small: list[Image.Image] = []
 
     def draw() -> Iterator[np.ndarray]:
-        frames = draw_frames(film, opengl)
+        frames = (frame for film in films for frame in draw_frames(film, opengl))
         bar = tqdm(frames, "drawing", count, leave=False, disable=None, unit="frame")
         for number, frame in enumerate(bar):
             if gif is not None and number % every == 0:
@@ -59,13 +64,13 @@ def write_film(
             yield frame
 
     if mp4 is not None:
-        title = film.episode.title
-        write_atomic(Path(mp4), lambda path: write_mp4(path, draw(), film.size, film.fps, title))
+        title = films[-1].episode.title
+        write_atomic(Path(mp4), lambda path: write_mp4(path, draw(), size, fps, title))
     else:
         for _ in draw():
             pass
     if gif is not None:
-        write_atomic(Path(gif), make_gif(small, every / film.fps))
+        write_atomic(Path(gif), make_gif(small, every / fps))
 
 
 def write_mp4(

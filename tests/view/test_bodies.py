@@ -1,0 +1,432 @@
+"""Bodies that evolved, in run folders made by hand: who lived, and what is shown of them."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjx_revolve import export, replay, report, viewer
+from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.episodes.champion import champion_number, load_episode, load_individuals
+from mjx_revolve.episodes.lives import find_lives, read_generations, read_lives
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.pieces import make_pieces
+from mjx_revolve.view.population import (
+    pick_ancestors,
+    pick_generations,
+    read_population,
+    trace_family,
+)
+from mjx_revolve.view.report import bodies as report_bodies
+from mjx_revolve.view.report import page as report_page
+from mjx_revolve.view.report.data import read_run
+from mjx_revolve.view.report.sizes import plot_sizes
+from mjx_revolve.view.thumbnails import SIZE, draw_bodies, plot_best
+
+SETTINGS = {
+    "world": "empty_underwater",
+    "controller": {"type": "sine"},
+    "task": {"type": "speed", "duration": 0.5, "settle": 0.1, "trials": 1},
+    "bodies": {"max_modules": 8, "max_hinges": 4},
+    "evolution": {"population_size": 4, "generations": 3},
+}
+# number, parents, generation, origin, score, hinges
+BORN = [
+    (0, [], 1, "random", -1.0, 1),
+    (1, [], 1, "seed <b>$x$</b>", 0.1, 2),
+    (2, [], 1, "random", None, 3),
+    (3, [1], 2, "mutation", 0.3, 2),
+    (4, [0, 3], 2, "crossover", 0.2, 1),
+    (5, [3, 4], 3, "crossover, mutation", 0.5, 3),
+]
+LIVING = {1: [0, 1, 2], 2: [1, 3, 4], 3: [5, 3, 4]}
+
+
+def body(hinges):
+    """A chain of hinges in front of a core."""
+    chain = None
+    for k in range(hinges, 0, -1):
+        hinge = {"id": f"h{k}", "type": "ActiveHinge", "orientation": 0}
+        chain = hinge | ({"children": {1: chain}} if chain else {})
+    return {"id": "robot", "body": {"id": "core", "type": "Core", "children": {0: chain}}}
+
+
+def line_of(number, parents, born, origin, score, hinges):
+    grown = make_morphology(body(hinges), MODULES)
+    # A sine has an amplitude, a phase and an offset for each joint, and one frequency.
+    genes = None if score is None else [0.1 * k for k in range(3 * hinges + 1)]
+    return {
+        "id": number, "parents": parents, "born": born, "origin": origin, "score": score,
+        "trials": 1, "measures": {"speed_m_s": 0.5}, "descriptors": dict(grown.descriptors),
+        "brain": {}, "learnt": None, "genes": genes, "genome": None, "body": grown.to_mapping(),
+    }  # fmt: skip
+
+
+def make_run(folder, bodies=(), born=BORN, living=LIVING):
+    """A run folder as evolution leaves it, without evolution."""
+    settings = SETTINGS | {"bodies": SETTINGS["bodies"] | dict(bodies)}
+    (folder / "champion").mkdir(parents=True)
+    (folder / "config.yaml").write_text(json.dumps(settings))
+    lines = [json.dumps(line_of(*one)) for one in born]
+    (folder / "individuals.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    lines = [json.dumps({"generation": g, "living": who}) for g, who in living.items()]
+    (folder / "generations.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    rows = ["generation,best,mean,champion", "1,0.1,-0.4,0.1", "2,0.3,0.2,0.3", "3,0.5,0.3,0.5"]
+    (folder / "metrics.csv").write_text("".join(f"{row}\n" for row in rows))
+    facts = {"score": 0.4, "score_std": 0.1, "individual": 5, "measures": {"speed_m_s": 0.5}}
+    info = {"finished": "2026-01-02T03:05:00+00:00", "generations": 3, "champion": facts}
+    (folder / "run.json").write_text(json.dumps(info))
+    last = line_of(*born[-1])
+    (folder / "champion/morphology.yaml").write_text(json.dumps(last["body"]))
+    champion = {**facts, "config": "../config.yaml", "morphology": "morphology.yaml"}
+    (folder / "champion/genes.yaml").write_text(json.dumps(champion | {"genes": last["genes"]}))
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    return make_run(tmp_path / "run")
+
+
+@pytest.fixture
+def still(monkeypatch):
+    """Reports in which nobody swims: nothing is compiled."""
+    monkeypatch.setattr(report_page, "_replay", lambda groups: ({}, []))
+
+
+def show(*folders):
+    return report_page.make_report([read_run(folder) for folder in folders])
+
+
+# --- who lived ---
+
+
+def test_lives_are_read_back(run):
+    lives, problems = read_lives(run)
+    assert problems == [] and list(lives) == [0, 1, 2, 3, 4, 5]
+    assert (lives[5].parents, lives[5].born, lives[5].origin) == ((3, 4), 3, "crossover, mutation")
+    assert (lives[5].figures["score"], lives[5].figures["num_hinges"]) == (0.5, 3.0)
+    assert lives[5].figures["speed_m_s"] == 0.5
+    assert lives[5].genes.tolist() == np.float32([0.1 * k for k in range(10)]).tolist()
+    assert math.isnan(lives[2].score) and lives[2].genes is None
+    assert lives[1].grow(MODULES) == make_morphology(body(2), MODULES)
+    assert read_generations(run) == ({g: tuple(who) for g, who in LIVING.items()}, [])
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["{", "[]", '{"id": 9}', "\\x00", json.dumps(line_of(*BORN[0]) | {"id": -1}),
+     json.dumps(line_of(*BORN[0]) | {"parents": [7]}),  # nobody is older than a parent
+     json.dumps(line_of(*BORN[0]) | {"score": "good"}),
+     json.dumps(line_of(*BORN[0]) | {"descriptors": {"mass": None}})],
+)  # fmt: skip
+def test_damaged_lines_are_left_out(run, line):
+    path = run / "individuals.jsonl"
+    lines = path.read_text().splitlines(True)
+    # One amidst the others, and one that is still being written.
+    path.write_text("".join([*lines[:3], f"{line}\n", *lines[3:], lines[0][:50]]))
+    lives, problems = read_lives(run)
+    assert list(lives) == [0, 1, 2, 3, 4, 5]
+    assert problems == ["individuals.jsonl: 1 line is damaged and left out"]
+
+
+def test_damaged_generations_are_left_out(run):
+    with open(run / "generations.jsonl", "a") as file:
+        file.write('{"generation": 4, "living": [1.5]}\n{"generation": 5}\n{"generation": 6, "liv')
+    found, problems = read_generations(run)
+    assert list(found) == [1, 2, 3]
+    assert problems == ["generations.jsonl: 2 lines are damaged and left out"]
+
+
+def test_who_was_best_and_who_came_of_whom(run):
+    population, problems = read_population(run)
+    assert problems == []
+    assert [life.number for life in population.alive(3)] == [5, 3, 4]
+    assert [life.number for life in population.alive(1)] == [1, 0, 2]  # failures come last
+    assert population.alive(9) == [] and population.last == 3
+    assert population.best().number == 5
+    assert population.figures(2, "num_hinges").tolist() == [2.0, 1.0, 2.0]  # best first
+    assert [life.number for life in population.line(5)] == [1, 3, 5]
+    family = trace_family(population, 5)
+    assert [(kin.life.number, kin.mate and kin.mate.number, kin.skipped) for kin in family] == [
+        (1, None, 0), (3, None, 0), (5, 4, 0)
+    ]  # fmt: skip
+    assert [life.number for life in pick_ancestors(population, 5, 1)] == [1, 5]
+    assert [life.number for life in pick_ancestors(population, 5, 9)] == [1, 3, 5]
+    assert pick_ancestors(population, 77, 3) == []
+
+
+def test_of_a_long_line_those_stay_who_gained_most(tmp_path):
+    scores = [0.0, 0.1, 0.15, 0.5, 0.4, 0.9, 0.91]
+    born = [(k, [k - 1] * (k > 0), k + 1, "mutation", s, 1) for k, s in enumerate(scores)]
+    run = make_run(tmp_path / "long", born=born, living={7: [6]})
+    population, _ = read_population(run)
+    family = trace_family(population, 6, most=4)
+    assert [(kin.life.number, kin.skipped) for kin in family] == [(0, 0), (3, 2), (5, 1), (6, 0)]
+    assert [life.number for life in pick_ancestors(population, 6, 3)] == [0, 2, 4, 6]
+    assert pick_generations([1, 2, 3, 4, 5], 3) == [1, 3, 5]
+    assert pick_generations([4], 3) == [4] and pick_generations([], 3) == []
+
+
+def test_without_generations_the_new_born_stand_in(run):
+    (run / "generations.jsonl").unlink()
+    population, (problem,) = read_population(run)
+    assert population.living == {1: (0, 1, 2), 2: (3, 4), 3: (5,)}
+    assert problem.startswith("generations.jsonl: nobody knows who was alive")
+    (run / "generations.jsonl").write_text('{"generation":1,"living":[0,8,9]}\n')
+    assert read_population(run)[1] == ["individuals.jsonl lacks 2 of those who were alive"]
+
+
+def test_numbers_are_checked(run, tmp_path):
+    assert [life.number for life in find_lives(run, [4, 1])] == [4, 1]
+    with pytest.raises(InputError, match="expected individual 6; found those from 0 to 5"):
+        find_lives(run, [1, 6])
+    with pytest.raises(InputError, match="individual 2: genes: expected 10; found none: every"):
+        load_episode(run, individual=2)
+    assert champion_number(run) == 5
+    (run / "config.yaml").write_text(
+        json.dumps(SETTINGS | {"bodies": None, "morphology": "m.yaml"})
+    )
+    (run / "m.yaml").write_text(json.dumps(body(1)))
+    with pytest.raises(InputError, match="expected a run in which bodies evolve"):
+        load_episode(run, individual=1)
+
+
+# --- pictures ---
+
+
+def test_pictures_have_one_scale_and_fit():
+    small, large = (make_morphology(body(hinges), MODULES) for hinges in (1, 4))
+    together = draw_bodies([small, large])
+    assert [picture.shape for picture in together] == [(SIZE[1], SIZE[0], 3)] * 2
+    drawn = [(picture < 250).any(axis=-1) for picture in together]
+    assert 0.2 < drawn[0].sum() / drawn[1].sum() < 0.8
+    for mask in drawn:  # whole, and in the middle
+        rows, columns = np.nonzero(mask)
+        assert rows.min() > 2 and columns.min() > 2
+        assert abs(rows.min() + rows.max() + 1 - SIZE[1]) <= 4
+        assert abs(columns.min() + columns.max() + 1 - SIZE[0]) <= 4
+    alone = (draw_bodies([small])[0] < 250).any(axis=-1)
+    assert alone.sum() > 1.2 * drawn[0].sum()
+    assert draw_bodies([]) == []
+
+
+def test_modules_without_a_colour_have_that_of_their_kind():
+    plain = make_morphology(body(1), MODULES)
+    pieces = [piece for piece in make_pieces(plain) if not piece.mark]
+    assert len({tuple(piece.color) for piece in pieces}) == 3  # core, and both parts of a hinge
+    named = body(1)
+    named["body"]["params"] = {"red": 0.1, "green": 0.2, "blue": 0.3}
+    assert make_pieces(make_morphology(named, MODULES))[0].color.tolist() == [0.1, 0.2, 0.3]
+
+
+def test_a_sheet_of_the_best(run):
+    figure = plot_best(run, MODULES, "a $title")
+    texts = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert texts == ["5: 0.5", "4 modules, 3 hinges", "3: 0.3", "3 modules, 2 hinges",
+                     "4: 0.2", "2 modules, 1 hinge"]  # fmt: skip
+    figure.canvas.draw()  # a dollar is no formula
+
+
+def test_sizes_over_the_generations(run):
+    population, _ = read_population(run)
+    figure = plot_sizes(population, ("speed_m_s",))
+    panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
+    assert list(panels)[:3] == ["speed (m/s)", "modules", "hinges"]
+    mean, best = panels["hinges"].lines
+    assert mean.get_xdata().tolist() == [1, 2, 3]
+    assert np.allclose(mean.get_ydata(), [2.0, 5 / 3, 2.0])
+    assert best.get_ydata().tolist() == [2.0, 2.0, 3.0]
+    assert plot_sizes(read_population(Path("/nowhere"))[0]) is None
+
+
+# --- the page ---
+
+
+def test_the_page_shows_who_lived(run, still):
+    page = show(run)
+    order = [int(n) for n in re.findall(r"<b>#(\d+)</b>", page)]
+    # Generations 3, 2 and 1, the best first; then the line 1, 3, (4 above) 5.
+    assert order == [5, 3, 4, 3, 4, 1, 1, 0, 2, 1, 3, 4, 5]
+    assert page.count('alt="Body of individual') == len(order)
+    assert "evolved bodies: speed (run)" in page
+    assert "seed &lt;b&gt;$x$&lt;/b&gt;" in page and "<b>$x$" not in page
+    assert "The archive" not in page and "more</p>" not in page
+    assert read_run(run).problems == read_run(run).problems
+
+
+ARCHIVE = {"archive": {"axes": {
+    "num_hinges": {"low": 0.5, "high": 3.5, "cells": 3},
+    "speed_m_s": {"low": 0, "high": 1, "cells": 2},
+}}}  # fmt: skip
+
+
+def test_cells_of_the_archive_are_links(tmp_path, still):
+    run = make_run(tmp_path / "a b", ARCHIVE)
+    record = read_run(run)
+    archive = report_bodies._fill_archive(record)
+    # Cells of one, two and three hinges, speeds in the upper half; the best of each.
+    assert archive.ids.tolist() == [-1, 4, -1, 3, -1, 5]
+    (run / "individuals").mkdir()
+    (run / "individuals" / "3.html").write_text("")
+    page = report_page.make_report([record], at=tmp_path / "elsewhere")
+    assert set(re.findall(r'xlink:href="([^"]*html|#individual[^"]*)"', page)) == {
+        "../a b/individuals/3.html", f"#{report_bodies.anchor(record, 4)}",
+        f"#{report_bodies.anchor(record, 5)}",
+    }  # fmt: skip
+    for number in (3, 4, 5):
+        assert f'id="{report_bodies.anchor(record, number)}"' in page
+    assert "--individual 4" in page and "&#39;" in page  # a name with a blank is quoted
+    assert '<a href="../a b/individuals/3.html">#3</a>' in page
+    assert "<?xml" not in page and page.count("<svg") == 1
+
+
+def test_whose_pages_are_asked_for(run, tmp_path):
+    record = read_run(run)
+    assert report_bodies.choose_individuals(record, [4, 1, 4]) == [4, 1]
+    assert report_bodies.choose_individuals(record, "best") == [5, 3, 4, 1]
+    with pytest.raises(InputError, match="expected individual 6; found none"):
+        report_bodies.choose_individuals(record, [6])
+    with pytest.raises(InputError, match="expected a run with an archive; found none"):
+        report_bodies.choose_individuals(record, "archive")
+    kept = read_run(make_run(tmp_path / "archive", ARCHIVE))
+    assert report_bodies.choose_individuals(kept, "archive") == [4, 3, 5]
+
+
+def test_pages_that_are_there_stay(run, monkeypatch):
+    asked = []
+
+    def load(folder, numbers):
+        asked.append(list(numbers))
+        return [f"episode {number}" for number in numbers]
+
+    def write(episode, path, forces):
+        assert not forces
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(episode)
+
+    monkeypatch.setattr(report_bodies, "load_individuals", load)
+    monkeypatch.setattr(report_bodies, "write_viewer", write)
+    record = read_run(run)
+    assert report_bodies.write_pages(record, [5, 3]) == 2
+    assert report_bodies.write_pages(record, [3, 4]) == 1
+    assert report_bodies.write_pages(record, [3, 4]) == 0
+    assert asked == [[5, 3], [4]]
+    assert (run / "individuals/4.html").read_text() == "episode 4"
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda run: (run / "individuals.jsonl").unlink(), "individuals.jsonl has nobody"),
+        (lambda run: (run / "generations.jsonl").write_text(""), "generations.jsonl: nobody knows"),
+        (lambda run: (run / "champion/genes.yaml").unlink(), "the champion shown is the best"),
+        (lambda run: (run / "config.yaml").write_text("a: {"), "config.yaml: line"),
+        (lambda run: (run / "generations.jsonl").write_text('{"generation":1,"living":[0]}\n'),
+         "generations.jsonl ends at generation 1, but the run reached 3"),
+    ],
+)  # fmt: skip
+def test_what_is_left_is_shown(run, still, damage, message):
+    damage(run)
+    record = read_run(run)
+    assert message in record.warning
+    page = report_page.make_report([record])
+    assert ("Body of individual" in page) == (run / "individuals.jsonl").is_file()
+
+
+def test_a_body_that_cannot_be_read_has_no_picture(run, still):
+    path = run / "individuals.jsonl"
+    path.write_text(path.read_text().replace("ActiveHinge", "Wheel", 3))
+    record = read_run(run)
+    page = report_page.make_report([record])
+    assert "individual 0: " in record.warning and "Wheel" in record.warning
+    assert page.count('alt="Body of individual 0"') == 0 and "<b>#0</b>" in page
+
+
+def test_best_individual_stands_in_for_a_lost_champion(run):
+    (run / "champion/genes.yaml").unlink()
+    record = read_run(run)
+    assert record.stand_in == "best individual in individuals.jsonl, number 5"
+    assert record.individual == 5 and record.genes.shape == (10,)
+    assert report_page._champions_body(record, record.config).num_hinges == 3
+
+
+# --- commands ---
+
+
+@pytest.mark.parametrize(
+    ("main", "argv", "message"),
+    [
+        (report, ["run", "--individuals", "worst"], "expected best, archive, or numbers"),
+        (report, ["run", "run", "--individuals", "1"], "expected each run once"),
+        (report, ["run", "--individuals", "archive"], "expected a run with an archive"),
+        (viewer, ["run", "--individual", "-1"], "expected a whole number"),
+        (viewer, ["run", "--individual", "77"], "expected individual 77; found those from 0 to 5"),
+        (export, ["spider", "--individual", "1"], "expected a run folder; found no config.yaml"),
+        (replay, ["run", "--ancestors", "0"], "expected a whole number from 1 to 30"),
+        (replay, ["run", "--ancestors", "2", "--html"], "expected neither --view nor --html"),
+        (viewer, ["run", "--individual", "1", "--world", "lake"], "expected none: a champion"),
+    ],
+)
+def test_wrong_commands(run, main, argv, message, capsys):
+    assert run_command(main.main, argv) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_film_of_ancestors(run, monkeypatch, capsys):
+    """The line at equal distances, each for five seconds at most, in one file."""
+    asked, made = [], []
+
+    class Episode(str):
+        """Stands for one; films are not drawn here."""
+
+    def load(folder, numbers, duration, seed):
+        asked.append((list(numbers), duration))
+        return [Episode(number) for number in numbers]
+
+    class Film:
+        lost, fps, size, time = None, 10, (64, 64), range(30)
+
+    def write(films, opengl, mp4, gif):
+        made.append((len(films), mp4, gif))
+        mp4.parent.mkdir(exist_ok=True)
+        mp4.write_bytes(b"film")
+
+    cuts = []
+    monkeypatch.setattr("mjx_revolve.replay.find_opengl", lambda: "egl")
+    monkeypatch.setattr("mjx_revolve.episodes.champion.load_individuals", load)
+    monkeypatch.setattr("mjx_revolve.view.course.cut_episode", lambda e, s: cuts.append(s) or e)
+    monkeypatch.setattr("mjx_revolve.view.film.film.make_film", lambda *_: Film())
+    monkeypatch.setattr("mjx_revolve.view.film.video.write_film", write)
+    assert run_command(replay.main, ["run", "--ancestors", "1"]) == 0
+    assert run_command(replay.main, ["run", "--ancestors", "4", "--individual", "4",
+                                     "--duration", "2"]) == 0  # fmt: skip
+    assert asked == [([1, 5], None), ([0, 4], 2.0)] and cuts == [5.0, 5.0]
+    assert [entry[1].name for entry in made] == ["ancestors.mp4", "4-ancestors.mp4"]
+    assert "6 s, 2 robots" in capsys.readouterr().out
+    assert run_command(replay.main, ["run", "--ancestors", "1"]) == 2  # it is there
+
+
+@pytest.mark.slow
+def test_many_swim_as_each_does_alone(run):
+    """One compiled program for all gives what each gets alone, up to rounding."""
+    together = load_individuals(run, [1, 5], seed=3)
+    for number, many in zip([1, 5], together, strict=True):
+        alone = load_episode(run, individual=number, seed=3)
+        every = round(float(many.trajectory.time[0] / alone.trajectory.time[0]))
+        assert every > 1 and len(alone.trajectory.time) == every * len(many.trajectory.time)
+        for name in ("time", "qpos", "xpos", "ctrl"):
+            rows = np.asarray(getattr(alone.trajectory, name))[every - 1 :: every]
+            assert np.allclose(getattr(many.trajectory, name), rows, atol=2e-5), name
+        assert np.ptp(np.asarray(many.trajectory.qpos)[:, 7:]) > 0.01
+        assert (many.score, many.starts) == (
+            alone.score,
+            f"generation {1 if number == 1 else 3}'s starts",
+        )
