@@ -39,6 +39,7 @@ _WHERE = {
     "simulate": "episodes.simulate",
     "make_fitness": "episodes.fitness",
     "make_mixed_fitness": "episodes.fitness",
+    "load_archive": "evolution.runs",
     "prepare_process": "numerics.runtime",
 }
 
@@ -69,6 +70,7 @@ if TYPE_CHECKING:
     from mjx_revolve.episodes.fitness import make_fitness as make_fitness
     from mjx_revolve.episodes.fitness import make_mixed_fitness as make_mixed_fitness
     from mjx_revolve.episodes.simulate import simulate as simulate
+    from mjx_revolve.evolution.runs import load_archive as load_archive
     from mjx_revolve.inputs.errors import InputError as InputError
     from mjx_revolve.numerics.runtime import prepare_process as prepare_process
     from mjx_revolve.water.world import load_world as load_world

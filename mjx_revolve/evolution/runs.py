@@ -28,6 +28,8 @@ import yaml
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.config import Config, dump_config, load_config
+from mjx_revolve.episodes.lives import Life, find_lives
+from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.evolution.checkpoints import (
     Checkpoint,
     DamageError,
@@ -226,6 +228,27 @@ class Run:
         if self._lock is not None:
             self._lock.close()
             self._lock = None
+
+
+def load_archive(folder: str | Path) -> tuple[Archive, list[Life]]:
+    """The archive of a run in which bodies evolved, as its newest checkpoint has it.
+
+    Args:
+        folder: the run folder, which may still be written to.
+
+    Returns:
+        The archive, and who is in it, in the order of `archive.filled` and `archive.rows`.
+
+    Raises:
+        InputError: it is no run folder, or has no archive yet.
+    """
+    run = Run(Path(folder))
+    arrays = run.load_checkpoint().arrays
+    own = {k.removeprefix("archive."): v for k, v in arrays.items() if k.startswith("archive.")}
+    if not own:
+        raise InputError(f"{folder}: expected a run with bodies.archive; found none in it")
+    found = from_arrays(own)
+    return found, find_lives(run.folder, [int(number) for number in found.ids[filled(found)]])
 
 
 def check_new_folder(folder: str | Path, option: str = "--out") -> None:

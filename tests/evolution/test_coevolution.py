@@ -331,6 +331,9 @@ def test_what_is_in_a_run_folder(folder, capsys):
         person = people[int(row["id"])]
         assert float(row["score"]) == pytest.approx(person["score"])
         assert float(row["num_hinges"]) == person["descriptors"]["num_hinges"]
+    archive, lives = runs.load_archive(run_folder)
+    assert [life.number for life in lives] == [int(row["id"]) for row in rows]
+    assert [life.score for life in lives] == [archive.scores[int(row["cell"])] for row in rows]
     body = load_morphology(run_folder / "champion" / "morphology.yaml")
     assert body.num_hinges == 3
     champion = people[champion_number(run_folder)]
