@@ -1,0 +1,84 @@
+"""The smallest run in which bodies evolve, with real water, from the command to the champion."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from laboratory import QUICK
+from mjx_revolve import evolve as command
+from mjx_revolve.episodes.champion import load_episode
+from mjx_revolve.episodes.config import load_config
+from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.scoring import replay_key
+from mjx_revolve.evolution.body_fitness import make_body_fitness
+from mjx_revolve.evolution.coevolution import check_bodies
+from mjx_revolve.evolution.individuals import from_record
+from mjx_revolve.evolution.life import evaluate
+from mjx_revolve.evolution.pool import Pool
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.shipped import find_shipped
+
+CONFIG = {
+    "world": "empty_underwater",
+    "trim": "neutral",
+    "controller": {"type": "sine"},
+    "task": {"type": "speed", "duration": 0.5, "settle": 0.1, "trials": 1},
+    "bodies": {"max_modules": 5, "max_hinges": 2, "learning": {"population_size": 3}},
+    "evolution": {"population_size": 4, "generations": 2, "checkpoint_every": 1},
+}
+
+
+@pytest.fixture
+def quick_compiles(monkeypatch):
+    monkeypatch.setattr("mjx_revolve.episodes.evaluation.compiler_options", lambda: QUICK)
+
+
+def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
+    """Scores are those of each individual alone, to the bit, and the champion can be replayed."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").write_text(json.dumps(CONFIG))
+    argv = ["small.yaml", "--out", "run", "--workers", "1"]
+    assert run_command(command.main, argv) == 0
+    assert "champion: " in capsys.readouterr().out
+    people = [json.loads(line) for line in (tmp_path / "run" / "individuals.jsonl").open()]
+    assert len(people) == 8 and sum(bool(person["parents"]) for person in people) == 4
+
+    fitness = make_body_fitness(load_config("small.yaml"))
+    pool = Pool(fitness, fitness.block_size)
+    modules = read_modules(fitness.config)
+    lived = [from_record(p, fitness.genotype, modules, fitness.brains.check) for p in people]
+    for one in lived[::3]:
+        key = jax.random.fold_in(jax.random.key(0), one.born)
+        [(scores, measures)] = score(pool, one, jax.random.split(key)[0])
+        assert scores[0] == one.score
+        assert {name: float(x[0]) for name, x in measures.items()} == one.measures
+        assert 0 <= one.measures["energy_j"] < 1
+
+    # Alone the champion is stepped by another program, and by the one that users see replayed.
+    episode = load_episode("run")
+    key = replay_key(0)
+    champion = next(one for one in lived if one.genes == tuple(map(float, episode.genes)))
+    [(scores, _)] = score(pool, champion, key)
+    assert episode.fitness.judge(episode.trajectory, key)[0] == pytest.approx(scores[0], abs=1e-4)
+
+
+def score(pool, one, key):
+    """What somebody has learnt, scored by itself."""
+    genes = np.zeros((1, pool.num_genes), np.float32)
+    genes[0, pool.layout(one.body).columns] = one.genes
+    return evaluate(pool, [one], [genes], key)
+
+
+@pytest.mark.parametrize("name", ["lake_coevolve", "bed_coevolve", "lake_map_elites"])
+def test_shipped_configurations(name):
+    """They are whole, and there is room for all bodies that they grow."""
+    config = load_config(find_shipped(name, "configs"))
+    fitness = make_body_fitness(config)
+    check_bodies(config, Pool(fitness, fitness.block_size))
+    rng = np.random.default_rng(1)
+    bodies = [fitness.genotype.develop(fitness.genotype.random(rng)) for _ in range(40)]
+    packed = fitness.mixed.pack([fitness.build(body) for body in bodies])
+    assert packed.count.max() <= fitness.mixed.capacity.rows
+    assert fitness.mixed.touches == (name == "bed_coevolve")
