@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import json
 import os
 import shlex
 import shutil
@@ -34,6 +33,7 @@ from mjx_revolve.evolution.start import check_unchanged
 from mjx_revolve.inputs.commands import Parser, whole
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.population import read_population
 
 BASE = Path(__file__).with_name("studies.yaml")
 COMMAND = (sys.executable, "-m", "mjx_revolve.evolve")
@@ -332,22 +332,15 @@ def _read_outcome(plan: Plan, run: Run, add: Callable[[str, Figures], Figures]) 
     body = load_morphology(plan.folder / "champion" / "morphology.yaml")
     champion = {"score": float(facts["score"]), **facts["measures"], **body.descriptors}
     champion |= add(plan.case, champion)
-    population: Figures = {}
-    if (plan.folder / "generations.jsonl").exists():
-        living = set(_lines(plan.folder / "generations.jsonl")[-1]["living"])
-        lives = [
-            {"score": one["score"], **one["measures"], **one["descriptors"]}
-            for one in _lines(plan.folder / "individuals.jsonl")
-            if one["id"] in living and one["score"] is not None
-        ]
-        lives = [life | add(plan.case, life) for life in lives]
-        population = {name: float(np.mean([life[name] for life in lives])) for name in lives[0]}
+    people, problems = read_population(plan.folder)
+    if problems:
+        raise ValueError(problems[0])
+    alive = [dict(life.figures) for life in people.alive(people.last) if life.score == life.score]
+    lives = [life | add(plan.case, life) for life in alive]
+    population = {
+        name: float(np.mean([life[name] for life in lives])) for name in (lives or [{}])[0]
+    }
     return Outcome(plan, champion, population, run.load_metrics(), body)
-
-
-def _lines(path: Path) -> list[dict]:
-    """JSON, a value per line."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list[Outcome]]:

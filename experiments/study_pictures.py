@@ -10,13 +10,10 @@ from matplotlib.figure import Figure
 
 from experiments.statistics import interval
 from experiments.studies import Outcome
-from mjx_revolve.view.pieces import rest_scene
 from mjx_revolve.view.plots import COLORS, WIDE, dress, head, new_figure
-from mjx_revolve.view.raster import draw_scene, make_view
+from mjx_revolve.view.thumbnails import SIZE, draw_bodies
 
 Cases = Mapping[str, Sequence[Outcome]]
-_VIEW = make_view(-58.0, 30.0)
-_PIXELS = 260  # along the largest body; a choice, for small files
 
 
 def color_of(k: int) -> str:
@@ -89,7 +86,7 @@ def plot_dots(panels: Mapping[str, Mapping[str, Sequence[float]]], columns: int 
 
 
 def plot_bodies(cases: Cases) -> Figure:
-    """The champions at rest, with their scores, all in one scale: a line for each case.
+    """The champions at rest, with scores and lengths, in one scale: a line for each case.
 
     Args:
         cases: outcomes by case.
@@ -97,33 +94,21 @@ def plot_bodies(cases: Cases) -> Figure:
     Returns:
         The figure.
     """
-    scenes = {name: [rest_scene(o.body) for o in found] for name, found in cases.items()}
-    corners = [s.corners.reshape(-1, 3) @ _VIEW[:2].T for row in scenes.values() for s in row]
-    wide, tall = 1.06 * np.max([np.ptp(points, axis=0) for points in corners], axis=0)
-    columns = max(map(len, scenes.values()))
-    figure = new_figure(WIDE, (WIDE / columns * tall / wide + 0.3) * len(cases))
+    pictures = iter(draw_bodies([o.body for found in cases.values() for o in found]))
+    columns = max(map(len, cases.values()))
+    figure = new_figure(WIDE, (WIDE / columns * SIZE[1] / SIZE[0] + 0.25) * len(cases))
     grid = figure.subplots(len(cases), columns, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
     for k, (line, (name, found)) in enumerate(zip(grid, cases.items(), strict=True)):
-        for axes, outcome, scene in zip(line, found, scenes[name], strict=False):
-            points = scene.corners.reshape(-1, 3) @ _VIEW[:2].T
-            low, high = points.min(0), points.max(0)
-            image, extent = draw_scene(scene, _VIEW, low, high, wide / _PIXELS)
-            axes.imshow(image, extent=extent, origin="lower", interpolation="bilinear")
-            x, y = (low + high) / 2
-            axes.set(xlim=(x - wide / 2, x + wide / 2), ylim=(y - tall / 2, y + tall / 2))
-            words = f"seed {outcome.plan.seed}: {outcome.champion['score']:.3g}"
-            axes.set_title(words, fontsize=7, color="#333333")
+        for axes, outcome in zip(line, found, strict=False):
+            axes.imshow(next(pictures), interpolation="lanczos")
+            length = 100 * outcome.body.descriptors["length"]
+            words = f"seed {outcome.plan.seed}: {outcome.champion['score']:.3g}, {length:.0f} cm"
+            axes.set_title(words.replace("-", "−"), fontsize=7, color="#333333", pad=2)
         # Left of the line's first body.
         line[0].text(
             -0.02, 0.5, name.replace("_", " "), transform=line[0].transAxes, rotation=90,
             ha="right", va="center", fontsize=10, color=color_of(k), fontweight="bold",
         )  # fmt: skip
-    bar = 0.1 if wide < 0.8 else 0.2  # m
-    left, low = grid[-1][0].get_xlim()[0], grid[-1][0].get_ylim()[0]
-    grid[-1][0].plot([left, left + bar], [low, low], color="#333333", lw=3, clip_on=False)
-    grid[-1][0].text(
-        left + bar / 2, low + 0.02 * tall, f"{bar:g} m", fontsize=7, ha="center", va="bottom"
-    )
     return figure
