@@ -51,6 +51,7 @@ def quick_compiles():
 
 def limp(robot):
     """The robot without servos, friction and end stops; before anything compiles it."""
+    _ = robot.mj_model  # angles are drawn from its range
     ours = robot.assembly
     ours.stiffness[:], ours.damping[:], ours.speed[:] = 1e-12, 0.0, np.inf
     ours.range[:] = [-1e3, 1e3]
