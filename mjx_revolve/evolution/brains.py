@@ -7,6 +7,7 @@ that tells each joint's genes from its place (`cppn`, after Stanley's HyperNEAT,
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +22,8 @@ from mjx_revolve.inputs.errors import InputError, show
 # are divided before they enter it [m], about two modules. Choices.
 _HIDDEN = 12
 _LENGTH = 0.1
+# What edits put behind the name of a copy.
+_COPY = re.compile(r"_\d+$")
 _FUNCTIONS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
     np.sin,
     np.tanh,
@@ -131,8 +134,12 @@ def _make_joints(settings: BrainsConfig, common: Controller) -> Brains:
         noise = settings.mutation * rng.standard_normal(len(layout.names))
         fresh = settings.std_init * rng.standard_normal(len(layout.names))
         known: Mapping[str, float] = {k: v for p in reversed(parents) for k, v in p.items()}
-        have = np.array([name in known for name in layout.names], bool)
-        values = np.array([known.get(name, 0.0) for name in layout.names])
+        # A copy has a number behind its original's name; so has what a second parent gives where
+        # the first one has that name, too.
+        copied = {k: v for p in parents for k, v in p.items()}
+        found = [known.get(n, copied.get(_COPY.sub("", n))) for n in layout.names]
+        have = np.array([value is not None for value in found], bool)
+        values = np.array([0.0 if value is None else value for value in found])
         for k in np.flatnonzero(~have):
             # Where the body has grown: as the nearest joint does that had a parent.
             alike = [i for i in np.flatnonzero(have) if _alike(layout.genes[i], layout.genes[k])]

@@ -115,6 +115,22 @@ def test_of_two_parents_the_first_ones_joints_come_first():
     assert child == second | first
 
 
+def test_a_copy_does_as_its_original():
+    """Of a limb that was doubled; one that a second parent gave does as it did there."""
+    brains = make_brains(BrainsConfig(mutation=0.0), common())
+    bare = add_module(body("core"), 0, 0, "ActiveHinge", name="fin")
+    bare = add_module(bare, 0, 1, "ActiveHinge", name="leg")
+    double = add_module(bare, 0, 2, "ActiveHinge", name="fin_2")
+    layout = layout_of(double, common=common())
+    parent = {name: 1.0 + k for k, name in enumerate(layout_of(bare, common=common()).names)}
+    child = brains.inherit(np.random.default_rng(0), [parent], layout)
+    for what in ("u", "v", "offset"):
+        assert child[f"{what} fin_2"] == child[f"{what} fin"] == parent[f"{what} fin"]
+    other = dict.fromkeys(parent, -1.0)
+    child = brains.inherit(np.random.default_rng(0), [parent, other], layout)
+    assert child["u fin_2"] == -1 and child["u fin"] == parent["u fin"]
+
+
 def test_a_limb_where_there_was_none():
     """With nobody to learn from, genes are drawn."""
     brains = joints(std_init=0.5, mutation=0.0)
