@@ -459,8 +459,8 @@ def make_mixed_fitness(
     examples: Sequence[Morphology],
     hinges: int = 0,
     rows: int = 0,
-    modules: int = 0,
     kinds: Sequence[ModuleType] = (),
+    modules: int = 0,
     **overrides: Any,
 ) -> MixedFitness:
     """Builds the fitness function of a configuration for bodies of many kinds.
@@ -471,9 +471,9 @@ def make_mixed_fitness(
             and the largest of them sets the size.
         hinges: most hinges that a body may have, if more than the examples'.
         rows: most rows of tables that a body may need (see `engine.rows`), likewise.
-        modules: most modules that a body may have, likewise: there is room for all bodies of these
-            types with so many modules and hinges.
         kinds: types of modules that bodies may be made of, beside those of the examples.
+        modules: most modules that a body may have: there is then room for all bodies of these types
+            with so many modules and hinges, whatever their shape.
         **overrides: as in `make_fitness`.
 
     Returns:
