@@ -27,6 +27,7 @@ from experiments.studies import (
     make_plans,
     read_outcomes,
     run_study,
+    score_still,
     study_parser,
     write_csv,
 )
@@ -175,7 +176,7 @@ def main(argv: list[str] | None = None) -> int:
     folder, plans = make_plans(make_cases(given_settings(options)), options, "budgets")
     if not options.report and (code := run_study(plans, "budgets", argv)):
         return code
-    outcomes = read_outcomes(plans)
+    outcomes = score_still(read_outcomes(plans))
     print("\n".join(write_report(folder, outcomes)))
     print(f"{len(outcomes)} of {len(plans)} runs; written: budgets.md in {shown(folder)}")
     return 0

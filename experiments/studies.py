@@ -37,6 +37,7 @@ from mjx_revolve.view.population import read_population
 
 BASE = Path(__file__).with_name("studies.yaml")
 COMMAND = (sys.executable, "-m", "mjx_revolve.evolve")
+_STILL_KEY, _STARTS = 20_000, 8  # of the starts from which champions are scored at rest; a choice
 _LOOK = 0.2  # how often a running command is looked after [s]
 
 
@@ -343,6 +344,55 @@ def _read_outcome(plan: Plan, run: Run, add: Callable[[str, Figures], Figures]) 
     return Outcome(plan, champion, population, run.load_metrics(), body)
 
 
+def score_still(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Scores the champions once more with all joints at rest.
+
+    A body that starts in another attitude than that in which it hangs in the water turns, and its
+    core moves; what it scores by that is not swimming.
+
+    Args:
+        outcomes: of the finished runs.
+
+    Returns:
+        The same with `still_score` among the champions' figures: the mean over a few fresh starts.
+    """
+    from mjx_revolve.numerics.runtime import prepare_process
+
+    prepare_process()
+    found = []
+    for some in by_case(outcomes, dict.fromkeys(o.plan.case for o in outcomes)).values():
+        scores = _still_scores(some)
+        found += [
+            o._replace(champion={**o.champion, "still_score": score})
+            for o, score in zip(some, scores.tolist(), strict=True)
+        ]
+    return found
+
+
+def _still_scores(outcomes: Sequence[Outcome]) -> np.ndarray:
+    """`[n]` of one case, by the program that its runs had."""
+    import jax
+
+    from mjx_revolve.episodes.fitness import make_fitness
+    from mjx_revolve.evolution.body_fitness import make_body_fitness
+    from mjx_revolve.evolution.individuals import Individual
+    from mjx_revolve.evolution.life import evaluate
+    from mjx_revolve.evolution.pool import Pool
+
+    config = outcomes[0].plan.config
+    keys = jax.random.split(jax.random.key(_STILL_KEY), _STARTS)
+    if config.bodies is None:
+        fitness = make_fitness(config)
+        still = np.zeros((config.evolution.population_size, fitness.num_genes), np.float32)
+        score = np.mean([fitness.evaluate(still, key)[0][0] for key in keys])
+        return np.full(len(outcomes), score)
+    bodies = make_body_fitness(config)
+    pool = Pool(bodies, bodies.block_size)
+    who = [Individual(k, (), 0, "champion", None, o.body, None) for k, o in enumerate(outcomes)]
+    genes = [np.zeros((1, bodies.num_genes), np.float32)] * len(who)
+    return np.mean([[s[0] for s, _ in evaluate(pool, who, genes, key)] for key in keys], 0)
+
+
 def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list[Outcome]]:
     """Outcomes by case, in the order of the cases; those without any are left out."""
     found = {name: [o for o in outcomes if o.plan.case == name] for name in cases}
@@ -350,23 +400,32 @@ def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list
 
 
 def describe_runs(cases: Mapping[str, Sequence[Outcome]], known: Mapping[str, Case]) -> list[str]:
-    """A table in Markdown: what was run, how often, for how long, and the champions' scores.
+    """Markdown: what was run, how often, for how long, and the champions' scores.
 
     Args:
         cases: outcomes by case.
         known: the cases by name.
 
     Returns:
-        Its lines.
+        Lines of a table, and what is to be known of it.
     """
-    lines = ["| | what | seeds | trials each | s each | champions' score |", f"|{'---|' * 6}"]
+    lines = ["| | what | seeds | trials each | s each | champions' score | with joints at rest |"]
+    lines.append(f"|{'---|' * 7}")
     for name, outcomes in cases.items():
         tried = sorted({f"{int(o.metrics['evaluations'][-1]):,}" for o in outcomes})
         seconds = np.mean([o.metrics["seconds"][-1] for o in outcomes])
-        score = interval([o.champion["score"] for o in outcomes])
-        cells = (known[name].words, str(len(outcomes)), " or ".join(tried), f"{seconds:.0f}")
-        lines.append(f"| `{name}` | {' | '.join(cells)} | {score} |")
-    return lines
+        scores = (
+            interval([o.champion.get(figure, np.nan) for o in outcomes])
+            for figure in ("score", "still_score")
+        )
+        cells = (known[name].words, len(outcomes), " or ".join(tried), f"{seconds:.0f}", *scores)
+        lines.append(f"| `{name}` | {' | '.join(map(str, cells))} |")
+    return [*lines, "", fill(_STILL)]
+
+
+_STILL = """Scores are in body lengths/s, of each run's champion on fresh starts. A body that does
+not start in the attitude in which it hangs in the water turns, and its core moves without any work
+of a joint: only what a champion scores beyond its score with all joints at rest is its doing."""
 
 
 def fill(text: str) -> str:

@@ -15,7 +15,7 @@ import pytest
 from experiments import budgets, environments, statistics, studies
 from experiments.environments import ENVIRONMENTS
 from experiments.random_bodies import random_body
-from laboratory import ROOT
+from laboratory import ROOT, body
 from mjx_revolve import evolve
 from mjx_revolve.evolution.runs import Run
 from mjx_revolve.inputs.commands import run_command
@@ -82,6 +82,7 @@ def started(monkeypatch):
 
     monkeypatch.setattr(studies, "_run", run)
     monkeypatch.setattr(environments, "write_report", lambda *_: [])  # its pictures take a while
+    monkeypatch.setattr(environments, "score_still", lambda outcomes: outcomes)
     return commands
 
 
@@ -120,7 +121,7 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
     count = len(started)
     for options, message in (
         (("--generations", "2"), "expected a run of 2 generations at most; found 3"),
-        (("--generations", "3", "--set", "task.duration=7"), "task.duration: expected 6.0"),
+        (("--generations", "3", "--set", "task.duration=13"), "task.duration: expected 12"),
     ):
         with pytest.raises(InputError, match=message):
             study(tmp_path, *two, *options)
@@ -271,20 +272,38 @@ def test_budgets_are_equal(settings):
         )
 
 
+@pytest.mark.slow
+def test_what_a_body_scores_at_rest_is_told():
+    """A spider hangs as it starts; a crooked body turns at first, and its core moves."""
+    case = ENVIRONMENTS["open_water"]
+    settings = (*case.settings, "task.settle=1.0", "task.duration=3.0")
+    plan = studies.Plan("open_water", 0, ROOT, settings)
+    bodies = [body("spider"), random_body(1, 4, 3)]
+    given = [studies.Outcome(plan, {"score": 1.0}, {}, {}, each) for each in bodies]
+    level, crooked = (o.champion["still_score"] for o in studies.score_still(given))
+    assert abs(level) < 0.01
+    assert crooked > 0.03
+
+    robot = budgets.make_cases()["spider"].settings
+    plan = studies.Plan("spider", 0, ROOT, (*robot, *settings))
+    (outcome,) = studies.score_still([given[0]._replace(plan=plan)])
+    assert outcome.champion == {"score": 1.0, "still_score": pytest.approx(level, abs=1e-4)}
+
+
 # ------------------------------------------------------------------ reports
 
 
 def outcomes(values):
     """Of invented champions; `values` of all speeds and gaits by case, all bodies are the same."""
-    found, body = [], random_body(0, 2, 1)
+    found, one = [], random_body(0, 2, 1)
     for case, numbers in values.items():
         for seed, number in enumerate(numbers):
             figures = {name: number for name in environments.FIGURES}
-            figures |= {"score": number, **body.descriptors}
+            figures |= {"score": number, **one.descriptors}
             curve = {"evaluations": np.array([10.0, 20.0]), "champion": np.array([0.0, number])}
             plan = studies.Plan(case, seed, ROOT / case / f"seed_{seed}", ())
             found.append(
-                studies.Outcome(plan, figures, figures, curve | {"seconds": np.ones(2)}, body)
+                studies.Outcome(plan, figures, figures, curve | {"seconds": np.ones(2)}, one)
             )
     return found
 
