@@ -48,24 +48,24 @@ class Episode:
         robot: the compiled robot; its world is `robot.world`.
         trajectory: what it did.
         score: its mean score, or None.
-        starts: over which starts that is.
         score_unit: of the score, e.g. "body lengths/s"; "" without one.
         water: surface and current along the way, where they are not just the world's.
         genes: `[G]` or None without a controller.
         fitness: what the genes were evolved for, or None.
         folder: the run folder, or None.
+        starts: over which the score is the mean.
     """
 
     title: str
     robot: Robot
     trajectory: Trajectory
     score: float | None = None
-    starts: str = "fresh starts"
     score_unit: str = ""
     water: Water | None = None
     genes: np.ndarray | None = None
     fitness: Fitness | None = None
     folder: Path | None = None
+    starts: str = "fresh starts"
 
 
 def load_episode(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from browser import Browser, find_browser
 from mjx_revolve import export, replay, report, viewer
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import make_morphology
@@ -16,6 +17,7 @@ from mjx_revolve.episodes.lives import find_lives, read_generations, read_lives
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.pieces import make_pieces
+from mjx_revolve.view.plots import plot_fitness
 from mjx_revolve.view.population import (
     pick_ancestors,
     pick_generations,
@@ -235,6 +237,14 @@ def test_a_sheet_of_the_best(run):
     figure.canvas.draw()  # a dollar is no formula
 
 
+def test_fitness_has_how_large_bodies_are():
+    metrics = {"generation": np.arange(1.0, 4), "best": np.ones(3), "champion": np.ones(3),
+               "mean_num_modules": np.array([4.0, 5.0, 6.0])}  # fmt: skip
+    figure = plot_fitness(metrics)
+    (axes,) = [axes for axes in figure.axes if axes.get_ylabel() == "modules, mean\nof the living"]
+    assert axes.lines[0].get_ydata().tolist() == [4.0, 5.0, 6.0]
+
+
 def test_sizes_over_the_generations(run):
     population, _ = read_population(run)
     figure = plot_sizes(population, ("speed_m_s",))
@@ -286,6 +296,24 @@ def test_cells_of_the_archive_are_links(tmp_path, still):
     assert "--individual 4" in page and "&#39;" in page  # a name with a blank is quoted
     assert '<a href="../a b/individuals/3.html">#3</a>' in page
     assert "<?xml" not in page and page.count("<svg") == 1
+
+
+@pytest.mark.skipif(find_browser() is None, reason="needs Chromium or Chrome")
+def test_a_click_on_a_cell_shows_who_lives_there(tmp_path, still):
+    run = make_run(tmp_path / "run", ARCHIVE)
+    record = read_run(run)
+    (tmp_path / "report.html").write_text(report_page.make_report([record]))
+    card = f"document.getElementById('{report_bodies.anchor(record, 3)}')"
+    with Browser(900, 700) as browser:
+        browser.send("Page.navigate", url=(tmp_path / "report.html").as_uri())
+        browser.wait("document.readyState === 'complete' && !!document.querySelector('.map svg a')")
+        assert browser.evaluate(f"{card}.offsetHeight") == 0
+        link = f".map a[*|href='#{report_bodies.anchor(record, 3)}']"
+        browser.evaluate(f'document.querySelector("{link}").scrollIntoView()')
+        browser.click(link)
+        browser.wait(f"{card}.offsetHeight > 100")
+        assert "--individual 3" in browser.evaluate(f"{card}.textContent")
+        assert browser.errors == []
 
 
 def test_whose_pages_are_asked_for(run, tmp_path):

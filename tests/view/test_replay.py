@@ -468,7 +468,7 @@ def command(episode, monkeypatch):
     import mjx_revolve.episodes.champion
     import mjx_revolve.view.viewer
 
-    def load(path, world="lake", duration=None, seed=None):
+    def load(path, world="lake", duration=None, seed=None, individual=None):
         return episode
 
     monkeypatch.setattr(mjx_revolve.episodes.champion, "load_episode", load)

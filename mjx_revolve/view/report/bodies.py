@@ -274,7 +274,11 @@ def viewer_command(record: RunRecord, number: int) -> str:
 
 
 def inline_svg(svg: bytes) -> str:
-    """An SVG as a part of a page: without its head and its size, which the page decides on."""
-    text = svg[svg.index(b"<svg") :].decode()
-    return re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1",
-                  re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1), count=1)  # fmt: skip
+    """An SVG as a part of a page.
+
+    Without its head; without its size, which the page decides on; and without its links' wish for a
+    window of their own.
+    """
+    text = svg[svg.index(b"<svg") :].decode().replace(' target="_blank"', "")
+    start, end = text.split(">", 1)
+    return re.sub(r' (width|height)="[^"]*"', "", start) + ">" + end
