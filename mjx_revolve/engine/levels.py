@@ -18,6 +18,7 @@ import numpy as np
 
 from mjx_revolve.engine.columns import Columns, pick_level, read_columns
 from mjx_revolve.engine.level import Laws, Level, Thrusters
+from mjx_revolve.engine.model_changes import changed_assembly, changed_columns
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.thrusters import read_thrusters
 from mjx_revolve.numerics.spatial import add, fold, total
@@ -172,8 +173,9 @@ def make_levels(robot: Robot, contact: bool = True) -> Levels:
     Returns:
         The levels.
     """
-    assembly = robot.assembly
-    columns, parent = read_columns(assembly), assembly.parent.tolist()
+    assembly = changed_assembly(robot)
+    columns = changed_columns(robot, read_columns(assembly))
+    parent = assembly.parent.tolist()
     depth = {1: 0}
     for body in range(2, len(parent)):
         depth[body] = depth[parent[body]] + 1

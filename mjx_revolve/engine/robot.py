@@ -52,13 +52,22 @@ class Robot:
         return compile_model(self.assembly)
 
     @property
+    def is_compiled(self) -> bool:
+        """Whether MuJoCo's model was made, and may have been changed by hand."""
+        return "_model" in self.__dict__
+
+    @property
     def mj_spec(self) -> mujoco.MjSpec:
         """The editable MuJoCo model."""
         return self._model[0]
 
     @property
     def mj_model(self) -> mujoco.MjModel:
-        """The compiled model. Its own fluid (`opt.density`, `opt.viscosity`) is off."""
+        """The compiled model. Its own fluid (`opt.density`, `opt.viscosity`) is off.
+
+        Masses, inertias, hinges and servos may be changed in it before an engine is made of the
+        robot; batches of many robots take bodies as they are built.
+        """
         return self._model[1]
 
     @cached_property

@@ -20,6 +20,7 @@ from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.assembly import assemble
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.columns import read_columns
+from mjx_revolve.engine.model_changes import changed_assembly, changed_columns
 from mjx_revolve.engine.mujoco_model import compile_model
 from mjx_revolve.engine.plant import figure_of
 from mjx_revolve.inputs.errors import InputError
@@ -204,3 +205,23 @@ def test_robots_of_two_worlds_do_not_stand_side_by_side():
     one, other = build_robot(body("core"), world()), build_robot(body("core"), world(gravity=3.7))
     with pytest.raises(InputError, match="robot 'core': expected the world of 'core'"):
         pack_bodies([one, other], fit_capacity([one]))
+
+
+def test_what_was_changed_in_the_model_by_hand_counts():
+    """Hinges, servos and masses; and nothing else differs, not even in its last bit."""
+    robot = build_robot(body("spider"), load_world("lake"))
+    untouched = read_columns(robot.assembly)
+    model = robot.mj_model
+    assert changed_assembly(robot) is robot.assembly
+    assert changed_columns(robot, untouched) is untouched
+    model.dof_damping[8], model.jnt_limited[:] = 0.5, 0
+    model.actuator_gainprm[:, 0], model.actuator_biasprm[:] = 0.0, 0.0
+    model.body_mass[3] *= 2
+    found = changed_columns(robot, untouched).hinges
+    np.testing.assert_array_equal(found.gain[2:], 0)
+    np.testing.assert_array_equal(found.stiffness[2:], 0)
+    np.testing.assert_array_equal(found.range[1][2:], np.inf)
+    assert found.damping[4] == 0.5 and np.sum(found.damping != untouched.hinges.damping) == 1
+    assert found.armature is untouched.hinges.armature
+    ratio = changed_assembly(robot).mass[1:] / robot.assembly.mass[1:]
+    np.testing.assert_allclose(ratio, np.where(np.arange(1, 10) == 3, 2, 1))
