@@ -186,6 +186,7 @@ def test_generations(folder, selection):
         )
 
 
+@pytest.mark.slow
 def test_evolution_finds_what_is_asked_for(folder):
     """Three hinges, and genes near a half: far above what random search finds."""
     found = {}
@@ -200,6 +201,7 @@ def test_evolution_finds_what_is_asked_for(folder):
     assert found["plus"] > found["random"] / 2
 
 
+@pytest.mark.slow
 def test_inheritance(folder):
     """Children begin with what their parents learnt, were born with, or with nothing of either."""
     learning = {"population_size": 8, "generations": 4, "std_init": 0.5}
@@ -303,9 +305,12 @@ def contents(folder):
 
 @pytest.mark.parametrize("bodies", [
     {"learning": {"population_size": 4, "generations": 2, "strategy": "CMA_ES"}},
-    ARCHIVE,
-    {"selection": {"type": "nsga2", "objectives": ["score", "novelty"], "novelty": ["length"]},
-     "genotype": "plasticoding", "brains": {"type": "cppn"}},
+    pytest.param(ARCHIVE, marks=pytest.mark.slow),
+    pytest.param(
+        {"selection": {"type": "nsga2", "objectives": ["score", "novelty"], "novelty": ["length"]},
+         "genotype": "plasticoding", "brains": {"type": "cppn"}},
+        marks=pytest.mark.slow,
+    ),
 ], ids=["learning", "map_elites", "plasticoding"])  # fmt: skip
 def test_a_run_that_goes_on_ends_as_one_that_never_stopped(folder, bodies, capsys):
     toys.write_bodies_config(folder / "toy.yaml", bodies)
@@ -350,6 +355,7 @@ def test_a_run_cannot_become_another(folder, changed, capsys):
     assert f"bodies.{changed.split('.')[1].split('=')[0]}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_workers_change_nothing(folder):
     """The same bits from this process and from two others."""
     toys.write_bodies_config(folder / "toy.yaml", {"learning": {"population_size": 6}})
