@@ -46,7 +46,7 @@ def drawn(robot, lanes, seed=0, speed=1.0):
 
 def stock(robot):
     """The robot with MuJoCo's own servos, which know no top speed; before anything compiles it."""
-    robot.assembly.speed[:] = np.inf
+    robot.mj_model.jnt_user[:] = np.inf
     return robot
 
 

@@ -261,10 +261,10 @@ def test_jointed_without_water_it_is_mujocos_step():
     Until MJX leaves a corner out: of a box, it takes those within 1 mm of the deepest.
     """
     robot = elbow_robot(world(gravity=G, bed=FLAT))
-    # MuJoCo knows no top speed, and its solver does not see the hinges' friction, as ours does.
-    ours = robot.assembly
-    ours.speed[:], ours.damping[:], ours.stiffness[:] = np.inf, 0.0, 0.3
     model = robot.mj_model
+    # MuJoCo knows no top speed, and its solver does not see the hinges' friction, as ours does.
+    model.jnt_user[:], model.dof_damping[:] = np.inf, 0.0
+    model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = 0.3, -0.3
     qpos, qvel = at_rest(robot, 1, FLAT["height"] + 0.1)
     qpos[3:7, 0] = np.array([9, 2, 1, 0]) / np.sqrt(86)
     time, q, v, _ = march(robot, 0.125, qpos, qvel, engine="mjx")

@@ -51,10 +51,9 @@ def quick_compiles():
 
 def limp(robot):
     """The robot without servos, friction and end stops; before anything compiles it."""
-    _ = robot.mj_model  # angles are drawn from its range
-    ours = robot.assembly
-    ours.stiffness[:], ours.damping[:], ours.speed[:] = 1e-12, 0.0, np.inf
-    ours.range[:] = [-1e3, 1e3]
+    model = robot.mj_model
+    model.actuator_gainprm[:, 0], model.actuator_biasprm[:] = 1e-12, 0.0
+    model.dof_damping[:], model.jnt_limited[:], model.jnt_user[:] = 0.0, 0, np.inf
     return robot
 
 
