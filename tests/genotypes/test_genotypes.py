@@ -403,6 +403,7 @@ def test_unknown_genotypes_are_refused():
 # ------------------------------------------------------------------------- users' own
 
 PAGE = (ROOT / "docs" / "evolution.md").read_text(encoding="utf-8")
+PAGE = PAGE.split("\n## Genotypes\n")[1].split("\n## Selection\n")[0]
 
 
 def block(language):
