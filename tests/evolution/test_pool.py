@@ -307,7 +307,7 @@ def troubled(tmp_path_factory):
             patch.setenv(name, value)
         patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
         patch.setenv("TOY_TROUBLE", str(folder / "order"))
-        patch.setattr(jobs, "LIMITS", Limits(block=4.0))
+        patch.setattr(jobs, "LIMITS", Limits(block=15.0))
         with make_pool(toy_config(folder), 2, toys.make_troubled) as pool:
             pool.folder = folder / "lost"
             pool(np.zeros((12, 5)), KEY)
@@ -323,7 +323,7 @@ def pids_of(pool):
     ("kind", "how"),
     [
         ("kill", "killed by SIGKILL"),
-        ("stop", r"no answer for \d s"),
+        ("stop", r"no answer for \d+ s"),
         ("exit", "exit code 3: out of luck"),
         ("raise", None),
     ],
