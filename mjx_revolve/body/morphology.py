@@ -298,9 +298,13 @@ def _read_id(value: Any, place: str) -> str:
             f"put them in quotes); found {show(value)}"
         )
     try:
-        return str(value)
+        name = str(value)
     except ValueError:
         raise InputError(f"{place}: expected a name or a number; found {show(value)}") from None
+    # It goes into XML, pages and terminals; lines and tabs harm none of them.
+    if not name.replace("\n", "").replace("\t", "").isprintable():
+        raise InputError(f"{place}: expected printable characters; found {show(value)}")
+    return name
 
 
 def read_orientation(value: Any, place: str) -> float:

@@ -20,9 +20,13 @@ from mjx_revolve.body.placement import turned
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.robot import Robot
 
+# Centres of mass and of volume nearer than this are one point [m]: those of symmetric bodies are,
+# but for rounding. A choice.
+_ONE_POINT = 1e-6
+
 
 class Figure(NamedTuple):
-    """A body's size, a number or `[lanes]` each.
+    """A body's size and balance, a number or `[lanes]` each.
 
     Attributes:
         length: largest extent at rest [m].
@@ -31,6 +35,9 @@ class Figure(NamedTuple):
         radius: how far it reaches from the core's vertical [m].
         sinks: whether the water carries less than half of its weight.
         num_hinges: how many hinges it has.
+        up: `[3]` or `[3, lanes]` direction from the centre of mass to that of the displaced volume
+            at rest, core frame: what points up once the body hangs still in deep water. (0, 0, 1)
+            where the two are one.
     """
 
     length: Any
@@ -39,11 +46,12 @@ class Figure(NamedTuple):
     radius: Any
     sinks: Any
     num_hinges: Any
+    up: Any
 
 
 def figure_of(robot: Robot) -> Figure:
     """The size of a robot, in its world."""
-    return Figure(*(x.item() for x in figures_of(robot.assembly)))
+    return Figure(*(x[..., 0].tolist() for x in figures_of(robot.assembly)))
 
 
 def figures_of(assembly: Assembly) -> Figure:
@@ -57,6 +65,9 @@ def figures_of(assembly: Assembly) -> Figure:
     corners = layout.core_corners()
     across = np.hypot(corners[..., 0], corners[..., 1])
     mass = np.bincount(layout.body, table.mass)
+    lever = _buoyancy_center(assembly) - _mass_center(assembly)
+    arm = np.linalg.norm(lever, axis=1, keepdims=True)
+    hangs = arm > _ONE_POINT
     displaced = world.density * np.bincount(layout.body, table.volume)
     return Figure(
         length=extent.max(1),
@@ -65,7 +76,28 @@ def figures_of(assembly: Assembly) -> Figure:
         radius=np.maximum.reduceat(across.max(1), first),
         sinks=(displaced < mass / 2) | (world.buoyancy == "off"),
         num_hinges=np.array([float(body.num_hinges) for body in assembly.morphologies]),
+        up=np.where(hangs, lever / np.where(hangs, arm, 1.0), (0.0, 0.0, 1.0)).T,
     )
+
+
+def _mass_center(assembly: Assembly) -> np.ndarray:
+    """`[robots, 3]` centres of mass at rest, core frame [m]."""
+    place = assembly.position + turned(assembly.rotation, assembly.center)
+    return _mean(place[1:], assembly.mass[1:], assembly.robot[1:], len(assembly.morphologies))
+
+
+def _buoyancy_center(assembly: Assembly) -> np.ndarray:
+    """`[robots, 3]` centres of what the parts displace at rest, core frame [m]."""
+    layout, table = assembly.layout, assembly.fluid
+    place = layout.position + turned(layout.rotation, table.center_of_volume)
+    return _mean(place, table.volume, layout.body, len(assembly.morphologies))
+
+
+def _mean(place: np.ndarray, weight: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
+    """`[count, 3]` weighted means of what each owns; 0 where nothing weighs."""
+    moment = np.stack([np.bincount(owner, weight * x, count) for x in place.T], 1)
+    whole = np.bincount(owner, weight, count)[:, None]
+    return moment / np.where(whole > 0, whole, 1.0)
 
 
 @partial(

@@ -128,6 +128,9 @@ class TaskConfig(Section):
     """Score lost per joule of joint work [1/J]."""
     start_tilt: Annotated[NonNegative, Unit("rad")] = 0.1
     """Standard deviation of the start's roll and pitch [rad]."""
+    start_attitude: Literal["level", "righted"] = "level"
+    """How the core stands before it is tilted: `level`, or `righted`, as the body comes to rest in
+    deep water, its centre of mass below that of its volume."""
     start_yaw: Annotated[NonNegative, Unit("rad")] = 0.0
     """Standard deviation of the start's heading [rad]."""
     start_position: Annotated[NonNegative, Unit("m")] = 0.0

@@ -101,7 +101,32 @@ def start_pose(
         `[7, lanes]` position, world frame [m], and quaternion (w, x, y, z).
     """
     place = task.start(settings, world, figure, starts.place)
-    return jnp.concatenate([place, starts.quat])
+    quat = starts.quat
+    if settings.start_attitude == "righted":
+        quat = _after(_righting(figure.up), quat)
+    return jnp.concatenate([place, quat])
+
+
+def _righting(up: Any) -> tuple[Any, ...]:
+    """The least turn (w, x, y, z) that brings a direction, a unit vector, upright."""
+    x, y, z = (jnp.asarray(component) for component in up)
+    # Half way round, where any horizontal axis would do, it is x.
+    over = jnp.where(z < -1 + 1e-6, 1.0, 0.0)
+    w, x, y = (1 - over) * (1 + z), over + (1 - over) * y, -(1 - over) * x
+    norm = jnp.sqrt(w * w + x * x + y * y)
+    return w / norm, x / norm, y / norm, jnp.zeros_like(w)
+
+
+def _after(first: tuple[Any, ...], then: jax.Array) -> jax.Array:
+    """`[4, lanes]` one turn after the other."""
+    (a, b, c, d), (e, f, g, h) = then, first
+    product = (
+        a * e - b * f - c * g - d * h,
+        a * f + b * e + c * h - d * g,
+        a * g - b * h + c * e + d * f,
+        a * h + b * g - c * f + d * e,
+    )
+    return jnp.stack([x.astype(then.dtype) for x in product])
 
 
 def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Water:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,13 +13,15 @@ from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.inputs.errors import InputError, show
 
+Found = TypeVar("Found")
+
 # Bounds on length and mass are kept up to rounding.
 SLACK = 1 + 1e-9
 # Variations of a parent that are tried before it is left as it is, and random genomes before it is
 # said that there are none. Choices: most bounds let every second or third pass.
 TRIES = 50
 _RANDOM_TRIES = 300
-# Genomes whose bodies are remembered: a choice, those of some generations.
+# Values of which is remembered what was found: a choice, those of some generations.
 _REMEMBERED = 1000
 
 
@@ -173,26 +175,26 @@ def make_space(
 # ------------------------------------------------------------------------- what genotypes share
 
 
-def remember(develop: Callable[[Any], Morphology]) -> Callable[[Any], Morphology]:
-    """The same function, which knows the bodies of the genomes that it was last asked for.
+def remember(find: Callable[[Any], Found]) -> Callable[[Any], Found]:
+    """The same function, which knows what it has found for those that it was last asked for.
 
     Who varies a genome develops it to see whether it is in the space; so will who asked for it.
 
     Args:
-        develop: genome → body.
+        find: a function of values that do not change, such as genome → body.
 
     Returns:
         The function.
     """
-    known: dict[int, tuple[Any, Morphology]] = {}
+    known: dict[int, tuple[Any, Found]] = {}
 
-    def look_up(genome: Any) -> Morphology:
+    def look_up(asked: Any) -> Found:
         # Genomes need have no hash. They are kept, so that no other comes to have their id.
-        if id(genome) not in known:
+        if id(asked) not in known:
             if len(known) >= _REMEMBERED:
                 known.clear()
-            known[id(genome)] = genome, develop(genome)
-        return known[id(genome)][1]
+            known[id(asked)] = asked, find(asked)
+        return known[id(asked)][1]
 
     return look_up
 

@@ -29,6 +29,7 @@ from mjx_revolve.inputs.schema import (
     checked,
     words,
 )
+from mjx_revolve.inputs.witness import tell
 
 # Shortest wave [m]. Far below 0.1 m surface tension drives waves, which these laws do not know.
 _SHORTEST = 0.01
@@ -293,6 +294,10 @@ def load_current_field(path: str | Path) -> CurrentField:
         InputError: it cannot be read or is no full grid; the message names file and place.
     """
     path = Path(path)
+    if path.is_file():
+        with reading(path):
+            content = path.read_bytes()
+        tell(path, "data", content)
     with reading(path):
         if path.suffix.lower() == ".npz":
             return _read_arrays(path)

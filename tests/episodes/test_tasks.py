@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from laboratory import QUICK, body
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
+from mjx_revolve.body.edits import add_module
+from mjx_revolve.engine.plant import figure_of
+from mjx_revolve.episodes.starts import start_pose
 from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task, score_unit
 
 KEY, G, RHO = jax.random.key(0), 9.81, 999.1026
@@ -114,3 +118,88 @@ def test_units_are_those_of_the_first_lines():
     for name, task in TASKS.items():
         assert f"[{task.unit}]" in task.score.__doc__.splitlines()[0]
         assert score_unit(name) == task.unit
+
+
+# ---------------------------------------------------------------------------- how episodes start
+
+
+def lopsided():
+    """A core with a brick on one side: its centre of mass is off, and its buoyancy elsewhere."""
+    return add_module(body("core"), 0, 1, "FixedBrick")
+
+
+def righted(settings, **task):
+    return settings("lifting", trim="neutral") | {
+        "task": {"type": "speed", "duration": 3.0, "settle": 0.5, "trials": 3, **task}
+    }
+
+
+def test_a_righted_body_starts_with_its_centre_of_mass_below_that_of_its_volume(settings):
+    config = righted(settings, start_attitude="righted", start_tilt=0.0, start_yaw=1.0)
+    many = make_mixed_fitness(config, [lopsided(), body("core")])
+    robots = [many.build(lopsided()), many.build(body("core"))]
+    for robot, figure in zip(robots, figures_alone_and_in_a_batch(many, robots), strict=True):
+        modules = robot.morphology.modules
+        parts = [(m.position + m.rotation @ part.position, m.rotation, part)
+                 for m in modules for part in m.kind.parts]  # fmt: skip
+        mass, volume = (np.array([getattr(p, x) for *_, p in parts])
+                        for x in ("mass", "total_volume"))  # fmt: skip
+        # By MuJoCo, and by hand.
+        model = robot.mj_model
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        weighs = data.subtree_com[1] - data.xpos[1]
+        floats = volume @ [o + r @ part.displaced_center for o, r, part in parts] / volume.sum()
+        lever = floats - weighs
+        # The core alone balances in any attitude, and so stays level.
+        expected = lever / np.linalg.norm(lever) if lever.any() else np.array([0.0, 0.0, 1.0])
+        assert mass.sum() == pytest.approx(volume.sum() * RHO, rel=1e-4)
+        pose = start_pose(TASKS["speed"], many.config.task, many.world, figure,
+                          many.setup.starts(KEY))  # fmt: skip
+        for quat in np.asarray(pose[3:].T, float):
+            turned = np.zeros(3)
+            mujoco.mju_rotVecQuat(turned, expected, quat)
+            assert turned == pytest.approx([0, 0, 1], abs=1e-5)
+
+
+def figures_alone_and_in_a_batch(many, robots):
+    """Each robot's figure, once it was seen that a batch has the same numbers."""
+    together = many.pack(robots).figure
+    for k, robot in enumerate(robots):
+        alone = figure_of(robot)
+        for name in alone._fields:
+            batch = np.asarray(getattr(together, name), float)[..., k]
+            assert batch == pytest.approx(np.asarray(getattr(alone, name), float), rel=1e-6), name
+        yield alone
+
+
+def test_what_points_down_is_turned_half_way_round(settings):
+    config = righted(settings, start_attitude="righted", start_tilt=0.0)
+    fitness = make_fitness(config)
+    figure = figure_of(fitness.robot)._replace(up=[0.0, 0.0, -1.0])
+    pose = start_pose(fitness.task, fitness.setup.settings, fitness.robot.world, figure,
+                      fitness.setup.starts(KEY))  # fmt: skip
+    down = np.zeros(3)
+    mujoco.mju_rotVecQuat(down, np.array([0.0, 0.0, -1.0]), np.asarray(pose[3:, 0], float))
+    assert down == pytest.approx([0, 0, 1], abs=1e-6)
+
+
+@pytest.mark.slow
+def test_a_righted_body_stays_and_a_level_one_swings(settings, tmp_path):
+    """No torque acts where the centre of mass hangs below that of the volume."""
+    lopsided().save(tmp_path / "lopsided.yaml")
+    more = {"morphology": str(tmp_path / "lopsided.yaml")}
+    moved = {}
+    for attitude in ("righted", "level"):
+        config = righted(settings, start_attitude=attitude, start_tilt=0.0) | more
+        fitness = make_fitness(config)
+        found = fitness.replay(np.zeros(fitness.num_genes, np.float32), KEY).qpos
+        moved[attitude] = np.abs(np.asarray(found) - np.asarray(found[0])).max()
+    assert moved["righted"] < 1e-3 < 0.1 < moved["level"]
+
+
+def test_what_starts_on_the_bed_starts_level(settings):
+    config = settings("standing", world={"bed": {"kind": "flat", "height": -2.0}})
+    config["task"] = config["task"] | {"start_attitude": "righted"}
+    with pytest.raises(InputError, match=r"start_attitude: expected level, as .* starts on"):
+        make_fitness(config)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from laboratory import tree
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.genotypes.cppn import grow
 from mjx_revolve.genotypes.genotype import Space
@@ -20,16 +21,6 @@ NONE, BRICK, HINGE, TURN = range(4)
 
 def network(*links, nodes=()):
     return Network(5, 4, tuple(nodes), tuple(Link(*link) for link in links))
-
-
-def tree(body):
-    """(slots from the core, type, turn) of all modules but the core, in order."""
-    paths = [()]
-    for module in body.modules[1:]:
-        paths.append((*paths[module.parent], module.slot))
-    return [
-        (path, m.type, m.orientation) for path, m in zip(paths[1:], body.modules[1:], strict=True)
-    ]
 
 
 def test_a_cross_with_a_tail():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from laboratory import tree
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.genotypes.genotype import Space
@@ -25,16 +26,6 @@ LETTERS = make_alphabet(SPACE)
 
 def draw(sentence, space=SPACE, seed=None):
     return draw_sentence(sentence.split(), make_alphabet(space), space, seed=seed)
-
-
-def tree(body):
-    """(slots from the core, type, turn) of all modules but the core, in order."""
-    paths = [()]
-    for module in body.modules[1:]:
-        paths.append((*paths[module.parent], module.slot))
-    return [
-        (path, m.type, m.orientation) for path, m in zip(paths[1:], body.modules[1:], strict=True)
-    ]
 
 
 # ------------------------------------------------------------------------- early development
