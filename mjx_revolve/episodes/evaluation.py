@@ -126,13 +126,17 @@ class Setup:
         run = self._evaluate if traced else self._jitted
         return run(bodies, jnp.asarray(population), key)
 
+    def _starts_as(self, population: jax.Array, key: jax.Array) -> Starts:
+        """What a key's episodes start from, in the population's precision."""
+        return jax.tree.map(lambda x: x.astype(population.dtype), self.starts(key))
+
     @cached_property
     def _jitted(self) -> Any:
         # Compiler options belong to the outermost jit, so under somebody else's we go without.
         return jax.jit(self._evaluate, compiler_options=compiler_options())
 
     def _evaluate(self, bodies: Bodies | None, population: Any, key: jax.Array) -> Any:
-        starts = jax.tree.map(lambda x: x.astype(population.dtype), self.starts(key))
+        starts = self._starts_as(population, key)
         if population.ndim == 2:
             return self._score(bodies, population, starts, bodies is None)
         each = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), -1, 0)[..., None], bodies)
@@ -143,7 +147,13 @@ class Setup:
         """Scores and measures of one population; `alike`: of one body."""
         trials = self.settings.trials
         run = partial(self._episode, bodies, alike, population, starts)
-        return average_trials(over_chunks(run)(*list_episodes(len(population), trials)), trials)
+        individual, trial = list_episodes(len(population), trials)
+        if alike:
+            return average_trials(over_chunks(run)(individual, trial), trials)
+        # A chunk takes as long as its largest body: those of a size share chunks.
+        order = jnp.argsort(bodies.count, stable=True).astype(individual.dtype)
+        scores = average_trials(over_chunks(run)(order[individual], trial), trials)
+        return jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x), scores)
 
     def _episode(
         self,
@@ -199,7 +209,7 @@ class Setup:
             return record
 
         def run(bodies: Bodies, population: jax.Array, key: jax.Array, trial: jax.Array) -> Any:
-            starts = jax.tree.map(lambda x: x.astype(population.dtype), self.starts(key))
+            starts = self._starts_as(population, key)
 
             def chunk(individual: jax.Array, trial: jax.Array) -> Any:
                 return self._roll(

@@ -9,8 +9,8 @@ XLA takes minutes to compile derivatives for many bodies; `evaluation` does the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
+from mjx_revolve.body.edits import add_module, replace_module
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
-from mjx_revolve.control.controller import Controller, bind_genes, gene_places
+from mjx_revolve.control.controller import Controller, as_plant, bind_genes, gene_places
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.batch import Bodies, Capacity, fit_capacity, pack_bodies
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_positions
-from mjx_revolve.engine.plant import Plant, actuators_of, figure_of, plant_of
+from mjx_revolve.engine.plant import Plant, actuators_of, figure_of
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.episodes.config import Config, load_config, make_config
@@ -117,6 +118,7 @@ class Fitness:
             qpos=self.starts(key)[0][:, trial],
             water=self.water(key, trial),
             engine=self.config.engine,
+            once=True,
         )
 
     def judge(self, trajectory: Trajectory, key: jax.Array) -> tuple[float, dict[str, float]]:
@@ -245,9 +247,9 @@ class MixedFitness:
         """Compiles a body for this world, trimmed as the configuration says."""
         return _build(self.config, self.world, morphology)
 
-    def controller_of(self, robot: Robot) -> Controller:
+    def controller_of(self, body: Plant | Robot) -> Controller:
         """The controller of one body alone, whose genes are named after its own joints."""
-        return _find_controller(self.config, plant_of(robot))
+        return _find_controller(self.config, as_plant(body))
 
     def pad_genes(self, genes: Any, robot: Robot) -> Any:
         """The genes of one body's own controller as this fitness takes them.
@@ -504,10 +506,37 @@ def make_mixed_fitness(
         figures.append(figures[0]._replace(length=longest, sinks=sinks))
     reach = max(farthest(config.task, world, figure) for figure in figures)
     touches = may_touch_bed(task, config.task, world, reach)
-    capacity = fit_capacity(robots, kinds, touches, hinges, rows, modules)
+    shown = [*robots, *_show_kinds(kinds, robots, hinges)]
+    capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules)
     example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
     controller = _find_controller(config, capacity.plant, example)
     return MixedFitness(Setup(config, world, task, controller, capacity=capacity), touches)
+
+
+def _show_kinds(
+    kinds: Sequence[ModuleType], robots: Sequence[Robot], hinges: int
+) -> Iterator[Robot]:
+    """A core with a module of each type that the robots lack, so that there is room for its parts.
+
+    Those with a hinge are left out where bodies may have none.
+    """
+    known = {module.kind.name for robot in robots for module in robot.morphology.modules}
+    bodies = [robot.morphology for robot in robots]
+    body = next((body for body in bodies if body.modules[0].kind.slots), bodies[0])
+    core = replace(body, modules=body.modules[:1], overlaps=())
+    hinged = hinges > 0 or any(robot.num_hinges for robot in robots)
+    for kind in kinds:
+        if kind.name in known or (kind.hinge is not None and not hinged):
+            continue
+        catalogue = {kind.name: kind}
+        if kind.mount is None:
+            found = replace_module(core, 0, kind.name, modules=catalogue)
+        elif core.modules[0].kind.slots:
+            slot = min(core.modules[0].kind.slots)
+            found = add_module(core, 0, slot, kind.name, modules=catalogue, allow_overlap=True)
+        else:
+            continue
+        yield build_robot(found, robots[0].world)
 
 
 def _diagonal(kind: ModuleType) -> float:
@@ -542,6 +571,11 @@ def _place(config: Config) -> tuple[World, Task]:
         raise InputError(
             f"{config.source}: task.type: {config.task.name} expected a world with a bed; found "
             "none"
+        )
+    if task.on_bed and config.task.start_attitude != "level":
+        raise InputError(
+            f"{config.source}: task.start_attitude: expected level, as {config.task.name} starts "
+            f"on the bed; found {config.task.start_attitude}"
         )
     return world, task
 

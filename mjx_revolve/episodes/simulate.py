@@ -18,7 +18,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import compiler_options
+from mjx_revolve.numerics.xla import compiler_options, hasty_options
 from mjx_revolve.water.flow import Water, gust_path, water_of
 
 
@@ -55,7 +55,7 @@ class Trajectory:
 
 @lru_cache(maxsize=64)
 def _compiled(
-    robot: Robot, engine: str, steps: int, controller: Controller | None, still: bool
+    robot: Robot, engine: str, steps: int, controller: Controller | None, still: bool, once: bool
 ) -> Any:
     """The jitted rollout of one robot; cached, so that a second call compiles nothing.
 
@@ -111,7 +111,8 @@ def _compiled(
             command=jax.vmap(simulator.command)(states)[..., 0],
         )
 
-    jitted = jax.jit(run, compiler_options=compiler_options())
+    hasty = once and engine == "population"
+    jitted = jax.jit(run, compiler_options=hasty_options() if hasty else compiler_options())
     return jitted, partial(run, derived=True)
 
 
@@ -125,6 +126,7 @@ def simulate(
     key: jax.Array | None = None,
     water: Water | None = None,
     engine: str = "population",
+    once: bool = False,
 ) -> Trajectory:
     """Simulates one robot.
 
@@ -143,6 +145,8 @@ def simulate(
         water: surface and current, by default the world's; each a number or `[T]`, a row for each
             step. It replaces the world's gusts.
         engine: "population" or "mjx".
+        once: whether it is compiled in haste, as little is simulated by it: one is sooner done with
+            a minute or less.
 
     Returns:
         The trajectory, one row after each step. Differentiable in qpos, qvel, ctrl and water.
@@ -191,7 +195,7 @@ def simulate(
         for leaf in jax.tree.leaves(water):
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
                 raise InputError(f"water: expected numbers or [{steps}]; found {list(leaf.shape)}")
-    jitted, plain = _compiled(robot, engine, steps, controller, water is None)
+    jitted, plain = _compiled(robot, engine, steps, controller, water is None, once)
     traced = any(
         isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((qpos, qvel, drive_input, water))
     )

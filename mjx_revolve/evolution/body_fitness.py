@@ -7,10 +7,9 @@ a time, a chunk holds one body, which is the faster way; else bodies share chunk
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -25,14 +24,14 @@ from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.fitness import (
     Fitness,
     MixedFitness,
-    make_fitness,
+    fit_body,
     make_mixed_fitness,
     read_modules,
 )
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.evolution.blocks import block_size
 from mjx_revolve.evolution.brains import Brains, Layout, lay_out_genes, make_brains
-from mjx_revolve.genotypes.genotype import Genotype, Space, make_space
+from mjx_revolve.genotypes.genotype import Genotype, Space, make_space, remember
 from mjx_revolve.genotypes.kinds import make_genotype
 from mjx_revolve.inputs.errors import InputError
 
@@ -41,8 +40,6 @@ _EXAMPLES = 64
 # From which share of real individuals on a block is better filled up than shared: a body by itself
 # takes three quarters of the time, or less.
 _WORTH = 0.75
-# Compiled bodies that are remembered. A choice: some megabytes.
-_REMEMBERED = 512
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +89,7 @@ class BodyFitness:
             return False
         return tried >= _WORTH * block * -(-tried // block)
 
-    @property
+    @cached_property
     def identity(self) -> str:
         """What scores depend on beside settings: the world and the types of modules."""
         kinds = [repr(kind) for kind in self.space_types.values()]
@@ -114,37 +111,38 @@ class BodyFitness:
     @cached_property
     def figures(self) -> tuple[str, ...]:
         """Names of all figures of an individual: the score, measures and descriptors."""
-        example = self.genotype.develop(self.genotype.random(np.random.default_rng(0)))
-        return ("score", *self.measured, *example.descriptors)
-
-    def single(self, path: str | Path) -> Fitness:
-        """The fitness of one body alone, read from a file, for replays."""
-        return make_fitness(self.config.for_body(path))
+        return ("score", *self.measured, *self._example.descriptors)
 
     @cached_property
-    def _built(self) -> dict[int, tuple[Morphology, Robot]]:
-        return {}
+    def _example(self) -> Morphology:
+        """A random body, the same in all processes."""
+        return self.genotype.develop(self.genotype.random(np.random.default_rng(0)))
 
-    def build(self, body: Morphology) -> Robot:
-        """The compiled body; those of the last generations are remembered."""
-        known = self._built.get(id(body))
-        if known is None or known[0] is not body:
-            while len(self._built) >= _REMEMBERED:
-                del self._built[next(iter(self._built))]
-            known = self._built[id(body)] = (body, self.mixed.build(body))
-        return known[1]
+    def single(self, body: Morphology) -> Fitness:
+        """The fitness of one body alone, for replays."""
+        return fit_body(self.config, body)
 
-    def layout(self, body: Morphology) -> Layout:
-        """Where the genes of a body belong."""
-        robot = self.build(body)
-        own = self.mixed.controller_of(robot)
-        return lay_out_genes(own, self.mixed.setup.controller, plant_of(robot))
+    @cached_property
+    def build(self) -> Callable[[Morphology], Robot]:
+        """Body → it compiled; those of the last generations are remembered."""
+        return remember(self.mixed.build)
+
+    @cached_property
+    def layout(self) -> Callable[[Morphology], Layout]:
+        """Body → where its genes belong; likewise."""
+
+        def lay_out(body: Morphology) -> Layout:
+            plant = plant_of(self.build(body))
+            own = self.mixed.controller_of(plant)
+            return lay_out_genes(own, self.mixed.setup.controller, plant)
+
+        return remember(lay_out)
 
     def example_block(self) -> tuple[Any, ...]:
         """A block to compile for."""
-        body = self.genotype.develop(self.genotype.random(np.random.default_rng(0)))
         size = self.block_size or self.config.evolution.population_size
-        return np.zeros((size, self.num_genes), np.float32), np.zeros(size, np.int32), [body]
+        genes = np.zeros((size, self.num_genes), np.float32)
+        return genes, np.zeros(size, np.int32), [self._example]
 
     def evaluate(
         self, genes: np.ndarray, which: np.ndarray, bodies: Sequence[Morphology], key: jax.Array
@@ -216,8 +214,7 @@ def _ask_for_measures(config: Config) -> Config:
 def _examples(genotype: Genotype) -> list[Morphology]:
     """Random bodies, the same in all processes."""
     rng = np.random.default_rng(0)
-    found = [genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES)]
-    return found
+    return [genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES)]
 
 
 def _load_seed(path: str, modules: Any, config: Config, space: Space) -> Morphology:

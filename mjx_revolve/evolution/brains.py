@@ -9,19 +9,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from annotated_types import Len
 
 from mjx_revolve.control.controller import Controller, Gene, gene_places
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.episodes.bodies_config import BrainsConfig
-from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.schema import Number, read, words
 
 # The network's hidden nodes, one each of these functions in turn, and the length by which places
 # are divided before they enter it [m], about two modules. Choices.
 _HIDDEN = 12
 _LENGTH = 0.1
+# A brain of genes by name. (Of a `dict`, messages would name the gene that is wrong.)
+_NAMED = Annotated[Mapping[str, Number], words("genes by name")]
 # What edits put behind the name of a copy.
 _COPY = re.compile(r"_\d+$")
 _FUNCTIONS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
@@ -158,9 +162,7 @@ def _make_joints(settings: BrainsConfig, common: Controller) -> Brains:
         return genes
 
     def check(brain: Any) -> dict[str, float]:
-        if not isinstance(brain, dict) or not all(_is_number(x) for x in brain.values()):
-            raise InputError(f"brain: expected genes by name; found {show(brain)}")
-        return {str(name): float(value) for name, value in brain.items()}
+        return read(_NAMED, brain, "brain")
 
     return Brains(
         draw,
@@ -230,9 +232,8 @@ def _make_cppn(settings: BrainsConfig, common: Controller) -> Brains:
         return _weights(found + settings.mutation * rng.standard_normal(size))
 
     def check(brain: Any) -> list[float]:
-        if not isinstance(brain, list) or len(brain) != size or not all(map(_is_number, brain)):
-            raise InputError(f"brain: expected {size} weights; found {show(brain)}")
-        return [float(x) for x in brain]
+        weights = Annotated[list[Number], Len(size, size), words(f"{size} weights")]
+        return read(weights, brain, "brain")
 
     return Brains(
         draw,
@@ -247,7 +248,3 @@ def _make_cppn(settings: BrainsConfig, common: Controller) -> Brains:
 
 def _weights(values: Any) -> list[float]:
     return [float(x) for x in np.asarray(values, np.float32)]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

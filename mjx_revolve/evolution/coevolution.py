@@ -31,12 +31,12 @@ from mjx_revolve.evolution.loop import (
     CHOOSE_STREAM,
     NUM_ELITES,
     Champion,
+    score_afresh,
     summarize,
 )
 from mjx_revolve.evolution.novelty import novelty, spread
 from mjx_revolve.evolution.pool import Pool
 from mjx_revolve.evolution.selection import SCHEMES, Candidates, check_selection, order
-from mjx_revolve.evolution.strategies import FAILED_SCORE
 from mjx_revolve.inputs.errors import InputError
 
 # Descriptors whose mean over the living goes into the metrics.
@@ -148,20 +148,20 @@ class _Step:
         born = live(self.pool, self.learner, born, key)
 
         together = [*search.living, *born]
-        past = self._remember(search, born)
+        new = self._novelty(together, search.past)
+        past = self._remember(search.past, born, new[len(search.living) :])
         archive, kept = self._store(search, born)
         if self.selection.type == "map_elites":
-            living = tuple(kept.values())
+            living = list(kept.values())
         else:
-            everybody = self._candidates(together, search.past, len(search.living))
+            everybody = self._candidates(together, new, len(search.living))
             stay = self.scheme.survivors(everybody, self.selection, mu, generation)
-            living = tuple(together[k] for k in stay)
-        living = tuple(living) or tuple(born)
+            living = [together[k] for k in stay]
         elites = _best([*search.elites, *born])
         seconds = time.perf_counter() - began
         found = BodySearch(
             generation=generation,
-            living=living,
+            living=tuple(living or born),
             elites=elites,
             archive=archive,
             kept=kept,
@@ -181,7 +181,7 @@ class _Step:
         count = self.selection.offspring if search.living else None
         count = count or evolution.population_size
         seeds = self.fitness.seeds if not search.living else ()
-        sown = round((1 - self.bodies.random) * count) if seeds else 0
+        sown = round((1 - self.bodies.random) * count)
         sown = max(sown, min(len(seeds), count)) if seeds else 0
         genotype, found = self.fitness.genotype, []
         for k in range(count):
@@ -195,14 +195,15 @@ class _Step:
             else:
                 genome, origin = genotype.random(rng), "random"
             number = search.next_number + k
-            found.append(self._grow(rng, number, (), generation, origin, genome, ()))
+            found.append(self._grow(rng, number, (), generation, origin, genome))
         return found
 
     def _children(self, search: BodySearch, generation: int) -> list[Individual]:
         evolution, genotype = self.config.evolution, self.fitness.genotype
         count = self.selection.offspring or evolution.population_size
         rng = np.random.default_rng([evolution.seed, generation])
-        living = self._candidates(search.living, search.past, len(search.living))
+        new = self._novelty(search.living, search.past)
+        living = self._candidates(search.living, new, len(search.living))
         pairs = self.scheme.parents(rng, living, self.selection, count)
         found = []
         for k, (i, j) in enumerate(pairs):
@@ -216,7 +217,7 @@ class _Step:
                 genome = genotype.mutate(rng, genome)
                 origin = "mutation" if len(parents) == 1 else "crossover, mutation"
             number = search.next_number + k
-            found.append(self._grow(rng, number, parents, generation, origin, genome, parents))
+            found.append(self._grow(rng, number, parents, generation, origin, genome))
         return found
 
     def _grow(
@@ -227,17 +228,16 @@ class _Step:
         generation: int,
         origin: str,
         genome: Any,
-        teachers: Sequence[Individual],
     ) -> Individual:
         """A new individual: its body, and the brain that it is born with."""
         body = self.fitness.genotype.develop(genome)
         layout, brains = self.fitness.layout(body), self.fitness.brains
         how = self.bodies.brains.inheritance
-        if not teachers or how == "none":
+        if not parents or how == "none":
             brain = brains.draw(rng, layout)
         else:
             learnt = how == "lamarckian"
-            taught = [t.learnt if learnt and t.learnt is not None else t.brain for t in teachers]
+            taught = [p.learnt if learnt and p.learnt is not None else p.brain for p in parents]
             brain = brains.inherit(rng, taught, layout)
         ancestors = tuple(parent.number for parent in parents)
         return Individual(number, ancestors, generation, origin, genome, body, brain)
@@ -245,18 +245,13 @@ class _Step:
     # --- who stays
 
     def _candidates(
-        self, individuals: Sequence[Individual], past: np.ndarray, old: int
+        self, individuals: Sequence[Individual], new: np.ndarray, old: int
     ) -> Candidates:
-        """The first `old` ones are parents."""
-        new = self._novelty(individuals, past) if self.selection.novelty else None
+        """The first `old` ones are parents; how `new` each is follows from the past."""
         columns = []
         for name in self.selection.objectives:
             plain = name.lstrip("-")
-            if plain == "novelty":
-                assert new is not None
-                values = new
-            else:
-                values = _figures(individuals, plain)
+            values = new if plain == "novelty" else _figures(individuals, plain)
             columns.append(-values if name.startswith("-") else values)
         objectives = np.stack(columns, -1)
         objectives[np.isnan([individual.score for individual in individuals])] = np.nan
@@ -268,20 +263,21 @@ class _Step:
         )
 
     def _novelty(self, individuals: Sequence[Individual], past: np.ndarray) -> np.ndarray:
+        """`[N]` how new each is; 0 where nobody asks."""
+        if not self.selection.novelty:
+            return np.zeros(len(individuals))
         points = _points(individuals, self.selection.novelty)
         scale = spread(np.concatenate([points, past]))
         return novelty(points, past, self.selection.neighbours, scale)
 
-    def _remember(self, search: BodySearch, born: Sequence[Individual]) -> np.ndarray:
+    def _remember(
+        self, past: np.ndarray, born: Sequence[Individual], new: np.ndarray
+    ) -> np.ndarray:
         """The past, and the most novel one of those that were born."""
-        if not self.selection.novelty:
-            return search.past
-        together = [*search.living, *born]
-        new = self._novelty(together, search.past)[len(search.living) :]
-        if not np.isfinite(new).any():
-            return search.past
+        if not self.selection.novelty or not np.isfinite(new).any():
+            return past
         best = born[int(np.nanargmax(new))]
-        return np.concatenate([search.past, _points([best], self.selection.novelty)])
+        return np.concatenate([past, _points([best], self.selection.novelty)])
 
     def _store(
         self, search: BodySearch, born: Sequence[Individual]
@@ -374,13 +370,17 @@ def judge(config: Config, pool: Pool, search: BodySearch) -> Champion:
 
     def fresh(who: Sequence[Individual], stream: int, episodes: int) -> tuple[Any, Any]:
         """`[episodes, who]` scores, and measures alike."""
-        genes = [brain_genes(fitness, individual)[None] for individual in who]
-        key, scores, figures = jax.random.fold_in(root, stream), [], []
-        for k in range(episodes):
-            found = evaluate(pool, who, genes, jax.random.fold_in(key, k))
-            scores.append([s[0] if np.isfinite(s[0]) else FAILED_SCORE for s, _ in found])
-            figures.append({n: [m[n][0] for _, m in found] for n in found[0][1]})
-        return np.array(scores, float), {n: np.array([f[n] for f in figures]) for n in figures[0]}
+        genes = [
+            fitness.mixed.pad_genes(np.array([i.genes], np.float32), fitness.build(i.body))
+            for i in who
+        ]
+
+        def score(key: jax.Array) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+            found = evaluate(pool, who, genes, key)
+            measures = {n: np.concatenate([m[n] for _, m in found]) for n in found[0][1]}
+            return np.concatenate([s for s, _ in found]), measures
+
+        return score_afresh(score, jax.random.fold_in(root, stream), episodes)
 
     means = fresh(search.elites, CHOOSE_STREAM, CHOOSE_EPISODES)[0].mean(0)
     winner = search.elites[int(np.argmax(means))]
@@ -400,13 +400,6 @@ def judge(config: Config, pool: Pool, search: BodySearch) -> Champion:
 def describe_origin(individual: Individual) -> str:
     """Where an individual came from, in words."""
     return f"individual {individual.number} of generation {individual.born}, {individual.origin}"
-
-
-def brain_genes(fitness: BodyFitness, individual: Individual) -> np.ndarray:
-    """`[num_genes]` what an individual has learnt, as the fitness of all bodies takes it."""
-    layout = fitness.layout(individual.body)
-    brain = individual.brain if individual.learnt is None else individual.learnt
-    return fitness.brains.express(fitness.brains.to_vector(brain, layout)[None], layout)[0]
 
 
 def archive_table(search: BodySearch) -> str:

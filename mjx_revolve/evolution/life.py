@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.bodies_config import LearningConfig
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.brains import Brains, Layout
@@ -166,14 +167,14 @@ def evaluate(
     fitness: BodyFitness = pool.fitness
     owner = np.repeat(np.arange(len(genes)), [len(g) for g in genes])
     rows = np.concatenate(genes)
-    # Blocks of rows: of one body each, or across bodies as they come.
-    groups = [np.flatnonzero(owner == k) for k in range(len(genes))] if fitness.alone else None
-    size = pool.block or len(rows)
-    cut = [
-        group[start : start + size]
-        for group in (groups if groups is not None else [np.arange(len(rows))])
-        for start in range(0, len(group), size)
-    ]
+    mine = [np.flatnonzero(owner == k) for k in range(len(genes))]
+    # Blocks of rows: of one body each, or across bodies of about a size, as a block takes as long
+    # as its largest body.
+    size, groups = pool.block or len(rows), mine
+    if not fitness.alone:
+        order = sorted(range(len(mine)), key=lambda k: _size(individuals[k].body))
+        groups = [np.concatenate([mine[k] for k in order])]
+    cut = [g[start : start + size] for g in groups for start in range(0, len(g), size)]
     blocks = []
     for part in cut:
         # The last block is filled up with its own first row: one shape, one program.
@@ -188,5 +189,9 @@ def evaluate(
             whole = measures.setdefault(name, np.full(len(rows), np.nan, np.float32))
             whole[part] = np.asarray(values)[: len(part)]
     scores[~(scores > fitness.worst_score)] = np.nan
-    mine = [np.flatnonzero(owner == k) for k in range(len(genes))]
     return [(scores[k], {name: values[k] for name, values in measures.items()}) for k in mine]
+
+
+def _size(body: Morphology) -> tuple[int, int]:
+    """What the step of a body costs, to be compared with others'."""
+    return body.num_hinges, len(body.modules)

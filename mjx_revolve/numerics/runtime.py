@@ -14,6 +14,7 @@ import os
 import platform
 import subprocess
 import sys
+import time
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -201,6 +202,8 @@ def remove_broken_entries(folder: Path) -> list[str]:
     """
     marker = folder / ".checked"
     checked = marker.stat().st_mtime if marker.exists() else 0.0
+    if checked > time.time():  # the clock went backwards: new entries look older than they are
+        checked = 0.0
     removed = []
     newest = checked
     for entry in sorted(folder.glob("*-cache")):

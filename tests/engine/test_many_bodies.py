@@ -17,12 +17,15 @@ import pytest
 from experiments.random_bodies import random_body
 from laboratory import QUICK, ROOT, WATER, accelerate, body, march, random_states, read, world
 from mjx_revolve import MODULES, load_config, load_morphology, make_fitness, make_mixed_fitness
+from mjx_revolve.body.edits import add_module
 from mjx_revolve.control.controller import gene_places
 from mjx_revolve.engine.batch import Group, fit_capacity, order_rows, pack_bodies, resize
 from mjx_revolve.engine.columns import read_columns
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.rows import make_rows
 from mjx_revolve.engine.step import acceleration, make_step_engine
+from mjx_revolve.episodes.config import make_config
+from mjx_revolve.episodes.fitness import fit_body
 from mjx_revolve.episodes.rollout import roll_out
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import share_once
@@ -363,6 +366,39 @@ def test_every_controller_drives_every_body(config, tmp_path, kind, other, tank,
         for name, value in more.items():
             found = float(measures[name][k])
             assert found == pytest.approx(float(value[0]), rel=2e-3, abs=1e-4), name
+
+
+KINDS = [MODULES[name] for name in ("Core", "ActiveHinge", "Fin", "Thruster")]
+
+
+@pytest.fixture(scope="module")
+def stranger(config):
+    """A body of types that no example has, a fitness with room for it, and its own."""
+    overrides = {"task.duration": 0.5, "task.settle": 0.1, "controller.harmonics": 1}
+    config = make_config(config.model_dump(), overrides=overrides)
+    fitness = make_mixed_fitness(config, [random_body(4, 2, 1)], 2, kinds=KINDS, modules=5)
+    tail = add_module(body("core"), "core", 1, "ActiveHinge", name="tail")
+    fish = add_module(add_module(tail, "tail", 1, "Fin"), "core", 2, "Thruster")
+    return fitness.build(fish), fitness, fit_body(config, fish)
+
+
+def test_there_is_room_for_types_that_no_example_has(config, stranger):
+    robot, fitness, _ = stranger
+    packed = fitness.pack([robot])
+    assert packed.count <= fitness.capacity.rows and len(fitness.capacity.groups) == 3
+    # Where bodies have no hinge, types with one take no room.
+    assert make_mixed_fitness(config, [body("core")], kinds=KINDS, modules=5).capacity.hinges == 0
+
+
+@pytest.mark.slow
+def test_types_that_no_example_has_score_as_alone(stranger):
+    """Fins and thrusters obey laws of their own."""
+    robot, fitness, single = stranger
+    genes = jax.random.normal(jax.random.key(3), (2, single.num_genes))
+    expected = np.asarray(single(genes, jax.random.key(2)))
+    found = fitness(robot, fitness.pad_genes(genes, robot), jax.random.key(2))
+    assert np.asarray(found) == pytest.approx(expected, abs=1e-5)
+    assert np.abs(np.diff(expected)) > 1e-3
 
 
 def test_genes_find_their_joints_again(fitness):

@@ -87,8 +87,10 @@ def test_learning_improves_and_is_what_counts(folder):
     for individual in learned:
         assert individual.trials == 48 and individual.brain in [n.brain for n in naive]
     # Scored by itself, what was learnt gives the score again, on the same starts.
-    genes = [coevolution.brain_genes(pool.fitness, individual)[None] for individual in learned]
-    again = evaluate(pool, learned, genes, jax.random.split(key)[0])
+    wide = np.zeros((len(learned), 1, pool.num_genes), np.float32)
+    for row, individual in zip(wide, learned, strict=True):
+        row[:, pool.fitness.layout(individual.body).columns] = individual.genes
+    again = evaluate(pool, learned, wide, jax.random.split(key)[0])
     for (score, _), individual in zip(again, learned, strict=True):
         assert score[0] == pytest.approx(individual.score, abs=1e-6)
 
