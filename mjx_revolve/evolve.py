@@ -30,12 +30,13 @@ from mjx_revolve.inputs.commands import (
     run_command,
     whole,
 )
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.files import short_path
+from mjx_revolve.inputs.trust import add_trust_argument, is_run_config, opening, remembering
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.loop import Champion
     from mjx_revolve.evolution.pool import Pool
     from mjx_revolve.evolution.runs import Run
     from mjx_revolve.evolution.start import Start
@@ -58,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
         help="processes on this machine (default: its cores)")  # fmt: skip
     add("--cluster", metavar="SCHEDULER",
         help="a Dask scheduler's address, or its scheduler file: its workers score")  # fmt: skip
+    add_trust_argument(parser)
     return parser
 
 
@@ -70,8 +72,8 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
             `pool.make_pool`.
 
     Returns:
-        The exit code: 0 when the run is finished, 130 or 143 when it was interrupted, 1 when the
-        disk refused a file or no worker was left.
+        The exit code: 0 when the run is finished, 130, 143 or 129 when it was interrupted, 1 when
+        the disk refused a file or no worker was left.
 
     Raises:
         InputError: the arguments, the configuration or the run folder are wrong.
@@ -81,17 +83,21 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
         raise InputError("--cluster: expected no --workers beside it; found both")
     if arguments.seed is not None:
         arguments.settings.append(f"evolution.seed={arguments.seed}")
-    runtime.prepare_process()
     try:
-        with contextlib.ExitStack() as open_pools:
-            return _lead(arguments, make_fitness, open_pools)
+        # From the first heavy import on: some of them swallow a KeyboardInterrupt, or die of it.
+        with Interrupts() as interrupts, contextlib.ExitStack() as open_pools:
+            runtime.prepare_process()
+            return _lead(arguments, make_fitness, open_pools, interrupts)
     except WorkerError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
 
 
 def _lead(
-    arguments: argparse.Namespace, make_fitness: Callable | None, open_pools: contextlib.ExitStack
+    arguments: argparse.Namespace,
+    make_fitness: Callable | None,
+    open_pools: contextlib.ExitStack,
+    interrupts: Interrupts,
 ) -> int:
     """A whole run; `open_pools` ends its workers."""
     from mjx_revolve.evolution.start import begin_run, continue_run
@@ -107,98 +113,63 @@ def _lead(
         raise InputError("expected a CONFIG, or --resume DIR; found neither")
     if folder is not None and arguments.out is not None:
         raise InputError(f"--resume {folder}: expected no --out beside it; found {arguments.out}")
-    try:
-        if folder is None:
-            start = begin_run(path, settings, arguments.out, make)
-        else:
+    trust = arguments.trust
+    if folder is None:
+        # Who names a configuration wants what it names; that of a run folder may be a stranger's.
+        theirs = is_run_config(Path(path)) and not trust
+        with opening(path, trust=False) if theirs else remembering():
+            start = begin_run(path, settings, arguments.out, make, interrupts.writing)
+    else:
+        with opening(folder, *([path] if path else []), trust=trust):
             start = continue_run(folder, path, settings, make)
-    except KeyboardInterrupt:
-        print("interrupted before the first generation", file=sys.stderr)
-        return 130
     run = start.run
     try:
-        return _evolve(start)
-    except KeyboardInterrupt:
-        return 130
+        return _evolve(start, interrupts)
     except WorkerError as error:
         raise WorkerError(f"{error}\n{_resume_hint(run)}") from None
+    except BrokenPipeError:
+        raise  # nobody listens to what is printed: no fault of the disk
     except OSError as error:
         print(f"error: {describe_refusal(error)}", file=sys.stderr)
         if run.checkpoints():
-            last = f"the last checkpoint, {_shown(run.checkpoints()[0])}, is intact; make room"
+            last = f"the last checkpoint, {short_path(run.checkpoints()[0])}, is intact; make room"
             print(f"{last}, then\n{_resume_hint(run)}", file=sys.stderr)
         return 1
     finally:
         run.close()
 
 
-def _evolve(start: Start) -> int:
+def _evolve(start: Start, interrupts: Interrupts) -> int:
     """Everything after the arguments are known to be right."""
-    from mjx_revolve.episodes.scoring import REPORT_EPISODES
-    from mjx_revolve.episodes.tasks import score_unit
     from mjx_revolve.evolution import session
+    from mjx_revolve.view.results import describe_score, save_pictures
 
     run, config = start.run, start.config
     done = start.search.generation if start.search else 0
     if start.is_finished:
         print(
-            f"{_shown(run.folder)}: finished after {done} generations; to go on: "
+            f"{short_path(run.folder)}: finished after {done} generations; to go on: "
             f"--set evolution.generations={2 * done}"
         )
         return 0
-    print(_describe(start), flush=True)
-    if start.search:
-        print(f"resuming after generation {done}", flush=True)
-    with Interrupts("finishing what is under way") as interrupts:
-        session.write_start(start)
-        search = session.run_generations(start, interrupts)
-        if interrupts.signal and search.generation < config.evolution.generations:
-            saved = f"stopped after generation {search.generation}; all of it is saved"
-            print(f"{saved}\n{_resume_hint(run)}", flush=True)
-            return interrupts.exit_code
-        unit = score_unit(config.task.type)
-
-        def result(champion: Champion) -> str:
-            score = f"{champion.score:.3g} ± {champion.std:.2g} {unit}".rstrip()
-            return f"{score} over {REPORT_EPISODES} fresh starts"
-
-        champion = session.finish_run(
-            start, search, lambda champion: _draw(start, champion, result(champion), unit)
-        )
-    print(f"champion: {result(champion)} ({champion.origin})")
+    print(plain(_describe(start)), flush=True)
+    if start.resumed:
+        words = f"after generation {done}" if done else "from the start: it has no checkpoint yet"
+        print(f"resuming {words}", flush=True)
+    interrupts.be_patient("finishing what is under way")
+    search, champion = session.run_to_end(
+        start, interrupts, lambda champion: save_pictures(start, champion)
+    )
+    if champion is None:
+        saved = f"stopped after generation {search.generation}; all of it is saved"
+        print(f"{saved}\n{_resume_hint(run)}", flush=True)
+        return interrupts.exit_code
+    print(f"champion: {describe_score(champion, config)} ({champion.origin})")
     if champion.measures:
         figures = (f"{name} {value:.3g}" for name, value in champion.measures.items())
         print(f"measures: {', '.join(figures)}")
-    print(f"run folder: {_shown(run.folder)}")
+    print(f"run folder: {short_path(run.folder)}")
     return 0
-
-
-def _draw(start: Start, champion: Champion, result: str, unit: str) -> None:
-    """The run's pictures, as far as its fitness can replay the champion."""
-    from mjx_revolve.episodes.fitness import read_modules
-    from mjx_revolve.view import plots
-    from mjx_revolve.view.motion import counted_time
-    from mjx_revolve.view.swim_picture import plot_swim
-    from mjx_revolve.view.thumbnails import plot_best
-
-    run, fitness = start.run, start.fitness
-    if start.config.bodies is not None:
-        fitness = fitness.single(run.folder / "champion" / "morphology.yaml")
-    title = f"{run.folder.name}: {result}"
-    label = f"fitness ({unit})" if unit else "fitness"
-    figures = {"fitness.png": plots.plot_fitness(run.load_metrics(), title, label)}
-    if start.config.bodies is not None:
-        figures["bodies.png"] = plot_best(run.folder, read_modules(start.config), title)
-    if hasattr(fitness, "replay"):
-        trajectory = fitness.replay(champion.genes, champion.key)
-        robot = getattr(fitness, "robot", None)
-        height = float(getattr(getattr(robot, "world", None), "surface_height", 0.0))
-        figures["trajectory.png"] = plots.plot_trajectory(trajectory, height, title)
-        if robot is not None:
-            counted = counted_time(start.config.task, robot.world.timestep)
-            figures["swim.png"] = plot_swim(robot, trajectory, counted)
-    for name, figure in figures.items():
-        run.write(name, plots.figure_png(figure))
 
 
 def _describe(start: Start) -> str:
@@ -224,7 +195,7 @@ def _describe(start: Start) -> str:
     return (
         f"{body}{fitness.num_genes} genes | {config.task.name} in {Path(config.world_name).stem} | "
         f"{_search_name(config)} {evolution.population_size} x {evolution.generations}, "
-        f"seed {evolution.seed} | {device} | {_shown(start.run.folder)}"
+        f"seed {evolution.seed} | {device} | {short_path(start.run.folder)}"
     )
 
 
@@ -237,16 +208,10 @@ def _search_name(config: Config) -> str:
     return f"{selection.type}{learns},"
 
 
-def _shown(path: Path) -> str:
-    """A path as short as it can be typed here."""
-    path = Path(path).absolute()
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
-
-
 def _resume_hint(run: Run) -> str:
     python = Path(sys.executable)
-    name = _shown(python) if python.is_relative_to(Path.cwd()) else "python"
-    words = [name, "-m", "mjx_revolve.evolve", "--resume", _shown(run.folder)]
+    name = short_path(python) if python.is_relative_to(Path.cwd()) else "python"
+    words = [name, "-m", "mjx_revolve.evolve", "--resume", short_path(run.folder)]
     return f"resume: {shlex.join(words)}"
 
 

@@ -22,7 +22,7 @@ from mjx_revolve.inputs.commands import (
     read_path,
     run_command,
 )
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import check_name
 from mjx_revolve.numerics import runtime
 
@@ -103,15 +103,13 @@ def main(argv: list[str] | None = None) -> int:
     check_episode_path(arguments.path)
     runtime.prepare_process()
     # JAX takes seconds to import: not for those who ask for help.
-    from mjx_revolve.episodes.champion import load_episode
+    from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.formats.export import export_robot
     from mjx_revolve.formats.ros_bag import check_rosbags
 
     if arguments.mcap is not None:
         check_rosbags()
-    episode = load_episode(
-        arguments.path, arguments.world, arguments.duration, arguments.seed, arguments.individual
-    )
+    episode = load_asked(arguments)
     if not files:  # never over what is there
         folder = Path(f"{Path(episode.robot.morphology.name).name}_export")
         if episode.folder is not None:
@@ -130,7 +128,7 @@ def main(argv: list[str] | None = None) -> int:
             lacking = error
             del files["mcap"]
     for path, words in export_robot(episode.robot, files, episode.trajectory, arguments.meshes):
-        print(f"{path}: {words}")
+        print(plain(f"{path}: {words}"))
     if lacking is not None:
         print(f"no bag: {lacking}", file=sys.stderr)
     return 0

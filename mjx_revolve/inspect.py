@@ -14,6 +14,7 @@ from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.table import module_table, summary, thruster_table
 from mjx_revolve.inputs.commands import Parser, read_path, run_command
+from mjx_revolve.inputs.errors import plain
 
 # Fresh water at 15 °C, the thesis's value [kg/m³].
 _DENSITY = 999.1026
@@ -78,10 +79,10 @@ def main(argv: list[str] | None = None) -> int:
         from mjx_revolve.view.pictures import draw_morphology
 
         draw_morphology(morphology, arguments.picture)
-    print(f"{arguments.file}: {morphology.name}\n")
+    print(plain(f"{arguments.file}: {morphology.name}"), end="\n\n")
     for table in (module_table(morphology), thruster_table(morphology)):
         if table:
-            print("\n".join(table), end="\n\n")
+            print("\n".join(map(plain, table)), end="\n\n")
     print("\n".join(summary(morphology, arguments.density, arguments.gravity)))
     if arguments.picture is not None:
         print(f"\npicture: {arguments.picture}")

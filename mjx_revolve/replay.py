@@ -20,11 +20,12 @@ from mjx_revolve.inputs.commands import (
     check_episode_path,
     check_place,
     individual_name,
+    opening_episode,
     read_path,
     run_command,
     whole,
 )
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.view.film.opengl import check_screen, find_opengl
 
 if TYPE_CHECKING:
@@ -181,15 +182,15 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
-    from mjx_revolve.episodes.champion import load_episode
+    from mjx_revolve.episodes.champion import load_asked
 
     if arguments.ancestors is not None:
-        return _film_ancestors(arguments, folder, opengl, paths or {})
-    episode = load_episode(
-        path, arguments.world, arguments.duration, arguments.seed, arguments.individual
-    )
+        with opening_episode(arguments):
+            return _film_ancestors(arguments, folder, opengl, paths or {})
+    episode = load_asked(arguments)
     if paths is None:
-        paths = {} if view else _usual_paths(Path(), str(episode.robot.morphology.name), kinds)
+        name = Path(f"{episode.robot.morphology.name}.").name[:-1]  # it may lead elsewhere
+        paths = {} if view else _usual_paths(Path(), name, kinds)
     if view or films:
         from mjx_revolve.view.film.draw import show_film
         from mjx_revolve.view.film.film import make_film
@@ -259,7 +260,7 @@ def _say_film(paths: dict[str, Path], films: Sequence[Film]) -> None:
 def _say(paths: dict[str, Path], kind: str, words: str) -> None:
     """Says what was written, if it was."""
     if kind in paths:
-        print(f"{paths[kind]}: {words}, {paths[kind].stat().st_size / 1e6:.2f} MB")
+        print(plain(f"{paths[kind]}: {words}, {paths[kind].stat().st_size / 1e6:.2f} MB"))
 
 
 if __name__ == "__main__":

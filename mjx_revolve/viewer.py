@@ -18,7 +18,7 @@ from mjx_revolve.inputs.commands import (
     read_path,
     run_command,
 )
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import PAGES, check_name
 from mjx_revolve.view.viewer import write_viewer
 
@@ -53,24 +53,24 @@ def main(argv: list[str] | None = None) -> int:
         check_place(check_name(arguments.out, PAGES), arguments.out)
     check_episode_path(arguments.path)
     # JAX takes seconds to import: not for those who ask for help.
-    from mjx_revolve.episodes.champion import load_episode
+    from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
-    episode = load_episode(
-        arguments.path, arguments.world, arguments.duration, arguments.seed, arguments.individual
-    )
+    episode = load_asked(arguments)
     name = individual_name(arguments.individual) or "viewer"
     out = arguments.out or _usual_path(episode.folder, name, episode.robot.morphology.name)
     write_viewer(episode, out)
     size = Path(out).stat().st_size / 1e6
-    print(f"{out}: {episode.trajectory.time[-1]:.4g} s, {size:.2f} MB; open it in a browser")
+    length = f"{episode.trajectory.time[-1]:.4g} s"
+    print(plain(f"{out}: {length}, {size:.2f} MB; open it in a browser"))
     return 0
 
 
 def _usual_path(folder: Path | None, inside: str, name: str) -> Path:
     """Where a page goes that was given no name: never over a file that is there."""
-    path = Path(os.path.normpath(folder / f"{inside}.html")) if folder else Path(f"{name}.html")
+    own = Path(f"{name}.html").name  # a robot's name may lead elsewhere
+    path = Path(os.path.normpath(folder / f"{inside}.html")) if folder else Path(own)
     if path.exists():
         raise InputError(f"{path}: expected no such file yet; name it with --out to replace it")
     return path

@@ -15,6 +15,11 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="mjx_revolve_tests_")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
+# What users have used before is remembered; not what tests use.
+if "mjx_revolve_state_" not in os.environ.get("XDG_STATE_HOME", ""):
+    os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="mjx_revolve_state_")
+    atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
+
 import jax
 import pytest
 

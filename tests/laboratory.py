@@ -46,6 +46,16 @@ def body(name: str) -> Morphology:
     return load_morphology(ROOT / "morphologies" / f"{name}.yaml")
 
 
+def tree(body: Morphology) -> list[tuple[tuple[int, ...], str, float]]:
+    """(slots from the core, type, turn) of all modules but the core, in order."""
+    paths: list[tuple[int, ...]] = [()]
+    for module in body.modules[1:]:
+        paths.append((*paths[module.parent], module.slot))
+    return [
+        (path, m.type, m.orientation) for path, m in zip(paths[1:], body.modules[1:], strict=True)
+    ]
+
+
 def box_robot(size, mass: float, tank: World, volume: float | None = None, **part) -> Robot:
     """A single box; without `volume`, it displaces what its box holds."""
     volume = float(np.prod(size)) if volume is None else volume

@@ -84,13 +84,6 @@ def test_a_stopped_run_resumed_equals_one_never_stopped(small, whole, tmp_path):
     np.testing.assert_array_equal(champion(parts), champion(whole))
 
 
-@pytest.mark.slow
-def test_another_seed_is_another_run(small, whole, tmp_path):
-    other = small(tmp_path / "other", 1, "--seed", 1)
-    assert len(metrics(other)) == 1
-    assert metrics(other) != metrics(whole)[:1]
-
-
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
     """The folder of the shipped run, as it is."""

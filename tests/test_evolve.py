@@ -3,6 +3,7 @@
 Bits are compared within one process or on one machine with the same thread settings, as promised.
 """
 
+import datetime
 import errno
 import itertools
 import json
@@ -14,6 +15,9 @@ import struct
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,18 +30,14 @@ from mjx_revolve.evolution import checkpoints, runs
 from mjx_revolve.evolution import start as beginning
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-from toys import CLOCK, Quadratic
+from toys import CLOCK, Quadratic, read_until
 
 # --- the command line ---
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a config, current; the compilation cache off."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-    monkeypatch.chdir(tmp_path)
-    toys.write_config(tmp_path / "toy.yaml", population_size=8, checkpoint_every=2)
-    return tmp_path
+    return toys.enter_folder(tmp_path, monkeypatch)
 
 
 def toy(config):
@@ -117,19 +117,43 @@ def test_default_folder(folder):
     assert re.fullmatch(r"toy-\d{8}-\d{6}", run.name)
 
 
-@pytest.mark.parametrize("drop", [1, 4, 6])
+@pytest.mark.parametrize("drop", [1, 2, 4, 6])
 def test_a_dropped_run_continues_bit_for_bit(folder, drop, capsys):
     assert run_main("toy.yaml", "--out", "whole") == 0
     with pytest.raises(DroppedError):
         run_main("toy.yaml", "--out", "part", make_fitness=dropping(drop))
-    if drop == 1:  # before the first checkpoint
-        assert run_main("--resume", "part") == 2
-        assert "expected a checkpoint to resume from; found none" in capsys.readouterr().err
-        return
     assert run_main("--resume", "part") == 0
-    assert f"resuming after generation {(drop - 1) // 2 * 2}" in capsys.readouterr().out
+    before = f"after generation {(drop - 1) // 2 * 2}" if drop > 2 else "from the start: it has no"
+    assert f"resuming {before}" in capsys.readouterr().out
     assert contents(folder / "part") == contents(folder / "whole")
     assert len(json.loads((folder / "part" / "run.json").read_text())["resumed"]) == 1
+
+
+def test_what_died_before_its_first_checkpoint_stays_the_same_run(folder, capsys):
+    with pytest.raises(DroppedError):
+        run_main("toy.yaml", "--out", "run", make_fitness=dropping(2))
+    path = folder / "run" / "config.yaml"
+    text = path.read_text()
+    path.write_text(text.replace("duration: 10.0", "duration: 9.0"))
+    assert run_main("--resume", "run") == 2
+    assert "expected the config.yaml that it began with" in capsys.readouterr().err
+    path.unlink()  # as if it had died even before that was written
+    shutil.rmtree(folder / "run" / "champion", ignore_errors=True)
+    (folder / "run" / "metrics.csv").unlink()
+    assert run_main("toy.yaml", "--out", "run") == 0
+    assert path.read_text() == text
+
+
+def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(folder, monkeypatch):
+    """Four at once; the second is held still, as it would pass too soon."""
+    moment = datetime.datetime(2026, 1, 2, 3, 4, 5)
+    clock = SimpleNamespace(datetime=SimpleNamespace(now=lambda: moment))
+    monkeypatch.setattr(beginning, "datetime", clock)
+    config = SimpleNamespace(name="toy")
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(lambda _: beginning._claim_folder(config), range(4)))
+    tail = ("", "-2", "-3", "-4")
+    assert sorted(found) == [Path("runs", f"toy-20260102-030405{end}") for end in tail]
 
 
 def test_a_damaged_checkpoint_costs_only_time(folder, capsys):
@@ -327,15 +351,6 @@ def start(folder, *argv):
         env=os.environ | XLA_FLAGS | {"PYTHONPATH": path, "JAX_COMPILATION_CACHE_DIR": ""},
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
-
-
-def read_until(process, words):
-    lines = []
-    for line in process.stdout:
-        lines.append(line)
-        if words in line:
-            return lines
-    raise AssertionError("".join(lines))
 
 
 @pytest.mark.slow

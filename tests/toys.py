@@ -32,6 +32,24 @@ def write_config(path: Path, **evolution) -> Path:
     return path
 
 
+def enter_folder(path: Path, monkeypatch) -> Path:
+    """A folder with a configuration, current; the compilation cache off."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    monkeypatch.chdir(path)
+    write_config(path / "toy.yaml", population_size=8, checkpoint_every=2)
+    return path
+
+
+def read_until(process, words: str) -> list[str]:
+    """What a process has printed up to a line with some words."""
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if words in line:
+            return lines
+    raise AssertionError("".join(lines))
+
+
 class Quadratic:
     """The higher, the nearer to a target; noise by key, the same for all, as with real starts."""
 
@@ -156,7 +174,7 @@ class BodyToy(BodyFitness):
         names = dict.fromkeys(self.measured, np.asarray(hinges, np.float32))
         return -((hinges - 3.0) ** 2) - away + noise, names
 
-    def single(self, path):
+    def single(self, body):
         """What nothing can be replayed with."""
         return object()
 

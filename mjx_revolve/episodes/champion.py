@@ -6,6 +6,7 @@ fresh starts on which the champion was judged.
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Sequence
 from contextlib import suppress
@@ -25,11 +26,12 @@ from mjx_revolve.episodes.fitness import (
     make_mixed_fitness,
     read_modules,
 )
-from mjx_revolve.episodes.lives import Life, find_lives
+from mjx_revolve.episodes.lives import LARGEST, Life, find_lives
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.inputs.commands import opening_episode
 from mjx_revolve.inputs.errors import InputError, load_yaml, show
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.water.flow import Water, gust_path
@@ -122,8 +124,30 @@ def load_episode(
         steps = max(1, round(seconds / water.timestep))
         gusts = gust_path(water.gust, gust_key, steps, water.timestep, 1)
         gusty = gusty_water(water, gusts[..., 0])
-    trajectory = simulate(robot, None, seconds, key=key, water=gusty)
+    trajectory = simulate(robot, None, seconds, key=key, water=gusty, once=True)
     return Episode(morphology.name, robot, trajectory, water=gusty)
+
+
+def load_asked(arguments: argparse.Namespace) -> Episode:
+    """The episode that a command was asked for; a stranger's files are asked for first.
+
+    Args:
+        arguments: with what `commands.add_episode_arguments` adds.
+
+    Returns:
+        The episode.
+
+    Raises:
+        InputError: as `load_episode`, or a file is not trusted (see `trust.opening`).
+    """
+    with opening_episode(arguments):
+        return load_episode(
+            arguments.path,
+            arguments.world,
+            arguments.duration,
+            arguments.seed,
+            arguments.individual,
+        )
 
 
 def _genes_file(folder: Path) -> Path:
@@ -344,6 +368,12 @@ def load_genes(path: str | Path) -> np.ndarray:
         path = inside if inside.exists() else path / "champion" / "genes.yaml"
     data = load_yaml(path)
     genes = data.get("genes") if isinstance(data, dict) else None
-    if not isinstance(genes, list) or not all(isinstance(gene, float | int) for gene in genes):
-        raise InputError(f"{path}: genes: expected a list of numbers; found {str(genes)[:60]}")
+    if not isinstance(genes, list):
+        raise InputError(f"{path}: genes: expected a list of numbers; found {show(genes)}")
+    for index, gene in enumerate(genes):
+        huge = isinstance(gene, int) and abs(gene) > LARGEST  # infinite ones have their own words
+        if isinstance(gene, bool) or not isinstance(gene, float | int) or huge:
+            raise InputError(
+                f"{path}: genes: expected a list of numbers; found {show(gene)} at {index}"
+            )
     return np.asarray(genes, np.float32)

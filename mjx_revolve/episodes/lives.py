@@ -19,6 +19,8 @@ from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, make_morphology
 from mjx_revolve.inputs.errors import InputError
 
+LARGEST = float(np.finfo(np.float32).max)
+"""The largest number of float32, as genes are kept."""
 INDIVIDUALS, GENERATIONS = "individuals.jsonl", "generations.jsonl"
 
 
@@ -170,7 +172,7 @@ def _read_life(text: bytes) -> Life | None:
             return None
         origin = str(line["origin"])
         return Life(number, tuple(parents), born, origin, float(score), figures, text)
-    except (KeyError, TypeError, ValueError, AttributeError):
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         return None
 
 
@@ -179,4 +181,6 @@ def _is_whole(value: Any) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= LARGEST  # neither infinite nor NaN, nor a whole number of many digits

@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.inputs.own_code import content_name, parse_own
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
@@ -60,6 +61,30 @@ def settings_hash(config: Config) -> str:
         bodies["seeds"] = [hash_text(Path(path).read_text("utf-8")) for path in bodies["seeds"]]
     data["world"]["name"] = Path(data["world"]["name"]).name
     return hash_text(json.dumps(data, sort_keys=True, default=str))
+
+
+def fitness_hash(config: Config) -> str:
+    """Of all settings that a fitness is made of, files by their content.
+
+    Runs that have it in common can share a fitness. It does not know the seed, nor how genes are
+    searched for.
+    """
+    data = plain_settings(config)
+    data["evolution"] = config.evolution.population_size
+    return hash_text(json.dumps(_by_content(data), sort_keys=True, default=str))
+
+
+def _by_content(value: Any) -> Any:
+    """The same nested values, absolute paths of files replaced by what is in them."""
+    if isinstance(value, dict):
+        return {key: _by_content(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_by_content(item) for item in value]
+    if not isinstance(value, str) or parse_own(value):
+        return content_name(value) if isinstance(value, str) else value
+    if os.path.isabs(value) and os.path.isfile(value):
+        return f"{Path(value).name} {hashlib.sha256(Path(value).read_bytes()).hexdigest()}"
+    return value
 
 
 def model_hash(fitness: Any) -> str:

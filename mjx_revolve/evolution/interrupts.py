@@ -1,50 +1,144 @@
-"""Ctrl-C and SIGTERM as requests: the first is noted, the second ends the process at once."""
+"""Ctrl-C, SIGTERM and SIGHUP as requests: what is done is saved before one ends the process.
+
+Python runs signal handlers between two instructions of the main thread, and so not while that is
+inside a compiled program, perhaps for minutes. A thread of its own hears of signals at once.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
-from typing import Any
+import socket
+import stat
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+# What asks a process to end; SIGHUP is a terminal that is lost.
+_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+_EARLY = "interrupted before the run began"
 
 
 class Interrupts:
-    """Takes the signals while it is entered.
+    """Takes the signals while it is entered, in the main thread.
+
+    At first a signal ends the process at once, with one line. From `be_patient` on, the first is
+    noted, and what is under way can be finished; the second ends the process, once what was done
+    until then is saved.
 
     Attributes:
-        signal: the number of the one that came; None so far.
+        signal: the number of the first one that came; None so far.
+        writing: held by whoever writes; nothing ends the process meanwhile.
+        rescue: saves what is not saved yet, before the process is ended. Called in another thread,
+            while `writing` is held.
     """
 
-    def __init__(self, answer: str) -> None:
-        """Says nothing yet.
+    def __init__(self) -> None:
+        """Nothing came yet."""
+        self.signal: int | None = None
+        self.writing = threading.Lock()
+        self.rescue: Callable[[], None] = lambda: None
+        self._answer: str | None = None
+        self._answering = threading.RLock()  # the handler may come in the middle of itself
+        self._previous: dict[int, Any] = {}
+        self._ends: tuple[socket.socket, socket.socket] | None = None
+        self._thread: threading.Thread | None = None
+        self._former = -1
+
+    def be_patient(self, answer: str) -> None:
+        """From now on the first signal only asks.
 
         Args:
-            answer: what the first signal is answered by; how to quit at once is added.
+            answer: what it is answered by; how to quit at once is added.
         """
-        self.signal: int | None = None
         self._answer = answer
-        self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            try:
-                self._previous[number] = signal.signal(number, self._note)
-            except ValueError:  # not in the main thread: whoever owns that decides
-                break
+        if threading.current_thread() is not threading.main_thread():
+            return self  # whoever owns that decides
+        ears, mouth = self._ends = socket.socketpair()
+        mouth.setblocking(False)
+        self._former = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
+        for number in _SIGNALS:
+            # nohup has the loss of a terminal ignored, and so do we.
+            if number != signal.SIGINT and signal.getsignal(number) is signal.SIG_IGN:
+                continue
+            self._previous[number] = signal.signal(number, self._note)
+        self._thread = threading.Thread(target=self._listen, args=(ears,), daemon=True)
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._ends is None or self._thread is None:
+            return
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+        signal.set_wakeup_fd(self._former)
+        ears, mouth = self._ends
+        mouth.close()  # the end, for the thread
+        self._thread.join()
+        ears.close()
+        self._ends = None
 
     def _note(self, number: int, _: object) -> None:
-        self.signal = number
-        # The next one ends the process at once, even inside a compiled program.
-        for other in self._previous:
-            signal.signal(other, signal.SIG_DFL)
-        # No print: the signal may have come in the middle of one.
-        os.write(2, f"\n{self._answer}; press Ctrl-C again to quit at once\n".encode())
+        """Python's own handler; it may come later than `_listen`, or earlier."""
+        if self._answer is not None:
+            self._ask(number)
+
+    def _ask(self, number: int) -> None:
+        """Notes the first signal, and says so once."""
+        with self._answering:
+            if self.signal is None:
+                self.signal = number
+                _say(f"{self._answer}; press Ctrl-C again to quit at once")
+
+    def _listen(self, ears: socket.socket) -> None:
+        """Hears of each signal at once, whatever the main thread does."""
+        count = 0
+        while came := ears.recv(1):
+            number = came[0]
+            if number not in self._previous:  # another's signal is heard here, too
+                continue
+            count += 1
+            _leave_lost_terminal()
+            if self._answer is None:
+                self._end(number, _EARLY)
+            elif count > 1:
+                self._end(number, "ended at once; what was finished is saved")
+            self._ask(number)
+
+    def _end(self, number: int, words: str) -> NoReturn:
+        """Ends the process; whatever stands on the main thread's stack."""
+        with self.writing:
+            try:
+                self.rescue()
+            except Exception as error:  # a full disk, say: the checkpoint before stays whole
+                words = f"not saved: {' '.join(str(error).split())}"
+            if words:
+                _say(words)
+            os._exit(128 + number)
 
     @property
     def exit_code(self) -> int:
         """What a shell expects of a process that was interrupted; 0 if it was not."""
         return 128 + self.signal if self.signal else 0
+
+
+def _say(words: str) -> None:
+    """A line on stderr; no print, as the main thread may be in the middle of one."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"{chr(10) if sys.stderr.isatty() else ''}{words}\n".encode())
+
+
+def _leave_lost_terminal() -> None:
+    """Nothing that is printed to a terminal which is gone may keep a run from being saved."""
+    for descriptor in (1, 2):
+        with contextlib.suppress(OSError):
+            if stat.S_ISCHR(os.fstat(descriptor).st_mode) and not os.isatty(descriptor):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, descriptor)
+                os.close(nowhere)

@@ -9,8 +9,9 @@ search that is read back from disk continues with the same bits: the random numb
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -289,14 +290,15 @@ def choose_champion(config: EvolutionConfig, fitness: Fitness, search: Search) -
     candidates += [candidates[0]] * (size - count if size <= _FILL_UP_TO and not fills_up else 0)
     rows = np.stack(candidates).astype(np.float32)
     root = jax.random.key(config.seed)
-    scores, _ = _fresh(fitness, rows, jax.random.fold_in(root, CHOOSE_STREAM), CHOOSE_EPISODES)
+    key = jax.random.fold_in(root, CHOOSE_STREAM)
+    scores, _ = score_afresh(partial(_evaluate, fitness, rows), key, CHOOSE_EPISODES)
     # Empty places among the elites hold zero genes and must not win.
     means = scores.mean(axis=0)[:count]
     means[: len(search.elite_scores)][~np.isfinite(search.elite_scores)] = -np.inf
     winner = int(np.argmax(means))
     key = jax.random.fold_in(root, REPORT_STREAM)
     rows = np.repeat(rows[winner][None], len(rows), 0)  # one row is enough; the shape must stay
-    scores, measures = _fresh(fitness, rows, key, REPORT_EPISODES)
+    scores, measures = score_afresh(partial(_evaluate, fitness, rows), key, REPORT_EPISODES)
     return Champion(
         genes=rows[0],
         score=float(scores[:, 0].mean()),
@@ -307,11 +309,22 @@ def choose_champion(config: EvolutionConfig, fitness: Fitness, search: Search) -
     )
 
 
-def _fresh(
-    fitness: Fitness, rows: np.ndarray, key: jax.Array, episodes: int
+def score_afresh(
+    score: Callable[[jax.Array], tuple[np.ndarray, dict[str, np.ndarray]]],
+    key: jax.Array,
+    episodes: int,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Scores `[episodes, rows]` and measures alike, on one key after the other."""
-    results = [_evaluate(fitness, rows, jax.random.fold_in(key, i)) for i in range(episodes)]
+    """Scores candidates on one key after the other.
+
+    Args:
+        score: key → `[candidates]` scores, not finite where a rollout failed, and measures alike.
+        key: draws the keys.
+        episodes: how many.
+
+    Returns:
+        `[episodes, candidates]` scores, `FAILED_SCORE` where a rollout failed, and measures alike.
+    """
+    results = [score(jax.random.fold_in(key, i)) for i in range(episodes)]
     scores = np.stack([np.where(np.isfinite(s), s, FAILED_SCORE) for s, _ in results])
     measures = {name: np.stack([m[name] for _, m in results]) for name in results[0][1]}
     return scores.astype(np.float64), measures

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.lives import GENERATIONS, INDIVIDUALS
 from mjx_revolve.evolution import coevolution, loop
 from mjx_revolve.evolution.individuals import to_text
 from mjx_revolve.evolution.loop import Champion
@@ -83,12 +84,10 @@ def _of_bodies(config: Config, pool: Pool) -> Method:
     fitness = pool.fitness
 
     def record(run: Run, search: coevolution.BodySearch) -> None:
-        run.append_lines(
-            "individuals.jsonl", (to_text(i, fitness.genotype) for i in search.newborn)
-        )
+        run.append_lines(INDIVIDUALS, (to_text(i, fitness.genotype) for i in search.newborn))
         living = [individual.number for individual in search.living]
         line = {"generation": search.generation, "living": living}
-        run.append_lines("generations.jsonl", [json.dumps(line, separators=(",", ":"))])
+        run.append_lines(GENERATIONS, [json.dumps(line, separators=(",", ":"))])
 
     def save_best(run: Run, search: coevolution.BodySearch) -> None:
         if search.archive is not None:

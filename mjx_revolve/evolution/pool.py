@@ -73,6 +73,11 @@ class Pool:
         return self.fitness.num_genes
 
     @property
+    def closed(self) -> bool:
+        """Whether it scores no more."""
+        return self._closed
+
+    @property
     def workers(self) -> int:
         """How many processes score."""
         return self._workplace.workers

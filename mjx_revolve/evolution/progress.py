@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import sys
@@ -78,6 +79,13 @@ class Progress:
             row: its figures: generation, best, mean, evaluations_per_second, and failed where
                 there is such a column.
         """
+        try:
+            self._tell(row)
+        except OSError:  # the terminal or the pipe is gone: no reason to end a run of days
+            self._out, self._live = _Nowhere(), False
+            self._bar.disable = True
+
+    def _tell(self, row: Mapping[str, float]) -> None:
         generation = int(row["generation"])
         figures = {
             "best": f"{row['best']:.4g}",
@@ -116,4 +124,5 @@ class Progress:
 
     def close(self) -> None:
         """Leaves the last state of the line where it stands."""
-        self._bar.close()
+        with contextlib.suppress(OSError):
+            self._bar.close()

@@ -28,7 +28,7 @@ import yaml
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.config import Config, dump_config, load_config
-from mjx_revolve.episodes.lives import Life, find_lives
+from mjx_revolve.episodes.lives import GENERATIONS, INDIVIDUALS, Life, find_lives
 from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.evolution.checkpoints import (
     Checkpoint,
@@ -48,8 +48,10 @@ try:
 except ImportError:  # not on Windows: there, nothing keeps two processes off one folder
     fcntl = None  # type: ignore[assignment]
 
-LOGS = ("individuals.jsonl", "generations.jsonl")
+LOGS = (INDIVIDUALS, GENERATIONS)
 """Files that only grow, a line at a time; a run that goes on cuts them to its checkpoint."""
+# A folder with nothing else was begun by a process that died while making it.
+_BEGINNING = {"inputs", "checkpoints", ".lock", "run.json"}
 _TEMPORARY = re.compile(r"\.\d+-")
 
 
@@ -193,15 +195,23 @@ class Run:
             f"{self.folder / 'checkpoints'}: expected a checkpoint to resume from; found {found}"
         )
 
-    def rewind(self, checkpoint: Checkpoint) -> None:
-        """Forgets what came after a checkpoint: metrics, checkpoints, half-written files."""
-        positions = {"metrics.csv": checkpoint.meta["metrics_position"]}
-        for name, position in (positions | checkpoint.meta.get("positions", {})).items():
-            if (self.folder / name).exists():
-                os.truncate(self.folder / name, position)
-        for path in self.checkpoints():
-            if generation_of(path) > checkpoint.meta["generation"]:
-                path.unlink(missing_ok=True)
+    def rewind(self, checkpoint: Checkpoint | None) -> None:
+        """Forgets what came after a checkpoint: metrics, checkpoints, half-written files.
+
+        Args:
+            checkpoint: the checkpoint; None: the run's beginning.
+        """
+        if checkpoint is None:
+            for name in ("metrics.csv", *LOGS):
+                (self.folder / name).unlink(missing_ok=True)
+        else:
+            positions = {"metrics.csv": checkpoint.meta["metrics_position"]}
+            for name, position in (positions | checkpoint.meta.get("positions", {})).items():
+                if (self.folder / name).exists():
+                    os.truncate(self.folder / name, position)
+            for path in self.checkpoints():
+                if generation_of(path) > checkpoint.meta["generation"]:
+                    path.unlink(missing_ok=True)
         for path in self.folder.rglob(".*"):
             if _TEMPORARY.match(path.name):
                 path.unlink(missing_ok=True)
@@ -251,6 +261,15 @@ def load_archive(folder: str | Path) -> tuple[Archive, list[Life]]:
     return found, find_lives(run.folder, [int(number) for number in found.ids[filled(found)]])
 
 
+def is_new_folder(folder: Path) -> bool:
+    """Whether a folder is empty, or was being made by a process that has died."""
+    if not folder.is_dir():
+        return False
+    names = {path.name for path in folder.iterdir()}
+    begun = ".lock" in names and not any(folder.glob("checkpoints/*"))
+    return not names or (begun and names <= _BEGINNING)
+
+
 def check_new_folder(folder: str | Path, option: str = "--out") -> None:
     """Refuses a folder that holds something.
 
@@ -262,7 +281,7 @@ def check_new_folder(folder: str | Path, option: str = "--out") -> None:
         InputError: there is a file, or a folder that is not empty.
     """
     folder = Path(folder)
-    if folder.is_dir() and not any(folder.iterdir()):
+    if is_new_folder(folder):
         return
     if folder.is_dir():
         hint = "; continue it with --resume" if (folder / "run.json").exists() else ""
@@ -291,14 +310,15 @@ def create_run(folder: str | Path, config: Config, **info: Any) -> tuple[Run, Co
     check_new_folder(folder)
     folder = Path(folder).absolute()
     try:
-        (folder / "inputs").mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        run = _lock_run(folder)
+        (folder / "inputs").mkdir(exist_ok=True)
         (folder / "checkpoints").mkdir(exist_ok=True)
     except OSError as error:
         raise with_path(error, folder) from None
-    run = _lock_run(folder)
     config = _copy_own_code(_copy_robots(config, folder / "inputs"), folder / "inputs")
-    run.save_config(config)
     run.update_info(**info)
+    run.save_config(config)  # last: where it is, the run can be continued
     return run, config
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TextIO
 
 from mjx_revolve.evolution.fingerprints import model_hash, settings_hash
 from mjx_revolve.evolution.interrupts import Interrupts
@@ -19,10 +19,10 @@ from mjx_revolve.evolution.tensorboard import TensorBoardLog
 def write_start(start: Start) -> None:
     """Writes down who evolves what; a run that goes on forgets what came after its checkpoint."""
     run = start.run
-    if start.checkpoint is not None and start.search is not None:
+    if start.resumed:
         run.rewind(start.checkpoint)
         run.save_config(start.config)
-        done = start.search.generation
+        done = 0 if start.search is None else start.search.generation
         resumption = {"time": timestamp(), "generation": done, "argv": sys.argv}
         resumed = [*run.info.get("resumed", []), resumption]
         run.update_info(resumed=resumed, finished=None, champion=None)
@@ -35,12 +35,42 @@ def write_start(start: Start) -> None:
         run.write("champion/robot.xml", robot.mj_spec.to_xml().encode())
 
 
-def run_generations(start: Start, interrupts: Interrupts) -> Any:
+def run_to_end(
+    start: Start,
+    interrupts: Interrupts,
+    draw: Callable[[Champion], None],
+    out: TextIO | None = None,
+) -> tuple[Any, Champion | None]:
+    """A whole run, or as much of it as there is before an interrupt; either way it is saved.
+
+    Args:
+        start: the run.
+        interrupts: looked at after each generation.
+        draw: draws the run's pictures; see `finish_run`.
+        out: where progress is told; None: standard output.
+
+    Returns:
+        The search, and its champion; None where generations are left.
+
+    Raises:
+        WorkerError: see `run_generations`.
+        OSError: likewise.
+    """
+    with interrupts.writing:
+        write_start(start)
+    search = run_generations(start, interrupts, out)
+    if interrupts.signal and search.generation < start.config.evolution.generations:
+        return search, None
+    return search, finish_run(start, search, draw)
+
+
+def run_generations(start: Start, interrupts: Interrupts, out: TextIO | None = None) -> Any:
     """All generations, or as many as there are before an interrupt or the loss of all workers.
 
     Args:
         start: the run.
         interrupts: looked at after each generation.
+        out: where progress is told; None: standard output.
 
     Returns:
         The search, which is saved.
@@ -53,24 +83,39 @@ def run_generations(start: Start, interrupts: Interrupts) -> Any:
     search = start.search
     before = 0 if search is None else search.generation
     log = _open_log(run, before) if evolution.tensorboard else None
-    progress = Progress(before, evolution.generations)
+    progress = Progress(before, evolution.generations, out)
+    unsaved: Any = None
+
+    def save() -> None:
+        nonlocal unsaved
+        if unsaved is not None:
+            _save(start, unsaved)
+            unsaved = None
+
+    interrupts.rescue = save
     try:
         for search, row in method.advance(start.search):
-            run.append_metrics(row)
-            method.record(run, search)
-            if log is not None:
-                log.add(row)
-            progress.show(row)
             done = search.generation
             last = done == evolution.generations
-            if last or interrupts.signal or done % evolution.checkpoint_every == 0:
-                _save(start, search)
+            with interrupts.writing:
+                run.append_metrics(row)
+                method.record(run, search)
+                if log is not None:
+                    log.add(row)
+                unsaved = search
+                if last or done % evolution.checkpoint_every == 0:
+                    save()
+            progress.show(row)
             if interrupts.signal:
+                with interrupts.writing:
+                    save()
                 break
     except WorkerError as error:
         if search is None:
             search = method.start()
-        _save(start, search)
+        with interrupts.writing:
+            _save(start, search)
+            unsaved = None
         done = search.generation
         what = f"generation {done}" if done else "the start, before any generation,"
         raise WorkerError(f"{error}; {what} is saved") from None

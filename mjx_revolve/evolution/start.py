@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import logging
 from collections.abc import Callable, Sequence
@@ -16,12 +17,14 @@ from mjx_revolve.evolution.fingerprints import (
     plain_settings,
     settings_hash,
 )
+from mjx_revolve.evolution.memory import check_memory
 from mjx_revolve.evolution.pool import Pool
 from mjx_revolve.evolution.runs import Checkpoint, Run, check_new_folder, create_run, open_run
 from mjx_revolve.evolution.tensorboard import check_tensorboard
 from mjx_revolve.inputs.commands import check_place
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.inputs.files import with_path
+from mjx_revolve.inputs.own_code import announce, content_name
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.numerics import runtime
 
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
 
 # What the bits of a run depend on, besides its configuration.
 _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
+_RUNS = Path("runs")
 _log = logging.getLogger(__name__)
 
 
@@ -44,6 +48,7 @@ class Start:
         method: how it is evolved.
         search: where it goes on; None: a new run.
         checkpoint: where `search` is from.
+        resumed: whether it was begun before.
     """
 
     run: Run
@@ -52,6 +57,7 @@ class Start:
     method: Method
     search: Any = None
     checkpoint: Checkpoint | None = None
+    resumed: bool = False
 
     @property
     def is_finished(self) -> bool:
@@ -61,7 +67,11 @@ class Start:
 
 
 def begin_run(
-    path: str, settings: Sequence[str], out: str | None, make_pool: Callable[[Config], Pool]
+    path: str,
+    settings: Sequence[str],
+    out: str | None,
+    make_pool: Callable[[Config], Pool],
+    writing: contextlib.AbstractContextManager | None = None,
 ) -> Start:
     """Begins a new run.
 
@@ -70,6 +80,7 @@ def begin_run(
         settings: what was typed to change it, `KEY.PATH=VALUE` each.
         out: the run folder; None: one below `runs/`, named after the configuration and the time.
         make_pool: makes the fitness.
+        writing: entered while the folder is made, as by `Interrupts.writing`.
 
     Returns:
         The run.
@@ -81,11 +92,41 @@ def begin_run(
     config = load_config(path, settings)
     if config.evolution.tensorboard:
         check_tensorboard(config.source)
-    folder = Path(out) if out else _default_folder(config)
-    check_new_folder(folder)  # before the expensive part
-    check_place(folder / "any", f"--out {folder}")
+    if out:
+        check_new_folder(out)  # before the expensive part
+    place = Path(out) if out else _RUNS / "any"
+    check_place(place / "any", f"--out {place}")
+    _announce_code(config)
     fitness = make_pool(config)
+    check_memory(config, fitness.num_genes)
+    check_search(config, fitness)
     # Not before: workers compile while evosax is imported, which takes a while.
+    from mjx_revolve.evolution.methods import make_method
+
+    info = {
+        "started": timestamp(),
+        "seed": config.evolution.seed,
+        "config_file": str(find_shipped(path, "configs").absolute()),
+        "settings": _portable(settings, config),
+        "model_hash": model_hash(fitness),
+        "settings_hash": settings_hash(config),
+        **runtime.describe_process(),
+    }
+    with writing or contextlib.nullcontext():
+        run, config = create_run(out or _claim_folder(config), config, **info)
+    return Start(run, config, fitness, make_method(config, fitness))
+
+
+def check_search(config: Config, fitness: Pool) -> None:
+    """Refuses settings that only those can check who have the fitness: a strategy's, for example.
+
+    Args:
+        config: the configuration.
+        fitness: its fitness.
+
+    Raises:
+        InputError: they are wrong.
+    """
     from mjx_revolve.evolution.methods import make_method
 
     try:
@@ -94,23 +135,14 @@ def begin_run(
         if str(error).startswith(("evolution.", "bodies.")):
             raise InputError(f"{config.source}: {error}") from None
         raise
-    run, config = create_run(
-        folder,
-        config,
-        started=timestamp(),
-        seed=config.evolution.seed,
-        config_file=str(find_shipped(path, "configs").absolute()),
-        settings=_portable(settings, config),
-        model_hash=model_hash(fitness),
-        **runtime.describe_process(),
-    )
-    return Start(run, config, fitness, make_method(config, fitness))
 
 
 def continue_run(
     folder: str, path: str | None, settings: Sequence[str], make_pool: Callable[[Config], Pool]
 ) -> Start:
     """Opens a run that was stopped, at its newest checkpoint that is whole.
+
+    One that was stopped before its first checkpoint begins anew.
 
     Args:
         folder: the run folder.
@@ -122,7 +154,7 @@ def continue_run(
         The run.
 
     Raises:
-        InputError: it is no run folder, has no checkpoint, or would become another run.
+        InputError: it is no run folder, has damaged checkpoints only, or would become another run.
         WorkerError: workers cannot be started.
     """
     label = f"--resume {folder}"
@@ -138,37 +170,58 @@ def continue_run(
     config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
     if config.evolution.tensorboard:
         check_tensorboard(label)
-    checkpoint = run.load_checkpoint()
-    for name in checkpoint.damaged:
+    checkpoint = run.load_checkpoint() if run.checkpoints() else None
+    for name in checkpoint.damaged if checkpoint else ():
         _log.warning("passed over a damaged checkpoint: %s", name)
-    if checkpoint.meta["settings_hash"] != settings_hash(config):
+    begun = checkpoint.meta if checkpoint else run.info
+    settled = settings_hash(config)
+    if begun.get("settings_hash", settled) != settled:  # an older version's run.json has none
         raise InputError(f"{label}: expected the config.yaml that it began with; found it changed")
+    _announce_code(config)
     fitness = make_pool(config)
+    check_memory(config, fitness.num_genes)
     from mjx_revolve.evolution.methods import make_method
 
-    if checkpoint.meta["model_hash"] != model_hash(fitness):
+    if begun.get("model_hash") != model_hash(fitness):
         raise InputError(
             f"{label}: expected the robot and the world that it began with; found them changed (a "
             "file that config.yaml names, or the program)"
         )
     run.update_info(settings=[*earlier, *_portable(settings, config)])
+    method = make_method(config, fitness)
+    if checkpoint is None:
+        return Start(run, config, fitness, method, resumed=True)
     if found := _differences(checkpoint.meta["host"], describe_host()):
         _log.warning(
             "the run continues, but not bit for bit, because this process differs: %s",
             "; ".join(found),
         )
-    method = make_method(config, fitness)
     search = method.from_arrays(checkpoint.arrays)
-    return Start(run, config, fitness, method, search, checkpoint)
+    return Start(run, config, fitness, method, search, checkpoint, resumed=True)
 
 
-def _default_folder(config: Config) -> Path:
+def _announce_code(config: Config) -> None:
+    """Tells of users' own code before workers, whom nobody watches, run it."""
+    for name in (config.task.type, config.controller.type):
+        announce(name)
+    if config.bodies is not None:
+        announce(config.bodies.genotype)
+
+
+def _claim_folder(config: Config) -> Path:
+    """A new folder of a run that was given none, its own even if others begin at the same time."""
     stem = f"{config.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    folder, count = Path("runs") / stem, 1
-    while folder.exists():
-        count += 1
-        folder = Path("runs") / f"{stem}-{count}"
-    return folder
+    count = 1
+    while True:
+        folder = _RUNS / (stem if count == 1 else f"{stem}-{count}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            count += 1
+        except OSError as error:
+            raise with_path(error, folder) from None
+        else:
+            return folder
 
 
 def _differences(old: Any, new: Any, place: str = "") -> list[str]:

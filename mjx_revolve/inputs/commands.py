@@ -12,13 +12,18 @@ import contextlib
 import logging
 import math
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import NoReturn
 
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.early import end_at_once, is_importing
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.shipped import list_shipped
+from mjx_revolve.inputs.trust import add_trust_argument, opening
 
 _SEEDS = 2**32  # what JAX's keys take, and a run's configuration
 # A day [s]: its poses already take several GB.
@@ -98,6 +103,17 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         help="one of those who lived in the run, where bodies evolve (default: the champion)",
     )  # fmt: skip
     parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
+    add_trust_argument(parser)
+
+
+def opening_episode(arguments: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
+    """Asks for what the path names, as `trust.opening` does, while it is entered.
+
+    Args:
+        arguments: with what `add_episode_arguments` adds.
+    """
+    named = [name for name in (arguments.path, arguments.world) if name is not None]
+    return opening(*named, trust=arguments.trust)
 
 
 def individual_name(number: int | None) -> str:
@@ -143,11 +159,19 @@ def check_place(path: str | Path, label: str) -> None:
             raise InputError(f"{label}: expected the folder {folder}; found a file")
 
 
+class _Note(logging.Formatter):
+    """Notes repeat names from files, which must not move a terminal's cursor."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The note, each line of it plain."""
+        return "\n".join(map(plain, super().format(record).split("\n")))
+
+
 @contextlib.contextmanager
 def show_notes() -> Iterator[None]:
     """Shows on stderr what the package says by `logging`, while it is entered."""
     handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("note: %(message)s"))
+    handler.setFormatter(_Note("note: %(message)s"))
     logger = logging.getLogger("mjx_revolve")
     logger.addHandler(handler)
     try:
@@ -167,8 +191,9 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         The exit code: `main`'s; 2 where the input is wrong (`InputError`), 1 where the system
         refused something (a full disk, too little memory), and 130 when interrupted.
     """
+    interrupts: list[int] = []
     try:
-        with show_notes():
+        with _noting_interrupts(interrupts), show_notes():
             return main(argv)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -177,18 +202,43 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         sys.stderr.close()
         return 1
     except OSError as error:
-        print(f"error: {describe_refusal(error)}", file=sys.stderr)
+        print(f"error: {plain(describe_refusal(error))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
     except Exception as error:
+        if interrupts:  # what the import of compiled code makes of a KeyboardInterrupt
+            print("interrupted", file=sys.stderr)
+            return 130
         # XLA's kind of error; its class cannot be named without importing JAX.
         if not (isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)):
             raise
         reason = str(error).partition("\n")[0].removeprefix("RESOURCE_EXHAUSTED:").strip()
         print(f"error: too little memory: {reason or 'none is left'}", file=sys.stderr)
         return 1
+
+
+@contextlib.contextmanager
+def _noting_interrupts(noted: list[int]) -> Iterator[None]:
+    """Has Ctrl-C raise `KeyboardInterrupt`, as ever, and notes it; while importing, see `early`."""
+
+    def note(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+        if before is end_at_once and is_importing(frame):
+            end_at_once(number, frame)
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    ours = before in (signal.default_int_handler, end_at_once)
+    if not ours or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def describe_refusal(error: OSError) -> str:

@@ -16,15 +16,46 @@ from typing import Any
 
 import yaml
 
+from mjx_revolve.inputs.witness import tell
+
 # Revolve's deepest evolved robots stay below 60 levels of YAML; Python's own recursion limit is
 # 1000. A file nested deeper than this is a mistake or an attack.
 _MAX_DEPTH = 200
 # An alias bomb is small in the file and huge when walked; our files need no aliases at all.
 _MAX_NODES = 200_000
+# PyYAML reads some 500 kB in a second; a robot of a thousand modules is a fifth of that.
+_MAX_BYTES = 2_000_000
+# The longest value, without blanks or in quotes, that a message repeats [characters].
+_MAX_VALUE = 200
+
+
+def plain(text: str) -> str:
+    """A text on one line of a terminal or a page: what is not printable is spelled out."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+_LONG = re.compile(
+    rf"(?<![^\s(\[])(['\"])(?:(?!\1).){{{_MAX_VALUE},}}\1(?!\w)|\S{{{2 * _MAX_VALUE},}}"
+)
+
+
+def _cut(match: re.Match[str]) -> str:
+    """Beginning and end of a long value."""
+    half = _MAX_VALUE // 4
+    return f"{match[0][:half]}…{match[0][-half:]}"
 
 
 class InputError(ValueError):
-    """A user's input is wrong; the message says where, what was expected and what was found."""
+    """A user's input is wrong; the message says where, what was expected and what was found.
+
+    Names in it may be a stranger's: the message is one printable line, and long values are cut.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        """Takes the message."""
+        super().__init__(_LONG.sub(_cut, plain(str(message))))
 
 
 _SHORT = reprlib.Repr()
@@ -83,9 +114,9 @@ def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hasha
         key = loader.construct_object(key_node, deep=True)
         place = f"line {key_node.start_mark.line + 1}"
         if not isinstance(key, Hashable):
-            raise InputError(f"{place}: expected a plain key; found {key!r}")
+            raise InputError(f"{place}: expected a plain key; found {show(key)}")
         if key in mapping:
-            raise InputError(f"{place}: expected each key once; found {key!r} twice")
+            raise InputError(f"{place}: expected each key once; found {show(key)} twice")
         mapping[key] = loader.construct_object(value_node, deep=True)
     return mapping
 
@@ -122,7 +153,13 @@ def load_yaml(path: str | Path) -> Any:
             key.
     """
     with reading(path):
-        text = Path(path).read_text(encoding="utf-8")
+        with open(path, "rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise InputError(f"expected at most {_MAX_BYTES // 10**6} MB of YAML; found more")
+    tell(path, "data", content)
+    with reading(path):
+        text = content.decode("utf-8")
         try:
             data = yaml.load(text, Loader=SafeLoader)
             _check_size(data)

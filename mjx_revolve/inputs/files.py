@@ -64,6 +64,12 @@ def resolve_inside(path: str | Path, folder: str | Path) -> Path:
     return full
 
 
+def short_path(path: str | Path) -> str:
+    """A path as short as it can be typed here."""
+    path = Path(path).absolute()
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
 def write_atomic(path: Path, content: bytes | Callable[[Path], None]) -> None:
     """Writes a file so that a crash leaves the old one or the new one, never half of it.
 

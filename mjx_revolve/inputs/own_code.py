@@ -3,7 +3,7 @@
 A configuration names them where it would name one of ours (`task: {type: mine/tasks.py:stay}`).
 The file is ordinary Python and may import what is installed. It is run when a fitness is made from
 the configuration, in every process that makes one, so a run folder that holds such a file holds a
-program: open only those that you trust.
+program: commands ask before they run a stranger's (`trust.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.witness import tell
 
 # Longest message of another library that we pass on [characters].
 _LONGEST = 200
@@ -74,6 +75,22 @@ def content_name(name: str) -> str:
     return f"{own.function} {hashlib.sha256(content).hexdigest()[:16]}"
 
 
+def announce(name: str) -> None:
+    """Tells of a user's file, if a name means one, without running it; see `witness.tell`.
+
+    Workers run what the process that starts them has announced.
+
+    Args:
+        name: of a task, controller or genotype.
+
+    Raises:
+        InputError: it is refused.
+    """
+    own = parse_own(name)
+    if own is not None and Path(own.path).is_file():
+        tell(own.path, "Python", Path(own.path).read_bytes())
+
+
 def load_own(name: str, label: str, kind: type | tuple[type, ...] = ()) -> Any:
     """The function that FILE.py:FUNCTION names; its file is run once per process and content.
 
@@ -117,6 +134,7 @@ def _run_file(path: str, label: str) -> types.ModuleType:
         raise InputError(f"{label}: expected a file; found none at {path}") from None
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
+    tell(path, "Python", content)
     digest = hashlib.sha256(path.encode() + b"\0" + content).hexdigest()[:16]
     name = f"mjx_revolve_own_{digest}"
     if name in sys.modules:

@@ -28,6 +28,13 @@ def list_shipped(kind: Kind) -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
+def is_shipped(path: Path) -> bool:
+    """Whether a file comes with the package; without links."""
+    kinds = ("configs", "morphologies")
+    folders = (_PACKAGE, *(_PACKAGE.parent / kind for kind in kinds))
+    return any(path.is_relative_to(folder) for folder in folders)
+
+
 def find_shipped(
     path: str | Path, kind: Kind, folder: str | Path = "", label: str | None = None
 ) -> Path:

@@ -20,6 +20,7 @@ import pytest
 import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
+from mjx_revolve import sweep
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import jobs, runs
 from mjx_revolve.evolution.jobs import Limits, WorkerError
@@ -126,6 +127,25 @@ def test_workers_may_join_at_any_time(cluster, pool, caplog):
     check_scores(pool, 2)
     assert pool.describe() == {"cluster": str(cluster.file), "block": 4}
     assert [line for line in said(caplog) if "waiting" not in line] == []
+
+
+def test_a_sweep_has_the_workers_of_a_cluster(cluster, pool, tmp_path, monkeypatch, capsys):
+    """The same bits as in this process, over several runs that share its workers."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
+    toys.write_config(tmp_path / "toy.yaml", population_size=8, generations=3)
+    for options in (["--out", "here"], ["--out", "there", "--cluster", str(cluster.file)]):
+        argv = ["toy.yaml", "--seeds", "2", *options]
+        assert run_command(lambda argv: sweep.main(argv, toys.make_toy), argv) == 0
+    for name in ("toy/seed_0", "toy/seed_1"):
+        here, there = (runs.Run(tmp_path / out / name) for out in ("here", "there"))
+        assert "cluster" in there.info["workers"]
+        assert here.info["champion"] == there.info["champion"]
+        tables = [
+            {k: v.tolist() for k, v in run.load_metrics().items() if k not in CLOCK}
+            for run in (here, there)
+        ]
+        assert tables[0] == tables[1]
 
 
 @pytest.mark.parametrize("kind", ["kill", "hang", "raise"])

@@ -1,6 +1,7 @@
 """What a run says while it goes on."""
 
 import io
+import os
 import re
 
 import pytest
@@ -133,3 +134,14 @@ def test_dumb_terminals_get_plain_lines(clock, monkeypatch):
     assert out.getvalue() == (
         "generation 1/4  best 0.25  mean 0.3333  evaluations/s 1234  left ?\n"
     )
+
+
+def test_nobody_listening_is_no_reason_to_end(clock):
+    """A real pipe without a reader."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    out = io.TextIOWrapper(io.FileIO(writer, "w"), write_through=True)
+    shown = progress.Progress(0, 3, out)
+    for generation in range(1, 4):
+        shown.show(row(generation))
+    shown.close()

@@ -5,11 +5,14 @@ import errno
 import io
 import json
 import os
+import time
 import zlib
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import make_config
@@ -268,6 +271,10 @@ def test_champion_genes_come_back_bit_for_bit(run):
         load_genes(run.folder)
     with pytest.raises(InputError, match=r"genes.yaml: expected a file; found none"):
         load_genes(run.folder / "inputs")
+    for huge in ("1" + 400 * "0", "0x1" + 5000 * "0", "true"):
+        (run.folder / "champion" / "genes.yaml").write_text(f"genes: [0.5, {huge}]")
+        with pytest.raises(InputError, match=r"expected a list of numbers; found .{1,80} at 1$"):
+            load_genes(run.folder)
 
 
 # --- the compilation cache ---
@@ -283,6 +290,39 @@ def test_half_written_cache_entries_are_removed_once(tmp_path):
     assert runtime.remove_broken_entries(tmp_path) == []
     (tmp_path / "late-cache").write_bytes(whole[:500])
     assert runtime.remove_broken_entries(tmp_path) == ["late-cache"]
+
+
+def test_a_clock_that_went_backwards_hides_no_broken_entry(tmp_path):
+    (tmp_path / "old-cache").write_bytes(zlib.compress(b"x"))
+    later = time.time() + 3600  # what was written before somebody set the clock back
+    os.utime(tmp_path / "old-cache", (later, later))
+    assert runtime.remove_broken_entries(tmp_path) == []
+    (tmp_path / "new-cache").write_bytes(b"half")
+    assert runtime.remove_broken_entries(tmp_path) == ["new-cache"]
+
+
+@pytest.mark.filterwarnings("ignore:Error reading persistent compilation cache")
+def test_a_damaged_cache_entry_costs_only_time(tmp_path):
+    """Damaged behind our back, after entries were looked through."""
+    before = {
+        name: getattr(jax.config, name)
+        for name in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs",
+                     "jax_persistent_cache_min_entry_size_bytes")
+    }  # fmt: skip
+    compilation_cache.reset_cache()
+    try:
+        for name, value in zip(before, (str(tmp_path), 0.0, 0), strict=True):
+            jax.config.update(name, value)
+        for damage in (None, lambda data: data[: len(data) // 2], lambda data: flip(data, 90)):
+            for entry in tmp_path.glob("*-cache") if damage else ():
+                entry.write_bytes(damage(entry.read_bytes()))
+            jax.clear_caches()
+            assert jax.jit(lambda x: jax.numpy.sin(x) * 3 + 1)(0.0) == 1.0
+            assert list(tmp_path.glob("*-cache"))
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
 
 
 def test_cache_folder_is_absolute_and_names_the_jaxlib(monkeypatch, tmp_path):

@@ -1,0 +1,121 @@
+"""Whose run folder it is: what may be run and read because of one, and what is asked first.
+
+A run folder names Python files of its owner's, and may name any file at all. Before a command runs
+or reads such a file, it must be one that this user has used: named in a configuration that they
+gave to `evolve`, or allowed by `--trust`. Both are remembered by what is in the file, outside of
+all run folders, so that a folder may be moved and another's is never taken for one's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.shipped import is_shipped
+from mjx_revolve.inputs.witness import Kind, heard_by
+
+_log = logging.getLogger(__name__)
+
+
+class UntrustedError(InputError):
+    """A file is not used because nobody has allowed it."""
+
+
+def add_trust_argument(parser: argparse.ArgumentParser) -> None:
+    """Adds `--trust` to a command that opens run folders."""
+    parser.add_argument(
+        "--trust", action="store_true",
+        help="run the Python files, and read the files elsewhere, that the run folder names; "
+        "those that you have used yourself are known",
+    )  # fmt: skip
+
+
+def record_path() -> Path:
+    """Where it is remembered: below `$XDG_STATE_HOME`, or `~/.local/state`."""
+    home = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(home).absolute() / "mjx_revolve" / "trusted"
+
+
+@contextlib.contextmanager
+def opening(*places: str | Path, trust: bool) -> Iterator[None]:
+    """Asks for what run folders name.
+
+    Args:
+        places: the folders, or files in them: what lies there is read without asking, but never
+            run.
+        trust: whether everything is allowed, and remembered.
+    """
+    roots = [_root_of(Path(place)) for place in places]
+
+    def ask(path: Path, kind: Kind, content: bytes) -> None:
+        real = path.resolve()
+        if kind == "data" and is_run_config(real):
+            # Genes of one's own may name any run's configuration: that run is opened, too.
+            roots.append(real.parent)
+        inside = any(real.is_relative_to(root) for root in roots)
+        if is_shipped(real) or (kind == "data" and inside) or _is_known(kind, content):
+            return
+        if kind == "Python":
+            raise UntrustedError(
+                f"{path}: expected a Python file that you have used before, or --trust; found one "
+                "that is new here and would be run: read it first"
+            )
+        raise UntrustedError(
+            f"{path}: expected a file inside the run folder, one that you have used before, or "
+            "--trust; found another"
+        )
+
+    with heard_by(_remember if trust else ask):
+        yield
+
+
+def remembering() -> contextlib.AbstractContextManager[None]:
+    """Remembers all files that are used meanwhile as this user's own choice."""
+    return heard_by(_remember)
+
+
+def is_run_config(path: Path) -> bool:
+    """Whether a configuration is that of a run folder, rather than one that a user has written."""
+    return path.name == "config.yaml" and (path.parent / "run.json").exists()
+
+
+def _root_of(place: Path) -> Path:
+    """The run folder that a path belongs to, without links."""
+    base = place if place.is_dir() else place.parent
+    if not (base / "config.yaml").is_file() and (base.parent / "config.yaml").is_file():
+        base = base.parent
+    return base.resolve()
+
+
+def _digest(kind: Kind, content: bytes) -> str:
+    """A line of the record. What was read as data is not thereby allowed to run."""
+    return f"{kind} {hashlib.sha256(content).hexdigest()}"
+
+
+def _is_known(kind: Kind, content: bytes) -> bool:
+    try:
+        return _digest(kind, content) in record_path().read_text(encoding="ascii").splitlines()
+    except (OSError, ValueError):
+        return False
+
+
+def _remember(path: Path, kind: Kind, content: bytes) -> None:
+    if is_shipped(path.resolve()) or _is_known(kind, content):
+        return
+    record = record_path()
+    try:
+        record.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with open(record, "a", encoding="ascii", opener=_private) as file:
+            file.write(f"{_digest(kind, content)}\n")
+    except OSError as error:  # a read-only home: --trust is asked for again
+        _log.warning("not remembered that you use %s: %s", path, error.strerror)
+
+
+def _private(name: str, flags: int) -> int:
+    return os.open(name, flags, 0o600)

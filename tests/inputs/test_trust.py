@@ -1,0 +1,203 @@
+"""A stranger's run folder: what is run and read because of it, and what its names can do."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+import toys
+from laboratory import _ELBOW as ELBOW
+from mjx_revolve import evolve, export, replay, report, viewer
+from mjx_revolve.episodes.config import load_config
+from mjx_revolve.episodes.lives import INDIVIDUALS, read_lives
+from mjx_revolve.evolution import runs
+from mjx_revolve.inputs import own_code, trust
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError, load_yaml
+
+MINE = "import pathlib\npathlib.Path({mark!r}).touch()\ndef rise(track, settings): return 0.0\n"
+SECRET = "hunter2: s3cr3t-token\n"
+COMMANDS = {
+    "viewer": (viewer.main, ["run"]),
+    "replay": (replay.main, ["run", "--html"]),
+    "export": (export.main, ["run", "--out", "out"]),
+    "evolve": (evolve.main, ["--resume", "run", "--workers", "1"]),
+    "again": (evolve.main, ["run/config.yaml", "--out", "out", "--workers", "1"]),
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A run folder that came from elsewhere, with a task in Python, and a private file."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(MINE.format(mark=str(tmp_path / "was run")))
+    (tmp_path / "elbow.yaml").write_text(ELBOW)
+    settings = {
+        "morphology": "elbow.yaml", "world": "lake", "task": {"type": "own.py:rise"},
+        "evolution": {"strategy": "SNES", "population_size": 4, "generations": 1},
+    }  # fmt: skip
+    (tmp_path / "swim.yaml").write_text(json.dumps(settings))
+    run, _ = runs.create_run("run", load_config("swim.yaml"), settings=[])
+    run.save_champion(np.zeros(3, np.float32), final=False, origin="<b>x</b>\x1b[2J")
+    run.close()
+    (tmp_path / "private.yaml").write_text(SECRET)
+    return tmp_path
+
+
+def change(folder, **settings):
+    """Edits the run's configuration as its owner might have."""
+    path = folder / "run" / "config.yaml"
+    path.write_text(json.dumps(load_yaml(path) | settings))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_nothing_of_a_strangers_is_run_unless_allowed(folder, name, capsys):
+    main, argv = COMMANDS[name]
+    assert run_command(main, argv) == 2
+    err = capsys.readouterr().err
+    assert "run/inputs/own.py: expected a Python file that you have used before, or --trust" in err
+    assert err.count("\n") == 1
+    assert not (folder / "was run").exists()
+    assert not (folder / "out").exists()
+
+
+def test_a_report_shows_the_rest(folder, capsys):
+    assert run_command(report.main, ["run"]) == 0
+    err = capsys.readouterr().err
+    assert "expected a Python file that you have used before, or --trust" in err
+    assert not (folder / "was run").exists()
+    page = (folder / "run" / "report.html").read_text()
+    assert "inputs/own.py" in page and "not shown in full" in page
+
+
+def test_what_one_has_evolved_oneself_is_known(folder):
+    toy = toys.make_toy
+    main = lambda argv: evolve.main(argv, toy)  # noqa: E731
+    assert run_command(main, ["swim.yaml", "--out", "mine"]) == 0
+    assert trust.record_path().stat().st_mode & 0o077 == 0
+    shutil.move("mine", "moved")
+    name = f"{folder / 'moved' / 'inputs' / 'own.py'}:rise"
+    with trust.opening("moved", trust=False):
+        own_code.load_own(name, "task.type")
+    (folder / "moved" / "inputs" / "own.py").write_text("rise = print\n")
+    with trust.opening("moved", trust=False), pytest.raises(trust.UntrustedError):
+        own_code.load_own(name, "task.type")
+    with trust.opening("moved", trust=True):  # allowed, and known from now on
+        own_code.load_own(name, "task.type")
+    (folder / "copy.py").write_text("rise = print\n")
+    with trust.opening("moved", trust=False):
+        own_code.load_own(f"{folder / 'copy.py'}:rise", "task.type")
+
+
+def test_what_was_read_is_not_thereby_allowed_to_run(folder):
+    text = "id: robot\nbody: {id: core, type: Core}\n"
+    (folder / "both.py").write_text(text)
+    with trust.remembering():
+        load_yaml("both.py")
+    with trust.opening("run", trust=False):
+        load_yaml("both.py")
+        with pytest.raises(trust.UntrustedError):
+            own_code.load_own(f"{folder / 'both.py'}:body", "task.type")
+
+
+def test_genes_elsewhere_may_name_a_runs_configuration(folder, capsys):
+    (folder / "mine").mkdir()
+    genes = folder / "mine" / "genes.yaml"
+    genes.write_text(json.dumps({"config": "../run/config.yaml", "genes": [0, 0, 0]}))
+    with trust.opening(genes, trust=False):
+        load_yaml(folder / "run" / "config.yaml")
+        load_yaml(folder / "run" / "inputs" / "elbow.yaml")
+        with pytest.raises(trust.UntrustedError):
+            load_yaml(folder / "private.yaml")
+    assert run_command(viewer.main, ["mine/genes.yaml", "--out", "page.html"]) == 2
+    assert "own.py: expected a Python file that you have used" in capsys.readouterr().err
+    assert not (folder / "was run").exists()
+
+
+@pytest.mark.parametrize("how", ["named", "link", "config", "body"])
+def test_private_files_are_not_shown(folder, how, capsys):
+    private = folder / "private.yaml"
+    change(folder, task={"type": "speed"})
+    if how == "named":
+        change(folder, morphology=str(private))
+    elif how == "link":
+        (folder / "run" / "inputs" / "elbow.yaml").unlink()
+        (folder / "run" / "inputs" / "elbow.yaml").symlink_to(private)
+    elif how == "config":
+        (folder / "run" / "config.yaml").unlink()
+        (folder / "run" / "config.yaml").symlink_to(private)
+    else:
+        genes = folder / "run" / "champion" / "genes.yaml"
+        genes.write_text(json.dumps({"config": str(private), "genes": [0, 0, 0]}))
+    code = run_command(viewer.main, ["run", "--out", "page.html"])
+    code_of_report = 0
+    if how != "body":  # nothing is wrong with the rest of that run, which takes a while
+        code_of_report = run_command(report.main, ["run", "--out", "report.html"])
+    out = "".join(capsys.readouterr())
+    page = folder / "report.html"
+    shown = out + (page.read_text() if page.exists() else "")
+    assert code == 2 and code_of_report in (0, 2)
+    assert "s3cr3t" not in shown and "hunter2" not in shown
+
+
+def test_names_move_no_cursor_and_write_no_markup(folder, capsys):
+    nasty = "<script>alert(1)</script>\x1b]0;x\x07\u202e"
+    change(folder, **{nasty: 1, "task": {"type": "speed"}})
+    body = folder / "run" / "inputs" / "elbow.yaml"
+    body.write_text(body.read_text().replace("id:", f"id: {json.dumps(nasty)} # ", 1))
+    assert run_command(report.main, ["run", "--out", "report.html"]) == 0
+    assert run_command(viewer.main, ["run", "--out", "page.html"]) == 2
+    shown = "".join(capsys.readouterr()).replace("\n", "")
+    assert shown.isprintable()
+    page = (folder / "report.html").read_text()
+    assert "<script>alert" not in page and "<b>x</b>" not in page
+    assert not any(c in page for c in "\x1b\x07\u202e")
+
+
+def test_a_robots_name_leads_nowhere(tmp_path, monkeypatch):
+    inside = tmp_path / "here"
+    inside.mkdir()
+    monkeypatch.chdir(inside)
+    assert str(viewer._usual_path(None, "viewer", "../../out")) == "out.html"
+
+
+@pytest.mark.parametrize("name", ["a\0b", "\ud800", "\x1b[2J", "\u202e"])
+def test_ids_are_printable(tmp_path, name):
+    from mjx_revolve.body.morphology import make_morphology
+
+    for data in ({"id": name, "body": {"type": "Core"}}, {"body": {"id": name, "type": "Core"}}):
+        with pytest.raises(InputError, match="id: expected printable characters; found"):
+            make_morphology(data)
+
+
+def test_messages_are_one_line_and_cut():
+    long = "x" * 5000
+    message = str(InputError(f"a.yaml: expected a name; found '{long} {long}'\nand\x1b[2J {long}"))
+    assert len(message) < 500 and message.isprintable()
+    assert message.startswith("a.yaml: expected a name; found 'xxx")
+    plain = "robot's own: expected one of " + "a, " * 200 + "the user's"
+    assert str(InputError(plain)) == plain
+
+
+def test_a_huge_yaml_is_refused_at_once(tmp_path):
+    (tmp_path / "big.yaml").write_text("- [1, 2, 3]\n" * 900_000)
+    with pytest.raises(InputError, match="expected at most 2 MB of YAML; found more"):
+        load_yaml(tmp_path / "big.yaml")
+    with pytest.raises(InputError, match="expected at most 2 MB"):
+        load_yaml(os.devnull.replace("null", "zero"))
+
+
+def test_huge_numbers_in_a_log_are_damage(tmp_path):
+    line = {"id": 1, "parents": [], "born": 1, "origin": "random", "score": 1.0, "genes": [10**400],
+            "descriptors": {}, "measures": {}}  # fmt: skip
+    lines = [json.dumps(line), json.dumps(line | {"id": 2, "score": 10**400})]
+    (tmp_path / INDIVIDUALS).write_text("\n".join(lines) + "\n")
+    lives, problems = read_lives(tmp_path)
+    assert list(lives) == [1] and problems == [f"{INDIVIDUALS}: 1 line is damaged and left out"]
+    with pytest.raises(InputError, match="individual 1: genes: expected numbers; found"):
+        assert lives[1].genes is None
