@@ -27,10 +27,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from experiments.common import ROOT, make_folder, make_parser, shown
+from experiments.common import ROOT, make_folder, make_parser
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import short_path
 
 # Longest wait for an answer [s]; 256 bodies are built, and the largest compile, in two minutes.
 _PATIENCE = 600.0
@@ -511,7 +512,7 @@ def main(argv: list[str] | None = None) -> int:
             f"\nOther programs were running: C's threads got {statistics.median(served):.1f} of "
             f"{wanted} cores, so its rates are too low here, and the ratios to them too high."
         )
-    print(f"\n{time.monotonic() - began:.0f} s in all; written: {shown(target)}")
+    print(f"\n{time.monotonic() - began:.0f} s in all; written: {short_path(target)}")
     return 0
 
 

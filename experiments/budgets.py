@@ -8,34 +8,26 @@ on when it is started again; see `studies.py`. What all runs share stands in `st
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from experiments.common import ROOT, shown
-from experiments.statistics import COVERAGE, difference, holm, rank_test
+from experiments.common import ROOT
 from experiments.studies import (
     BASE,
     Case,
-    Outcome,
-    by_case,
     describe_runs,
     fill,
-    given_settings,
-    make_plans,
-    read_outcomes,
-    run_study,
-    score_still,
-    study_parser,
-    write_csv,
+    study_main,
 )
-from experiments.study_pictures import draw_curves, draw_dots, plot_bodies
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.outcomes import Outcome, by_case, write_csv
 from mjx_revolve.view.plots import WIDE, figure_png, new_figure
+from mjx_revolve.view.statistics import COVERAGE, difference, holm, rank_test
+from mjx_revolve.view.sweep_pictures import draw_curves, draw_dots, plot_bodies
 
 ROBOTS = ("spider", "gecko", "snake", "centipede", "fish")
 BRAINS = 64  # CMA-ES's population for one body: as many lanes as the step takes at a time, a choice
@@ -170,16 +162,8 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the study, and reports it."""
-    argv = sys.argv[1:] if argv is None else argv
     what = "Co-evolution, random search and hand-made bodies, each with as many trials."
-    options = study_parser("budgets", what, make_cases()).parse_args(argv)
-    folder, plans = make_plans(make_cases(given_settings(options)), options, "budgets")
-    if not options.report and (code := run_study(plans, "budgets", argv)):
-        return code
-    outcomes = score_still(read_outcomes(plans))
-    print("\n".join(write_report(folder, outcomes)))
-    print(f"{len(outcomes)} of {len(plans)} runs; written: budgets.md in {shown(folder)}")
-    return 0
+    return study_main("budgets", what, make_cases, write_report, argv)
 
 
 if __name__ == "__main__":

@@ -48,9 +48,3 @@ def make_folder(out: str | None, name: str) -> Path:
             f"--out: expected a folder to write into; found {error.strerror}: {out}"
         ) from None
     return folder
-
-
-def shown(path: Path) -> str:
-    """A path as a user would type it."""
-    path = path.resolve()
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

@@ -8,15 +8,25 @@ Each run is an ordinary run folder. Stopped by Ctrl-C, it goes on when it is sta
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from scipy import stats
 
-from experiments.common import shown
-from experiments.statistics import (
+from experiments.studies import (
+    Case,
+    describe_runs,
+    fill,
+    study_main,
+)
+from mjx_revolve.body.descriptors import UNITS
+from mjx_revolve.episodes.measure_table import MEASURES
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.outcomes import Figures, Outcome, by_case, write_csv
+from mjx_revolve.view.plots import WIDE, figure_png, new_figure
+from mjx_revolve.view.statistics import (
     ALPHA,
     COVERAGE,
     Comparison,
@@ -24,26 +34,7 @@ from experiments.statistics import (
     interval,
     smallest_p,
 )
-from experiments.studies import (
-    Case,
-    Figures,
-    Outcome,
-    by_case,
-    describe_runs,
-    fill,
-    make_plans,
-    read_outcomes,
-    run_study,
-    score_still,
-    study_parser,
-    write_csv,
-)
-from experiments.study_pictures import draw_curves, plot_bodies, plot_dots
-from mjx_revolve.body.descriptors import UNITS
-from mjx_revolve.episodes.measure_table import MEASURES
-from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.files import write_atomic
-from mjx_revolve.view.plots import WIDE, figure_png, new_figure
+from mjx_revolve.view.sweep_pictures import draw_curves, plot_bodies, plot_dots
 
 CURRENT = 0.05  # m/s along x, of `current`; about what a small swimmer can keep up with, a choice
 # A pond that bodies of 0.2 to 0.3 m must notice: their core starts 0.15 m from surface and bed, and
@@ -61,7 +52,7 @@ ENVIRONMENTS: dict[str, Case] = {
     ),
     "bed": Case(
         "on the lake's bed; bodies are not trimmed, so they sink",
-        ("world=lake", "trim=none", "task.type=crawl"),
+        ("world=lake", "trim=none", "task.type=crawl", "task.start_attitude=level"),
     ),
     "current": Case(
         f"2 m below the lake's surface in a current of {CURRENT:g} m/s; progress against it counts",
@@ -100,7 +91,7 @@ _BODY = (
     "height_base_ratio",
 )  # fmt: skip
 FIGURES: dict[str, str] = {
-    "water_speed_bl_s": "speed through the water (body lengths/s)",
+    "water_speed_bl_s": "water speed (body lengths/s)",
     **{name: f"{MEASURES[name].words} ({MEASURES[name].unit})" for name in _GAIT[1:]},
     **{name: f"{name.removeprefix('num_').replace('_', ' ')} ({UNITS[name]})" for name in _BODY},
 }
@@ -202,9 +193,11 @@ runs have in common. The runs are small (the last plot shows whether they were s
 all of it is simulated: larger budgets or other laws of the water may give other bodies.
 """
 _NOTES = """Speeds and gaits of champions are means over sixteen fresh starts; those of populations
-are as their last lives went, each with the best of its trials, so they flatter. The speed through
-the water is the score, which counts what the environment's task asks for, and what the current
-takes. `docs/measures.md` has the formulas, `environments.csv` all other figures."""
+are as their last lives went, each with the best of its trials, so they flatter. The water speed is
+that through the water: the score, which counts what the environment's task asks for, and what the
+current takes. The current takes all bodies along alike, of which longer ones lose fewer of their
+own lengths: that alone favours them there. `docs/measures.md` has the formulas, `environments.csv`
+all other figures."""
 
 
 _TESTS = f"""{COVERAGE} p in the tables is Kruskal's and Wallis's test over all environments; over
@@ -286,16 +279,9 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the study, and reports it."""
-    argv = sys.argv[1:] if argv is None else argv
-    parser = study_parser("environments", "Bodies evolved in four environments.", ENVIRONMENTS)
-    options = parser.parse_args(argv)
-    folder, plans = make_plans(ENVIRONMENTS, options, "environments")
-    if not options.report and (code := run_study(plans, "environments", argv)):
-        return code
-    outcomes = score_still(read_outcomes(plans, through_water))
-    print("\n".join(write_report(folder, outcomes)))
-    print(f"{len(outcomes)} of {len(plans)} runs; written: environments.md in {shown(folder)}")
-    return 0
+    what = "Bodies evolved in four environments."
+    cases = lambda settings: ENVIRONMENTS  # noqa: E731
+    return study_main("environments", what, cases, write_report, argv, through_water)
 
 
 if __name__ == "__main__":

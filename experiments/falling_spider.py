@@ -19,10 +19,11 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.common import ROOT, make_folder, make_parser, shown
+from experiments.common import ROOT, make_folder, make_parser
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import short_path
 from mjx_revolve.view.plots import figure_png
 
 DROP = 0.25  # height of the release above the surface [m]
@@ -520,7 +521,7 @@ def main(argv: list[str] | None = None) -> int:
         print("\n".join(textwrap.wrap(line, 98, initial_indent="- ", subsequent_indent="  ")))
     (folder / "falls.png").write_bytes(figure_png(draw(falls, data, readings, still.share)))
     write_csv(folder / "falls.csv", falls)
-    print(f"\nwritten: falls.png and falls.csv in {shown(folder)}")
+    print(f"\nwritten: falls.png and falls.csv in {short_path(folder)}")
     return 0
 
 

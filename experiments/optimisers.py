@@ -19,9 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common import ROOT, make_folder, make_parser, shown
+from experiments.common import ROOT, make_folder, make_parser
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command, whole
+from mjx_revolve.inputs.files import short_path
 
 SEED = 0
 # Genes are angles that the controllers fold by a sine; beyond this, values repeat.
@@ -268,7 +269,7 @@ def main(argv: list[str] | None = None) -> int:
             f"(compiled in {seconds:.0f} s)."
         )
     write_csv(folder / "optimisers.csv", outcomes)
-    print(f"written: {shown(folder / 'optimisers.csv')}")
+    print(f"written: {short_path(folder / 'optimisers.csv')}")
     return 0
 
 

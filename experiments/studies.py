@@ -1,44 +1,37 @@
-"""Many evolutions that are one study: made by the ordinary command, and continued where stopped.
+"""Many evolutions that are one study, run as a sweep is: stopped and continued as one.
 
-A study is a folder: `CASE/seed_K/` is a run folder, `CASE/seed_K.log` is what its command printed.
-Runs that are finished are left alone, so a study is continued by starting it again.
+A study is a folder as `mjx_revolve.evolution.plans` describes it; what is compared, and how it is
+reported, is for the experiments to say.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
-import os
 import shlex
-import shutil
-import subprocess
 import sys
 import textwrap
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from experiments.common import ROOT, make_folder, make_parser, shown
-from experiments.statistics import interval
-from mjx_revolve.body.morphology import load_morphology
-from mjx_revolve.body.tree import Morphology
-from mjx_revolve.episodes.config import Config, load_config
-from mjx_revolve.evolution.interrupts import Interrupts
-from mjx_revolve.evolution.runs import Run, open_run
-from mjx_revolve.evolution.start import check_unchanged
+from experiments.common import make_folder, make_parser
+from mjx_revolve.evolution.plans import Plan
+from mjx_revolve.evolution.plans import make_plans as plan_runs
+from mjx_revolve.evolution.pool import make_pool
+from mjx_revolve.evolution.sweeps import choose_steps, run_plans
 from mjx_revolve.inputs.commands import Parser, whole
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.files import write_atomic
-from mjx_revolve.view.population import read_population
+from mjx_revolve.inputs.files import short_path
+from mjx_revolve.numerics.runtime import prepare_process
+from mjx_revolve.view.outcomes import Figures, Outcome, by_case, find_outcomes
+from mjx_revolve.view.results import save_pictures
+from mjx_revolve.view.statistics import interval
 
 BASE = Path(__file__).with_name("studies.yaml")
-COMMAND = (sys.executable, "-m", "mjx_revolve.evolve")
+MAKE_FITNESS = None  # the real one; see `pool.make_pool`
 _STILL_KEY, _STARTS = 20_000, 8  # of the starts from which champions are scored at rest; a choice
-_LOOK = 0.2  # how often a running command is looked after [s]
 
 
 class Case(NamedTuple):
@@ -51,56 +44,6 @@ class Case(NamedTuple):
 
     words: str
     settings: tuple[str, ...]
-
-
-class Plan(NamedTuple):
-    """One evolution of a study.
-
-    Attributes:
-        case: the name of its case.
-        seed: its seed.
-        folder: its run folder.
-        settings: what replaces values of `BASE`.
-    """
-
-    case: str
-    seed: int
-    folder: Path
-    settings: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return f"{self.case}/{self.folder.name}"
-
-    @property
-    def config(self) -> Config:
-        """The configuration, everything replaced.
-
-        Raises:
-            InputError: it is wrong.
-        """
-        return load_config(BASE, [*self.settings, f"evolution.seed={self.seed}"])
-
-
-class Outcome(NamedTuple):
-    """What a finished evolution has found.
-
-    Attributes:
-        plan: of the evolution.
-        champion: figures of its champion by name: `score` and measures on fresh starts, descriptors
-            of its body.
-        population: means over those who lived at the end, as their lives went; empty where only
-            brains evolve.
-        metrics: the columns of `metrics.csv`.
-        body: the champion's.
-    """
-
-    plan: Plan
-    champion: Mapping[str, float]
-    population: Mapping[str, float]
-    metrics: Mapping[str, np.ndarray]
-    body: Morphology
 
 
 def study_parser(name: str, description: str, cases: Mapping[str, Case]) -> Parser:
@@ -134,6 +77,39 @@ def study_parser(name: str, description: str, cases: Mapping[str, Case]) -> Pars
     return parser
 
 
+def study_main(
+    name: str,
+    description: str,
+    make_cases: Callable[[Sequence[str]], Mapping[str, Case]],
+    write_report: Callable[[Path, Sequence[Outcome]], Sequence[str]],
+    argv: list[str] | None = None,
+    add: Callable[[str, Figures], Figures] = lambda case, figures: {},
+) -> int:
+    """Runs a study, and reports it.
+
+    Args:
+        name: of the experiment's module.
+        description: what it does, in a sentence.
+        make_cases: what is compared, from what replaces values of the configuration.
+        write_report: writes `NAME.md` and more into a folder, from the outcomes; returns what was
+            found, in lines.
+        argv: the arguments; by default the command line's.
+        add: as in `read_outcomes`.
+
+    Returns:
+        The exit code, see `run_study`.
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    options = study_parser(name, description, make_cases(())).parse_args(argv)
+    folder, plans = make_plans(make_cases(given_settings(options)), options, name)
+    if not options.report and (code := run_study(plans, name, argv)):
+        return code
+    outcomes = score_still(read_outcomes(plans, add))
+    print("\n".join(write_report(folder, outcomes)))
+    print(f"{len(outcomes)} of {len(plans)} runs; written: {name}.md in {short_path(folder)}")
+    return 0
+
+
 def given_settings(options: argparse.Namespace) -> tuple[str, ...]:
     """What the options of `study_parser` replace in all configurations, `KEY.PATH=VALUE` each."""
     if options.generations is None:
@@ -144,7 +120,7 @@ def given_settings(options: argparse.Namespace) -> tuple[str, ...]:
 def make_plans(
     cases: Mapping[str, Case], options: argparse.Namespace, name: str
 ) -> tuple[Path, list[Plan]]:
-    """The evolutions of a study, the first seeds of all cases first.
+    """The evolutions of a study.
 
     Args:
         cases: what is compared.
@@ -159,62 +135,12 @@ def make_plans(
     """
     folder = make_folder(options.out, name).resolve()
     given = given_settings(options)
-    return folder, [
-        Plan(case, seed, folder / case / f"seed_{seed}", (*given, *cases[case].settings))
-        for seed in range(options.seeds)
-        for case in options.only
-    ]
-
-
-def next_command(plan: Plan) -> list[str] | None:
-    """Arguments of the command that begins a run or goes on with it.
-
-    A run without a checkpoint is forgotten, as nothing of it is worth keeping.
-
-    Args:
-        plan: the run.
-
-    Returns:
-        The arguments; None where it is finished.
-
-    Raises:
-        InputError: the folder holds something else, or a run that another process writes, of
-            another configuration, or with more generations.
-    """
-    folder, wanted = plan.folder, plan.config
-    if folder.exists() and any(folder.iterdir()):
-        run = open_run(folder)
-        try:
-            check_unchanged(run.load_config(), wanted, shown(folder))
-            found, length = _generations(run), wanted.evolution.generations
-            finished, checkpoints = "finished" in run.info, run.checkpoints()
-        finally:
-            run.close()
-        if found > length:
-            raise InputError(
-                f"{shown(folder)}: expected a run of {length} generations at most; found {found} "
-                "(choose another --out)"
-            )
-        if finished and found == length:
-            return None
-        if checkpoints:
-            return ["--resume", str(folder), "--set", f"evolution.generations={length}"]
-        shutil.rmtree(folder)
-    settings = [word for setting in plan.settings for word in ("--set", setting)]
-    new = [str(BASE), "--seed", str(plan.seed), "--out", str(folder)]
-    return [*new, *settings]
-
-
-def _generations(run: Run) -> int:
-    """How many a run has done."""
-    metrics = run.load_metrics() if run.metrics_path.exists() else {}
-    return int(metrics["generation"][-1]) if len(metrics.get("generation", ())) else 0
+    settings = {case: (*given, *cases[case].settings) for case in options.only}
+    return folder, plan_runs(folder, BASE, settings, range(options.seeds))
 
 
 def run_study(plans: Sequence[Plan], name: str, argv: Sequence[str]) -> int:
-    """Runs what is not finished, one evolution after the other, with a line for each.
-
-    Ctrl-C ends the evolution under way after its generation, and the study with it.
+    """Runs what is not finished; see `sweeps.run_plans`.
 
     Args:
         plans: the evolutions.
@@ -222,79 +148,17 @@ def run_study(plans: Sequence[Plan], name: str, argv: Sequence[str]) -> int:
         argv: its arguments, for the hint how to go on.
 
     Returns:
-        The exit code: 0 when all are finished, 130 or 143 when interrupted, 1 when one failed.
+        The exit code.
 
     Raises:
-        InputError: see `next_command`.
+        InputError: a run is wrong, or cannot go on.
     """
-    began, ran = time.perf_counter(), 0
-    commands = {plan: next_command(plan) for plan in plans}  # what is wrong is said at once
-    left = sum(command is not None for command in commands.values())
-    with Interrupts("stopping after the generation under way") as interrupts:
-        for k, (plan, command) in enumerate(commands.items()):
-            print(f"[{k + 1:{len(str(len(plans)))}}/{len(plans)}] {plan.name}: ", end="")
-            if command is None:
-                print(_result(plan, "finished before"))
-                continue
-            print("running ... ", end="", flush=True)
-            started, log = time.perf_counter(), plan.folder.with_suffix(".log")
-            code = _run(command, log, interrupts)
-            seconds = time.perf_counter() - started
-            if interrupts.signal:
-                words = ["python", "-m", f"experiments.{name}", *argv]
-                print(f"stopped\ngo on: {shlex.join(words)}", flush=True)
-                return interrupts.exit_code
-            if code:
-                print(f"failed: exit code {code} after {seconds:.0f} s", flush=True)
-                print(f"error: {_last_line(log)} (all of it: {shown(log)})", file=sys.stderr)
-                return 1
-            ran += 1
-            left -= 1
-            rest = left * (time.perf_counter() - began) / ran
-            more = f", some {max(1, round(rest / 60))} min left" if left else ""
-            print(_result(plan, f"{seconds:.0f} s{more}"), flush=True)
-    return 0
-
-
-def _run(arguments: Sequence[str], log: Path, interrupts: Interrupts) -> int:
-    """Runs the command; what it prints goes to a file."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    with log.open("ab") as file:
-        # A session of its own: Ctrl-C is ours to pass on, once.
-        process = subprocess.Popen(
-            [*COMMAND, *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, "PYTHONPATH": paths},
-            start_new_session=True,
-        )
-    told = False
-    while True:
-        try:
-            return process.wait(_LOOK)
-        except subprocess.TimeoutExpired:
-            if interrupts.signal and not told:
-                process.send_signal(interrupts.signal)
-                told = True
-
-
-def _result(plan: Plan, words: str) -> str:
-    """What became of a run, and a remark."""
-    champion = Run(plan.folder).info.get("champion", {})
-    return f"{champion.get('score', float('nan')):.3g}, {words}"
-
-
-def _last_line(log: Path) -> str:
-    """The last that a command said."""
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return lines[-1].removeprefix("error: ") if lines else "it said nothing"
-
-
-# --- what has come of them ------------------------------------------------------------------------
-
-Figures = dict[str, float]
+    prepare_process()
+    again = shlex.join(["python", "-m", f"experiments.{name}", *argv])
+    steps = choose_steps(plans, MAKE_FITNESS)
+    return run_plans(
+        steps, lambda config: make_pool(config, make_fitness=MAKE_FITNESS), save_pictures, again
+    )
 
 
 def read_outcomes(
@@ -312,36 +176,12 @@ def read_outcomes(
     Raises:
         InputError: none is finished, or a run is damaged.
     """
-    found = []
-    for plan in plans:
-        run = Run(plan.folder)
-        if not (plan.folder / "run.json").is_file() or "finished" not in run.info:
-            continue
-        try:
-            found.append(_read_outcome(plan, run, add))
-        except (OSError, KeyError, ValueError, TypeError, IndexError) as error:
-            raise InputError(
-                f"{shown(plan.folder)}: expected a whole run; found: {error}"
-            ) from None
+    found, lost = find_outcomes(plans, add)
+    if lost:
+        raise InputError(lost[0])
     if not found:
         raise InputError("--report: expected runs that are finished; found none")
     return found
-
-
-def _read_outcome(plan: Plan, run: Run, add: Callable[[str, Figures], Figures]) -> Outcome:
-    facts = run.info["champion"]
-    body = load_morphology(plan.folder / "champion" / "morphology.yaml")
-    champion = {"score": float(facts["score"]), **facts["measures"], **body.descriptors}
-    champion |= add(plan.case, champion)
-    people, problems = read_population(plan.folder)
-    if problems:
-        raise ValueError(problems[0])
-    alive = [dict(life.figures) for life in people.alive(people.last) if life.score == life.score]
-    lives = [life | add(plan.case, life) for life in alive]
-    population = {
-        name: float(np.mean([life[name] for life in lives])) for name in (lives or [{}])[0]
-    }
-    return Outcome(plan, champion, population, run.load_metrics(), body)
 
 
 def score_still(outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -356,8 +196,6 @@ def score_still(outcomes: Sequence[Outcome]) -> list[Outcome]:
     Returns:
         The same with `still_score` among the champions' figures: the mean over a few fresh starts.
     """
-    from mjx_revolve.numerics.runtime import prepare_process
-
     prepare_process()
     found = []
     for some in by_case(outcomes, dict.fromkeys(o.plan.case for o in outcomes)).values():
@@ -393,12 +231,6 @@ def _still_scores(outcomes: Sequence[Outcome]) -> np.ndarray:
     return np.mean([[s[0] for s, _ in evaluate(pool, who, genes, key)] for key in keys], 0)
 
 
-def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list[Outcome]]:
-    """Outcomes by case, in the order of the cases; those without any are left out."""
-    found = {name: [o for o in outcomes if o.plan.case == name] for name in cases}
-    return {name: some for name, some in found.items() if some}
-
-
 def describe_runs(cases: Mapping[str, Sequence[Outcome]], known: Mapping[str, Case]) -> list[str]:
     """Markdown: what was run, how often, for how long, and the champions' scores.
 
@@ -431,12 +263,3 @@ of a joint: only what a champion scores beyond its score with all joints at rest
 def fill(text: str) -> str:
     """A paragraph of Markdown in lines of the width of our pages."""
     return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Rows as CSV, whole or not at all; what a row lacks stays empty."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)))
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomic(path, text.getvalue().encode())

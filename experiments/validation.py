@@ -13,9 +13,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.common import make_folder, make_parser, shown
+from experiments.common import make_folder, make_parser
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.files import short_path
 from mjx_revolve.view.plots import figure_png
 
 HEADINGS = ("case", "quantity", "expected", "found", "error", "tolerance", "unit", "")
@@ -78,7 +79,7 @@ def main(argv: list[str] | None = None) -> int:
         (folder / "validation.png").write_bytes(figure_png(draw(curves)))
         written += " and validation.png"
     verdict = f"{failed} outside their tolerances" if failed else "all within their tolerances"
-    print(f"\n{len(table) - 2} comparisons, {verdict}\nwritten: {written} in {shown(folder)}")
+    print(f"\n{len(table) - 2} comparisons, {verdict}\nwritten: {written} in {short_path(folder)}")
     return 1 if failed else 0
 
 

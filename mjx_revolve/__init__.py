@@ -9,6 +9,10 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from mjx_revolve.inputs.early import watch_imports
+
+watch_imports()  # first of all: the rest takes time
+
 __version__ = "0.1.0"
 
 _WHERE = {

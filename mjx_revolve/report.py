@@ -1,6 +1,7 @@
 """Command line: a page about one run or several, with pictures, tables and how to repeat them.
 
     python -m mjx_revolve.report RUN [RUN ...] [--out FILE.html]
+    python -m mjx_revolve.report SWEEP [--out FILE.html]
 
 Runs of one configuration with different seeds are put together; different configurations are
 compared. A run that is incomplete or damaged is named as such, and the page shows what is left.
@@ -10,11 +11,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from mjx_revolve.inputs.commands import Parser, read_path, run_command
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
+from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics import runtime
 
 
@@ -23,10 +26,11 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m mjx_revolve.report",
         description="Writes a page about runs: one HTML file that needs nothing else.",
     )
-    parser.add_argument("runs", nargs="+", type=read_path, metavar="RUN", help="a run folder")
+    parser.add_argument("runs", nargs="+", type=read_path, metavar="RUN",
+                        help="a run folder; or the folder of one sweep")  # fmt: skip
     parser.add_argument(
         "--out", type=read_path, metavar="FILE.html",
-        help="the page (default: RUN/report.html of one run, ./report.html of several)",
+        help="the page (default: report.html in a run's or sweep's folder; of several runs, here)",
     )  # fmt: skip
     parser.add_argument(
         "--every-champion", action="store_true",
@@ -38,6 +42,7 @@ def _parser() -> argparse.ArgumentParser:
         "report leads: best (of the last generation, and the champion's family), archive (all who "
         "live there), or numbers such as 17,42; a minute or two",
     )  # fmt: skip
+    add_trust_argument(parser)
     return parser
 
 
@@ -61,16 +66,24 @@ def _named_file(out: str) -> Path:
     return path
 
 
-def _usual_file(folder: Path, generator: str) -> Path:
-    """The page's usual name in a folder, unless somebody else's file has it."""
-    path = folder / "report.html"
-    if path.exists():
-        with open(path, "rb") as file:
-            ours = f'content="{generator}"'.encode() in file.read(1000)
-        if not ours:
-            raise InputError(f"{path}: expected no file or an earlier report; found another file "
-                             "(name it with --out to replace it)")  # fmt: skip
-    return path
+def _report_sweep(sweeps: Sequence[str], arguments: argparse.Namespace) -> int:
+    """The page about a sweep, as far as it has got."""
+    from mjx_revolve.view.report.sweep import write_report
+
+    if len(arguments.runs) > 1:
+        raise InputError(
+            f"{sweeps[0]}: expected nothing beside a sweep; found {len(arguments.runs)} folders"
+        )
+    for option in ("every_champion", "individuals"):
+        if getattr(arguments, option):
+            name = option.replace("_", "-")
+            raise InputError(f"--{name}: expected run folders; found the sweep {sweeps[0]}")
+    page = None if arguments.out is None else _named_file(arguments.out)
+    report = write_report(sweeps[0], page)
+    for line in report.lost:
+        print(f"warning: {line}", file=sys.stderr)
+    print(f"report: {report.page}; {report.table}")
+    return 0
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -88,18 +101,27 @@ def main(argv: list[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     runtime.prepare_process()
+    with opening(*arguments.runs, trust=arguments.trust):
+        return _report(arguments)
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    """Writes the page, and those of individuals."""
+    from mjx_revolve.evolution.sweeps import FILE
     from mjx_revolve.view.report.bodies import INDIVIDUALS, choose_individuals, write_pages
     from mjx_revolve.view.report.data import read_runs
-    from mjx_revolve.view.report.page import GENERATOR, make_report
+    from mjx_revolve.view.report.page import make_report, usual_place
 
+    if sweeps := [name for name in arguments.runs if (Path(name) / FILE).is_file()]:
+        return _report_sweep(sweeps, arguments)
     records, lost = read_runs(arguments.runs)
     if arguments.out is not None:
         path = _named_file(arguments.out)
     elif len(arguments.runs) > 1:
-        path = _usual_file(Path("."), GENERATOR)
+        path = usual_place(Path("."))
     else:
         folder = Path(records[0].label)
-        path = _usual_file(folder if folder.is_dir() else records[0].folder, GENERATOR)
+        path = usual_place(folder if folder.is_dir() else records[0].folder)
     which = arguments.individuals
     if which is not None and len(records) > 1 and not isinstance(which, str):
         raise InputError(f"--individuals: expected numbers of one run; found {len(records)} runs")
@@ -110,10 +132,10 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{record.label}/{INDIVIDUALS}: {len(numbers)} pages, {written} of them new")
     page = make_report(records, lost, arguments.every_champion, path.parent).encode()
     for line in lost:
-        print(f"warning: nothing could be read: {line}", file=sys.stderr)
+        print(f"warning: nothing could be read: {plain(line)}", file=sys.stderr)
     for record in records:
         if record.problems:
-            print(f"warning: {record.warning}", file=sys.stderr)
+            print(f"warning: {plain(record.warning)}", file=sys.stderr)
     write_atomic(path, page)
     print(f"report: {path} ({len(page) / 1e6:.1f} MB)")
     return 0

@@ -2,60 +2,22 @@
 
 import csv
 import json
-import math
 import os
 import signal
-import sys
-import threading
-import time
 
 import numpy as np
 import pytest
 
-from experiments import budgets, environments, statistics, studies
+from experiments import budgets, environments, studies
 from experiments.environments import ENVIRONMENTS
 from experiments.random_bodies import random_body
 from laboratory import ROOT, body
-from mjx_revolve import evolve
+from mjx_revolve.evolution.plans import Plan
 from mjx_revolve.evolution.runs import Run
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.outcomes import Outcome, by_case
 from toys import CLOCK, make_toy_bodies
-
-# ------------------------------------------------------------------ statistics
-
-
-def test_intervals_are_the_quantiles_of_resampled_means():
-    # Of 0 and 1, a quarter of all resamples is (0, 0), a quarter (1, 1); of differences 1 in 16.
-    assert statistics.interval([0, 1]) == (0.5, 0, 1)
-    assert statistics.difference([10, 11], [0, 1]) == (10, 9, 11)
-    assert statistics.interval([3, np.nan, 3]) == (3, 3, 3)
-    assert str(statistics.interval([-2.0])) == "−2"
-    assert str(statistics.interval([])) == "–"
-    assert str(statistics.Interval(0.12345, -0.0, 1234.5)) == "0.123 [0, 1234]"
-
-
-def test_rank_tests_are_exact_with_few_values_and_with_equal_ones():
-    assert statistics.rank_test(range(5), range(5, 10)) == pytest.approx(2 / math.comb(10, 5))
-    assert statistics.smallest_p(5, 5, 6) == pytest.approx(6 * 2 / 252)
-    # Of the 20 ways to choose three of 1, 1, 2, 2, 3, 3, two have ranks as low as 1, 1, 2.
-    assert statistics.rank_test([1, 1, 2], [2, 3, 3]) == pytest.approx(2 * 2 / 20)
-    assert statistics.rank_test([1, 1], [1, 1, 1]) == 1
-
-
-def test_holms_correction_by_hand():
-    assert statistics.holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert statistics.holm([0.6, 0.7]) == [1, 1]
-
-
-def test_groups_are_compared_together_and_in_pairs():
-    found = statistics.compare({"a": [1, 2, 3], "b": [4, 5, 6], "c": [7, 8, 9]})
-    # Mean ranks 2, 5, 8: H = 12 / (9 · 10) · 3 (3² + 0 + 3²) = 7.2, of two degrees of freedom.
-    assert found.p == pytest.approx(math.exp(-7.2 / 2))
-    assert found.pairs == pytest.approx({("a", "b"): 0.3, ("a", "c"): 0.3, ("b", "c"): 0.3})
-    assert statistics.compare({"a": [1, 1], "b": [1, 1]}).p == 1
-    assert statistics.compare({"a": [1, 2]}) == (1, {})
-
 
 # ------------------------------------------------------------------ runs
 
@@ -71,18 +33,19 @@ TINY = [
 
 @pytest.fixture
 def started(monkeypatch):
-    """Commands run here, with a fitness that costs nothing; what was run."""
+    """A fitness that costs nothing; what was run."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    monkeypatch.setattr(studies, "MAKE_FITNESS", make_toy_bodies)
     commands = []
+    run_plans = studies.run_plans
 
-    def run(arguments, log, interrupts):
-        commands.append(arguments)
-        log.parent.mkdir(parents=True, exist_ok=True)
-        return run_command(lambda argv: evolve.main(argv, make_toy_bodies), arguments)
+    def run(steps, *arguments):
+        commands.extend((plan.name, step) for plan, step in steps.items() if step != "finished")
+        return run_plans(steps, *arguments)
 
-    monkeypatch.setattr(studies, "_run", run)
+    monkeypatch.setattr(studies, "run_plans", run)
     monkeypatch.setattr(environments, "write_report", lambda *_: [])  # its pictures take a while
-    monkeypatch.setattr(environments, "score_still", lambda outcomes: outcomes)
+    monkeypatch.setattr(studies, "score_still", lambda outcomes: outcomes)
     return commands
 
 
@@ -112,7 +75,7 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
 
     # More generations: each goes on, to where it would have come at once.
     assert study(tmp_path, *two, "--generations", "3") == 0
-    assert [command[0] for command in started[2:]] == ["--resume"] * 2
+    assert started[2:] == [("open_water/seed_0", "continue"), ("bed/seed_0", "continue")]
     once = tmp_path / "once"
     assert study(once, "--only", "bed", "--generations", "3") == 0
     assert metrics(once / "bed" / "seed_0") == metrics(tmp_path / "bed" / "seed_0")
@@ -121,7 +84,7 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
     count = len(started)
     for options, message in (
         (("--generations", "2"), "expected a run of 2 generations at most; found 3"),
-        (("--generations", "3", "--set", "task.duration=13"), "task.duration: expected 12"),
+        (("--generations", "3", "--set", "task.duration=7"), "task.duration: expected 6"),
     ):
         with pytest.raises(InputError, match=message):
             study(tmp_path, *two, *options)
@@ -151,84 +114,20 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
         assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_no_checkpoint_is_of_begins_anew(tmp_path, started):
-    options = environments.study_parser("environments", "", ENVIRONMENTS).parse_args(
-        ["--out", str(tmp_path), *TINY, "--seeds", "1", "--only", "bed", "--generations", "1"]
-    )
-    _, (plan,) = studies.make_plans(ENVIRONMENTS, options, "environments")
-    new = studies.next_command(plan)
-    assert new[1:5] == ["--seed", "0", "--out", str(plan.folder)]
-    assert studies.run_study([plan], "environments", []) == 0
-    assert studies.next_command(plan) is None
+def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path, started, monkeypatch, capsys):
+    """Ctrl-C while the first picture is drawn: that run is finished, the next is not begun."""
 
-    run = Run(plan.folder)
-    run.update_info(finished=None)
-    assert studies.next_command(plan)[0] == "--resume"
-    for path in run.checkpoints():
-        path.unlink()
-    assert studies.next_command(plan) == new
-    assert not plan.folder.exists()
-    plan.folder.mkdir()
-    (plan.folder / "thesis.txt").write_text("years of work")
-    with pytest.raises(InputError, match=r"expected a run folder; found no config\.yaml"):
-        studies.next_command(plan)
-
-
-def test_a_run_that_fails_says_why(tmp_path, monkeypatch, capsys):
-    words = "print('error: the pond is dry'); raise SystemExit(2)"
-    monkeypatch.setattr(studies, "COMMAND", (sys.executable, "-c", words))
-    assert study(tmp_path, "--only", "shore") == 1
-    captured = capsys.readouterr()
-    assert "[1/1] shore/seed_0: running ... failed: exit code 2" in captured.out
-    assert captured.err.startswith("error: the pond is dry (all of it: ")
-
-
-_SLOW = """
-import sys, time
-sys.path.insert(0, {tests!r})
-import toys
-from mjx_revolve import evolve
-from mjx_revolve.inputs.commands import run_command
-
-class Slow(toys.BodyToy):
-    def evaluate(self, *block):
-        time.sleep(0.01)
-        return super().evaluate(*block)
-
-def make(config):
-    made = toys.make_toy_bodies(config)
-    return Slow(made.config, made.genotype, made.mixed, made.brains, made.seeds)
-
-sys.exit(run_command(lambda argv: evolve.main(argv, make), [*sys.argv[1:], "--workers", "1"]))
-"""
-
-
-@pytest.mark.slow
-def test_ctrl_c_stops_a_study_and_it_goes_on(tmp_path, monkeypatch, capsys, request):
-    """Real processes: the run under way is told, saves and ends; the next call finishes it."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-    (tmp_path / "slow.py").write_text(_SLOW.format(tests=str(ROOT / "tests")))
-    monkeypatch.setattr(studies, "COMMAND", (sys.executable, str(tmp_path / "slow.py")))
-    out, folder = tmp_path / "out", tmp_path / "out" / "bed" / "seed_0"
-
-    def interrupt():
-        while not (folder / "metrics.csv").exists():
-            time.sleep(0.05)
+    def interrupt(start, champion):
         os.kill(os.getpid(), signal.SIGINT)
 
-    threading.Thread(target=interrupt, daemon=True).start()
-    options = ("--only", "bed", "--generations", "400")
-    assert study(out, *options) == 130
+    monkeypatch.setattr(studies, "save_pictures", interrupt)
+    options = ("--only", "bed,shore", "--generations", "1")
+    assert study(tmp_path, *options) == 130
     printed = capsys.readouterr().out
-    assert "stopped\ngo on: python -m experiments.environments --out" in printed
-    assert 1 <= len(metrics(folder)["generation"]) < 400
-    assert Run(folder).checkpoints()
-
-    request.getfixturevalue("started")  # the rest without sleep
-    settings = ["bed", "--generations", str(len(metrics(folder)["generation"]) + 1)]
-    assert study(out, "--only", *settings) == 0
-    assert study(tmp_path / "once", "--only", *settings) == 0
-    assert metrics(folder) == metrics(tmp_path / "once" / "bed" / "seed_0")
+    assert printed.startswith("[1/2] shore/seed_0: running ... ")
+    assert "\ngo on: python -m experiments.environments --out" in printed
+    assert not (tmp_path / "bed").exists()
+    monkeypatch.undo()
 
 
 # ------------------------------------------------------------------ what is compared
@@ -236,7 +135,7 @@ def test_ctrl_c_stops_a_study_and_it_goes_on(tmp_path, monkeypatch, capsys, requ
 
 def test_environments_are_what_they_are_called():
     plans = {
-        name: studies.Plan(name, 3, ROOT, case.settings).config
+        name: Plan(name, 3, ROOT, studies.BASE, case.settings).config
         for name, case in ENVIRONMENTS.items()
     }
     assert {plan.evolution.seed for plan in plans.values()} == {3}
@@ -255,11 +154,11 @@ def test_environments_are_what_they_are_called():
 def test_budgets_are_equal(settings):
     cases = budgets.make_cases(settings)
     configs = {
-        name: studies.Plan(name, 0, ROOT, (*settings, *case.settings)).config
+        name: Plan(name, 0, ROOT, studies.BASE, (*settings, *case.settings)).config
         for name, case in cases.items()
     }
     trials = budgets.count_trials(configs["coevolution"])
-    assert trials == (24 + 6 * 16 if settings else 24 + 23 * 16) * 32
+    assert trials == (24 + 6 * 16 if settings else 24 + 15 * 16) * 2 * 64
     assert budgets.count_trials(configs["random_search"]) == trials
     for robot in budgets.ROBOTS:
         assert configs[robot].bodies is None
@@ -276,16 +175,17 @@ def test_budgets_are_equal(settings):
 def test_what_a_body_scores_at_rest_is_told():
     """A spider hangs as it starts; a crooked body turns at first, and its core moves."""
     case = ENVIRONMENTS["open_water"]
-    settings = (*case.settings, "task.settle=1.0", "task.duration=3.0")
-    plan = studies.Plan("open_water", 0, ROOT, settings)
+    times = "task.settle=1.0", "task.duration=3.0"
+    settings = (*case.settings, *times, "task.start_attitude=level")
+    plan = Plan("open_water", 0, ROOT, studies.BASE, settings)
     bodies = [body("spider"), random_body(1, 4, 3)]
-    given = [studies.Outcome(plan, {"score": 1.0}, {}, {}, each) for each in bodies]
+    given = [Outcome(plan, {"score": 1.0}, {}, {}, each) for each in bodies]
     level, crooked = (o.champion["still_score"] for o in studies.score_still(given))
     assert abs(level) < 0.01
     assert crooked > 0.03
 
     robot = budgets.make_cases()["spider"].settings
-    plan = studies.Plan("spider", 0, ROOT, (*robot, *settings))
+    plan = Plan("spider", 0, ROOT, studies.BASE, (*robot, *settings))
     (outcome,) = studies.score_still([given[0]._replace(plan=plan)])
     assert outcome.champion == {"score": 1.0, "still_score": pytest.approx(level, abs=1e-4)}
 
@@ -301,16 +201,14 @@ def outcomes(values):
             figures = {name: number for name in environments.FIGURES}
             figures |= {"score": number, **one.descriptors}
             curve = {"evaluations": np.array([10.0, 20.0]), "champion": np.array([0.0, number])}
-            plan = studies.Plan(case, seed, ROOT / case / f"seed_{seed}", ())
-            found.append(
-                studies.Outcome(plan, figures, figures, curve | {"seconds": np.ones(2)}, one)
-            )
+            plan = Plan(case, seed, ROOT / case / f"seed_{seed}", studies.BASE, ())
+            found.append(Outcome(plan, figures, figures, curve | {"seconds": np.ones(2)}, one))
     return found
 
 
 def test_a_difference_is_said_only_where_the_tests_bear_it():
     def said(values):
-        cases = studies.by_case(outcomes(values), ENVIRONMENTS)
+        cases = by_case(outcomes(values), ENVIRONMENTS)
         figures = environments.compare_figures(cases, "champion")
         return environments.describe_differences(figures, "champions"), figures
 
@@ -320,14 +218,14 @@ def test_a_difference_is_said_only_where_the_tests_bear_it():
     # All speeds and gaits, no descriptor.
     assert len(lines) == len(environments.FIGURES) - 8
     assert lines[0] == (
-        "- speed through the water (body lengths/s) of champions: larger in `bed` (1.3) than in "
+        "- water speed (body lengths/s) of champions: larger in `bed` (1.3) than in "
         "`open_water` (0.3), `shore` (0.35), `current` (0.35)"
     )
     # Benjamini and Hochberg: half of the figures have the same p, so it is doubled.
     assert figures[0].p == pytest.approx(2 * figures[0].comparison.p)
     assert figures[-1].p == 1
     _, _, row, *_ = environments.tabulate(figures)
-    assert row.startswith("| speed through the water (body lengths/s) | 0.3 [0.1")
+    assert row.startswith("| water speed (body lengths/s) | 0.3 [0.1")
     # Rank sums 35, 42.5, 90, 42.5 and five ties: H = 10.97, of three degrees of freedom.
     assert row.endswith(" **.024** |")
 

@@ -114,7 +114,7 @@ def test_commands_of_the_installed_package(installed, tmp_path):
     assert "lake_swim, smoke, which come with the package; found none\n" in said
     code, said = run(tmp_path, command, "dance")
     assert (code, said.count("\n")) == (2, 1)
-    assert said.startswith("error: expected one of evolve, inspect, ")
+    assert said.startswith("error: expected one of evolve, sweep, inspect, ")
     for name in ("replay", "report", "export", "viewer"):
         code, said = run(tmp_path, installed / "bin" / "python", "-m", f"mjx_revolve.{name}", "-h")
         assert code == 0 and "usage" in said, said

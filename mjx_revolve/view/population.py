@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from mjx_revolve.episodes.lives import Life, read_generations, read_lives
+
+Picked = TypeVar("Picked")
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +132,10 @@ def pick_ancestors(population: Population, number: int, count: int) -> list[Life
     Returns:
         The oldest one first, the individual last.
     """
-    line = population.line(number)
-    places = np.linspace(0, len(line) - 1, min(count + 1, len(line)))
-    return [line[k] for k in np.round(places).astype(int)]
+    return pick_evenly(population.line(number), count + 1)
 
 
-def pick_generations(generations: Sequence[int], count: int) -> list[int]:
-    """Some of the generations at equal distances, the last one among them, the first one first."""
-    places = np.linspace(0, len(generations) - 1, min(count, len(generations)))
-    return [generations[k] for k in np.round(places).astype(int)]
+def pick_evenly(these: Sequence[Picked], count: int) -> list[Picked]:
+    """Some of these at equal distances, the last one among them, the first one first."""
+    places = np.linspace(0, len(these) - 1, min(count, len(these)))
+    return [these[k] for k in np.round(places).astype(int)]

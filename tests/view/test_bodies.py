@@ -20,7 +20,7 @@ from mjx_revolve.view.pieces import make_pieces
 from mjx_revolve.view.plots import plot_fitness
 from mjx_revolve.view.population import (
     pick_ancestors,
-    pick_generations,
+    pick_evenly,
     read_population,
     trace_family,
 )
@@ -173,8 +173,8 @@ def test_of_a_long_line_those_stay_who_gained_most(tmp_path):
     family = trace_family(population, 6, most=4)
     assert [(kin.life.number, kin.skipped) for kin in family] == [(0, 0), (3, 2), (5, 1), (6, 0)]
     assert [life.number for life in pick_ancestors(population, 6, 3)] == [0, 2, 4, 6]
-    assert pick_generations([1, 2, 3, 4, 5], 3) == [1, 3, 5]
-    assert pick_generations([4], 3) == [4] and pick_generations([], 3) == []
+    assert pick_evenly([1, 2, 3, 4, 5], 3) == [1, 3, 5]
+    assert pick_evenly([4], 3) == [4] and pick_evenly([], 3) == []
 
 
 def test_without_generations_the_new_born_stand_in(run):

@@ -25,7 +25,7 @@ from mjx_revolve.evolution import archive as archives
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.archive_map import plot_archive
 from mjx_revolve.view.plots import figure_svg
-from mjx_revolve.view.population import pick_generations, trace_family
+from mjx_revolve.view.population import pick_evenly, trace_family
 from mjx_revolve.view.report.record import RunRecord
 from mjx_revolve.view.report.sizes import plot_sizes
 from mjx_revolve.view.report.tables import format_number
@@ -76,7 +76,7 @@ def show_population(record: RunRecord, at: Path) -> dict[str, Any]:
     population = record.population
     assert population is not None
     shown = [g for g in population.living if population.alive(g)]
-    earlier = pick_generations(shown, _GENERATIONS + 1)[:-1]
+    earlier = pick_evenly(shown, _GENERATIONS + 1)[:-1]
     groups = {g: population.alive(g)[:_EARLIER] for g in earlier}
     groups |= {g: population.alive(g)[:_LAST] for g in shown[-1:]}
     champion = _champion(record)

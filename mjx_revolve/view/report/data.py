@@ -24,10 +24,14 @@ from mjx_revolve.episodes.config import Config, make_config
 from mjx_revolve.episodes.lives import GENERATIONS, INDIVIDUALS
 from mjx_revolve.evolution.checkpoints import DamageError, read_checkpoint
 from mjx_revolve.evolution.runs import Run
-from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.inputs.errors import InputError, load_yaml, reading
+from mjx_revolve.inputs.files import resolve_inside
 from mjx_revolve.view.population import read_population
 from mjx_revolve.view.report.record import Problem, RunRecord
 
+# Read one way or another, and shown; none of them may be a link to a file elsewhere.
+_FILES = ("config.yaml", "run.json", "metrics.csv", "champion/genes.yaml",
+          "champion/morphology.yaml", INDIVIDUALS, GENERATIONS)  # fmt: skip
 # Whose version decides what a replay gives.
 _PACKAGES = ("mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax")
 
@@ -52,6 +56,9 @@ def read_run(folder: str | Path) -> RunRecord:
         path = path.parent
     label = str(path) if str(path) not in (".", "..") else path.resolve().name
     record = RunRecord(path.absolute(), label)
+    for name in _FILES:
+        with reading(path):
+            resolve_inside(name, path)
     _read_info(record)
     _read_config(record)
     record.metrics, problems = read_metrics(record.folder / "metrics.csv")

@@ -27,6 +27,7 @@ from mjx_revolve.episodes.fitness import fit_body, make_fitness, read_modules
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.evolution.fingerprints import model_hash
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.view.plots import COLORS, figure_svg, plot_fitness, plot_way
 from mjx_revolve.view.report import champion_pictures, run_pictures, tables
 from mjx_revolve.view.report.bodies import anchor, inline_svg, show_population, viewer_command
@@ -104,6 +105,28 @@ def make_report(
     return make_page(title, ", ".join(record.label for record in records), lead, content)
 
 
+def usual_place(folder: Path) -> Path:
+    """Where the page about a folder goes.
+
+    Args:
+        folder: the folder.
+
+    Returns:
+        The path of its `report.html`.
+
+    Raises:
+        InputError: somebody else's file has that name.
+    """
+    path = folder / "report.html"
+    if path.exists():
+        with open(path, "rb") as file:
+            ours = f'content="{GENERATOR}"'.encode() in file.read(1000)
+        if not ours:
+            raise InputError(f"{path}: expected no file or an earlier report; found another file "
+                             "(name it with --out to replace it)")  # fmt: skip
+    return path
+
+
 def make_page(title: str, words: str, lead: str, content: Sequence[tuple[str, str, str]]) -> str:
     """The frame around the sections.
 
@@ -124,6 +147,15 @@ def make_page(title: str, words: str, lead: str, content: Sequence[tuple[str, st
     )  # fmt: skip
 
 
+def _heading(word: str, groups: Sequence[Group], k: int, record: RunRecord, best: RunRecord) -> str:
+    """The heading of a section about one run of the k-th group: whose, as far as there are more."""
+    if len(groups) > 1:
+        word += f" of {run_pictures.letter(k)}, {groups[k].name}"
+    if len(groups[k].records) > 1:
+        word += f": {'the best, ' if record is best else ''}seed {record.seed}"
+    return word
+
+
 # --- who lived ------------------------------------------------------------------------------------
 
 
@@ -135,15 +167,11 @@ def _populations(groups: Sequence[Group], every: bool, at: Path) -> list[tuple[s
         for record in group.records:
             if record.population is None or not (record is best or every):
                 continue
-            heading = "Bodies"
-            if len(groups) > 1:
-                heading += f" of {run_pictures.letter(k)}, {group.name}"
-            if len(group.records) > 1:
-                heading += f": {'the best, ' if record is best else ''}seed {record.seed}"
             shown = show_population(record, at)
             content = sections.population(
                 shown, partial(anchor, record), partial(viewer_command, record)
             )
+            heading = _heading("Bodies", groups, k, record, best)
             found.append((f"bodies-{k}-{record.seed}", heading, content))
     return found
 
@@ -174,6 +202,8 @@ def _replay(
                                 "version than when it evolved: the replay may differ")  # fmt: skip
                 if record.genes is not None:
                     replays[record.folder] = replay_champion(record, fitness)
+            except UntrustedError as error:
+                record.note("untrusted", f"no replay: {error}")
             except InputError as error:
                 record.note("damaged", f"no replay: {error}")
         if fitness is not None:
@@ -218,13 +248,9 @@ def _champions(
         for record in group.records:
             if record is not best and not every:
                 continue
-            heading = "Champion"
-            if len(groups) > 1:
-                heading += f" of {run_pictures.letter(k)}, {group.name}"
-            if len(group.records) > 1:
-                heading += f": {'the best, ' if record is best else ''}seed {record.seed}"
             replay = replays.get(record.folder)
             content = _saved_pictures(record) if replay is None else _champion(record, replay)
+            heading = _heading("Champion", groups, k, record, best)
             found.append((f"champion-{k}-{record.seed}", heading, content))
     return found
 
@@ -240,7 +266,7 @@ def _champion(record: RunRecord, replay: Replay) -> str:
         "thrusters": champion_pictures.plot_thrusters(motion) if robot.num_thrusters else None,
         "energy": champion_pictures.plot_energy(motion),
     }
-    pictures = {name: figure and _svg(figure) for name, figure in drawn.items()}
+    pictures = {name: figure and svg_source(figure) for name, figure in drawn.items()}
     pictures["swim"] = _source(_swim_jpeg(replay), "jpeg")
     origin = record.stand_in or record.champion.get("origin")
     return sections.champion(
@@ -275,7 +301,8 @@ def _source(data: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
-def _svg(figure: Figure) -> str:
+def svg_source(figure: Figure) -> str:
+    """A figure as an address that holds it."""
     return _source(figure_svg(figure), "svg+xml")
 
 
@@ -298,7 +325,7 @@ def _convergence(groups: Sequence[Group]) -> str:
     for task in dict.fromkeys(group.task for group in shown):
         members = [group for group in groups if group.task == task]
         if sum(bool(group.shown) for group in members) > 1 or len(members[0].shown) > 1:
-            comparisons.append(_svg(run_pictures.plot_comparison(members, styles)))
+            comparisons.append(svg_source(run_pictures.plot_comparison(members, styles)))
     entries = []
     for group in shown:
         record, several = group.shown[0], len(group.shown) > 1
@@ -311,8 +338,8 @@ def _convergence(groups: Sequence[Group]) -> str:
             "below": "how far the search spreads" if record.population is None
             else "how full the archive is, or how large the living are",
             "band": "quartiles" if quartiles else "mean and standard deviation",
-            "seeds": _svg(run_pictures.plot_seeds(group)) if several else None,
-            "fitness": None if several else _svg(plot_fitness(record.metrics, "", label)),
+            "seeds": svg_source(run_pictures.plot_seeds(group)) if several else None,
+            "fitness": None if several else svg_source(plot_fitness(record.metrics, "", label)),
         })  # fmt: skip
     return sections.convergence(comparisons, entries)
 
@@ -326,7 +353,7 @@ def _side_by_side(groups: Sequence[Group], replays: Mapping[Path, Replay]) -> st
     members = [member for member in members if member[2]]
     if sum(len(found) for *_, found in members) < 2:
         return ""
-    return sections.side_by_side(_svg(run_pictures.plot_champions(members)))
+    return sections.side_by_side(svg_source(run_pictures.plot_champions(members)))
 
 
 # --- the end --------------------------------------------------------------------------------------

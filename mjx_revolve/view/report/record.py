@@ -13,8 +13,9 @@ import numpy as np
 
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.tasks import score_unit
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.own_code import content_name
+from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.view.population import Population
 
 # Kinds of problems, gravest first, and what they make of the run.
@@ -22,6 +23,7 @@ KINDS = {
     "damaged": "damaged",
     "missing": "incomplete",
     "unfinished": "not finished",
+    "untrusted": "not shown in full",
     "version": "of another version",
     "changed": "changed",
     "copy": "a copy",
@@ -73,7 +75,7 @@ class RunRecord:
 
     def note(self, kind: str, text: str) -> None:
         """Adds a problem; what it says of the folder is said once."""
-        problem = Problem(kind, text.replace(f"{self.folder}/", ""))
+        problem = Problem(kind, plain(text.replace(f"{self.folder}/", "")))
         if problem not in self.problems:
             self.problems.append(problem)
 
@@ -82,6 +84,8 @@ class RunRecord:
         """What cannot be read in here is a problem rather than the end."""
         try:
             yield
+        except UntrustedError as error:
+            self.note("untrusted", str(error))
         except (InputError, OverflowError) as error:
             self.note("damaged", str(error))
 

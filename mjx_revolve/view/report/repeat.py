@@ -125,12 +125,15 @@ def sources(record: RunRecord) -> list[tuple[str, str]]:
     Each with what it is called.
     """
     found = []
+    # Never what lies elsewhere: a page is shown to others, and a run has copies of its own.
+    inside = record.folder.resolve()
     if record.settings and (record.folder / "config.yaml").is_file():
         found.append(record.folder / "config.yaml")
     named = record.config.morphology if record.config is not None else None
     robot = Path(named) if named else record.folder / "champion" / "morphology.yaml"
     if robot.is_file():
         found.append(robot)
+    found = [path for path in found if path.resolve().is_relative_to(inside)]
     texts = [(path.name, path.read_text(errors="replace")) for path in found]
     if record.genes is not None:
         data = {"genes": [float(gene) for gene in record.genes]}

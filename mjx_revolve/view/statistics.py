@@ -125,10 +125,10 @@ def rank_test(values: ArrayLike, others: ArrayLike) -> float:
         others: `[m]`.
 
     Returns:
-        p; 1 where a side has no values or all are the same.
+        p; 1 where a side has fewer than two values or all are the same.
     """
     x, y = _finite(values), _finite(others)
-    if not len(x) or not len(y) or not np.ptp(np.concatenate([x, y])):
+    if min(len(x), len(y)) < 2 or not np.ptp(np.concatenate([x, y])):
         return 1.0
     method = stats.PermutationMethod(n_resamples=_RESAMPLES, rng=np.random.default_rng(0))
     return float(min(1.0, stats.mannwhitneyu(x, y, method=method).pvalue))
@@ -136,7 +136,10 @@ def rank_test(values: ArrayLike, others: ArrayLike) -> float:
 
 def smallest_p(count: int, other: int, pairs: int = 1) -> float:
     """The smallest p that `rank_test` can give, after Holm's correction for so many pairs."""
-    return min(1.0, 2 * pairs / comb(count + other, count))
+    if min(count, other) < 2:
+        return 1.0
+    ways = min(comb(count + other, count), _RESAMPLES + 1)  # beyond, permutations are drawn
+    return min(1.0, 2 * pairs / ways)
 
 
 def holm(p: ArrayLike) -> list[float]:
@@ -156,20 +159,21 @@ def holm(p: ArrayLike) -> list[float]:
     return found.tolist()
 
 
-def compare(groups: Mapping[str, ArrayLike]) -> Comparison:
+def compare(groups: Mapping[str, ArrayLike], pairs: bool = True) -> Comparison:
     """Tests whether groups differ, and which.
 
     Args:
         groups: values by name.
+        pairs: whether each two of them are tested, too.
 
     Returns:
         The comparison.
     """
     known = {name: _finite(values) for name, values in groups.items()}
-    pairs = list(combinations(known, 2))
-    corrected = holm([rank_test(known[a], known[b]) for a, b in pairs])
+    two = list(combinations(known, 2)) if pairs else []
+    corrected = holm([rank_test(known[a], known[b]) for a, b in two])
     together = np.concatenate(list(known.values()))
     p = 1.0
     if len(known) > 1 and all(map(len, known.values())) and np.ptp(together):
         p = float(stats.kruskal(*known.values()).pvalue)
-    return Comparison(p, dict(zip(pairs, corrected, strict=True)))
+    return Comparison(p, dict(zip(two, corrected, strict=True)))

@@ -1,0 +1,120 @@
+"""Command line: a grid of runs, with as many seeds each, and one report over all of them.
+
+    python -m mjx_revolve.sweep lake_swim --seeds 10 --set morphology=spider,gecko [--out DIR]
+
+The same command goes on with a sweep that was stopped or killed: finished runs are skipped, the one
+that was under way continues at its checkpoint, bit for bit. Each run is an ordinary run folder,
+`DIR/CASE/seed_K`. The runs take turns, each with all workers (see `mjx_revolve.evolve`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mjx_revolve.inputs.commands import Parser, read_path, run_command, whole
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import short_path
+from mjx_revolve.inputs.grids import MOST_SEEDS
+from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.numerics import runtime
+
+if TYPE_CHECKING:
+    from mjx_revolve.evolution.sweeps import Sweep
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(
+        prog="python -m mjx_revolve.sweep",
+        description="Runs a grid of evolutions, several seeds of each, and reports on all of them. "
+        "Started again, it skips what is finished and goes on with the rest.",
+    )
+    add = parser.add_argument
+    add("config", type=read_path, metavar="CONFIG",
+        help="a YAML file, or a shipped configuration's name, see configs/")  # fmt: skip
+    add("--seeds", type=whole(1, MOST_SEEDS), default=5, metavar="N",
+        help="runs of each case, with seeds from 0 on (default: 5)")  # fmt: skip
+    add("--set", action="append", default=[], metavar="KEY.PATH=VALUE,...", dest="settings",
+        help="values of one setting, with commas between them; may be repeated: all combinations "
+        "are run")  # fmt: skip
+    add("--out", type=read_path, metavar="DIR",
+        help="the sweep's folder (default: runs/CONFIG-sweep-X, X by --set)")  # fmt: skip
+    add("--workers", type=whole(1), metavar="N",
+        help="processes on this machine (default: its cores)")  # fmt: skip
+    add("--cluster", metavar="SCHEDULER",
+        help="a Dask scheduler's address, or its scheduler file: its workers score")  # fmt: skip
+    return parser
+
+
+def main(argv: list[str] | None = None, make_fitness: Callable | None = None) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments; None: `sys.argv[1:]`.
+        make_fitness: see `mjx_revolve.evolve.main`.
+
+    Returns:
+        The exit code: 0 when all runs are finished, 130 or 143 when interrupted, 1 when the disk
+        refused a file or no worker was left.
+
+    Raises:
+        InputError: the arguments, a configuration or a run folder are wrong.
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    arguments = _parser().parse_args(argv)
+    if arguments.cluster is not None and arguments.workers is not None:
+        raise InputError("--cluster: expected no --workers beside it; found both")
+    runtime.prepare_process()
+    from mjx_revolve.evolution.pool import make_pool
+    from mjx_revolve.evolution.sweeps import (
+        Sweep,
+        check_folder,
+        choose_steps,
+        run_plans,
+        write_sweep,
+    )
+    from mjx_revolve.view.report.page import usual_place
+    from mjx_revolve.view.report.sweep import write_report
+    from mjx_revolve.view.results import save_pictures
+
+    path = find_shipped(arguments.config, "configs").absolute()
+    sweep = Sweep(str(path), arguments.seeds, tuple(arguments.settings))
+    folder = Path(arguments.out) if arguments.out else _usual_folder(sweep)
+    check_folder(folder)
+    usual_place(folder)  # refuses now what it would refuse after days
+    steps = choose_steps(sweep.plans(folder.absolute()), make_fitness)
+    write_sweep(folder, sweep)
+    cases = len(sweep.cases)
+    print(f"{cases} case{'s' * (cases > 1)}, {sweep.seeds} seed{'s' * (sweep.seeds > 1)} each | "
+          f"{short_path(folder)}", flush=True)  # fmt: skip
+    again = shlex.join(["python", "-m", "mjx_revolve.sweep", *argv])
+    workers, cluster = arguments.workers, arguments.cluster
+    code = run_plans(
+        steps,
+        lambda config: make_pool(config, workers, make_fitness, cluster),
+        save_pictures,
+        again,
+    )
+    if code:
+        return code
+    report = write_report(folder)
+    for line in report.lost:
+        print(f"warning: {line}", file=sys.stderr)
+    print(f"report: {short_path(report.page)}; {short_path(report.table)}")
+    return 0
+
+
+def _usual_folder(sweep: Sweep) -> Path:
+    """The same for the same command, so that it goes on; more seeds make it a longer one."""
+    from mjx_revolve.evolution.fingerprints import hash_text
+
+    digest = hash_text(sweep.config, *sweep.settings)[:6]
+    return Path("runs") / f"{Path(sweep.config).stem}-sweep-{digest}"
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main))

@@ -1,0 +1,127 @@
+"""What the runs of a study have found: figures of champions and populations, ready to compare."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.body.tree import Morphology
+from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.tasks import TASKS
+from mjx_revolve.evolution.plans import Plan
+from mjx_revolve.evolution.runs import Run
+from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.view.population import read_population
+
+Figures = dict[str, float]
+"""Numbers by name."""
+
+
+class Outcome(NamedTuple):
+    """What a finished evolution has found.
+
+    Attributes:
+        plan: of the evolution.
+        champion: figures of its champion by name: `score` and measures on fresh starts, descriptors
+            of its body.
+        population: means over those who lived at the end, as their lives went; empty where only
+            brains evolve.
+        metrics: the columns of `metrics.csv`.
+        body: the champion's; None where nothing is known of it.
+        task: the task's type.
+        unit: of the scores; "" where it is not known.
+        evolved: whether bodies have evolved.
+    """
+
+    plan: Plan
+    champion: Mapping[str, float]
+    population: Mapping[str, float]
+    metrics: Mapping[str, np.ndarray]
+    body: Morphology | None
+    task: str = ""
+    unit: str = ""
+    evolved: bool = True
+
+
+def is_finished(plan: Plan) -> bool:
+    """Whether a run has all its generations and its champion.
+
+    Raises:
+        InputError: its `run.json` is damaged.
+    """
+    return (plan.folder / "run.json").is_file() and "finished" in Run(plan.folder).info
+
+
+def find_outcomes(
+    plans: Sequence[Plan], add: Callable[[str, Figures], Figures] = lambda case, figures: {}
+) -> tuple[list[Outcome], list[str]]:
+    """What the finished runs have found. Nobody's code is run for it.
+
+    Args:
+        plans: the runs; those that are not finished are left out.
+        add: (case, figures of an individual) → more figures of it.
+
+    Returns:
+        The outcomes, and a line on each run that is damaged.
+    """
+    found, lost = [], []
+    for plan in plans:
+        try:
+            if is_finished(plan):
+                found.append(_read_outcome(plan, add))
+        except (OSError, KeyError, ValueError, TypeError, IndexError) as error:
+            place = short_path(plan.folder)
+            words = " ".join(str(error).split())
+            lost.append(f"{place}: expected a whole run; found: {words.removeprefix(place + ': ')}")
+    return found, lost
+
+
+def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome:
+    run = Run(plan.folder)
+    facts, config = run.info["champion"], run.load_config()
+    path = plan.folder / "champion" / "morphology.yaml"
+    body = None
+    if path.is_file() or config.bodies is not None:
+        body = load_morphology(path, read_modules(config), allow_overlap=True)
+    champion = {"score": float(facts["score"])}
+    champion |= {name: float(value) for name, value in facts["measures"].items()}
+    champion |= {} if body is None else body.descriptors
+    champion |= add(plan.case, champion)
+    population: Figures = {}
+    if config.bodies is not None:
+        people, problems = read_population(plan.folder)
+        if problems:
+            raise ValueError(problems[0])
+        living = people.alive(people.last)
+        alive = [dict(life.figures) for life in living if life.score == life.score]
+        lives = [life | add(plan.case, life) for life in alive]
+        names = lives[0] if lives else {}
+        population = {name: float(np.mean([life[name] for life in lives])) for name in names}
+    metrics = run.load_metrics()
+    for name in ("generation", "evaluations", "seconds", "champion"):
+        _ = metrics[name][-1]
+    task = config.task.type
+    unit = TASKS[task].unit if task in TASKS else ""
+    evolved = config.bodies is not None
+    return Outcome(plan, champion, population, metrics, body, task, unit, evolved)
+
+
+def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list[Outcome]]:
+    """Outcomes by case, in the order of the cases; those without any are left out."""
+    found = {name: [o for o in outcomes if o.plan.case == name] for name in cases}
+    return {name: some for name, some in found.items() if some}
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """Rows as CSV (RFC 4180), whole or not at all; what a row lacks stays empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)))
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomic(path, text.getvalue().encode())

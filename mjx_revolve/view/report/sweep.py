@@ -1,0 +1,298 @@
+"""The page about a sweep: scores of all cases, what few seeds can say of them, curves, a table."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from mjx_revolve.evolution.plans import Plan
+from mjx_revolve.evolution.sweeps import Sweep, read_sweep
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.inputs.grids import read_axes
+from mjx_revolve.view.outcomes import Outcome, by_case, find_outcomes, is_finished, write_csv
+from mjx_revolve.view.plots import LABELS, WIDE, new_figure
+from mjx_revolve.view.report.page import make_page, sections, svg_source, usual_place
+from mjx_revolve.view.report.run_pictures import letter
+from mjx_revolve.view.report.tables import format_number
+from mjx_revolve.view.statistics import (
+    ALPHA,
+    COVERAGE,
+    compare,
+    difference,
+    interval,
+    smallest_p,
+)
+from mjx_revolve.view.sweep_pictures import draw_curves, draw_dots, plot_bodies
+
+TABLE = "sweep.csv"
+# Pairs of more cases than this are not tested: Holm's correction would leave nothing (a choice).
+_MOST_TESTED = 12
+_MOST_BODIES = 100  # in the picture of bodies (a choice)
+
+Numbered = Mapping[int, Sequence[Outcome]]
+"""Outcomes by the number of their case in the sweep, which gives it letter and colour."""
+
+
+class Report(NamedTuple):
+    """What was written about a sweep.
+
+    Attributes:
+        page: HTML that needs no other file.
+        table: CSV, a row for each finished run.
+        finished: how many runs are.
+        planned: how many there are to be.
+        lost: a line on each run that could not be read.
+    """
+
+    page: Path
+    table: Path
+    finished: int
+    planned: int
+    lost: list[str]
+
+
+def write_report(folder: str | Path, page: Path | None = None) -> Report:
+    """Writes the page and the table, of what is finished.
+
+    Args:
+        folder: of the sweep.
+        page: where to; None: `report.html` in the folder.
+
+    Returns:
+        What was written.
+
+    Raises:
+        InputError: it is no sweep, no run is finished, or somebody else's file has the page's name.
+        OSError: a file cannot be written.
+    """
+    folder = Path(folder)
+    sweep = read_sweep(folder)
+    page = page or usual_place(folder)
+    plans = sweep.plans(folder)
+    outcomes, lost = find_outcomes(plans)
+    if not outcomes:
+        found = lost[0] if lost else "none"
+        raise InputError(f"{short_path(folder)}: expected runs that are finished; found {found}")
+    text = make_report(sweep, folder, outcomes, lost, page.parent)
+    write_csv(folder / TABLE, list_rows(sweep, outcomes))
+    write_atomic(page, text.encode())
+    return Report(page, folder / TABLE, len(outcomes), len(plans), lost)
+
+
+def list_rows(sweep: Sweep, outcomes: Sequence[Outcome]) -> list[dict[str, object]]:
+    """Rows of the table.
+
+    Args:
+        sweep: the sweep.
+        outcomes: of the finished runs.
+
+    Returns:
+        A row for each: case, settings in which cases differ as they were typed, seed, generations,
+        evaluations, seconds, and all figures of the champion.
+    """
+    varied = [axis.key for axis in read_axes(sweep.settings) if len(axis.texts) > 1]
+    rows = []
+    for outcome in outcomes:
+        typed = dict(setting.split("=", 1) for setting in outcome.plan.settings)
+        row: dict[str, object] = {"case": outcome.plan.case}
+        row |= {key: typed[key] for key in varied} | {"seed": outcome.plan.seed}
+        row |= {name: int(outcome.metrics[name][-1]) for name in ("generation", "evaluations")}
+        row["seconds"] = float(outcome.metrics["seconds"][-1])
+        rows.append({"generations" if k == "generation" else k: v for k, v in row.items()}
+                    | dict(outcome.champion))  # fmt: skip
+    return rows
+
+
+def make_report(
+    sweep: Sweep, folder: Path, outcomes: Sequence[Outcome], lost: Sequence[str], at: Path
+) -> str:
+    """Makes the page.
+
+    Args:
+        sweep: the sweep.
+        folder: its folder.
+        outcomes: of the finished runs, at least one.
+        lost: a line on each run that could not be read.
+        at: the folder that the page goes to, where links start.
+
+    Returns:
+        A complete HTML document that needs no other file.
+    """
+    cases = list(sweep.cases)
+    plans = sweep.plans(folder)
+    known = by_case(outcomes, cases)
+    numbered = {cases.index(case): found for case, found in known.items()}
+    tasks = dict.fromkeys(found[0].task for found in numbered.values())
+    content: list[tuple[str, str, str]] = []
+    for n, task in enumerate(tasks):
+        members = {k: found for k, found in numbered.items() if found[0].task == task}
+        of = f": {task.replace('_', ' ')}" if len(tasks) > 1 else ""
+        content += [
+            (f"scores-{n}", f"Scores{of}", _scores(members, cases)),
+            (f"tests-{n}", f"Tests{of}", _tests(members, cases)),
+            (f"measures-{n}", f"Measures{of}", _measures(members)),
+            (f"curves-{n}", f"Curves{of}", _curves(members, cases)),
+        ]
+    content += [
+        ("bodies", "Bodies", _bodies(numbered)),
+        ("runs", "Runs", _runs(plans, outcomes, cases, folder, at)),
+        ("repeat", "Repeat it", sections.sweep_repeat(_command(sweep), list(sweep.cases.items()))),
+    ]
+    lead = sections.headline([
+        (f"{len(outcomes)} of {len(plans)}", "runs finished"),
+        (str(len(cases)), "cases" if len(cases) > 1 else "case"),
+        (str(sweep.seeds), "seeds of each"),
+    ])  # fmt: skip
+    lead += sections.problems([], lost, True)
+    title = f"Sweep of {Path(sweep.config).stem}"
+    return make_page(title, short_path(folder), lead, content)
+
+
+def _command(sweep: Sweep) -> str:
+    words = ["python", "-m", "mjx_revolve.sweep", sweep.config, "--seeds", str(sweep.seeds)]
+    for setting in sweep.settings:
+        words += ["--set", setting]
+    return shlex.join(words)
+
+
+def _values(outcomes: Sequence[Outcome], name: str) -> list[float]:
+    return [o.champion.get(name, math.nan) for o in outcomes]
+
+
+def _range(outcomes: Sequence[Outcome], name: str) -> str:
+    """The last value of a metric; its least and most where seeds differ in it."""
+    values = [o.metrics[name][-1] for o in outcomes]
+    ends = dict.fromkeys(f"{value:,.0f}" for value in (min(values), max(values)))
+    return " to ".join(ends)
+
+
+# --- scores ---------------------------------------------------------------------------------------
+
+
+def _scores(members: Numbered, cases: Sequence[str]) -> str:
+    """Means and intervals of the champions' scores, and a dot for each seed."""
+    unit = next(iter(members.values()))[0].unit
+    header = ["", "case", "n\nseeds", f"mean score\n{unit}", f"best seed\n{unit}"]
+    header += ["evaluations\neach", "time\ns each"]
+    rows = []
+    for k, found in members.items():
+        scores = _values(found, "score")
+        seconds = np.mean([o.metrics["seconds"][-1] for o in found])
+        rows.append([
+            k, cases[k], len(found), str(interval(scores)), format_number(np.max(scores)),
+            _range(found, "evaluations"), f"{seconds:.0f}",
+        ])  # fmt: skip
+    figure = new_figure(min(WIDE, 2.5 + 0.9 * len(members)), 3.2)
+    groups = {letter(k): _values(found, "score") for k, found in members.items()}
+    draw_dots(figure.subplots(), groups, f"champions' scores ({unit})", [*members])
+    return sections.sweep_scores(header, rows, svg_source(figure), COVERAGE)
+
+
+def _tests(members: Numbered, cases: Sequence[str]) -> str:
+    """Whether cases differ, and which."""
+    if len(members) < 2:
+        return ""
+    scores = {k: _values(found, "score") for k, found in members.items()}
+    counts = sorted(map(len, scores.values()))
+    said = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+    if len(members) > _MOST_TESTED:
+        alone = compare({letter(k): values for k, values in scores.items()}, pairs=False)
+        return sections.sweep_tests(_p(alone.p), said, [], "", ALPHA, _MOST_TESTED)
+    pairs = list(combinations(scores, 2))
+    found = compare({letter(k): values for k, values in scores.items()})
+    least = smallest_p(counts[-1], counts[-2], len(pairs))
+    rows = [
+        [
+            f"{letter(a)} − {letter(b)}", cases[a], cases[b],
+            str(difference(scores[a], scores[b])),
+            f"{len(scores[a])} + {len(scores[b])}", _p(found.pairs[letter(a), letter(b)]),
+        ]
+        for a, b in pairs
+    ]  # fmt: skip
+    return sections.sweep_tests(_p(found.p), said, rows, f"{least:.2g}", ALPHA, _MOST_TESTED)
+
+
+def _p(value: float) -> str:
+    """A p value to three decimals."""
+    return "< 0.001" if value < 1e-3 else f"{value:.3f}"
+
+
+def _measures(members: Numbered) -> str:
+    """Means and intervals of all that was measured of champions."""
+    everything = [o for found in members.values() for o in found]
+    bodies = {name for o in everything if o.body is not None for name in o.body.descriptors}
+    fixed = {name for name in bodies if len({o.champion[name] for o in everything}) == 1}
+    names = [n for n in dict.fromkeys(n for o in everything for n in o.champion) if n != "score"]
+    rows = [
+        [LABELS.get(name, name.replace("_", " ")),
+         *(str(interval(_values(found, name))) for found in members.values())]
+        for name in names if name not in fixed
+    ]  # fmt: skip
+    return sections.sweep_measures(["", *map(letter, members)], rows) if rows else ""
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+
+def _curves(members: Numbered, cases: Sequence[str]) -> str:
+    unit = next(iter(members.values()))[0].unit
+    figure = new_figure(WIDE, 4.4)
+    named = {f"{letter(k)}: {cases[k]}": found for k, found in members.items()}
+    draw_curves(figure.subplots(), named, f"best score so far ({unit})", [*members])
+    return sections.sweep_curves(svg_source(figure))
+
+
+def _bodies(numbered: Numbered) -> str:
+    evolved = {letter(k): found for k, found in numbered.items() if found[0].evolved}
+    if not evolved or sum(map(len, evolved.values())) > _MOST_BODIES:
+        return ""
+    numbers = [k for k, found in numbered.items() if found[0].evolved]
+    return sections.sweep_bodies(svg_source(plot_bodies(evolved, numbers)))
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+def _runs(
+    plans: Sequence[Plan],
+    outcomes: Sequence[Outcome],
+    cases: Sequence[str],
+    folder: Path,
+    at: Path,
+) -> str:
+    """A line for each run, with links to its folder where these can be relative."""
+    found = {o.plan: o for o in outcomes}
+    rows: list[list[Any]] = []
+    near = folder.resolve() == at.resolve()
+    for plan in plans:
+        outcome, link = found.get(plan), plan.folder.name
+        if near and plan.folder.is_dir():
+            place = f"{plan.case}/{plan.folder.name}/"
+            link = Markup('<a href="{}">{}</a>').format(place, link)
+        row = [cases.index(plan.case), plan.case, link]
+        if outcome is None:
+            rows.append([*row, "–", "–", "–", _state(plan)])
+            continue
+        generations = int(outcome.metrics["generation"][-1])
+        score = format_number(outcome.champion["score"])
+        seconds = f"{outcome.metrics['seconds'][-1]:.0f}"
+        rows.append([*row, generations, score, seconds, "finished"])
+    return sections.sweep_runs(rows)
+
+
+def _state(plan: Plan) -> str:
+    """Of a run that has no outcome."""
+    try:
+        if is_finished(plan):
+            return "damaged"
+    except InputError:
+        return "damaged"
+    return "not finished" if plan.folder.is_dir() else "not begun"

@@ -1,0 +1,52 @@
+"""What a run has come to, in words and pictures, when it ends."""
+
+from __future__ import annotations
+
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.scoring import REPORT_EPISODES
+from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.evolution.loop import Champion
+from mjx_revolve.evolution.start import Start
+from mjx_revolve.view import plots
+from mjx_revolve.view.motion import counted_time
+from mjx_revolve.view.swim_picture import plot_swim
+from mjx_revolve.view.thumbnails import plot_best
+
+
+def describe_score(champion: Champion, config: Config) -> str:
+    """The result of a run in words: `0.158 ± 0.0025 body lengths/s over 16 fresh starts`."""
+    unit = score_unit(config.task.type)
+    score = f"{champion.score:.3g} ± {champion.std:.2g} {unit}".rstrip()
+    return f"{score} over {REPORT_EPISODES} fresh starts"
+
+
+def save_pictures(start: Start, champion: Champion) -> None:
+    """Writes a run's pictures, as far as its fitness can replay the champion.
+
+    Args:
+        start: the run, its generations done.
+        champion: the champion, judged.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    run, fitness, config = start.run, start.fitness, start.config
+    unit = score_unit(config.task.type)
+    if config.bodies is not None:
+        fitness = fitness.single(champion.body)
+    title = f"{run.folder.name}: {describe_score(champion, config)}"
+    label = f"fitness ({unit})" if unit else "fitness"
+    figures = {"fitness.png": plots.plot_fitness(run.load_metrics(), title, label)}
+    if config.bodies is not None:
+        figures["bodies.png"] = plot_best(run.folder, read_modules(config), title)
+    if hasattr(fitness, "replay"):
+        trajectory = fitness.replay(champion.genes, champion.key)
+        robot = getattr(fitness, "robot", None)
+        height = float(getattr(getattr(robot, "world", None), "surface_height", 0.0))
+        figures["trajectory.png"] = plots.plot_trajectory(trajectory, height, title)
+        if robot is not None:
+            counted = counted_time(config.task, robot.world.timestep)
+            figures["swim.png"] = plot_swim(robot, trajectory, counted)
+    for name, figure in figures.items():
+        run.write(name, plots.figure_png(figure))

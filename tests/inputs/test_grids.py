@@ -1,0 +1,84 @@
+"""Grids of settings: where values are cut, what combinations there are, and their names."""
+
+import pytest
+
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.grids import combine, read_axes, split_values
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("a.yaml,b.yaml", ["a.yaml", "b.yaml"]),
+        (" 1 , 2.5,1e-3", ["1", "2.5", "1e-3"]),
+        ("[0,0,0],[0.1, 0, 0]", ["[0,0,0]", "[0.1, 0, 0]"]),
+        ("{name: lake, bed: {height: -2}},{}", ["{name: lake, bed: {height: -2}}", "{}"]),
+        ("[[1,2],[3,4]]", ["[[1,2],[3,4]]"]),
+        ("'a,b',\"c,[d\\\",e\"", ["'a,b'", '"c,[d\\",e"']),
+        ("'it''s, here',don't,can't", ["'it''s, here'", "don't", "can't"]),
+        ("", [""]),
+    ],
+)  # fmt: skip
+def test_commas_separate_values_outside_of_brackets_and_quotes(text, values):
+    assert split_values(text, "--set a") == values
+
+
+def test_a_grid_has_all_combinations_by_names_that_folders_may_have():
+    axes = read_axes(
+        ["morphology=my/spider.yaml,gecko", "task.duration=5", "evolution.population_size=8,16"]
+    )
+    assert combine(axes, "lake_swim") == {
+        "morphology=spider+population_size=8":
+            ("morphology=my/spider.yaml", "task.duration=5", "evolution.population_size=8"),
+        "morphology=spider+population_size=16":
+            ("morphology=my/spider.yaml", "task.duration=5", "evolution.population_size=16"),
+        "morphology=gecko+population_size=8":
+            ("morphology=gecko", "task.duration=5", "evolution.population_size=8"),
+        "morphology=gecko+population_size=16":
+            ("morphology=gecko", "task.duration=5", "evolution.population_size=16"),
+    }  # fmt: skip
+    assert combine(read_axes(["task.duration=5"]), "lake_swim") == {
+        "lake_swim": ("task.duration=5",)
+    }
+    assert combine([], "lake_swim") == {"lake_swim": ()}
+
+
+def test_names_tell_cases_apart_whatever_they_are_made_of():
+    cases = combine(read_axes(["a.type=../x/b.yaml,../y/b.yaml,B.yaml", "b.type=1,2"]), "c")
+    assert len({name.casefold() for name in cases}) == 6
+    assert next(iter(cases)) == "a.type=b+b.type=1"
+    names = list(
+        combine(read_axes(["x=-1,../..,/etc/passwd,'" + 300 * "a" + "','<b>&amp;\n'"]), "")
+    )
+    assert names[:3] == ["x=-1", "x=.._..", "x=_etc_passwd"]
+    assert len(names[3]) == 80
+    assert names[4] == "x=_b_amp_"
+    assert not any({*name} & {*"/\\ <>&'\"\n"} or name[0] in ".-" for name in names)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["a.b"], r"--set a\.b: expected KEY\.PATH=VALUE; found 'a\.b'"),
+        (["=1,2"], r"expected KEY\.PATH=VALUE"),
+        (["a=1,,2"], "--set a: expected a value between commas; found none in '1,,2'"),
+        (["a=1,2,"], "expected a value between commas"),
+        (["a=[1,2"], r"--set a: expected a bracket to be closed; found '\[1,2'"),
+        (["a=[1,2}"], "expected brackets in pairs"),
+        (["a='1,2"], "expected a quote to be closed"),
+        (["a=1,2,1.0"], "--set a: expected each value once; found '1.0' twice"),
+        (["a=1", "a=2"], "--set a: expected each setting once, with commas between its values"),
+        (["a={b: }: c},2"], "--set a"),
+    ],
+)
+def test_what_is_no_grid_is_refused_in_one_line(settings, message):
+    with pytest.raises(InputError, match=message) as found:
+        read_axes(settings)
+    assert "\n" not in str(found.value)
+
+
+def test_true_is_not_one_and_a_million_combinations_are_a_mistake():
+    assert read_axes(["a=1,true"])[0].texts == ("1", "true")
+    numbers = ",".join(map(str, range(11)))
+    with pytest.raises(InputError, match="expected at most 1000 combinations; found 1331"):
+        combine(read_axes([f"{key}={numbers}" for key in "abc"]), "")

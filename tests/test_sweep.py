@@ -1,0 +1,334 @@
+"""Sweeps, on fitnesses that cost nothing: what is run, stopped, killed, continued and reported.
+
+Bits are compared within one process or on one machine with the same thread settings, as promised.
+"""
+
+import csv
+import itertools
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+import toys
+from laboratory import ROOT, XLA_FLAGS
+from mjx_revolve import evolve, report, sweep
+from mjx_revolve.evolution.runs import Run
+from mjx_revolve.inputs.commands import run_command
+from toys import CLOCK, make_toy
+
+GRID = ("toy.yaml", "--seeds", "2", "--set", "evolution.strategy=SNES,CMA_ES", "--out", "out")
+CASES = ("strategy=SNES", "strategy=CMA_ES")
+RUNS = [f"{case}/seed_{seed}" for case in CASES for seed in (0, 1)]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a config, current; the compilation cache off."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    monkeypatch.chdir(tmp_path)
+    toys.write_config(tmp_path / "toy.yaml", population_size=8, generations=5, checkpoint_every=2)
+    return tmp_path
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Runs end without their plots, which take a second each."""
+    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
+
+
+def run_sweep(*argv, make_fitness=make_toy):
+    return run_command(lambda argv: sweep.main(argv, make_fitness), [str(a) for a in argv])
+
+
+def contents(folder):
+    """What must be the same for two runs of the same seed."""
+    run = Run(folder)
+    arrays = run.load_checkpoint().arrays
+    kept = [
+        {name: a.tobytes() for name, a in table.items() if name not in CLOCK}
+        for table in (run.load_metrics(), arrays)
+    ]
+    return kept, (folder / "champion" / "genes.yaml").read_text(), run.info["champion"]
+
+
+def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures, capsys):
+    made = []
+
+    def make(config):
+        made.append(config.evolution.strategy)
+        return make_toy(config)
+
+    assert run_sweep(*GRID, make_fitness=make) == 0
+    # Once for the checks and once for all runs: neither seed nor strategy makes another fitness.
+    assert made == ["SNES", "SNES"]
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == "2 cases, 2 seeds each | out"
+    assert [re.match(r"\[\d/4\] (\S+): running ... -", line)[1] for line in out[1:5]] == RUNS
+    assert out[5] == "report: out/report.html; out/sweep.csv"
+
+    alone = ["toy.yaml", "--seed", "1", "--out", "alone", "--set", "evolution.strategy=CMA_ES"]
+    assert run_command(lambda argv: evolve.main(argv, make_toy), alone) == 0
+    assert contents(folder / "alone") == contents(folder / "out" / RUNS[-1])
+    log = (folder / "out" / f"{RUNS[-1]}.log").read_text()
+    assert log.startswith("beginning strategy=CMA_ES/seed_1\ngeneration 1/5  best ")
+
+    with (folder / "out" / "sweep.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(r["evolution.strategy"], r["seed"]) for r in rows] == [
+        ("SNES", "0"), ("SNES", "1"), ("CMA_ES", "0"), ("CMA_ES", "1")
+    ]  # fmt: skip
+    info = Run(folder / "alone").info["champion"]
+    assert float(rows[3]["score"]) == info["score"]
+    assert float(rows[3]["distance_m"]) == info["measures"]["distance_m"]
+    assert (rows[3]["generations"], rows[3]["evaluations"]) == ("5", "40")
+
+    page = (folder / "out" / "report.html").read_text()
+    scores = [float(row["score"]) for row in rows]
+    mean = f"{sum(scores[2:]) / 2:.3g}".replace("-", "−")
+    assert re.search(rf"strategy=CMA_ES</td><td>2</td><td>{mean} \[", page)
+    # Of two and two values, the rank test gives a third at the least.
+    assert "2 seeds each: p = " in page
+    assert "it is 0.33 at the" in page
+    assert '<a href="strategy=CMA_ES/seed_1/">seed_1</a>' in page
+
+    # Again: nothing to do. More seeds: only those.
+    assert run_sweep(*GRID) == 0
+    assert capsys.readouterr().out.count("finished before") == 4
+    kept = contents(folder / "out" / RUNS[0])
+    assert run_sweep(*GRID, "--seeds", "3", "--set", "evolution.checkpoint_every=1") == 0
+    assert re.findall(r"\[\d/6\] (\S+): running", capsys.readouterr().out) == [
+        f"{case}/seed_2" for case in CASES
+    ]
+    assert contents(folder / "out" / RUNS[0]) == kept
+
+    # The report command makes the same page.
+    (folder / "out" / "report.html").unlink()
+    assert run_command(report.main, ["out"]) == 0
+    again = (folder / "out" / "report.html").read_text()
+    assert "6 of 6</b>runs finished" in again
+    assert run_command(report.main, ["out", "alone"]) == 2
+
+
+class DroppedError(Exception):
+    """Stands for kill -9: nothing that the program does at its end happens."""
+
+
+def dropping(evaluation):
+    """A fitness that drops the process at an evaluation of a block."""
+    count = itertools.count(1)
+
+    class Dropping(toys.Toy):
+        def evaluate(self, population, key):
+            if next(count) == evaluation:
+                raise DroppedError
+            return super().evaluate(population, key)
+
+    return lambda config: Dropping()
+
+
+def test_wherever_a_sweep_is_dropped_it_ends_in_the_same_bits(folder, no_pictures, capsys):
+    assert run_sweep(*GRID, "--out", "whole") == 0
+    # A run takes 10 blocks and some for its champion: in its first generation, between two
+    # checkpoints, in the second run, in the second case.
+    for evaluation in (1, 6, 21, 60):
+        with pytest.raises(DroppedError):
+            run_sweep(*GRID, make_fitness=dropping(evaluation))
+    assert run_sweep(*GRID) == 0
+    assert "finished before" in capsys.readouterr().out
+    for name in RUNS:
+        assert contents(folder / "out" / name) == contents(folder / "whole" / name)
+
+
+_SLOW = """
+import sys
+sys.path.insert(0, {tests!r})
+import toys
+from mjx_revolve import sweep
+from mjx_revolve.inputs.commands import run_command
+
+if __name__ == "__main__":
+    sys.exit(run_command(lambda argv: sweep.main(argv, toys.make_slow)))
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_process_with_workers_goes_on(folder, no_pictures):
+    """Real processes: kill -9 in the second run; here, without workers, to the end."""
+    options = ("toy.yaml", "--seeds", "2", "--set", "evolution.generations=12", "--out")
+    (folder / "slow.py").write_text(_SLOW.format(tests=str(ROOT / "tests")))
+    metrics = folder / "out" / "toy" / "seed_1" / "metrics.csv"
+    words = [sys.executable, "slow.py", *options, "out", "--workers", "2"]
+    environment = os.environ | XLA_FLAGS | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        deadline = time.monotonic() + 120
+        while not metrics.exists() or len(metrics.read_bytes().splitlines()) < 6:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        process.kill()
+        assert process.stdout.read().endswith("[2/2] toy/seed_1: running ... ")
+    assert 5 <= len(Run(metrics.parent).load_metrics()["generation"]) < 12
+
+    for out in ("out", "whole"):
+        assert run_sweep(*options, out) == 0
+    log = metrics.parent.with_name("seed_1.log").read_text()
+    assert log.count("resuming toy/seed_1 after generation") == 1
+    for name in ("toy/seed_0", "toy/seed_1"):
+        assert contents(folder / "out" / name) == contents(folder / "whole" / name)
+
+
+def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
+    class Pressed(toys.Toy):
+        def evaluate(self, population, key):
+            if (folder / "out" / RUNS[1]).exists():
+                os.kill(os.getpid(), signal.SIGINT)
+            return super().evaluate(population, key)
+
+    # The second evaluation of that generation would end the process at once.
+    Pressed.block_size = 8
+    assert run_sweep(*GRID, make_fitness=lambda config: Pressed()) == 130
+    printed = capsys.readouterr().out
+    assert printed.endswith(
+        f"{RUNS[1]}: running ... stopped\ngo on: python -m mjx_revolve.sweep {' '.join(GRID)}\n"
+    )
+    assert len(Run(folder / "out" / RUNS[1]).load_metrics()["generation"]) == 1
+    assert (folder / "out" / RUNS[0] / "fitness.png").read_bytes().startswith(b"\x89PNG")
+    # What there is can be reported meanwhile.
+    assert run_command(report.main, ["out"]) == 0
+    page = (folder / "out" / "report.html").read_text()
+    assert "1 of 4</b>runs finished" in page
+    assert (page.count("not finished</td>"), page.count("not begun</td>")) == (1, 2)
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_anew(folder, no_pictures, capsys):
+    one = ("toy.yaml", "--seeds", "1", "--out", "out")
+    assert run_sweep(*one) == 0
+    run = folder / "out" / "toy" / "seed_0"
+    whole = contents(run)
+
+    for path in (*run.glob("checkpoints/*"), *run.glob("champion/*")):
+        path.unlink()
+    (run / ".4711-run.json").write_text("half")
+    Run(run).update_info(finished=None)
+    assert run_sweep(*one) == 0  # before its first checkpoint
+    assert contents(run) == whole
+    for there in ({".lock", "inputs"}, {".lock", "inputs", "run.json"}):  # while it was made
+        for path in run.iterdir():
+            if path.name not in there:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        assert run_sweep(*one) == 0
+        assert contents(run) == whole
+
+    # Nothing of the user's is removed.
+    (run / "thesis.txt").write_text("years of work")
+    for path in run.glob("checkpoints/*"):
+        path.unlink()
+    Run(run).update_info(finished=None)
+    assert run_sweep(*one) == 0
+    assert (run / "thesis.txt").read_text() == "years of work"
+    (run / "run.json").unlink()
+    capsys.readouterr()
+    assert run_sweep(*one) == 2
+    assert "expected a run folder; found no run.json in it" in capsys.readouterr().err
+    assert (run / "thesis.txt").read_text() == "years of work"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "task.durations=5,6"], "--set task.durations: expected one of type, duration"),
+        (
+            ["--set", "task.duration=5,-6"],
+            "duration=-6: --set task.duration: expected a number >",
+        ),
+        (["--set", "morphology=robot.yaml,dog.yaml"], "--set morphology: expected a file; found n"),
+        (["--set", "evolution.strategy=SNES,Magic"], "=Magic: toy.yaml: evolution.strategy: expec"),
+        (
+            ["--set", "evolution.population_size=8,16", "--set", "task.settle=1,11"],
+            "population_size=8+settle=11: --set task.settle: expected a time below task.duration",
+        ),
+        (["--set", "evolution.seed=1,2"], "--set evolution.seed: expected --seeds N instead"),
+        (["--set", "task.duration=[1,2"], "--set task.duration: expected a bracket to be closed"),
+        (["--seeds", "0"], "--seeds: expected a whole number from 1 to 10000; found '0'"),
+        (["--workers", "2", "--cluster", "x"], "--cluster: expected no --workers beside it"),
+        (["--cluster", "nobody.json"], "nobody.json"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_before_anything_is_written(
+    arguments, message, folder, capsys
+):
+    if "--cluster" in arguments[:1]:
+        pytest.importorskip("distributed")
+    (folder / "out").mkdir()
+    assert run_sweep("toy.yaml", "--out", "out", *arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert message in captured.err.replace(f"{folder}/", "")
+    assert not [*folder.glob("out/*/*/run.json")]
+
+
+def test_a_folder_of_something_else_is_refused(folder, no_pictures, capsys):
+    (folder / "out").mkdir()
+    (folder / "out" / "thesis.txt").write_text("years of work")
+    assert run_sweep(*GRID) == 2
+    assert "expected a new or empty folder, or that of a sweep" in capsys.readouterr().err
+    one = ("toy.yaml", "--seeds", "1", "--out", "sweep")
+    assert run_sweep(*one) == 0
+    capsys.readouterr()
+    # Another sweep into the same folder, fewer generations, and a page of somebody else's.
+    assert run_sweep(*one, "--set", "task.duration=9") == 2
+    assert "task.duration: expected 10.0 as in the run; found 9.0" in capsys.readouterr().err
+    assert run_sweep(*one, "--set", "evolution.generations=4") == 2
+    assert "expected a run of 4 generations at most; found 5" in capsys.readouterr().err
+    (folder / "sweep" / "report.html").write_text("<p>my homepage")
+    assert run_sweep(*one) == 2
+    assert "expected no file or an earlier report" in capsys.readouterr().err
+    assert (folder / "sweep" / "report.html").read_text() == "<p>my homepage"
+
+
+def test_more_generations_go_on_where_each_run_ended(folder, no_pictures):
+    one = (*GRID, "--seeds", "1")
+    assert run_sweep(*one) == 0
+    assert run_sweep(*one, "--set", "evolution.generations=9") == 0
+    assert run_sweep(*one, "--set", "evolution.generations=9", "--out", "once") == 0
+    for name in RUNS[::2]:
+        assert contents(folder / "out" / name) == contents(folder / "once" / name)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[]", "sweep.yaml: expected a mapping with config, seeds; found []"),
+        ("{config: a.yaml}", "sweep.yaml: seeds: expected a whole number >= 1 and <= 10000; found"),
+        ("{config: a, seeds: 2, x: 1}", "sweep.yaml: x: expected one of config, seeds, settings"),
+        ("{config: a, seeds: 1, settings: ['a=[1']}", "sweep.yaml: --set a: expected a bracket"),
+        ("{config: a, seeds: 1, settings: []}", "out: expected runs that are finished; found none"),
+    ],
+)
+def test_what_is_no_sweep_has_no_report(text, message, folder, capsys):
+    (folder / "out").mkdir()
+    (folder / "out" / "sweep.yaml").write_text(text)
+    assert run_command(report.main, ["out"]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+
+
+def test_a_damaged_run_is_named_and_the_others_are_reported(folder, no_pictures, capsys):
+    settings = ("--set", "controller.amplitude=0.5,1.0", "--set", "task.measures=[depth_m],[]")
+    assert run_sweep("toy.yaml", "--seeds", "1", "--out", "o<b>", *settings) == 0
+    damaged = next((folder / "o<b>").glob("*/seed_0/run.json"))
+    damaged.write_text("[")
+    assert run_command(report.main, ["o<b>"]) == 0
+    assert "expected a whole run; found: " in capsys.readouterr().err
+    page = (folder / "o<b>" / "report.html").read_text()
+    assert "3 of 4</b>runs finished" in page
+    assert "damaged</td>" in page
+    assert "<b>/" not in page  # names are text
