@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import subprocess
 import sys
 
@@ -11,16 +12,17 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import OAR, ROOT
+from laboratory import OAR, ROOT, XLA_FLAGS
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.film.opengl import find_opengl
 from toys import CLOCK
 
 
-def command(name, *arguments, check=True):
+def command(name, *arguments, check=True, flags=None):
     run = subprocess.run(
         [sys.executable, "-m", f"mjx_revolve.{name}", *map(str, arguments)],
         cwd=ROOT,
+        env=os.environ | (flags or {}),
         capture_output=True,
         text=True,
         timeout=1800,  # a guard against hanging, on a busy machine too
@@ -44,14 +46,14 @@ def champion(folder):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """`evolve` of the smoke configuration's task, for the robot that compiles soonest."""
+    """`evolve` of the smoke configuration's task, for the robot that compiles soonest, cheaply."""
     path = tmp_path_factory.mktemp("robot") / "oar.yaml"
     path.write_text(OAR)
 
     def evolve(folder, generations, *more):
         settings = (f"morphology={path}", f"evolution.generations={generations}")
         sets = [word for setting in settings for word in ("--set", setting)]
-        command("evolve", "configs/smoke.yaml", "--out", folder, *sets, *more)
+        command("evolve", "configs/smoke.yaml", "--out", folder, *sets, *more, flags=XLA_FLAGS)
         return folder
 
     return evolve
@@ -79,7 +81,7 @@ def test_a_run_leaves_all_that_the_readme_promises(whole):
 @pytest.mark.slow
 def test_a_stopped_run_resumed_equals_one_never_stopped(small, whole, tmp_path):
     parts = small(tmp_path / "parts", 2)
-    command("evolve", "--resume", parts, "--set", "evolution.generations=4")
+    command("evolve", "--resume", parts, "--set", "evolution.generations=4", flags=XLA_FLAGS)
     assert metrics(parts) == metrics(whole)
     np.testing.assert_array_equal(champion(parts), champion(whole))
 

@@ -374,21 +374,6 @@ def test_ctrl_c_saves_and_says_how_to_go_on(folder):
 
 
 @pytest.mark.slow
-def test_sigterm_and_impatience(folder):
-    process = start(folder, "toy.yaml", "--out", "run", "--set", "evolution.generations=2000")
-    read_until(process, "generation 1/")
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 143
-    process = start(folder, "--resume", "run")
-    read_until(process, "generation ")
-    # Two at once: the second one ends it there and then.
-    process.send_signal(signal.SIGINT)
-    time.sleep(0.005)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(60) in (-signal.SIGINT, 130)
-
-
-@pytest.mark.slow
 def test_kill_nine_costs_only_time(folder):
     argv = ("--set", "evolution.strategy=CMA_ES", "--set", "evolution.generations=40")
     whole = start(folder, "toy.yaml", "--out", "whole", *argv)

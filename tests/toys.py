@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 
@@ -41,11 +42,13 @@ def enter_folder(path: Path, monkeypatch) -> Path:
 
 
 def read_until(process, words: str) -> list[str]:
-    """What a process has printed up to a line with some words."""
-    lines = []
+    """What a process has printed up to a line with some words; one that hangs is killed."""
+    lines, clock = [], threading.Timer(120.0, process.kill)
+    clock.start()
     for line in process.stdout:
         lines.append(line)
         if words in line:
+            clock.cancel()
             return lines
     raise AssertionError("".join(lines))
 

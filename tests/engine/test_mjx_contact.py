@@ -203,7 +203,7 @@ def wet():
     current = np.zeros((3, 8))
     current[0, 5:] = 0.0, 0.2, 1.0
     water = Water(np.zeros(8), tuple(current))
-    return robot, qpos, qvel, march(robot, 3.0, qpos, qvel, water=water, engine="mjx")
+    return robot, qpos, qvel, march(robot, 2.0, qpos, qvel, water=water, engine="mjx")
 
 
 @pytest.mark.slow
@@ -314,7 +314,7 @@ def test_a_core_lands_in_the_lake():
     qpos[2] = np.asarray(bed_height(robot.world.bed, *places)) + 0.1
     qpos[3:7] = draw.normal(size=(4, 4))
     qpos[3:7] /= np.linalg.norm(qpos[3:7], axis=0)
-    _, q, v, _ = march(robot, 4.0, qpos, qvel, engine="mjx", every=4, x64=False)
+    _, q, v, _ = march(robot, 2.5, qpos, qvel, engine="mjx", every=4, x64=False)
     for lane in range(4):
         clear = clearance(robot, q[:, :, lane])
         assert clear.min() > -0.01
@@ -334,7 +334,7 @@ def test_a_jointed_body_lies_still_in_float32():
     qpos, qvel = at_rest(robot, 2, FLAT["height"] + 0.1)
     qpos[3:7, 1] = 0, 1, 0, 0
     ctrl = np.full((robot.mj_model.nu, 2), 0.3)
-    _, q, v, _ = march(robot, 3.0, qpos, qvel, ctrl, engine="mjx", every=4, x64=False)
+    _, q, v, _ = march(robot, 2.0, qpos, qvel, ctrl, engine="mjx", every=4, x64=False)
     for lane in range(2):
         clear = clearance(robot, q[:, :, lane])
         assert clear.min() > -5e-3

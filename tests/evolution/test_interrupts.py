@@ -102,9 +102,8 @@ def test_two_signals_at_once_save_even_inside_a_compiled_program(folder, monkeyp
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "module"),
-    [("evolve", "argparse"), ("evolve", "numpy._core.multiarray"),
-     ("viewer", "mjx_revolve.view.viewer"), ("viewer", "numpy._core.multiarray")],
-)  # fmt: skip
+    [("evolve", "argparse"), ("viewer", "numpy._core.multiarray")],
+)
 def test_ctrl_c_while_importing_is_one_line(folder, command, module):
     process = subprocess.Popen(
         [sys.executable, "-X", "importtime", "-m", f"mjx_revolve.{command}", "toy.yaml"],

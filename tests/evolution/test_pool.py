@@ -459,25 +459,13 @@ def start(folder, *argv, **environment):
     )  # fmt: skip
 
 
-def read_until(process, words):
-    lines = []
-    clock = threading.Timer(120.0, process.kill)
-    clock.start()
-    for line in process.stdout:
-        lines.append(line)
-        if words in line:
-            clock.cancel()
-            return lines
-    raise AssertionError("".join(lines))
-
-
 LONG = ("toy.yaml", "--out", "run", "--workers", 2, "--set", "evolution.generations=5000")
 
 
 @needs_proc
 def test_ctrl_c_finishes_the_generation(folder):
     process = start(folder, *LONG)
-    read_until(process, "generation 1/")
+    toys.read_until(process, "generation 1/")
     workers = workers_of(process.pid)
     assert len(workers) == 2
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
@@ -494,7 +482,7 @@ def test_ctrl_c_finishes_the_generation(folder):
 @needs_proc
 def test_workers_do_not_outlive_their_leader(folder):
     process = start(folder, *LONG)
-    read_until(process, "generation 1/")
+    toys.read_until(process, "generation 1/")
     workers = workers_of(process.pid)
     assert len(workers) == 2
     os.kill(workers[0], signal.SIGSTOP)  # it is not asked

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from laboratory import _ELBOW as ELBOW
+from laboratory import XLA_FLAGS
 from mjx_revolve import evolve
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.config import load_config, override_config
@@ -298,7 +299,8 @@ def test_evolving_with_workers_and_resuming(folder):
 
     def command(*words):
         run = [sys.executable, "-m", "mjx_revolve.evolve", *words]
-        there = {**os.environ, "PYTHONPATH": str(Path(own_code.__file__).parents[2])}
+        path = str(Path(own_code.__file__).parents[2])
+        there = {**os.environ, **XLA_FLAGS, "PYTHONPATH": path}
         return subprocess.run(run, capture_output=True, text=True, cwd=folder, env=there)
 
     many = ["--set", "task.trials=16", "--set", "evolution.population_size=8"]  # two blocks
