@@ -11,6 +11,7 @@ import contextlib
 import ctypes
 import gc
 import json
+import math
 import os
 import resource
 import sys
@@ -106,12 +107,22 @@ def make_generation(job: dict[str, Any]) -> Case:
     return lambda: next(generations), job["population"] * _episode_steps(pool)
 
 
-def _bodies(job: dict[str, Any]) -> list[Any]:
-    """Different bodies of 4 to 16 hinges and 6 bricks, as many as individuals."""
+def _bodies(job: dict[str, Any], each: int = 1) -> list[Any]:
+    """Different bodies of 4 to 16 hinges and 6 bricks, with so many individuals `each`.
+
+    Processes get blocks of bodies of a size, as evolution deals them: the largest first, and who is
+    done first takes the next.
+    """
     from experiments.random_bodies import random_body
+    from mjx_revolve.numerics.xla import LANES
 
     first, step = job["share"]
-    return [random_body(k, 4 + k % 13, 6) for k in range(first, step * job["population"], step)]
+    everybody = sorted(range(step * job["population"]), key=lambda k: (-(k % 13), k))
+    turns = [*range(step), *reversed(range(step))]
+    block = math.gcd(LANES // each, job["population"])
+    own = [k for n, k in enumerate(everybody) if turns[n // block % (2 * step)] == first]
+    assert len(own) == job["population"], "expected whole blocks"
+    return [random_body(k, 4 + k % 13, 6) for k in own]
 
 
 def make_mixed(job: dict[str, Any], learners: int = 0) -> Case:
@@ -123,7 +134,7 @@ def make_mixed(job: dict[str, Any], learners: int = 0) -> Case:
 
     from mjx_revolve import make_mixed_fitness
 
-    bodies = _bodies(job)
+    bodies = _bodies(job, max(learners, 1))
     fitness = make_mixed_fitness(_config(job), bodies, hinges=16)
     packed = fitness.pack([fitness.build(body) for body in bodies])
     each = (len(bodies), learners) if learners else (len(bodies),)

@@ -172,7 +172,7 @@ def evaluate(
     # as its largest body.
     size, groups = pool.block or len(rows), mine
     if not fitness.alone:
-        order = sorted(range(len(mine)), key=lambda k: _size(individuals[k].body))
+        order = sorted(range(len(mine)), key=lambda k: _size(individuals[k].body), reverse=True)
         groups = [np.concatenate([mine[k] for k in order])]
     cut = [g[start : start + size] for g in groups for start in range(0, len(g), size)]
     blocks = []
