@@ -41,6 +41,18 @@ sys.exit(run_command(lambda argv: evolve.main(argv, make_fitness), sys.argv[1:])
 PATH = f"{ROOT}{os.pathsep}{ROOT / 'tests'}"
 
 
+@pytest.fixture(autouse=True)
+def heard():
+    """Tests started under nohup or in the background ignore signals, as would what they start."""
+    numbers = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)
+    ignored = [n for n in numbers if signal.getsignal(n) == signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, signal.SIG_DFL)
+    yield
+    for number in ignored:
+        signal.signal(number, signal.SIG_IGN)
+
+
 @pytest.fixture
 def folder(tmp_path):
     """A configuration that saves nothing by itself."""
