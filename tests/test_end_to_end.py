@@ -72,6 +72,7 @@ def check_files(folder):
         assert (folder / "champion" / name).stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_a_run_leaves_all_that_the_readme_promises(whole):
     assert len(metrics(whole)) == 4
     assert np.all(np.isfinite(champion(whole)))

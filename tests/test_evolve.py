@@ -117,6 +117,7 @@ def test_default_folder(folder):
     assert re.fullmatch(r"toy-\d{8}-\d{6}", run.name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drop", [1, 2, 4, 6])
 def test_a_dropped_run_continues_bit_for_bit(folder, drop, capsys):
     assert run_main("toy.yaml", "--out", "whole") == 0
@@ -156,6 +157,7 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(folder, mo
     assert sorted(found) == [Path("runs", f"toy-20260102-030405{end}") for end in tail]
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_costs_only_time(folder, capsys):
     assert run_main("toy.yaml", "--out", "whole") == 0
     with pytest.raises(DroppedError):
@@ -299,6 +301,7 @@ def test_wrong_robots_leave_nothing_behind(folder, capsys):
     assert not (folder / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_full_disk_costs_one_generation(folder, capsys, monkeypatch):
     assert run_main("toy.yaml", "--out", "whole") == 0
     write = checkpoints.write_atomic
@@ -428,6 +431,7 @@ def events(folder):
     return scalars
 
 
+@pytest.mark.slow
 def test_tensorboard_has_what_the_metrics_have(folder):
     pytest.importorskip("tensorboardX")
     board = ("--set", "evolution.tensorboard=true")
@@ -461,6 +465,7 @@ def test_tensorboard_itself_reads_it(folder):
     assert [event.step for event in reader.Scalars("fitness/best")] == list(range(1, 8))
 
 
+@pytest.mark.slow
 def test_tensorboard_may_begin_late_and_end_early(folder):
     pytest.importorskip("tensorboardX")
     assert run_main("toy.yaml", "--out", "run") == 0

@@ -241,6 +241,7 @@ def test_the_counter_keeps_the_best():
     assert (counter.best_score, counter.evaluations) == (3.0, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", optimisers.OPTIMISERS)
 def test_each_library_maximises(name):
     def score(population):

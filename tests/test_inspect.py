@@ -189,6 +189,7 @@ def test_overlap_is_refused_unless_allowed(tmp_path, capsys):
 # --- the picture --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
     from matplotlib.image import imread
 
@@ -207,6 +208,7 @@ def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
     assert 0.3 < white.mean() < 0.9
 
 
+@pytest.mark.slow
 def test_thrusts_are_drawn_as_green_arrows(tmp_path):
     from matplotlib.image import imread
 
@@ -260,6 +262,7 @@ def test_what_is_nearer_hides_what_is_farther():
     assert not np.isfinite(depth).any()  # faces that look away are not drawn
 
 
+@pytest.mark.slow
 def test_drawing_leaves_matplotlib_alone():
     code = (
         "import sys, matplotlib; before = matplotlib.rcParams.copy(); "

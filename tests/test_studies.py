@@ -62,6 +62,7 @@ def metrics(folder):
     return {name: values.tolist() for name, values in found.items() if name not in CLOCK}
 
 
+@pytest.mark.slow
 def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch, capsys):
     two = ("--only", "bed,open_water")
     assert study(tmp_path, *two, "--generations", "2") == 0
@@ -236,6 +237,7 @@ def test_a_difference_is_said_only_where_the_tests_bear_it():
     assert environments.Compared("length", {}, 0.06, figures[0].comparison).differs == []
 
 
+@pytest.mark.slow
 def test_budgets_say_by_how_much_coevolution_is_better(tmp_path):
     values = {"coevolution": [0.3, 0.3], "random_search": [0.1, 0.1], "fish": [0.1, 0.5]}
     lines = budgets.write_report(tmp_path, outcomes(values))

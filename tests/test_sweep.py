@@ -132,6 +132,7 @@ def dropping(evaluation):
     return lambda config: Dropping()
 
 
+@pytest.mark.slow
 def test_wherever_a_sweep_is_dropped_it_ends_in_the_same_bits(folder, no_pictures, capsys):
     assert run_sweep(*GRID, "--out", "whole") == 0
     # A run takes 10 blocks and some for its champion: in its first generation, between two
@@ -206,6 +207,7 @@ def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
     assert (page.count("not finished</td>"), page.count("not begun</td>")) == (1, 2)
 
 
+@pytest.mark.slow
 def test_a_run_killed_before_its_first_checkpoint_begins_anew(folder, no_pictures, capsys):
     one = ("toy.yaml", "--seeds", "1", "--out", "out")
     assert run_sweep(*one) == 0
@@ -293,6 +295,7 @@ def test_a_folder_of_something_else_is_refused(folder, no_pictures, capsys):
     assert (folder / "sweep" / "report.html").read_text() == "<p>my homepage"
 
 
+@pytest.mark.slow
 def test_more_generations_go_on_where_each_run_ended(folder, no_pictures):
     one = (*GRID, "--seeds", "1")
     assert run_sweep(*one) == 0
@@ -321,6 +324,7 @@ def test_what_is_no_sweep_has_no_report(text, message, folder, capsys):
     assert captured.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_damaged_run_is_named_and_the_others_are_reported(folder, no_pictures, capsys):
     settings = ("--set", "controller.amplitude=0.5,1.0", "--set", "task.measures=[depth_m],[]")
     assert run_sweep("toy.yaml", "--seeds", "1", "--out", "o<b>", *settings) == 0

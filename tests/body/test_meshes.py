@@ -423,6 +423,7 @@ def test_module_meshes_have_the_tabulated_volume_and_outer_size(kind, part):
         assert mesh.bounds[1, 0] > high[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "part"), PARTS, ids=PART_NAMES)
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.9, 1.0, 1.5])
 def test_types_of_users_are_drawn_with_their_volume(kind, part, share):

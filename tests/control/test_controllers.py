@@ -289,6 +289,7 @@ def strokes(robot, lanes=32):
     return np.clip(ctrl, -np.pi / 4, np.pi / 4), *march(robot, 1.0, qpos, qvel, ctrl)
 
 
+@pytest.mark.slow
 def test_servos_keep_the_speed_limit(elbow):
     """Under water, hinges stay below 5.236 rad/s, and get where they are told to go."""
     targets, _, q, v, _ = strokes(elbow)
@@ -346,6 +347,7 @@ def test_a_hinge_at_its_top_speed_gets_no_more_push():
             assert abs(gained) < 0.02 * SPEED
 
 
+@pytest.mark.slow
 def test_a_hinge_that_carries_nothing_comes_to_rest():
     """A hinge at the end of a limb, nudged by 1 mrad/s, as in the centipede's feet."""
     robot = build_robot(
@@ -357,6 +359,7 @@ def test_a_hinge_that_carries_nothing_comes_to_rest():
     assert np.abs(v[-20:, 6]).max() < 1e-2
 
 
+@pytest.mark.slow
 def test_a_hinge_that_carries_a_brick_comes_to_rest(elbow):
     qpos, qvel = random_states(elbow, 8, speed=0.1)
     qvel[6:] = 1.0

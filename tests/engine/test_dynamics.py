@@ -77,6 +77,7 @@ def relative(found, expected):
 # ------------------------------------------------------------------------- accelerations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drag", MUJOCO_LAWS)
 def test_acceleration_is_mujocos(drag):
     """To rounding of float64, with a current as MuJoCo's wind."""
@@ -263,6 +264,7 @@ def check_engines(robot):
     assert other_energy == pytest.approx(energy, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_two_engines_agree_on_one_module():
     """Through the surface, with drag, carried water and a current, half a second in float64."""
     check_engines(build_robot(body("core"), world(**WATER, current=CURRENT)))

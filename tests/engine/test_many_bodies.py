@@ -477,6 +477,7 @@ def test_a_number_that_is_the_same_in_all_bodies_of_the_types_must_stay_so():
         pack_bodies([other], capacity)
 
 
+@pytest.mark.slow
 def test_slanted_modules_are_no_constants():
     """A type that leaves the right angles frees what right angles would fix."""
     limb = "{type: ActiveHinge, children: {1: {type: FixedBrick}}}"

@@ -98,6 +98,7 @@ def test_a_limp_jointed_body_keeps_energy_and_impulse():
     assert np.divide(*lost) == pytest.approx(2.0, abs=0.4)
 
 
+@pytest.mark.slow
 def test_servos_give_no_more_energy_than_they_deliver():
     """At the default step, without drag, from a tumble of 1 m/s: start + work bounds the energy."""
     robot = arm_robot(world(added_mass=True))
@@ -122,6 +123,7 @@ def gusty(tank, seed, seconds):
     return np.asarray(path), gusty_water(tank, path)
 
 
+@pytest.mark.slow
 def test_a_neutral_body_goes_with_the_water_whatever_its_shape():
     """Without drag; pressure and carried water move it as they would the water in its place."""
     gust = {"std": [0.2, 0.1, 0.1], "time": 0.5}
@@ -138,6 +140,7 @@ def test_a_neutral_body_goes_with_the_water_whatever_its_shape():
     assert np.abs(found.qvel[:, 3:]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_gusts_move_a_heavy_body_less():
     """m v' = ρ V u' + m_a (u' - v'), so v - v₀ = (ρ V + m_a) / (m + m_a) (u - u₀).
 
@@ -159,6 +162,7 @@ def test_gusts_move_a_heavy_body_less():
         assert np.abs(found.qvel[:, 3:]).max() < (0.05 if added_mass else 1e-12)
 
 
+@pytest.mark.slow
 def test_the_worlds_own_gusts_come_from_the_key():
     """As `gust_path` draws them from the key that `simulate` is given."""
     tank = world(added_mass=True, buoyancy="partial", gust={"std": 0.2, "time": 0.5})
@@ -170,6 +174,7 @@ def test_the_worlds_own_gusts_come_from_the_key():
     assert found.qvel[:, :3] == pytest.approx(np.asarray(path[1:]), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_whole_rollout_does_not_know_how_fast_its_water_goes():
     """Galilei: in a uniform current, moving along with it, an arm strokes as in still water."""
     robot = arm_robot(world(**WATER))
@@ -420,6 +425,7 @@ def test_gradient_at_rest():
     check_slope(trimmed(world(**WATER)), {})
 
 
+@pytest.mark.slow
 def test_gradient_at_the_waterline():
     """The core's centre in the surface, and its deck or its keel just in it."""
     robot = build_robot(body("core"), world(**WATER))

@@ -81,6 +81,7 @@ def test_an_individual_does_not_feel_the_population_around_it(fitness, populatio
     np.testing.assert_array_equal(few, scores[:40])
 
 
+@pytest.mark.slow
 def test_an_individual_adds_little_memory_however_long_it_lives(settings):
     """XLA's own sum of what lives beside arguments and results; a track alone would be 800 B."""
     long = make_fitness(settings, **{"task.duration": 5.0, "task.trials": 1})
@@ -98,6 +99,7 @@ def test_a_blown_up_individual_scores_worst_and_spreads_nothing(fitness, populat
     np.testing.assert_array_equal(found[others], scores[others])
 
 
+@pytest.mark.slow
 def test_zero_genes_do_no_work(fitness):
     score, measures = fitness.evaluate(jnp.zeros((1, fitness.num_genes)), KEY)
     # The oar is heavier at one end and lighter at the other, so it turns a little, without work.

@@ -59,6 +59,7 @@ def swing(frequency, lags=(0.0, 0.7, 1.4), sizes=(0.4, 0.4, 0.4), time=TIME):
 # ------------------------------------------------------------------ the table
 
 
+@pytest.mark.slow
 def test_every_measure_is_made_and_in_the_tables_order():
     given = still(
         angle=swing(1.0), quat=np.tile([1.0, 0, 0, 0], (90, 1)), bed_force=np.zeros((90, 3))

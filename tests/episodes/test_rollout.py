@@ -55,6 +55,7 @@ def still(elbow):
 # ------------------------------------------------------------------------- what comes back
 
 
+@pytest.mark.slow
 def test_shapes_and_time(elbow, still):
     assert isinstance(still, Trajectory)
     assert still.time == pytest.approx(DT * np.arange(1, STEPS + 1), rel=1e-6)
@@ -70,6 +71,7 @@ def test_shapes_and_time(elbow, still):
     assert np.linalg.norm(still.qpos[:, 3:7], axis=1) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_default_duration_is_five_seconds(core):
     trajectory = simulate(core)
     assert trajectory.time[-1] == pytest.approx(5.0)
@@ -119,6 +121,7 @@ def test_all_forms_of_joint_targets(elbow, still):
     assert clock.ctrl[:, 0] == pytest.approx(DT * np.arange(STEPS), abs=1e-7)
 
 
+@pytest.mark.slow
 def test_a_controller_in_a_vacuum_and_for_one_step(arm):
     """The shortest programs: nothing of them may be left that XLA:CPU aborts over."""
     controller = make_sine(arm)
@@ -128,6 +131,7 @@ def test_a_controller_in_a_vacuum_and_for_one_step(arm):
         assert trajectory.qpos.shape[0] == steps and np.all(np.isfinite(trajectory.qpos))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [make_cpg, pytest.param(make_sine, marks=pytest.mark.slow)])
 def test_a_controller_with_its_genes(elbow, make):
     """Played from its genes, without rows of controls (XLA:CPU has aborted over such a rollout)."""
@@ -191,6 +195,7 @@ def test_a_key_turns_the_start_about_the_vertical(elbow):
     assert np.abs(quats[0] - quats[2]).max() > 0.01
 
 
+@pytest.mark.slow
 def test_water_of_its_own():
     """A surface below the robot and a current, without compiling the robot anew."""
     # Trimmed, so that it drifts and does not flutter as it sinks.

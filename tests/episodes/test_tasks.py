@@ -74,12 +74,14 @@ def score(config):
     return fitness, float(fitness(jnp.zeros((1, fitness.num_genes)), KEY)[0])
 
 
+@pytest.mark.slow
 def test_the_waters_force_on_a_neutral_body_is_its_weight(settings):
     fitness, found = score(settings("lifting", trim="neutral"))
     assert found == pytest.approx(fitness.robot.morphology.mass * G, rel=1e-4)
     assert fitness.task.unit == "N"
 
 
+@pytest.mark.slow
 def test_the_beds_force_on_a_body_at_rest_is_what_the_water_leaves_of_its_weight(settings):
     tank = {"bed": {"kind": "flat", "height": -2.0}}
     fitness, found = score(settings("standing", world=tank))

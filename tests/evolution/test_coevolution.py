@@ -61,6 +61,7 @@ def strangers(config, pool):
     return coevolution._Step(config, pool)._strangers(coevolution.start_search(config), 1)
 
 
+@pytest.mark.slow
 def test_a_life_alone_is_the_life_among_others(folder):
     for learning in ({}, {"population_size": 4, "generations": 3}):
         config, pool = start(folder, {"learning": learning})
@@ -305,6 +306,7 @@ def contents(folder):
     return arrays, table, [(folder / name).read_text() for name in names]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bodies", [
     {"learning": {"population_size": 4, "generations": 2, "strategy": "CMA_ES"}},
     pytest.param(ARCHIVE, marks=pytest.mark.slow),
@@ -323,6 +325,7 @@ def test_a_run_that_goes_on_ends_as_one_that_never_stopped(folder, bodies, capsy
     assert contents(folder / "whole") == contents(folder / "parts")
 
 
+@pytest.mark.slow
 def test_what_is_in_a_run_folder(folder, capsys):
     toys.write_bodies_config(folder / "toy.yaml", ARCHIVE)
     assert main("toy.yaml", "--out", "run") == 0
@@ -350,6 +353,7 @@ def test_what_is_in_a_run_folder(folder, capsys):
     assert table["coverage"][-1] == pytest.approx(len(rows) / 28)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", ["bodies.max_modules=9", "bodies.selection.type=steady"])
 def test_a_run_cannot_become_another(folder, changed, capsys):
     assert main("toy.yaml", "--out", "run", "--set", "evolution.generations=2") == 0

@@ -110,6 +110,7 @@ def test_a_folder_that_is_removed(folder, capsys):
     assert err == f"error: {folder / 'run' / 'metrics.csv'}: No such file or directory\n"
 
 
+@pytest.mark.slow
 def test_a_second_run_in_one_folder_is_refused(folder, capsys):
     codes = []
 

@@ -111,6 +111,7 @@ def test_ties_keep_the_order_of_the_others():
 QUICK = ("CMA_ES", "OpenES", "SNES", "PGPE")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_strategies_reach_the_optimum(name):
     check_optimum(name)

@@ -222,6 +222,7 @@ def test_functions_without_a_name_cannot_have_workers(tmp_path):
         make_pool(toy_config(tmp_path), 2, lambda config: toys.Toy())
 
 
+@pytest.mark.slow
 def test_blocks_of_bodies(tmp_path):
     """Whatever `evaluate` takes before the key; the same function in one process as in two."""
     config = toy_config(tmp_path)
@@ -318,6 +319,7 @@ def pids_of(pool):
     return [worker.process.pid for worker in pool._workplace._workers]
 
 
+@pytest.mark.slow
 @needs_proc
 @pytest.mark.parametrize(
     ("kind", "how"),
@@ -350,6 +352,7 @@ def test_a_lost_worker_is_replaced_and_costs_nothing(troubled, kind, how, caplog
         assert len(said) == 1 and re.fullmatch(rf"a worker is replaced \({how}\)", said[0]), said
 
 
+@pytest.mark.slow
 def test_a_block_that_kills_scores_worst_and_is_named(troubled, caplog):
     pool, _ = troubled
     population = np.random.default_rng(4).normal(size=(10, 5)).astype(np.float32)
@@ -380,6 +383,7 @@ def test_a_lost_block_can_be_scored_again(tmp_path):
     assert scores.tobytes() == Pool(toys.Toy(), 4)(block[0], KEY).tobytes()
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_when_workers_are_killed(folder, capsys, monkeypatch):
     """At any moment; the same bits as in this process alone."""
     monkeypatch.setenv("TOY_TROUBLE", str(folder / "order"))
@@ -409,6 +413,7 @@ def test_a_run_goes_on_when_workers_are_killed(folder, capsys, monkeypatch):
     assert host == runs.Run(folder / "whole").load_checkpoint().meta["host"]
 
 
+@pytest.mark.slow
 def test_workers_that_cannot_be_built(folder, capsys, monkeypatch):
     monkeypatch.setenv("TOY_LEADER", str(os.getpid()))
     argv = ("toy.yaml", "--out", "run", "--workers", 2)
@@ -426,6 +431,7 @@ def test_workers_that_cannot_be_built(folder, capsys, monkeypatch):
     assert differences(folder / "run", folder / "whole") == []
 
 
+@pytest.mark.slow
 def test_workers_of_another_program_score_nothing(tmp_path, caplog):
     """As when somebody edits the package or the world's file while the run goes on."""
     with make_pool(toy_config(tmp_path), 2, toys.make_toy) as pool:
@@ -462,6 +468,7 @@ def start(folder, *argv, **environment):
 LONG = ("toy.yaml", "--out", "run", "--workers", 2, "--set", "evolution.generations=5000")
 
 
+@pytest.mark.slow
 @needs_proc
 def test_ctrl_c_finishes_the_generation(folder):
     process = start(folder, *LONG)
@@ -479,6 +486,7 @@ def test_ctrl_c_finishes_the_generation(folder):
     assert differences(folder / "run", folder / "whole") == []
 
 
+@pytest.mark.slow
 @needs_proc
 def test_workers_do_not_outlive_their_leader(folder):
     process = start(folder, *LONG)

@@ -47,6 +47,7 @@ def run(capsys, *arguments):
     return code, out, err
 
 
+@pytest.mark.slow
 def test_command_writes_everything_once(quick, capsys):
     pytest.importorskip("rosbags", reason="the package rosbags writes bags")
     code, out, err = run(capsys, "odd.yaml")

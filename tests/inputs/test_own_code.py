@@ -111,6 +111,7 @@ def lab(tmp_path_factory):
 # ------------------------------------------------------------------------- what they do
 
 
+@pytest.mark.slow
 def test_an_own_task_scores_what_an_own_controller_does(lab):
     scores, measures = lab.evaluate(GENES, jax.random.key(0))
     # In a fifth of a second the robot sinks by some millimetres below where it began.

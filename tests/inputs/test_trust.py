@@ -75,6 +75,7 @@ def test_a_report_shows_the_rest(folder, capsys):
     assert "inputs/own.py" in page and "not shown in full" in page
 
 
+@pytest.mark.slow
 def test_what_one_has_evolved_oneself_is_known(folder):
     toy = toys.make_toy
     main = lambda argv: evolve.main(argv, toy)  # noqa: E731

@@ -55,6 +55,7 @@ def plain(x):
     return carry, jnp.stack(kept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pieces", [1, 2, 5])
 def test_they_change_nothing(monkeypatch, pieces):
     """Whole, and cut into pieces: to rounding, as the compiler may contract other products."""

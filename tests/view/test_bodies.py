@@ -260,6 +260,7 @@ def test_sizes_over_the_generations(run):
 # --- the page ---
 
 
+@pytest.mark.slow
 def test_the_page_shows_who_lived(run, still):
     page = show(run)
     order = [int(n) for n in re.findall(r"<b>#(\d+)</b>", page)]
@@ -278,6 +279,7 @@ ARCHIVE = {"archive": {"axes": {
 }}}  # fmt: skip
 
 
+@pytest.mark.slow
 def test_cells_of_the_archive_are_links(tmp_path, still):
     run = make_run(tmp_path / "a b", ARCHIVE)
     record = read_run(run)
@@ -350,6 +352,7 @@ def test_pages_that_are_there_stay(run, monkeypatch):
     assert (run / "individuals/4.html").read_text() == "episode 4"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -369,6 +372,7 @@ def test_what_is_left_is_shown(run, still, damage, message):
     assert ("Body of individual" in page) == (run / "individuals.jsonl").is_file()
 
 
+@pytest.mark.slow
 def test_a_body_that_cannot_be_read_has_no_picture(run, still):
     path = run / "individuals.jsonl"
     path.write_text(path.read_text().replace("ActiveHinge", "Wheel", 3))

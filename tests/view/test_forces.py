@@ -103,6 +103,7 @@ def test_buoyancy_of_what_is_under_water():
     assert not forces.drag.any() and not forces.thrust.any()
 
 
+@pytest.mark.slow
 def test_buoyancy_of_each_module():
     """Modules under water are held up by ρ V g each, hinge and all."""
     robot = build_robot(body("spider"), world(**WATER))
@@ -233,6 +234,7 @@ def _momentum_rate(robot: Robot, qpos, qvel, qacc, step=1e-5) -> np.ndarray:
     return (momentum(step) - momentum(-step)) / (2 * step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "laws",
     [

@@ -209,6 +209,7 @@ def test_stage_stands_as_the_robot_does(name):
         assert near.max() < 1e-5
 
 
+@pytest.mark.slow
 def test_stage_counts_from_its_origin(spider):
     model = build_stage(spider, origin=(380.0, 20.0, -10.0), sight=5.0)
     data = mujoco.MjData(model)
@@ -373,6 +374,7 @@ def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
         make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)))
 
 
+@pytest.mark.slow
 def test_frames_show_the_robot_in_its_colours_in_blue_water(frames):
     film, drawn = frames
     assert len(drawn) == len(film.time) == 10
@@ -393,6 +395,7 @@ def test_light_falls_from_above_in_a_film(frames):
     assert drawn[0][20:40].mean() > drawn[0][90:105].mean() + 10
 
 
+@pytest.mark.slow
 def test_the_bed_shows_where_it_is_near(spider, way):
     world = load_world("lake", bed={"kind": "flat", "height": -1.3})
     robot = build_robot(spider.morphology, world)
@@ -480,6 +483,7 @@ def command(episode, monkeypatch):
     return lambda *words: run_command(replay.main, list(words))
 
 
+@pytest.mark.slow
 def test_command_writes_film_gif_and_page(command, way, tmp_path, capsys):
     (tmp_path / "config.yaml").write_text("")
     small = ("--size", f"{SIZE[0]}x{SIZE[1]}", "--fps", "10")
@@ -640,6 +644,7 @@ def test_view_without_a_screen_is_one_line(command, tmp_path, capsys, monkeypatc
     assert capsys.readouterr().err.startswith("error: --view: expected a screen")
 
 
+@pytest.mark.slow
 def test_a_lost_robot_is_named(episode, command, way, tmp_path, capsys, monkeypatch):
     import mjx_revolve.episodes.champion
 

@@ -172,6 +172,7 @@ def test_means_are_written_to_the_digits_that_count(values, text):
 # --- groups ---
 
 
+@pytest.mark.slow
 def test_seeds_are_grouped_and_configurations_told_apart(lab, tmp_path):
     config, fitness, folder = lab["config"], lab["fitness"], lab["folder"]
     longer = make_config(config.model_dump(), "/", ["evolution.generations=9"], config.source)
@@ -303,6 +304,7 @@ def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
         assert plots.figure_svg(plots.plot_fitness(record.metrics)).startswith(b"<?xml")
 
 
+@pytest.mark.slow
 def test_values_of_the_wrong_kind_do_not_stop_a_report(copy, quick, capsys):
     info = json.loads((copy / "run.json").read_text())
     info |= {"champion": {"score": 10**400, "measures": [1]}, "versions": {"jax": 1}, "git": 7,
@@ -458,6 +460,7 @@ def test_comparison_of_very_different_lengths(lab, tmp_path):
     assert left.get_xscale() == "linear"
 
 
+@pytest.mark.slow
 def test_searches_in_which_everything_fails_make_pictures(lab, tmp_path):
     make_run(tmp_path / "0", lab["config"], lab["fitness"], 0, 1)
     make_run(tmp_path / "1", lab["config"], lab["fitness"], 1, 3)
@@ -651,6 +654,7 @@ def test_a_page_about_one_run(copy, quick, capsys):
     assert run_main("run") == 0  # its own page is replaced
 
 
+@pytest.mark.slow
 def test_a_page_about_several_runs(lab, copy, quick, capsys):
     runs_of = [lab["folder"] / f"s{seed}" for seed in range(3)]
     assert run_main(*runs_of, "run", "--out", "page.html") == 0
@@ -725,6 +729,7 @@ def test_wrong_commands(copy, argv, message, capsys):
     assert (copy / "report.html").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line(copy, quick, capsys, monkeypatch):
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))

@@ -105,6 +105,7 @@ def test_getting_under_way_does_not_count(small):
     assert "0.4 m" in said and "in 4 s, after the first 2 s" in said
 
 
+@pytest.mark.slow
 def test_the_surface_is_named_where_it_is_in_sight(small):
     said = words_of(small, swim(small, depth=0.02))
     assert "water surface" in said
@@ -118,6 +119,7 @@ def test_the_picture_is_whole_and_always_the_same(small):
     assert first == second
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heading", [0.0, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_the_robot_is_inside_the_frame_whichever_way_it_swims(small, heading):
     """Bright red: nothing else on the page is, so its pixels are the robot's."""

@@ -75,6 +75,7 @@ def unpack(packed, *shape):
 # --------------------------------------------------------------------- what the page is given
 
 
+@pytest.mark.slow
 def test_poses(episode, data):
     """Fifty rows a second; meshes on bodies, put together, are the robot as pictures have it."""
     robot, q = episode.robot, np.asarray(episode.trajectory.qpos)

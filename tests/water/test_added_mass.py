@@ -201,6 +201,7 @@ def check_lagrange(robot, lanes, seed=0):
         assert needed == pytest.approx(expected, abs=1e-7 * scale)
 
 
+@pytest.mark.slow
 def test_a_jointed_body_obeys_lagrange():
     check_lagrange(arm_robot(world(added_mass=True)), 12)
 
@@ -211,6 +212,7 @@ def test_shipped_bodies_obey_lagrange(name):
     check_lagrange(build_robot(body(name), world(added_mass=True)), 4)
 
 
+@pytest.mark.slow
 def test_galilean_invariance_in_a_uniform_current():
     """A current is a moving frame: accelerations as in still water at velocities less by it."""
     robot = arm_robot(world(added_mass=True, drag="faces", gravity=9.81, buoyancy="partial"))

@@ -244,6 +244,7 @@ STATES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STATES)
 @pytest.mark.parametrize("half", [(0.5, 0.5, 0.5), (0.3, 0.2, 0.1)])
 def test_gradients_against_differences(name, half):
@@ -471,6 +472,7 @@ def test_bobbing_frequency(size, relative_density, added_mass):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("added_mass", [False, True])
 def test_righting_frequency_of_a_submerged_box(added_mass):
     """A neutral box, its volume above its mass, swings like a pendulum: ω² = ρVgh / (I + I_a)."""

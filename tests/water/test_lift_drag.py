@@ -241,6 +241,7 @@ def test_radial_symmetry():
     assert wrench(v, p)[0] == pytest.approx(wrench(v, plate)[0], abs=1e-10)
 
 
+@pytest.mark.slow
 def test_each_plate_its_own_numbers():
     """Coefficients, areas and directions as `[npart, nbody, 1]`, mixed with round ones."""
     plates = list(PLATES.values())
@@ -495,6 +496,7 @@ def test_stiff_fin_does_not_blow_up(mass):
     assert np.all(np.diff(speed, axis=0) < 1e-9)
 
 
+@pytest.mark.slow
 def test_stiff_fin_that_carries_water_does_not_blow_up():
     """No more than all of its first energy, that of the water included, can become its speed."""
     mass = 0.05

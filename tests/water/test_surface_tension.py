@@ -113,6 +113,7 @@ def test_upright_walls_are_pulled_by_the_length_of_their_waterline(angle, axis):
     assert torque == pytest.approx(0.0, abs=1e-15)
 
 
+@pytest.mark.slow
 def test_a_wetting_body_is_pulled_down_and_a_shedding_one_up():
     up = attitudes(50, 1)
     for angle, sign in ((0.5, -1), (2.0, 1)):
@@ -132,6 +133,7 @@ def test_an_inclined_wall_is_pulled_by_its_waterline_over_its_steepness():
     assert np.sum(force * up) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_faces_that_the_water_does_not_reach_do_not_count():
     up, depth = attitudes(20, 2), np.zeros(20)
     whole = pull(up, depth, CORE)
@@ -140,6 +142,7 @@ def test_faces_that_the_water_does_not_reach_do_not_count():
         assert sum(part[i] for part in parts) == pytest.approx(whole[i], abs=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOXES)
 @pytest.mark.parametrize("angle", [0.0, 2.0])
 def test_force_and_torque_are_the_slopes_of_the_energy(name, angle):
@@ -240,6 +243,7 @@ def test_a_level_face_is_wetted_over_one_capillary_length():
     assert (force - only_walls)[:, 2] == pytest.approx(bottom, rel=1e-12, abs=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x64", [True, False])
 def test_gradients_are_finite_and_right(x64):
     """Everywhere finite; against differences where the slope has no jump of its own."""
@@ -271,6 +275,7 @@ def test_gradients_are_finite_and_right(x64):
                 assert found == pytest.approx(expected, abs=2e-5 * max(1, np.abs(expected).max()))
 
 
+@pytest.mark.slow
 def test_lanes_parts_and_vmap_agree():
     """`[npart, nbody, lanes]` with a table of sizes, or one state at a time."""
     draw = np.random.default_rng(4)

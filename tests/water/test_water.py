@@ -409,6 +409,7 @@ def test_gradients_against_differences(name):
     assert np.allclose(np.moveaxis(found, 1, 2), expected, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WORLDS)
 def test_jit_and_vmap(name):
     """Of one place at a time, and of a level of bodies `[nbody, lanes]` with lanes' own water."""
@@ -436,6 +437,7 @@ def test_jit_and_vmap(name):
 STD = np.array([0.3, 0.1, 0.02])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("relative", [1e-3, 0.01, 0.1, 1.0, 5.0])
 def test_gusts_have_the_mean_variance_and_memory_that_were_asked_for(relative):
     """At any time step, within 4.5 standard errors of each estimate: 1 in 150,000 by chance.
@@ -483,6 +485,7 @@ def test_gusts_belong_to_their_key():
     assert np.allclose(jax.vmap(drawn)(keys)[3], path, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gusts_of_no_size():
     path = gust_path(Gust((0.0, 0.2, 0.0), time=4.0), jax.random.key(0), 40, 0.1, 5)
     assert not np.any(path[:, [0, 2]])
