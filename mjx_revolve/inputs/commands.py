@@ -23,6 +23,7 @@ from typing import NoReturn
 from mjx_revolve.inputs.early import end_at_once, is_importing
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.shipped import list_shipped
+from mjx_revolve.inputs.terminal import spell_what_is_lacking
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 
 _SEEDS = 2**32  # what JAX's keys take, and a run's configuration
@@ -191,6 +192,7 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         The exit code: `main`'s; 2 where the input is wrong (`InputError`), 1 where the system
         refused something (a full disk, too little memory), and 130 when interrupted.
     """
+    spell_what_is_lacking()
     interrupts: list[int] = []
     try:
         with _noting_interrupts(interrupts), show_notes():

@@ -134,7 +134,7 @@ def sources(record: RunRecord) -> list[tuple[str, str]]:
     if robot.is_file():
         found.append(robot)
     found = [path for path in found if path.resolve().is_relative_to(inside)]
-    texts = [(path.name, path.read_text(errors="replace")) for path in found]
+    texts = [(path.name, path.read_text(encoding="utf-8", errors="replace")) for path in found]
     if record.genes is not None:
         data = {"genes": [float(gene) for gene in record.genes]}
         genes = yaml.safe_dump(data, default_flow_style=None, width=90)
