@@ -263,9 +263,10 @@ def _remember(search: Search, genes: np.ndarray, score: float, generation: int) 
 
 
 def choose_champion(config: EvolutionConfig, fitness: Fitness, search: Search) -> Champion:
-    """Judges the elites, the last best and the last mean on fresh starts.
+    """Judges the elites, the last best, the last mean and zero genes on fresh starts.
 
-    The candidate with the best mean over `CHOOSE_EPISODES` fresh keys wins; its score is then
+    Zero genes are where every search begins, a robot that does nothing: where noise has led a
+    search astray, its champion is at least no worse than that. The candidate with the best mean over `CHOOSE_EPISODES` fresh keys wins; its score is then
     measured on `REPORT_EPISODES` others.
 
     Args:
@@ -284,6 +285,9 @@ def choose_champion(config: EvolutionConfig, fitness: Fitness, search: Search) -
     if mean is not None and np.isfinite(mean).all():
         candidates.append(mean)
         origins.append("mean of the last distribution")
+    # Last, so that of equal ones what has evolved wins.
+    candidates.append(np.zeros(fitness.num_genes))
+    origins.append("zero genes: nothing that evolved is better")
     count = len(candidates)
     size = config.population_size
     fills_up = getattr(fitness, "block", None) is not None

@@ -329,6 +329,24 @@ def test_the_champion_is_judged_on_fresh_keys():
     assert champion.measures.keys() == {"distance_m"}
 
 
+def test_doing_nothing_is_a_candidate():
+    """Where all that has evolved is worse than zero genes on fresh starts, they are champion."""
+
+    class Still(Quadratic):
+        def evaluate(self, population, key):
+            scores, measures = super().evaluate(population, key)
+            return -jnp.sum(population**2, 1), measures
+
+    config = settings(generations=3)
+    search, _ = finish(config, Quadratic())
+    champion = choose_champion(config, Still(), search)
+    assert champion.origin.startswith("zero genes")
+    assert champion.score == 0 and not champion.genes.any()
+    # Of equal ones, what has evolved wins.
+    champion = choose_champion(config, Broken(lambda rows: rows >= 0, 1.0), search)
+    assert champion.origin.startswith("best of generation")
+
+
 def test_candidates_that_fail_do_not_win():
     config = settings(generations=5)
     search, _ = finish(config, Quadratic())
