@@ -31,6 +31,7 @@ from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.inputs.brief import brief
 from mjx_revolve.inputs.commands import opening_episode
 from mjx_revolve.inputs.errors import InputError, load_yaml, show
 from mjx_revolve.inputs.shipped import find_shipped
@@ -41,7 +42,7 @@ from mjx_revolve.water.world import load_world
 _SECONDS = 10.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Episode:
     """One life of one robot, with all that is known about it.
 
@@ -68,6 +69,8 @@ class Episode:
     fitness: Fitness | None = None
     folder: Path | None = None
     starts: str = "fresh starts"
+
+    __repr__ = brief
 
 
 def load_episode(

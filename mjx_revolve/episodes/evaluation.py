@@ -40,7 +40,7 @@ from mjx_revolve.water.world import World
 _TRACE = 0.02  # between the rows of a trace [s]: enough for pictures that move
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Setup:
     """What all episodes of a configuration have in common.
 

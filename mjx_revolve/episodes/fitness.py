@@ -42,7 +42,7 @@ from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World, load_world
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fitness:
     """Scores of a population of one body: `fitness(population, key)`.
 
@@ -73,6 +73,12 @@ class Fitness:
     def task(self) -> Task:
         """What episodes are about."""
         return self.setup.task
+
+    def __repr__(self) -> str:
+        """A line: `Fitness(directed_swim in lake, Morphology('spider': ...), 57 genes)`."""
+        config = self.config
+        what = f"{config.task.name} in {Path(config.world_name).stem}"
+        return f"Fitness({what}, {self.robot.morphology!r}, {self.num_genes} genes)"
 
     @property
     def num_genes(self) -> int:
@@ -205,7 +211,7 @@ class Fitness:
         return jnp.concatenate([root, rest]), starts.water
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MixedFitness:
     """Scores of different bodies: `fitness(robots, population, key)`.
 
@@ -232,6 +238,12 @@ class MixedFitness:
         """What the bodies must fit."""
         assert self.setup.capacity is not None
         return self.setup.capacity
+
+    def __repr__(self) -> str:
+        """A line: `MixedFitness(directed_swim in lake, at most 113 genes)`."""
+        config = self.setup.config
+        what = f"{config.task.name} in {Path(config.world_name).stem}"
+        return f"MixedFitness({what}, at most {self.num_genes} genes)"
 
     @property
     def num_genes(self) -> int:

@@ -17,6 +17,7 @@ from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.episodes.starts import gusty_water
+from mjx_revolve.inputs.brief import brief
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import compiler_options, hasty_options
 from mjx_revolve.water.flow import Water, gust_path, water_of
@@ -27,7 +28,7 @@ from mjx_revolve.water.flow import Water, gust_path, water_of
     data_fields=["time", "qpos", "qvel", "xpos", "ctrl", "power", "command"],
     meta_fields=[],
 )
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectory:
     """What a robot did, one row after each step.
 
@@ -51,6 +52,8 @@ class Trajectory:
     ctrl: jax.Array
     power: jax.Array
     command: jax.Array | None = None
+
+    __repr__ = brief
 
 
 @lru_cache(maxsize=64)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mjx_revolve.inputs.brief import brief
 from mjx_revolve.inputs.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ _SECOND = 1.0
 _NEAR = 0.1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Motion:
     """What a robot did in an episode, up to the first row that is not finite; T rows.
 
@@ -91,6 +92,8 @@ class Motion:
     speed: float
     cost: float
     costs: np.ndarray
+
+    __repr__ = brief
 
 
 def analyse_motion(

@@ -1,0 +1,36 @@
+"""A dataclass in one line: of an array its shape, of all else a few words."""
+
+from __future__ import annotations
+
+import dataclasses
+import reprlib
+from typing import Any
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 80
+
+
+def brief(value: Any) -> str:
+    """What a dataclass holds, for `__repr__ = brief`: `Trajectory(time [200], qpos [200, 15])`.
+
+    Args:
+        value: the dataclass; fields that are None, or hidden by `field(repr=False)`, are left out.
+
+    Returns:
+        The line.
+    """
+    parts = []
+    for field in dataclasses.fields(value):
+        found = getattr(value, field.name, None)
+        if field.repr and found is not None:
+            shape = getattr(found, "shape", None)
+            array = isinstance(shape, tuple) and shape != ()
+            parts.append(f"{field.name} {[*shape]}" if array else _field(field.name, found))
+    return f"{type(value).__name__}({', '.join(parts)})"
+
+
+def _field(name: str, value: Any) -> str:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        text = repr(value)
+        return f"{name}={text if len(text) <= 200 else type(value).__name__ + '(...)'}"
+    return f"{name}={_SHORT.repr(value)}"
