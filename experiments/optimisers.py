@@ -10,6 +10,7 @@ to call the function, not which optimiser is best.
 from __future__ import annotations
 
 import csv
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -144,11 +145,14 @@ class Outcome:
     seconds: float
 
 
-def optimise(evaluations: int) -> tuple[list[Outcome], float]:
+def optimise(
+    evaluations: int, tell: Callable[[str], None] = lambda _: None
+) -> tuple[list[Outcome], float]:
     """Runs the three optimisers on one fitness function.
 
     Args:
         evaluations: budget of each, at least; rounded up to whole generations.
+        tell: told what goes on, a line at a time.
 
     Returns:
         What each reached, and the score of a robot that keeps still.
@@ -165,10 +169,12 @@ def optimise(evaluations: int) -> tuple[list[Outcome], float]:
     def score(population: np.ndarray, key: jax.Array = key) -> np.ndarray:
         return np.asarray(fitness(jnp.asarray(population, jnp.float32), key), np.float64)
 
-    still = score(np.zeros((size, fitness.num_genes)))  # compiles, too
+    tell("compiling the fitness, some ten seconds where it is not in the cache yet")
+    still = score(np.zeros((size, fitness.num_genes)))
     outcomes = []
     for name, use in OPTIMISERS.items():
         counter = Counter(score, np.zeros(fitness.num_genes))
+        tell(f"{name}: {size} individuals x {-(-evaluations // size)} generations")
         began = time.perf_counter()
         use(counter, fitness.num_genes, size, -(-evaluations // size))
         seconds = time.perf_counter() - began
@@ -185,15 +191,41 @@ def optimise(evaluations: int) -> tuple[list[Outcome], float]:
     ], float(still[0])
 
 
-def climb(genes: np.ndarray, duration: float = 1.0) -> tuple[float, float, float, float]:
-    """One step of gradient ascent through a short rollout.
+@dataclass(frozen=True)
+class Climb:
+    """One step of gradient ascent.
+
+    Attributes:
+        before: the score at its start.
+        after: at its end; the same where no step was better.
+        slope: length of the gradient, score per unit of the genes.
+        step: its length in genes; 0 where no step was better.
+        seconds: time to compile [s].
+    """
+
+    before: float
+    after: float
+    slope: float
+    step: float
+    seconds: float
+
+
+# The longest step, in genes, and how often it is halved: below 1e-4 the score's rounding shows.
+LONGEST, HALVINGS = 0.1, 10
+
+
+def climb(genes: np.ndarray, duration: float = 1.0) -> Climb:
+    """One step of gradient ascent through a short rollout, as long as it pays.
+
+    The gradient tells where the score rises, not how far: along it, the longest of some steps that
+    raises the score is taken (a backtracking line search).
 
     Args:
         genes: `[G]` where to start.
         duration: of the episode [s].
 
     Returns:
-        Score before, score after, length of the gradient, and time to compile [s].
+        What it came to.
     """
     import jax
     import jax.numpy as jnp
@@ -208,13 +240,29 @@ def climb(genes: np.ndarray, duration: float = 1.0) -> tuple[float, float, float
     def slope(genes: Any) -> Any:
         return jax.value_and_grad(lambda x: fitness(x[None], key)[0])(genes)
 
-    start = jnp.asarray(genes, jnp.float32)
     began = time.perf_counter()
+    start = jnp.asarray(genes, jnp.float32)
     value, gradient = jax.block_until_ready(slope(start))
     seconds = time.perf_counter() - began
-    length = float(jnp.linalg.norm(gradient))
-    after, _ = slope(start + 0.02 * gradient / max(length, 1e-12))
-    return float(value), float(after), length, seconds
+    before, length = float(value), float(jnp.linalg.norm(gradient))
+    step, after = line_search(
+        lambda step: float(slope(start + step * gradient / max(length, 1e-12))[0]), before
+    )
+    return Climb(before, after, length, step, seconds)
+
+
+def line_search(score: Callable[[float], float], before: float) -> tuple[float, float]:
+    """The longest step that raises the score, and the score there; 0 and `before` where none does.
+
+    Args:
+        score: step in genes → score.
+        before: the score without a step.
+    """
+    for step in LONGEST * 0.5 ** np.arange(HALVINGS + 1):
+        after = score(float(step))
+        if after > before:
+            return float(step), after
+    return 0.0, before
 
 
 def write_csv(path: Path, outcomes: list[Outcome]) -> None:
@@ -245,7 +293,11 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
-    outcomes, still = optimise(options.evaluations)
+
+    def tell(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    outcomes, still = optimise(options.evaluations, tell)
     rows = [
         ("optimiser", "best", "on fresh starts", "evaluations", "speed"),
         ("", "body lengths/s", "body lengths/s", "", "evaluations/s"),
@@ -262,11 +314,15 @@ def main(argv: list[str] | None = None) -> int:
     )
     if not options.no_gradient:
         best = max(outcomes, key=lambda o: o.score)
-        before, after, length, seconds = climb(best.genes)
+        tell("compiling the gradient, some minutes where it is not in the cache yet")
+        up = climb(best.genes)
+        found = f"no step along it raises the score of {up.before:.4f}"
+        if up.step:
+            scores = f"from {up.before:.4f} to {up.after:.4f}"
+            found = f"a step of {up.step:.2g} along it takes the score {scores}"
         print(
-            f"Gradient through 1 s from the best genes: {length:.3f} body lengths/s per unit gene; "
-            f"a step of 0.02 along it takes the score from {before:.4f} to {after:.4f} "
-            f"(compiled in {seconds:.0f} s)."
+            f"Gradient through 1 s from the best genes: {up.slope:.3f} body lengths/s per unit "
+            f"gene; {found} (compiled in {up.seconds:.0f} s)."
         )
     write_csv(folder / "optimisers.csv", outcomes)
     print(f"written: {short_path(folder / 'optimisers.csv')}")

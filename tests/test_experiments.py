@@ -254,12 +254,23 @@ def test_each_library_maximises(name):
     assert counter.best_score > -0.02
 
 
+def test_a_step_along_the_gradient_never_lowers_the_score():
+    """The longest that pays, of steps that are halved; none where none pays."""
+    hill = lambda step: 1.0 - (step - 0.02) ** 2  # noqa: E731
+    step, after = optimisers.line_search(hill, hill(0.0))
+    assert step == pytest.approx(0.025) and after == hill(step) > hill(0.0)
+    assert optimisers.line_search(lambda step: -step, 0.0) == (0.0, 0.0)
+    assert optimisers.line_search(lambda step: float("nan"), 0.5) == (0.0, 0.5)
+
+
 @pytest.mark.slow
 def test_the_three_optimisers_share_one_fitness(monkeypatch):
     # Half the hinges, half the time to compile.
     fish = str(ROOT / "morphologies" / "fish.yaml")
     monkeypatch.setitem(optimisers.CONFIG, "morphology", fish)
-    outcomes, still = optimisers.optimise(300)
+    told = []
+    outcomes, still = optimisers.optimise(300, told.append)
+    assert len(told) == 4 and told[0].startswith("compiling")
     assert still == pytest.approx(0.0, abs=0.02)
     assert len({outcome.evaluations for outcome in outcomes}) == 1
     assert all(outcome.score > still for outcome in outcomes)
