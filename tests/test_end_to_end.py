@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import av
+import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -70,6 +71,10 @@ def check_files(folder):
         assert (folder / name).stat().st_size > 0
     for name in ("morphology.yaml", "robot.xml"):
         assert (folder / "champion" / name).stat().st_size > 0
+    # In MuJoCo's own water, held up by what it displaces.
+    model = mujoco.MjModel.from_xml_path(str(folder / "champion" / "robot.xml"))
+    assert model.opt.density > 990 and model.opt.viscosity > 0 and model.nkey == 1
+    assert model.body_gravcomp.max() > 0
 
 
 @pytest.mark.slow

@@ -266,8 +266,8 @@ def choose_champion(config: EvolutionConfig, fitness: Fitness, search: Search) -
     """Judges the elites, the last best, the last mean and zero genes on fresh starts.
 
     Zero genes are where every search begins, a robot that does nothing: where noise has led a
-    search astray, its champion is at least no worse than that. The candidate with the best mean over `CHOOSE_EPISODES` fresh keys wins; its score is then
-    measured on `REPORT_EPISODES` others.
+    search astray, its champion is at least no worse than that. The candidate with the best mean
+    over `CHOOSE_EPISODES` fresh keys wins; its score is then measured on `REPORT_EPISODES` others.
 
     Args:
         config: strategy and seed.

@@ -32,7 +32,6 @@ def write_start(start: Start) -> None:
     robot = getattr(start.fitness, "robot", None)
     if robot is not None:
         run.write("champion/morphology.yaml", robot.morphology.save)
-        run.write("champion/robot.xml", robot.mj_spec.to_xml().encode())
 
 
 def run_to_end(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.evolution.loop import Champion
 from mjx_revolve.evolution.start import Start
+from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.view import plots
 from mjx_revolve.view.motion import counted_time
 from mjx_revolve.view.swim_picture import plot_swim
@@ -22,7 +25,7 @@ def describe_score(champion: Champion, config: Config) -> str:
 
 
 def save_pictures(start: Start, champion: Champion) -> None:
-    """Writes a run's pictures, as far as its fitness can replay the champion.
+    """Writes a run's pictures, and the champion as MJCF with water, as far as there is a robot.
 
     Args:
         start: the run, its generations done.
@@ -46,6 +49,10 @@ def save_pictures(start: Start, champion: Champion) -> None:
         height = float(getattr(getattr(robot, "world", None), "surface_height", 0.0))
         figures["trajectory.png"] = plots.plot_trajectory(trajectory, height, title)
         if robot is not None:
+            # In the first of the poses from which it was judged.
+            run.write(
+                "champion/robot.xml", make_mjcf(robot, np.asarray(trajectory.qpos[0])).encode()
+            )
             counted = counted_time(config.task, robot.world.timestep)
             figures["swim.png"] = plot_swim(robot, trajectory, counted)
     for name, figure in figures.items():

@@ -334,7 +334,7 @@ def test_doing_nothing_is_a_candidate():
 
     class Still(Quadratic):
         def evaluate(self, population, key):
-            scores, measures = super().evaluate(population, key)
+            _, measures = super().evaluate(population, key)
             return -jnp.sum(population**2, 1), measures
 
     config = settings(generations=3)
