@@ -108,8 +108,8 @@ class TaskConfig(Section):
     """What the robot is scored for, and how its episodes start."""
 
     type: Annotated[str, one_of(TASKS)]
-    """`directed_swim`, `speed`, `reach_target`, `hold_depth`, `crawl`, or FILE.py:FUNCTION, a
-    function like those in `tasks`."""
+    """`directed_swim` (along `direction`, over ground), `speed` (through the water, any way),
+    `reach_target`, `hold_depth`, `crawl`, or FILE.py:FUNCTION, a function like those in `tasks`."""
     duration: Annotated[Positive, Unit("s")] = 10.0
     """Length of an episode [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0

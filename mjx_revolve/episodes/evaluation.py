@@ -34,7 +34,7 @@ from mjx_revolve.episodes.starts import Starts, check_key, draw_starts, gusty_wa
 from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import compiler_options, derived_by, over_chunks
-from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.water.flow import Water, flow, water_of
 from mjx_revolve.water.world import World
 
 _TRACE = 0.02  # between the rows of a trace [s]: enough for pictures that move
@@ -167,7 +167,7 @@ class Setup:
         """Scores of one chunk of episodes; see `_roll`."""
         recorded, root, figure = self._roll(
             bodies, alike, population, starts, individual, trial, self.record_every,
-            partial(make_recorder, task=self.task),
+            partial(make_recorder, task=self.task, world=self.world),
         )  # fmt: skip
         return score_episodes(self.task, self.settings, self.world, recorded, root[:3], figure)
 
@@ -291,7 +291,7 @@ class Setup:
 
 
 def make_recorder(
-    engine: Engine, task: Task
+    engine: Engine, task: Task, world: World
 ) -> Callable[[Any, jax.Array, jax.Array, Water], dict[str, jax.Array]]:
     """What `rollout.roll_out` records for a task: fields of a `tasks.Track`."""
 
@@ -310,6 +310,11 @@ def make_recorder(
                 found["bed_force"] = jnp.stack(bed)
             if "forces" in task.records:
                 found["water_force"] = jnp.stack(wet)
+        if "water" in task.records:
+            velocity, _ = flow(world, water, *root.position)
+            found["water_velocity"] = jnp.stack(
+                [jnp.broadcast_to(jnp.asarray(v, energy.dtype), energy.shape) for v in velocity]
+            )
         return found
 
     return record

@@ -163,7 +163,9 @@ class Fitness:
             if command.shape[0] and hasattr(state, "command"):
                 state = state._replace(command=command)
             asked = self.engine.plant.arrange(ctrl[actuators_of(self.robot)])
-            kept = make_recorder(self.engine, self.task)(state, asked, energy[:, 0], water)
+            kept = make_recorder(self.engine, self.task, self.robot.world)(
+                state, asked, energy[:, 0], water
+            )
             recorded = {
                 name: jnp.moveaxis(x, -1, 0)[..., None]
                 for name, x in kept.items()

@@ -26,8 +26,8 @@ class Measure(NamedTuple):
 
 
 MEASURES: dict[str, Measure] = {
-    "speed_bl_s": Measure("speed", "body lengths/s"),
-    "speed_m_s": Measure("speed", "m/s"),
+    "speed_bl_s": Measure("speed over ground", "body lengths/s"),
+    "speed_m_s": Measure("speed over ground", "m/s"),
     "path_speed_m_s": Measure("speed along the path", "m/s"),
     "displacement_m": Measure("displacement", "m"),
     "path_length_m": Measure("path length", "m"),
@@ -36,6 +36,7 @@ MEASURES: dict[str, Measure] = {
     "cost_of_transport": Measure("cost of transport", "-"),
     "depth_m": Measure("depth", "m"),
     "depth_error_m": Measure("depth error", "m"),
+    "water_speed_m_s": Measure("speed through the water", "m/s", "water"),
     "gait_frequency_hz": Measure("gait frequency", "Hz", "joints"),
     "gait_phase_spread_rad": Measure("spread of gait phases", "rad", "joints"),
     "gait_phase_lag_rad": Measure("gait phase lag", "rad", "joints"),

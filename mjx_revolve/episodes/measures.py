@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.episodes.measure_table import MEASURES, records_of
-from mjx_revolve.episodes.tasks import Track
+from mjx_revolve.episodes.tasks import Track, moved_through_water
 from mjx_revolve.numerics.spatial import quat_to_rows, safe_norm
 
 # All below are choices. Fewer periods than this in the record are no gait, as for the reports.
@@ -39,7 +39,7 @@ def measure(track: Track, names: Iterable[str] = ()) -> dict[str, jax.Array]:
         `[lanes]` each, by name, units as in `MEASURES`. Always:
 
         - `displacement_m` distance between the core's first and last place; `speed_m_s` the same
-          over time, `speed_bl_s` in body lengths;
+          over time, so over ground, `speed_bl_s` in body lengths;
         - `path_length_m` length of the core's path, `path_speed_m_s` the same over time;
         - `straightness` displacement over path length;
         - `energy_j` work of the servos, summed without sign;
@@ -47,9 +47,9 @@ def measure(track: Track, names: Iterable[str] = ()) -> dict[str, jax.Array]:
         - `depth_m` mean depth of the core, `depth_error_m` root mean square distance from the
           start's depth.
 
-        By name, from joints: see `_gait`; from the core: see `_attitude`; from contacts:
-        `bed_contact` share of the rows in which the bed bears a thousandth of the robot's weight in
-        air or more, `bed_force_n` mean size of its force.
+        By name, from the water: see `_through_water`; from joints: see `_gait`; from the core: see
+        `_attitude`; from contacts: `bed_contact` share of the rows in which the bed bears a
+        thousandth of the robot's weight in air or more, `bed_force_n` mean size of its force.
     """
     moved = jnp.diff(track.position, axis=0)
     net = safe_norm(tuple(jnp.sum(moved, 0)))
@@ -76,6 +76,12 @@ def measure(track: Track, names: Iterable[str] = ()) -> dict[str, jax.Array]:
     for record in records_of(wanted):
         found |= _MAKERS[record](fixed)
     return {name: found[name] for name in MEASURES if name in wanted}
+
+
+def _through_water(track: Track) -> dict[str, jax.Array]:
+    """`water_speed_m_s`: net way through the water around the core, over time: drift is none."""
+    net = jnp.sum(moved_through_water(track), 0)
+    return {"water_speed_m_s": safe_norm(tuple(net)) / track.duration}
 
 
 def _gait(track: Track) -> dict[str, jax.Array]:
@@ -170,4 +176,6 @@ def _contacts(track: Track) -> dict[str, jax.Array]:
 
 
 # By what they need a track to hold.
-_MAKERS = {"joints": _gait, "core": _attitude, "contacts": _contacts}
+_MAKERS = {
+    "water": _through_water, "joints": _gait, "core": _attitude, "contacts": _contacts,
+}  # fmt: skip

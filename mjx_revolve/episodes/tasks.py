@@ -26,7 +26,7 @@ from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
 # What a task may have recorded beside the core's position and the energy: see `Track`.
-RECORDS = ("core", "joints", "contacts", "forces")
+RECORDS = ("core", "joints", "contacts", "forces", "water")
 
 
 @partial(
@@ -34,6 +34,7 @@ RECORDS = ("core", "joints", "contacts", "forces")
     data_fields=[
         "position", "clearance", "energy", "start_height", "length", "weight", "surface_height",
         "num_hinges", "quat", "velocity", "spin", "angle", "speed", "bed_force", "water_force",
+        "water_velocity",
     ],
     meta_fields=["interval"],
 )  # fmt: skip
@@ -62,6 +63,8 @@ class Track:
             are recorded.
         water_force: `[S, 3, lanes]` of the water on the robot, buoyancy included, the inertia of
             carried water not, world frame [N]; None unless "forces" are recorded.
+        water_velocity: `[S, 3, lanes]` of the water where the core is, as if the robot were not
+            there, world frame [m/s]; None unless "water" is recorded.
     """
 
     position: jax.Array
@@ -80,6 +83,7 @@ class Track:
     speed: jax.Array | None = None
     bed_force: jax.Array | None = None
     water_force: jax.Array | None = None
+    water_velocity: jax.Array | None = None
 
     @property
     def duration(self) -> float:
@@ -155,8 +159,15 @@ def _keeps_depth(track: Track, settings: Any) -> jax.Array:
     return _keeping(middle - track.start_height, settings.depth_tolerance)
 
 
+def moved_through_water(track: Track) -> jax.Array:
+    """`[S - 1, 3, lanes]` the core's way from row to row, less that of the water around it [m]."""
+    assert track.water_velocity is not None
+    water = (track.water_velocity[1:] + track.water_velocity[:-1]) / 2
+    return jnp.diff(track.position, axis=0) - track.interval * water
+
+
 def directed_swim(track: Track, settings: Any) -> jax.Array:
-    """Progress along a direction while the robot keeps its depth [body lengths/s]."""
+    """Progress along a direction, over ground, while the robot keeps its depth [body lengths/s]."""
     direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
     moved = jnp.diff(track.position, axis=0)
     along = sum(float(direction[i]) * moved[:, i] for i in range(3))
@@ -165,8 +176,12 @@ def directed_swim(track: Track, settings: Any) -> jax.Array:
 
 
 def speed(track: Track, settings: Any) -> jax.Array:
-    """Net horizontal speed in any direction while the robot keeps its depth [body lengths/s]."""
-    counted = jnp.diff(track.position[:, :2], axis=0) * _keeps_depth(track, settings)[:, None]
+    """Net horizontal speed through the water while the robot keeps its depth [body lengths/s].
+
+    In any direction; who drifts with a current has none.
+    """
+    moved = moved_through_water(track)[:, :2]
+    counted = moved * _keeps_depth(track, settings)[:, None]
     return safe_norm(tuple(jnp.sum(counted, 0))) / (track.duration * track.length)
 
 
@@ -200,7 +215,7 @@ def crawl(track: Track, settings: Any) -> jax.Array:
 _SPEED = "body lengths/s"
 TASKS: Mapping[str, Task] = {
     "directed_swim": Task(directed_swim, _SPEED),
-    "speed": Task(speed, _SPEED),
+    "speed": Task(speed, _SPEED, records=("water",)),
     "reach_target": Task(reach_target, "body lengths"),
     "hold_depth": Task(hold_depth, "body lengths"),
     "crawl": Task(crawl, _SPEED, start=start_on_bed, on_bed=True),
@@ -268,7 +283,7 @@ def _example_track(records: tuple[str, ...]) -> Any:
         return jax.ShapeDtypeStruct(shape, jnp.float32)
 
     of = {"core": ("quat", "velocity", "spin"), "joints": ("angle", "speed")}
-    of |= {"contacts": ("bed_force",), "forces": ("water_force",)}
+    of |= {"contacts": ("bed_force",), "forces": ("water_force",), "water": ("water_velocity",)}
     wide = {"quat": 4, "angle": _HINGES, "speed": _HINGES}
     more = {field: given(_ROWS, wide.get(field, 3), _LANES) for r in records for field in of[r]}
     return Track(

@@ -151,8 +151,8 @@ def test_wrong_populations_are_refused(fitness):
         fitness(jnp.zeros((3, 4)), 1)
 
 
-def track(x, z=None, clearance=1.0, start=0.0):
-    """One individual that moves along x in steps of 1 s."""
+def track(x, z=None, clearance=1.0, start=0.0, drift=0.0):
+    """One individual that moves along x in steps of 1 s, in water that does, too [m/s]."""
     x = np.asarray(x, np.float32)
     z = np.zeros_like(x) if z is None else np.asarray(z, np.float32)
     return Track(
@@ -164,6 +164,7 @@ def track(x, z=None, clearance=1.0, start=0.0):
         length=0.5,
         weight=2.0,
         surface_height=3.0,
+        water_velocity=jnp.full((len(x), 3, 1), 0.0).at[:, 0].set(drift),
     )
 
 
@@ -178,6 +179,8 @@ SETTINGS = SimpleNamespace(direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, targe
         ("directed_swim", track([0, 1, 2], z=[-1, -1, -1]), 0.0),  # not at its depth
         ("directed_swim", track([0, 1, 2], z=[0, 0, 2]), 1.0),  # for the first metre only
         ("speed", track([0, -1, -2]), 2.0),
+        ("speed", track([0, 1, 2], drift=1.0), 0.0),  # it drifted
+        ("speed", track([0, 0, 0], drift=0.5), 1.0),  # it held its own
         ("reach_target", track([0, 1, 3]), 6.0),  # from 4 m away to 1 m
         ("hold_depth", track([0, 1], z=[0.5, 0.5]), -1.0),
         ("crawl", track([0, 1, 2], clearance=0.05), 2.0),

@@ -62,15 +62,34 @@ def swing(frequency, lags=(0.0, 0.7, 1.4), sizes=(0.4, 0.4, 0.4), time=TIME):
 @pytest.mark.slow
 def test_every_measure_is_made_and_in_the_tables_order():
     given = still(
-        angle=swing(1.0), quat=np.tile([1.0, 0, 0, 0], (90, 1)), bed_force=np.zeros((90, 3))
+        angle=swing(1.0),
+        quat=np.tile([1.0, 0, 0, 0], (90, 1)),
+        bed_force=np.zeros((90, 3)),
+        water_velocity=np.zeros((90, 3)),
     )
     assert list(measure(given, MEASURES)) == list(MEASURES)
     assert {*measure(given)} == ALWAYS
     assert {entry.record for entry in MEASURES.values()} - {""} <= {*RECORDS}
-    assert records_of(MEASURES) == ("contacts", "core", "joints")
+    assert records_of(MEASURES) == ("contacts", "core", "joints", "water")
     for name, (_, unit, _) in MEASURES.items():  # those that name their unit name that one
         ends = {"m/s": "_m_s", "rad/s": "_rad_s", "Hz": "_hz", "J": "_j", "N": "_n", "rad": "_rad"}
         assert unit not in ends or name.endswith(ends[unit]), name
+
+
+def test_speed_through_the_water_leaves_drift_out():
+    """Over ground 0.5 m/s along x; the water goes along at 0.3, or across."""
+    path = np.outer(TIME, [0.5, 0, 0])
+    along, across = np.tile([0.3, 0, 0], (90, 1)), np.tile([0, 0.5, 0], (90, 1))
+    found = read(track(path, water_velocity=along), "water_speed_m_s")
+    assert found["water_speed_m_s"] == pytest.approx(0.2, rel=1e-4)
+    assert found["speed_m_s"] == pytest.approx(0.5, rel=1e-4)
+    found = read(track(path, water_velocity=across), "water_speed_m_s")
+    assert found["water_speed_m_s"] == pytest.approx(math.hypot(0.5, 0.5), rel=1e-4)
+    # A gust to and fro, in which it drifts.
+    gust = np.outer(np.cos(TIME), [0.2, 0, 0])
+    drift = np.outer(np.sin(TIME), [0.2, 0, 0])
+    found = read(track(drift, water_velocity=gust), "water_speed_m_s")
+    assert found["water_speed_m_s"] < 1e-3
 
 
 def test_a_measure_that_is_asked_for_comes_alone():
@@ -214,8 +233,9 @@ def test_hinges_that_a_robot_lacks_change_nothing():
 def test_measures_leave_the_scores_gradient_whole():
     """Joints in all phases or none, a core that stands upright: no NaN comes back."""
     given = still(
-        angle=np.zeros((90, 3)), quat=np.tile([1.0, 0, 0, 0], (90, 1)), bed_force=np.zeros((90, 3))
-    )
+        angle=np.zeros((90, 3)), quat=np.tile([1.0, 0, 0, 0], (90, 1)), bed_force=np.zeros((90, 3)),
+        water_velocity=np.zeros((90, 3)),
+    )  # fmt: skip
 
     def loss(angle, quat, force):
         found = measure(replace(given, angle=angle, quat=quat, bed_force=force), MEASURES)
