@@ -221,7 +221,7 @@ def _film_ancestors(
     from mjx_revolve.view.film.video import write_film
     from mjx_revolve.view.population import pick_ancestors, read_population
 
-    refuse_world(arguments.world)
+    refuse_world(arguments.world, arguments.modules)
     if folder is None:
         raise InputError(f"{arguments.path}: expected a run folder, for --ancestors; found none")
     number = arguments.individual

@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology, trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.config import Config, load_config
@@ -79,6 +80,7 @@ def load_episode(
     duration: float | None = None,
     seed: int | None = None,
     individual: int | None = None,
+    modules: str | Path | None = None,
 ) -> Episode:
     """Reads a champion, an individual or a morphology, and lets it live.
 
@@ -92,31 +94,36 @@ def load_episode(
         seed: draws another start than the first on which the champion was judged.
         individual: number of one of those who lived in the run, in place of the champion, where
             bodies have evolved.
+        modules: of a morphology: a YAML of module types of the user's own (see
+            `catalogue.load_modules`); None for a champion, whose run names its own.
 
     Returns:
         The episode.
 
     Raises:
         InputError: there is no champion or individual, a file holds something else, or it is to
-            swim in another world.
+            swim in another world or be made of other modules.
     """
     path = Path(path)
     if individual is not None:
-        refuse_world(world)
+        refuse_world(world, modules)
         return _individual(path, individual, duration, seed)
     if path.is_dir():
-        return _champion(_genes_file(path), world, duration, seed)
+        refuse_world(world, modules)
+        return _champion(_genes_file(path), duration, seed)
     path = find_shipped(path, "morphologies")
     data = load_yaml(path)
     if isinstance(data, dict) and "genes" in data:
-        return _champion(path, world, duration, seed)
+        refuse_world(world, modules)
+        return _champion(path, duration, seed)
     if not (isinstance(data, dict) and "body" in data):
         raise InputError(
             f"{path}: expected a run folder, a champion's genes.yaml or a morphology; found a file "
             "with neither genes nor body"
         )
     water = load_world("lake" if world is None else world)
-    morphology = load_morphology(path)
+    own = {} if modules is None else load_modules(modules)
+    morphology = load_morphology(path, MODULES | own)
     with suppress(InputError):  # what floats, floats
         morphology = trim_neutral(morphology, water.density)
     robot = build_robot(morphology, water)
@@ -150,6 +157,7 @@ def load_asked(arguments: argparse.Namespace) -> Episode:
             arguments.duration,
             arguments.seed,
             arguments.individual,
+            arguments.modules,
         )
 
 
@@ -166,8 +174,7 @@ def _genes_file(folder: Path) -> Path:
     raise InputError(f"{folder}: expected a run folder; found no config.yaml in it")
 
 
-def _champion(path: Path, world: str | None, duration: float | None, seed: int | None) -> Episode:
-    refuse_world(world)
+def _champion(path: Path, duration: float | None, seed: int | None) -> Episode:
     genes = load_genes(path)
     data = load_yaml(path)
     named = data.get("config", "../config.yaml")
@@ -225,8 +232,8 @@ def champion_number(folder: Path) -> int:
     return found
 
 
-def refuse_world(world: str | None) -> None:
-    """Refuses a world for those who swim in their own.
+def refuse_world(world: str | None, modules: str | Path | None = None) -> None:
+    """Refuses a world, or modules, for those who swim in their own.
 
     Raises:
         InputError: there is one.
@@ -234,6 +241,10 @@ def refuse_world(world: str | None) -> None:
     if world is not None:
         raise InputError(
             f"world: expected none: a champion swims in the world it evolved in; found {world!r}"
+        )
+    if modules is not None:
+        raise InputError(
+            f"modules: expected none: a run's configuration names its own; found {str(modules)!r}"
         )
 
 

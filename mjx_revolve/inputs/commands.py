@@ -87,7 +87,7 @@ read_seed = whole(0, _SEEDS - 1)
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds what `champion.load_episode` is to be told: path, duration, seed, individual and world.
+    """Adds what `champion.load_episode` is to be told: path, duration, seed, individual, world ...
 
     Args:
         parser: of a command that shows an episode.
@@ -104,6 +104,10 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         help="one of those who lived in the run, where bodies evolve (default: the champion)",
     )  # fmt: skip
     parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
+    parser.add_argument(
+        "--modules", type=read_path, metavar="MY.yaml",
+        help="of a morphology: module types of your own (a run's are in its folder)",
+    )  # fmt: skip
     add_trust_argument(parser)
 
 
@@ -113,8 +117,8 @@ def opening_episode(arguments: argparse.Namespace) -> contextlib.AbstractContext
     Args:
         arguments: with what `add_episode_arguments` adds.
     """
-    named = [name for name in (arguments.path, arguments.world) if name is not None]
-    return opening(*named, trust=arguments.trust)
+    named = (arguments.path, arguments.world, arguments.modules)
+    return opening(*(name for name in named if name is not None), trust=arguments.trust)
 
 
 def individual_name(number: int | None) -> str:

@@ -471,7 +471,7 @@ def command(episode, monkeypatch):
     import mjx_revolve.episodes.champion
     import mjx_revolve.view.viewer
 
-    def load(path, world="lake", duration=None, seed=None, individual=None):
+    def load(path, world="lake", duration=None, seed=None, individual=None, modules=None):
         return episode
 
     monkeypatch.setattr(mjx_revolve.episodes.champion, "load_episode", load)

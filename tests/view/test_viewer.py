@@ -14,9 +14,10 @@ import pytest
 from browser import Browser, find_browser
 from laboratory import QUICK, ROOT, WATER, body, box_robot, world
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes import champion
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.simulate import Trajectory
-from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.commands import Parser, add_episode_arguments, run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view import page_data as page_data_module
 from mjx_revolve.view.forces import module_forces, sum_modules
@@ -441,6 +442,34 @@ def test_command(tmp_path, monkeypatch, capsys, quick_compiles):
     assert run_command(main, [CORE]) == 2
     assert capsys.readouterr().err.startswith("error: box.html: expected no such file yet; name")
     assert main([CORE, "--out", "box.html"]) == 0
+
+
+FLOAT = """
+modules:
+  Float:
+    mount: -x
+    parts:
+      - {name: foam, size: [0.04, 0.04, 0.04], mass: 0.01}
+"""
+BUOY = "id: buoy\nbody: {type: Core, children: {1: {id: float, type: Float}}}\n"
+
+
+def test_robots_of_modules_of_ones_own(tmp_path, monkeypatch):
+    """Named by `--modules`, for viewer, replay and export alike; a run has its own."""
+    (tmp_path / "mine.yaml").write_text(FLOAT)
+    (tmp_path / "buoy.yaml").write_text(BUOY)
+    (tmp_path / "genes.yaml").write_text("genes: [0.1]\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(champion, "simulate", lambda robot, *_, **__: made_up(robot, 0.5))
+    parser = Parser()
+    add_episode_arguments(parser)
+    arguments = parser.parse_args(["buoy.yaml", "--modules", "mine.yaml"])
+    body = champion.load_asked(arguments).robot.morphology
+    assert [module.type for module in body.modules] == ["Core", "Float"]
+    with pytest.raises(InputError, match=r"buoy.yaml: .*Float"):
+        champion.load_episode("buoy.yaml")
+    with pytest.raises(InputError, match="modules: expected none: a run's configuration names"):
+        champion.load_episode("genes.yaml", modules="mine.yaml")
 
 
 @pytest.mark.parametrize(
