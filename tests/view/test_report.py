@@ -648,6 +648,9 @@ def test_a_page_about_one_run(copy, quick, capsys):
     for words in ("Convergence", "Champion", "Robot", "Repeat it", "FixedBrick", "config.yaml"):
         assert words in page.words
     assert "python -m mjx_revolve.evolve run/config.yaml --out run-again" in page.text
+    # One seed is one seed, and what is spread is said.
+    assert "One seed: with another, evolution ends elsewhere" in text
+    assert "mean ± standard deviation over 16 fresh starts" in text
     assert len(page.images) == 6  # fitness, swim, way, joints, phases, energy
     assert "Not everything could be read" not in page.text
     assert len(text) < 2e6
@@ -665,6 +668,7 @@ def test_a_page_about_several_runs(lab, copy, quick, capsys):
     assert "Champions side by side" in page.words
     assert any("95 % confidence" in words for words in page.words)
     assert len(page.images) == 3 + 5
+    assert not any("One seed" in words for words in page.words)
 
 
 @pytest.mark.slow

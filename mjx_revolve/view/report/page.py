@@ -101,6 +101,8 @@ def make_report(
     kinds = {problem.kind for record in records for problem in record.problems}
     is_grave = bool(lost) or bool(kinds & {"damaged", "missing"})
     lead = sections.headline(tables.headline(groups))
+    if single and first.is_finished:
+        lead += sections.one_seed()
     lead += sections.problems([record for record in records if record.problems], lost, is_grave)
     return make_page(title, ", ".join(record.label for record in records), lead, content)
 

@@ -80,13 +80,15 @@ def headline(groups: Sequence[Group]) -> list[tuple[str, str]]:
     else:
         (record,) = group.records
         if record.is_finished:
-            pairs.append((_score(record), f"score{unit}, {REPORT_EPISODES} fresh starts"))
+            starts = f"mean ± standard deviation over {REPORT_EPISODES} fresh starts"
+            pairs.append((_score(record), f"score{unit}, {starts}"))
         elif "champion" in record.metrics:
             best = format_number(float(record.metrics["champion"][-1]))
             pairs.append((best, f"best so far{unit}"))
         known = [name for name in ("speed_m_s", "cost_of_transport") if _measure(record, name)]
         pairs += [(format_number(_measure(record, name)), _label(name)) for name in known]
         pairs.append((str(record.generations), "generations"))
+        pairs.append(("1", "seed"))
     for name, words, scale in (
         ("evaluations", "evaluated individuals", 1), ("seconds", "minutes of evolution", 60)
     ):  # fmt: skip
@@ -105,7 +107,7 @@ def task_tables(groups: Sequence[Group]) -> list[dict[str, Any]]:
     Returns:
         For each task the `header` and `rows` of a table, each row's first cell being the group's
         number; `compare`: whether it has several groups; `unequal`: settings of the task in which
-        they differ.
+        they differ; `lone`: names of groups with a single seed.
     """
     return [
         _task_table([(k, group) for k, group in enumerate(groups) if group.task == task])
@@ -135,7 +137,8 @@ def _task_table(members: Sequence[tuple[int, Group]]) -> dict[str, Any]:
             row.append(format_interval(mean_interval([v for v in values if v is not None])))
         rows.append(row)
     unequal = [key for key in differences(groups) if key.startswith("task.")]
-    return {"header": header, "rows": rows, "compare": compare, "unequal": unequal}
+    lone = [group.name for group in groups if len(group.scores()) == 1]
+    return {"header": header, "rows": rows, "compare": compare, "unequal": unequal, "lone": lone}
 
 
 def different_settings(groups: Sequence[Group]) -> list[list[Any]]:
