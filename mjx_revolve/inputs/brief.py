@@ -23,9 +23,9 @@ def brief(value: Any) -> str:
     for field in dataclasses.fields(value):
         found = getattr(value, field.name, None)
         if field.repr and found is not None:
-            shape = getattr(found, "shape", None)
-            array = isinstance(shape, tuple) and shape != ()
-            parts.append(f"{field.name} {[*shape]}" if array else _field(field.name, found))
+            shape = getattr(found, "shape", ())
+            array = isinstance(shape, tuple) and len(shape) > 0
+            parts.append(f"{field.name} {list(shape)}" if array else _field(field.name, found))
     return f"{type(value).__name__}({', '.join(parts)})"
 
 

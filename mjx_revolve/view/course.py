@@ -13,8 +13,9 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.motion import count_finite
+from mjx_revolve.view.surroundings import water_velocity
 from mjx_revolve.water.bed import Bed, bed_height
-from mjx_revolve.water.flow import Water, flow
+from mjx_revolve.water.flow import Water
 
 SECTORS = 96  # points on each ring around the way on which the bed is drawn
 
@@ -119,9 +120,7 @@ def water_drift(robot: Robot, water: Water, place: np.ndarray, step: float) -> n
     Returns:
         `[S, 3]` world frame [m].
     """
-    velocity, _ = flow(replace(robot.world, waves=()), water, *place.T.astype(np.float32))
-    speed = [np.broadcast_to(np.asarray(v, float), len(place)) for v in velocity]
-    gone = np.cumsum(step * np.stack(speed, axis=-1), axis=0)
+    gone = np.cumsum(step * water_velocity(robot, water, place), axis=0)
     return np.concatenate([np.zeros((1, 3)), gone[:-1]])
 
 

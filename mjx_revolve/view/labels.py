@@ -79,6 +79,83 @@ def write(axes: Axes, spot: Sequence[float], words: str, **style: Any) -> Text:
     return axes.text(spot[0], spot[1], words, path_effects=rim, zorder=8, **(look | style))
 
 
+_CURRENT, _TARGET = "#0b7a85", "#c2185b"
+_ARROW = 62  # of a current's arrow [pixels]
+
+
+def draw_current(panel: Panel, velocity: np.ndarray, places: Places) -> None:
+    """An arrow along a current, and how fast it is, where the upper left corner is free.
+
+    Args:
+        panel: whose projection shows its direction; the length says nothing.
+        velocity: `[3]` of the water, world frame [m/s].
+        places: what is taken.
+    """
+    size = float(np.linalg.norm(velocity))
+    along = panel.view[:2] @ velocity / size  # its length is below 1 where it leads away or nearer
+    arrow = _ARROW * along / max(float(np.linalg.norm(along)), 0.5)
+    words = f"current {size:.2g} m/s"
+    label = write(places.axes, (0, 0), words, color=_CURRENT, fontweight="bold")
+    wide, high = np.ptp(places.extent(label), axis=0)
+    box = np.array([max(wide, abs(arrow[0])), high + 14 + abs(arrow[1])])
+    columns, rows = panel.size
+    for low in (np.array([x, y]) for y in range(rows - 14, 20, -8) for x in range(14, columns, 24)):
+        low = low - [0, box[1]]
+        if places.free(low, low + box, 8):
+            break
+    else:
+        label.remove()
+        return
+    places.take(low, low + box)
+    label.set_position((low[0] + box[0] / 2, low[1] + box[1] - high / 2))
+    middle = low + np.array([box[0] / 2, (box[1] - high - 6) / 2])
+    _arrow(places.axes, middle - arrow / 2, middle + arrow / 2, _CURRENT)
+
+
+def draw_target(panel: Panel, target: np.ndarray, here: np.ndarray, places: Places) -> None:
+    """A mark on the target; or, where it is out of the picture, an arrow that points there.
+
+    Args:
+        panel: what is shown.
+        target: `[3]` world frame [m].
+        here: `[3]` where the robot ends, world frame [m].
+        places: what is taken.
+    """
+    (x, y), (columns, rows) = panel.pixels(target), panel.size
+    if 0 < x < columns and 0 < y < rows:
+        for size, fill in ((16, "none"), (5, _TARGET)):
+            places.axes.plot([x], [y], "o", markersize=size, markerfacecolor=fill,
+                             markeredgecolor=_TARGET, markeredgewidth=2, zorder=6)  # fmt: skip
+        places.take(np.array([x - 14, y - 14]), np.array([x + 14, y + 14]))
+        spots = [(x + side, y + up) for up in (26, -26, 44, -44) for side in (0, 40, -40)]
+        places.put(write(places.axes, (x, y), "target", color=_TARGET, fontweight="bold"), spots)
+        return
+    away = float(np.linalg.norm(target - here))
+    start = panel.pixels(here)
+    along = np.array([x, y]) - start
+    along = along / np.linalg.norm(along)
+    words = f"target, {away:.2g} m on"
+    label = write(places.axes, (0, 0), words, color=_TARGET, fontweight="bold")
+    for reach in range(70, 500, 12):
+        middle = start + along * (reach + _ARROW / 2)
+        label.set_position((middle[0], middle[1] + 16 + 0.5 * _ARROW * abs(along[1])))
+        low, high = places.extent(label)
+        low = np.minimum(low, middle - _ARROW / 2 * np.abs(along))
+        high = np.maximum(high, middle + _ARROW / 2 * np.abs(along))
+        if places.free(low, high, 4):
+            places.take(low, high)
+            _arrow(places.axes, middle - _ARROW / 2 * along, middle + _ARROW / 2 * along, _TARGET)
+            return
+    spots = [(columns - 110, y) for y in range(rows - 20, 20, -12)]
+    places.put(label, spots)
+
+
+def _arrow(axes: Axes, start: np.ndarray, end: np.ndarray, color: str) -> None:
+    look = {"arrowstyle": "-|>", "color": color, "lw": 2.6, "mutation_scale": 18}
+    ends = {"xy": (end[0], end[1]), "xytext": (start[0], start[1])}
+    axes.annotate("", **ends, zorder=7, arrowprops=look | {"shrinkA": 0, "shrinkB": 0})
+
+
 def draw_scale_bars(panel: Panel, along: np.ndarray, length: float, places: Places) -> None:
     """Bars of a round number of metres and of one body length, parallel to the way.
 

@@ -14,6 +14,8 @@ import numpy as np
 
 from mjx_revolve.inputs.brief import brief
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.surroundings import water_velocity
+from mjx_revolve.water.flow import Water
 
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
@@ -61,7 +63,10 @@ class Motion:
         first: the row from which the following are counted.
         seconds: how long [s].
         distance: net [m].
-        speed: net [m/s]; 0 in a single row.
+        speed: net, over ground [m/s]; 0 in a single row.
+        current: `[T, 3]` velocity of the water where the core is, waves apart, world frame [m/s].
+        water_speed: net, through that water [m/s].
+        target: `[3]` where it was to go, world frame [m], or None.
         cost: of transport, energy over weight times net distance [-].
         costs: `[T]` the same so far; NaN before it counts, and while the robot is closer than a
             tenth of its way to where it began.
@@ -90,6 +95,9 @@ class Motion:
     seconds: float
     distance: float
     speed: float
+    current: np.ndarray
+    water_speed: float
+    target: np.ndarray | None
     cost: float
     costs: np.ndarray
 
@@ -101,6 +109,8 @@ def analyse_motion(
     trajectory: Trajectory,
     counted_from: float = 0.0,
     phases: np.ndarray | None = None,
+    water: Water | None = None,
+    target: np.ndarray | None = None,
 ) -> Motion:
     """Makes a motion of a trajectory.
 
@@ -109,6 +119,8 @@ def analyse_motion(
         trajectory: what it did. Rows after the first that is not finite are left out.
         counted_from: see `Motion`.
         phases: `[T, nhinge]`, see `Motion`.
+        water: surface and current, each a number or `[T]`; None: the world's.
+        target: see `Motion`.
 
     Returns:
         The motion.
@@ -136,6 +148,10 @@ def analyse_motion(
     first = max(min(int(np.searchsorted(time, counted_from - 1e-6)), count - 2), 0)
     away = np.linalg.norm(path - path[first], axis=1)
     seconds, distance = float(time[-1] - time[first]), float(away[-1])
+    if water is not None:
+        water = Water(*_rows(water, count))
+    current = water_velocity(robot, water, path)
+    drift = current[first:-1].sum(axis=0) * (seconds / max(count - 1 - first, 1))
     # A millimetre bounds the cost where the robot stays, as in `measures.measure`.
     costs = (energy - energy[first]) / (weight * np.maximum(away, 1e-3))
     far = away > _NEAR * max(float(away[first:].max()), 1e-3)
@@ -163,9 +179,25 @@ def analyse_motion(
         seconds=seconds,
         distance=distance,
         speed=distance / seconds if seconds > 0.0 else 0.0,
+        current=current,
+        water_speed=float(np.linalg.norm(path[-1] - path[first] - drift)) / seconds
+        if seconds > 0.0
+        else 0.0,
+        target=target,
         cost=float(costs[-1]),
         costs=np.where(far & (np.arange(count) > first), costs, np.nan),
     )
+
+
+def _rows(water: Water, count: int) -> list[Any]:
+    """The first rows of water, whose values are numbers or have a row each."""
+
+    def cut(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(cut, value))
+        return np.asarray(value)[:count] if np.ndim(value) else value
+
+    return [cut(value) for value in water]
 
 
 def counted_time(task: TaskConfig, timestep: float) -> float:

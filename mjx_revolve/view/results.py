@@ -13,6 +13,7 @@ from mjx_revolve.evolution.start import Start
 from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.view import plots
 from mjx_revolve.view.motion import counted_time
+from mjx_revolve.view.surroundings import target_of
 from mjx_revolve.view.swim_picture import plot_swim
 from mjx_revolve.view.thumbnails import plot_best
 
@@ -54,6 +55,8 @@ def save_pictures(start: Start, champion: Champion) -> None:
                 "champion/robot.xml", make_mjcf(robot, np.asarray(trajectory.qpos[0])).encode()
             )
             counted = counted_time(config.task, robot.world.timestep)
-            figures["swim.png"] = plot_swim(robot, trajectory, counted)
+            water = fitness.water(champion.key) if hasattr(fitness, "water") else None
+            target = target_of(config.task)
+            figures["swim.png"] = plot_swim(robot, trajectory, counted, water, target)
     for name, figure in figures.items():
         run.write(name, plots.figure_png(figure))

@@ -18,10 +18,19 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mjx_revolve.view.labels import INK, SOFT, Places, draw_scale_bars, write
+from mjx_revolve.view.labels import (
+    INK,
+    SOFT,
+    Places,
+    draw_current,
+    draw_scale_bars,
+    draw_target,
+    write,
+)
 from mjx_revolve.view.motion import Motion, analyse_motion, stroke_rows
 from mjx_revolve.view.pieces import Piece, Scene, make_pieces, mount_piece, place_pieces
 from mjx_revolve.view.raster import make_view
+from mjx_revolve.view.surroundings import moves
 from mjx_revolve.view.water_panel import (
     Panel,
     Surface,
@@ -33,6 +42,7 @@ from mjx_revolve.view.water_panel import (
     region_around,
 )
 from mjx_revolve.water.bed import bed_height, bed_slope
+from mjx_revolve.water.flow import Water
 
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
@@ -128,6 +138,9 @@ def _draw_way(
     shown = points
     if surface is not None:
         shown = np.concatenate([points, [[*path[0, :2], surface.height]]])
+    target = motion.target
+    if target is not None and _is_near(motion, target):
+        shown = np.concatenate([shown, target[None]])
     panel = fit_panel(view, shown, size, (46, 46, 34, 40))
 
     image = open_water(size)
@@ -152,11 +165,24 @@ def _draw_way(
               markersize=7, zorder=5)  # fmt: skip
     places = Places(axes, layer[..., 3] > 0.02)
     places.take_line(way)
+    if target is not None:
+        draw_target(panel, target, path[-1], places)
     _label_poses(motion, panel, scenes, places, surface is None)
+    if moves(motion.current):
+        mean = motion.current.mean(axis=0)
+        if np.linalg.norm(mean) > 0.1 * np.linalg.norm(motion.current, axis=1).mean():
+            draw_current(panel, mean, places)
     draw_scale_bars(panel, motion.along, length, places)
     if surface is not None:
         spots = [(x, y) for y in range(size[1] - 20, 20, -10) for x in range(90, size[0] - 90, 20)]
         places.put(write(axes, (0, 0), "water surface", color=SOFT), spots)
+
+
+def _is_near(motion: Motion, target: np.ndarray) -> bool:
+    """Whether a target has room in the picture: within half the way of it, or two bodies."""
+    away = float(np.linalg.norm(motion.path - target, axis=1).min())
+    way = float(np.linalg.norm(motion.path[-1] - motion.path[0]))
+    return away <= max(0.5 * way, 2 * motion.length)
 
 
 def _label_poses(
@@ -217,7 +243,11 @@ def _headline(motion: Motion) -> str:
     name = str(motion.robot.morphology.name)
     if motion.seconds <= 0.0:
         return name
-    return f"{name}: {motion.speed / motion.length:.2g} body lengths/s ({motion.speed:.2g} m/s)"
+    words = f"{name}: {motion.speed / motion.length:.2g} body lengths/s ({motion.speed:.2g} m/s)"
+    if not moves(motion.current):
+        return words
+    # What drifts covers ground without swimming.
+    return f"{words} over ground, {motion.water_speed / motion.length:.2g} through the water"
 
 
 def _facts(motion: Motion) -> str:
@@ -258,13 +288,21 @@ def draw_motion(motion: Motion) -> Figure:
     return figure
 
 
-def plot_swim(robot: Robot, trajectory: Trajectory, counted_from: float = 0.0) -> Figure:
+def plot_swim(
+    robot: Robot,
+    trajectory: Trajectory,
+    counted_from: float = 0.0,
+    water: Water | None = None,
+    target: np.ndarray | None = None,
+) -> Figure:
     """Draws the way a robot swam, see `draw_motion`.
 
     Args:
         robot: the robot.
         trajectory: what it did. Rows after the first that is not finite are left out.
         counted_from: when its task begins to count, see `motion.counted_time` [s].
+        water: surface and current, each a number or a row for each step; None: the world's.
+        target: `[3]` where it was to go, world frame [m].
 
     Returns:
         The figure.
@@ -272,4 +310,4 @@ def plot_swim(robot: Robot, trajectory: Trajectory, counted_from: float = 0.0) -
     Raises:
         InputError: the trajectory is another robot's, or has no finite row.
     """
-    return draw_motion(analyse_motion(robot, trajectory, counted_from))
+    return draw_motion(analyse_motion(robot, trajectory, counted_from, None, water, target))

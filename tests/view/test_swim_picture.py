@@ -17,6 +17,7 @@ from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.plots import figure_png
 from mjx_revolve.view.swim_picture import plot_swim, pose_scene
+from mjx_revolve.water.flow import Water
 
 PERIOD, SPEED, SECONDS = 0.8, 0.05, 6.0
 TIME = np.arange(0.02, SECONDS + 1e-9, 0.02)
@@ -144,6 +145,37 @@ def test_a_robot_that_stays_is_drawn_once(small):
     # The last pose alone, and how deep; the strip says when with a sign or two decimals.
     assert [w for w in said if w[0].isdigit() and "depth" in w] == ["6 s\ndepth 1.00 m"]
     assert "core: 0 body lengths/s (0 m/s)" in said
+
+
+def adrift(small, **changes):
+    return build_robot(small.morphology, replace(small.world, **changes))
+
+
+def test_currents_are_drawn_and_speeds_told_apart(small):
+    """Over ground at 0.05 m/s, in water that comes towards it or goes along."""
+    length = small.morphology.length
+    for current, through in ((-0.05, 0.1), (0.05, 0.0)):
+        said = words_of(adrift(small, current=(current, 0.0, 0.0)), swim(small))
+        assert "current 0.05 m/s" in said
+        (headline,) = (w for w in said if "over ground" in w)
+        assert headline.startswith("core: ") and "(0.05 m/s) over ground, " in headline
+        found = float(headline.split("over ground, ")[1].split()[0])
+        assert found == pytest.approx(through / length, rel=0.05, abs=1e-3)
+    # An episode's own water, with a row for each step, goes before the world's.
+    gust = Water(0.0, (0.0, np.linspace(0.0, 0.08, len(TIME)), 0.0))
+    assert "current 0.04 m/s" in words_of(small, swim(small), water=gust)
+    still = words_of(small, swim(small))
+    assert not any("current" in w or "over ground" in w for w in still)
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [((0.4, 0.05, -1.0), "target"), ((5.3, 0.0, -1.0), "target, 5 m on"), (None, None)],
+)
+def test_targets_are_drawn_or_pointed_at(small, target, words):
+    place = None if target is None else np.array(target)
+    said = [w for w in words_of(small, swim(small), target=place) if "target" in w]
+    assert said == ([] if words is None else [words])
 
 
 @pytest.mark.slow

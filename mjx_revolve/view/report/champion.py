@@ -18,6 +18,7 @@ from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.motion import Motion, analyse_motion, count_finite, counted_time
 from mjx_revolve.view.report.record import RunRecord, number
+from mjx_revolve.view.surroundings import target_of
 
 # A replay further than this from the recorded mean is another swim: standard deviations over the
 # fresh starts, and a share of the score itself where those hardly differ.
@@ -70,7 +71,11 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
     _compare(record, score)
     phases = cpg_phases(fitness, record.genes, count) if has_phases(fitness) else None
     begin = counted_time(fitness.config.task, fitness.robot.world.timestep)
-    return Replay(analyse_motion(fitness.robot, trajectory, begin, phases), score, measures)
+    motion = analyse_motion(
+        fitness.robot, trajectory, begin, phases, fitness.water(key),
+        target_of(fitness.config.task),
+    )  # fmt: skip
+    return Replay(motion, score, measures)
 
 
 def has_phases(fitness: Fitness) -> bool:
