@@ -151,9 +151,9 @@ def draw_target(panel: Panel, target: np.ndarray, here: np.ndarray, places: Plac
 
 
 def _arrow(axes: Axes, start: np.ndarray, end: np.ndarray, color: str) -> None:
-    look = {"arrowstyle": "-|>", "color": color, "lw": 2.6, "mutation_scale": 18}
-    ends = {"xy": (end[0], end[1]), "xytext": (start[0], start[1])}
-    axes.annotate("", **ends, zorder=7, arrowprops=look | {"shrinkA": 0, "shrinkB": 0})
+    look: dict[str, Any] = {"arrowstyle": "-|>", "color": color, "lw": 2.6, "mutation_scale": 18}
+    look |= {"shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", (end[0], end[1]), (start[0], start[1]), zorder=7, arrowprops=look)
 
 
 def draw_scale_bars(panel: Panel, along: np.ndarray, length: float, places: Places) -> None:

@@ -14,6 +14,7 @@ from mjx_revolve.view.course import bed_rings, finite_part, pose_robot, water_dr
 from mjx_revolve.view.forces import module_forces, sum_modules, water_at
 from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
 from mjx_revolve.view.pieces import make_pieces, mount_piece
+from mjx_revolve.view.surroundings import moves, target_of, water_velocity
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World
 
@@ -67,6 +68,7 @@ def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
     low = float((poses.parts[..., 2] - np.linalg.norm(robot.fluid.half_size, axis=1)).min())
     surface = _first(water.surface_height)
     net = qpos[-1, :2] - qpos[0, :2]
+    target = target_of(episode.fitness.config.task) if episode.fitness else None
     moved = float(np.linalg.norm(net)) > 0.05 * length
     return {
         "length": length,
@@ -79,6 +81,8 @@ def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
         "center": _f32(center),
         "speed": _f32(speed_over(time, qpos[:, :3], period)),
         "drift": _f32(water_drift(robot, now, center, step)),
+        "current": _current(water_velocity(robot, now, center)),
+        "target": None if target is None else target.tolist(),
         "robot": {
             "bodies": poses.position.shape[1] - 1,
             **_pieces(robot),
@@ -110,6 +114,13 @@ def _forces(episode: Episode, every: int, water: Water) -> dict[str, Any]:
         name: _arrows(color, sum_modules(robot, getattr(found, name)), length)
         for name, color in _COLORS.items()
     }
+
+
+def _current(velocity: np.ndarray) -> dict[str, Any] | None:
+    """The water's velocity around the robot, waves apart `[S, 3]` [m/s]; None where it is still."""
+    if not moves(velocity):
+        return None
+    return {"fastest": float(np.linalg.norm(velocity, axis=1).max()), "velocity": _f32(velocity)}
 
 
 def _stride(time: np.ndarray) -> int:

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -180,6 +181,22 @@ def test_dust_goes_with_the_water():
     episode = replace(episode, water=Water(0.0, (0.0, gust, 0.0)))
     drift = unpack(page_data(episode)["drift"], -1, 3)
     assert drift[-1] == pytest.approx([0, 0.02 * gust[1:97:4].sum(), 0], rel=1e-4)
+
+
+def test_current_and_target(episode, data):
+    """The water's velocity along the way, where it moves, and where the task sends the robot."""
+    assert data["current"] is None and data["target"] is None
+    moving = small_episode(world(current=(0.2, 0.0, -0.1)))
+    task = SimpleNamespace(target=(1.0, 2.0, -1.5))
+    sent = replace(moving, fitness=SimpleNamespace(config=SimpleNamespace(task=task)))
+    given = page_data(sent, forces=False)
+    velocity = unpack(given["current"]["velocity"], -1, 3)
+    assert velocity == pytest.approx(np.tile([0.2, 0, -0.1], (given["count"], 1)), rel=1e-5)
+    assert given["current"]["fastest"] == pytest.approx(math.hypot(0.2, 0.1), rel=1e-5)
+    assert given["target"] == [1.0, 2.0, -1.5]
+    text = make_page(sent, forces=False)
+    assert 'id="current"' in text and 'id="target"' in text
+    assert 'id="current"' not in make_page(small_episode(world()), forces=False)
 
 
 def test_bed():
@@ -405,10 +422,13 @@ def test_follow(browser, page):
 @pytest.mark.slow
 def test_other_worlds_draw(browser, tmp_path):
     """Waves from above, a bed and thrusters: every shader compiles, every arrow is there."""
-    sea = load_world("lake", waves=[{"amplitude": 0.05, "wavelength": 1.5}], bed=-2.3)
+    waves = [{"amplitude": 0.05, "wavelength": 1.5}]
+    sea = load_world("lake", waves=waves, bed=-2.3, current=(0.1, 0, 0))
     robot = build_robot(body("auv"), sea)
     path = tmp_path / "auv.html"
-    write_viewer(Episode("auv", robot, made_up(robot, 1.0)), path)
+    config = SimpleNamespace(task=SimpleNamespace(target=(0.5, 0.0, -1.5)))
+    fitness = SimpleNamespace(config=config)
+    write_viewer(Episode("auv", robot, made_up(robot, 1.0), fitness=fitness), path)
     browser.open(path, "#plain&paused&t=0.5&elevation=40&distance=12")
     assert changed(drawn(browser), np.zeros(3)) > 0.9 * SIZE[0] * SIZE[1]
     browser.open(path, "#plain&paused&t=0.5")

@@ -56,6 +56,9 @@ function start() {
   const trail = makeTrail(core, data);
   scene.add(background.mesh, robot.group, surface.mesh, grid, dust.points, trail.mesh);
   if (world.bed !== null) scene.add(makeBed(world.bed));
+  const current = data.current && makeCurrent(data.current, step, size);
+  if (current) scene.add(current.group);
+  if (data.target) scene.add(makeTarget(data.target, size));
   const arrows = {};
   for (const name in data.forces) {
     arrows[name] = makeArrows(data.forces[name], data.anchors, robot, step, size);
@@ -146,7 +149,10 @@ function start() {
     follow: (on) => (state.follow = on),
     trail: (on) => (trail.mesh.visible = on),
     grid: (on) => (grid.visible = on),
-    water: (on) => (surface.mesh.visible = dust.points.visible = on),
+    water: (on) => {
+      surface.mesh.visible = dust.points.visible = on;
+      if (current) current.group.visible = on;
+    },
   };
   for (const name in arrows) shown[name] = (on) => (arrows[name].group.visible = on);
 
@@ -222,11 +228,13 @@ function start() {
 
   // ------------------------------------------------------------------ instruments
 
-  const readings = Object.fromEntries(["time", "speed", "lengths", "depth", "way"].map((id) => [id, byId(id)]));
+  const readings = Object.fromEntries(["time", "speed", "lengths", "depth", "way", "current", "target"].map((id) => [id, byId(id)]));
 
   function write(id, text) {
     if (readings[id].textContent !== text) readings[id].textContent = text;
   }
+
+  const aim = new THREE.Vector3().fromArray(data.target || [0, 0, 0]);
 
   function drawInstruments() {
     core.vector(state.time, 0, here);
@@ -236,6 +244,8 @@ function start() {
     write("lengths", `${(v / size).toFixed(2)} body lengths/s`);
     const depth = world.surface - here.z;
     write("depth", `${depth.toFixed(2)} m`);
+    if (current) write("current", `${current.at(state.time).toFixed(3)} m/s`);
+    if (data.target) write("target", `${here.distanceTo(aim).toFixed(2)} m`);
     write("way", `${Math.hypot(here.x - from[0], here.y - from[1], here.z - from[2]).toFixed(2)} m`);
     scrub.value = state.time;
     byId("clock").textContent = `${(data.start + state.time).toFixed(1)} / ${(data.start + last).toFixed(1)} s`;
@@ -397,6 +407,7 @@ function start() {
     shared.uTarget.value.copy(here);
     dust.material.uniforms.uDrift.value = drift.vector(time, 0, dust.material.uniforms.uDrift.value);
     trail.material.uniforms.uNow.value = time;
+    if (current && current.group.visible) current.update(time, here);
     background.update(camera);
     surface.update(here, camera.position);
     for (const name in arrows) if (arrows[name].group.visible) arrows[name].update(time);

@@ -341,6 +341,47 @@ function makeArrows(kind, anchors, robot, step, size) {
   };
 }
 
+// --------------------------------------------------------------------- the current and the target
+
+// An arrow above the robot along the water's velocity; the fastest is 0.6 body lengths long.
+function makeCurrent(data, step, size) {
+  const holder = new THREE.Group(), scale = (0.6 * size) / data.fastest;
+  const kind = { force: data.velocity, color: [0.45, 1.0, 0.85], scale };
+  const arrow = makeArrows(kind, [{ body: 0, place: [0, 0, 0] }], { bodies: [holder] }, step, size);
+  const velocity = new Track(data.velocity, 3, step), now = new THREE.Vector3();
+  return {
+    group: arrow.group,
+    at: (time) => velocity.vector(time, 0, now).length(),
+    update(time, center) {
+      velocity.vector(time, 0, now);
+      // Its middle is above the robot.
+      holder.position.copy(center).addScaledVector(now, -0.5 * scale);
+      holder.position.z += 0.3 * size;
+      holder.updateMatrixWorld(true);
+      arrow.update(time);
+    },
+  };
+}
+
+// A diamond where the robot is to go, that shines through what hides it.
+function makeTarget(place, size) {
+  const group = new THREE.Group(), color = new THREE.Vector3(1.0, 0.25, 0.55);
+  for (const solid of [true, false]) {
+    const options = solid ? {} : { transparent: true, depthTest: false, depthWrite: false };
+    const material = makeMaterial(ARROW, { uColor: color, uAlpha: solid ? 1 : 0.35 }, options);
+    for (const up of [1, -1]) {
+      const half = new THREE.ConeGeometry(0.6, 1, 24).translate(0, 0.5, 0).rotateX((up * Math.PI) / 2);
+      const mesh = new THREE.InstancedMesh(half, material, 1);
+      const matrix = new THREE.Matrix4().makeScale(0.12 * size, 0.12 * size, 0.12 * size);
+      mesh.setMatrixAt(0, matrix.setPosition(...place));
+      mesh.frustumCulled = false;
+      mesh.renderOrder = solid ? 0 : 6;
+      group.add(mesh);
+    }
+  }
+  return group;
+}
+
 // --------------------------------------------------------------------- the robot's shadow
 
 function makeShadow(size) {
