@@ -5,15 +5,16 @@ import math
 import os
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
 
 import av
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 
-from laboratory import body
+from laboratory import WATER, body, world
 from mjx_revolve import replay
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
@@ -21,7 +22,7 @@ from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
-from mjx_revolve.view.film import opengl
+from mjx_revolve.view.film import opengl, overlay
 from mjx_revolve.view.film.camera import FOVY, plan_shots
 from mjx_revolve.view.film.draw import draw_frames
 from mjx_revolve.view.film.film import make_film
@@ -460,6 +461,32 @@ def test_long_and_noisy_gifs_get_smaller():
     assert 30_000 < len(content) < 100_000
     with Image.open(io.BytesIO(content)) as gif:
         assert gif.n_frames == 4 and gif.width * 3 == pytest.approx(gif.height * 4, abs=4)
+
+
+def test_current_and_target_are_shown():
+    """An arrow and a number in the corner; a ring on the target, or an arrow at the edge."""
+    robot = build_robot(body("core"), world(**WATER, current=(0.0, 0.1, 0.0)))
+    time = 0.02 * np.arange(1, 51)
+    qpos = np.tile(robot.start_qpos(), (50, 1))
+    still = np.zeros((50, 0))
+    rows = Trajectory(time, qpos, np.zeros((50, 6)), np.zeros((50, 2, 3)), still, 0 * time)
+
+    def signs(target):
+        config = SimpleNamespace(task=SimpleNamespace(target=target))
+        fitness = None if target is None else SimpleNamespace(config=config)
+        film = make_film(Episode("core", robot, rows, fitness=fitness), (320, 240), 10)
+        picture = Image.new("RGB", (320, 240))
+        words = overlay._make_signs(film, 1.0)(ImageDraw.Draw(picture, "RGBA"), 3)
+        pink = (np.asarray(picture, int) - overlay._AIM[:3] == 0).all(-1)
+        return [text for *_, text, _ in words], pink.sum(), words
+
+    assert signs(None)[:2] == (["current 0.10 m/s"], 0)
+    x, y, z = qpos[0, :3]
+    said, pixels, words = signs((x, y, z + 0.05))
+    assert said == ["current 0.10 m/s", "target, 0.05 m"] and pixels > 30
+    assert 100 < words[1][0] < 220 and 40 < words[1][1] < 180  # not far from the robot
+    said, pixels, words = signs((x + 5.0, y, z))
+    assert said[1] == "target, 5 m" and pixels > 30
 
 
 # --- the command --------------------------------------------------------------------------------

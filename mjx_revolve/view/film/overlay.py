@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from mjx_revolve.view.course import bed_at, water_drift
 from mjx_revolve.view.film.camera import FOVY
 from mjx_revolve.view.film.film import Film
+from mjx_revolve.view.surroundings import moves, target_of, water_velocity
 
 # Motes in a cube around the camera, and its edge in camera distances.
 _MOTES, _CUBE = 1500, 6.0
@@ -27,6 +28,8 @@ _MARK, _TRAIL = 0.25, 12.0
 _PALE, _YELLOW = (0.86, 0.97, 1.0), (1.0, 0.88, 0.45)
 _REACH = 7  # of a dot [pixels]
 _WHITE, _SHADE, _SOFT = (255, 255, 255, 245), (4, 28, 44, 150), (226, 240, 246, 235)
+
+_AIM, _FLOW = (255, 92, 150, 255), (122, 255, 220, 255)  # target, current
 
 _Dots = Callable[[np.ndarray, np.ndarray, int], None]
 
@@ -150,6 +153,8 @@ def _make_captions(film: Film) -> Callable[[np.ndarray, int], np.ndarray]:
         score = f"score {episode.score:.3g} {episode.score_unit}".rstrip()
         score += f", mean over {episode.starts}"
 
+    sign = _make_signs(film, unit)
+
     def caption(picture: np.ndarray, frame: int) -> np.ndarray:
         image = Image.fromarray(picture)
         # Draws half-transparent colours over an opaque picture.
@@ -160,6 +165,8 @@ def _make_captions(film: Film) -> Callable[[np.ndarray, int], np.ndarray]:
             draw.text((x + shift, y + shift), words, font=font, anchor=anchor, fill=_SHADE)
             draw.text((x, y), words, font=font, anchor=anchor, fill=color)
 
+        for x, y, words, color in sign(draw, frame):
+            write(x, y, words, "mm", plain, color)
         write(edge, edge, title, "la", bold, _WHITE)
         write(edge, edge + line, score, "la", plain, _SOFT)
         write(edge, base - line, f"{film.time[frame]:.1f} s", "ls", bold, _WHITE)
@@ -181,6 +188,65 @@ def _make_captions(film: Film) -> Callable[[np.ndarray, int], np.ndarray]:
         return np.asarray(image)
 
     return caption
+
+
+_Sign = tuple[float, float, str, tuple[int, int, int, int]]
+
+
+def _make_signs(film: Film, unit: float) -> Callable[[ImageDraw.ImageDraw, int], list[_Sign]]:
+    """The current as an arrow in a corner, and the target: marked, or pointed at from the edge.
+
+    Args:
+        film: whose frames they are.
+        unit: of sizes [pixels].
+
+    Returns:
+        A function of a picture's pen and the frame's number, which draws and returns words: where
+        their middle is [pixels], and their colour.
+    """
+    (width, height), shots = film.size, film.shots
+    fitness = film.episode.fitness
+    target = target_of(fitness.config.task) if fitness is not None else None
+    current = water_velocity(film.robot, film.water, film.center)
+    flows, arm, thick = moves(current), 20 * unit, max(2, round(2.5 * unit))
+
+    def arrow(draw: ImageDraw.ImageDraw, middle: np.ndarray, along: np.ndarray, color: Any) -> None:
+        along = along / max(float(np.linalg.norm(along)), 1e-9)
+        across, tip = np.array([-along[1], along[0]]), middle + arm * along
+        neck = tip - 9 * unit * along
+        draw.line([tuple(middle - arm * along), tuple(neck)], fill=color, width=thick)
+        wings = (tip, neck + 5 * unit * across, neck - 5 * unit * across)
+        draw.polygon([tuple(point) for point in wings], fill=color)
+
+    def sign(draw: ImageDraw.ImageDraw, frame: int) -> list[_Sign]:
+        words: list[_Sign] = []
+        if flows:
+            right, up = shots.axes(frame)[:2]
+            along = np.array([right @ current[frame], -(up @ current[frame])])
+            middle = np.array([width - 70 * unit, 62 * unit])
+            if np.linalg.norm(along) > 0.05 * np.linalg.norm(current[frame]):
+                arrow(draw, middle, along, _FLOW)
+            speed = f"current {np.linalg.norm(current[frame]):.2f} m/s"
+            words.append((middle[0], 24 * unit, speed, _FLOW))
+        if target is not None:
+            flat, away = shots.project(frame, target[None])
+            middle = np.array([width / 2, height / 2])
+            at = middle + height / 2 * flat[0] * (1, -1)
+            inside = away[0] > 0 and (at > 0).all() and (at < (width, height)).all()
+            left = f"{np.linalg.norm(target - film.center[frame]):.2g} m"
+            if inside:
+                for reach in (5 * unit, 10 * unit):
+                    draw.ellipse([*(at - reach), *(at + reach)], outline=_AIM, width=thick)
+                words.append((at[0], at[1] - 22 * unit, f"target, {left}", _AIM))
+            else:
+                along = (at - middle) * (1 if away[0] > 0 else -1)
+                room = middle - 80 * unit  # from the middle to where arrows stand
+                edge = middle + along / max(float(np.abs(along / room).max()), 1e-9)
+                arrow(draw, edge, along, _AIM)
+                words.append((edge[0], edge[1] - 30 * unit, f"target, {left}", _AIM))
+        return words
+
+    return sign
 
 
 def _facts(film: Film, frame: int, below: str) -> list[str]:
