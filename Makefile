@@ -41,6 +41,7 @@ format: $(READY)  ## let ruff mend what it can
 	$(RUN) -m ruff format .
 
 docs: $(READY)  ## the documentation and a reference of all functions, as HTML in build/docs
+	$(RUN) docs/settings.py
 	$(RUN) docs/reference.py build/docs
 
 bench: $(READY)  ## throughput beside MuJoCo C and plain MJX, from the same run

@@ -25,8 +25,8 @@ DOCS = ROOT / "docs"
 PACKAGE = "mjx_revolve"
 # The order in which a user meets the pages; those not named here follow.
 FIRST = (
-    "tutorial", "evolution", "viewer", "replay", "report", "sweeps", "measures", "interchange",
-    "physics", "parallel",
+    "tutorial", "settings", "evolution", "viewer", "replay", "report", "sweeps", "measures",
+    "interchange", "physics", "parallel",
 )  # fmt: skip
 # The package's rooms in reading order: each imports only from itself and from those before it.
 ROOMS = (

@@ -1,0 +1,144 @@
+"""Writes docs/settings.md: every task, controller and setting, from the code that reads them.
+
+    python docs/settings.py
+
+A test compares the page with what this would write, so that it cannot go stale.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic_core import PydanticUndefined
+
+from mjx_revolve.body.plates import LiftDrag
+from mjx_revolve.control.kinds import CONTROLLERS
+from mjx_revolve.episodes import config as settings
+from mjx_revolve.episodes.tasks import TASKS
+from mjx_revolve.evolution.strategies import STRATEGIES
+from mjx_revolve.inputs.complaints import describe, fields_of
+from mjx_revolve.water.bed import Bed
+from mjx_revolve.water.currents import Gust, Shear, Wave
+from mjx_revolve.water.world import SurfaceTension, World
+
+PAGE = Path(__file__).with_name("settings.md")
+# The parts of a world that are mappings of their own.
+_PARTS: dict[str, type] = {
+    "bed": Bed, "gust": Gust, "shear": Shear, "waves": Wave, "lift_drag": LiftDrag,
+    "surface_tension": SurfaceTension,
+}  # fmt: skip
+_HEAD = """# Tasks, controllers and all settings
+
+Written by `python docs/settings.py` from the code that reads configurations; do not edit it by
+hand. Each setting can be replaced on the command line, as in `--set task.duration=5`; what is left
+out has the value under "usual". A value that does not fit is refused with one line that says what
+was expected.
+"""
+
+
+def meanings(kind: type) -> dict[str, str]:
+    """What each field means: the docstring behind it, or its line under `Attributes`."""
+    found: dict[str, str] = {}
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(tree, ast.ClassDef)
+    for field, after in zip(tree.body, tree.body[1:], strict=False):
+        said = after.value if isinstance(after, ast.Expr) else None
+        if isinstance(field, ast.AnnAssign) and isinstance(said, ast.Constant):
+            found[ast.unparse(field.target)] = " ".join(str(said.value).split())
+    _, _, listed = (inspect.getdoc(kind) or "").partition("Attributes:\n")
+    for name, text in re.findall(r"^    (\w+): (.*(?:\n {8,}.*)*)", listed, re.MULTILINE):
+        found.setdefault(name, " ".join(text.split()))
+    return found
+
+
+def usual(field: Any) -> str:
+    """The value of a field that is left out."""
+    value = field.get_default(call_default_factory=True)
+    if value is PydanticUndefined:
+        return "must be given"
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"`[{', '.join(f'{x:.7g}' if isinstance(x, float) else str(x) for x in value)}]`"
+    if isinstance(value, int | float | str | dict):
+        return f"`{value:.7g}`" if isinstance(value, float) else f"`{value}`"
+    return "as below"
+
+
+def table(kind: type, prefix: str = "") -> Iterator[str]:
+    """A class's settings, those of other sections apart."""
+    meant = meanings(kind)
+    yield "| setting | takes | usual | |"
+    yield "|---|---|---|---|"
+    for name, field in fields_of(kind).items():
+        if "Config" in str(field.annotation):
+            continue
+        takes = describe(Annotated[(field.annotation, field)])
+        cells = (f"`{prefix}{name}`", takes, usual(field), meant.get(name, ""))
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+    yield ""
+
+
+def sections(kind: Any, prefix: str = "") -> Iterator[tuple[str, type]]:
+    """The sections of a section, in order."""
+    for name, field in fields_of(kind).items():
+        options = [field.annotation, *getattr(field.annotation, "__args__", ())]
+        for option in options:
+            if inspect.isclass(option) and option.__name__.endswith("Config"):
+                yield prefix + name, option
+                yield from sections(option, f"{prefix}{name}.")
+
+
+def first_paragraph(function: Any) -> str:
+    """Of a docstring, on one line."""
+    return " ".join((inspect.getdoc(function) or "").partition("\n\n")[0].split())
+
+
+def make_page() -> str:
+    """The page."""
+    lines = [_HEAD, "## Tasks", "", "`task.type`; `docs/tutorial.md` writes one of your own.", ""]
+    lines += ["| task | score | unit | cannot do without |", "|---|---|---|---|"]
+    for name, task in TASKS.items():
+        needs = ", ".join(f"`{x}`" for x in settings.TASKS[name])
+        needs += "a world with a bed" if task.on_bed else ""
+        said = re.sub(r" \[[^\]]+\].$", "", first_paragraph(task.score))
+        lines.append(f"| `{name}` | {said} | {task.unit} | {needs} |")
+    lines += ["", "## Controllers", "", "`controller.type`; likewise.", ""]
+    lines += ["| controller | | settings that only it has |", "|---|---|---|"]
+    for name in CONTROLLERS:
+        only = ", ".join(f"`{x}`" for x in settings.CONTROLLERS[name])
+        lines.append(f"| `{name}` | {first_paragraph(_maker(name))} | {only} |")
+    lines += ["", "## A configuration", "", "`docs/evolution.md` tells more of `bodies`.", ""]
+    lines += table(settings.Config)
+    for name, kind in sections(settings.Config):
+        lines += [f"### `{name}`: {first_paragraph(kind)}", ""]
+        lines += table(kind, f"{name}.")
+    strategies = ", ".join(f"`{name}`" for name in STRATEGIES)
+    where = "`evolution.strategy` and `bodies.learning.strategy`"
+    lines += ["### Strategies", "", f"{where}, by evosax's names: {strategies}."]
+    lines += ["", "## A world", "", "`docs/physics.md` has the laws.", ""]
+    lines += table(World)
+    for name, kind in _PARTS.items():
+        lines += [f"### `{name}`: {first_paragraph(kind)}", ""]
+        lines += table(kind, f"{name}.")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _maker(name: str) -> Any:
+    """The function whose docstring tells of a controller."""
+    module = __import__(f"mjx_revolve.control.{name}", fromlist=["_"])
+    return getattr(module, f"make_{name}")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(make_page(), encoding="utf-8")
+    sys.exit(0)
