@@ -5,6 +5,7 @@ Imports stand inside functions: a worker's threads are set before NumPy and JAX 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pkgutil
@@ -124,15 +125,23 @@ def _map_texts(value: Any, change: Callable[[str], str]) -> Any:
     return change(value) if isinstance(value, str) else value
 
 
-def open_job(job: Job) -> Any:
+def open_job(job: Job, scratch: Path | None = None) -> Any:
     """The fitness of a job.
+
+    Args:
+        job: the job.
+        scratch: an empty folder for copies of its files; None: one that is gone afterwards.
+
+    Returns:
+        The fitness.
 
     Raises:
         InputError: a file that its configuration names is missing or wrong here.
     """
     from mjx_revolve.episodes.config import make_config
 
-    with tempfile.TemporaryDirectory(prefix="mjx_revolve_") as folder:
+    with contextlib.ExitStack() as made:
+        folder = scratch or made.enter_context(tempfile.TemporaryDirectory(prefix="mjx_revolve_"))
         copies = {}
         for number, (path, content) in enumerate(job.files):
             copy = Path(folder) / str(number) / Path(path).name
