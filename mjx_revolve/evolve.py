@@ -154,8 +154,7 @@ def _evolve(start: Start, interrupts: Interrupts) -> int:
         return 0
     print(plain(_describe(start)), flush=True)
     if start.resumed:
-        words = f"after generation {done}" if done else "from the start: it has no checkpoint yet"
-        print(f"resuming {words}", flush=True)
+        print(f"resuming {start.resumption}", flush=True)
     interrupts.be_patient("finishing what is under way")
     search, champion = session.run_to_end(
         start, interrupts, lambda champion: save_pictures(start, champion)

@@ -184,6 +184,19 @@ def test_a_killed_process_with_workers_goes_on(folder, no_pictures):
         assert contents(folder / "out" / name) == contents(folder / "whole" / name)
 
 
+def test_a_run_without_a_checkpoint_is_begun_again(folder, no_pictures):
+    class Dropped(toys.Toy):
+        def evaluate(self, population, key):
+            raise FloatingPointError
+
+    options = ("toy.yaml", "--seeds", "1", "--out", "out")
+    with pytest.raises(FloatingPointError):
+        run_sweep(*options, make_fitness=lambda config: Dropped())
+    assert run_sweep(*options) == 0
+    log = (folder / "out" / "toy" / "seed_0.log").read_text()
+    assert "resuming toy/seed_0 from the start: it has no checkpoint yet\n" in log
+
+
 def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
     class Pressed(toys.Toy):
         def evaluate(self, population, key):

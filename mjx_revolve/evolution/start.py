@@ -22,7 +22,7 @@ from mjx_revolve.evolution.pool import Pool
 from mjx_revolve.evolution.runs import Checkpoint, Run, check_new_folder, create_run, open_run
 from mjx_revolve.evolution.tensorboard import check_tensorboard
 from mjx_revolve.inputs.commands import check_place
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import with_path
 from mjx_revolve.inputs.own_code import announce, content_name
 from mjx_revolve.inputs.shipped import find_shipped
@@ -58,6 +58,12 @@ class Start:
     search: Any = None
     checkpoint: Checkpoint | None = None
     resumed: bool = False
+
+    @property
+    def resumption(self) -> str:
+        """Where a run that was begun before goes on, in words."""
+        done = self.search.generation if self.search else 0
+        return f"after generation {done}" if done else "from the start: it has no checkpoint yet"
 
     @property
     def is_finished(self) -> bool:
@@ -191,12 +197,13 @@ def continue_run(
     method = make_method(config, fitness)
     if checkpoint is None:
         return Start(run, config, fitness, method, resumed=True)
-    if found := _differences(checkpoint.meta["host"], describe_host()):
+    if found := _differences(checkpoint.meta.get("host"), describe_host()):
         _log.warning(
             "the run continues, but not bit for bit, because this process differs: %s",
             "; ".join(found),
         )
-    search = method.from_arrays(checkpoint.arrays)
+    with reading(checkpoint.path):
+        search = method.from_arrays(checkpoint.arrays)
     return Start(run, config, fitness, method, search, checkpoint, resumed=True)
 
 

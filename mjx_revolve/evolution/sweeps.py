@@ -271,8 +271,7 @@ def _run(
         if step == "continue":
             with opening(folder, trust=False):
                 start = continue_run(str(folder), None, _changes(plan), pools)
-            done = 0 if start.search is None else start.search.generation
-            print(f"resuming {plan.name} after generation {done}", file=out, flush=True)
+            print(f"resuming {plan.name} {start.resumption}", file=out, flush=True)
         else:
             with _asking(plan):
                 place = str(folder)
