@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import resolve_inside
 from mjx_revolve.inputs.schema import Positive, read
+from mjx_revolve.inputs.witness import tell
 
 # A mesh is a `trimesh.Trimesh` or a pair (vertices [n, 3], faces [m, 3]).
 Mesh = trimesh.Trimesh | tuple[ArrayLike, ArrayLike]
@@ -275,6 +276,7 @@ def load_mesh(
         if file.stat().st_size > _MAX_BYTES:
             raise InputError(f"expected at most {_MAX_BYTES // 2**20} MiB; found more")
         data = file.read_bytes()
+    tell(file, "data", data)
     mesh = _parse(data, suffix[1:], str(path))
     vertices, faces = np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces)
     if np.isfinite(vertices).all() and ((faces >= 0) & (faces < len(vertices))).all():

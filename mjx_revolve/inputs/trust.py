@@ -88,9 +88,10 @@ def is_run_config(path: Path) -> bool:
 def _root_of(place: Path) -> Path:
     """The run folder that a path belongs to, without links."""
     base = place if place.is_dir() else place.parent
-    if not (base / "config.yaml").is_file() and (base.parent / "config.yaml").is_file():
-        base = base.parent
-    return base.resolve()
+    base = base.resolve()
+    # Any other folder's parent may hold a configuration that has nothing to do with it.
+    inner = base.name in ("champion", "lost") and not (base / "config.yaml").is_file()
+    return base.parent if inner and (base.parent / "config.yaml").is_file() else base
 
 
 def _digest(kind: Kind, content: bytes) -> str:

@@ -15,6 +15,7 @@ from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, Box
 from mjx_revolve.body.meshes import check_mesh, load_mesh, mesh_center_of_volume, mesh_volume
 from mjx_revolve.body.solids import part_mesh
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.witness import heard_by
 
 TETRAHEDRON = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
 TETRAHEDRON_FACES = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
@@ -41,6 +42,15 @@ def inverted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 # --- volume and centre --------------------------------------------------------------------------
+
+
+def test_whoever_is_asked_hears_of_a_file(tmp_path):
+    """As `--trust` does, of files elsewhere."""
+    trimesh.creation.box().export(tmp_path / "box.stl")
+    heard = []
+    with heard_by(lambda path, kind, content: heard.append((path.name, kind, len(content)))):
+        load_mesh(tmp_path / "box.stl")
+    assert heard == [("box.stl", "data", 684)]
 
 
 def test_volume_of_a_unit_tetrahedron_is_a_sixth():

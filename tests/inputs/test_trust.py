@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -93,6 +94,32 @@ def test_what_one_has_evolved_oneself_is_known(folder):
     (folder / "copy.py").write_text("rise = print\n")
     with trust.opening("moved", trust=False):
         own_code.load_own(f"{folder / 'copy.py'}:rise", "task.type")
+
+
+@pytest.mark.parametrize("argv", [["--resume", "run"], ["run/config.yaml", "--out", "out"]])
+def test_a_command_runs_what_is_trusted_and_remembers(folder, argv, capsys):
+    shutil.rmtree("run")
+
+    def make(config):
+        own_code.load_own(config.task.type, "task.type")
+        return toys.Toy()
+
+    def run(*argv):
+        return run_command(lambda argv: evolve.main(argv, make), [*argv, "--workers", "1"])
+
+    assert run("swim.yaml", "--out", "run") == 0
+    shutil.rmtree(folder / "state")  # it has become somebody else's
+    code = folder / "run" / "inputs" / "own.py"
+    sys.modules.pop(own_code.load_own(f"{code}:rise", "task.type").__module__)
+    (folder / "was run").unlink()
+    assert run(*argv) == 2
+    assert "own.py: expected a Python file that you have used" in capsys.readouterr().err
+    assert not (folder / "was run").exists()
+    assert run(*argv, "--trust") == 0
+    assert (folder / "was run").exists()
+    if "--out" in argv:
+        shutil.rmtree("out")
+    assert run(*argv) == 0
 
 
 def test_what_was_read_is_not_thereby_allowed_to_run(folder):
