@@ -27,7 +27,7 @@ from mjx_revolve.episodes.fitness import (
     make_mixed_fitness,
     read_modules,
 )
-from mjx_revolve.episodes.lives import LARGEST, Life, find_lives
+from mjx_revolve.episodes.lives import Life, find_lives
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import gusty_water
@@ -35,6 +35,7 @@ from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.brief import brief
 from mjx_revolve.inputs.commands import opening_episode
 from mjx_revolve.inputs.errors import InputError, load_yaml, show
+from mjx_revolve.inputs.schema import LARGEST
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.water.flow import Water, gust_path
 from mjx_revolve.water.world import load_world
@@ -273,7 +274,8 @@ def read_individuals(
         InputError: the run evolves no bodies, or one of them never lived.
     """
     folder = Path(path)
-    folder = folder if (folder / "config.yaml").is_file() else folder.parent
+    if folder.name == "champion" and not (folder / "config.yaml").is_file():
+        folder = folder.parent
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{path}: expected a run folder; found no config.yaml in it")
     overrides = {} if duration is None else {"task.duration": float(duration)}
@@ -385,9 +387,9 @@ def load_genes(path: str | Path) -> np.ndarray:
     if not isinstance(genes, list):
         raise InputError(f"{path}: genes: expected a list of numbers; found {show(genes)}")
     for index, gene in enumerate(genes):
-        huge = isinstance(gene, int) and abs(gene) > LARGEST  # infinite ones have their own words
-        if isinstance(gene, bool) or not isinstance(gene, float | int) or huge:
+        number = isinstance(gene, float | int) and not isinstance(gene, bool)
+        if not number or not abs(gene) <= LARGEST:
             raise InputError(
-                f"{path}: genes: expected a list of numbers; found {show(gene)} at {index}"
+                f"{path}: genes: expected a list of finite numbers; found {show(gene)} at {index}"
             )
     return np.asarray(genes, np.float32)

@@ -18,9 +18,8 @@ import numpy as np
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, make_morphology
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.schema import LARGEST
 
-LARGEST = float(np.finfo(np.float32).max)
-"""The largest number of float32, as genes are kept."""
 INDIVIDUALS, GENERATIONS = "individuals.jsonl", "generations.jsonl"
 
 

@@ -9,6 +9,7 @@ algorithm", IEEE Trans. Evolutionary Computation 22(4), 2018.
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -211,9 +212,27 @@ def to_arrays(archive: Archive) -> dict[str, np.ndarray]:
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray]) -> Archive:
-    """The inverse of `to_arrays`."""
-    found: dict[str, Any] = {field.name: arrays[field.name] for field in fields(Archive)}
+    """The inverse of `to_arrays`.
+
+    Raises:
+        InputError: the arrays are no archive's.
+    """
+    found: dict[str, Any] = {
+        field.name: np.asarray(arrays.get(field.name)) for field in fields(Archive)
+    }
+    count, axes = len(np.atleast_1d(found["ids"])), np.size(found["names"])
+    both = {"centers": (count, axes), "points": (count, axes)}
+    ends = dict.fromkeys(("names", "lows", "highs"), (axes,))
+    shapes = both | ends | {"ids": (count,), "scores": (count,)}
+    shapes["shape"] = (axes,) if found["shape"].size else (0,)
+    kinds = dict.fromkeys(shapes, "f") | {"names": "U", "ids": "i", "shape": "i"}
+    for name, array in found.items():
+        if array.shape != shapes[name] or array.dtype.kind != kinds[name]:
+            what = f"{array.dtype} {list(array.shape)}" if name in arrays else "nothing"
+            raise InputError(f"archive.{name}: expected that of an archive; found {what}")
     names, shape = (tuple(found[name].tolist()) for name in ("names", "shape"))
+    if shape and (min(shape) < 1 or math.prod(shape) != count):
+        raise InputError(f"archive.shape: expected one of {count} cells; found {list(shape)}")
     return Archive(**found | {"names": names, "shape": shape})
 
 

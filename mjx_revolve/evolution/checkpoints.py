@@ -72,6 +72,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
         DamageError: it is damaged, or no checkpoint.
     """
     try:
+        if not path.is_file():  # a pipe would have us wait for ever
+            raise DamageError("expected a file; found none")
         with zipfile.ZipFile(path) as file:
             broken = file.testzip()  # every checksum; np.load looks only at what it happens to read
         if broken:
@@ -87,6 +89,6 @@ def read_checkpoint(path: Path) -> Checkpoint:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError,
             NotImplementedError, MemoryError, SyntaxError) as error:  # fmt: skip
         raise DamageError((str(error) or type(error).__name__).splitlines()[0]) from None
-    if not isinstance(meta, dict) or not isinstance(meta.get("metrics_position"), int):
+    if not isinstance(meta, dict) or "metrics_position" not in meta:
         raise DamageError("meta is no mapping")
     return Checkpoint(path, arrays, meta)

@@ -445,7 +445,7 @@ def search_from_arrays(
     try:
         if int(arrays["seed"]) != config.evolution.seed:
             raise InputError(
-                f"checkpoint: seed: expected evolution.seed {config.evolution.seed}; found "
+                f"seed: expected evolution.seed {config.evolution.seed}; found "
                 f"{int(arrays['seed'])}"
             )
         modules = read_modules(config)
@@ -464,5 +464,8 @@ def search_from_arrays(
             past=arrays["past"],
             **fields,
         )
-    except (KeyError, ValueError, TypeError) as error:
-        raise InputError(f"checkpoint: expected a search over bodies; found: {error}") from None
+    except InputError:
+        raise
+    except (KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"expected a search over bodies; found {reason}") from None

@@ -381,12 +381,12 @@ def search_from_arrays(
         if found is None or found.shape != value.shape or found.dtype != value.dtype:
             what = "nothing" if found is None else f"{found.dtype} {list(found.shape)}"
             raise InputError(
-                f"checkpoint: {name}: expected {value.dtype} {list(value.shape)}, as "
+                f"{name}: expected {value.dtype} {list(value.shape)}, as "
                 f"{config.strategy} of this version has it; found {what}"
             )
     if not np.array_equal(arrays["root_key"], root_key):
         raise InputError(
-            f"checkpoint: root_key: expected the key of evolution.seed {config.seed}; found another"
+            f"root_key: expected the key of evolution.seed {config.seed}; found another"
         )
     paths, structure = jax.tree_util.tree_flatten_with_path(template.state)
     leaves = [arrays["state" + jax.tree_util.keystr(path)] for path, _ in paths]

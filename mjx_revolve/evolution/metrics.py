@@ -53,10 +53,10 @@ def load_metrics(path: str | Path) -> dict[str, np.ndarray]:
     Raises:
         InputError: there is no such file, or it holds something else.
     """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: expected a file; found none")
     try:
         text = Path(path).read_bytes().decode()
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file; found none") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected a CSV file; found: {error}") from None
     rows = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))

@@ -39,8 +39,8 @@ from mjx_revolve.evolution.checkpoints import (
     write_checkpoint,
 )
 from mjx_revolve.evolution.metrics import append_metrics, load_metrics
-from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.files import with_path, write_atomic
+from mjx_revolve.inputs.errors import InputError, reading, show
+from mjx_revolve.inputs.files import resolve_inside, with_path, write_atomic
 from mjx_revolve.inputs.own_code import parse_own
 
 try:
@@ -178,12 +178,13 @@ class Run:
         for path in self.checkpoints():
             try:
                 checkpoint = read_checkpoint(path)
+                _check_meta(checkpoint.meta)
                 have = self.metrics_path.stat().st_size if self.metrics_path.exists() else 0
                 if have < checkpoint.meta["metrics_position"]:
                     raise DamageError(f"metrics.csv lacks lines: {have} bytes long")
                 for name, position in checkpoint.meta.get("positions", {}).items():
-                    path = self.folder / name
-                    have = path.stat().st_size if path.exists() else 0
+                    log = self.folder / name
+                    have = log.stat().st_size if log.exists() else 0
                     if have < position:
                         raise DamageError(f"{name} lacks lines: {have} bytes long")
             except DamageError as error:
@@ -240,6 +241,22 @@ class Run:
             self._lock = None
 
 
+def _check_meta(meta: Mapping[str, Any]) -> None:
+    """Refuses plain values by which a run could not go on, or would cut files not its own.
+
+    Raises:
+        DamageError: they are others.
+    """
+    logs = meta.get("positions", {})
+    if not isinstance(logs, dict) or not logs.keys() <= set(LOGS):
+        raise DamageError(f"meta: positions: expected those of {', '.join(LOGS)}; found others")
+    numbers = {"generation": meta.get("generation"), **meta, **logs}
+    for name in ("generation", "metrics_position", *logs):
+        value = numbers[name]
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise DamageError(f"meta: {name}: expected a whole number; found {show(value)}")
+
+
 def load_archive(folder: str | Path) -> tuple[Archive, list[Life]]:
     """The archive of a run in which bodies evolved, as its newest checkpoint has it.
 
@@ -257,7 +274,8 @@ def load_archive(folder: str | Path) -> tuple[Archive, list[Life]]:
     own = {k.removeprefix("archive."): v for k, v in arrays.items() if k.startswith("archive.")}
     if not own:
         raise InputError(f"{folder}: expected a run with bodies.archive; found none in it")
-    found = from_arrays(own)
+    with reading(folder):
+        found = from_arrays(own)
     return found, find_lives(run.folder, [int(number) for number in found.ids[filled(found)]])
 
 
@@ -377,7 +395,23 @@ def open_run(folder: str | Path) -> Run:
     for name in ("config.yaml", "run.json"):
         if not (folder / name).is_file():
             raise InputError(f"{folder}: expected a run folder; found no {name} in it")
+    for path in folder.iterdir():
+        _check_writable(path, folder)
     return _lock_run(folder)
+
+
+def _check_writable(path: Path, folder: Path) -> None:
+    """Refuses what would have a run write, cut or delete files that are not its own, or hang."""
+    with reading(folder):
+        real = resolve_inside(path.name, folder)
+    if path.name in ("checkpoints", "champion", "inputs"):
+        what, fits = "a folder", real.is_dir()
+    elif path.name in (".lock", "metrics.csv", *LOGS):
+        what, fits = "a file", real.is_file()
+    else:
+        what, fits = "a file or a folder", real.is_file() or real.is_dir()
+    if not fits:
+        raise InputError(f"{path}: expected {what}; found something else")
 
 
 def _lock_run(folder: Path) -> Run:

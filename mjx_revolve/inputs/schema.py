@@ -42,6 +42,9 @@ from mjx_revolve.inputs.errors import show
 
 T = TypeVar("T")
 
+LARGEST = (2.0 - 2.0**-23) * 2.0**127
+"""The largest number of float32."""
+
 words = doc
 """What messages say of a type instead of its name, as metadata of `Annotated`."""
 
@@ -70,8 +73,17 @@ def _unit_vector(vector: tuple[float, float, float]) -> tuple[float, float, floa
     return (x, y, z)
 
 
-Number = Annotated[float, AllowInfNan(False), Strict(), BeforeValidator(_plain)]
-"""A finite number: neither truth value nor text."""
+def _within(number: float) -> float:
+    """The number, if single precision holds it, in which all is computed."""
+    if abs(number) > LARGEST:
+        raise MisfitError("", f"a number between -{LARGEST:.3g} and {LARGEST:.3g}", show(number))
+    return number
+
+
+Number = Annotated[
+    float, AllowInfNan(False), Strict(), BeforeValidator(_plain), AfterValidator(_within)
+]
+"""A finite number of single precision: neither truth value nor text."""
 NonNegative = Annotated[Number, Ge(0)]
 Positive = Annotated[Number, Gt(0)]
 Share = Annotated[Number, Ge(0), Le(1), Unit("-")]

@@ -217,7 +217,7 @@ def test_arrays_of_another_search_are_refused():
     arrays = search_to_arrays(config, search)
     for other, genes, message in (
         (settings(strategy="SNES"), 5, "expected float32"),
-        (settings(), 6, "checkpoint: elites: expected float32 [4, 6], as CMA_ES of this version"),
+        (settings(), 6, "elites: expected float32 [4, 6], as CMA_ES of this version"),
         (settings(seed=9), 5, "expected the key of evolution.seed 9; found another"),
     ):
         with pytest.raises(InputError, match=re.escape(message)):

@@ -5,6 +5,7 @@ import errno
 import io
 import json
 import os
+import shutil
 import time
 import zlib
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_revolve.episodes.champion import load_genes
-from mjx_revolve.episodes.config import make_config
+from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.evolution import runs
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
@@ -258,6 +259,53 @@ def test_a_checkpoint_ahead_of_its_metrics_is_passed_over(run):
     assert "metrics.csv lacks lines" in checkpoint.damaged[0]
 
 
+def test_a_checkpoint_ahead_of_its_logs_is_passed_over(run):
+    run.append_lines(runs.LOGS[0], ["{}"])
+    save(run, 1)
+    os.truncate(run.folder / runs.LOGS[0], 1)
+    with pytest.raises(InputError) as caught:
+        run.load_checkpoint()
+    assert "only damaged ones: generation_000001.npz (individuals.jsonl lacks lines: 1 by" in str(
+        caught.value
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("positions", {"../../thesis.tex": 0}), ("positions", {"/etc/passwd": 0}), ("positions", [1]),
+     ("positions", {runs.LOGS[0]: "0"}), ("generation", -1), ("metrics_position", True)],
+)  # fmt: skip
+def test_a_checkpoint_cuts_no_other_files(run, key, value):
+    path = save(run, 1)
+    with np.load(path) as file:
+        arrays = dict(file)
+    meta = json.loads(arrays["meta"].tobytes()) | {key: value}
+    np.savez(path, **arrays | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
+    with pytest.raises(InputError, match=r"only damaged ones: generation_000001.npz \(meta: "):
+        run.load_checkpoint()
+
+
+def test_a_pipe_among_the_checkpoints_keeps_nobody_waiting(run):
+    save(run, 1)
+    os.mkfifo(run.folder / "checkpoints" / "generation_000002.npz")
+    assert run.load_checkpoint().meta["generation"] == 1
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "individuals.jsonl", ".lock", "checkpoints"])
+@pytest.mark.parametrize("what", ["link", "pipe"])
+def test_a_run_writes_no_files_elsewhere_and_waits_for_none(run, tmp_path, name, what):
+    run.save_config(load_config("smoke"))
+    run.close()
+    path = run.folder / name
+    if path.exists():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    (tmp_path / "mine").mkdir()
+    path.symlink_to(tmp_path / "mine") if what == "link" else os.mkfifo(path)
+    found = "a link that leads out" if what == "link" else "something else"
+    with pytest.raises(InputError, match=rf"{name}: expected a .+; found {found}$"):
+        runs.open_run(run.folder)
+
+
 # --- champion ---
 
 
@@ -267,13 +315,13 @@ def test_champion_genes_come_back_bit_for_bit(run):
     for place in (run.folder, run.folder / "champion", run.folder / "champion" / "genes.yaml"):
         assert load_genes(place).tobytes() == genes.tobytes()
     (run.folder / "champion" / "genes.yaml").write_text("genes: [1, a]")
-    with pytest.raises(InputError, match=r"genes.yaml: genes: expected a list of numbers; found"):
+    with pytest.raises(InputError, match=r"genes.yaml: genes: expected a list of finite numbers"):
         load_genes(run.folder)
     with pytest.raises(InputError, match=r"genes.yaml: expected a file; found none"):
         load_genes(run.folder / "inputs")
-    for huge in ("1" + 400 * "0", "0x1" + 5000 * "0", "true"):
+    for huge in ("1" + 400 * "0", ".nan", "-.inf", "1e39", "true"):
         (run.folder / "champion" / "genes.yaml").write_text(f"genes: [0.5, {huge}]")
-        with pytest.raises(InputError, match=r"expected a list of numbers; found .{1,80} at 1$"):
+        with pytest.raises(InputError, match=r"list of finite numbers; found .{1,60} at 1$"):
             load_genes(run.folder)
 
 

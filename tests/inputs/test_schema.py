@@ -102,7 +102,8 @@ NAMES = "name, axis, place, leaves, by_number, first, age, mass, shade, green"
     [
         ({"name": 3}, "name: expected a name; found 3"),
         ({"axis": (0, 0, 0)}, "axis: expected a direction, not zero; found [0.0, 0.0, 0.0]"),
-        ({"axis": (1e300, 1e300, 0)}, "axis: expected a direction, not zero; found [1e+300, 1e"),
+        ({"axis": (1e-300, 0, 0)}, "axis: expected a direction, not zero; found [1e-300, 0.0"),
+        ({"mass": 1e39}, "mass: expected a number between -3.4e+38 and 3.4e+38; found 1e+39"),
         ({"place": (1, 2)}, "place: expected three numbers [m]; found (1, 2)"),
         ({"place": [1, 2, 3, 4]}, "place: expected three numbers [m]; found [1, 2, 3, 4]"),
         ({"place": "xyz"}, "place: expected three numbers [m]; found 'xyz'"),

@@ -255,8 +255,8 @@ def _read_champion(record: RunRecord) -> None:
     else:
         with record.noting_damage():
             genes = load_genes(path)
-            if not genes.size or not np.isfinite(genes).all():
-                raise InputError(f"{path}: genes: expected finite numbers; found others")
+            if not genes.size:
+                raise InputError(f"{path}: genes: expected finite numbers; found none")
             record.genes = genes
             record.champion = {k: fact for k, fact in load_yaml(path).items() if k != "genes"}
     judged = record.info.get("champion")
@@ -283,10 +283,13 @@ def _read_checkpoints(record: RunRecord) -> tuple[np.ndarray | None, str]:
             if record.population is not None:
                 continue
             elites, scores = arrays["elites"], arrays["elite_scores"]
+            if elites.dtype.kind != "f" or elites.ndim != 2 or scores.shape != elites.shape[:1]:
+                raise DamageError(f"elites: expected genes; found {elites.dtype} {elites.shape}")
         except (DamageError, KeyError) as error:
             record.note("damaged", f"checkpoints/{path.name}: {error}")
             continue
-        if found[0] is None and np.isfinite(scores[0]) and np.isfinite(elites[0]).all():
+        whole = np.isfinite(scores[:1]).all() and np.isfinite(elites[:1]).all()
+        if found[0] is None and len(elites) and whole:
             found = np.asarray(elites[0], np.float32), f"checkpoints/{path.name}"
     if not paths:
         record.note("missing", "checkpoints/ has none: the run cannot be resumed")
