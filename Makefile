@@ -7,7 +7,7 @@ TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile 
 READY  := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve test test-quick check format docs bench lock clean
+.PHONY: help install evolve test test-quick fuzz check format docs bench lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -27,6 +27,9 @@ evolve: $(READY)  ## evolve a swimmer in the lake (into runs/)
 
 test: $(READY)  ## all tests
 	$(TEST)
+
+fuzz: $(READY)  ## malformed files of all kinds, drawn anew; N of each (default: 2000)
+	MJX_REVOLVE_FUZZ=$(or $(N),2000) $(RUN) -m pytest tests/inputs/test_fuzz.py
 
 test-quick: $(READY)  ## the quick tests, under two minutes
 	$(TEST) -m "not slow"

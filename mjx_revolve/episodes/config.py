@@ -60,6 +60,9 @@ def _check_measure(name: str) -> str:
 def _check_world(value: str | dict[str, Any]) -> str | dict[str, Any]:
     if value == "":
         raise MisfitError("", "a name or a path", "an empty text")
+    for key in value if isinstance(value, dict) else ():
+        if not isinstance(key, str):
+            raise MisfitError(show(key), "the name of a setting", "a key that is no text")
     if isinstance(value, dict) and (not isinstance(value.get("name"), str) or not value["name"]):
         named = "a `name` (a world's name or path) beside the overrides"
         raise MisfitError("", named, "none")

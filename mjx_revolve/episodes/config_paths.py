@@ -37,8 +37,8 @@ def resolve_paths(data: dict[str, Any], origin: Callable[[str], tuple[Path, str]
     """
 
     def resolve(section: Any, key: Any, within: str = "", robot: bool = False) -> None:
-        value = section[key] if isinstance(section, list) else None
-        value = section.get(key) if isinstance(section, dict) else value
+        value = section.get(key) if isinstance(section, dict) else None
+        value = section[key] if isinstance(section, list) and isinstance(key, int) else value
         if not isinstance(value, str) or not value:
             return
         code = key in ("type", "genotype")

@@ -60,7 +60,18 @@ def settings_hash(config: Config) -> str:
         bodies["genotype"] = content_name(bodies["genotype"])
         bodies["seeds"] = [hash_text(Path(path).read_text("utf-8")) for path in bodies["seeds"]]
     data["world"]["name"] = Path(data["world"]["name"]).name
-    return hash_text(json.dumps(data, sort_keys=True, default=str))
+    return hash_text(_dump(data))
+
+
+def _dump(data: Any) -> str:
+    """Nested values as JSON, the same for the same; keys may be other than texts in `params`."""
+    return json.dumps(_text_keys(data), sort_keys=True, default=str)
+
+
+def _text_keys(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _text_keys(item) for key, item in value.items()}
+    return [_text_keys(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def fitness_hash(config: Config) -> str:
@@ -71,7 +82,7 @@ def fitness_hash(config: Config) -> str:
     """
     data = plain_settings(config)
     data["evolution"] = config.evolution.population_size
-    return hash_text(json.dumps(_by_content(data), sort_keys=True, default=str))
+    return hash_text(_dump(_by_content(data)))
 
 
 def _by_content(value: Any) -> Any:

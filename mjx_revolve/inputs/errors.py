@@ -23,8 +23,12 @@ from mjx_revolve.inputs.witness import tell
 _MAX_DEPTH = 200
 # An alias bomb is small in the file and huge when walked; our files need no aliases at all.
 _MAX_NODES = 200_000
-# PyYAML reads some 500 kB in a second; a robot of a thousand modules is a fifth of that.
+# PyYAML reads some 20,000 values in a second; a robot of a thousand modules has as many.
+_MAX_WRITTEN = 100_000
+# It reads some 500 kB in a second; a robot of a thousand modules is a fifth of that.
 _MAX_BYTES = 2_000_000
+# Python refuses to print integers of more than 4300 digits.
+_MAX_BITS = 14_000
 # The longest value, without blanks or in quotes, that a message repeats [characters].
 _MAX_VALUE = 200
 
@@ -94,8 +98,50 @@ def reading(path: str | Path) -> Iterator[None]:
         raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
 
 
+def _too_deep() -> InputError:
+    return InputError(f"expected at most {_MAX_DEPTH} levels of nesting; found more")
+
+
 class SafeLoader(yaml.SafeLoader):
-    """`yaml.SafeLoader` that reads `1e-3` as a number and refuses duplicate keys."""
+    """`yaml.SafeLoader` that reads `1e-3` as a number and refuses duplicate keys.
+
+    What is neither mapping, list, text, number, truth value nor date is refused, too; so is what is
+    nested too deeply or too much, as soon as that can be told.
+    """
+
+    _depth = _count = 0
+
+    def fetch_flow_collection_start(self, token: Any) -> None:
+        """Scans a `[` or a `{`; PyYAML's time grows with the square of how many are open."""
+        if self.flow_level > _MAX_DEPTH:
+            raise _too_deep()
+        super().fetch_flow_collection_start(token)
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """The next node and all within it."""
+        self._depth += 1
+        self._count += 1
+        if self._depth > _MAX_DEPTH:
+            raise _too_deep()
+        if self._count > _MAX_WRITTEN:
+            raise InputError(f"expected at most {_MAX_WRITTEN} values; found more")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """The value of a node; a text that its tag cannot have (`!!int x`) is an `InputError`."""
+        try:
+            return super().construct_object(node, deep)
+        except (InputError, yaml.YAMLError, RecursionError):
+            raise
+        except Exception as error:  # PyYAML's constructors take their tag's word for it
+            kind = node.tag.rpartition(":")[2]
+            reason = f": {error}" if isinstance(error, ValueError) else ""
+            raise InputError(
+                f"line {node.start_mark.line + 1}: expected valid YAML; found {show(node.value)} "
+                f"as {kind}{reason}"
+            ) from None
 
 
 # YAML 1.1 wants a dot in floats and no sign before it; people write 1e-3 and -.5 and mean it.
@@ -121,7 +167,22 @@ def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hasha
     return mapping
 
 
+def _construct_int(loader: SafeLoader, node: yaml.ScalarNode) -> int:
+    value = yaml.SafeLoader.construct_yaml_int(loader, node)
+    if value.bit_length() > _MAX_BITS:  # hexadecimal digits may be as many as there are
+        place = f"line {node.start_mark.line + 1}"
+        raise InputError(f"{place}: expected a whole number of a few digits; found a huge integer")
+    return value
+
+
+def _refuse_tag(loader: SafeLoader, node: yaml.Node) -> None:
+    loader.construct_undefined(node)
+
+
 SafeLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
+SafeLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
+for _name in ("binary", "omap", "pairs", "set"):  # bytes, tuples and sets: no file of ours has any
+    SafeLoader.add_constructor(f"tag:yaml.org,2002:{_name}", _refuse_tag)
 
 
 def _check_size(data: Any) -> None:
@@ -130,7 +191,7 @@ def _check_size(data: Any) -> None:
         item, depth = stack.pop()
         count += 1
         if depth > _MAX_DEPTH:
-            raise InputError(f"expected at most {_MAX_DEPTH} levels of nesting; found more")
+            raise _too_deep()
         if count > _MAX_NODES:
             raise InputError(f"expected at most {_MAX_NODES} values; found more (aliases?)")
         if isinstance(item, dict):
@@ -164,14 +225,10 @@ def load_yaml(path: str | Path) -> Any:
             data = yaml.load(text, Loader=SafeLoader)
             _check_size(data)
         except RecursionError:
-            raise InputError(f"expected at most {_MAX_DEPTH} levels; found more") from None
+            raise _too_deep() from None
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None)
             place = f"line {mark.line + 1}: " if mark else ""
             problem = getattr(error, "problem", None) or str(error).splitlines()[0]
             raise InputError(f"{place}expected valid YAML; found: {problem}") from None
-        except InputError:
-            raise
-        except ValueError as error:  # e.g. an impossible date
-            raise InputError(f"expected valid YAML values; found: {error}") from None
     return data

@@ -877,7 +877,10 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
         (HINGE_ON % "orientation: [90]", "expected 0, 90, 180, 270 or -90 [deg]; found [90]"),
         (HINGE_ON % "orientation: 360", "expected 0, 90, 180, 270 or -90 [deg]; found 360"),
         (HINGE_ON % "id: no", "children.1.id: expected a name or a number (YAML reads yes, no,"),
-        (HINGE_ON % f"id: 0x{'f' * 4000}", "expected a name or a number; found a huge integer"),
+        (
+            HINGE_ON % f"id: 0x{'f' * 4000}",
+            "line 1: expected a whole number of a few digits; found a h",
+        ),
         (HINGE_ON % "id: [a]", "children.1.id: expected a name or a number"),
         ("id: {}\nbody: {type: Core}", "id: expected a name or a number"),
         (HINGE_ON % "params: 3", "children.1.params: expected a mapping; found 3"),
@@ -1121,7 +1124,7 @@ def test_bodies_and_modules_print_one_line():
 
 
 def test_what_yaml_cannot_hold_is_refused(tmp_path):
-    robot = read(tmp_path, f"body: {{type: Core}}\nbrain: 0x{'f' * 4000}")
+    robot = make_morphology({"body": {"type": "Core"}, "brain": 16**4000})
     with pytest.raises(InputError, match="expected values that YAML can hold; found: Exceeds"):
         robot.save(tmp_path / "saved.yaml")
 
