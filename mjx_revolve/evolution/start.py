@@ -104,7 +104,7 @@ def begin_run(
     check_place(place / "any", f"--out {place}")
     _announce_code(config)
     fitness = make_pool(config)
-    check_memory(config, fitness.num_genes)
+    check_memory(config, fitness.num_genes, getattr(fitness, "genotype", None))
     check_search(config, fitness)
     # Not before: workers compile while evosax is imported, which takes a while.
     from mjx_revolve.evolution.methods import make_method
@@ -185,7 +185,7 @@ def continue_run(
         raise InputError(f"{label}: expected the config.yaml that it began with; found it changed")
     _announce_code(config)
     fitness = make_pool(config)
-    check_memory(config, fitness.num_genes)
+    check_memory(config, fitness.num_genes, getattr(fitness, "genotype", None))
     from mjx_revolve.evolution.methods import make_method
 
     if begun.get("model_hash") != model_hash(fitness):
