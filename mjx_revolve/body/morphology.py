@@ -85,8 +85,9 @@ def make_morphology(
     Read as found in the wild: slots may be numbers or text; a module's `slot` key means nothing;
     `orientation` (0), `params` and `id` may be missing (a module without id is named after its type
     and place in the order); numbers in `params` may be written like `0.707;`; the brain is kept as
-    it is. Where an id repeats, or is one that MuJoCo needs, the later modules get the suffix _2,
-    _3 and so on. Anything else unexpected is refused.
+    it is, and so are keys of `params` that do not look like ours. Where an id repeats, or is one
+    that MuJoCo needs, the later modules get the suffix _2, _3 and so on. Anything else unexpected
+    is refused.
 
     `params` may hold `red`, `green`, `blue` (0 to 1, all or none) and these overrides; numbers are
     >= 0:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,7 +18,7 @@ from mjx_revolve.body.module_types import ModuleType, PartBuoyancy, PartDrag
 from mjx_revolve.body.plates import LiftDrag
 from mjx_revolve.body.propellers import Thruster
 from mjx_revolve.body.tree import COLORS
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import NonNegative, Number, Share, Switch, Text, Triple, read, words
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -58,6 +59,9 @@ _OVERRIDES: dict[str, Any] = _PLAIN | {
     "lift_drag": _Some,
     "thruster": _Some,
 }
+# How alike a key and one of ours are that is taken for a slip of the finger: one letter in four. A
+# choice; what others write into `params` is kept.
+_ALIKE = 0.8
 _READ = _OVERRIDES | dict.fromkeys(COLORS, Annotated[Share, _Loose, words("a number from 0 to 1")])
 
 
@@ -65,15 +69,22 @@ def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
     """The params with overrides and colours checked, numbers as floats.
 
     Args:
-        params: of one module; other keys are kept as they are.
+        params: of one module; other keys are kept as they are, unless they look like one of ours.
         place: where, for messages.
 
     Returns:
         The same keys.
 
     Raises:
-        InputError: a value is out of range.
+        InputError: a value is out of range, or a key seems to be misspelt.
     """
+    for key in params:
+        if isinstance(key, str) and key not in _READ:
+            near = difflib.get_close_matches(key.strip().lower(), _READ, n=1, cutoff=_ALIKE)
+            if near:
+                raise InputError(
+                    f"{place}: expected {near[0]}, or a key less like it; found {show(key)}"
+                )
     return {
         key: read(_READ[key], value, f"{place}.{key}") if key in _READ else value
         for key, value in params.items()

@@ -83,12 +83,13 @@ brain: {type: cpg, period: [1, 2.5, null]}
 """
 ROBOTS = (_ARM, _ELBOW, ROBOT)
 # What a brain is, others know; so do those who write into `params` what we do not.
-FREE = re.compile(r"^brain\b|\bparams\.(?!lift_drag|thruster)|^$")
+FREE = re.compile(r"^brain\b|\bparams\.foo$")
 
 
 @fuzz(60)
 @given(mutants(*ROBOTS))
 @example(Mutant(b"{body: {type: Core}, brain: &a !!omap [b: *a]}"))
+@example(Mutant(b"{body: {type: Core, params: {mas: 0.2}}}", "body.params.mas"))
 @example(Mutant(b'{id: "a\\0", body: {type: Core}}'))
 def test_morphologies(folder, mutant):
     path = keep(folder, "robot.yaml", mutant)
