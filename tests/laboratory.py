@@ -74,6 +74,14 @@ def box_robot(size, mass: float, tank: World, volume: float | None = None, **par
     return build_robot(Morphology("box", (module,)), tank)
 
 
+def limp(robot):
+    """The robot without servos, friction and end stops; before anything compiles it."""
+    model = robot.mj_model
+    model.actuator_gainprm[:, 0], model.actuator_biasprm[:] = 1e-12, 0.0
+    model.dof_damping[:], model.jnt_limited[:], model.jnt_user[:] = 0.0, 0, np.inf
+    return robot
+
+
 def at_rest(robot: Robot, lanes: int = 1, height: float = 0.0):
     """`[nq, lanes]` rest pose at a height of the core, and `[nv, lanes]` zeros."""
     model = robot.mj_model

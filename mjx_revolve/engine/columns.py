@@ -305,7 +305,7 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
     along = lambda x: turned(swap, x)  # noqa: E731
     size = lambda x: turned(np.abs(swap), x)  # noqa: E731
     drags = set(table.drag)
-    carried = None
+    carried, carried_mass, carried_inertia = None, None, None
     if np.any(table.carried_mass) or np.any(table.carried_inertia):
         x, across = _skews(position), turn.swapaxes(1, 2)
         linear = world.density * (turn * table.carried_mass[:, None]) @ across
@@ -315,6 +315,8 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
             _mat(_end(x @ linear, 0.0)),
             _sym(_end(linear, 0.0)),
         )
+        carried_mass = _vec(_end(size(world.density * table.carried_mass), 0.0))
+        carried_inertia = _vec(_end(size(world.density * table.carried_inertia), 0.0))
     facing = bool(drags & {"faces", "lift_drag"})
     plate: dict[str, Any] = {}
     if "lift_drag" in drags:
@@ -337,6 +339,8 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
         drag_linear=_vec(_end(size(world.density * table.drag_linear), 0.0)) if facing else None,
         drag_angular=_vec(_end(size(world.density * table.drag_angular), 0.0)) if facing else None,
         carried=carried,
+        carried_mass=carried_mass,
+        carried_inertia=carried_inertia,
         ellipsoid=_ellipsoids(assembly, size) if "ellipsoid" in drags else None,
         mounts=_mounts(assembly, turn, position) if len(assembly.thruster_row) else None,
         **plate,

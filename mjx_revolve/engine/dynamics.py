@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_revolve.engine.contact import bed_on_level
-from mjx_revolve.engine.hydrodynamics import Outer, water_on_level
+from mjx_revolve.engine.hydrodynamics import Before, Outer, water_on_level
 from mjx_revolve.engine.level import Hinges, Level
 from mjx_revolve.engine.levels import Levels
 from mjx_revolve.engine.rows import Rows
@@ -70,6 +70,7 @@ def outer_forces(
     water: Water,
     thrusts: Any,
     world: World,
+    before: Before | None = None,
 ) -> Outer:
     """What water, thrusters and bed do to the bodies of a level, their weight apart.
 
@@ -81,11 +82,12 @@ def outer_forces(
         water: surface, current, time.
         thrusts: of the thrusters, `[nthruster, lanes]` [N].
         world: which laws act.
+        before: as in `hydrodynamics.water_on_level`.
 
     Returns:
         Forces, torques and inertias.
     """
-    outer = water_on_level(world, level, motion, swirling, gravity, water, thrusts)
+    outer = water_on_level(world, level, motion, swirling, gravity, water, thrusts, before)
     if level.points is None:
         return outer
     torque, force, damping = bed_on_level(world, level, motion, level.points, water)
@@ -129,13 +131,16 @@ def own_inertia(
     thrusts: Any,
     gravity: Vec,
     dt: float,
-) -> tuple[Block, tuple[Vec, Vec]]:
+    wet: Any,
+) -> tuple[Block, tuple[Vec, Vec], Any]:
     """Each body's inertia with its carried water, and the bias force that needs no acceleration.
 
+    Takes the submerged shares of the step before, as `State.wet` has them, and gives those of now.
     Where water is carried, the whole momentum h turns by K(h) ν in the middle of the step (see
     `accelerate`), which makes the inertia's matrix unsymmetric.
     """
-    outer = outer_forces(level, motion, swirling, gravity, water, thrusts, world)
+    before = Before(wet, dt) if wet and dt else None
+    outer = outer_forces(level, motion, swirling, gravity, water, thrusts, world, before)
     weight = tuple(neg(g) for g in gravity)
     force = vadd(outer.force, vscale(level.mass, weight))
     torque = vadd(outer.torque, cross(level.moment, weight))
@@ -146,7 +151,7 @@ def own_inertia(
     if carries and dt:
         block = add_block(block, 0.5 * dt, gyroscope(*momentum))
     bias = cross_force(motion.spin, motion.velocity, *momentum)
-    return block, (vsub(bias[0], torque), vsub(bias[1], force))
+    return block, (vsub(bias[0], torque), vsub(bias[1], force)), outer.wet
 
 
 def turn_hinges(hinges: Hinges, angle: Scalar) -> Mat:
@@ -287,7 +292,7 @@ _NO_BIAS = ((0.0,) * 3, (0.0,) * 3)
 
 def accelerate(
     bodies: Bodies, state: State, targets: Any, water: Water, thrusts: Any, dt: float
-) -> tuple[Vec, Vec, Any, Scalar]:
+) -> tuple[Vec, Vec, Any, Scalar, Any]:
     """Accelerations, by the articulated-body algorithm.
 
     Where water is carried, the momentum h of each body with its water turns as K(h) ν, and the step
@@ -306,18 +311,19 @@ def accelerate(
 
     Returns:
         Root: linear and angular, body frame, as rates of the body-frame components [m/s², rad/s²];
-        hinges [rad/s²]; servo power, summed over the hinges without sign [W], `[lanes]`.
+        hinges [rad/s²]; servo power, summed over the hinges without sign [W], `[lanes]`; submerged
+        shares, as `State.wet`.
     """
     symmetric = not (bodies.carries and dt)
     root, moved, midway = move_bodies(bodies, state, _is_located(bodies, water), dt)
 
-    def own_of(level: Level, moving: Moving) -> Any:
+    def own_of(level: Level, moving: Moving, wet: Any) -> Any:
         gravity = felt_gravity(bodies.world, water, moving.motion)
-        block, bias = own_inertia(
+        block, bias, wet = own_inertia(
             bodies.world, bodies.carries, level, moving.motion, moving.swirling, water, thrusts,
-            gravity, dt,
+            gravity, dt, wet,
         )  # fmt: skip
-        return _flatten(block, bias, symmetric)
+        return _flatten(block, bias, symmetric), wet
 
     def hold(hinges: Hinges, angle: Scalar, speed: Scalar) -> tuple[Scalar, Scalar]:
         """Torque on a hinge by itself, and what is implicit of it, with the armature."""
@@ -327,8 +333,9 @@ def accelerate(
 
     def lift(level: Level, gathered: Any, *x: Any) -> tuple[Any, Any, Scalar]:
         """Tips to root: articulated inertias."""
-        (moving, turn), angle, speed, midway, target = x
-        hinges, own = level.hinges, own_of(level, moving)
+        (moving, turn), angle, speed, midway, target, *before = x
+        hinges = level.hinges
+        own, wet = own_of(level, moving, *(before or ((),)))
         assert hinges is not None
         load, inertia = hold(hinges, angle, speed)
         block, bias = _unflatten(
@@ -352,21 +359,25 @@ def accelerate(
             symmetric,
         )
         block, bias = to_parent(turn, hinges.position, left, bias, symmetric)
-        return _flatten(block, bias, symmetric), released, jnp.abs(motor * speed)
+        return (
+            _flatten(block, bias, symmetric),
+            (released, bodies.set_apart(wet)),
+            jnp.abs(motor * speed),
+        )
 
-    gathered, released, power = bodies.up(
+    gathered, kept, power = bodies.up(
         lift,
         (_flatten(_NO_BLOCK, _NO_BIAS, symmetric), 0.0),
-        moved, state.angle, state.speed, midway, targets,
+        moved, state.angle, state.speed, midway, targets, *state.wet[1:],
     )  # fmt: skip
-    whole = own_of(bodies.root, root)
+    whole, wet = own_of(bodies.root, root, state.wet[0] if state.wet else ())
     if gathered is not None:
         whole = jax.tree.map(add, whole, gathered)
     angular, linear = solve_root(*_unflatten(whole, symmetric), symmetric)
 
     def release(level: Level, parent: Any, *x: Any) -> tuple[Any, Scalar]:
         """Root to tips: accelerations."""
-        (moving, turn), midway, released = x
+        (moving, turn), midway, (released, _) = x
         assert level.hinges is not None
         up_angular, up_linear = parent
         coriolis = _coriolis(moving.swirling, midway)
@@ -377,7 +388,7 @@ def accelerate(
         hinge = mul(released.inverse, hinge)
         return ((a[0], a[1], add(a[2], hinge)), b), hinge
 
-    hinges = bodies.down(release, (angular, linear), moved, midway, released)
+    hinges = bodies.down(release, (angular, linear), moved, midway, kept)
     lanes, dtype = state.position[0].shape, state.position[0].dtype
     lane = lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), (1, *lanes))[0]  # noqa: E731
     return (
@@ -385,4 +396,5 @@ def accelerate(
         tuple(map(lane, angular)),
         hinges,
         jnp.broadcast_to(jnp.asarray(power, dtype), lanes),
+        (wet, bodies.put_together(kept, lambda x: x[1])) if state.wet else (),
     )

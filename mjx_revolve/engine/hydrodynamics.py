@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.level import Level, Mounts, Parts
+from mjx_revolve.engine.level import Level, Mounts, Parts, is_present
 from mjx_revolve.numerics.inertia import (
     Motion,
     SpatialInertia,
@@ -41,6 +41,7 @@ from mjx_revolve.numerics.spatial import (
     vscale,
     vsub,
 )
+from mjx_revolve.water.added_mass import come_aboard, slam
 from mjx_revolve.water.buoyancy import displaced, submersion, surface_tension
 from mjx_revolve.water.drag import ellipsoid, inertia_box, quadratic_drag
 from mjx_revolve.water.flow import Water, flow, is_uniform, surface, wave_convection
@@ -62,6 +63,8 @@ class Outer(NamedTuple):
             body asks for a force that the step adds.
         damping: how force and torque fall with the bodies' velocity, as a 6×6 [N·s/m ...], for
             the implicit part of a step; or None.
+        wet: submerged shares of each group of parts that carries water, `[npart, nbody, lanes]`
+            each [-].
     """
 
     torque: Vec
@@ -69,6 +72,19 @@ class Outer(NamedTuple):
     carried: SpatialInertia | None
     momentum: tuple[Vec, Vec] | None
     damping: SpatialInertia | None
+    wet: tuple[Scalar, ...] = ()
+
+
+class Before(NamedTuple):
+    """What a step knows of the one before it, for the water that comes aboard.
+
+    Attributes:
+        wet: submerged shares a step ago, as `Outer.wet`, or those of one group.
+        dt: of the step [s].
+    """
+
+    wet: Any
+    dt: float
 
 
 class _Stream(NamedTuple):
@@ -80,11 +96,6 @@ class _Stream(NamedTuple):
 
 def _is_array(x: Scalar) -> bool:
     return hasattr(x, "shape")
-
-
-def _present(x: Scalar) -> bool:
-    """Whether it is more than a plain zero; what is traced counts as something."""
-    return isinstance(x, jax.Array) or bool(np.any(x))
 
 
 def _some(vector: Any) -> Any:
@@ -172,6 +183,16 @@ def _twist(
     if together:
         return torque, damping
     return tuple(map(gather, torque)), tuple(map(gather, damping))
+
+
+def _whirl(parts: Parts, w: Vec, aboard: Scalar, gather: Callable[[Scalar], Scalar]) -> Vec:
+    """Torque of the slam on what turns, on each body, body frame; `w` is in the part frame."""
+    if any(map(_of_parts, w)):
+        torque = matvec(parts.rotation, slam(aboard, parts.carried_inertia, w))
+        return tuple(map(gather, torque))
+    # All parts turn alike about their own axes.
+    together = tuple(gather(mul(aboard, x)) for x in parts.carried_inertia)
+    return matvec(parts.rotation, slam(1.0, together, w))
 
 
 def _pressure(
@@ -285,7 +306,14 @@ def _sizes(parts: Parts, n: int, motion: Motion) -> Callable[[Scalar], Scalar]:
 
 
 def _water_on_parts(
-    world: World, parts: Parts, n: int, motion: Motion, gravity: Vec, water: Water, thrusts: Any
+    world: World,
+    parts: Parts,
+    n: int,
+    motion: Motion,
+    gravity: Vec,
+    water: Water,
+    thrusts: Any,
+    before: Before | None,
 ) -> tuple[Vec, Vec, SpatialInertia | None, SpatialInertia | None, Scalar]:
     """Torque, force, carried water, damping and submerged share of one group of parts."""
     k, wide = parts.count, _sizes(parts, n, motion)
@@ -296,6 +324,10 @@ def _water_on_parts(
     force, torque, damping = _push(world, parts, v, w, wet.share)
     pull, turn = _pull(world, parts, wet, wide)
     force, torque = vadd(force, pull), vadd(torque, turn)
+    aboard = None
+    if before is not None:
+        aboard = come_aboard(wet.share, before.wet, before.dt)
+        force = vadd(force, slam(aboard, parts.carried_mass, v))
     force = matvec(parts.rotation, force)
     torque = vadd(matvec(parts.rotation, torque), cross(parts.position, force))
     if parts.mounts is not None:
@@ -306,6 +338,8 @@ def _water_on_parts(
         gradient = _gradient(gravity, stream)
         righting, lift = _pressure(world, parts, wet.share, wet.moment, gradient, gather)
         torque, force = vadd(torque, righting), vadd(force, lift)
+    if aboard is not None:
+        torque = vadd(torque, _whirl(parts, w, aboard, gather))
     resisting = None
     if damping is not None:
         x, y, z = damping
@@ -320,8 +354,8 @@ def _water_on_parts(
             tuple(map(gather, one.linear)),
         )
     carried = None
-    if parts.carried is not None and any(map(_present, jax.tree.leaves(parts.carried))):
-        weigh = lambda x: sum_parts(mul(x, wet.share), k) if _present(x) else 0.0  # noqa: E731
+    if parts.carries:
+        weigh = lambda x: sum_parts(mul(x, wet.share), k) if is_present(x) else 0.0  # noqa: E731
         carried = jax.tree.map(weigh, parts.carried)
     return torque, force, carried, resisting, wet.share
 
@@ -451,6 +485,7 @@ def water_on_level(
     gravity: Vec,
     water: Water,
     thrusts: Any = (),
+    before: Before | None = None,
 ) -> Outer:
     """What the water does to the bodies of a level.
 
@@ -470,16 +505,23 @@ def water_on_level(
         gravity: upwards, body frames, with the uniform current's acceleration [m/s²].
         water: surface, current, time.
         thrusts: of the thrusters, `[nthruster, lanes]` [N].
+        before: the step before, for the slam (`added_mass.slam`); None for none.
 
     Returns:
         Forces, torques and inertias.
     """
     torque, force = _ZERO, _ZERO
     carried, damping, shares = None, None, []
+    wet: list[Scalar] = []
     for parts in level.parts:
+        earlier = None
+        if before is not None and parts.carries:
+            earlier = before._replace(wet=before.wet[len(wet)])
         on_torque, on_force, more_carried, more_damping, share = _water_on_parts(
-            world, parts, level.count, motion, gravity, water, thrusts
+            world, parts, level.count, motion, gravity, water, thrusts, earlier
         )
+        if parts.carries:
+            wet.append(share)
         torque, force = vadd(torque, on_torque), vadd(force, on_force)
         carried, damping = _plus(carried, more_carried), _plus(damping, more_damping)
         shares.append(share)
@@ -493,7 +535,7 @@ def water_on_level(
     spin, velocity = swirling
     stream = _stream(world, water, motion, _ZERO)
     if stream.velocity is None:
-        return Outer(torque, force, carried, None, damping)
+        return Outer(torque, force, carried, None, damping, tuple(wet))
     momentum = apply_inertia(carried, _ZERO, tuple(map(neg, stream.velocity)))
     # The step turns the momentum with the body's velocity, not with the relative one.
     linear = apply_inertia(carried, spin, vsub(velocity, stream.velocity))[1]
@@ -503,4 +545,4 @@ def water_on_level(
         change = vsub(change, stream.acceleration)
     turning = apply_inertia(carried, _ZERO, change)
     torque, force = vsub(torque, turning[0]), vsub(force, turning[1])
-    return Outer(torque, force, carried, momentum, damping)
+    return Outer(torque, force, carried, momentum, damping, tuple(wet))

@@ -16,9 +16,15 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.spatial import Mat, Scalar, Sym, Vec
+
+
+def is_present(x: Scalar) -> bool:
+    """Whether a number is more than a plain zero; what is traced counts as something."""
+    return isinstance(x, jax.Array) or bool(np.any(x))
 
 
 class Laws(NamedTuple):
@@ -108,8 +114,8 @@ class Mounts(NamedTuple):
     jax.tree_util.register_dataclass,
     data_fields=[
         "position", "rotation", "half_size", "center_position", "volume", "exposed",
-        "drag_linear", "drag_angular", "carried", "plate", "plate_area", "plate_forward",
-        "plate_upward", "plate_center", "ellipsoid", "mounts",
+        "drag_linear", "drag_angular", "carried", "carried_mass", "carried_inertia", "plate",
+        "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid", "mounts",
     ],
     meta_fields=["laws", "count"],
 )  # fmt: skip
@@ -133,6 +139,8 @@ class Parts:
         drag_linear: ρ ½ C_d A of each pair of faces [kg/m].
         drag_angular: the same against turning [kg·m²].
         carried: inertia of the water that they carry along, wholly wet, about the body's origin.
+        carried_mass: of that water along the part's axes [kg].
+        carried_inertia: likewise about them, about the box's centre [kg·m²].
         plate: coefficients of `lift_drag`, a `PlateTable`.
         plate_area: [m²].
         plate_forward: unit vector of zero angle of attack, part's axes.
@@ -153,6 +161,8 @@ class Parts:
     drag_linear: Any = None
     drag_angular: Any = None
     carried: SpatialInertia | None = None
+    carried_mass: Any = None
+    carried_inertia: Any = None
     plate: Any = None
     plate_area: Any = None
     plate_forward: Any = None
@@ -160,6 +170,11 @@ class Parts:
     plate_center: Any = None
     ellipsoid: Any = None
     mounts: Mounts | None = None
+
+    @property
+    def carries(self) -> bool:
+        """Whether any of them may carry water along."""
+        return self.carried is not None and any(map(is_present, jax.tree.leaves(self.carried)))
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["position", "mass"], meta_fields=["count"])
@@ -206,6 +221,11 @@ class Level:
     box: InertiaBox | None
     parts: tuple[Parts, ...]
     points: Points | None
+
+    @property
+    def carrying(self) -> tuple[int, ...]:
+        """How many parts of a body each group has that may carry water along."""
+        return tuple(parts.count for parts in self.parts if parts.carries)
 
 
 @partial(

@@ -82,6 +82,24 @@ class Levels:
             return jnp.zeros((0, *like.shape), like.dtype)
         return jnp.concatenate(values)[np.argsort(self.hinge_order).astype(np.int32)]
 
+    # What parts are, group by group.
+
+    def set_apart(self, groups: tuple[jax.Array, ...]) -> tuple[Any, ...]:
+        """`[npart, nbody, lanes]` of groups, as a traversal keeps them."""
+        return groups
+
+    def put_together(self, kept: Any, which: Callable[[Any], Any]) -> tuple[Any, ...]:
+        """The way back from `set_apart`, of what `which` takes of a value that was kept."""
+        return tuple(map(which, kept))
+
+    def all_wet(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
+        """`State.wet` of parts that are wholly under water."""
+
+        def ones(level: Level) -> tuple[jax.Array, ...]:
+            return tuple(jnp.ones((n, level.count, *lanes), dtype) for n in level.carrying)
+
+        return ones(self.root), tuple(map(ones, self.below))
+
     # The traversal.
 
     def map(self, fun: Callable[..., Any], *xs: Any) -> Any:

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.engine.dynamics import outer_forces, with_water
+from mjx_revolve.engine.hydrodynamics import Before
 from mjx_revolve.engine.levels import Levels, make_levels
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.pushes import push_of
@@ -140,7 +141,7 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         return command, thrusts, jnp.sum(pumped, 0)
 
     def step(state: Any, ctrl: jax.Array, water: Water) -> tuple[Any, jax.Array]:
-        qpos, qvel, pace, command = state
+        qpos, qvel, pace, command, wet = state
         lanes = qpos.shape[-1]
         # Plain numbers stay constants, so that still water costs nothing; arrays are mapped.
         plain = lambda x: isinstance(x, int | float)  # noqa: E731
@@ -148,30 +149,33 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         given = jax.tree.map(lambda x: None if plain(x) else x, water)
         command, thrusts, pumped = drive(command, ctrl)
 
-        def single(qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, given: Any) -> Any:
+        def single(
+            qpos: Any, qvel: Any, pace: Any, wet: Any, ctrl: Any, thrusts: Any, given: Any
+        ) -> Any:
             merged = jax.tree.map(
                 lambda a, b: b if a is None else a, fixed, given, is_leaf=lambda x: x is None
             )
-            return _step(plan, model_of(qpos.dtype), qpos, qvel, pace, ctrl, thrusts, merged)
+            return _step(plan, model_of(qpos.dtype), qpos, qvel, pace, wet, ctrl, thrusts, merged)
 
         given = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes,)), given)
-        qpos, qvel, pace, power = jax.vmap(single, in_axes=-1, out_axes=-1)(
-            qpos, qvel, pace, ctrl, thrusts, given
+        qpos, qvel, pace, wet, power = jax.vmap(single, in_axes=-1, out_axes=-1)(
+            qpos, qvel, pace, wet, ctrl, thrusts, given
         )
-        return (qpos, qvel, pace if levels.carries else None, command), power + pumped
+        return (qpos, qvel, pace if levels.carries else None, command, wet), power + pumped
 
     def init(qpos: jax.Array, qvel: jax.Array) -> Any:
         length = jnp.sqrt(jnp.sum(qpos[3:7] ** 2, 0))
         command = jnp.zeros((thrusters.count, *qpos.shape[1:]), qpos.dtype)
         pace = jnp.zeros_like(qvel) if levels.carries else None
-        return qpos.at[3:7].divide(length), qvel, pace, command
+        root, below = levels.all_wet(qpos.shape[1:], qpos.dtype)
+        return qpos.at[3:7].divide(length), qvel, pace, command, (root, *below)
 
     def root(state: Any) -> Root:
         qpos, qvel, *_ = state
         return Root(tuple(qpos[:3]), tuple(qpos[3:7]), tuple(qvel[:3]), tuple(qvel[3:6]))
 
     def push(state: Any, ctrl: jax.Array, water: Water) -> Any:
-        qpos, qvel, _, command = state
+        qpos, qvel, _, command, _ = state
         return push_of(levels, start(levels, qpos, qvel), water, drive(command, ctrl)[1])
 
     return Engine(
@@ -190,17 +194,29 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
 
 
 def _step(
-    plan: _Plan, model: Any, qpos: Any, qvel: Any, pace: Any, ctrl: Any, thrusts: Any, water: Water
-) -> tuple[Any, Any, Any, Any]:
-    """One step of one individual: (qpos, qvel, pace) after it, and the servos' power."""
+    plan: _Plan,
+    model: Any,
+    qpos: Any,
+    qvel: Any,
+    pace: Any,
+    wet: Any,
+    ctrl: Any,
+    thrusts: Any,
+    water: Water,
+) -> tuple[Any, Any, Any, Any, Any]:
+    """One step of one individual: (qpos, qvel, pace, wet) after it, and the servos' power."""
     zero = jnp.zeros((), qpos.dtype)
     current, acceleration = (
         jnp.stack([zero + x for x in xs]) for xs in (water.current, water.acceleration)
     )
     data, flow = _start(plan, model, qpos, qvel, pace, current, acceleration)
     matrices = _rigid(plan, model, data, flow)
-    for level in range(len(plan.levels.all)):
-        matrices = _add_water(plan, model, data, flow, matrices, level, water, thrusts)
+    shares = []
+    for level, before in enumerate(wet):
+        matrices, share = _add_water(
+            plan, model, data, flow, matrices, level, water, thrusts, before
+        )
+        shares.append(share)
     damping = jnp.asarray(plan.robot.mj_model.dof_damping * plan.dt, qpos.dtype)
     matrices = matrices._replace(mass=matrices.mass + jnp.diag(damping))
     power = zero
@@ -214,7 +230,7 @@ def _step(
         smooth = rates.at[:3].add(acceleration)
         push = _contact_force(model, data, matrices.mass, smooth)
         rates = rates + jax.scipy.linalg.solve(matrices.mass, push, assume_a=kind)
-    return *_advance(plan, flow, rates, current), power
+    return *_advance(plan, flow, rates, current), tuple(shares), power
 
 
 def _start(
@@ -276,8 +292,12 @@ def _add_water(
     level: int,
     water: Water,
     thrusts: Any,
-) -> _Matrices:
-    """Water, thrusters and bed on the bodies of a level, by the population step's functions."""
+    wet: Any,
+) -> tuple[_Matrices, Any]:
+    """Water, thrusters and bed on the bodies of a level, by the population step's functions.
+
+    Takes the submerged shares of the step before, `[npart, nbody]` each, and gives those of now.
+    """
     levels, dt, world = plan.levels, plan.dt, plan.levels.world
     constants, drift = levels.all[level], flow.drift[level]
     jacobian, axes = _jacobians(plan, model, data, level)
@@ -297,7 +317,8 @@ def _add_water(
     upwards = flow.acceleration + jnp.array([0.0, 0.0, world.gravity], flow.qpos.dtype)
     gravity = column(jnp.einsum("bji,j->bi", axes, upwards))
     pushes = thrusts[:, None] if levels.thrusters.count else ()
-    outer = outer_forces(constants, motion, swirling, gravity, water, pushes, world)
+    before = Before(tuple(x[..., None] for x in wet), dt) if wet else None
+    outer = outer_forces(constants, motion, swirling, gravity, water, pushes, world, before)
     n = constants.count
     wrench = jnp.concatenate([_stack(outer.torque, n), _stack(outer.force, n)], -1)
     implicit = []
@@ -321,7 +342,8 @@ def _add_water(
     for spatial in implicit:
         wrench = wrench - jnp.einsum("bij,bj->bi", spatial, drift)
         mass = mass + jnp.einsum("bik,bij,bjl->kl", jacobian, spatial, jacobian)
-    return _Matrices(mass, matrices.force + jnp.einsum("bij,bi->j", jacobian, wrench))
+    found = _Matrices(mass, matrices.force + jnp.einsum("bij,bi->j", jacobian, wrench))
+    return found, tuple(x[..., 0] for x in outer.wet)
 
 
 def _add_servos(

@@ -128,6 +128,25 @@ class Rows:
         padded = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
         return jnp.take_along_axis(padded, self.bodies.row, 0)
 
+    # What parts are, group by group.
+
+    def set_apart(self, groups: tuple[jax.Array, ...]) -> tuple[Any, ...]:
+        """`[npart, 1, lanes]` of groups, as a traversal keeps them: part by part."""
+        return tuple(tuple(x[k] for k in range(x.shape[0])) for x in groups)
+
+    def put_together(self, kept: Joined, which: Callable[[Any], Any]) -> tuple[Any, ...]:
+        """The way back: `[rows, npart, 1, lanes]` of what `which` takes of a value."""
+        count = kept.tree.num_leaves
+        columns = kept.data.reshape(-1, count, 1, self.lanes)
+        groups = which(jax.tree.unflatten(kept.tree, range(count)))
+        return tuple(columns[:, own[0] : own[-1] + 1] for own in groups)
+
+    def all_wet(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
+        """`State.wet` of parts that are wholly under water."""
+        row, count = _whole(self.capacity.row, self.bodies.rows), self.capacity.rows
+        root = tuple(jnp.ones((n, 1, *lanes), dtype) for n in self.root.carrying)
+        return root, tuple(jnp.ones((count, n, 1, *lanes), dtype) for n in row.carrying)
+
     # The traversal.
 
     def down(self, fun: Callable[..., Any], root: Any, *xs: Any) -> Any:

@@ -43,6 +43,9 @@ class State(NamedTuple):
         pace: accelerations of the step before, (linear, angular, hinges); the root's as rates of
             its body-frame velocities; empty where nothing needs them.
         command: of the thrusters, behind their lag, `[nthruster, lanes]` [-]; empty without.
+        wet: submerged shares of the parts that carry water at the step before, by groups: (the
+            root's `[npart, 1, lanes]`, those of the bodies below it: `[npart, nbody, lanes]` for
+            each level, or `[rows, npart, 1, lanes]`) [-]; empty where no water is carried.
     """
 
     position: Vec
@@ -53,6 +56,7 @@ class State(NamedTuple):
     speed: Any
     pace: Any = ()
     command: Any = ()
+    wet: Any = ()
 
 
 class Root(NamedTuple):
@@ -125,7 +129,9 @@ def turn_quat(quat: tuple[Scalar, ...], spin: Vec, dt: float) -> tuple[Scalar, .
     return tuple(x * scale for x in turned)
 
 
-def advance(state: State, water: Water, pace: Any, dt: float, carries: bool) -> State:
+def advance(
+    state: State, water: Water, pace: Any, dt: float, carries: bool, wet: Any = ()
+) -> State:
     """The state after a step: semi-implicit Euler, velocities before positions.
 
     Args:
@@ -135,6 +141,7 @@ def advance(state: State, water: Water, pace: Any, dt: float, carries: bool) -> 
             velocities [m/s², rad/s²].
         dt: [s].
         carries: whether water is carried along.
+        wet: submerged shares of this step.
 
     Returns:
         The state; thrusters' commands as they were.
@@ -165,6 +172,7 @@ def advance(state: State, water: Water, pace: Any, dt: float, carries: bool) -> 
         speed=speed,
         pace=pace if carries else (),
         command=state.command,
+        wet=wet,
     )
 
 

@@ -60,6 +60,8 @@ def init(bodies: Bodies, qpos: jax.Array, qvel: jax.Array) -> State:
         speed=speed,
         pace=pace,
         command=jnp.zeros((count, *qpos.shape[1:]), qpos.dtype) if count else (),
+        # Nothing has come aboard before the first step, which finds the parts as wet as they are.
+        wet=bodies.all_wet(qpos.shape[1:], qpos.dtype) if bodies.carries else (),
     )
 
 
@@ -103,8 +105,8 @@ def step(bodies: Bodies, state: State, ctrl: jax.Array, water: Water) -> tuple[S
     targets, command, thrusts, pumped = _drive(bodies, state, ctrl)
     # The whole step is seen from the uniform current: there, no current is left.
     relative = state._replace(velocity=vsub(state.velocity, water.current))
-    *pace, power = accelerate(bodies, relative, targets, water, thrusts, dt)
-    new = advance(state, water, tuple(pace), dt, bodies.carries)
+    *pace, power, wet = accelerate(bodies, relative, targets, water, thrusts, dt)
+    new = advance(state, water, tuple(pace), dt, bodies.carries, wet)
     return new._replace(command=command), add(power, pumped)
 
 
@@ -188,11 +190,11 @@ def acceleration(
         `[nv, lanes]` qacc: root linear, world frame [m/s²], root angular, body frame [rad/s²],
         hinges [rad/s²].
     """
-    state = init(bodies, qpos, qvel)._replace(pace=())
+    state = init(bodies, qpos, qvel)._replace(pace=(), wet=())
     # As in mj_forward, a thruster behind a lag has not heard of its command yet.
     targets, _, thrusts, _ = _drive(bodies, state, ctrl)
     relative = state._replace(velocity=vsub(state.velocity, water.current))
-    linear, angular, hinges, _ = accelerate(bodies, relative, targets, water, thrusts, 0.0)
+    linear, angular, hinges, *_ = accelerate(bodies, relative, targets, water, thrusts, 0.0)
     turn = quat_to_rows(state.quat)
     seen = matTvec(turn, relative.velocity)
     linear = matvec(turn, vadd(linear, cross(state.spin, seen)))

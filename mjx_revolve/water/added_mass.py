@@ -6,8 +6,13 @@ water fills part of the envelope and moves with it like cargo.
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
 from scipy.special import elliprd
+
+from mjx_revolve.numerics.spatial import Scalar, Vec, mul, neg
 
 
 def lamb_coefficients(semi_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,3 +85,44 @@ def entrained_water(
     square = (2 * np.asarray(half_size, np.float64)) ** 2
     inertia = volume[..., None] / 12 * (square.sum(-1, keepdims=True) - square)
     return np.repeat(volume[..., None], 3, -1), inertia
+
+
+def come_aboard(share: Scalar, before: Scalar, dt: float) -> Scalar:
+    """How fast a part's wet share grows; 0 where it shrinks.
+
+    Args:
+        share: of the part that is submerged [-].
+        before: the same a step ago.
+        dt: of the step [s].
+
+    Returns:
+        Its rate [1/s].
+    """
+    # A choice and no max: where both are 1, under water, that would share out a slope.
+    return jnp.where(share > before, (share - before) * (1 / dt), 0)
+
+
+def slam(rate: Scalar, carried: Any, speed: Vec) -> Vec:
+    """Force of the water that a part begins to carry, or torque of what turns with it: -ṁ_a v.
+
+    Von Karman's theory of the slam (1929, The impact on seaplane floats during landing, NACA TN
+    321): body and carried water keep their momentum while more of it comes aboard, d/dt (m + m_a) v
+    = f. Water that is left behind keeps its velocity, and so does the body: nothing acts while m_a
+    falls. Either way ½ |ṁ_a| v² is lost to the body: entry gives it to the spray, exit to the water
+    that is left. So no way in and out of the water makes energy.
+
+    In a step, with E = Σ A_k max(0, s_k - s_k') over the parts k, whose shares were s_k' a step
+    ago, this is (M + Σ A_k s_k) dt ν' = -E ν. What multiplies the old velocity, M + Σ A_k min(s_k,
+    s_k'), is never negative and at most the inertia that the step solves with: a slam can stop a
+    body but not throw it back, at any step, even where a share jumps from 0 to 1. And what comes
+    aboard in one step is carried in the next, so that momentum is kept however long the step.
+
+    Args:
+        rate: from `come_aboard` [1/s].
+        carried: what the part carries wholly wet, along or about its axes [kg, or kg·m²].
+        speed: relative to the water [m/s, or rad/s].
+
+    Returns:
+        [N, or N·m].
+    """
+    return tuple(mul(mul(rate, neg(m)), x) for m, x in zip(carried, speed, strict=True))

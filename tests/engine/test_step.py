@@ -20,6 +20,7 @@ from laboratory import (
     at_rest,
     body,
     box_robot,
+    limp,
     march,
     random_states,
     read,
@@ -47,14 +48,6 @@ def quick_compiles():
 
 
 # ------------------------------------------------------------------------- conservation
-
-
-def limp(robot):
-    """The robot without servos, friction and end stops; before anything compiles it."""
-    model = robot.mj_model
-    model.actuator_gainprm[:, 0], model.actuator_biasprm[:] = 1e-12, 0.0
-    model.dof_damping[:], model.jnt_limited[:], model.jnt_user[:] = 0.0, 0, np.inf
-    return robot
 
 
 def impulse(lagrangian, qpos, qvel):
