@@ -237,7 +237,7 @@ class _Wet(NamedTuple):
         share: of each part that is submerged [-].
         moment: of the submerged share, as from `submersion`, part's axes.
         up: the surface's normal, part's axes.
-        depth: of the part's centre below the surface [m].
+        depth: of the box's centre below the surface [m].
     """
 
     share: Scalar
@@ -251,9 +251,9 @@ def _submerge(
 ) -> _Wet:
     height, slope = water.surface_height, None
     if world.waves:
-        x, y, _ = _world_place(motion, parts.center_position)
+        x, y, _ = _world_place(motion, parts.position)
         height, slope = surface(world, water, x, y)
-    below = sub(height, add(motion.height, dot(motion.up, parts.center_position)))
+    below = sub(height, add(motion.height, dot(motion.up, parts.position)))
     normal = motion.up
     if slope is not None:
         # Distance to the surface's tangent plane, and its normal.

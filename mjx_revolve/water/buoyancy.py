@@ -180,12 +180,15 @@ def displaced(
 ) -> tuple[Scalar, Vec]:
     """The water that a part displaces: its mass and the first moment of it.
 
-    The box's submerged share is that of the part's own volume, and its centre moves as the box's
-    does: exact wholly under water, and for a part that fills its box.
+    The surface cuts the box where it is. The box's submerged share is that of the part's own
+    volume, whose centre stands as far from the submerged piece's as it does from the box's when
+    all is under water: exact there, and for a part that fills its box. Where the centre of volume is
+    off the box's by e and the surface cuts the box, force and moment have no potential: a part that
+    goes in with e downwards and comes out with e upwards has gained 2 ρ V g |e| on its way round.
 
     Args:
-        share: submerged share of the volume [-].
-        moment: share times centre of the submerged piece, from the centre of volume [m].
+        share: submerged share of the box [-].
+        moment: share times centre of the submerged piece, from the box's centre [m].
         volume: displaced when wholly submerged [m³].
         center: centre of volume, from where moments are taken, in the frame of `moment` [m].
         density: of the water [kg/m³].

@@ -167,7 +167,7 @@ def test_slanted_modules_have_our_water():
             mujoco.mj_jac(model, data, *jacobians, place, 1)
             v, w = (axes.T @ j @ qvel[:, lane] for j in jacobians)
             center = table.center_of_volume[p]
-            share, moment = clip_box(axes[2], -(place + axes @ center)[2], half)
+            share, moment = clip_box(axes[2], -place[2], half)
             lift = density * 9.81 * table.volume[p] * axes[2]
             push = share * (lift - density * table.drag_linear[p] * np.abs(v) * v)
             twist = -share * density * table.drag_angular[p] * np.abs(w) * w

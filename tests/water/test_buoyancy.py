@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import at_rest, body, box_robot, march, world
+from laboratory import QUICK, accelerate, at_rest, body, box_robot, march, world
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import trim_neutral
+from mjx_revolve.engine.levels import make_levels
+from mjx_revolve.engine.pushes import part_forces
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.step import init
 from mjx_revolve.water.buoyancy import buoyancy, submersion
-from mjx_revolve.water.flow import Water
+from mjx_revolve.water.flow import Water, water_of
 from references import clip_box
 
 WATER = 999.1026  # kg/m³, the thesis's
@@ -487,3 +490,59 @@ def test_righting_frequency_of_a_submerged_box(added_mass):
     inertia += WATER * robot.fluid.added_inertia[0, 0] if added_mass else 0.0
     omega = np.sqrt(mass * G * lever / inertia)
     assert 2 * qpos[:, 4, 0] == pytest.approx(1e-3 * np.cos(omega * time), abs=2e-5)
+
+
+def test_a_box_is_cut_where_it_is_wherever_its_volume_has_its_centre():
+    """A half-dense cube whose volume has its centre off the box's: half wet at half its height.
+
+    Upright it floats there; on its side it is turned by ½ ρ V g times the lever, and deep by all of
+    it. With the mask the box's centre counts, too.
+    """
+    size, lever, half = 0.1, 0.02, 0.5**0.5
+    mass = 0.5 * WATER * size**3
+    qpos = np.zeros((7, 5))
+    qpos[2] = 0.0, 0.0, -1.0, 0.01, -0.01
+    qpos[3:7] = np.array([[1, 0, 0, 0], *2 * [[half, half, 0, 0]], *2 * [[1, 0, 0, 0]]]).T
+    box = partial(box_robot, (size,) * 3, mass, center_of_volume=(0.0, 0.0, lever))
+    found = accelerate(box(world(gravity=G, buoyancy="partial")), qpos, np.zeros((6, 5)))
+    assert found[2] == pytest.approx([0, 0, G, -0.2 * G, 0.2 * G], abs=1e-12)
+    torque = WATER * size**3 * G * lever * np.array([0, 0.5, 1, 0, 0])
+    # The volume's centre lies to the side of the mass's, and the water lifts it up.
+    assert -found[3] == pytest.approx(torque / (mass * size**2 / 6), abs=1e-9)
+    found = accelerate(box(world(gravity=G, buoyancy="mask")), qpos, np.zeros((6, 5)))
+    assert found[2, 3:] == pytest.approx([-G, G], abs=1e-12)
+
+
+def part_buoyancy(robot, qpos, qvel):
+    """`[lanes, npart, 3]` buoyancy of each part, world frame."""
+    with jax.enable_x64(True):
+        levels = make_levels(robot)
+        state = init(levels, jnp.asarray(qpos), jnp.asarray(qvel))
+        thrusts = jnp.zeros((robot.num_thrusters, qpos.shape[1]))
+        run = jax.jit(partial(part_forces, levels), compiler_options=QUICK)
+        return np.asarray(run(state, water_of(robot.world), thrusts)[0])
+
+
+def test_the_shipped_auv_is_cut_where_its_core_is():
+    """Its ballast's volume puts the core's centre of volume 4.7 mm off the box's.
+
+    Half its core's box is under water where the core's centre is, at any attitude about it.
+    """
+    robot = build_robot(body("auv"), world(gravity=G, buoyancy="partial"))
+    fluid = robot.fluid
+    core = int(fluid.volume.argmax())
+    off = np.linalg.norm(fluid.center_of_volume[core])
+    assert off > 2e-3
+    quat = np.random.default_rng(4).normal(size=(4, 8))
+    qpos, qvel = at_rest(robot, 8)
+    qpos[3:7] = quat / np.linalg.norm(quat, axis=0)
+    data, forces = mujoco.MjData(robot.mj_model), part_buoyancy(robot, qpos, qvel)
+    for lane in range(8):
+        data.qpos[:] = qpos[:, lane]
+        mujoco.mj_kinematics(robot.mj_model, data)
+        for p, whole in enumerate(WATER * G * fluid.volume):
+            turn = data.xmat[fluid.body[p]].reshape(3, 3)
+            depth = -(data.xpos[fluid.body[p]] + turn @ fluid.position[p])[2]
+            up = (turn @ fluid.rotation[p])[2]
+            share, _ = clip_box(up, depth, fluid.half_size[p])
+            assert forces[lane, p] == pytest.approx([0, 0, share * whole], abs=1e-9)
