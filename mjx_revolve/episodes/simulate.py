@@ -25,7 +25,7 @@ from mjx_revolve.water.flow import Water, gust_path, water_of
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["time", "qpos", "qvel", "xpos", "ctrl", "power", "command"],
+    data_fields=["time", "qpos", "qvel", "xpos", "ctrl", "power", "command", "surface_height"],
     meta_fields=[],
 )
 @dataclass(frozen=True, repr=False)
@@ -43,6 +43,7 @@ class Trajectory:
         power: `[T]` mechanical power at the servos, summed without sign, and what ideal propellers
             need for the thrust [W].
         command: `[T, nthruster]` commands of the thrusters behind their lag [-].
+        surface_height: `[T]` z of the still surface, world frame [m]; None for the world's.
     """
 
     time: jax.Array
@@ -52,6 +53,7 @@ class Trajectory:
     ctrl: jax.Array
     power: jax.Array
     command: jax.Array | None = None
+    surface_height: jax.Array | None = None
 
     __repr__ = brief
 
@@ -112,6 +114,7 @@ def _compiled(
             ctrl=ctrl[..., 0][:, back],
             power=energy[..., 0] / dt,
             command=jax.vmap(simulator.command)(states)[..., 0],
+            surface_height=None if moving is None else moving.surface_height[:, 0],
         )
 
     hasty = once and engine == "population"
@@ -139,8 +142,8 @@ def simulate(
             `BoundController` (see `controller.bind_genes`), or a function of time [s] that
             returns `[nu]` and that JAX can trace. Thrusters take commands within their range.
         duration: [s]; by default as long as `ctrl` has rows, else 5.
-        qpos: `[nq]` start; by default the rest pose 1 m below the surface. Root position, world
-            frame [m], quaternion (w, x, y, z), hinges [rad].
+        qpos: `[nq]` start; by default the rest pose 1 m below the world's still surface, whatever
+            that of `water`. Root position, world frame [m], quaternion (w, x, y, z), hinges [rad].
         qvel: `[nv]` start, by default at rest; root velocity, world frame [m/s], root angular
             velocity, body frame [rad/s], hinges [rad/s].
         key: if given, the default start pose is turned at random about the vertical; it also draws
@@ -188,6 +191,11 @@ def simulate(
             turned = jnp.stack([jnp.cos(half), 0 * half, 0 * half, jnp.sin(half)])
             qpos = jnp.asarray(qpos).at[3:7].set(turned)
     qpos = _array("qpos", qpos, (model.nq,))
+    if not isinstance(qpos, jax.core.Tracer) and not np.any(qpos[3:7]):
+        raise InputError(
+            "qpos[3:7]: expected a quaternion (w, x, y, z) of any length but 0; found zeros "
+            "([1, 0, 0, 0] for the rest pose)"
+        )
     qvel = jnp.zeros(model.nv) if qvel is None else _array("qvel", qvel, (model.nv,))
     if water is None and robot.world.gust is not None:
         gust_key = jax.random.fold_in(jax.random.key(0) if key is None else key, 1)

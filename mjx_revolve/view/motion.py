@@ -48,7 +48,8 @@ class Motion:
         path: `[T, 3]` of the core, world frame [m].
         steady: `[T, 3]` the path without the to and fro of the strokes [m].
         along: `[2]` unit vector of the way in the horizontal plane; x where the robot stayed.
-        depth: `[T]` of the core below the still surface [m].
+        surface: `[T]` z of the still surface, world frame [m].
+        depth: `[T]` of the core below it [m].
         period: of the strokes [s]; None where the hinges do not repeat themselves.
         poses: rows along the way that can be told apart, see `choose_poses`.
         angles: `[T, nhinge]` of the joints in the order of the servos [rad].
@@ -80,6 +81,7 @@ class Motion:
     path: np.ndarray
     steady: np.ndarray
     along: np.ndarray
+    surface: np.ndarray
     depth: np.ndarray
     period: float | None
     poses: list[int]
@@ -138,6 +140,8 @@ def analyse_motion(
     time, qpos, ctrl, power = (np.asarray(column, float)[:count] for column in columns)
     length = robot.morphology.length
     weight = robot.morphology.mass * max(robot.world.gravity, 1e-9)
+    own = getattr(trajectory, "surface_height", None)  # what has none is in the world's water
+    surface = np.full(count, robot.world.surface_height) if own is None else np.array(own)[:count]
     path, period = qpos[:, :3], stroke_period(time, qpos[:, 7:])
     net = path[-1, :2] - path[0, :2]
     moved = float(np.linalg.norm(net)) > _STAYED * length
@@ -164,7 +168,8 @@ def analyse_motion(
         path=path,
         steady=smooth_path(time, path, period),
         along=net / np.linalg.norm(net) if moved else np.array([1.0, 0.0]),
-        depth=float(robot.world.surface_height) - path[:, 2],
+        surface=surface,
+        depth=surface - path[:, 2],
         period=period,
         poses=choose_poses(time, path, length),
         angles=qpos[:, robot.mj_model.jnt_qposadr[joints]],

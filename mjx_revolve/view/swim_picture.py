@@ -120,7 +120,7 @@ def _ground(robot: Robot, points: np.ndarray) -> tuple[float, np.ndarray, bool]:
 
 def _surface(motion: Motion, points: np.ndarray, top: float, fade: float) -> Surface | None:
     """The water's surface around points `[n, 2]`, if it is near the robot's top [m]."""
-    height = float(motion.robot.world.surface_height)
+    height = float(motion.surface[0])
     if height >= top + _SURFACE_NEAR * motion.length:
         return None
     return Surface(height, region_around(motion.along, points, fade))

@@ -181,8 +181,8 @@ def displaced(
     """The water that a part displaces: its mass and the first moment of it.
 
     The surface cuts the box where it is. The box's submerged share is that of the part's own
-    volume, whose centre stands as far from the submerged piece's as it does from the box's when
-    all is under water: exact there, and for a part that fills its box. Where the centre of volume is
+    volume, whose centre stands as far from the submerged piece's as it does from the box's when all
+    is under water: exact there, and for a part that fills its box. Where the centre of volume is
     off the box's by e and the surface cuts the box, force and moment have no potential: a part that
     goes in with e downwards and comes out with e upwards has gained 2 ρ V g |e| on its way round.
 

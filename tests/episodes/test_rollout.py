@@ -26,12 +26,14 @@ from laboratory import (
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg
+from mjx_revolve.control.feedback import make_feedback
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.kinematics import body_positions
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.motion import analyse_motion
 from mjx_revolve.water.flow import Water
 
 STEPS, DT = 40, 0.005
@@ -50,6 +52,41 @@ def quick_compiles():
 def still(elbow):
     """The elbow left alone for 0.2 s."""
     return simulate(elbow, None, SPAN)
+
+
+# ------------------------------------------------------------------------- surfaces
+
+
+def test_depths_are_below_the_surface_of_the_water_that_is_given():
+    """What is sensed, floats and is told of depth moves with the surface, all of it alike.
+
+    An AUV holds 2 m by feedback, from 1 m, in the world's water and in one whose surface stands 5 m
+    higher.
+    """
+    tank = world(**WATER)
+    robot = build_robot(trim_neutral(body("auv"), tank.density), tank)
+    holds = make_feedback(robot, depth=2.0)
+    weights = np.zeros((4, 7))
+    weights[:2, 0], weights[:2, 1] = -0.5, -1.0  # depth error and climb to the two that heave
+    genes = bind_genes(holds, np.concatenate([np.zeros(4), weights.ravel()]))
+    with jax.enable_x64(True):
+        at_home = simulate(robot, genes, 40.0)
+        start = robot.start_qpos() + 5 * np.eye(7)[2]
+        higher = simulate(robot, genes, 40.0, qpos=start, water=Water(5.0, (0.0, 0.0, 0.0)))
+    moved = np.array(higher.qpos)
+    moved[:, 2] -= 5.0
+    assert moved == pytest.approx(np.array(at_home.qpos), abs=1e-6)
+    own, other = (analyse_motion(robot, x).depth for x in (at_home, higher))
+    assert own[0] == pytest.approx(1.0, abs=1e-3)
+    assert own[-1] == pytest.approx(2.0, abs=0.05)
+    assert other == pytest.approx(own, abs=1e-6)
+
+
+def test_a_start_without_direction_is_refused(elbow):
+    qpos = np.array(elbow.start_qpos())
+    qpos[3:7] = 0
+    with pytest.raises(InputError, match=r"qpos\[3:7\]: expected a quaternion .* found zeros"):
+        simulate(elbow, None, SPAN, qpos=qpos)
 
 
 # ------------------------------------------------------------------------- what comes back

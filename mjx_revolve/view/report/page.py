@@ -262,7 +262,7 @@ def _champion(record: RunRecord, replay: Replay) -> str:
     motion = replay.motion
     robot = motion.robot
     drawn = {
-        "way": plot_way(motion.time, motion.path, float(robot.world.surface_height)),
+        "way": plot_way(motion.time, motion.path, float(motion.surface[0])),
         "joints": champion_pictures.plot_joints(motion) if robot.num_hinges else None,
         "phases": None if motion.phases is None else champion_pictures.plot_phases(motion),
         "thrusters": champion_pictures.plot_thrusters(motion) if robot.num_thrusters else None,
