@@ -523,8 +523,8 @@ def _pick_rows(
 
 # What parts have only where a law of the robot's asks for it.
 _OPTIONAL = (
-    "exposed", "drag_linear", "drag_angular", "carried", "carried_mass", "carried_inertia", "plate",
-    "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid", "mounts",
+    "bulk", "exposed", "drag_linear", "drag_angular", "carried", "carried_mass", "carried_inertia",
+    "plate", "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid", "mounts",
 )  # fmt: skip
 
 

@@ -335,6 +335,7 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
         half_size=_vec(_end(size(table.half_size), 1.0)),
         center_position=_vec(_end(center, 0.0)),
         volume=_end(table.volume, 0.0),
+        bulk=_end(8 * table.half_size.prod(-1), 0.0) if world.drag == "inertia_box" else None,
         exposed=_vec(_end(size(table.exposed), 0.0)) if world.surface_tension else None,
         drag_linear=_vec(_end(size(world.density * table.drag_linear), 0.0)) if facing else None,
         drag_angular=_vec(_end(size(world.density * table.drag_angular), 0.0)) if facing else None,

@@ -402,7 +402,7 @@ def forces_on_parts(
 
     Returns:
         For each group of the level's parts. MuJoCo's inertia-box law, which knows only whole
-        bodies, is shared out among a body's parts by their submerged volume.
+        bodies, is shared out among a body's parts by what of their boxes is submerged.
     """
     found, shares = [], []
     for parts in level.parts:
@@ -426,12 +426,12 @@ def forces_on_parts(
         force = _inertia_box(world, level, motion, water, _share_of_body(level, shares))[1]
         total_wet = total(
             *[
-                sum_parts(mul(parts.volume, share), parts.count)
+                sum_parts(mul(parts.bulk, share), parts.count)
                 for parts, share in zip(level.parts, shares, strict=True)
             ]
         )
         for k, (parts, share) in enumerate(zip(level.parts, shares, strict=True)):
-            part = mul(parts.volume, share) / jnp.maximum(total_wet, 1e-30)
+            part = mul(parts.bulk, share) / jnp.maximum(total_wet, 1e-30)
             own = tuple(mul(part, x) for x in force)
             found[k] = found[k]._replace(drag=vadd(found[k].drag, own))
     return found
@@ -444,11 +444,14 @@ def _plus(a: SpatialInertia | None, b: SpatialInertia | None) -> SpatialInertia 
 
 
 def _share_of_body(level: Level, shares: Sequence[Scalar]) -> Scalar:
-    """Submerged share of each body, its parts weighted by volume."""
+    """Submerged share of each body, its parts weighted by their boxes' volume.
+
+    Not by what they displace: a part of no volume of its own is dragged, too.
+    """
     n = level.count
     wet, whole = 0.0, 1e-30
     for parts, share in zip(level.parts, shares, strict=True):
-        k, volume = parts.count, parts.volume
+        k, volume = parts.count, parts.bulk
         if not isinstance(volume, jax.Array):
             volume = np.broadcast_to(np.asarray(volume), (k, n, 1))
         wet = add(wet, sum_parts(mul(volume, share), k))

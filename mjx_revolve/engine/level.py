@@ -113,9 +113,9 @@ class Mounts(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=[
-        "position", "rotation", "half_size", "center_position", "volume", "exposed",
-        "drag_linear", "drag_angular", "carried", "carried_mass", "carried_inertia", "plate",
-        "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid", "mounts",
+        "position", "rotation", "half_size", "center_position", "volume", "bulk",
+        "exposed", "drag_linear", "drag_angular", "carried", "carried_mass", "carried_inertia",
+        "plate", "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid", "mounts",
     ],
     meta_fields=["laws", "count"],
 )  # fmt: skip
@@ -135,6 +135,7 @@ class Parts:
         half_size: half edges of the box [m].
         center_position: centre of the displaced volume [m].
         volume: displaced [m³].
+        bulk: volume of the box [m³].
         exposed: share of each pair of faces that the water reaches [-].
         drag_linear: ρ ½ C_d A of each pair of faces [kg/m].
         drag_angular: the same against turning [kg·m²].
@@ -157,6 +158,7 @@ class Parts:
     half_size: Vec
     center_position: Vec
     volume: Scalar
+    bulk: Any = None
     exposed: Any = None
     drag_linear: Any = None
     drag_angular: Any = None

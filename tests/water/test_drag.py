@@ -302,3 +302,21 @@ def test_mujoco_qfrc_passive(law, size):
             found = ellipsoid(v, w, constants, True)
         found = np.concatenate([np.stack(x) for x in found])
     assert found == pytest.approx(expected, abs=1e-10 * np.abs(expected).max())
+
+
+def test_a_body_that_displaces_nothing_has_the_inertia_boxs_drag():
+    """Deep, with the law's whole force and torque; half in, half of them, as its box is."""
+    size, mass = np.array([0.1, 0.06, 0.04]), 0.2
+    robot = box_robot(tuple(size), mass, world(drag="inertia_box", buoyancy="partial"), volume=0.0)
+    qpos, qvel = at_rest(robot, 3)
+    qpos[2], qvel[:3], qvel[3:] = [-1.0, 0.0, 1.0], 0.3, 0.5
+    found = accelerate(robot, qpos, qvel)
+    viscosity = robot.world.viscosity
+    rates = (np.float64(0.3),) * 3, (np.float64(0.5),) * 3
+    with jax.enable_x64(True):
+        force, torque = inertia_box(*rates, tuple(size), RHO, viscosity)
+    share = np.array([1.0, 0.5, 0.0])
+    assert found[:3] == pytest.approx(np.outer(force, share) / mass, rel=1e-9)
+    own = mass / 12 * (np.sum(size**2) - size**2)
+    turning = np.array(torque)[:, None] * share - np.cross(0.5 * np.ones(3), 0.5 * own)[:, None]
+    assert found[3:] == pytest.approx(turning / own[:, None], rel=1e-9)
