@@ -49,6 +49,7 @@ class Controller(NamedTuple):
             feels.
         genes: `[num_genes]` what each belongs to, or () where that is not known: only needed to
             carry genes from one body to another.
+        feels: which of `sense.FEELS` it reads: they are there only for those who ask.
     """
 
     num_genes: int
@@ -57,6 +58,7 @@ class Controller(NamedTuple):
     init: Callable[[Any], Any]
     step: Callable[[Any, Any, jax.Array, Sense], tuple[Any, jax.Array]]
     genes: tuple[Gene, ...] = ()
+    feels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

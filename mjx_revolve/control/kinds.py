@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.feedback import make_feedback
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.sense import FEELS, Sense
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError
@@ -72,8 +72,12 @@ def _check_own(name: str, controller: Any, plant: Plant) -> None:
             f"{place}: gene_names: expected {count} of them, as num_genes says; found "
             f"{len(controller.gene_names)}"
         )
+    for name_felt in controller.feels:
+        if name_felt not in FEELS:
+            raise InputError(
+                f"{place}: feels: expected any of {', '.join(FEELS)}; found {name_felt!r}"
+            )
     lanes, rows = 3, plant.num_rows
-    one: Any = jax.ShapeDtypeStruct((lanes,), jnp.float32)
 
     def run(genes: jax.Array, time: jax.Array, sense: Sense) -> Any:
         parameters = controller.decode(genes, plant)
@@ -87,7 +91,7 @@ def _check_own(name: str, controller: Any, plant: Plant) -> None:
         run,
         jax.ShapeDtypeStruct((count, lanes), jnp.float32),
         jax.ShapeDtypeStruct((), jnp.float32),
-        Sense(one, one, (one, one, one), (one, one, one)),
+        _example_sense(plant.num_hinge_rows, lanes, controller.feels),
     )
     if getattr(targets, "shape", None) != (rows, lanes):
         raise InputError(
@@ -99,6 +103,31 @@ def _check_own(name: str, controller: Any, plant: Plant) -> None:
             f"{place}: step: expected a state of the shapes that init gives, {_shapes(before)}; "
             f"found {_shapes(after)}"
         )
+
+
+def _example_sense(hinges: int, lanes: int, feels: Sequence[str]) -> Sense:
+    """The shapes of what is felt."""
+
+    def given(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct((*shape, lanes), jnp.float32)
+
+    one, joint, touch = given(), given(hinges), given(1 + hinges)
+    three = (one, one, one)
+    asked: dict[str, Any] = {"force": three, "load": joint, "work": one, "touch": touch}
+    return Sense(
+        height=one,
+        climb=one,
+        up=three,
+        spin=three,
+        north=three,
+        angle=joint,
+        speed=joint,
+        flow=three,
+        altitude=one,
+        target=three,
+        noise=jax.ShapeDtypeStruct((lanes,), jnp.uint32),
+        **{name: asked[name] for name in feels},
+    )
 
 
 def _shapes(state: Any) -> str:

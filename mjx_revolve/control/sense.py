@@ -2,13 +2,62 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
-from mjx_revolve.engine.state import Root
-from mjx_revolve.numerics.spatial import Vec, quat_to_rows
-from mjx_revolve.water.flow import Water
+from mjx_revolve.engine.state import Engine, Root
+from mjx_revolve.numerics.spatial import Vec, matTvec, quat_to_rows, vadd, vscale, vsub
+from mjx_revolve.water.bed import bed_height
+from mjx_revolve.water.flow import Water, flow
+from mjx_revolve.water.world import World
+
+FEELS = ("force", "load", "work", "touch")
+"""Fields of `Sense` that are there only for a `Controller` that names them in `feels`.
+
+The first three need a memory, which travels with the state, and touch a sweep over the body; all
+others cost nothing unless they are used, as the compiler leaves out what nobody reads.
+"""
+
+
+class Cues(NamedTuple):
+    """What an episode gives its robots to feel beside their own state, `[lanes]` each or None.
+
+    Attributes:
+        target: where the target is at the start, world frame, three of `[lanes]` [m].
+        drift: its velocity, likewise [m/s]; None where it keeps still.
+        noise: what noise is drawn from, uint32 `[lanes]`; the same for all individuals in a trial.
+    """
+
+    target: Any = None
+    drift: Any = None
+    noise: Any = None
+
+    def target_at(self, time: Any) -> Vec:
+        """Where the target is, world frame [m].
+
+        Args:
+            time: since the episode's start [s].
+        """
+        if self.drift is None:
+            return tuple(self.target)
+        return vadd(self.target, vscale(time, self.drift))
+
+
+class Memory(NamedTuple):
+    """What is kept from step to step of what is felt; None where nobody asks for it.
+
+    Attributes:
+        acceleration: of the core over the last step, world frame, three of `[lanes]` [m/s²].
+        ctrl: the last command, `[n, lanes]` in the plant's order.
+        work: done so far `[lanes]` [J].
+    """
+
+    acceleration: Any = None
+    ctrl: Any = None
+    work: Any = None
 
 
 class Sense(NamedTuple):
@@ -19,27 +68,146 @@ class Sense(NamedTuple):
         climb: its vertical velocity [m/s].
         up: the world's vertical, core frame, three of `[lanes]` [-].
         spin: angular velocity, core frame, three of `[lanes]` [rad/s].
+        north: the world's x axis, core frame, three of `[lanes]` [-]: a compass.
+        angle: of the hinges, `[hinge rows, lanes]` in the plant's order; 0 for rows that are no
+            hinge [rad].
+        speed: of the hinges, likewise [rad/s].
+        flow: velocity of the water at the core relative to the core, core frame, three of `[lanes]`
+            [m/s].
+        altitude: of the core's centre above the bed, straight down [m]; infinite without a bed.
+        target: from the core to the target, core frame, three of `[lanes]` [m]; 0 without one.
+        noise: what noise of sensors is drawn from, uint32 `[lanes]`; None without.
+        force: specific force at the core, core frame, three of `[lanes]` [m/s²]: what an
+            accelerometer feels, the acceleration over the last step less gravity's. None unless
+            asked for; see `FEELS`.
+        load: torque of the servos under the last command, `[hinge rows, lanes]` [N·m]; likewise.
+        work: done by servos and propellers so far [J]; likewise.
+        touch: how hard the bed pushes the core's rigid body, then what each hinge carries,
+            `[1 + hinge rows, lanes]` [N]; likewise.
     """
 
     height: jax.Array
     climb: jax.Array
     up: Vec
     spin: Vec
+    north: Any = None
+    angle: Any = None
+    speed: Any = None
+    flow: Any = None
+    altitude: Any = None
+    target: Any = None
+    noise: Any = None
+    force: Any = None
+    load: Any = None
+    work: Any = None
+    touch: Any = None
 
 
-def feel(root: Root, water: Water) -> Sense:
+def feel(
+    world: World | None,
+    engine: Engine,
+    state: Any,
+    water: Water,
+    time: jax.Array,
+    cues: Cues,
+    memory: Memory,
+    feels: Sequence[str] = (),
+) -> Sense:
     """What robots feel.
 
     Args:
-        root: where their cores are and how they move.
+        world: around them; None where nobody asks for water or bed.
+        engine: what steps them.
+        state: of the population.
         water: its still surface is what heights are measured from.
+        time: since the episode's start [s].
+        cues: of the episode.
+        memory: from `start_memory` or `remember`.
+        feels: which of `FEELS` are asked for.
 
     Returns:
         The senses.
     """
+    root = engine.root(state)
+    turn = quat_to_rows(root.quat)
+    angle, speed = engine.joints(state)
+    zero = jnp.zeros_like(root.position[2])
+    moving: Any = (zero, zero, zero)
+    altitude = zero + jnp.inf
+    if world is not None:
+        current, _ = flow(world, water, *root.position)
+        moving = matTvec(turn, vsub(current, root.velocity))
+        if world.bed is not None:
+            altitude = root.position[2] - bed_height(world.bed, *root.position[:2])
+    target: Any = (zero, zero, zero)
+    if cues.target is not None:
+        target = matTvec(turn, vsub(cues.target_at(time), root.position))
+    force = None
+    if memory.acceleration is not None:
+        gravity = 9.81 if world is None else world.gravity
+        x, y, z = memory.acceleration
+        force = matTvec(turn, (x, y, z + gravity))
     return Sense(
-        root.position[2] - water.surface_height,
-        root.velocity[2],
-        quat_to_rows(root.quat)[2],
-        root.spin,
+        height=root.position[2] - water.surface_height,
+        climb=root.velocity[2],
+        up=turn[2],
+        spin=root.spin,
+        north=turn[0],
+        angle=angle,
+        speed=speed,
+        flow=moving,
+        altitude=altitude,
+        target=target,
+        noise=cues.noise,
+        force=force,
+        load=None if memory.ctrl is None else engine.load(state, memory.ctrl),
+        work=memory.work,
+        touch=engine.touch(state, water) if "touch" in feels else None,
+    )
+
+
+def start_memory(feels: Sequence[str], engine: Engine, state: Any) -> Memory:
+    """What is remembered before the first step: rest, no work, servos told to stay where they are.
+
+    Args:
+        feels: which of `FEELS` are asked for.
+        engine: what steps the robots.
+        state: at the start.
+
+    Returns:
+        The memory.
+    """
+    zero = jnp.zeros_like(engine.root(state).position[0])
+    angle = engine.joints(state)[0]
+    pad = jnp.zeros((engine.plant.num_rows - angle.shape[0], *angle.shape[1:]), angle.dtype)
+    return Memory(
+        acceleration=(zero, zero, zero) if "force" in feels else None,
+        ctrl=jnp.concatenate([angle, pad]) if "load" in feels else None,
+        work=zero if "work" in feels else None,
+    )
+
+
+def remember(
+    memory: Memory, before: Root, after: Root, ctrl: jax.Array, work: jax.Array, dt: float
+) -> Memory:
+    """The memory after a step.
+
+    Args:
+        memory: before it.
+        before: where the cores were and how they moved.
+        after: where they are.
+        ctrl: what was asked for, `[n, lanes]`.
+        work: done in the step `[lanes]` [J].
+        dt: of the step [s].
+
+    Returns:
+        The memory.
+    """
+    acceleration = memory.acceleration
+    if acceleration is not None:
+        acceleration = vscale(1 / dt, vsub(after.velocity, before.velocity))
+    return Memory(
+        acceleration=acceleration,
+        ctrl=None if memory.ctrl is None else ctrl,
+        work=None if memory.work is None else memory.work + work,
     )

@@ -82,6 +82,10 @@ class Levels:
             return jnp.zeros((0, *like.shape), like.dtype)
         return jnp.concatenate(values)[np.argsort(self.hinge_order).astype(np.int32)]
 
+    def merge(self, values: Sequence[jax.Array], like: jax.Array) -> jax.Array:
+        """The way back from `split`; `[0, lanes]` of the kind of `like` without hinges."""
+        return jnp.concatenate(values) if self.below else jnp.zeros((0, *like.shape), like.dtype)
+
     # What parts are, group by group.
 
     def set_apart(self, groups: tuple[jax.Array, ...]) -> tuple[Any, ...]:

@@ -20,11 +20,12 @@ from mjx_revolve.engine.dynamics import outer_forces, with_water
 from mjx_revolve.engine.hydrodynamics import Before
 from mjx_revolve.engine.levels import Levels, make_levels
 from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.engine.pushes import push_of
+from mjx_revolve.engine.pushes import push_of, touch_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
 from mjx_revolve.engine.servos import end_stop, servo
 from mjx_revolve.engine.state import Engine, Root, turn_quat
 from mjx_revolve.engine.step import init as start
+from mjx_revolve.engine.step import load as torques
 from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.numerics.inertia import Motion, SpatialInertia, cross_force, gyroscope
 from mjx_revolve.numerics.spatial import full, quat_to_rows
@@ -178,11 +179,26 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         qpos, qvel, _, command, _ = state
         return push_of(levels, start(levels, qpos, qvel), water, drive(command, ctrl)[1])
 
+    def load(state: Any, ctrl: jax.Array) -> jax.Array:
+        qpos, qvel, *_ = state
+        # The plant's rows are the robot's hinges, and so are those of the levels, spread again.
+        rows = ctrl[: plant.num_hinges][levels.hinge_order]
+        found = torques(levels, start(levels, qpos, qvel), rows)
+        return levels.gather(levels.split(found), qpos[0])
+
+    def touch(state: Any, water: Water) -> jax.Array:
+        qpos, qvel, *_ = state
+        found = touch_of(levels, start(levels, qpos, qvel), water)
+        return jnp.concatenate([found[:1], levels.gather(levels.split(found[1:]), qpos[0])])
+
     return Engine(
         init=init,
         step=step,
         observe=lambda state: state[:2],
         root=root,
+        joints=lambda state: (state[0][7:], state[1][6:]),
+        load=load,
+        touch=touch,
         command=lambda state: state[3],
         push=push,
         plant=plant,

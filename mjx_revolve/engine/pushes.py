@@ -18,6 +18,7 @@ from mjx_revolve.numerics.spatial import (
     Vec,
     add,
     dot,
+    safe_norm,
     vsub,
 )
 from mjx_revolve.water.flow import Water
@@ -61,6 +62,39 @@ def push_of(bodies: Bodies, state: State, water: Water, thrusts: Any) -> tuple[V
     own = jax.tree.map(lambda x: x[0], pushes(bodies.root, None, (root, None))[2])
     bed, wet = jax.tree.map(add, own, below)
     return bed, wet
+
+
+def touch_of(bodies: Bodies, state: State, water: Water) -> jax.Array:
+    """How hard the bed pushes each moving body.
+
+    Args:
+        bodies: the robots.
+        state: the population.
+        water: surface and current.
+
+    Returns:
+        `[1 + nhinge, lanes]` length of its force on the core's rigid body, then on what each hinge
+        carries, in the order of `bodies.merge` [N]; 0 where there is no bed within reach.
+    """
+    like = state.position[0]
+    if not bodies.touches:
+        hinges = bodies.merge(state.angle, like)
+        return jnp.zeros((1 + hinges.shape[0], *like.shape), like.dtype)
+    relative = state._replace(velocity=vsub(state.velocity, water.current))
+    root, moved, *_ = move_bodies(bodies, relative, True, 0.0)
+
+    def pushes(level: Level, gathered: Any, moved: tuple[Moving, Any]) -> tuple[Any, Any, Any]:
+        motion = moved[0].motion
+        size = jnp.zeros((level.count, *like.shape), like.dtype)
+        if level.points is not None:
+            size = size + safe_norm(
+                bed_on_level(bodies.world, level, motion, level.points, water)[1]
+            )
+        return (), size, ()
+
+    _, below, _ = bodies.up(pushes, ((), ()), moved)
+    core = pushes(bodies.root, None, (root, None))[1]
+    return jnp.concatenate([core, bodies.merge(below, like)])
 
 
 def part_forces(

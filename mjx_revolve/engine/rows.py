@@ -128,6 +128,10 @@ class Rows:
         padded = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
         return jnp.take_along_axis(padded, self.bodies.row, 0)
 
+    def merge(self, values: jax.Array, like: jax.Array) -> jax.Array:
+        """The way back from `split`."""
+        return values[:, 0]
+
     # What parts are, group by group.
 
     def set_apart(self, groups: tuple[jax.Array, ...]) -> tuple[Any, ...]:
@@ -148,6 +152,10 @@ class Rows:
         return root, tuple(jnp.ones((count, n, 1, *lanes), dtype) for n in row.carrying)
 
     # The traversal.
+
+    def map(self, fun: Callable[..., Any], *xs: Any) -> Any:
+        """What `fun`, element-wise, gives for all rows at once; see `Levels.map`."""
+        return fun(_whole(self.capacity.row, self.bodies.rows), *xs)
 
     def down(self, fun: Callable[..., Any], root: Any, *xs: Any) -> Any:
         """From the roots to the tips; see `Levels.down`."""

@@ -72,6 +72,23 @@ def servo(
     return torque, dt * jnp.where(beyond, slope, jnp.where(near, chord, 0))
 
 
+def motor_torque(hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar) -> Scalar:
+    """Torque of the motors now, not what an implicit step makes of it, without joints' friction.
+
+    Args:
+        hinges: their numbers.
+        angle: `[nbody, lanes]` [rad].
+        speed: likewise [rad/s].
+        target: likewise [rad].
+
+    Returns:
+        The torque, likewise [N·m].
+    """
+    torque, _ = servo(hinges, angle, speed, target, 0.0, 1.0, 0.0)
+    # Beyond the top speed that torque brakes; a motor has no more than its effort.
+    return jnp.clip(torque, *(_cast(x, torque) for x in hinges.effort))
+
+
 def _cast(x: Scalar, like: jax.Array) -> Scalar:
     return x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)
 

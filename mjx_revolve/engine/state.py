@@ -84,6 +84,11 @@ class Engine(NamedTuple):
             the servos deliver or take up, summed without sign [W]).
         observe: state → (qpos `[nq, lanes]`, qvel `[nv, lanes]`).
         root: state → where the core is and how it moves; cheaper than observe.
+        joints: state → (angles [rad], speeds [rad/s]) of the hinges, `[hinge rows, lanes]` each in
+            the plant's order; cheaper than observe.
+        load: (state, ctrl) → torque of the servos that are told this, likewise [N·m].
+        touch: (state, water) → how hard the bed pushes the core's rigid body, then what each hinge
+            carries, `[1 + hinge rows, lanes]` [N]; a sweep over the body, so not for nothing.
         command: state → the thrusters' commands behind their lag, `[nthruster, lanes]` [-].
         push: (state, ctrl, water) → (force of the bed, force of the water) on the whole robot,
             world frame, three of `[lanes]` each [N]; weight and carried water's inertia apart.
@@ -95,6 +100,9 @@ class Engine(NamedTuple):
     step: Callable[[Any, jax.Array, Water], tuple[Any, jax.Array]]
     observe: Callable[[Any], tuple[jax.Array, jax.Array]]
     root: Callable[[Any], Root]
+    joints: Callable[[Any], tuple[jax.Array, jax.Array]]
+    load: Callable[[Any, jax.Array], jax.Array]
+    touch: Callable[[Any, Water], jax.Array]
     command: Callable[[Any], jax.Array]
     push: Callable[[Any, jax.Array, Water], tuple[Vec, Vec]]
     plant: Plant

@@ -13,10 +13,12 @@ import jax
 import jax.numpy as jnp
 
 from mjx_revolve.engine.dynamics import Bodies, accelerate
+from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.levels import Levels, make_levels
 from mjx_revolve.engine.plant import Plant, actuators_of, plant_of
-from mjx_revolve.engine.pushes import push_of
+from mjx_revolve.engine.pushes import push_of, touch_of
 from mjx_revolve.engine.robot import Robot, check_timestep
+from mjx_revolve.engine.servos import motor_torque
 from mjx_revolve.engine.state import Engine, State, advance, root_of
 from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.numerics.spatial import (
@@ -76,6 +78,24 @@ def observe(bodies: Bodies, state: State) -> tuple[jax.Array, jax.Array]:
     )
 
 
+def joints(bodies: Bodies, state: State) -> tuple[jax.Array, jax.Array]:
+    """Angles [rad] and speeds [rad/s] of the hinges, `[hinge rows, lanes]`, the plant's order."""
+    like = state.position[0]
+    return bodies.merge(state.angle, like), bodies.merge(state.speed, like)
+
+
+def load(bodies: Bodies, state: State, ctrl: jax.Array) -> jax.Array:
+    """Torque of the servos under a command, `[hinge rows, lanes]`, the plant's order [N·m]."""
+
+    def push(level: Level, angle: Scalar, speed: Scalar, target: Scalar) -> Scalar:
+        assert level.hinges is not None
+        return motor_torque(level.hinges, angle, speed, target)
+
+    asked = bodies.split(ctrl[: ctrl.shape[0] - bodies.thrusters.count])
+    found = bodies.map(push, state.angle, state.speed, asked)
+    return bodies.merge(found, state.position[0])
+
+
 def _drive(bodies: Bodies, state: State, ctrl: jax.Array) -> tuple[Any, Any, Any, Scalar]:
     """Targets of the servos, then the thrusters' commands, thrusts and power."""
     count = bodies.thrusters.count
@@ -128,11 +148,17 @@ def make_step_engine(bodies: Bodies, plant: Plant) -> Engine:
     def push(state: State, ctrl: jax.Array, water: Water) -> tuple[Vec, Vec]:
         return push_of(bodies, state, water, _drive(bodies, state, ctrl)[2])
 
+    def touch(state: State, water: Water) -> jax.Array:
+        return touch_of(bodies, state, water)
+
     return Engine(
         init=partial(init, bodies),
         step=partial(step, bodies),
         observe=partial(observe, bodies),
         root=root_of,
+        joints=partial(joints, bodies),
+        load=partial(load, bodies),
+        touch=touch,
         command=command,
         push=push,
         plant=plant,

@@ -10,7 +10,7 @@ import numpy as np
 from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.levels import make_levels
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.servos import servo
+from mjx_revolve.engine.servos import motor_torque
 
 
 def motor_torques(robot: Robot, qpos: Any, qvel: Any, ctrl: Any) -> np.ndarray:
@@ -29,10 +29,7 @@ def motor_torques(robot: Robot, qpos: Any, qvel: Any, ctrl: Any) -> np.ndarray:
 
     def push(level: Level, angle: Any, speed: Any, target: Any) -> Any:
         assert level.hinges is not None
-        # A step of no length: the torque now, not what an implicit step makes of it.
-        torque, _ = servo(level.hinges, angle, speed, target, 0.0, 1.0, 0.0)
-        # Beyond the top speed that torque brakes; a motor has no more than its effort.
-        return jnp.clip(torque, *(jnp.asarray(x) for x in level.hinges.effort))
+        return motor_torque(level.hinges, angle, speed, target)
 
     hinges = (np.asarray(qpos)[:, 7:], np.asarray(qvel)[:, 6:], np.asarray(ctrl)[:, robot.servos])
     rows = [levels.spread(jnp.asarray(x.T)) for x in hinges]

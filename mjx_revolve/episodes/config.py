@@ -40,10 +40,10 @@ from mjx_revolve.inputs.shipped import find_shipped
 # What is of use to one kind of controller only; `control.kinds.CONTROLLERS` has the functions.
 CONTROLLERS = {"cpg": (), "sine": ("harmonics",), "feedback": ("gain", "depth")}
 # What a task cannot do without; `tasks.TASKS` has the tasks themselves.
-TASKS = {
+TASKS: dict[str, tuple[str, ...]] = {
     "directed_swim": (),
     "speed": (),
-    "reach_target": ("target",),
+    "reach_target": (),
     "hold_depth": (),
     "crawl": (),
 }
@@ -122,7 +122,14 @@ class TaskConfig(Section):
     direction: Annotated[Vector, Unit("-")] = (1.0, 0.0, 0.0)
     """Where to swim, world frame; the length does not matter [-]."""
     target: Annotated[Vector, Unit("m")] | None = None
-    """Where to go, world frame; `reach_target` needs it [m]."""
+    """Where to go, world frame; `reach_target` needs it, or `target_distance` [m]."""
+    target_distance: Annotated[Positive, Unit("m")] | None = None
+    """How far from the start the target is, at its depth, in a direction drawn for each episode;
+    in place of `target` [m]."""
+    target_spread: Annotated[Positive, Le(math.pi), Unit("rad")] = math.pi
+    """Within which angle of the world's x axis, to both sides, that direction is drawn [rad]."""
+    target_speed: Annotated[NonNegative, Unit("m/s")] = 0.0
+    """How fast the target moves away, level, in a direction drawn for each episode [m/s]."""
     depth: Annotated[NonNegative, Unit("m")] = 2.0
     """Depth of the start below the surface; `crawl` starts on the bed instead [m]."""
     depth_tolerance: Annotated[Positive, Unit("m")] = 0.25
@@ -156,6 +163,12 @@ class TaskConfig(Section):
                 field = type(self).model_fields[name]
                 what = describe(Annotated[(field.annotation, field)]).removesuffix(", or nothing")
                 raise MisfitError(name, f"{what}, because task.type is {self.type}", "none")
+        found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
+        if len(found) > 1:
+            raise MisfitError("target", "none, as there is a target_distance", "one")
+        if not found and self.type == "reach_target":
+            what = "three numbers [m], or target_distance, because task.type is reach_target"
+            raise MisfitError("target", what, "none")
         if math.hypot(*self.direction) < 1e-9:
             raise MisfitError("direction", "a vector of some length", show(list(self.direction)))
         return self

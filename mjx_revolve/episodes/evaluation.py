@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_revolve.control.controller import Controller
+from mjx_revolve.control.sense import Cues
 from mjx_revolve.engine.batch import Bodies, Capacity
 from mjx_revolve.engine.plant import Figure
 from mjx_revolve.engine.rows import make_rows
@@ -30,7 +31,15 @@ from mjx_revolve.episodes.scoring import (
     sample_rows,
     score_episodes,
 )
-from mjx_revolve.episodes.starts import Starts, check_key, draw_starts, gusty_water, start_pose
+from mjx_revolve.episodes.starts import (
+    Starts,
+    check_key,
+    cues_of,
+    draw_starts,
+    gusty_water,
+    start_pose,
+    target_path,
+)
 from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import compiler_options, derived_by, over_chunks
@@ -128,7 +137,9 @@ class Setup:
 
     def _starts_as(self, population: jax.Array, key: jax.Array) -> Starts:
         """What a key's episodes start from, in the population's precision."""
-        return jax.tree.map(lambda x: x.astype(population.dtype), self.starts(key))
+        number = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
+        cast = lambda x: x.astype(population.dtype) if number(x) else x  # noqa: E731
+        return jax.tree.map(cast, self.starts(key))
 
     @cached_property
     def _jitted(self) -> Any:
@@ -165,10 +176,11 @@ class Setup:
         trial: jax.Array,
     ) -> Scores:
         """Scores of one chunk of episodes; see `_roll`."""
-        recorded, root, figure = self._roll(
+        recorded, root, figure, cues = self._roll(
             bodies, alike, population, starts, individual, trial, self.record_every,
             partial(make_recorder, task=self.task, world=self.world),
         )  # fmt: skip
+        recorded = record_target(self, recorded, cues)
         return score_episodes(self.task, self.settings, self.world, recorded, root[:3], figure)
 
     @property
@@ -231,7 +243,7 @@ class Setup:
         trial: jax.Array,
         every: int,
         make_record: Callable[[Engine], Callable[..., dict[str, jax.Array]]],
-    ) -> tuple[dict[str, jax.Array], jax.Array, Figure]:
+    ) -> tuple[dict[str, jax.Array], jax.Array, Figure, Cues]:
         """What is recorded of one chunk of episodes.
 
         A chunk picks what is its own from what all chunks share, so that nothing is kept for each
@@ -248,13 +260,14 @@ class Setup:
             make_record: engine → what `rollout.roll_out` takes as `record`.
 
         Returns:
-            Records, the cores' start poses `[7, lanes]`, and the bodies' sizes.
+            Records, the cores' start poses `[7, lanes]`, the bodies' sizes, and the cues.
         """
         world, controller, settings = self.world, self.controller, self.settings
         own = (lambda x: x) if alike else (lambda x: x[..., individual])
         bodies = jax.tree.map(lambda x: own(jnp.asarray(x)), bodies)
         starts = jax.tree.map(lambda x: x[..., trial], starts)
         root = start_pose(self.task, settings, world, self.figure_of(bodies), starts)
+        cues = cues_of(settings, starts, root[:3])
         plant = self.engine_of(None).plant if bodies is None else bodies.plant
         parameters = controller.decode(population[individual].T, plant)
         rows = None
@@ -263,7 +276,9 @@ class Setup:
             shape = (starts.gusts.shape[0] - 1, root.shape[-1])
             rows = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), rows)
 
-        def run(derived: bool, bodies: Any, root: Any, parameters: Any, water: Any, rows: Any):
+        def run(
+            derived: bool, bodies: Any, root: Any, parameters: Any, water: Any, rows: Any, cues: Any
+        ) -> Any:
             engine = self.engine_of(bodies, root.shape[-1], derived)
             still = water_of(world) if water is None else water
             hinges = jnp.zeros((engine.plant.num_hinges, root.shape[-1]), root.dtype)
@@ -280,14 +295,26 @@ class Setup:
                 every=every,
                 timestep=world.timestep,
                 derived=derived,
+                world=world,
+                cues=cues,
+                feels=controller.feels,
             )
             return kept
 
         episode: Any = partial(run, False)
         if self.engine is None or self.engine.fuses:  # MJX's step is differentiated as it is
             episode = derived_by(episode, partial(run, True))
-        recorded = episode(bodies, root, parameters, starts.water, rows)
-        return recorded, root, self.figure_of(bodies)
+        recorded = episode(bodies, root, parameters, starts.water, rows, cues)
+        return recorded, root, self.figure_of(bodies), cues
+
+
+def record_target(setup: Setup, recorded: dict[str, Any], cues: Cues) -> dict[str, Any]:
+    """Records with the target along the way, where the task asks for one and there is one."""
+    if "target" not in setup.task.records or cues.target is None:
+        return recorded
+    interval = setup.record_every * setup.world.timestep
+    time = interval * jnp.arange(1, setup.num_records + 1, dtype=recorded["position"].dtype)
+    return recorded | {"target": target_path(cues, time)}
 
 
 def make_recorder(

@@ -25,6 +25,7 @@ from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
 from mjx_revolve.control.controller import Controller, as_plant, bind_genes, gene_places
 from mjx_revolve.control.kinds import find_controller
+from mjx_revolve.control.sense import Cues
 from mjx_revolve.engine.batch import Bodies, Capacity, fit_capacity, pack_bodies
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_positions
@@ -32,10 +33,10 @@ from mjx_revolve.engine.plant import Plant, actuators_of, figure_of
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.episodes.config import Config, load_config, make_config
-from mjx_revolve.episodes.evaluation import Setup, make_recorder, pick_water
+from mjx_revolve.episodes.evaluation import Setup, make_recorder, pick_water, record_target
 from mjx_revolve.episodes.scoring import WORST, farthest, judge_tracks, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
-from mjx_revolve.episodes.starts import start_pose
+from mjx_revolve.episodes.starts import cues_of, start_pose
 from mjx_revolve.episodes.tasks import Task, find_task
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import Water, water_of
@@ -125,6 +126,7 @@ class Fitness:
             water=self.water(key, trial),
             engine=self.config.engine,
             once=True,
+            cues=self.cues(key, trial),
         )
 
     def judge(self, trajectory: Trajectory, key: jax.Array) -> tuple[float, dict[str, float]]:
@@ -148,6 +150,7 @@ class Fitness:
             jnp.asarray(trajectory.power * dt).reshape(records, every).sum(1)[:, None],
             jax.tree.map(lambda x: jnp.broadcast_to(x, (every * records,))[rows], water),
             height,
+            jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.cues(key)),
         )
         return float(score[0]), {name: float(value[0]) for name, value in measures.items()}
 
@@ -156,8 +159,9 @@ class Fitness:
         """The task and the measures of one lane, compiled once for all champions."""
 
         def run(
-            qpos: Any, qvel: Any, ctrl: Any, command: Any, energy: Any, water: Any, height: Any
-        ) -> Any:
+            qpos: Any, qvel: Any, ctrl: Any, command: Any, energy: Any, water: Any, height: Any,
+            cues: Any,
+        ) -> Any:  # fmt: skip
             # The rows of the episode stand side by side, as if they were a population.
             state = self.engine.init(qpos, qvel)
             if command.shape[0] and hasattr(state, "command"):
@@ -175,7 +179,7 @@ class Fitness:
                 self.task,
                 self.config.task,
                 self.robot.world,
-                recorded | {"energy": energy},
+                record_target(self.setup, recorded | {"energy": energy}, cues),
                 height,
                 self.setup.figure_of(None),
             )
@@ -185,6 +189,12 @@ class Fitness:
     def water(self, key: jax.Array, trial: int = 0) -> Water | None:
         """The water of one of a key's episodes, as `simulate` takes it; None: just the world's."""
         return pick_water(self.robot.world, self.setup.starts(key), trial)
+
+    def cues(self, key: jax.Array, trial: int = 0) -> Cues:
+        """What one of a key's episodes gives its robot to feel, as `simulate` takes it."""
+        starts = self.setup.starts(key)
+        place = self.starts(key)[0][:3, trial]
+        return cues_of(self.config.task, jax.tree.map(lambda x: x[..., trial], starts), place)
 
     @property
     def record_every(self) -> int:

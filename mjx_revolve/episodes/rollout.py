@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mjx_revolve.control.sense import Sense, feel
+from mjx_revolve.control.sense import Cues, Sense, feel, remember, start_memory
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.numerics.xla import fused_scan, share_once
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
+
+_NO_CUES = Cues()
 
 
 def roll_out(
@@ -28,6 +30,9 @@ def roll_out(
     every: int,
     timestep: float,
     derived: bool = False,
+    world: World | None = None,
+    cues: Cues = _NO_CUES,
+    feels: Sequence[str] = (),
 ) -> tuple[Any, Any]:
     """Steps a chunk of a population and records it now and then.
 
@@ -46,22 +51,30 @@ def roll_out(
         timestep: [s].
         derived: whether it is to be differentiated: each step is then computed again on the way
             back, so that memory grows with the state and not with its working.
+        world: whose water and bed the robots feel; None where they feel neither.
+        cues: what else they are given to feel.
+        feels: which of `sense.FEELS` are asked for.
 
     Returns:
         The last state, and the records, `[records, ...]` each.
     """
 
     def step(carry: Any, now: Any) -> tuple[Any, jax.Array]:
-        state, drive_state, energy, count = carry
+        state, drive_state, memory, energy, count = carry
         # The step counter travels as an integer, so that time is exact however long the run.
         time = count.astype(energy.dtype) * timestep
         water = flow(time, now)
-        drive_state, ctrl = drive(drive_state, time, now, feel(engine.root(state), water))
+        felt = feel(world, engine, state, water, time, cues, memory, feels)
+        drive_state, ctrl = drive(drive_state, time, now, felt)
+        before = engine.root(state)
         state, power = engine.step(state, ctrl, water)
-        return (state, drive_state, energy + timestep * power, count + 1), ctrl
+        work = timestep * power
+        memory = remember(memory, before, engine.root(state), ctrl, work, timestep)
+        return (state, drive_state, memory, energy + work, count + 1), ctrl
 
     energy = jnp.zeros_like(engine.root(state).spin[0])
-    carry = (state, drive_state, energy, jnp.zeros((), jnp.int32))
+    memory = start_memory(feels, engine, state)
+    carry = (state, drive_state, memory, energy, jnp.zeros((), jnp.int32))
     first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)
     pack = unpack = lambda x: x
     if engine.fuses and not derived:
@@ -72,15 +85,15 @@ def roll_out(
             step = jax.checkpoint(step, prevent_cse=False)
 
     def block(packed: Any, rows: Any) -> tuple[Any, Any]:
-        state, drive_state, energy, count = unpack(packed)
-        start = pack((state, drive_state, jnp.zeros_like(energy), count))
+        state, drive_state, memory, energy, count = unpack(packed)
+        start = pack((state, drive_state, memory, jnp.zeros_like(energy), count))
         last = None if rows is None else jax.tree.map(lambda x: x[-1], rows)
         if every == 1:
             packed, ctrl = step(start, last)
         else:
             packed, ctrls = jax.lax.scan(step, start, rows, length=every)
             ctrl = jax.tree.map(lambda x: x[-1], ctrls)
-        state, _, energy, count = unpack(packed)
+        state, _, _, energy, count = unpack(packed)
         water = flow((count - 1).astype(energy.dtype) * timestep, last)
         return packed, record(state, ctrl, energy, water)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.control.controller import BoundController, Controller
+from mjx_revolve.control.sense import Cues
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_positions
 from mjx_revolve.engine.plant import actuators_of
@@ -73,8 +74,14 @@ def _compiled(
     back = np.argsort(own[simulator.plant.source[:, 0]]).astype(np.int32)
 
     def run(
-        qpos: Any, qvel: Any, drive_input: Any, water: Water | None, derived: bool = False
+        qpos: Any,
+        qvel: Any,
+        drive_input: Any,
+        water: Water | None,
+        cues: Cues,
+        derived: bool = False,
     ) -> Trajectory:
+        cues = jax.tree.map(lambda x: x[None], cues)
         parameters, drive_state, targets = None, (), None
         if controller is None:
             targets = jax.vmap(simulator.plant.arrange)(drive_input[:, own, None])
@@ -104,6 +111,9 @@ def _compiled(
             every=1,
             timestep=dt,
             derived=derived,
+            world=robot.world,
+            cues=cues,
+            feels=() if controller is None else controller.feels,
         )
         qs, vs = jax.vmap(simulator.observe)(states)
         return Trajectory(
@@ -133,6 +143,7 @@ def simulate(
     water: Water | None = None,
     engine: str = "population",
     once: bool = False,
+    cues: Cues | None = None,
 ) -> Trajectory:
     """Simulates one robot.
 
@@ -153,6 +164,8 @@ def simulate(
         engine: "population" or "mjx".
         once: whether it is compiled in haste, as little is simulated by it: one is sooner done with
             a minute or less.
+        cues: what the robot is given to feel beside its own state, a number each; by default no
+            target, and noise of sensors that `key` draws.
 
     Returns:
         The trajectory, one row after each step. Differentiable in qpos, qvel, ctrl and water.
@@ -206,11 +219,16 @@ def simulate(
         for leaf in jax.tree.leaves(water):
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
                 raise InputError(f"water: expected numbers or [{steps}]; found {list(leaf.shape)}")
+    if cues is None:
+        noise_key = jax.random.fold_in(jax.random.key(0) if key is None else key, 3)
+        cues = Cues(noise=jax.random.bits(noise_key, (), "uint32"))
+    cues = jax.tree.map(jnp.asarray, cues)
     jitted, plain = _compiled(robot, engine, steps, controller, water is None, once)
     traced = any(
-        isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((qpos, qvel, drive_input, water))
+        isinstance(x, jax.core.Tracer)
+        for x in jax.tree.leaves((qpos, qvel, drive_input, water, cues))
     )
-    return (plain if traced else jitted)(qpos, qvel, drive_input, water)
+    return (plain if traced else jitted)(qpos, qvel, drive_input, water, cues)
 
 
 def _steps(rows: Any, duration: float | None, dt: float) -> int:

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from mjx_revolve.control.sense import Cues
 from mjx_revolve.engine.plant import Figure
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
@@ -27,12 +29,18 @@ class Starts(NamedTuple):
         water: `[trials]` where it varies, else None.
         gusts: `[steps + 1, 3, trials]` velocity around the episode's current [m/s], or None where
             the world has no gusts.
+        noise: `[trials]` uint32 what the sensors' noise is drawn from.
+        towards: `[3, trials]` from the start to the target [m]; None where the task draws none.
+        drift: `[3, trials]` velocity of the target [m/s]; None where it keeps still.
     """
 
     place: jax.Array
     quat: jax.Array
     water: Water | None
     gusts: jax.Array | None
+    noise: jax.Array
+    towards: jax.Array | None = None
+    drift: jax.Array | None = None
 
 
 def check_key(key: Any) -> None:
@@ -71,8 +79,10 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
     if world.gust is not None:
         gust_key = jax.random.fold_in(key, 1)
         gusts = gust_path(world.gust, gust_key, steps, world.timestep, trials)
+    noise = jax.random.bits(jax.random.fold_in(key, 3), (trials,), "uint32")
+    starts = Starts(place, quat, None, gusts, noise, *_draw_target(task, key))
     if task.current_std == 0 and not world.waves:
-        return Starts(place, quat, None, gusts)
+        return starts
     extra = task.current_std * jax.random.normal(current_key, (2, trials))
     x, y, z = world.current
     full = jnp.full((trials,), 0.0, place.dtype)
@@ -82,7 +92,58 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
         time_key = jax.random.fold_in(key, 2)
         water = water._replace(time=jax.random.uniform(time_key, (trials,), maxval=_SEA))
     water = jax.tree.map(lambda x: jnp.broadcast_to(x, (trials,)), water)
-    return Starts(place, quat, water, gusts)
+    return starts._replace(water=water)
+
+
+def _draw_target(task: TaskConfig, key: jax.Array) -> tuple[jax.Array | None, jax.Array | None]:
+    """Where targets are from the start, and how they move, `[3, trials]` each or None."""
+    bearing_key, drift_key = jax.random.split(jax.random.fold_in(key, 4))
+
+    def level(key: jax.Array, size: float, spread: float) -> jax.Array:
+        angle = jax.random.uniform(key, (task.trials,), minval=-spread, maxval=spread)
+        return size * jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)])
+
+    towards = drift = None
+    if task.target_distance is not None:
+        towards = level(bearing_key, task.target_distance, task.target_spread)
+    if task.target_speed > 0:
+        drift = level(drift_key, task.target_speed, np.pi)
+    return towards, drift
+
+
+def cues_of(task: TaskConfig, starts: Starts, place: jax.Array) -> Cues:
+    """What episodes give their robots to feel.
+
+    Args:
+        task: whose target it is.
+        starts: of the episodes, `[lanes]`.
+        place: `[3, lanes]` where the cores start, world frame [m].
+
+    Returns:
+        The cues.
+    """
+    target: Any = None
+    if starts.towards is not None:
+        target = tuple(place + starts.towards)
+    elif task.target is not None:
+        target = tuple(jnp.full_like(place[0], x) for x in task.target)
+    drift = None if starts.drift is None or target is None else tuple(starts.drift)
+    return Cues(target, drift, starts.noise)
+
+
+def target_path(cues: Cues, time: jax.Array) -> jax.Array:
+    """Where the targets are.
+
+    Args:
+        cues: of episodes, `[lanes]`.
+        time: `[S]` since their start [s].
+
+    Returns:
+        `[S, 3, lanes]` world frame [m].
+    """
+    place = jax.vmap(cues.target_at)(time) if cues.drift is not None else cues.target
+    wide = (time.shape[0], *jnp.shape(cues.target[0]))
+    return jnp.stack([jnp.broadcast_to(x, wide) for x in place], 1)
 
 
 def start_pose(

@@ -26,7 +26,7 @@ from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
 # What a task may have recorded beside the core's position and the energy: see `Track`.
-RECORDS = ("core", "joints", "contacts", "forces", "water")
+RECORDS = ("core", "joints", "contacts", "forces", "water", "target")
 
 
 @partial(
@@ -34,7 +34,7 @@ RECORDS = ("core", "joints", "contacts", "forces", "water")
     data_fields=[
         "position", "clearance", "energy", "start_height", "length", "weight", "surface_height",
         "num_hinges", "quat", "velocity", "spin", "angle", "speed", "bed_force", "water_force",
-        "water_velocity",
+        "water_velocity", "target",
     ],
     meta_fields=["interval"],
 )  # fmt: skip
@@ -65,6 +65,8 @@ class Track:
             carried water not, world frame [N]; None unless "forces" are recorded.
         water_velocity: `[S, 3, lanes]` of the water where the core is, as if the robot were not
             there, world frame [m/s]; None unless "water" is recorded.
+        target: `[S, 3, lanes]` where the target is, world frame [m]; None unless "target" is
+            recorded and there is one.
     """
 
     position: jax.Array
@@ -84,6 +86,7 @@ class Track:
     bed_force: jax.Array | None = None
     water_force: jax.Array | None = None
     water_velocity: jax.Array | None = None
+    target: jax.Array | None = None
 
     @property
     def duration(self) -> float:
@@ -187,11 +190,14 @@ def speed(track: Track, settings: Any) -> jax.Array:
 
 def reach_target(track: Track, settings: Any) -> jax.Array:
     """How much nearer to the target the robot ends than it began [body lengths]."""
-    target = np.asarray(settings.target, float)
-    away = [
-        safe_norm(tuple(row[i] - target[i] for i in range(3)))
-        for row in (track.position[0], track.position[-1])
-    ]
+    fixed = None if settings.target is None else np.asarray(settings.target, float)
+
+    def away_at(k: int) -> jax.Array:
+        target = fixed if track.target is None else track.target[k]
+        assert target is not None
+        return safe_norm(tuple(track.position[k][i] - target[i] for i in range(3)))
+
+    away = away_at(0), away_at(-1)
     return (away[0] - away[1]) / track.length
 
 
@@ -216,7 +222,7 @@ _SPEED = "body lengths/s"
 TASKS: Mapping[str, Task] = {
     "directed_swim": Task(directed_swim, _SPEED),
     "speed": Task(speed, _SPEED, records=("water",)),
-    "reach_target": Task(reach_target, "body lengths"),
+    "reach_target": Task(reach_target, "body lengths", records=("target",)),
     "hold_depth": Task(hold_depth, "body lengths"),
     "crawl": Task(crawl, _SPEED, start=start_on_bed, on_bed=True),
 }
@@ -284,6 +290,7 @@ def _example_track(records: tuple[str, ...]) -> Any:
 
     of = {"core": ("quat", "velocity", "spin"), "joints": ("angle", "speed")}
     of |= {"contacts": ("bed_force",), "forces": ("water_force",), "water": ("water_velocity",)}
+    of |= {"target": ("target",)}
     wide = {"quat": 4, "angle": _HINGES, "speed": _HINGES}
     more = {field: given(_ROWS, wide.get(field, 3), _LANES) for r in records for field in of[r]}
     return Track(

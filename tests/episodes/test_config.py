@@ -82,8 +82,10 @@ def test_it_is_frozen(folder):
          "found a"),
         ("task.params=3", "task.params: expected a mapping; found 3"),
         ("controller.params.a=1", "controller.params: expected none, as only own functions"),
-        ("task.type=reach_target", "task.target: expected three numbers [m], because task.type is "
-         "reach_target; found none"),
+        ("task.type=reach_target", "task.target: expected three numbers [m], or target_distance, "
+         "because task.type is reach_target; found none"),
+        ("task={type: reach_target, target: [1, 0, 0], target_distance: 1}", "task.target: "
+         "expected none, as there is a target_distance; found one"),
         ("controller.harmonics=3", "--set controller.harmonics: expected 1, as only type sine has "
          "it (--set controller.harmonics=1); found 3"),
         ("controller.gain=3.5", "--set controller.gain: expected 2, as only type feedback has it "

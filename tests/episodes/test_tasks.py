@@ -12,8 +12,10 @@ from laboratory import QUICK, body
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
 from mjx_revolve.engine.plant import figure_of
-from mjx_revolve.episodes.starts import start_pose
-from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task, score_unit
+from mjx_revolve.episodes.config import TaskConfig
+from mjx_revolve.episodes.starts import cues_of, draw_starts, start_pose, target_path
+from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task, Track, score_unit
+from mjx_revolve.water.world import load_world
 
 KEY, G, RHO = jax.random.key(0), 9.81, 999.1026
 OWN = """
@@ -205,3 +207,57 @@ def test_what_starts_on_the_bed_starts_level(settings):
     config["task"] = config["task"] | {"start_attitude": "righted"}
     with pytest.raises(InputError, match=r"start_attitude: expected level, as .* starts on"):
         make_fitness(config)
+
+
+# ------------------------------------------------------------------------- targets
+
+
+def test_targets_are_drawn_anew_for_each_episode_and_move():
+    settings = TaskConfig(type="reach_target", target_distance=1.5, target_speed=0.2, trials=64)
+    starts = draw_starts(settings, load_world("lake"), jax.random.key(0), 10)
+    place = jnp.ones((3, 64))
+    cues = cues_of(settings, starts, place)
+    away = np.stack(cues.target) - 1
+    assert np.hypot(*away[:2]) == pytest.approx(1.5) and not away[2].any()
+    bearing = np.arctan2(away[1], away[0])
+    assert bearing.min() < -2 and bearing.max() > 2 and len(set(bearing)) == 64
+    path = np.asarray(target_path(cues, jnp.array([0.0, 0.5, 2.0])))
+    assert path[0] == pytest.approx(np.stack(cues.target))
+    moved = path[2] - path[0]
+    assert np.hypot(*moved[:2]) == pytest.approx(0.4, rel=1e-5) and not moved[2].any()
+    # Another key, other targets and noise; a narrower spread, nearer to the x axis.
+    other = draw_starts(settings, load_world("lake"), jax.random.key(1), 10)
+    assert not np.any(other.towards[:2] == starts.towards[:2])
+    assert not np.any(other.noise == starts.noise) and len(set(starts.noise.tolist())) == 64
+    narrow = settings.model_copy(update={"target_spread": 0.3})
+    towards = draw_starts(narrow, load_world("lake"), jax.random.key(0), 10).towards
+    assert np.abs(np.arctan2(towards[1], towards[0])).max() <= 0.3 + 1e-6
+
+
+def test_a_target_that_flees_must_be_followed():
+    """From 4 m away to 1 m, while the target goes 1 m further."""
+    row = np.array([0.0, 1.0, 4.0])
+    zero = np.zeros_like(row)
+    track = Track(
+        position=jnp.asarray(np.stack([row, zero, zero], 1)[..., None]),
+        clearance=jnp.inf, energy=jnp.zeros((3, 1)), interval=0.1, start_height=jnp.zeros(1),
+        length=0.5, weight=1.0, surface_height=0.0,
+        target=jnp.asarray(np.stack([4 + row / 4, zero, zero], 1)[..., None]),
+    )  # fmt: skip
+    found = TASKS["reach_target"].score(track, TaskConfig(type="reach_target", target_distance=4.0))
+    assert found == pytest.approx((4 - 1) / 0.5)
+
+
+@pytest.mark.slow
+def test_a_target_is_recorded_as_it_is_felt(settings):
+    """A robot at rest far away: the score of an episode is that of its trajectory."""
+    task = {"type": "reach_target", "target_distance": 1.0, "target_speed": 0.5, "duration": 1.0}
+    task |= {"settle": 0.0, "depth": 1.0, "trials": 1, "start_tilt": 0.0}
+    fitness = make_fitness(settings("lifting", task=task, trim="neutral"))
+    key, genes = jax.random.key(4), np.zeros(fitness.num_genes)
+    score = fitness(genes[None], key)
+    assert fitness.judge(fitness.replay(genes, key), key)[0] == pytest.approx(float(score[0]))
+    cues = fitness.cues(key)
+    away = [np.linalg.norm(np.stack(cues.target_at(t)) - [0, 0, -1]) for t in (0.1, 1.0)]
+    length = fitness.robot.morphology.length
+    assert score[0] == pytest.approx((away[0] - away[1]) / length, abs=0.05)

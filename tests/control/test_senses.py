@@ -1,0 +1,230 @@
+"""What a robot feels: against MuJoCo's own sensors, for one body, for many, and in MJX."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import QUICK, WATER, arm_robot, box_robot, elbow_robot, random_states, world
+from mjx_revolve.control.sense import FEELS, Cues, feel, remember, start_memory
+from mjx_revolve.engine.batch import fit_capacity, pack_bodies
+from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.rows import make_rows
+from mjx_revolve.engine.state import Root
+from mjx_revolve.engine.step import make_step_engine
+from mjx_revolve.water.flow import Water, water_of
+
+LANES = 3
+TANK = world(**WATER | {"current": (0.3, 0.0, 0.0), "bed": {"height": -9.0}})
+CUES = Cues(target=(1.0, 2.0, -4.0), drift=(0.5, 0.0, 0.0))
+
+
+def senses(tank, make, qpos, qvel, ctrl, time=2.0, cues=CUES, water=None):
+    """What is felt in float64 of robots that were told `ctrl`, as NumPy."""
+    with jax.enable_x64(True):
+
+        def run(qpos, qvel, ctrl):
+            engine = make()
+            state = engine.init(qpos, qvel)
+            memory = start_memory(FEELS, engine, state)
+            asked = engine.plant.arrange(ctrl)
+            memory = memory._replace(ctrl=asked)
+            now = water_of(tank) if water is None else water
+            felt = feel(tank, engine, state, now, jnp.asarray(time), cues, memory, FEELS)
+            return felt._replace(noise=None), engine.plant.source
+
+        arrays = [jnp.asarray(x, jnp.float64) for x in (qpos, qvel, ctrl)]
+        found, source = jax.jit(run, compiler_options=QUICK)(*arrays)
+        return jax.tree.map(np.asarray, found), np.asarray(source)
+
+
+def own_order(rows, source, count):
+    """`[rows, lanes]` of the plant as `[count, lanes]` of the robot's hinges."""
+    wide = np.broadcast_to(source[: len(rows)], rows.shape)
+    lanes = range(rows.shape[1])
+    return np.array(
+        [[rows[wide[:, lane] == k, lane].item() for lane in lanes] for k in range(count)]
+    )
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return arm_robot(TANK)
+
+
+@pytest.fixture(scope="module")
+def states(robot):
+    """Any attitude, 6 m deep, and what the servos were told, in the robot's order."""
+    qpos, qvel = random_states(robot, LANES, seed=3, speed=0.3, depth=6.0)
+    ctrl = qpos[7:] + np.random.default_rng(0).uniform(-0.03, 0.03, qpos[7:].shape)
+    return qpos, qvel, ctrl
+
+
+@pytest.fixture(scope="module")
+def felt(robot, states):
+    """Of one body, by its own step."""
+    return senses(TANK, lambda: make_engine(robot), *states)
+
+
+@pytest.fixture(scope="module")
+def mujocos(robot, states):
+    """The same states' sensordata, by the sensors' names, `[dim, lanes]` each."""
+    spec, kinds = robot.mj_spec.copy(), mujoco.mjtSensor
+    site = spec.body(robot.mj_model.body(1).name).add_site(name="core")
+    assert np.all(site.pos == 0)
+    of_core = {"gyro": kinds.mjSENS_GYRO, "velocity": kinds.mjSENS_VELOCIMETER}
+    for name, kind in of_core.items():
+        site_kind = mujoco.mjtObj.mjOBJ_SITE
+        spec.add_sensor(name=name, type=kind, objtype=site_kind, objname="core")
+    for k in range(1, robot.mj_model.njnt):
+        joint = robot.mj_model.joint(k).name
+        for name, kind in (
+            ("angle", kinds.mjSENS_JOINTPOS),
+            ("speed", kinds.mjSENS_JOINTVEL),
+            ("load", kinds.mjSENS_JOINTACTFRC),
+        ):
+            joint_kind = mujoco.mjtObj.mjOBJ_JOINT
+            spec.add_sensor(name=f"{name}{k}", type=kind, objtype=joint_kind, objname=joint)
+    model = spec.compile()
+    data, rows = mujoco.MjData(model), []
+    for lane in range(LANES):
+        data.qpos[:], data.qvel[:] = states[0][:, lane], states[1][:, lane]
+        data.ctrl[list(robot.servos)] = states[2][:, lane]
+        mujoco.mj_forward(model, data)
+        found = {model.sensor(k).name: data.sensor(k).data.copy() for k in range(model.nsensor)}
+        found["axes"] = data.body(1).xmat.copy()
+        rows.append(found)
+    return {name: np.stack([row[name] for row in rows], -1) for name in rows[0]}
+
+
+def test_the_core_feels_what_mujocos_sensors_do(felt, mujocos, states):
+    sense, _ = felt
+    axes = mujocos["axes"].reshape(3, 3, LANES)
+    assert np.stack(sense.up) == pytest.approx(axes[2], abs=1e-12)
+    assert np.stack(sense.north) == pytest.approx(axes[0], abs=1e-12)
+    assert np.stack(sense.spin) == pytest.approx(mujocos["gyro"], abs=1e-12)
+    # Water that flows with .3 m/s along x, less the core's own velocity.
+    water = np.einsum("ijl,i->jl", axes, (0.3, 0.0, 0.0))
+    assert np.stack(sense.flow) == pytest.approx(water - mujocos["velocity"], abs=1e-12)
+    assert sense.height == pytest.approx(states[0][2])
+    assert sense.altitude == pytest.approx(states[0][2] + 9.0)
+    # After 2 s the target is at (2, 2, -4).
+    away = np.array([2.0, 2.0, -4.0])[:, None] - states[0][:3]
+    assert np.stack(sense.target) == pytest.approx(np.einsum("ijl,il->jl", axes, away), abs=1e-12)
+    # What stands still feels its weight, and nothing has been done yet.
+    assert np.stack(sense.force) == pytest.approx(9.81 * axes[2], abs=1e-12)
+    assert not sense.work.any()
+
+
+def test_joints_feel_what_mujocos_sensors_do(robot, felt, mujocos):
+    sense, source = felt
+    for name in ("angle", "speed", "load"):
+        expected = np.concatenate([mujocos[f"{name}{k}"] for k in range(1, robot.num_hinges + 1)])
+        found = own_order(getattr(sense, name), source, robot.num_hinges)
+        assert found == pytest.approx(expected, abs=1e-9), name
+        assert np.abs(expected).max() > 0.01
+
+
+def of_many(robots, capacity):
+    bodies = pack_bodies(robots, capacity, np.float64)
+    rows = make_rows(TANK, capacity, bodies, LANES)
+    return make_step_engine(rows, jax.tree.map(jnp.asarray, bodies.plant))
+
+
+@pytest.mark.parametrize("kind", ["alike", "different", "mjx"])
+def test_one_body_many_bodies_and_mjx_feel_the_same(kind, robot, felt, states):
+    if kind == "mjx":
+        found, source = senses(TANK, partial(make_engine, robot, "mjx"), *states)
+    else:
+        robots = [robot] if kind == "alike" else [robot, robot, elbow_robot(TANK)]
+        capacity = fit_capacity([*robots, elbow_robot(TANK)])
+        found, source = senses(TANK, lambda: of_many(robots, capacity), *states)
+    lanes = slice(0, 2 if kind == "different" else LANES)
+    one, own = felt
+    for name in one._fields:
+        if name not in ("angle", "speed", "load", "touch", "noise"):
+            a, b = np.stack(getattr(found, name)), np.stack(getattr(one, name))
+            assert a[..., lanes] == pytest.approx(b[..., lanes], abs=1e-12), name
+    for name in ("angle", "speed", "load"):
+        a = own_order(getattr(found, name)[:, lanes], source[:, lanes], robot.num_hinges)
+        b = own_order(getattr(one, name)[:, lanes], own, robot.num_hinges)
+        assert a == pytest.approx(b, abs=1e-9), name
+
+
+def test_an_accelerometer_in_a_spinning_vacuum_is_mujocos():
+    """Off the centre of mass, so that it feels the turning; over a step of .01 ms."""
+    tank = world(gravity=9.81, timestep=1e-5)
+    off = {"ballast_mass": 0.5, "ballast_position": (0.05, 0.02, 0.0)}
+    robot = box_robot((0.2, 0.1, 0.05), 1.0, tank, **off)
+    qpos, qvel = random_states(robot, 1, seed=1, speed=3.0)
+    spec = robot.mj_spec.copy()
+    spec.bodies[1].add_site(name="core")
+    site = mujoco.mjtObj.mjOBJ_SITE
+    spec.add_sensor(type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=site, objname="core")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos[:, 0], qvel[:, 0]
+    mujoco.mj_forward(model, data)
+    with jax.enable_x64(True):
+        engine, water = make_engine(robot), water_of(tank)
+
+        def run(qpos, qvel):
+            state = engine.init(qpos, qvel)
+            memory = start_memory(("force",), engine, state)
+            ctrl = jnp.zeros((0, 1))
+            new, _ = engine.step(state, ctrl, water)
+            memory = remember(memory, engine.root(state), engine.root(new), ctrl, 0.0, 1e-5)
+            return feel(tank, engine, new, water, jnp.zeros(()), Cues(), memory).force
+
+        found = jax.jit(run, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
+    assert np.concatenate(found) == pytest.approx(data.sensordata, abs=1e-3)
+    assert np.abs(data.sensordata).max() > 0.05
+
+
+def test_touch_is_the_beds_force_on_each_body(robot):
+    """At rest in still lanes above, in and on the bed: as `push` has it of the whole robot."""
+    qpos, qvel = random_states(robot, LANES, seed=5, speed=0.0)
+    qpos[3:7] = np.array([1.0, 0, 0, 0])[:, None]
+    qpos[7:] = 0
+    qpos[2] = -8.0, -8.98, -8.99
+    ctrl = np.zeros((robot.num_hinges, LANES))
+    found, _ = senses(TANK, lambda: make_engine(robot), qpos, qvel, ctrl)
+    assert found.touch.shape == (1 + robot.num_hinges, LANES)
+    assert not found.touch[:, 0].any() and np.sum(found.touch[:, 2] > 0) > 1
+    # The core's four lower corners are 2.5 mm deep in a bed of 3 kN/m; nothing else reaches it.
+    assert found.touch[:, 1] == pytest.approx([30, 0, 0, 0, 0], rel=1e-9)
+    with jax.enable_x64(True):
+        engine = make_engine(robot)
+
+        def push(qpos, qvel):
+            state = engine.init(qpos, qvel)
+            return engine.push(state, engine.plant.arrange(jnp.zeros(ctrl.shape)), water_of(TANK))
+
+        bed, _ = jax.jit(push, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
+    # Nothing moves, so that no force has friction: all of them point up.
+    assert found.touch.sum(0) == pytest.approx(np.asarray(bed[2]), rel=1e-9)
+
+
+def test_the_waters_surface_is_what_heights_are_measured_from(robot, states):
+    lifted = Water(1.5, TANK.current)
+    found, _ = senses(TANK, lambda: make_engine(robot), *states, water=lifted)
+    assert found.height == pytest.approx(states[0][2] - 1.5)
+
+
+def test_work_adds_up():
+    root = Root(*(4 * (jnp.zeros(1),),) * 4)
+    memory = start_memory(("work",), *_toy())
+    for _ in range(3):
+        memory = remember(memory, root, root, jnp.zeros((0, 1)), jnp.array([2.0]), 0.1)
+    assert memory.work == pytest.approx(6.0)
+    assert memory.acceleration is None and memory.ctrl is None
+
+
+def _toy():
+    engine = make_engine(box_robot((0.1, 0.1, 0.1), 1.0, world()))
+    return engine, engine.init(jnp.zeros((7, 1)).at[3].set(1.0), jnp.zeros((6, 1)))
