@@ -1,7 +1,7 @@
 """Bodies read: from Revolve's YAML, or from a mapping like it, checked and laid out at rest.
 
 A morphology file is Revolve's YAML: `id`, `body` (a tree of modules, each with `id`, `type`,
-`orientation`, `params` and `children` by slot) and `brain`.
+`orientation`, `params` and `children` by slot) and `brain`; and `sensors`, which Revolve has not.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, read_number
 from mjx_revolve.body.placement import Module, attach, check_overlaps, frozen
+from mjx_revolve.body.sensors import Sensor, SensorRow
 from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
 from mjx_revolve.inputs.errors import InputError, load_yaml, show
 from mjx_revolve.inputs.schema import Positive, read, words
@@ -110,7 +111,7 @@ def make_morphology(
       left-handed propeller; `thrust` [N] at its highest command, which scales its curve.
 
     Args:
-        mapping: `id`, `body` and `brain`, or a body's tree of modules alone; it is copied.
+        mapping: `id`, `body`, `sensors` and `brain`, or a body's tree of modules alone; copied.
         modules: the types of modules by name and alias.
         allow_overlap: make a robot whose modules overlap at rest; `overlaps` then names them.
         name: of the robot, where the mapping has no `id`.
@@ -136,7 +137,7 @@ def _make(
         raise InputError(
             f"{source}: expected a mapping with id, body and brain; found {show(data)}"
         )
-    _check_known(data, ("id", "body", "brain"), source)
+    _check_known(data, ("id", "body", "sensors", "brain"), source)
     if "body" not in data:
         raise InputError(f"{source}: expected the key body; found {show(list(data))}")
     tree = _read_tree(data["body"], modules, source)
@@ -145,7 +146,16 @@ def _make(
         modules=tree,
         brain=copy.deepcopy(data.get("brain")),
         overlaps=check_overlaps(tree, allow_overlap, f"{source}: body"),
+        sensors=_read_sensors(data.get("sensors"), source),
     )
+
+
+def _read_sensors(value: Any, source: str) -> tuple[Sensor, ...] | None:
+    """The sensors of a robot; None where a file does not speak of them."""
+    if value is None:
+        return None
+    found: tuple[Sensor, ...] = read(SensorRow, value, f"{source}: sensors")
+    return found
 
 
 def _check_known(item: dict[Any, Any], known: tuple[str, ...], place: str) -> None:

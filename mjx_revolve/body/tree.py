@@ -21,6 +21,7 @@ from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.descriptors import describe
 from mjx_revolve.body.module_types import Part, Vector
 from mjx_revolve.body.placement import Layout, Module, frozen, lay_out, same
+from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.inputs.errors import InputError, SafeLoader
 
 COLORS = ("red", "green", "blue")
@@ -30,7 +31,7 @@ COLORS = ("red", "green", "blue")
 class Morphology:
     """A robot's body as a tree of modules, depth first in the file's order.
 
-    Two morphologies are equal when name, modules and brain are.
+    Two morphologies are equal when name, modules, brain and sensors are.
 
     Attributes:
         name: the file's `id`, or its stem.
@@ -38,6 +39,7 @@ class Morphology:
         brain: the file's `brain` as it is, for whoever understands it; None where there is none.
         path: the file that it was read from.
         overlaps: names of the pairs of modules that overlap at rest (empty unless allowed).
+        sensors: the file's `sensors`; None where it has no such key.
     """
 
     name: str
@@ -45,15 +47,17 @@ class Morphology:
     brain: Any = None
     path: str | None = None
     overlaps: tuple[tuple[str, str], ...] = ()
+    sensors: tuple[Sensor, ...] | None = None
 
     def __eq__(self, other: object) -> bool:
-        """Same name, modules and brain; the path does not count."""
+        """Same name, modules, brain and sensors; the path does not count."""
         if not isinstance(other, Morphology):
             return NotImplemented
         return (
             self.name == other.name
             and self.modules == other.modules
             and same(self.brain, other.brain)
+            and self.sensors == other.sensors
         )
 
     def __repr__(self) -> str:
@@ -73,7 +77,7 @@ class Morphology:
         ]
         named = [k.name if MODULES.get(k.name) is k else k for k in kinds.values()]
         place = np.concatenate([x for m in self.modules for x in (m.position, *m.rotation)])
-        head = (self.name, self.brain, self.path, self.overlaps)
+        head = (self.name, self.brain, self.path, self.overlaps, self.sensors)
         return _unpack, (*head, rows, named, place.tobytes())
 
     @property
@@ -203,7 +207,7 @@ class Morphology:
         Types are named: a robot with a user's own types needs those again to be read.
 
         Returns:
-            A new mapping with `id`, `body` and, where there is one, `brain`.
+            A new mapping with `id`, `body` and, where there are any, `sensors` and `brain`.
         """
         items: list[dict[str, Any]] = []
         for module in self.modules:
@@ -218,6 +222,8 @@ class Morphology:
             if module.parent >= 0:
                 items[module.parent].setdefault("children", {})[module.slot] = item
         data: dict[str, Any] = {"id": self.name, "body": items[0]}
+        if self.sensors is not None:
+            data["sensors"] = [sensor.to_mapping() for sensor in self.sensors]
         if self.brain is not None:
             data["brain"] = copy.deepcopy(self.brain)
         return data
@@ -232,6 +238,7 @@ def _unpack(
     brain: Any,
     path: str | None,
     overlaps: tuple[tuple[str, str], ...],
+    sensors: tuple[Sensor, ...] | None,
     rows: list[Any],
     named: list[Any],
     place: bytes,
@@ -243,7 +250,7 @@ def _unpack(
         Module(own, type, parent, slot, turn, rgb, at[0], at[1:], kinds[kind], params)
         for (own, type, parent, slot, turn, rgb, kind, params), at in zip(rows, places, strict=True)
     ]
-    return Morphology(name, tuple(modules), brain, path, overlaps)
+    return Morphology(name, tuple(modules), brain, path, overlaps, sensors)
 
 
 class _Dumper(yaml.SafeDumper):

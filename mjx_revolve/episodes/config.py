@@ -17,6 +17,7 @@ import yaml
 from annotated_types import Ge, Le, Lt, MinLen, Unit
 from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
 
+from mjx_revolve.body.sensors import SensorRow
 from mjx_revolve.episodes.bodies_config import BodiesConfig
 from mjx_revolve.episodes.config_paths import resolve_paths
 from mjx_revolve.episodes.measure_table import MEASURES
@@ -91,6 +92,9 @@ class ControllerConfig(Section):
     """Largest answer to an error of normal size, as a share of the range; `type: feedback` [-]."""
     depth: Annotated[NonNegative, Unit("m")] | None = None
     """Depth that `type: feedback` holds; that of the task's start where none is given [m]."""
+    sensors: SensorRow | None = None
+    """What brains are told, kinds' names or mappings with fields of `Sensor`; by default the
+    robot's own `sensors`, or else `sensors.USUAL`."""
     params: dict[str, Any] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 

@@ -821,7 +821,7 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
         ("just text", "expected a mapping with id, body and brain; found 'just text'"),
         ("id: x\nbrain: {}", "expected the key body; found ['id', 'brain']"),
         ("{}", "expected the key body; found []"),
-        ("body: {type: Core}\nbrian: {}", "expected only id, body, brain; found 'brian'"),
+        ("body: {type: Core}\nbrian: {}", "expected only id, body, sensors, brain; found 'brian'"),
         ("body:", "body: expected a module (a mapping with a type); found nothing"),
         ("body: [1]", "body: expected a module (a mapping with a type); found [1]"),
         ("body: {}", "body.type: expected one of Core, CoreComponent; found none"),
@@ -1046,7 +1046,7 @@ def test_wrong_mappings_are_refused(mapping, message):
 
 
 def test_a_tree_without_its_file_around_it_is_no_file(tmp_path):
-    with pytest.raises(InputError, match="expected only id, body, brain; found 'type'"):
+    with pytest.raises(InputError, match="expected only id, body, sensors, brain; found 'type'"):
         read(tmp_path, "type: Core")
 
 

@@ -1,0 +1,256 @@
+"""Sensors as users declare them, and the table of their kinds.
+
+Revolve's are touch, an inertial unit of six numbers, light and battery; the names here are
+MuJoCo's where it has such a sensor (gyro, accelerometer).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, NamedTuple
+
+from annotated_types import Le, Unit
+from pydantic import AfterValidator, BeforeValidator
+
+from mjx_revolve.inputs.schema import (
+    MisfitError,
+    NonNegative,
+    Number,
+    Positive,
+    Row,
+    Text,
+    as_tuple,
+    checked,
+    show,
+    words,
+)
+
+
+class SensorKind(NamedTuple):
+    """What a sensor measures.
+
+    Attributes:
+        parts: names of its numbers; one without a name of its own is "".
+        unit: of them.
+        where: "robot": once, at the core; "joint": at each hinge; "body": of the core's rigid body
+            and of what each hinge carries.
+        range: lowest and highest, as most such devices have them; choices.
+        signal: (a `control.sense.Sense`) → its numbers, in the order of `parts`: `[lanes]` each of
+            a robot, `[hinge rows, lanes]` of joints, `[1 + hinge rows, lanes]` of bodies.
+        what: it is, in words.
+        feels: field of the sense that must be asked for, or "".
+    """
+
+    parts: tuple[str, ...]
+    unit: str
+    where: str
+    range: tuple[float, float]
+    signal: Callable[[Any], tuple[Any, ...]]
+    what: str
+    feels: str = ""
+
+
+def _distance(sense: Any) -> Any:
+    x, y, z = sense.target
+    # The tiny term keeps the gradient finite where the target is reached.
+    return (x * x + y * y + z * z + 1e-12) ** 0.5
+
+
+def _bearing(sense: Any) -> tuple[Any, ...]:
+    scale = 1 / _distance(sense)
+    return tuple(scale * component for component in sense.target)
+
+
+_ONE, _THREE = ("",), ("x", "y", "z")
+_EFFORT, _SPEED = 0.17658, 5.235988  # of Revolve's servo [N·m, rad/s]
+
+SENSORS: Mapping[str, SensorKind] = {
+    "depth": SensorKind(
+        _ONE, "m", "robot", (0, 10), lambda s: (-s.height,), "of the core below the still surface"
+    ),
+    "climb": SensorKind(_ONE, "m/s", "robot", (-1, 1), lambda s: (s.climb,), "vertical velocity"),
+    "tilt": SensorKind(
+        _THREE, "-", "robot", (-1, 1), lambda s: s.up, "the world's vertical, core frame"
+    ),
+    "compass": SensorKind(
+        _THREE, "-", "robot", (-1, 1), lambda s: s.north, "the world's x axis, core frame"
+    ),
+    "gyro": SensorKind(
+        _THREE, "rad/s", "robot", (-10, 10), lambda s: s.spin, "angular velocity, core frame"
+    ),
+    "accelerometer": SensorKind(
+        _THREE,
+        "m/s2",
+        "robot",
+        (-20, 20),
+        lambda s: s.force,
+        "specific force at the core over the last step, core frame",
+        "force",
+    ),
+    "flow": SensorKind(
+        _THREE,
+        "m/s",
+        "robot",
+        (-1, 1),
+        lambda s: s.flow,
+        "velocity of the water relative to the core, core frame",
+    ),
+    "sonar": SensorKind(
+        _ONE,
+        "m",
+        "robot",
+        (0, 10),
+        lambda s: (s.altitude,),
+        "height of the core above the bed, straight down",
+    ),
+    "target": SensorKind(
+        _THREE, "m", "robot", (-5, 5), lambda s: s.target, "from the core to the target, core frame"
+    ),
+    "bearing": SensorKind(
+        _THREE, "-", "robot", (-1, 1), _bearing, "direction of the target, core frame"
+    ),
+    "distance": SensorKind(
+        _ONE, "m", "robot", (0, 10), lambda s: (_distance(s),), "of the target from the core"
+    ),
+    "battery": SensorKind(
+        _ONE,
+        "J",
+        "robot",
+        (0, 100),
+        lambda s: (s.work,),
+        "work that servos and propellers have done so far",
+        "work",
+    ),
+    "angle": SensorKind(
+        _ONE, "rad", "joint", (-math.pi / 4, math.pi / 4), lambda s: (s.angle,), "of each hinge"
+    ),
+    "speed": SensorKind(
+        _ONE, "rad/s", "joint", (-_SPEED, _SPEED), lambda s: (s.speed,), "of each hinge"
+    ),
+    "load": SensorKind(
+        _ONE,
+        "N m",
+        "joint",
+        (-_EFFORT, _EFFORT),
+        lambda s: (s.load,),
+        "torque of each servo under its last command",
+        "load",
+    ),
+    "contact": SensorKind(
+        _ONE,
+        "N",
+        "body",
+        (0, 1),
+        lambda s: (s.touch,),
+        "force of the bed on the core's rigid body and on what each hinge carries",
+        "touch",
+    ),
+}
+"""All kinds of sensors by name."""
+
+
+def _read_range(value: Any) -> Any:
+    """A number r as -r to r."""
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    return (-value, value) if plain else as_tuple(value)
+
+
+_Range = Annotated[
+    tuple[Number, Number],
+    BeforeValidator(_read_range),
+    words("a number, or the lowest and the highest"),
+]
+
+
+@checked
+class Sensor:
+    """A sensor of a robot.
+
+    What it gives is a number between -1 and 1: the true value, with noise, clipped to the range and
+    divided by the range's larger end, so that 0 stays 0.
+
+    Attributes:
+        type: its kind, a name in `SENSORS`.
+        name: of its own; by default the type.
+        unit: of range and noise, if it is written: that of the kind.
+        range: lowest and highest value, or one number for both signs; by default the kind's.
+        noise: standard deviation, of every sample by itself [unit].
+        rate: how often it measures; what it has measured stays until the next time. By default
+            before every step [Hz].
+        delay: how old what it gives is [s].
+
+    Raises:
+        InputError: there is no such kind, or a number is out of range.
+    """
+
+    type: Text
+    name: Text = ""
+    unit: Text | None = None
+    range: _Range | None = None
+    noise: NonNegative = 0.0
+    rate: Annotated[Positive, Le(1e4), Unit("Hz")] | None = None
+    delay: Annotated[NonNegative, Le(5), Unit("s")] = 0.0
+
+    def __post_init__(self) -> None:
+        """Checks that there is such a kind, and the range."""
+        if self.type not in SENSORS:
+            raise MisfitError("type", f"one of {', '.join(SENSORS)}", show(self.type))
+        kind = SENSORS[self.type]
+        if self.unit is not None and self.unit != kind.unit:
+            raise MisfitError("unit", f"{kind.unit!r}, as of {self.type}", show(self.unit))
+        low, high = self.limits
+        if low >= high:
+            raise MisfitError("range", "the lowest below the highest", show(list(self.limits)))
+
+    @property
+    def kind(self) -> SensorKind:
+        """What it measures."""
+        return SENSORS[self.type]
+
+    @property
+    def label(self) -> str:
+        """Its name, or its type."""
+        return self.name or self.type
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest value [unit]."""
+        return self.kind.range if self.range is None else self.range
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its numbers."""
+        return tuple(f"{self.label} {part}".strip() for part in self.kind.parts)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """As a file has it, without what is usual."""
+        usual = {"name": "", "unit": None, "range": None, "noise": 0.0, "rate": None, "delay": 0.0}
+        found: dict[str, Any] = {"type": self.type}
+        for key, value in usual.items():
+            own = getattr(self, key)
+            if own != value:
+                found[key] = list(own) if isinstance(own, tuple) else own
+        return found
+
+
+def _read_sensor(value: Any) -> Any:
+    """A kind's name alone as a sensor of it."""
+    return {"type": value} if isinstance(value, str) else value
+
+
+def _check_names(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+    labels = [sensor.label for sensor in sensors]
+    for k, label in enumerate(labels):
+        if label in labels[:k]:
+            unlike = "names that differ (give one of them a `name`)"
+            raise MisfitError(f"{k}.name", unlike, f"{label!r} twice")
+    return sensors
+
+
+SensorRow = Annotated[
+    Row[Annotated[Sensor, BeforeValidator(_read_sensor)]],
+    AfterValidator(_check_names),
+    words("a list of sensors"),
+]
+"""Sensors in a user's file: kinds' names, or mappings with fields of `Sensor`."""

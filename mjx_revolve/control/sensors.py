@@ -1,0 +1,253 @@
+"""From declared sensors to one observation: noise, range, rate and delay.
+
+Noise is a function of the episode's number (`Cues.noise`), of the sensor's place in the list, of
+the joint and of the sample: it is the same for all individuals in one trial, in whatever company,
+as gusts and starts are, and the same whenever the trial is run again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.body.sensors import SENSORS, Sensor
+from mjx_revolve.control.sense import Sense
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import sincos
+
+USUAL = tuple(Sensor(type=name) for name in ("tilt", "gyro", "angle", "speed"))
+"""What brains are told where nothing is declared."""
+
+# A moment this share of a sample before it is due counts as due: float32's clock errs by less.
+_DUE = 0.01
+# The most samples that a delay may keep; a choice.
+_LONGEST = 256
+
+
+class Observation(NamedTuple):
+    """What a brain is told, each number between -1 and 1.
+
+    Attributes:
+        robot: of the robot as a whole, `[lanes]` each.
+        joint: of the hinges, `[hinge rows, lanes]` each, in the plant's order; what is no hinge's
+            says nothing of use.
+    """
+
+    robot: tuple[jax.Array, ...]
+    joint: tuple[jax.Array, ...]
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Makes observations.
+
+    Attributes:
+        sensors: that are declared.
+        timestep: between observations [s].
+    """
+
+    sensors: tuple[Sensor, ...]
+    timestep: float
+
+    def __post_init__(self) -> None:
+        """Refuses a delay of very many samples."""
+        for k, sensor in enumerate(self.sensors):
+            if self._kept(sensor) > _LONGEST:
+                rate = self._rate(sensor)
+                raise InputError(
+                    f"sensors.{k}.delay: expected at most {_LONGEST / rate:g} s at {rate:g} Hz; "
+                    f"found {sensor.delay:g}"
+                )
+
+    @cached_property
+    def robot_names(self) -> tuple[str, ...]:
+        """Of what there is once."""
+        found = [name for s in self.sensors if s.kind.where != "joint" for name in s.names]
+        return tuple(found)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Of what there is at each hinge."""
+        found = [name for s in self.sensors if s.kind.where != "robot" for name in s.names]
+        return tuple(found)
+
+    @property
+    def feels(self) -> tuple[str, ...]:
+        """What a `Controller` must name in its `feels`."""
+        return tuple(dict.fromkeys(s.kind.feels for s in self.sensors if s.kind.feels))
+
+    def init(self, like: jax.Array) -> Any:
+        """What sensors with a rate or a delay keep, before the first step.
+
+        Args:
+            like: `[hinge rows, lanes]` of the floating-point type.
+
+        Returns:
+            For each of them the number of its last sample, and its samples, the newest first.
+        """
+        found: list[Any] = []
+        for sensor in self.sensors:
+            if self._keeps(sensor):
+                blank = jax.tree.map(jnp.zeros_like, self._shapes(sensor, like))
+                kept = tuple(blank for _ in range(self._kept(sensor)))
+                found.append((jnp.full((), -1, like.dtype), kept))
+        return tuple(found)
+
+    def observe(
+        self, state: Any, time: jax.Array, sense: Sense, joint: Any
+    ) -> tuple[Any, Observation]:
+        """What is told before a step.
+
+        Args:
+            state: from `init`, or of the step before.
+            time: since the start [s].
+            sense: what is felt.
+            joint: `[hinge rows, lanes]` or `[hinge rows, 1]` which of the robot's hinges each row
+                is, whole numbers: noise belongs to the hinge, not to its row.
+
+        Returns:
+            The state, and the observation.
+        """
+        before, after = iter(state), []
+        robot: list[jax.Array] = []
+        joints: list[jax.Array] = []
+        for place, sensor in enumerate(self.sensors):
+            count = jnp.floor(time * self._rate(sensor) + _DUE)
+            values = self._measure(place, sensor, count, sense, joint)
+            if self._keeps(sensor):
+                kept, values = self._hold(sensor, next(before), time, count, values)
+                after.append(kept)
+            robot += values[0]
+            joints += values[1]
+        return tuple(after), Observation(tuple(robot), tuple(joints))
+
+    def _rate(self, sensor: Sensor) -> float:
+        """How often it measures [Hz]."""
+        each = 1 / self.timestep
+        return each if sensor.rate is None else min(sensor.rate, each)
+
+    def _kept(self, sensor: Sensor) -> int:
+        """How many samples it keeps."""
+        return 1 + math.ceil(sensor.delay * self._rate(sensor) - 1e-6)
+
+    def _keeps(self, sensor: Sensor) -> bool:
+        """Whether there is a rate or a delay."""
+        return self._rate(sensor) < 1 / self.timestep or self._kept(sensor) > 1
+
+    def _shapes(self, sensor: Sensor, like: jax.Array) -> Any:
+        """Numbers like those of a sample: those of the robot, those of the hinges."""
+        where, count = sensor.kind.where, len(sensor.kind.parts)
+        robot = [like[0] if like.shape[0] else jnp.zeros(like.shape[1:], like.dtype)] * count
+        return (robot if where != "joint" else [], [like] * count if where != "robot" else [])
+
+    def _measure(
+        self, place: int, sensor: Sensor, count: jax.Array, sense: Sense, joint: Any
+    ) -> tuple[list[jax.Array], list[jax.Array]]:
+        """A sample: numbers of the robot, and of the hinges."""
+        kind, (low, high) = sensor.kind, sensor.limits
+        scale = 1 / max(abs(low), abs(high))
+        robot: list[jax.Array] = []
+        joints: list[jax.Array] = []
+        for part, value in enumerate(kind.signal(sense)):
+            pieces: list[tuple[list[jax.Array], Any, Any]] = [(robot, value, None)]
+            if kind.where == "joint":
+                pieces = [(joints, value, joint)]
+            elif kind.where == "body":
+                pieces = [(robot, value[0], None), (joints, value[1:], joint)]
+            for found, true, number in pieces:
+                if sensor.noise > 0:
+                    # 0 is the robot's own, so hinges count from 1.
+                    which = 16 * place + part, 0 if number is None else number + 1
+                    true = true + sensor.noise * draw_normal(sense.noise, *which, count, true.dtype)
+                found.append(scale * jnp.clip(true, low, high))
+        return robot, joints
+
+    def _hold(
+        self, sensor: Sensor, state: Any, time: jax.Array, count: jax.Array, values: Any
+    ) -> tuple[Any, Any]:
+        """Keeps a sample where one is due, and gives the one that is old enough."""
+        last, kept = state
+        first, due = last < 0, count != last
+        fresh: list[Any] = []
+        for k, old in enumerate(kept):
+            new = values if k == 0 else kept[k - 1]
+
+            def pick(new: Any, old: Any, start: Any) -> Any:
+                return jnp.where(first, start, jnp.where(due, new, old))
+
+            fresh.append(jax.tree.map(pick, new, old, values))
+        if len(fresh) == 1:
+            return (count, tuple(fresh)), fresh[0]
+        wanted = jnp.maximum(jnp.floor((time - sensor.delay) * self._rate(sensor) + _DUE), 0)
+        oldest = count - wanted > len(fresh) - 1.5
+        given = jax.tree.map(lambda a, b: jnp.where(oldest, a, b), fresh[-1], fresh[-2])
+        return (count, tuple(fresh)), given
+
+
+def make_observer(sensors: Sequence[Sensor] | None, timestep: float) -> Observer:
+    """An observer of sensors.
+
+    Args:
+        sensors: that are declared; None for the usual ones.
+        timestep: between observations [s].
+
+    Returns:
+        The observer.
+
+    Raises:
+        InputError: a delay is too long for what it would have to keep.
+    """
+    return Observer(USUAL if sensors is None else tuple(sensors), timestep)
+
+
+def _mix(x: Any) -> Any:
+    """A hash of 32 bits: Wellons' `lowbias32` (nullprogram.com, 2018)."""
+    x = (x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D)
+    x = (x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B)
+    return x ^ (x >> np.uint32(16))
+
+
+def draw_normal(seed: Any, number: int, joint: Any, sample: Any, dtype: Any) -> jax.Array:
+    """A normal number that follows from its arguments: no state, and no neighbours.
+
+    By a hash of a counter and Box and Muller's method (1958), as `jax.random` inside the step's
+    loop would cost ten times as much.
+
+    Args:
+        seed: uint32 `[lanes]`; None for 0.
+        number: of the sensor's part.
+        joint: whole numbers that broadcast against the lanes.
+        sample: a whole number.
+        dtype: of the result.
+
+    Returns:
+        Mean 0 and standard deviation 1.
+    """
+    whole = lambda x: jnp.asarray(x).astype(jnp.int32).astype(jnp.uint32)  # noqa: E731
+    state = jnp.zeros((1,), jnp.uint32) if seed is None else seed
+    for counter in (whole(number), whole(joint), whole(sample)):
+        state = _mix(state ^ (counter * np.uint32(0x9E3779B9) + np.uint32(0x85EBCA6B)))
+    first, second = _mix(state ^ np.uint32(0x68E31DA4)), _mix(state ^ np.uint32(0xB5297A4D))
+    # 24 bits each, in (0, 1] and [0, 1).
+    share = lambda x: (x >> np.uint32(8)).astype(dtype) * np.asarray(2.0**-24, dtype)  # noqa: E731
+    radius = jnp.sqrt(-2 * jnp.log(share(first) + np.asarray(2.0**-24, dtype)))
+    return radius * sincos(2 * np.pi * share(second))[1]
+
+
+def name_sensors() -> str:
+    """All kinds of sensors as rows of a Markdown table, for the documentation."""
+    rows = []
+    for name, kind in SENSORS.items():
+        low, high = kind.range
+        reach = f"±{high:.4g}" if low == -high else f"{low:g} to {high:g}"
+        rows.append(
+            f"| `{name}` | {len(kind.parts)} | {kind.unit} | {kind.where} | {reach} | {kind.what} |"
+        )
+    return "\n".join(rows)

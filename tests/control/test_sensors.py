@@ -1,0 +1,183 @@
+"""Declared sensors: noise, range, rate and delay by hand; and how they are read."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from laboratory import OAR, read
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.body.sensors import SENSORS, Sensor, SensorRow
+from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.sensors import draw_normal, make_observer
+from mjx_revolve.inputs import schema
+from mjx_revolve.inputs.errors import InputError
+
+DT = 0.01
+
+
+def watch(sensor, signal, noise=None, joint=None, dt=DT):
+    """`[T, ...]` of what one sensor gives while the core's height follows a signal `[T, lanes]`."""
+    observer = make_observer([sensor], dt)
+    joint = np.zeros((1, 1), np.int32) if joint is None else joint
+
+    def step(state, now):
+        k, height = now
+        angle = jnp.broadcast_to(height, (joint.shape[0], *height.shape))
+        sense = Sense(height, height, (), (), angle=angle, noise=noise)
+        state, found = observer.observe(state, k * dt, sense, joint)
+        return state, jnp.stack([*found.robot, *found.joint])
+
+    with jax.enable_x64(True):
+        signal = jnp.asarray(signal, float)
+        state = observer.init(jnp.zeros((joint.shape[0], signal.shape[1])))
+        rows = jnp.arange(len(signal)), signal
+        return np.asarray(jax.jit(lambda: jax.lax.scan(step, state, rows)[1])())[:, 0]
+
+
+def ramp(steps, slope=0.1):
+    """0, slope, 2 slope, ...: tells which step it was measured in."""
+    return slope * np.arange(steps)[:, None]
+
+
+def test_a_plain_sensor_gives_the_value_over_its_range():
+    found = watch(Sensor(type="climb", range=2.0), [[0.5], [-1.0], [3.0], [-np.inf]])
+    assert found[:, 0] == pytest.approx([0.25, -0.5, 1.0, -1.0])
+    # A range from 0 on: 0 stays 0, and what lies below is clipped to it.
+    found = watch(Sensor(type="depth", range=(0, 4)), [[-1.0], [0.5], [-5.0]])
+    assert found[:, 0] == pytest.approx([0.25, 0.0, 1.0])
+
+
+def test_a_rate_samples_and_holds():
+    """At 40 Hz and steps of 10 ms: measured at 0, 30, 50, 80 and 100 ms."""
+    found = watch(Sensor(type="climb", rate=40.0), ramp(12, 0.01))
+    expected = [0, 0, 0, 3, 3, 5, 5, 5, 8, 8, 10, 10]
+    assert found[:, 0] == pytest.approx(0.01 * np.array(expected))
+    # Faster than the steps is at each step.
+    found = watch(Sensor(type="climb", rate=1000.0), ramp(5, 0.01))
+    assert found[:, 0] == pytest.approx(0.01 * np.arange(5))
+
+
+def test_a_delay_gives_what_was():
+    """Three steps late; before that, the first value."""
+    found = watch(Sensor(type="climb", delay=0.03), 0.5 + ramp(7, 0.01))
+    assert found[:, 0] == pytest.approx(0.5 + 0.01 * np.array([0, 0, 0, 0, 1, 2, 3]))
+
+
+def test_rate_and_delay_together():
+    """Samples at 0, 50 and 100 ms are there 30 ms later; and one and a half samples later."""
+    expected = np.array([0, 0, 0, 0, 0, 0, 0, 0, 5, 5, 5, 5, 5, 10])
+    found = watch(Sensor(type="climb", rate=20.0, delay=0.03), ramp(14, 0.01))
+    assert found[:, 0] == pytest.approx(0.01 * expected)
+    found = watch(Sensor(type="climb", rate=20.0, delay=0.075), ramp(19, 0.01))
+    # A sample of 50 ms is due at 125 ms, so that the step at 130 ms is the first to have it.
+    expected = np.array([0] * 13 + [5] * 5 + [10])
+    assert found[:, 0] == pytest.approx(0.01 * expected)
+
+
+def test_noise_is_drawn_anew_for_each_sample_and_lane_and_stays_the_same():
+    lanes, steps = 64, 400
+    seeds = jnp.arange(lanes, dtype=jnp.uint32)
+    still = np.zeros((steps, lanes))
+    found = watch(Sensor(type="climb", noise=0.02, range=1.0), still, seeds)
+    assert abs(found.mean()) < 4 * 0.02 / np.sqrt(found.size)
+    assert found.std() == pytest.approx(0.02, rel=0.02)
+    assert len(np.unique(found)) > 0.99 * found.size
+    # Neighbouring samples and lanes know nothing of each other.
+    for a, b in ((found[1:], found[:-1]), (found[:, 1:], found[:, :-1])):
+        assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 4 / np.sqrt(found.size)
+    # A lane's noise is its own, wherever it stands.
+    some = watch(Sensor(type="climb", noise=0.02), still[:, :2], seeds[jnp.array([7, 3])])
+    assert np.array_equal(some, found[:, [7, 3]])
+    # With a rate, it is drawn with the sample.
+    held = watch(Sensor(type="climb", noise=0.02, rate=10.0), still[:40, :2], seeds[:2])
+    assert len(np.unique(held)) == 2 * 4
+
+
+def test_noise_belongs_to_the_hinge_not_to_its_row():
+    def noise(order):
+        number = np.array(order, np.int32)[:, None]
+        observer = make_observer([Sensor(type="angle", noise=0.1)], DT)
+        angle = jnp.zeros((3, 4))
+        sense = Sense(0.0, 0.0, (), (), angle=angle, noise=jnp.arange(4, dtype=jnp.uint32))
+        return np.asarray(observer.observe((), jnp.array(0.5), sense, number)[1].joint[0])
+
+    assert np.array_equal(noise([2, 0, 1])[[1, 2, 0]], noise([0, 1, 2]))
+    assert len(np.unique(noise([0, 1, 2]))) == 12
+
+
+def test_the_noise_is_normal():
+    """Kolmogorov and Smirnov's distance of 200,000 draws, and the tails."""
+    from scipy.stats import kstest
+
+    seeds = jnp.arange(200_000, dtype=jnp.uint32)
+    found = np.asarray(draw_normal(seeds, 3, 0, 17, jnp.float32))
+    assert kstest(found, "norm").statistic < 0.004
+    assert np.mean(np.abs(found) > 3) == pytest.approx(0.0027, rel=0.15)
+    assert np.isfinite(found).all()
+
+
+def test_a_sensor_of_bodies_speaks_of_core_and_hinges():
+    observer = make_observer([Sensor(type="contact", range=(0, 10)), Sensor(type="gyro")], DT)
+    touch = jnp.array([[1.0], [2.0], [30.0]])
+    spin = tuple(jnp.full(1, x) for x in (1.0, 2.0, -3.0))
+    sense = Sense(0.0, 0.0, (), spin, touch=touch)
+    _, found = observer.observe((), jnp.array(0.0), sense, np.zeros((2, 1), np.int32))
+    assert np.concatenate(found.robot) == pytest.approx([0.1, 0.1, 0.2, -0.3])
+    assert found.joint[0] == pytest.approx(np.array([[0.2], [1.0]]))
+    assert observer.robot_names == ("contact", "gyro x", "gyro y", "gyro z")
+    assert observer.joint_names == ("contact",) and observer.feels == ("touch",)
+
+
+# ------------------------------------------------------------------------- files
+
+
+SENSED = f"""
+{OAR}
+sensors:
+  - gyro
+  - {{type: sonar, name: echo, unit: m, range: [0, 3], noise: 0.01, rate: 8, delay: 0.05}}
+"""
+
+
+def test_a_robots_sensors_are_read_and_saved(tmp_path):
+    body = read(SENSED)
+    assert body.sensors is not None
+    gyro, echo = body.sensors
+    assert gyro == Sensor(type="gyro") and gyro.limits == SENSORS["gyro"].range
+    assert (echo.label, echo.limits, echo.noise, echo.rate) == ("echo", (0.0, 3.0), 0.01, 8.0)
+    body.save(tmp_path / "again.yaml")
+    again = load_morphology(tmp_path / "again.yaml")
+    assert again == body.__class__(body.name, again.modules, sensors=body.sensors)
+    assert again != body.__class__(body.name, again.modules)
+    assert read(OAR).sensors is None
+
+
+@pytest.mark.parametrize(
+    ("sensors", "message"),
+    [
+        ("gyro", "sensors: expected a list of sensors; found 'gyro'"),
+        ([3], "sensors.0: expected a mapping with type; found 3"),
+        (["gyr"], "sensors.0.type: expected one of depth, climb, tilt, "),
+        (["gyro", "gyro"], "sensors.1.name: expected names that differ (give one of them a `name`)"
+         "; found 'gyro' twice"),
+        ([{"type": "gyro", "unit": "m"}], "sensors.0.unit: expected 'rad/s', as of gyro; found"),
+        ([{"type": "gyro", "range": -1}], "sensors.0.range: expected the lowest below the highest"),
+        ([{"type": "gyro", "range": "far"}], "sensors.0.range: expected a number, or the lowest"),
+        ([{"type": "gyro", "noise": -1}], "sensors.0.noise: expected a number >= 0; found -1"),
+        ([{"type": "gyro", "rate": 0}], "sensors.0.rate: expected a number > 0 and <= 10000 [Hz]"),
+        ([{"type": "gyro", "delay": 9}], "sensors.0.delay: expected a number >= 0 and <= 5 [s]"),
+        ([{"type": "gyro", "colour": 1}], "sensors.0.colour: expected one of type, name, unit"),
+    ],
+)  # fmt: skip
+def test_wrong_sensors(sensors, message):
+    with pytest.raises(InputError) as caught:
+        schema.read(SensorRow, sensors, "sensors")
+    assert message in str(caught.value)
+
+
+def test_a_delay_of_too_many_samples():
+    with pytest.raises(InputError, match=r"sensors.0.delay: expected at most 2.56 s at 100 Hz"):
+        make_observer([Sensor(type="gyro", delay=4.0)], DT)
