@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.control.controller import Controller, Gene, as_plant, make_controller
+from mjx_revolve.control.neighbours import join_pairs
 from mjx_revolve.control.sense import Sense
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
@@ -43,7 +44,8 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
         folded, rows = jnp.sin(genes), plant.num_hinge_rows
-        coupling = _couple(np.pi * max_frequency * folded[n : n + pairs], plant)
+        weights = np.pi * max_frequency * folded[n : n + pairs]
+        coupling = join_pairs(weights, -weights, plant)
         # Of each row: its oscillator's w, or its thruster's command.
         values = plant.arrange(jnp.concatenate([folded[:n], folded[n + pairs :]]))
         middle, reach = plant.middle(genes), plant.reach(genes)
@@ -76,30 +78,3 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
         return (x, y), jnp.concatenate([targets, constant])
 
     return make_controller(made_for, genes, decode, init, step)
-
-
-def _couple(weights: jax.Array, plant: Plant) -> dict[int, jax.Array]:
-    """The antisymmetric coupling of neighbours, column by column.
-
-    Args:
-        weights: `[num_pairs, lanes]`, how the later hinge of a pair acts on the earlier one.
-        plant: whose pairs.
-
-    Returns:
-        For each hinge row that may act on others, `[hinge rows, lanes]` how it does.
-    """
-    rows, lanes = plant.num_hinge_rows, weights.shape[1:]
-    if not plant.num_pairs:
-        return {}
-    wide = lambda x: jnp.broadcast_to(jnp.asarray(x), weights.shape)  # noqa: E731
-    i, j = wide(plant.first), wide(plant.second)
-    lane = jnp.arange(lanes[0]) if lanes else 0
-    matrix = jnp.zeros((rows, rows, *lanes), weights.dtype)
-    # What is past the end stands for no pair.
-    matrix = matrix.at[i, j, lane].add(weights, mode="drop")
-    matrix = matrix.at[j, i, lane].add(-weights, mode="drop")
-    if isinstance(plant.first, jax.Array):
-        acting = list(range(rows))
-    else:
-        acting = sorted({*plant.first.ravel().tolist(), *plant.second.ravel().tolist()})
-    return {j: matrix[:, j] for j in acting}

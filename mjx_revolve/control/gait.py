@@ -29,13 +29,14 @@ def describe_gait(plant: Plant, settings: Any, genes: Any) -> dict[str, float]:
     Revolve (`measure_brain.py`) takes medians, over the parameters' ranges, and squashed standard
     deviations; here they are means and standard deviations in the parameters' own units, of phases
     the circular ones: √(-2 ln R), R the length of the mean of exp(i φ). Its recurrence, reach of
-    sensors and synaptic reception are of neural networks, which these controllers are not.
+    sensors and synaptic reception are of neural networks, whose gait is in what they do.
 
     Each hinge's target is taken for a sin(2π t / T + φ) about its middle. `sine`: its first
     harmonic; the period is common. `cpg`: its oscillators are coupled linearly, so that each x is a
     sum of sines whose frequencies are the system matrix's; the greatest of them counts (of equal
-    ones the fastest), with the amplitude that tanh leaves of it. Hinges whose target keeps still do
-    not count.
+    ones the fastest), with the amplitude that tanh leaves of it. `splines`: its curve's first
+    harmonic. `sensory_cpg`: its oscillators where nothing is felt, once their phases have settled.
+    Hinges whose target keeps still do not count.
 
     Args:
         plant: of one robot, from `plant_of`.
@@ -99,4 +100,35 @@ def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
     return -turns[best], size, np.angle(1j * wave)
 
 
-_WAVES = {"sine": _sine_waves, "cpg": _cpg_waves}
+def _splines_waves(parameters: Any, hinges: int) -> _Waves:
+    """The same of each curve's first harmonic, `[hinges]`."""
+    rows, rate = parameters[0], 2 * np.pi * np.asarray(parameters[1], float).item()
+    points = len(rows)
+    turn = np.exp(-2j * np.pi * np.arange(points) / points)
+    bumps = turn @ np.stack([np.asarray(row, float)[:hinges, 0] for row in rows])
+    # A cubic B-spline is a box four times folded with itself.
+    wave = 2 / points * bumps * np.sinc(1 / points) ** 4
+    return np.full(hinges, rate), np.abs(wave), np.angle(1j * wave)
+
+
+def _sensory_waves(parameters: Any, hinges: int) -> _Waves:
+    """The same of oscillators that feel nothing, once their phases have settled, `[hinges]`."""
+    (size, *_), _, rate, near, (reach, _), _ = parameters
+    lag = np.zeros((hinges, hinges), complex)
+    for j in near[0]:
+        cosine, sine = (np.asarray(columns[j], float)[:, 0] for columns in near)
+        lag[:, j] = cosine - 1j * sine
+    phase = np.zeros(hinges)
+    for _ in range(2000):
+        phase += 0.02 * np.imag(np.exp(-1j * phase) * (lag @ np.exp(1j * phase)))
+    sizes = np.asarray(size, float)[:, 0] * np.asarray(reach, float)[:hinges, 0]
+    phase = phase + np.pi * (sizes < 0)
+    return np.full(hinges, np.asarray(rate, float).item()), np.abs(sizes), phase
+
+
+_WAVES = {
+    "sine": _sine_waves,
+    "cpg": _cpg_waves,
+    "splines": _splines_waves,
+    "sensory_cpg": _sensory_waves,
+}

@@ -11,8 +11,11 @@ import jax.numpy as jnp
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.feedback import make_feedback
+from mjx_revolve.control.joint_network import make_joint_network
 from mjx_revolve.control.sense import FEELS, Sense
+from mjx_revolve.control.sensory_cpg import make_sensory_cpg
 from mjx_revolve.control.sine import make_sine
+from mjx_revolve.control.splines import make_splines
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.own_code import call_own, load_own, parse_own, short_name
@@ -24,7 +27,27 @@ CONTROLLERS: dict[str, Callable[[Plant, Any], Controller]] = {
         plant, settings.max_frequency, settings.amplitude, settings.harmonics
     ),
     "feedback": lambda plant, settings: make_feedback(plant, settings.depth, settings.gain),
+    "mlp": lambda plant, settings: _make_network(plant, settings, False),
+    "rnn": lambda plant, settings: _make_network(plant, settings, True),
+    "sensory_cpg": lambda plant, settings: make_sensory_cpg(
+        plant, settings.sensors, settings.max_frequency, settings.amplitude, settings.gain
+    ),
+    "splines": lambda plant, settings: make_splines(
+        plant, settings.points, settings.max_frequency, settings.amplitude
+    ),
 }
+
+
+def _make_network(plant: Plant, settings: Any, recurrent: bool) -> Controller:
+    return make_joint_network(
+        plant,
+        settings.sensors,
+        settings.hidden,
+        settings.messages,
+        settings.max_frequency,
+        settings.amplitude,
+        recurrent,
+    )
 
 
 def find_controller(

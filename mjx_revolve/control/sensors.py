@@ -37,7 +37,7 @@ class Observation(NamedTuple):
     Attributes:
         robot: of the robot as a whole, `[lanes]` each.
         joint: of the hinges, `[hinge rows, lanes]` each, in the plant's order; what is no hinge's
-            says nothing of use.
+            says nothing of use. Nothing where there are no hinges.
     """
 
     robot: tuple[jax.Array, ...]
@@ -144,8 +144,9 @@ class Observer:
     def _shapes(self, sensor: Sensor, like: jax.Array) -> Any:
         """Numbers like those of a sample: those of the robot, those of the hinges."""
         where, count = sensor.kind.where, len(sensor.kind.parts)
-        robot = [like[0] if like.shape[0] else jnp.zeros(like.shape[1:], like.dtype)] * count
-        return (robot if where != "joint" else [], [like] * count if where != "robot" else [])
+        robot = [jnp.zeros(like.shape[1:], like.dtype)] * count
+        joint = [like] * count if where != "robot" and like.shape[0] else []
+        return (robot if where != "joint" else [], joint)
 
     def _measure(
         self, place: int, sensor: Sensor, count: jax.Array, sense: Sense, joint: Any
@@ -161,6 +162,8 @@ class Observer:
                 pieces = [(joints, value, joint)]
             elif kind.where == "body":
                 pieces = [(robot, value[0], None), (joints, value[1:], joint)]
+            if not joint.shape[0]:  # XLA takes nothing of no size into its loops
+                pieces = [piece for piece in pieces if piece[0] is robot]
             for found, true, number in pieces:
                 if sensor.noise > 0:
                     # 0 is the robot's own, so hinges count from 1.

@@ -748,9 +748,10 @@ def _wire(assembly: Assembly, row: np.ndarray, capacity: Capacity) -> Plant:
     rank = counted(np.bincount(jets, minlength=robots))[1]
     k = np.concatenate([row[hinge, assembly.robot[moved]], capacity.rows + rank])
     low, high = np.zeros((2, n, robots))
-    place = np.zeros((n, 3, robots))
+    place, axis = np.zeros((2, n, 3, robots))
     source = np.full((n, robots), capacity.hinges + capacity.thrusters)
-    low[k, robot], high[k, robot], place[k, :, robot] = read_actuators(assembly.morphologies)
+    found = read_actuators(assembly.morphologies)
+    low[k, robot], high[k, robot], place[k, :, robot], axis[k, :, robot] = found
     source[k, robot] = np.concatenate([hinge, capacity.hinges + rank])
     first, second = np.full((2, capacity.pairs, robots), n)
     for r, body in enumerate(assembly.morphologies):
@@ -761,6 +762,7 @@ def _wire(assembly: Assembly, row: np.ndarray, capacity: Capacity) -> Plant:
         low=low,
         high=high,
         place=place,
+        axis=axis,
         source=source,
         first=first,
         second=second,

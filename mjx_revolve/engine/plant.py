@@ -102,7 +102,7 @@ def _mean(place: np.ndarray, weight: np.ndarray, owner: np.ndarray, count: int) 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["low", "high", "place", "source", "first", "second"],
+    data_fields=["low", "high", "place", "axis", "source", "first", "second"],
     meta_fields=["num_hinges", "num_thrusters", "num_pairs", "names", "pairs", "timestep"],
 )
 @dataclass(frozen=True)
@@ -122,6 +122,8 @@ class Plant:
         low: `[n, lanes]` least command of each row: hinges [rad], thrusters [-].
         high: `[n, lanes]` greatest.
         place: `[n, 3, lanes]` of hinges and thrusters at rest, core frame [m].
+        axis: `[n, 3, lanes]` about which hinges turn and along which thrusters push, at rest, unit
+            vectors, core frame [-]; 0 where a row is no actuator.
         source: `[n, lanes]` which of the robot's actuators a row is; past their end: none.
         first: `[num_pairs, lanes]` the row of the pair's earlier hinge; past the end: no pair.
         second: `[num_pairs, lanes]` of the later one.
@@ -136,6 +138,7 @@ class Plant:
     low: Any = None
     high: Any = None
     place: Any = None
+    axis: Any = None
     source: Any = None
     first: Any = None
     second: Any = None
@@ -206,7 +209,7 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
     Returns:
         Its table, `[n, 1]`.
     """
-    body, (low, high, place) = robot.morphology, read_actuators([robot.morphology])
+    body, (low, high, place, axis) = robot.morphology, read_actuators([robot.morphology])
     source = np.array(range(len(low)) if order is None else order, np.int32)
     row = np.argsort(source)
     names = tuple(
@@ -224,6 +227,7 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
         low=low[source, None],
         high=high[source, None],
         place=place[source][..., None],
+        axis=axis[source][..., None],
         source=source[:, None],
         first=ends[:, :1],
         second=ends[:, 1:],
@@ -232,14 +236,15 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
 
 def read_actuators(
     bodies: Sequence[Morphology],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Hinges of all bodies, then thrusters of all: their least and greatest commands and places.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Hinges of all bodies, then thrusters of all: their commands' ranges, places and axes.
 
     Args:
         bodies: of the robots.
 
     Returns:
-        `[n]` and `[n]` ends of the range [rad] or [-], and `[n, 3]` places at rest, core frame [m].
+        `[n]` and `[n]` ends of the range [rad] or [-], `[n, 3]` places at rest, core frame [m], and
+        `[n, 3]` axes of hinges and directions of thrust, likewise [-].
     """
     modules = [module for body in bodies for module in body.modules]
     hinges = [(m, m.kind.hinge) for m in modules if m.kind.hinge is not None]
@@ -249,8 +254,10 @@ def read_actuators(
     carriers = [*(m for m, _ in hinges), *(m for m, _, _ in thrusters)]
     local = [hinge.anchor for _, hinge in hinges]
     local += [tuple(np.add(part.position, jet.position)) for _, part, jet in thrusters]
+    axes = [hinge.axis for _, hinge in hinges] + [jet.axis for *_, jet in thrusters]
     ranges = [*(hinge.range for _, hinge in hinges), *(jet.range for *_, jet in thrusters)]
     origin = np.array([m.position for m in carriers]).reshape(-1, 3)
     rotation = np.array([m.rotation for m in carriers]).reshape(-1, 3, 3)
     low, high = np.array(ranges).reshape(-1, 2).T
-    return low, high, origin + turned(rotation, np.array(local).reshape(-1, 3))
+    place, axis = (turned(rotation, np.array(x).reshape(-1, 3)) for x in (local, axes))
+    return low, high, origin + place, axis

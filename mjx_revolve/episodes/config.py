@@ -39,7 +39,15 @@ from mjx_revolve.inputs.schema import (
 from mjx_revolve.inputs.shipped import find_shipped
 
 # What is of use to one kind of controller only; `control.kinds.CONTROLLERS` has the functions.
-CONTROLLERS = {"cpg": (), "sine": ("harmonics",), "feedback": ("gain", "depth")}
+CONTROLLERS: dict[str, tuple[str, ...]] = {
+    "cpg": (),
+    "sine": ("harmonics",),
+    "feedback": ("gain", "depth"),
+    "mlp": ("sensors", "hidden", "messages"),
+    "rnn": ("sensors", "hidden", "messages"),
+    "sensory_cpg": ("sensors", "gain"),
+    "splines": ("points",),
+}
 # What a task cannot do without; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {
     "directed_swim": (),
@@ -81,7 +89,8 @@ class ControllerConfig(Section):
     """What turns genes into joint targets."""
 
     type: Annotated[str, one_of(CONTROLLERS)] = "cpg"
-    """`cpg`, `sine`, `feedback`, or FILE.py:FUNCTION, a function of a plant and this section."""
+    """`cpg`, `sine`, `feedback`, `mlp`, `rnn`, `sensory_cpg`, `splines`, or FILE.py:FUNCTION, a
+    function of a plant and this section."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """The fastest oscillation [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0
@@ -89,9 +98,16 @@ class ControllerConfig(Section):
     harmonics: Annotated[Whole, Ge(1), Le(8)] = 1
     """How many sines add up at each hinge; `type: sine` only [-]."""
     gain: Annotated[Positive, Unit("-")] = 2.0
-    """Largest answer to an error of normal size, as a share of the range; `type: feedback` [-]."""
+    """Largest answer to an error of normal size, or to a sensor at the end of its range, as a
+    share of the range; `type: feedback` and `sensory_cpg` [-]."""
     depth: Annotated[NonNegative, Unit("m")] | None = None
     """Depth that `type: feedback` holds; that of the task's start where none is given [m]."""
+    hidden: Annotated[Whole, Ge(1), Le(64)] = 8
+    """Units of the network that all joints share; `type: mlp` and `rnn` [-]."""
+    messages: Annotated[Whole, Ge(0), Le(8)] = 2
+    """How many numbers a joint tells its neighbours; `type: mlp` and `rnn` [-]."""
+    points: Annotated[Whole, Ge(3), Le(100)] = 8
+    """Through which each joint's curve goes; `type: splines` [-]."""
     sensors: SensorRow | None = None
     """What brains are told, kinds' names or mappings with fields of `Sensor`; by default the
     robot's own `sensors`, or else `sensors.USUAL`."""
@@ -101,13 +117,16 @@ class ControllerConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
         self.refuse_params(self.params)
-        for kind, settings in CONTROLLERS.items():
-            for name in settings if kind != self.type and not self.is_own else ():
-                usual, found = type(self).model_fields[name].default, getattr(self, name)
-                if found != usual:
-                    usual = "null" if usual is None else f"{usual:g}"
-                    only = f"as only type {kind} has it (--set controller.{name}={usual})"
-                    raise MisfitError(name, f"{usual}, {only}", f"{found:g}")
+        for name in dict.fromkeys(name for names in CONTROLLERS.values() for name in names):
+            kinds = [kind for kind, names in CONTROLLERS.items() if name in names]
+            usual, found = type(self).model_fields[name].default, getattr(self, name)
+            if found == usual or self.type in kinds or self.is_own:
+                continue
+            usual = "null" if usual is None else f"{usual:g}"
+            have = f"type {kinds[0]} has" if len(kinds) == 1 else f"types {', '.join(kinds)} have"
+            only = f"as only {have} it (--set controller.{name}={usual})"
+            shown = f"{len(found)} of them" if isinstance(found, tuple) else f"{found:g}"
+            raise MisfitError(name, f"{usual}, {only}", shown)
         return self
 
 

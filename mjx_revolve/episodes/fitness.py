@@ -476,7 +476,7 @@ def fit_body(config: Config, morphology: Morphology) -> Fitness:
     figure = figure_of(robot)
     reach = farthest(config.task, world, figure)
     engine = make_engine(robot, config.engine, may_touch_bed(task, config.task, world, reach))
-    controller = _find_controller(config, engine.plant)
+    controller = _find_controller(config, engine.plant, morphology)
     return Fitness(Setup(config, world, task, controller, engine, figure), robot)
 
 
@@ -533,7 +533,8 @@ def make_mixed_fitness(
     shown = [*robots, *_show_kinds(kinds, robots, hinges)]
     capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules)
     example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
-    controller = _find_controller(config, capacity.plant, example)
+    _check_alike(config, examples)
+    controller = _find_controller(config, capacity.plant, example=example)
     return MixedFitness(Setup(config, world, task, controller, capacity=capacity), touches)
 
 
@@ -610,8 +611,25 @@ def _build(config: Config, world: World, morphology: Morphology) -> Robot:
     return build_robot(morphology, world)
 
 
-def _find_controller(config: Config, plant: Plant, example: Plant | None = None) -> Controller:
+def _check_alike(config: Config, bodies: Sequence[Morphology]) -> None:
+    """Refuses bodies with sensors of their own where all must have the same."""
+    for body in bodies:
+        if body.sensors is not None and config.controller.sensors is None:
+            raise InputError(
+                f"{config.source}: controller.sensors: expected some, the same for all bodies; "
+                f"found none, and sensors of its own in {body.name!r}"
+            )
+
+
+def _find_controller(
+    config: Config,
+    plant: Plant,
+    body: Morphology | None = None,
+    example: Plant | None = None,
+) -> Controller:
     settings = config.controller
+    if settings.sensors is None and body is not None:
+        settings = settings.model_copy(update={"sensors": body.sensors})
     if settings.depth is None:
         settings = settings.model_copy(update={"depth": config.task.depth})
     return find_controller(plant, settings, config.source, example)

@@ -19,6 +19,7 @@ from mjx_revolve.control.sense import Sense
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.config import CONTROLLERS as CHOICES
 from mjx_revolve.episodes.config import ControllerConfig
 
 EFFORT, SPEED = 0.17658, 5.235988
@@ -86,7 +87,7 @@ def test_every_gene_has_a_name_of_its_own(kind):
 
 def test_the_names_that_a_configuration_gives():
     plant = plant_of(robot_of("spider"))
-    assert set(CONTROLLERS) == {"cpg", "sine", "feedback"}
+    assert set(CONTROLLERS) == {*CHOICES}
     for kind, genes in (("cpg", 18), ("sine", 25), ("feedback", 8 * (1 + 7))):
         assert CONTROLLERS[kind](plant, ControllerConfig(type=kind)).num_genes == genes
     assert CONTROLLERS["sine"](plant, ControllerConfig(type="sine", harmonics=2)).num_genes == 41

@@ -329,6 +329,19 @@ def make_wave(plant, settings):
 
 
 CRAWL = {"task.type": "crawl"}
+# With a memory of the last step, of older samples, and noise at each hinge.
+NOISY = {
+    "controller.sensors": [
+        "accelerometer",
+        {"type": "load", "noise": 0.01, "delay": 0.02},
+        {"type": "angle", "noise": 0.1, "rate": 20},
+        {"type": "battery", "range": [0, 1]},
+        "bearing",
+    ],
+    "task.type": "reach_target",
+    "task.target_distance": 1.0,
+    "task.target_speed": 0.2,
+}
 
 
 @pytest.mark.slow
@@ -339,6 +352,8 @@ CRAWL = {"task.type": "crawl"}
         ("feedback", "auv", {"name": "lake", "gust": {"std": 0.05, "time": 2.0}},
          {"task.trials": 2}, 1),
         ("own", "snake", {"name": "lake", "bed": {"kind": "flat", "height": -3.0}}, CRAWL, 0),
+        ("rnn", "auv", {"name": "lake"}, NOISY, 1),
+        ("sensory_cpg", "snake", {"name": "lake"}, NOISY, 1),
     ],
 )  # fmt: skip
 def test_every_controller_drives_every_body(config, tmp_path, kind, other, tank, task, checked):

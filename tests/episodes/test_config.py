@@ -88,8 +88,10 @@ def test_it_is_frozen(folder):
          "expected none, as there is a target_distance; found one"),
         ("controller.harmonics=3", "--set controller.harmonics: expected 1, as only type sine has "
          "it (--set controller.harmonics=1); found 3"),
-        ("controller.gain=3.5", "--set controller.gain: expected 2, as only type feedback has it "
-         "(--set controller.gain=2); found 3.5"),
+        ("controller.gain=3.5", "--set controller.gain: expected 2, as only types feedback, "
+         "sensory_cpg have it (--set controller.gain=2); found 3.5"),
+        ("controller.sensors=[gyro]", "--set controller.sensors: expected null, as only types mlp, "
+         "rnn, sensory_cpg have it (--set controller.sensors=null); found 1 of them"),
         ("controller.depth=1", "--set controller.depth: expected null, as only type feedback has "
          "it (--set controller.depth=null); found 1"),
         ("task.target=[1, 2]", "task.target: expected three numbers [m], or nothing; "

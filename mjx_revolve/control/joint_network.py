@@ -1,0 +1,191 @@
+"""One small network that all joints share, with messages between neighbours.
+
+The same weights at each joint, as in Huang, Mordatch & Pathak 2020 (One policy to control them
+all, ICML), so that a brain fits any body, and survives all changes of it. What a joint does differs
+from what another one does by what it feels, where it stands, and what its neighbours say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.body.sensors import Sensor
+from mjx_revolve.control.controller import Controller, Gene, as_plant, make_controller
+from mjx_revolve.control.neighbours import act, mean_of_neighbours
+from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.sensors import make_observer
+from mjx_revolve.engine.plant import Plant
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.numerics.spatial import sincos
+
+# A weight of one is sin(gene) times this; a choice, so that tanh can be driven to its ends.
+_WEIGHT = 2.0
+# By which places are divided before they enter the network [m], about two modules; a choice.
+_LENGTH = 0.1
+# How long commands take to fade in [s], so that no joint jumps at the start; as `make_sine`.
+_FADE = 0.5
+# Slowest and fastest unit of a recurrent network [s]; choices: a step, and a slow stroke.
+_SLOWEST, _FASTEST = 1.0, 0.02
+
+_PLACE = ("one", "x", "y", "z", "away", "axis x", "axis y", "axis z")
+_HINTS = ("sine", "cosine")
+
+
+def make_joint_network(
+    body: Plant | Robot,
+    sensors: Sequence[Sensor] | None = None,
+    hidden: int = 8,
+    messages: int = 2,
+    max_frequency: float = 2.0,
+    amplitude: float = 1.0,
+    recurrent: bool = False,
+) -> Controller:
+    """A network with one hidden layer, the same at each hinge and thruster.
+
+    Inputs of joint i are what the robot feels as a whole; what the joint feels; its place at rest
+    (x, y, z and distance from the core, in 0.1 m) and its axis, core frame; two phase hints,
+    sin(2π f t + φ_i) and cos, where φ_i is linear in the place, so that waves can run along the
+    body; and the mean of its neighbours' messages of the step before. With W from the genes,
+
+        h = tanh(W x),  message = tanh(U h),  target = middle + amplitude × half range × tanh(v·h),
+
+    whose targets fade in over half a second. Recurrent, hidden units are leaky and feel each other,
+    τ_k ḣ_k = -h_k + tanh((W x + R h)_k), τ_k from 0.02 to 1 s (a continuous-time recurrent
+    network, Beer 1995, Adaptive Behavior 3, with bounded states). Thrusters have a v of their own,
+    no joint's senses and no neighbours. Weights are 2 sin(gene): zero genes keep everything still.
+
+    Args:
+        body: whose hinges and thrusters are driven: a plant or a robot.
+        sensors: that tell it what it feels; by default `sensors.USUAL`.
+        hidden: units of the hidden layer [-].
+        messages: numbers that a joint tells its neighbours [-].
+        max_frequency: of the phase hints [Hz].
+        amplitude: share of the ranges used [-].
+        recurrent: whether hidden units keep a state.
+
+    Returns:
+        The controller; all genes are the robot's, so that their number does not depend on it.
+    """
+    made_for = as_plant(body)
+    observer = make_observer(sensors, made_for.timestep)
+    words = [f"message{k + 1}" for k in range(messages)]
+    given = [*observer.robot_names, *(f"joint {x}" for x in observer.joint_names)]
+    fixed, felt = len(_PLACE), len(observer.robot_names)
+    inputs = [*_PLACE, *given, *_HINTS, *words]
+    outputs = ["target", *words]
+    units = [f"h{k + 1}" for k in range(hidden)]
+    names = [f"{x}>{h}" for h in units for x in inputs]
+    names += [f"{h}>{x}" for h in units for x in outputs]
+    names += [f"{a}>{b}" for b in units for a in units] if recurrent else []
+    names += [f"{h} time" for h in units] if recurrent else []
+    names += ["frequency", *(f"phase {x}" for x in _PLACE[1:5])]
+    names += [f"{h}>thrust" for h in units] if made_for.num_thrusters else []
+    genes = [Gene(name, "robot") for name in names]
+    dt = made_for.timestep
+
+    def decode(genes: jax.Array, plant: Plant) -> Any:
+        folded, lanes, start = jnp.sin(genes), genes.shape[1:], 0
+
+        def take(*shape: int) -> jax.Array:
+            nonlocal start
+            size = int(np.prod(shape))
+            found = folded[start : start + size].reshape(*shape, *lanes)
+            start += size
+            return found
+
+        layer = _WEIGHT * take(hidden, len(inputs))
+        out = _WEIGHT * take(hidden, len(outputs))
+        back = _WEIGHT * take(hidden, hidden) if recurrent else None
+        pace = None
+        if recurrent:
+            # From the slowest to the fastest in equal ratios, 0.14 s for a gene of 0.
+            share = (1 + take(hidden)) / 2
+            tau = _SLOWEST * jnp.exp(share * np.log(_FASTEST / _SLOWEST))
+            pace = jnp.minimum(dt / tau, 1)[:, None]
+        rate = 2 * np.pi * max_frequency * (1 + take(1)) / 2
+        slope = np.pi * take(4)
+        target = out[:, :1]
+        if made_for.num_thrusters:
+            counts = plant.num_hinge_rows, plant.num_thrusters
+            both = target, _WEIGHT * take(hidden)[:, None]
+            wide = [jnp.repeat(x, n, 1) for x, n in zip(both, counts, strict=True)]
+            target = jnp.concatenate(wide, 1)
+        place = _places(plant, genes)
+        base = sum(layer[:, k, None] * place[k] for k in range(fixed))
+        late = slope[0, None] * place[1]
+        for k in range(1, 4):
+            late = late + slope[k, None] * place[k + 1]
+        sine, cosine = sincos(late)
+        return (
+            (base, layer[:, fixed:], back, pace, target, out[:, 1:]),
+            (rate, sine, cosine),
+            mean_of_neighbours(genes, plant),
+            (amplitude * plant.reach(genes), plant.middle(genes)),
+            plant.source[: plant.num_hinge_rows],
+        )
+
+    def init(parameters: Any) -> Any:
+        (base, *_), _, _, _, _ = parameters
+        rows = parameters[4].shape[0]
+        like = base[0][:rows]
+        said = tuple(jnp.zeros_like(like) for _ in range(messages)) if rows else ()
+        return observer.init(like), said, jnp.zeros_like(base) if recurrent else ()
+
+    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+        (base, layer, back, pace, target, speech), clock, near, (reach, middle), number = parameters
+        seen, said, memory = state
+        rows, total = number.shape[0], base.shape[1]
+        seen, observation = observer.observe(seen, time, sense, number)
+
+        def of_all(x: jax.Array) -> jax.Array:
+            """What only hinges have, with nothing for thrusters."""
+            if rows == total:
+                return x
+            return jnp.concatenate([x, jnp.zeros((total - rows, *x.shape[1:]), x.dtype)])
+
+        activity = base
+        for k, x in enumerate(observation.robot):  # written out: no reductions inside the loop
+            activity = activity + layer[:, k, None] * x
+        rate, sine, cosine = clock
+        s, c = sincos(rate * time)
+        hints = (sine * c + cosine * s, cosine * c - sine * s)
+        heard = [of_all(act(near, x)) for x in said]
+        own = [of_all(x) for x in observation.joint]
+        later = felt + len(observer.joint_names)
+        for start, found in ((felt, own), (later, [*hints, *heard])):
+            for k, x in enumerate(found):
+                activity = activity + layer[:, start + k, None] * x
+        if recurrent:
+            for k in range(hidden):
+                activity = activity + back[:, k, None] * memory[k]
+            h = memory = memory + pace * (jnp.tanh(activity) - memory)
+        else:
+            h = jnp.tanh(activity)
+        command = sum(target[k] * h[k] for k in range(hidden))
+        said = tuple(
+            jnp.tanh(sum(speech[k, m] * h[k][:rows] for k in range(hidden)))
+            for m in range(len(said))
+        )
+        fade = jnp.minimum(time / _FADE, 1)
+        return (seen, said, memory), middle + fade * reach * jnp.tanh(command)
+
+    found = make_controller(made_for, genes, decode, init, step)
+    return found._replace(feels=observer.feels)
+
+
+def _places(plant: Plant, like: jax.Array) -> list[jax.Array]:
+    """The inputs `_PLACE` of each row, `[n, lanes]`."""
+
+    def wide(x: Any) -> jax.Array:
+        x = x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)
+        return jnp.broadcast_to(x, (plant.num_rows, *like.shape[1:])).astype(like.dtype)
+
+    x, y, z = (wide(plant.place[:, i] / _LENGTH) for i in range(3))
+    # The tiny term keeps the gradient finite at the core's centre.
+    away = jnp.sqrt(x * x + y * y + z * z + 1e-12)
+    return [jnp.ones_like(x), x, y, z, away, *(wide(plant.axis[:, i]) for i in range(3))]

@@ -1,0 +1,105 @@
+"""RLPower's policies: a closed curve for each joint, through a few points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.control.controller import (
+    Controller,
+    Gene,
+    as_plant,
+    make_controller,
+    of_actuators,
+)
+from mjx_revolve.control.sense import Sense
+from mjx_revolve.engine.plant import Plant
+from mjx_revolve.engine.robot import Robot
+
+_FADE = 0.5  # [s], as `make_sine`
+
+
+def make_splines(
+    body: Plant | Robot, points: int = 8, max_frequency: float = 2.0, amplitude: float = 1.0
+) -> Controller:
+    """A periodic cubic spline per hinge or thruster, and a frequency shared by all.
+
+    The policies of RLPower (Kober & Peters 2009; for modular robots D'Angelo, Weel & Eiben 2013):
+    target_i(t) = middle + amplitude × half range × s_i(f t mod 1), s_i the periodic cubic spline
+    through sin(gene) at equal distances. There, a learner begins with 3 points and adds some as it
+    goes on, up to 100 (`refine_splines`). f = f_max (1 + sin(gene)) / 2. It fades in over the first
+    half second. Between its points a spline may swing beyond them; the servo's range clips it.
+
+    Args:
+        body: whose hinges and thrusters are driven: a plant or a robot.
+        points: of each curve, 3 or more [-].
+        max_frequency: upper end of f [Hz].
+        amplitude: share of the ranges used [-].
+
+    Returns:
+        The controller; genes: the first point of all actuators, the second and so on, then the
+        frequency.
+    """
+    made_for = as_plant(body)
+    n = made_for.num_actuators
+    what = [f"point{k + 1}" for k in range(points)]
+    genes = (*of_actuators(made_for, *what), Gene("frequency", "robot"))
+    solve = np.linalg.inv(_weights_of(np.arange(points), points))
+
+    def decode(genes: jax.Array, plant: Plant) -> Any:
+        folded, reach = jnp.sin(genes), amplitude * plant.reach(genes)
+        through = [reach * plant.arrange(folded[k * n : (k + 1) * n]) for k in range(points)]
+        # The B-spline's coefficients, so that the curve goes through the points.
+        rows = [sum(float(w) * x for w, x in zip(row, through, strict=True)) for row in solve]
+        return tuple(rows), max_frequency * (1 + folded[-1:]) / 2, plant.middle(genes)
+
+    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+        rows, rate, middle = parameters
+        turns = rate * time
+        at = points * (turns - jnp.floor(turns))
+        wave: Any = 0.0
+        for k, row in enumerate(rows):
+            wave = wave + _weight(at - k, points, jnp) * row
+        return state, middle + jnp.minimum(time / _FADE, 1) * wave
+
+    return make_controller(made_for, genes, decode, lambda parameters: (), step)
+
+
+def _weight(way: Any, points: int, xp: Any) -> Any:
+    """How much a B-spline's coefficient counts so far (-points to points) from its own place."""
+    found: Any = 0.0
+    # A bump is four points wide: of a short ring it meets itself.
+    for turn in (-2, -1, 0, 1, 2) if points < 4 else (-1, 0, 1):
+        far = xp.abs(way + turn * points)
+        outer, inner = xp.maximum(2 - far, 0), xp.maximum(1 - far, 0)
+        found = found + (outer * outer * outer - 4 * inner * inner * inner) / 6
+    return found
+
+
+def _weights_of(places: np.ndarray, points: int) -> np.ndarray:
+    """`[places, points]` weights of the coefficients at places of the ring."""
+    away: np.ndarray = np.subtract.outer(places, np.arange(points))
+    found: np.ndarray = _weight(away, points, np)
+    return found
+
+
+def refine_splines(genes: np.ndarray, points: int, more: int) -> np.ndarray:
+    """The genes of curves through more points, which follow the old ones as closely as they can.
+
+    Args:
+        genes: `[points * n + 1]` of `make_splines`.
+        points: how many each curve has.
+        more: how many each is to have.
+
+    Returns:
+        `[more * n + 1]` genes.
+    """
+    values = np.sin(np.asarray(genes, float)[:-1]).reshape(points, -1)
+    places = np.arange(more) * points / more
+    curve = _weights_of(places, points) @ np.linalg.inv(_weights_of(np.arange(points), points))
+    # What swings beyond its points is cut off at the ends of the range.
+    found = np.arcsin(np.clip(curve @ values, -1, 1))
+    return np.concatenate([found.ravel(), np.asarray(genes, float)[-1:]])
