@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.feedback import make_feedback
 from mjx_revolve.control.joint_network import make_joint_network
+from mjx_revolve.control.neurons import make_network
 from mjx_revolve.control.sense import FEELS, Sense
 from mjx_revolve.control.sensory_cpg import make_sensory_cpg
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.control.splines import make_splines
 from mjx_revolve.engine.plant import Plant
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.own_code import call_own, load_own, parse_own, short_name
 
 # By the name that a configuration gives; each takes (plant, settings).
@@ -38,6 +40,24 @@ CONTROLLERS: dict[str, Callable[[Plant, Any], Controller]] = {
 }
 
 
+def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | None) -> Controller:
+    """What a robot's file has under `brain`."""
+    place = f"{source}: controller.type"
+    if body is None:
+        raise InputError(f"{place}: expected another one, as bodies differ; found 'brain'")
+    brain, file = body.brain, body.path or body.name
+    if isinstance(brain, Mapping) and "neurons" in brain:
+        return make_network(plant, body, file)
+    kind = brain.get("type") if isinstance(brain, Mapping) else brain
+    if kind == "rlpower-splines":
+        return CONTROLLERS["splines"](plant, settings)
+    known = "neurons and connections, or type: rlpower-splines"
+    if kind == "bo-cpg":
+        known += " (its oscillators are those of controller.type cpg)"
+    found = "none" if brain is None else show(brain if kind is None else kind)
+    raise InputError(f"{file}: brain: expected {known}; found {found}")
+
+
 def _make_network(plant: Plant, settings: Any, recurrent: bool) -> Controller:
     return make_joint_network(
         plant,
@@ -51,7 +71,11 @@ def _make_network(plant: Plant, settings: Any, recurrent: bool) -> Controller:
 
 
 def find_controller(
-    plant: Plant, settings: Any, source: str = "config", example: Plant | None = None
+    plant: Plant,
+    settings: Any,
+    source: str = "config",
+    example: Plant | None = None,
+    body: Morphology | None = None,
 ) -> Controller:
     """The controller that a configuration names, made for a plant.
 
@@ -62,6 +86,7 @@ def find_controller(
             settings and returns a `Controller`.
         source: what messages call the configuration.
         example: a plant with its tables, to try a user's own on; by default `plant`.
+        body: whose plant it is, for `type: brain`; None for many.
 
     Returns:
         The controller.
@@ -70,6 +95,8 @@ def find_controller(
         InputError: the file or the function is missing, or what it makes is no controller of this
             plant; one line says where.
     """
+    if settings.type == "brain":
+        return _make_brain(plant, settings, source, body)
     if settings.type in CONTROLLERS:
         return CONTROLLERS[settings.type](plant, settings)
     name = settings.type

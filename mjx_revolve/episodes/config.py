@@ -47,6 +47,7 @@ CONTROLLERS: dict[str, tuple[str, ...]] = {
     "rnn": ("sensors", "hidden", "messages"),
     "sensory_cpg": ("sensors", "gain"),
     "splines": ("points",),
+    "brain": ("points",),
 }
 # What a task cannot do without; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {
@@ -89,8 +90,8 @@ class ControllerConfig(Section):
     """What turns genes into joint targets."""
 
     type: Annotated[str, one_of(CONTROLLERS)] = "cpg"
-    """`cpg`, `sine`, `feedback`, `mlp`, `rnn`, `sensory_cpg`, `splines`, or FILE.py:FUNCTION, a
-    function of a plant and this section."""
+    """`cpg`, `sine`, `feedback`, `mlp`, `rnn`, `sensory_cpg`, `splines`, `brain` (what the
+    robot's YAML has under `brain`), or FILE.py:FUNCTION, a function of a plant and this section."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """The fastest oscillation [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0
@@ -107,7 +108,7 @@ class ControllerConfig(Section):
     messages: Annotated[Whole, Ge(0), Le(8)] = 2
     """How many numbers a joint tells its neighbours; `type: mlp` and `rnn` [-]."""
     points: Annotated[Whole, Ge(3), Le(100)] = 8
-    """Through which each joint's curve goes; `type: splines` [-]."""
+    """Through which each joint's curve goes; `type: splines`, and `brain` where it has them [-]."""
     sensors: SensorRow | None = None
     """What brains are told, kinds' names or mappings with fields of `Sensor`; by default the
     robot's own `sensors`, or else `sensors.USUAL`."""
@@ -248,6 +249,9 @@ class Config(Settings):
         if self.morphology is not None:
             what = "none, as bodies evolve (bodies.seeds names robots to begin with)"
             raise MisfitError("morphology", what, self.morphology)
+        if self.controller.type == "brain":
+            what = "another one, as bodies evolve, and no brain of a file fits them"
+            raise MisfitError("controller.type", what, "brain")
         if self.engine != "population":
             raise MisfitError("engine", "population, as bodies evolve", self.engine)
         for name in ("strategy", "strategy_params"):

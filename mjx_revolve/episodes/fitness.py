@@ -632,4 +632,4 @@ def _find_controller(
         settings = settings.model_copy(update={"sensors": body.sensors})
     if settings.depth is None:
         settings = settings.model_copy(update={"depth": config.task.depth})
-    return find_controller(plant, settings, config.source, example)
+    return find_controller(plant, settings, config.source, example, body)

@@ -87,7 +87,7 @@ def test_every_gene_has_a_name_of_its_own(kind):
 
 def test_the_names_that_a_configuration_gives():
     plant = plant_of(robot_of("spider"))
-    assert set(CONTROLLERS) == {*CHOICES}
+    assert {*CONTROLLERS, "brain"} == {*CHOICES}
     for kind, genes in (("cpg", 18), ("sine", 25), ("feedback", 8 * (1 + 7))):
         assert CONTROLLERS[kind](plant, ControllerConfig(type=kind)).num_genes == genes
     assert CONTROLLERS["sine"](plant, ControllerConfig(type="sine", harmonics=2)).num_genes == 41

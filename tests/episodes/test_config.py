@@ -111,8 +111,8 @@ def test_it_is_frozen(folder):
         ("engine=gpu", "--set engine: expected one of population, mjx; found 'gpu'"),
         ("allow_overlap=1", "--set allow_overlap: expected true or false; found 1"),
         (
-            "controller.type=splines",
-            "expected one of cpg, sine, feedback, or FILE.py:FUNCTION; found 'splines'",
+            "controller.type=spline",
+            "rnn, sensory_cpg, splines, brain, or FILE.py:FUNCTION; found 'spline'",
         ),
         ("controller.max_frequency=21", "expected a number > 0 and <= 20 [Hz]; found 21"),
         ("controller.amplitude=0", "expected a number > 0 and <= 1 [-]; found 0"),
@@ -171,7 +171,7 @@ def test_wrong_files(folder, text, message):
 
 
 def test_the_kinds_are_those_there_are():
-    assert config.CONTROLLERS.keys() == kinds.CONTROLLERS.keys()
+    assert config.CONTROLLERS.keys() == {*kinds.CONTROLLERS, "brain"}  # which asks for a body
     assert config.TASKS.keys() == tasks.TASKS.keys()
     for what, kind in (
         (config.ControllerConfig, config.CONTROLLERS),

@@ -1,0 +1,200 @@
+"""Revolve's neural networks from a robot's YAML: read, run by hand, evolved and saved."""
+
+from __future__ import annotations
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+
+from laboratory import WILD, read, world
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.control.kinds import find_controller
+from mjx_revolve.control.neurons import evolve_brain, make_network, read_network
+from mjx_revolve.control.sense import Sense
+from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.config import ControllerConfig
+from mjx_revolve.inputs.errors import InputError
+
+DT, REACH = 0.005, np.pi / 4
+ROBOT = """
+id: thinker
+body:
+  id: core
+  type: Core
+  children:
+    1:
+      id: arm
+      type: ActiveHinge
+      children: {1: {id: hand, type: FixedBrick, children: {1: {id: pad, type: TouchSensor}}}}
+    2: {id: tail, type: ActiveHinge}
+    3: {id: fin, type: ActiveHinge}
+brain:
+  neurons:
+    a1: {id: a1, layer: input, part_id: core, type: Input}
+    a2: {id: a2, layer: input, part_id: core, type: Input}
+    a3: {id: a3, layer: input, part_id: core, type: Input}
+    g1: {id: g1, layer: input, part_id: core, type: Input}
+    t1: {id: t1, layer: input, part_id: pad, type: Input}
+    t2: {id: t2, layer: input, part_id: pad, type: Input}
+    clock: {id: clock, layer: hidden, type: Oscillator}
+    mix: {id: mix, layer: output, part_id: arm, type: Sigmoid}
+    sum: {id: sum, layer: output, part_id: tail, type: Simple}
+    late: {id: late, layer: output, part_id: tail, type: Simple}
+  connections:
+    - {src: a2, dst: mix, weight: 0.2}
+    - {src: g1, dst: mix, weight: -0.7}
+    - {src: t2, dst: sum, weight: 0.5}
+    - {src: clock, dst: sum, weight: 0.4}
+    - {src: mix, dst: sum, weight: 0.3}
+    - {src: sum, dst: mix, weight: 1.5}
+    - {src: sum, dst: sum, weight: -0.25}
+    - {src: sum, dst: clock, weight: 9.0}
+  params:
+    clock: {period: 0.8, phase_offset: 0.3, gain: 0.6}
+    mix: {bias: 0.1, gain: 0.9}
+    sum: {bias: -0.2, gain: 0.7}
+    late: {bias: 0.0, gain: 1.0}
+"""
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return build_robot(read(ROBOT), world())
+
+
+def play(robot, genes, steps, sense):
+    """`[steps, nhinge]` targets, in float64."""
+    plant = plant_of(robot)
+    with jax.enable_x64(True):
+        controller = make_network(plant, robot.morphology)
+        sense = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), sense)
+        genes = np.zeros(controller.num_genes) if genes is None else genes
+        parameters = controller.decode(jnp.asarray(genes, jnp.float64)[:, None], plant)
+        step = lambda state, k: controller.step(parameters, state, k * DT, sense)  # noqa: E731
+        run = jax.jit(lambda: jax.lax.scan(step, controller.init(parameters), jnp.arange(steps)))
+        return np.asarray(run()[1])[..., 0]
+
+
+def felt():
+    """Specific force, spin, and how the bed pushes core, arm, tail and fin."""
+    three = lambda *x: tuple(np.array([v]) for v in x)  # noqa: E731
+    touch = np.array([[0.0], [0.6], [3.0], [0.0]])
+    return Sense(0.0, 0.0, (), three(0.5, -1.0, 2.0), force=three(1.0, 3.0, 9.0), touch=touch)
+
+
+def test_a_network_by_hand(robot):
+    """Updated at 8 Hz, all at once, from the values before; held in between."""
+    found = play(robot, None, 100, felt())
+    mix = total = clock = 0.0
+    for k in range(100):
+        due = [
+            i for i in range(100) if i == 0 or int(i * DT * 8 + 0.01) > int((i - 1) * DT * 8 + 0.01)
+        ]
+        if k in due:
+            wave = (np.sin(2 * np.pi / 0.8 * (k * DT - 0.8 * 0.3)) + 1) / 2
+            activity = 0.2 * 3.0 - 0.7 * 0.5 + 1.5 * total
+            weighted = 0.5 * 0.6 + 0.4 * clock + 0.3 * mix - 0.25 * total
+            mix = 1 / (1 + np.exp(-0.9 * (activity - 0.1)))
+            total = 0.7 * (weighted + 0.2)
+            clock = 0.5 - 0.3 + 0.6 * wave
+        expected = REACH * (2 * np.clip([mix, total, 0.5], 0, 1) - 1)
+        assert found[k] == pytest.approx(expected, abs=1e-9), k
+    assert len(np.unique(found[:, 0])) == 4
+
+
+def test_what_it_asks_to_feel_and_what_may_evolve(robot):
+    controller = make_network(plant_of(robot), robot.morphology)
+    assert set(controller.feels) == {"force", "touch"}
+    # Seven weights, as that into the oscillator does nothing; three and three times two numbers.
+    assert controller.num_genes == 7 + 3 + 6 == len(set(controller.gene_names))
+    assert "weight 8 sum>clock" not in controller.gene_names
+    assert "period clock" in controller.gene_names and "bias mix" in controller.gene_names
+
+
+def test_what_has_evolved_is_saved_and_runs_the_same(robot, tmp_path):
+    count = make_network(plant_of(robot), robot.morphology).num_genes
+    genes = np.random.default_rng(0).normal(size=count)
+    brain = evolve_brain(robot.morphology.brain, genes)
+    mapping = robot.morphology.to_mapping() | {"brain": brain}
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False))
+    again = build_robot(load_morphology(tmp_path / "robot.yaml"), world())
+    expected = play(robot, genes, 200, felt())
+    assert play(again, None, 200, felt()) == pytest.approx(expected, abs=1e-12)
+    assert np.abs(expected - play(robot, None, 200, felt())).max() > 0.1
+    assert "amplitude" not in brain["params"]["clock"]  # written as it was
+    assert robot.morphology.brain["params"]["mix"]["bias"] == 0.1  # which stays as it is
+
+
+@pytest.mark.skipif(not WILD, reason="the robots found in the wild are not here")
+def test_robots_in_the_wild():
+    found = {}
+    for path in WILD:
+        body = load_morphology(path, allow_overlap=True)
+        if isinstance(body.brain, dict) and "neurons" in body.brain:
+            robot = build_robot(body, world())
+            found[path.stem] = make_network(plant_of(robot), body, str(path)).num_genes
+    assert found == {"robot_5": 6}  # two oscillators, whose inputs do nothing
+
+
+def changed(pattern, text):
+    return re.sub(pattern, text, ROBOT, count=1)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "text", "message"),
+    [
+        ("type: Sigmoid", "type: XOscillator", "brain.neurons.7.type: expected one of Input, "
+         "Simple, Sigmoid, Oscillator; found 'XOscillator'"),
+        ("layer: hidden", "layer: deep", "brain.neurons.6.layer: expected input, hidden or output"),
+        ("dst: mix, weight: 0.2", "dst: nix, weight: 0.2", "brain.connections.0.dst: expected the "
+         "id of a neuron that is no input; found 'nix'"),
+        ("dst: mix, weight: 0.2", "dst: a1, weight: 0.2", "brain.connections.0.dst: expected the "
+         "id of a neuron that is no input; found 'a1'"),
+        ("weight: 0.2", "weight: heavy", "brain.connections.0.weight: expected a number; found "),
+        ("period: 0.8", "period: 0", "brain.params.clock.period: expected a number > 0 [s]; "),
+        ("bias: 0.1, ", "", "brain.params.mix.bias: expected a number; found none"),
+        ("part_id: arm", "part_id: hand", "brain.neurons.mix.part_id: expected the id of a hinge "
+         "or a thruster; found 'hand'"),
+        ("part_id: pad", "part_id: hand", "brain.neurons.t1.part_id: expected a module with 1 "
+         "inputs (a core has 6, a touch sensor 2, others none); found 'hand' of type FixedBrick"),
+        ("part_id: pad", "part_id: paw", "brain.neurons.t1.part_id: expected a module's id; found"),
+        ("  params:", "  spikes: 1\n  params:", "brain: expected only type, neurons, connections, "
+         "params; found 'spikes'"),
+    ],
+)  # fmt: skip
+def test_wrong_networks(pattern, text, message):
+    robot = build_robot(read(changed(pattern, text)), world())
+    with pytest.raises(InputError) as caught:
+        make_network(plant_of(robot), robot.morphology, "mine.yaml")
+    assert f"mine.yaml: {message}" in str(caught.value)
+
+
+def test_what_a_file_may_have_for_a_brain(robot):
+    plant, settings = plant_of(robot), ControllerConfig(type="brain", points=4)
+
+    def find(brain):
+        body = read(re.sub(r"brain:.*", f"brain: {brain}", ROBOT, flags=re.DOTALL))
+        return find_controller(plant, settings, "run.yaml", body=body)
+
+    assert find("{type: rlpower-splines}").num_genes == 4 * 3 + 1
+    for brain, message in (
+        ("{type: bo-cpg}", "brain: expected neurons and connections, or type: rlpower-splines (its "
+         "oscillators are those of controller.type cpg); found 'bo-cpg'"),
+        ("null", "rlpower-splines; found none"),
+        ("{learner: x}", "rlpower-splines; found {'learner': 'x'}"),
+    ):  # fmt: skip
+        with pytest.raises(InputError) as caught:
+            find(brain)
+        assert message in str(caught.value)
+    with pytest.raises(InputError, match=r"run.yaml: controller.type: expected another one, as"):
+        find_controller(plant, settings, "run.yaml")
+
+
+def test_inputs_by_list_and_without_a_type():
+    brain = {"neurons": [{"id": 1, "layer": "input", "part_id": "core"}]}
+    assert read_network(brain, "x").neurons[0].type == "Input"
