@@ -278,7 +278,7 @@ DAMAGES = [
     (lambda run: (run / "champion" / "genes.yaml").unlink(), "incomplete",
      "the champion shown is the best individual in checkpoints/generation_000006.npz"),
     (lambda run: (run / "champion" / "genes.yaml").write_text("genes: [1, .nan]"), "damaged",
-     "champion/genes.yaml: genes: expected finite numbers"),
+     "champion/genes.yaml: genes: expected a list of finite numbers; found nan at 1"),
     (lambda run: (run / "champion" / "genes.yaml").write_text("genes: [1,"), "damaged",
      "champion/genes.yaml: line 1: expected valid YAML"),
     (lambda run: cut(run / "checkpoints" / "generation_000006.npz"), "damaged",
