@@ -115,7 +115,8 @@ class Mounts(NamedTuple):
     data_fields=[
         "position", "rotation", "half_size", "center_position", "volume", "bulk",
         "exposed", "drag_linear", "drag_angular", "carried", "carried_mass", "carried_inertia",
-        "plate", "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid", "mounts",
+        "plate", "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid",
+        "mounts",
     ],
     meta_fields=["laws", "count"],
 )  # fmt: skip

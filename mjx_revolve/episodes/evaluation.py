@@ -129,6 +129,11 @@ class Setup:
         shape, count = jnp.shape(population), self.controller.num_genes
         ranks = (2,) if bodies is None else (2, 3)
         if len(shape) not in ranks or shape[-1] != count or 0 in shape:
+            if count == 0:
+                raise InputError(
+                    "population: expected bodies with a hinge or a thruster to control; found "
+                    "none, so that there are no genes to evolve"
+                )
             raise InputError(f"population: expected [P, {count}]; found {list(shape)}")
         check_key(key)
         traced = any(isinstance(x, jax.core.Tracer) for x in (population, key))
@@ -150,6 +155,13 @@ class Setup:
         starts = self._starts_as(population, key)
         if population.ndim == 2:
             return self._score(bodies, population, starts, bodies is None)
+        if self.capacity is not None and not self.capacity.hinges:
+            # Of bodies without hinges, the program for one body has loops over nothing, over which
+            # XLA:CPU aborts (see `xla`); the one for different bodies does as well.
+            count, size, n = population.shape
+            beside = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), size, -1), bodies)
+            found = self._score(beside, population.reshape(count * size, n), starts, False)
+            return jax.tree.map(lambda x: x.reshape(count, size), found)
         each = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), -1, 0)[..., None], bodies)
         run = lambda own: self._score(own[0], own[1], starts, True)  # noqa: E731
         return jax.lax.map(run, (each, population))

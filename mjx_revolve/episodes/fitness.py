@@ -607,6 +607,11 @@ def _place(config: Config) -> tuple[World, Task]:
 
 def _build(config: Config, world: World, morphology: Morphology) -> Robot:
     if config.trim == "neutral":
+        if world.density == 0:
+            raise InputError(
+                f"{config.source}: trim: expected none, as water of density 0 carries nothing; "
+                "found neutral"
+            )
         morphology = trim_neutral(morphology, world.density)
     return build_robot(morphology, world)
 

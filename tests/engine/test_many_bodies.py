@@ -417,6 +417,27 @@ def test_types_that_no_example_has_score_as_alone(stranger):
     assert np.abs(np.diff(expected)) > 1e-3
 
 
+@pytest.mark.slow
+def test_bodies_of_one_module_score_in_a_batch_and_with_populations_of_their_own(config):
+    """Two cores, three individuals each; without hinges all of a core's individuals do the same."""
+    cores = [body("core"), read("body: {type: Core}")]
+    batch = make_mixed_fitness(config, cores)
+    robots = [batch.build(core) for core in cores]
+    genes = jax.random.normal(jax.random.key(0), (2, 3, batch.num_genes))
+    own = np.asarray(batch(robots, genes, jax.random.key(1)))
+    beside = np.asarray(batch(robots, genes[:, 0], jax.random.key(1)))
+    assert np.all(np.isfinite(own))
+    assert own == pytest.approx(np.repeat(beside[:, None], 3, 1), abs=1e-6)
+
+
+def test_bodies_without_anything_to_control_are_refused_by_name(config):
+    """A cpg has no genes where there are no hinges."""
+    changed = {"controller.type": "cpg", "controller.harmonics": 1}
+    batch = make_mixed_fitness(config, [body("core")], **changed)
+    with pytest.raises(InputError, match=r"expected bodies with a hinge or a thruster .* no genes"):
+        batch(batch.build(body("core")), np.zeros((2, 0)), jax.random.key(1))
+
+
 def test_genes_find_their_joints_again(fitness):
     robot = fitness.build(body("snake"))
     places = gene_places(fitness.controller_of(robot), fitness.setup.controller)
