@@ -22,6 +22,7 @@ from mjx_revolve.control.sensors import make_observer
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import sincos
+from mjx_revolve.numerics.xla import keep
 
 # A weight of one is sin(gene) times this; a choice, so that tanh can be driven to its ends.
 _WEIGHT = 2.0
@@ -29,6 +30,9 @@ _WEIGHT = 2.0
 _LENGTH = 0.1
 # How long commands take to fade in [s], so that no joint jumps at the start; as `make_sine`.
 _FADE = 0.5
+# How long messages take to be heard [s]; a choice. At once, joints that contradict each other would
+# chatter at the rate of the steps.
+_HEARD = 0.05
 # Slowest and fastest unit of a recurrent network [s]; choices: a step, and a slow stroke.
 _SLOWEST, _FASTEST = 1.0, 0.02
 
@@ -50,9 +54,10 @@ def make_joint_network(
     Inputs of joint i are what the robot feels as a whole; what the joint feels; its place at rest
     (x, y, z and distance from the core, in 0.1 m) and its axis, core frame; two phase hints,
     sin(2π f t + φ_i) and cos, where φ_i is linear in the place, so that waves can run along the
-    body; and the mean of its neighbours' messages of the step before. With W from the genes,
+    body; and the mean of its neighbours' messages, as they were 0.05 s ago (smoothed by a lag of
+    first order, so that joints do not chatter). With W from the genes,
 
-        h = tanh(W x),  message = tanh(U h),  target = middle + amplitude × half range × tanh(v·h),
+        h = tanh(W x),  message = U h,  target = middle + amplitude × half range × tanh(v·h),
 
     whose targets fade in over half a second. Recurrent, hidden units are leaky and feel each other,
     τ_k ḣ_k = -h_k + tanh((W x + R h)_k), τ_k from 0.02 to 1 s (a continuous-time recurrent
@@ -149,12 +154,16 @@ def make_joint_network(
             return jnp.concatenate([x, jnp.zeros((total - rows, *x.shape[1:]), x.dtype)])
 
         activity = base
-        for k, x in enumerate(observation.robot):  # written out: no reductions inside the loop
-            activity = activity + layer[:, k, None] * x
+        if observation.robot:
+            # What is the same for all joints is added up once.
+            alike = layer[:, 0] * observation.robot[0]
+            for k, x in enumerate(observation.robot[1:]):  # no reductions inside the loop
+                alike = alike + layer[:, k + 1] * x
+            activity = activity + keep(alike)[:, None]
         rate, sine, cosine = clock
         s, c = sincos(rate * time)
-        hints = (sine * c + cosine * s, cosine * c - sine * s)
-        heard = [of_all(act(near, x)) for x in said]
+        hints = keep(sine * c + cosine * s), keep(cosine * c - sine * s)
+        heard = [keep(of_all(act(near, x))) for x in said]
         own = [of_all(x) for x in observation.joint]
         later = felt + len(observer.joint_names)
         for start, found in ((felt, own), (later, [*hints, *heard])):
@@ -167,10 +176,9 @@ def make_joint_network(
         else:
             h = jnp.tanh(activity)
         command = sum(target[k] * h[k] for k in range(hidden))
-        said = tuple(
-            jnp.tanh(sum(speech[k, m] * h[k][:rows] for k in range(hidden)))
-            for m in range(len(said))
-        )
+        share = min(dt / _HEARD, 1.0)
+        told = [sum(speech[k, m] * h[k][:rows] for k in range(hidden)) for m in range(len(said))]
+        said = tuple(old + share * (new - old) for old, new in zip(said, told, strict=True))
         fade = jnp.minimum(time / _FADE, 1)
         return (seen, said, memory), middle + fade * reach * jnp.tanh(command)
 

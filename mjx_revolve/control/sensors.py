@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.body.sensors import SENSORS, Sensor
+from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.sense import Sense
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.spatial import sincos
+from mjx_revolve.numerics.xla import keep
 
 USUAL = tuple(Sensor(type=name) for name in ("tilt", "gyro", "angle", "speed"))
 """What brains are told where nothing is declared."""
@@ -124,8 +125,8 @@ class Observer:
             if self._keeps(sensor):
                 kept, values = self._hold(sensor, next(before), time, count, values)
                 after.append(kept)
-            robot += values[0]
-            joints += values[1]
+            robot += map(keep, values[0])
+            joints += map(keep, values[1])
         return tuple(after), Observation(tuple(robot), tuple(joints))
 
     def _rate(self, sensor: Sensor) -> float:
@@ -242,15 +243,3 @@ def draw_normal(seed: Any, number: int, joint: Any, sample: Any, dtype: Any) -> 
     share = lambda x: (x >> np.uint32(8)).astype(dtype) * np.asarray(2.0**-24, dtype)  # noqa: E731
     radius = jnp.sqrt(-2 * jnp.log(share(first) + np.asarray(2.0**-24, dtype)))
     return radius * sincos(2 * np.pi * share(second))[1]
-
-
-def name_sensors() -> str:
-    """All kinds of sensors as rows of a Markdown table, for the documentation."""
-    rows = []
-    for name, kind in SENSORS.items():
-        low, high = kind.range
-        reach = f"±{high:.4g}" if low == -high else f"{low:g} to {high:g}"
-        rows.append(
-            f"| `{name}` | {len(kind.parts)} | {kind.unit} | {kind.where} | {reach} | {kind.what} |"
-        )
-    return "\n".join(rows)

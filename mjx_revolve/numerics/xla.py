@@ -104,6 +104,16 @@ def store(x: jax.Array) -> jax.Array:
     return _never_inlined(x) if on_cpu() else x
 
 
+@jax.jit
+def keep(x: jax.Array) -> jax.Array:
+    """The same; inside a `Graph` it says that `x`, though used once, is to be stored.
+
+    For what is broadcast: within a loop over the wider array, XLA:CPU would compute it for each
+    element again.
+    """
+    return x
+
+
 def small_call(fun: Callable[..., Any]) -> Callable[..., Any]:
     """Makes XLA:CPU compile `fun`, element-wise but for loops, as one function."""
 
@@ -168,6 +178,7 @@ class Graph:
         self._structure = structure[0]
         self._operations: list[_Operation] = []
         self._constants: dict[int, Any] = {}
+        self._kept: set[int] = set()
         self._count = 0
         env = {v: self._number() for v in closed.jaxpr.invars}
         self._arguments = list(env.values())
@@ -264,6 +275,8 @@ class Graph:
                 # jnp.clip, jnp.where and their like.
                 inside = dict(zip(inner.jaxpr.invars, inputs, strict=True))
                 outputs = self._inline(inner.jaxpr, inner.consts, inside)
+                if eqn.params["name"] == "keep":
+                    self._kept.update(v for v in outputs if isinstance(v, int))
             else:
                 outputs = [self._number() for _ in eqn.outvars]
                 self._operations.append(_Operation(eqn, inputs, outputs))
@@ -298,7 +311,7 @@ class Graph:
                 if name in _LOOPS:
                     stored[v] = False
                 elif (
-                    uses.get(v, 0) > 1
+                    (uses.get(v, 0) > 1 or v in self._kept)
                     and spent >= _WORTH
                     and name not in _VIEWS
                     and jnp.issubdtype(variable.aval.dtype, jnp.floating)

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 
-from laboratory import OAR, read
-from mjx_revolve.body.morphology import load_morphology
+from laboratory import OAR, ROOT, read, world
+from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.body.sensors import SENSORS, Sensor, SensorRow
+from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.sense import Sense
 from mjx_revolve.control.sensors import draw_normal, make_observer
+from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.config import ControllerConfig
 from mjx_revolve.inputs import schema
 from mjx_revolve.inputs.errors import InputError
 
@@ -181,3 +188,31 @@ def test_wrong_sensors(sensors, message):
 def test_a_delay_of_too_many_samples():
     with pytest.raises(InputError, match=r"sensors.0.delay: expected at most 2.56 s at 100 Hz"):
         make_observer([Sensor(type="gyro", delay=4.0)], DT)
+
+
+# ------------------------------------------------------------------------- the documentation
+
+GUIDE = (ROOT / "docs" / "senses.md").read_text(encoding="utf-8")
+
+
+def test_the_guides_table_of_sensors_is_the_codes():
+    for name, kind in SENSORS.items():
+        low, high = kind.range
+        reach = f"±{high:.4g}" if low == -high else f"{low:g} to {high:g}"
+        row = (
+            f"| `{name}` | {len(kind.parts)} | {kind.unit} | {kind.where} | {reach} | {kind.what} |"
+        )
+        assert row in GUIDE
+
+
+def test_the_guides_examples_are_read():
+    sensed, thinker = (
+        yaml.safe_load(x) for x in re.findall(r"```yaml\n(.*?)```", GUIDE, re.DOTALL)
+    )
+    settings = ControllerConfig(**sensed["controller"])
+    plant = plant_of(build_robot(read(OAR), world()))
+    assert find_controller(plant, settings).num_genes > 0
+    body = make_morphology(thinker)
+    plant = plant_of(build_robot(body, world()))
+    network = find_controller(plant, ControllerConfig(type="brain"), body=body)
+    assert network.num_genes == 2 + 3 + 2

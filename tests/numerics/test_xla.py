@@ -112,3 +112,11 @@ def test_chunks_are_all_of_one_shape():
     np.testing.assert_array_equal(out["sum"], 3 * x)
     np.testing.assert_array_equal(out["rows"], jnp.stack([x, 2 * x]))
     assert set(seen) == {(4,)}
+
+
+def test_what_is_kept_is_stored_though_it_is_used_once():
+    x, y = jnp.ones(4), jnp.ones((8, 4))
+    plain = lambda x, y: jnp.tanh(x)[None] * y  # noqa: E731
+    kept = lambda x, y: xla.keep(jnp.tanh(x))[None] * y  # noqa: E731
+    assert (xla.Graph(plain, (x, y)).size, xla.Graph(kept, (x, y)).size) == (0, 1)
+    assert np.array_equal(xla.Graph(kept, (x, y))(x, y), plain(x, y))
