@@ -16,6 +16,7 @@ from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Layout, lay_out, turned
 from mjx_revolve.engine.fluid_table import FluidTable, make_fluid_table
+from mjx_revolve.inputs.brief import brief
 from mjx_revolve.water.world import World
 
 # Error at which the servo gives its full torque [rad]. A choice: hobby servos are stiff.
@@ -59,6 +60,8 @@ class Assembly:
         fluid: tables of the parts.
         thruster_row: `[nthruster]` their parts.
     """
+
+    __repr__ = brief
 
     morphologies: tuple[Morphology, ...]
     world: World

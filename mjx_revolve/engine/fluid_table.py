@@ -15,6 +15,7 @@ import numpy as np
 from mjx_revolve.body.exposure import exposed_shares
 from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.placement import Layout
+from mjx_revolve.inputs.brief import brief
 from mjx_revolve.water.added_mass import box_added_mass, entrained_water
 from mjx_revolve.water.drag import face_drag_coefficients
 from mjx_revolve.water.lift_drag import LiftDrag
@@ -51,6 +52,8 @@ class FluidTable:
         plate_upward: `[npart, 3]` unit vector of the plate's upper surface, part frame.
         plate_center: `[npart, 3]` centre of pressure, part frame [m].
     """
+
+    __repr__ = brief
 
     body: np.ndarray
     module: np.ndarray

@@ -198,7 +198,10 @@ def _is_heavy(part: Part) -> bool:
 
 
 def export_mjcf(robot: Robot, path: str | Path) -> None:
-    """Writes the model as MJCF that stock MuJoCo opens.
+    """Writes the model that the engines step as MJCF that stock MuJoCo opens, without any water.
+
+    `formats.mjcf.make_mjcf`, which run folders and `mjx_revolve.export` have, adds MuJoCo's own
+    water, meshes and a start.
 
     Args:
         robot: the robot.
