@@ -152,6 +152,7 @@ def test_neither_entry_nor_exit_makes_kinetic_energy(mode):
     assert lost[crossed[:, 0]].min() > 0.05
 
 
+@pytest.mark.slow
 def test_a_jointed_body_gains_none_either():
     """A limp arm that flies through the surface loses energy, all the way, and no momentum.
 
