@@ -167,8 +167,9 @@ _Range = Annotated[
 class Sensor:
     """A sensor of a robot.
 
-    What it gives is a number between -1 and 1: the true value, with noise, clipped to the range and
-    divided by the range's larger end, so that 0 stays 0.
+    What it gives is a number between -1 and 1: the true value, with noise, clipped to the range. A
+    range that holds 0 is divided by its larger end, so that 0 stays 0; another one counts from its
+    middle, so that its ends are -1 and 1.
 
     Attributes:
         type: its kind, a name in `SENSORS`.
@@ -217,6 +218,14 @@ class Sensor:
     def limits(self) -> tuple[float, float]:
         """Lowest and highest value [unit]."""
         return self.kind.range if self.range is None else self.range
+
+    @property
+    def scaling(self) -> tuple[float, float]:
+        """Which value is told as 0, and what one more is told as [unit, 1/unit]."""
+        low, high = self.limits
+        if low <= 0 <= high:
+            return 0.0, 1 / max(-low, high)
+        return (low + high) / 2, 2 / (high - low)
 
     @property
     def names(self) -> tuple[str, ...]:

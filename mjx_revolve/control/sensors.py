@@ -154,7 +154,7 @@ class Observer:
     ) -> tuple[list[jax.Array], list[jax.Array]]:
         """A sample: numbers of the robot, and of the hinges."""
         kind, (low, high) = sensor.kind, sensor.limits
-        scale = 1 / max(abs(low), abs(high))
+        zero, scale = sensor.scaling
         robot: list[jax.Array] = []
         joints: list[jax.Array] = []
         for part, value in enumerate(kind.signal(sense)):
@@ -170,7 +170,7 @@ class Observer:
                     # 0 is the robot's own, so hinges count from 1.
                     which = 16 * place + part, 0 if number is None else number + 1
                     true = true + sensor.noise * draw_normal(sense.noise, *which, count, true.dtype)
-                found.append(scale * jnp.clip(true, low, high))
+                found.append(scale * (jnp.clip(true, low, high) - zero))
         return robot, joints
 
     def _hold(

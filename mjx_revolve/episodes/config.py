@@ -55,6 +55,8 @@ TASKS: dict[str, tuple[str, ...]] = {
     "speed": (),
     "reach_target": (),
     "hold_depth": (),
+    "hold_heading": (),
+    "follow_bed": ("height",),
     "crawl": (),
 }
 
@@ -136,7 +138,8 @@ class TaskConfig(Section):
 
     type: Annotated[str, one_of(TASKS)]
     """`directed_swim` (along `direction`, over ground), `speed` (through the water, any way),
-    `reach_target`, `hold_depth`, `crawl`, or FILE.py:FUNCTION, a function like those in `tasks`."""
+    `reach_target`, `hold_depth`, `hold_heading`, `follow_bed`, `crawl`, or FILE.py:FUNCTION, a
+    function like those in `tasks`."""
     duration: Annotated[Positive, Unit("s")] = 10.0
     """Length of an episode [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
@@ -155,9 +158,12 @@ class TaskConfig(Section):
     target_speed: Annotated[NonNegative, Unit("m/s")] = 0.0
     """How fast the target moves away, level, in a direction drawn for each episode [m/s]."""
     depth: Annotated[NonNegative, Unit("m")] = 2.0
-    """Depth of the start below the surface; `crawl` starts on the bed instead [m]."""
+    """Depth of the start below the surface; `crawl` starts on the bed instead, and `follow_bed`
+    at `height` above it [m]."""
+    height: Annotated[Positive, Unit("m")] | None = None
+    """Of the core above the bed; `follow_bed` needs it [m]."""
     depth_tolerance: Annotated[Positive, Unit("m")] = 0.25
-    """How far from the start depth still counts as keeping it [m]."""
+    """How far from the start depth, or from `height`, still counts as keeping it [m]."""
     energy_weight: Annotated[NonNegative, Unit("1/J")] = 0.0
     """Score lost per joule of joint work [1/J]."""
     start_tilt: Annotated[NonNegative, Unit("rad")] = 0.1

@@ -116,6 +116,12 @@ def start_on_bed(settings: Any, world: World, figure: Figure, place: jax.Array) 
     return place.at[2].set(bed_height(world.bed, place[0], place[1]) + below + 0.005)
 
 
+def start_above_bed(settings: Any, world: World, figure: Figure, place: jax.Array) -> jax.Array:
+    """The core at the task's height above the bed; arguments of `start_at_depth`."""
+    assert world.bed is not None
+    return place.at[2].set(bed_height(world.bed, place[0], place[1]) + settings.height)
+
+
 def reach_below(settings: Any, figure: Figure) -> Any:
     """How far the rest pose reaches below the core's centre, in any attitude drawn [m].
 
@@ -208,6 +214,29 @@ def hold_depth(track: Track, settings: Any) -> jax.Array:
     return -jnp.sqrt(jnp.mean(error * error, 0) + 1e-12)
 
 
+def hold_heading(track: Track, settings: Any) -> jax.Array:
+    """Minus the root mean square errors of depth and of heading, added up [body lengths + rad].
+
+    Heading is where the core's x axis points, seen from above; it should be the direction's.
+    """
+    assert track.quat is not None
+    w, x, y, z = (track.quat[:, i] for i in range(4))
+    ahead, aside = w * w + x * x - y * y - z * z, 2 * (x * y + w * z)
+    # The tiny term: a core that stands upright has no heading, and its angle no slope.
+    level = np.asarray(settings.direction, float)[:2]
+    level = level / max(np.linalg.norm(level), 1e-9)
+    cosine, sine = float(level[0]), float(level[1])
+    across, along = cosine * aside - sine * ahead, cosine * ahead + sine * aside
+    error = jnp.arctan2(across, along + jnp.where(along == 0, 1e-9, 0))
+    return hold_depth(track, settings) - jnp.sqrt(jnp.mean(error * error, 0) + 1e-12)
+
+
+def follow_bed(track: Track, settings: Any) -> jax.Array:
+    """Progress along a direction while the core keeps its height above the bed [body lengths/s]."""
+    height = track.clearance - settings.height
+    return crawl(replace(track, clearance=height), settings)
+
+
 def crawl(track: Track, settings: Any) -> jax.Array:
     """Progress along a direction while the core stays near the bed [body lengths/s]."""
     direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
@@ -224,6 +253,8 @@ TASKS: Mapping[str, Task] = {
     "speed": Task(speed, _SPEED, records=("water",)),
     "reach_target": Task(reach_target, "body lengths", records=("target",)),
     "hold_depth": Task(hold_depth, "body lengths"),
+    "hold_heading": Task(hold_heading, "body lengths + rad", records=("core",)),
+    "follow_bed": Task(follow_bed, _SPEED, start=start_above_bed, on_bed=True),
     "crawl": Task(crawl, _SPEED, start=start_on_bed, on_bed=True),
 }
 

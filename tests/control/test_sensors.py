@@ -55,6 +55,9 @@ def test_a_plain_sensor_gives_the_value_over_its_range():
     # A range from 0 on: 0 stays 0, and what lies below is clipped to it.
     found = watch(Sensor(type="depth", range=(0, 4)), [[-1.0], [0.5], [-5.0]])
     assert found[:, 0] == pytest.approx([0.25, 0.0, 1.0])
+    # One that does not hold 0 counts from its middle.
+    found = watch(Sensor(type="depth", range=(1.5, 2.5)), [[-1.0], [-2.0], [-2.4], [-9.0]])
+    assert found[:, 0] == pytest.approx([-1.0, 0.0, 0.8, 1.0])
 
 
 def test_a_rate_samples_and_holds():

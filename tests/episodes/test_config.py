@@ -72,7 +72,9 @@ def test_it_is_frozen(folder):
         ("task.trials=0", "task.trials: expected a whole number >= 1; found 0"),
         ("task.trials=2.0", "task.trials: expected a whole number >= 1; found 2.0"),
         ("task.type=swim", "task.type: expected one of directed_swim, speed, reach_target, "
-         "hold_depth, crawl, or FILE.py:FUNCTION; found 'swim'"),
+         "hold_depth, hold_heading, follow_bed, crawl, or FILE.py:FUNCTION; found 'swim'"),
+        ("task.type=follow_bed", "task.height: expected a number > 0 [m], because task.type is "
+         "follow_bed; found none"),
         ("task.type=tasks.py", "or FILE.py:FUNCTION; found 'tasks.py'"),
         ("task.type='tasks.py:'", "or FILE.py:FUNCTION; found 'tasks.py:'"),
         ("task.type=tasks.py:3d", "or FILE.py:FUNCTION; found 'tasks.py:3d'"),

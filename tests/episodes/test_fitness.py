@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -168,7 +169,18 @@ def track(x, z=None, clearance=1.0, start=0.0, drift=0.0):
     )
 
 
-SETTINGS = SimpleNamespace(direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, target=(4.0, 0.0, 0.0))
+def turned(yaws, roll=0.3):
+    """One individual that stays and heads so far from the x axis [rad], rolled as well."""
+    yaws = np.asarray(yaws, np.float32)
+    c, s = np.cos(yaws / 2), np.sin(yaws / 2)
+    quat = [c * np.cos(roll / 2), c * np.sin(roll / 2), s * np.sin(roll / 2), s * np.cos(roll / 2)]
+    found = track(np.zeros(len(yaws)), z=np.full(len(yaws), 0.5))
+    return replace(found, quat=jnp.asarray(np.stack(quat, 1)[:, :, None]))
+
+
+SETTINGS = SimpleNamespace(
+    direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, target=(4.0, 0.0, 0.0), height=0.4
+)
 
 
 @pytest.mark.parametrize(
@@ -183,6 +195,10 @@ SETTINGS = SimpleNamespace(direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, targe
         ("speed", track([0, 0, 0], drift=0.5), 1.0),  # it held its own
         ("reach_target", track([0, 1, 3]), 6.0),  # from 4 m away to 1 m
         ("hold_depth", track([0, 1], z=[0.5, 0.5]), -1.0),
+        ("hold_heading", turned([0, 0]), -1.0),  # off its depth alone
+        ("hold_heading", turned([0.3, -0.3, 0.3]), -1.3),
+        ("follow_bed", track([0, 1, 2], clearance=0.45), 2.0),
+        ("follow_bed", track([0, 1, 2], clearance=0.05), 0.0),  # too low
         ("crawl", track([0, 1, 2], clearance=0.05), 2.0),
         ("crawl", track([0, 1, 2], clearance=0.5), 0.0),  # it swam
     ],
