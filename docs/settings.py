@@ -19,7 +19,7 @@ from typing import Annotated, Any
 from pydantic_core import PydanticUndefined
 
 from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.control.kinds import CONTROLLERS
+from mjx_revolve.control import joint_network, neurons
 from mjx_revolve.episodes import config as settings
 from mjx_revolve.episodes.tasks import TASKS
 from mjx_revolve.evolution.strategies import STRATEGIES
@@ -108,13 +108,12 @@ def make_page() -> str:
     lines = [_HEAD, "## Tasks", "", "`task.type`; `docs/tutorial.md` writes one of your own.", ""]
     lines += ["| task | score | unit | cannot do without |", "|---|---|---|---|"]
     for name, task in TASKS.items():
-        needs = ", ".join(f"`{x}`" for x in settings.TASKS[name])
-        needs += "a world with a bed" if task.on_bed else ""
+        needs = [f"`{x}`" for x in settings.TASKS[name]] + ["a world with a bed"] * task.on_bed
         said = re.sub(r" \[[^\]]+\].$", "", first_paragraph(task.score))
-        lines.append(f"| `{name}` | {said} | {task.unit} | {needs} |")
+        lines.append(f"| `{name}` | {said} | {task.unit} | {', '.join(needs)} |")
     lines += ["", "## Controllers", "", "`controller.type`; likewise.", ""]
     lines += ["| controller | | settings that only it has |", "|---|---|---|"]
-    for name in CONTROLLERS:
+    for name in settings.CONTROLLERS:
         only = ", ".join(f"`{x}`" for x in settings.CONTROLLERS[name])
         lines.append(f"| `{name}` | {first_paragraph(_maker(name))} | {only} |")
     lines += ["", "## A configuration", "", "`docs/evolution.md` tells more of `bodies`.", ""]
@@ -135,6 +134,10 @@ def make_page() -> str:
 
 def _maker(name: str) -> Any:
     """The function whose docstring tells of a controller."""
+    kinds = {"mlp": joint_network.make_joint_network, "rnn": joint_network.make_joint_network}
+    kinds["brain"] = neurons.make_network
+    if name in kinds:
+        return kinds[name]
     module = __import__(f"mjx_revolve.control.{name}", fromlist=["_"])
     return getattr(module, f"make_{name}")
 
