@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -21,6 +21,7 @@ from mjx_revolve.engine.level import Laws, Level, Thrusters
 from mjx_revolve.engine.model_changes import changed_assembly, changed_columns
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.thrusters import read_thrusters
+from mjx_revolve.engine.variation import Variation, vary_level
 from mjx_revolve.numerics.spatial import add, fold, total
 from mjx_revolve.water.world import World
 
@@ -64,6 +65,11 @@ class Levels:
     def touches(self) -> bool:
         """Whether any body may touch the bed."""
         return any(level.points is not None for level in self.all)
+
+    def varied(self, variation: Variation) -> Levels:
+        """The same robot with other coefficients, traced ones."""
+        below = tuple(vary_level(level, variation) for level in self.below)
+        return replace(self, root=vary_level(self.root, variation), below=below)
 
     # What hinges are, level by level, and in the robot's order.
 

@@ -31,6 +31,7 @@ import numpy as np
 
 from mjx_revolve.engine.batch import Bodies, Capacity
 from mjx_revolve.engine.level import Level, Thrusters
+from mjx_revolve.engine.variation import Variation, vary_level
 from mjx_revolve.numerics.spatial import Scalar
 from mjx_revolve.numerics.xla import share_once, store
 from mjx_revolve.water.world import World
@@ -81,6 +82,7 @@ class Rows:
         ports: of the rows.
         table: constants of the rows.
         count: how many rows to visit, a number or int32.
+        variation: factors on the constants, or None.
     """
 
     world: World
@@ -90,11 +92,20 @@ class Rows:
     ports: Ports
     table: _Table
     count: Any
+    variation: Variation | None = None
+
+    def varied(self, variation: Variation) -> Rows:
+        """The same robots with other coefficients, traced ones."""
+        return replace(self, variation=variation)
+
+    def _own(self, level: Level) -> Level:
+        """A level's constants, varied if need be."""
+        return level if self.variation is None else vary_level(level, self.variation)
 
     @property
     def root(self) -> Level:
         """Constants of the roots, `[1, lanes]`."""
-        return _whole(self.capacity.root, self.bodies.root)
+        return self._own(_whole(self.capacity.root, self.bodies.root))
 
     @property
     def thrusters(self) -> Thrusters:
@@ -155,7 +166,7 @@ class Rows:
 
     def map(self, fun: Callable[..., Any], *xs: Any) -> Any:
         """What `fun`, element-wise, gives for all rows at once; see `Levels.map`."""
-        return fun(_whole(self.capacity.row, self.bodies.rows), *xs)
+        return fun(self._own(_whole(self.capacity.row, self.bodies.rows)), *xs)
 
     def down(self, fun: Callable[..., Any], root: Any, *xs: Any) -> Any:
         """From the roots to the tips; see `Levels.down`."""
@@ -163,7 +174,7 @@ class Rows:
         own, parent = self.ports.own, self.ports.parent
 
         def visit(k: Scalar, above: Joined) -> tuple[Any, Any]:
-            return fun(self.table.row(k), self._part(above), *self._row(xs, k))
+            return fun(self._own(self.table.row(k)), self._part(above), *self._row(xs, k))
 
         def read(k: Scalar, stack: Any) -> Joined:
             return replace(first, data=self._pick(stack, _at(parent, k)))
@@ -179,7 +190,8 @@ class Rows:
         own, _, to, inner, apart = self.ports
 
         def visit(k: Scalar, gathered: Joined) -> tuple[Any, Any]:
-            value, keep, terms = fun(self.table.row(k), self._part(gathered), *self._row(xs, k))
+            level = self._own(self.table.row(k))
+            value, keep, terms = fun(level, self._part(gathered), *self._row(xs, k))
             return (value, terms), keep
 
         def read(k: Scalar, carry: Any) -> Joined:

@@ -94,6 +94,8 @@ class Engine(NamedTuple):
             world frame, three of `[lanes]` each [N]; weight and carried water's inertia apart.
         plant: the actuators in the order of `step`'s ctrl.
         fuses: whether a step is element-wise, so that it may be compiled as one function.
+        varied: a `variation.Variation` → the same engine with those coefficients; None where it
+            cannot.
     """
 
     init: Callable[[jax.Array, jax.Array], Any]
@@ -107,6 +109,7 @@ class Engine(NamedTuple):
     push: Callable[[Any, jax.Array, Water], tuple[Vec, Vec]]
     plant: Plant
     fuses: bool
+    varied: Callable[[Any], Engine] | None = None
 
 
 def root_of(state: State) -> Root:

@@ -21,6 +21,7 @@ from mjx_revolve.engine.robot import Robot, check_timestep
 from mjx_revolve.engine.servos import motor_torque
 from mjx_revolve.engine.state import Engine, State, advance, root_of
 from mjx_revolve.engine.thrusters import run_thrusters
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.numerics.spatial import (
     Scalar,
     Vec,
@@ -130,39 +131,45 @@ def step(bodies: Bodies, state: State, ctrl: jax.Array, water: Water) -> tuple[S
     return new._replace(command=command), add(power, pumped)
 
 
-def make_step_engine(bodies: Bodies, plant: Plant) -> Engine:
+def make_step_engine(bodies: Bodies, plant: Plant, variation: Variation | None = None) -> Engine:
     """The population step as an engine; its functions are pure, and run under jit, vmap and grad.
 
     Args:
         bodies: the robots.
         plant: their actuators.
+        variation: factors on their coefficients; None for none.
 
     Returns:
         The engine.
     """
+
+    def own() -> Bodies:
+        # Varied where they are used: a loop then holds a few factors, not all constants by lanes.
+        return bodies if variation is None else bodies.varied(variation)
 
     def command(state: State) -> jax.Array:
         lanes = state.position[0]
         return state.command if bodies.thrusters.count else jnp.zeros((0, *lanes.shape))
 
     def push(state: State, ctrl: jax.Array, water: Water) -> tuple[Vec, Vec]:
-        return push_of(bodies, state, water, _drive(bodies, state, ctrl)[2])
+        return push_of(own(), state, water, _drive(bodies, state, ctrl)[2])
 
     def touch(state: State, water: Water) -> jax.Array:
         return touch_of(bodies, state, water)
 
     return Engine(
         init=partial(init, bodies),
-        step=partial(step, bodies),
+        step=lambda state, ctrl, water: step(own(), state, ctrl, water),
         observe=partial(observe, bodies),
         root=root_of,
         joints=partial(joints, bodies),
-        load=partial(load, bodies),
+        load=lambda state, ctrl: load(own(), state, ctrl),
         touch=touch,
         command=command,
         push=push,
         plant=plant,
         fuses=True,
+        varied=lambda variation: make_step_engine(bodies, plant, variation),
     )
 
 

@@ -1,0 +1,99 @@
+"""What is not known exactly of water and motors, as factors on the constants of a step.
+
+A law's coefficients are known to some tens of per cent, a motor's speed to ten. The factors are
+traced, so that one compiled program serves all their values; without any, the constants stay what
+they are and fold away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.engine.columns import KNEE
+from mjx_revolve.engine.level import Hinges, Level, Parts
+from mjx_revolve.numerics.spatial import Scalar, mul
+
+
+class Variation(NamedTuple):
+    """Factors on what a world and its modules say, `[lanes]` or a number each; 1 changes nothing.
+
+    Attributes:
+        drag: on the coefficients of the faces' drag, and of drag and lift of plates (fins).
+        added_mass: on all water that parts carry along.
+        density: of the water: on buoyancy, on these drags and on what is carried. Weights stay, so
+            a robot that hovered no longer does. Thrusters keep their curves, which are measured.
+        motor: on the servos' top speed; they keep their effort.
+    """
+
+    drag: Scalar = 1.0
+    added_mass: Scalar = 1.0
+    density: Scalar = 1.0
+    motor: Scalar = 1.0
+
+
+def vary_level(level: Level, variation: Variation) -> Level:
+    """The constants of a step, varied.
+
+    Servos foresee a step's gain in speed with the inertia as it was, which only tells them when to
+    be careful, and MuJoCo's two drag laws and surface tension are not varied.
+
+    Args:
+        level: the constants, numbers or `[..., lanes]`.
+        variation: the factors.
+
+    Returns:
+        The same level with other numbers.
+    """
+    row = Variation(*(jnp.atleast_1d(jnp.asarray(x))[None] for x in variation))
+    return replace(
+        level,
+        hinges=None if level.hinges is None else _vary_hinges(level.hinges, row.motor),
+        parts=tuple(_vary_parts(parts, row) for parts in level.parts),
+    )
+
+
+def _vary_hinges(hinges: Hinges, motor: jax.Array) -> Hinges:
+    """The line between speed and torque near another top speed; see `columns.motor_line`."""
+    friction, slope, top = hinges.motor
+    limited = np.not_equal(slope, 0) if not isinstance(slope, jax.Array) else slope != 0
+    if not isinstance(limited, jax.Array) and not np.any(limited):
+        return hinges
+    friction, slope, top = (_as(x, motor) for x in (friction, slope, top))
+    effort = _as(hinges.effort[1], motor)
+    steeper = jnp.maximum((effort - motor * friction) / ((1 - KNEE) * motor * top), 0)
+    # Where there is no limit, the line lies far above any torque, and stays there.
+    return hinges._replace(
+        motor=(
+            jnp.where(limited, motor * friction, friction),
+            jnp.where(limited, steeper, slope),
+            jnp.where(limited, motor * top, top),
+        )
+    )
+
+
+def _vary_parts(parts: Parts, row: Variation) -> Parts:
+    drag, carried = row.drag * row.density, row.added_mass * row.density
+    return replace(
+        parts,
+        volume=_times(parts.volume, row.density),
+        drag_linear=_times(parts.drag_linear, drag),
+        drag_angular=_times(parts.drag_angular, drag),
+        plate_area=_times(parts.plate_area, drag),
+        carried=_times(parts.carried, carried),
+        carried_mass=_times(parts.carried_mass, carried),
+        carried_inertia=_times(parts.carried_inertia, carried),
+    )
+
+
+def _times(tree: Any, factor: jax.Array) -> Any:
+    """All numbers of a tree times a factor; plain zeros stay so, and None."""
+    return jax.tree.map(lambda x: mul(x, factor), tree)
+
+
+def _as(x: Scalar, like: jax.Array) -> Scalar:
+    return x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)

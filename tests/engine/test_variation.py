@@ -1,0 +1,91 @@
+"""Factors on coefficients: the same as a world, a module or a servo that has them."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from laboratory import QUICK, WATER, body, box_robot, random_states, world
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.engine.levels import make_levels
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.step import acceleration, level_plant
+from mjx_revolve.engine.variation import Variation
+from mjx_revolve.water.flow import water_of
+
+BOX = (0.2, 0.1, 0.06)
+# Inertia on both sides of one hinge.
+ARM = """
+id: arm
+body: {id: core, type: Core, children: {1: {id: hinge, type: ActiveHinge, children: {
+  1: {id: blade, type: FixedBrick}}}}}
+"""
+CUBE = {"mass": 1.0, "center_of_volume": (0.01, 0.0, 0.0)}
+
+
+def push(robot, states, variation=None, ctrl=None) -> np.ndarray:
+    """Accelerations of lanes of states, `[nv, lanes]`."""
+    levels = make_levels(robot)
+    ctrl = np.zeros((robot.mj_model.nu, states[0].shape[1])) if ctrl is None else ctrl
+
+    def run(qpos, qvel, ctrl, variation):
+        own = levels if variation is None else levels.varied(variation)
+        asked = level_plant(levels).arrange(ctrl)
+        return acceleration(own, qpos, qvel, asked, water_of(robot.world))
+
+    with jax.enable_x64(True):
+        arrays = jax.tree.map(jnp.asarray, (*states, ctrl, variation))
+        return np.asarray(jax.jit(run, compiler_options=QUICK)(*arrays))
+
+
+@pytest.mark.parametrize("drag", ["faces", pytest.param("lift_drag", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("factors", "part", "fields"),
+    [
+        ({"density": 1.2}, {}, {"density": 1200.0}),
+        ({"drag": 1.3}, {"drag_coefficient": 1.05 * 1.3}, {}),
+        ({"added_mass": 0.7}, {"added_mass_coefficient": 0.7}, {}),
+        ({}, {}, {}),
+    ],
+)
+def test_a_factor_is_worth_a_coefficient(factors, part, fields, drag):
+    if drag == "lift_drag" and part.get("drag_coefficient"):
+        pytest.skip("a plate's coefficients are its own")
+    tank = {**WATER, "density": 1000.0, "drag": drag}
+    plain = box_robot(BOX, tank=world(**tank), **CUBE)
+    other = box_robot(BOX, tank=world(**tank | fields), **CUBE | part)
+    states = random_states(plain, 3, depth=0.0)
+    found = push(plain, states, Variation(**factors))
+    expected = push(other, states)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    if factors:
+        assert not np.allclose(found, push(plain, states), rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_faster_motor_and_one_lane_each(tmp_path):
+    (tmp_path / "arm.yaml").write_text(ARM)
+    core = load_morphology(tmp_path / "arm.yaml")
+    arm = build_robot(core, world(**WATER))
+    qpos, qvel = random_states(arm, 2, speed=0.3)
+    qvel[6:] = 4.6  # between the knee and the top speed
+    ctrl = np.full((arm.mj_model.nu, 2), 1.0)
+    factors = np.array([0.8, 1.25])
+    found = push(arm, (qpos, qvel), Variation(motor=factors), ctrl)
+    for lane, factor in enumerate(factors):
+        other = build_robot(core, world(**WATER))
+        other.mj_model.jnt_user[:] *= factor
+        one = slice(lane, lane + 1)
+        expected = push(other, (qpos[:, one], qvel[:, one]), None, ctrl[:, one])
+        np.testing.assert_allclose(found[:, one], expected, rtol=1e-9)
+
+
+def test_motors_without_a_limit_have_none_after_it():
+    arm = build_robot(body("spider"), world(**WATER))
+    arm.mj_model.jnt_user[:] = np.inf
+    levels = make_levels(arm)
+    varied = levels.varied(Variation(motor=0.5))
+    for before, after in zip(levels.below, varied.below, strict=True):
+        assert after.hinges.motor == before.hinges.motor
