@@ -15,7 +15,14 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from annotated_types import Ge, Le, Lt, MinLen, Unit
-from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
 
 from mjx_revolve.body.sensors import SensorRow
 from mjx_revolve.episodes.bodies_config import BodiesConfig
@@ -29,10 +36,12 @@ from mjx_revolve.inputs.own_code import parse_own
 from mjx_revolve.inputs.schema import (
     MisfitError,
     NonNegative,
+    Number,
     Positive,
     Row,
     Vector,
     Whole,
+    is_off,
     show,
     words,
 )
@@ -133,6 +142,30 @@ class ControllerConfig(Section):
         return self
 
 
+class RobustConfig(Settings):
+    """By what factor coefficients may be larger or smaller that are drawn anew for each trial.
+
+    Uniformly in the factor's logarithm, the same for all individuals.
+    """
+
+    drag: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.5
+    """On the faces' drag, and on drag and lift of fins. Hoerner (1965, Fluid-Dynamic Drag) has .80
+    for a cube edge on, 1.17 for a plate, 2.05 for a long square rod; ours is 1.05 [-]."""
+    added_mass: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.35
+    """On the water that is carried along. Of a cube .64 to .68 of its volume are measured, where
+    Lamb's ellipsoid has .50 [-]."""
+    density: Annotated[Number, Ge(1), Le(2), Unit("-")] = 1.003
+    """Of the water: fresh water differs by so much between 0 and 30 °C. Robots keep the trim that
+    they have [-]."""
+    motor: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.1
+    """On the servos' top speed: about what a hobby servo's differs by between 4.8 and 6 V [-]."""
+
+
+def _read_robust(value: Any) -> Any:
+    """`true` as all usual ranges."""
+    return {} if value is True else None if is_off(value) else value
+
+
 class TaskConfig(Section):
     """What the robot is scored for, and how its episodes start."""
 
@@ -177,6 +210,9 @@ class TaskConfig(Section):
     """Standard deviation of the start's place, along each axis [m]."""
     current_std: Annotated[NonNegative, Unit("m/s")] = 0.0
     """Standard deviation of an extra horizontal current, drawn for each episode [m/s]."""
+    robust: Annotated[RobustConfig | None, BeforeValidator(_read_robust)] = None
+    """`true`, or ranges: coefficients of water and motors are drawn anew in each generation, for
+    each trial, the same for all individuals, so that champions do not live on one number."""
     measures: Row[Annotated[str, AfterValidator(_check_measure)]] = ()
     """What is measured beside what always is, names of `measure_table.MEASURES`."""
     params: dict[str, Any] = Field({})

@@ -22,6 +22,7 @@ from mjx_revolve.engine.plant import Figure
 from mjx_revolve.engine.rows import make_rows
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.engine.step import make_step_engine
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import Config, TaskConfig
 from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.episodes.scoring import (
@@ -289,9 +290,10 @@ class Setup:
             rows = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), rows)
 
         def run(
-            derived: bool, bodies: Any, root: Any, parameters: Any, water: Any, rows: Any, cues: Any
-        ) -> Any:
-            engine = self.engine_of(bodies, root.shape[-1], derived)
+            derived: bool, bodies: Any, root: Any, parameters: Any, water: Any, rows: Any,
+            cues: Any, variation: Any,
+        ) -> Any:  # fmt: skip
+            engine = vary_engine(self.engine_of(bodies, root.shape[-1], derived), variation)
             still = water_of(world) if water is None else water
             hinges = jnp.zeros((engine.plant.num_hinges, root.shape[-1]), root.dtype)
             qvel = jnp.concatenate([jnp.zeros_like(root[:6]), hinges])
@@ -316,8 +318,16 @@ class Setup:
         episode: Any = partial(run, False)
         if self.engine is None or self.engine.fuses:  # MJX's step is differentiated as it is
             episode = derived_by(episode, partial(run, True))
-        recorded = episode(bodies, root, parameters, starts.water, rows, cues)
+        recorded = episode(bodies, root, parameters, starts.water, rows, cues, starts.variation)
         return recorded, root, self.figure_of(bodies), cues
+
+
+def vary_engine(engine: Engine, variation: Variation | None) -> Engine:
+    """An engine with the coefficients of an episode; the same one where they are not varied."""
+    if variation is None:
+        return engine
+    assert engine.varied is not None, "`fitness` refuses worlds and engines that cannot"
+    return engine.varied(variation)
 
 
 def record_target(setup: Setup, recorded: dict[str, Any], cues: Cues) -> dict[str, Any]:

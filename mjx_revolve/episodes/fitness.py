@@ -32,8 +32,15 @@ from mjx_revolve.engine.kinematics import body_positions
 from mjx_revolve.engine.plant import Plant, actuators_of, figure_of
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.state import Engine
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import Config, load_config, make_config
-from mjx_revolve.episodes.evaluation import Setup, make_recorder, pick_water, record_target
+from mjx_revolve.episodes.evaluation import (
+    Setup,
+    make_recorder,
+    pick_water,
+    record_target,
+    vary_engine,
+)
 from mjx_revolve.episodes.scoring import WORST, farthest, judge_tracks, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import cues_of, start_pose
@@ -127,6 +134,7 @@ class Fitness:
             engine=self.config.engine,
             once=True,
             cues=self.cues(key, trial),
+            variation=self.variation(key, trial),
         )
 
     def judge(self, trajectory: Trajectory, key: jax.Array) -> tuple[float, dict[str, float]]:
@@ -151,6 +159,7 @@ class Fitness:
             jax.tree.map(lambda x: jnp.broadcast_to(x, (every * records,))[rows], water),
             height,
             jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.cues(key)),
+            self.variation(key),
         )
         return float(score[0]), {name: float(value[0]) for name, value in measures.items()}
 
@@ -160,14 +169,15 @@ class Fitness:
 
         def run(
             qpos: Any, qvel: Any, ctrl: Any, command: Any, energy: Any, water: Any, height: Any,
-            cues: Any,
+            cues: Any, variation: Any,
         ) -> Any:  # fmt: skip
             # The rows of the episode stand side by side, as if they were a population.
-            state = self.engine.init(qpos, qvel)
+            engine = vary_engine(self.engine, variation)
+            state = engine.init(qpos, qvel)
             if command.shape[0] and hasattr(state, "command"):
                 state = state._replace(command=command)
-            asked = self.engine.plant.arrange(ctrl[actuators_of(self.robot)])
-            kept = make_recorder(self.engine, self.task, self.robot.world)(
+            asked = engine.plant.arrange(ctrl[actuators_of(self.robot)])
+            kept = make_recorder(engine, self.task, self.robot.world)(
                 state, asked, energy[:, 0], water
             )
             recorded = {
@@ -195,6 +205,10 @@ class Fitness:
         starts = self.setup.starts(key)
         place = self.starts(key)[0][:3, trial]
         return cues_of(self.config.task, jax.tree.map(lambda x: x[..., trial], starts), place)
+
+    def variation(self, key: jax.Array, trial: int = 0) -> Variation | None:
+        """The coefficients of one of a key's episodes, as `simulate` takes them; None: as given."""
+        return jax.tree.map(lambda x: x[trial], self.setup.starts(key).variation)
 
     @property
     def record_every(self) -> int:
@@ -602,7 +616,24 @@ def _place(config: Config) -> tuple[World, Task]:
             f"{config.source}: task.start_attitude: expected level, as {config.task.name} starts "
             f"on the bed; found {config.task.start_attitude}"
         )
+    _check_robust(config, world)
     return world, task
+
+
+def _check_robust(config: Config, world: World) -> None:
+    """Refuses to vary what cannot be varied."""
+    if config.task.robust is None:
+        return
+    if config.engine != "population":
+        raise InputError(
+            f"{config.source}: task.robust: expected off, as engine is {config.engine}, which has "
+            "its coefficients as constants; found some ranges"
+        )
+    if world.drag in ("ellipsoid", "inertia_box"):
+        raise InputError(
+            f"{config.source}: task.robust: expected a world whose drag is faces, lift_drag or "
+            f"off, as MuJoCo's laws are not varied; found {world.drag}"
+        )
 
 
 def _build(config: Config, world: World, morphology: Morphology) -> Robot:

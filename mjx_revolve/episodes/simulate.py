@@ -16,6 +16,7 @@ from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_positions
 from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.rollout import flow_at, roll_out
 from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.inputs.brief import brief
@@ -67,11 +68,11 @@ def _compiled(
 
     `still` leaves the water's surface and current to the world, as constants that fold away.
     """
-    simulator = make_engine(robot, engine)
+    given = make_engine(robot, engine)
     dt = robot.world.timestep
     # MuJoCo's actuators in the robot's own order, and where each stands among the engine's rows.
     own = actuators_of(robot)
-    back = np.argsort(own[simulator.plant.source[:, 0]]).astype(np.int32)
+    back = np.argsort(own[given.plant.source[:, 0]]).astype(np.int32)
 
     def run(
         qpos: Any,
@@ -79,8 +80,13 @@ def _compiled(
         drive_input: Any,
         water: Water | None,
         cues: Cues,
+        variation: Variation | None,
         derived: bool = False,
     ) -> Trajectory:
+        simulator = given
+        if variation is not None:
+            assert given.varied is not None
+            simulator = given.varied(variation)
         cues = jax.tree.map(lambda x: x[None], cues)
         parameters, drive_state, targets = None, (), None
         if controller is None:
@@ -144,6 +150,7 @@ def simulate(
     engine: str = "population",
     once: bool = False,
     cues: Cues | None = None,
+    variation: Variation | None = None,
 ) -> Trajectory:
     """Simulates one robot.
 
@@ -166,9 +173,11 @@ def simulate(
             a minute or less.
         cues: what the robot is given to feel beside its own state, a number each; by default no
             target, and noise of sensors that `key` draws.
+        variation: factors on coefficients of water and motors, a number each; by default none.
 
     Returns:
-        The trajectory, one row after each step. Differentiable in qpos, qvel, ctrl and water.
+        The trajectory, one row after each step. Differentiable in qpos, qvel, ctrl,
+        water and variation.
 
     Raises:
         InputError: a shape or a number is wrong.
@@ -223,12 +232,16 @@ def simulate(
         noise_key = jax.random.fold_in(jax.random.key(0) if key is None else key, 3)
         cues = Cues(noise=jax.random.bits(noise_key, (), "uint32"))
     cues = jax.tree.map(jnp.asarray, cues)
+    if variation is not None:
+        if engine != "population":
+            raise InputError(f"variation: expected none, as engine is {engine}; found some")
+        variation = Variation(*(_array("variation", x, ()) for x in variation))
     jitted, plain = _compiled(robot, engine, steps, controller, water is None, once)
     traced = any(
         isinstance(x, jax.core.Tracer)
-        for x in jax.tree.leaves((qpos, qvel, drive_input, water, cues))
+        for x in jax.tree.leaves((qpos, qvel, drive_input, water, cues, variation))
     )
-    return (plain if traced else jitted)(qpos, qvel, drive_input, water, cues)
+    return (plain if traced else jitted)(qpos, qvel, drive_input, water, cues, variation)
 
 
 def _steps(rows: Any, duration: float | None, dt: float) -> int:

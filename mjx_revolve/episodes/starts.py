@@ -10,6 +10,7 @@ import numpy as np
 
 from mjx_revolve.control.sense import Cues
 from mjx_revolve.engine.plant import Figure
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.inputs.errors import InputError
@@ -32,6 +33,7 @@ class Starts(NamedTuple):
         noise: `[trials]` uint32 what the sensors' noise is drawn from.
         towards: `[3, trials]` from the start to the target [m]; None where the task draws none.
         drift: `[3, trials]` velocity of the target [m/s]; None where it keeps still.
+        variation: `[trials]` each, what is not known exactly; None where nothing is drawn.
     """
 
     place: jax.Array
@@ -41,6 +43,7 @@ class Starts(NamedTuple):
     noise: jax.Array
     towards: jax.Array | None = None
     drift: jax.Array | None = None
+    variation: Variation | None = None
 
 
 def check_key(key: Any) -> None:
@@ -81,6 +84,7 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
         gusts = gust_path(world.gust, gust_key, steps, world.timestep, trials)
     noise = jax.random.bits(jax.random.fold_in(key, 3), (trials,), "uint32")
     starts = Starts(place, quat, None, gusts, noise, *_draw_target(task, key))
+    starts = starts._replace(variation=_draw_variation(task, key))
     if task.current_std == 0 and not world.waves:
         return starts
     extra = task.current_std * jax.random.normal(current_key, (2, trials))
@@ -109,6 +113,15 @@ def _draw_target(task: TaskConfig, key: jax.Array) -> tuple[jax.Array | None, ja
     if task.target_speed > 0:
         drift = level(drift_key, task.target_speed, np.pi)
     return towards, drift
+
+
+def _draw_variation(task: TaskConfig, key: jax.Array) -> Variation | None:
+    """Factors within the ranges of `task.robust`, uniformly in their logarithm, `[trials]` each."""
+    if task.robust is None:
+        return None
+    shares = jax.random.uniform(jax.random.fold_in(key, 5), (4, task.trials), minval=-1.0)
+    ranges = [getattr(task.robust, name) for name in Variation._fields]
+    return Variation(*(width**share for width, share in zip(ranges, shares, strict=True)))
 
 
 def cues_of(task: TaskConfig, starts: Starts, place: jax.Array) -> Cues:

@@ -1,0 +1,103 @@
+"""`task.robust`: coefficients drawn for each trial, for one body and for many."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from laboratory import QUICK
+from mjx_revolve import InputError, load_morphology, make_fitness, make_mixed_fitness
+from mjx_revolve.engine.variation import Variation
+from mjx_revolve.episodes.config import RobustConfig, dump_config, load_config, make_config
+
+KEY = jax.random.key(7)
+TASK = {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 2}
+ROBOT = """
+id: oars
+body: {id: core, type: Core, children: {
+  1: {id: left, type: ActiveHinge, orientation: 90, children: {1: {id: blade, type: FixedBrick}}},
+  2: {id: right, type: ActiveHinge, children: {1: {id: other, type: FixedBrick}}}}}
+"""
+WIDE = {"drag": 2.0, "added_mass": 1.5, "density": 1.01, "motor": 1.3}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compiles():
+    with pytest.MonkeyPatch.context() as patch:
+        for place in ("evaluation.compiler_options", "simulate.hasty_options"):
+            patch.setattr(f"mjx_revolve.episodes.{place}", lambda: QUICK)
+        yield
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robust") / "oar.yaml"
+    path.write_text(ROBOT)
+    return {
+        "morphology": str(path),
+        "world": "lake",
+        "trim": "neutral",
+        "controller": {"type": "sine"},
+        "task": TASK | {"robust": WIDE},
+    }
+
+
+def test_what_may_stand_there(settings, tmp_path):
+    read = lambda value: make_config(settings, overrides={"task.robust": value}).task.robust  # noqa: E731
+    assert read(True) == RobustConfig() and read(False) is None and read("off") is None
+    assert make_config({**settings, "task": TASK}).task.robust is None
+    config = make_config(settings, overrides=["task.robust.drag=3"])
+    assert config.task.robust == RobustConfig(**WIDE | {"drag": 3.0})
+    (tmp_path / "config.yaml").write_text(dump_config(config))
+    assert load_config(tmp_path / "config.yaml").task == config.task
+    with pytest.raises(InputError, match=r"task\.robust\.drag"):
+        read({"drag": 0.5})
+    with pytest.raises(InputError, match=r"task\.robust"):
+        read({"lift": 2.0})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"engine": "mjx"}, "engine is mjx"), ({"world.drag": "ellipsoid"}, "found ellipsoid")],
+)
+def test_what_cannot_be_varied_is_refused(settings, change, words):
+    with pytest.raises(InputError, match=rf"task\.robust: expected .*{words}"):
+        make_fitness(settings, **change)
+
+
+def test_draws_are_the_keys_and_within_their_ranges(settings):
+    fitness = make_fitness(settings, **{"task.trials": 200})
+    drawn = fitness.setup.starts(KEY).variation
+    for name, factor in drawn._asdict().items():
+        low, high = np.log(np.asarray(factor)).min(), np.log(np.asarray(factor)).max()
+        most = np.log(WIDE[name])
+        assert -most <= low < -0.9 * most and 0.9 * most < high <= most
+    again, other = (fitness.setup.starts(key).variation for key in (KEY, jax.random.key(8)))
+    np.testing.assert_array_equal(np.stack(drawn), np.stack(again))
+    assert not np.any(np.stack(drawn) == np.stack(other))
+    # Starts are drawn as they are without.
+    plain = make_fitness(settings, **{"task.trials": 200, "task.robust": False}).setup.starts(KEY)
+    np.testing.assert_array_equal(plain.quat, fitness.setup.starts(KEY).quat)
+    assert plain.variation is None and Variation._fields == tuple(RobustConfig.model_fields)
+
+
+@pytest.mark.slow
+def test_one_body_and_many_and_its_replay(settings):
+    """The same scores from both programs, and from the trajectory of each trial."""
+    fitness = make_fitness(settings)
+    body = load_morphology(settings["morphology"])
+    mixed = make_mixed_fitness(settings, [body])
+    genes = 0.5 * jax.random.normal(jax.random.key(0), (3, fitness.num_genes))
+    scores = np.asarray(fitness(genes, KEY))
+    usual = make_fitness(settings, **{"task.robust": False})
+    assert not np.allclose(scores, usual(genes, KEY), rtol=1e-3)
+    robots = [mixed.build(body)] * 3
+    np.testing.assert_allclose(mixed(robots, genes, KEY), scores, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(mixed(robots[0], genes, KEY), scores, rtol=1e-3, atol=1e-5)
+    # Other draws, the same program.
+    assert not np.allclose(fitness(genes, jax.random.key(8)), scores, rtol=1e-3)
+    assert fitness.setup._jitted._cache_size() == 1
+    one = make_fitness(settings, **{"task.trials": 1})
+    score, _ = one.judge(one.replay(genes[0], KEY), KEY)
+    assert score == pytest.approx(float(one(genes[:1], KEY)[0]), rel=1e-3)
