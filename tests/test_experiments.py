@@ -7,7 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from experiments import bench, falling_spider, optimisers, validation, validation_cases
+from experiments import (
+    bench,
+    falling_spider,
+    optimisers,
+    sensitivity,
+    validation,
+    validation_cases,
+)
 from experiments.falling_spider import (
     GAZEBO_GRAVITY,
     RUNS,
@@ -22,6 +29,7 @@ from experiments.falling_spider import (
     row_ticks,
 )
 from laboratory import QUICK, ROOT
+from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
@@ -301,3 +309,49 @@ def test_a_case_outside_its_tolerance_fails_the_validation(tmp_path, monkeypatch
 
 def test_every_quick_case_is_a_case():
     assert set(validation_cases.QUICK_CASES) < set(validation_cases.CASES)
+
+
+# ------------------------------------------------------------------ sensitivity
+
+
+def test_factors_stay_within_their_ranges_and_the_others_are_one():
+    drawn = sensitivity.draw_factors(("drag",))
+    assert np.all(drawn["motor"] == 1) and np.ptp(np.log(drawn["drag"])) > 1.5 * np.log(1.5)
+    assert np.all(np.abs(np.log(drawn["drag"])) <= np.log(1.5))
+    # What is drawn of a number does not depend on what else is.
+    np.testing.assert_array_equal(
+        sensitivity.draw_factors(tuple(sensitivity.RANGES))["drag"], drawn["drag"]
+    )
+    factor, factors = sensitivity.vary_one("density")
+    assert factor[len(factor) // 2] == pytest.approx(1) and np.all(factors["drag"] == 1)
+
+
+def test_a_swims_speed_is_that_behind_the_settling_time_along_the_direction():
+    task = TaskConfig(type="directed_swim", duration=10.0, settle=2.0, direction=(0.0, 2.0, 0.0))
+    time = 0.1 * np.arange(1, 101)
+    # Fast while it settles, then 0.3 m/s along y, sideways and up.
+    along = np.where(time <= 2, 5 * time, 10 + 0.3 * (time - 2))
+    way = np.stack([time, along, 0.01 * time], 1)[:, :, None]
+    found = sensitivity.measure(way, task)
+    assert found.speed == pytest.approx([0.3]) and found.rise == pytest.approx([0.08])
+
+
+def test_the_tables_and_the_picture_of_sensitivity():
+    swim = sensitivity.Swim(np.array([0.05, 0.07]), np.array([0.1, -0.3]))
+    rows = sensitivity.table(
+        {"ours, all laws": swim, "no drag": swim._replace(speed=swim.speed / 2)}
+    )
+    assert rows[2][:2] == ["no drag", "3.00"] and rows[2][3] == "-50.0 %"
+    curves = {name: (np.array([0.5, 1.0, 2.0]), swim._replace(speed=np.ones(3)))
+              for name in sensitivity.RANGES}  # fmt: skip
+    found = sensitivity.Sensitivity(0.06, curves, {"start": swim, "drag": swim})
+    assert sensitivity.intervals(found, 0.25)[1][-1] == "50%"
+    assert len(sensitivity.draw(found, {"other": found}).axes) == 2
+
+
+def test_only_gaits_that_sense_nothing_can_be_played_to_mujoco(tmp_path):
+    text = (ROOT / "configs" / "auv_hold_depth.yaml").read_text()
+    text = text.replace("../morphologies", str(ROOT / "morphologies"))
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(InputError, match="sense nothing"):
+        sensitivity.read_champion(tmp_path)
