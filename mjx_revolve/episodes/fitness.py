@@ -41,6 +41,7 @@ from mjx_revolve.episodes.evaluation import (
     record_target,
     vary_engine,
 )
+from mjx_revolve.episodes.rollout import flow_at
 from mjx_revolve.episodes.scoring import WORST, farthest, judge_tracks, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import cues_of, start_pose
@@ -150,6 +151,7 @@ class Fitness:
         every, records, dt = self.record_every, self.num_records, self.robot.world.timestep
         rows = slice(every - 1, every * records, every)
         water = self.water(key) or water_of(self.robot.world)
+        water = flow_at(self.robot.world, water)(dt * jnp.arange(every * records), None)
         height = self.starts(key)[0][2, :1]
         command = trajectory.command
         score, measures = self._judge(
