@@ -43,6 +43,7 @@ _WHERE = {
     "simulate": "episodes.simulate",
     "make_fitness": "episodes.fitness",
     "make_mixed_fitness": "episodes.fitness",
+    "make_vector_env": "episodes.vector_env",
     "load_archive": "evolution.runs",
     "prepare_process": "numerics.runtime",
 }
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
     from mjx_revolve.episodes.fitness import make_fitness as make_fitness
     from mjx_revolve.episodes.fitness import make_mixed_fitness as make_mixed_fitness
     from mjx_revolve.episodes.simulate import simulate as simulate
+    from mjx_revolve.episodes.vector_env import make_vector_env as make_vector_env
     from mjx_revolve.evolution.runs import load_archive as load_archive
     from mjx_revolve.inputs.errors import InputError as InputError
     from mjx_revolve.numerics.runtime import prepare_process as prepare_process

@@ -1,0 +1,318 @@
+"""Our water as a vector environment of Gymnasium, for whatever learns by its interface.
+
+`gymnasium` is an extra, `pip install 'mjx_revolve[gym]'`, imported when the first environment is
+made. All environments are stepped in one compiled call.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.environment import (
+    Environment,
+    EnvironmentState,
+    Outcome,
+    make_environment,
+)
+from mjx_revolve.episodes.fitness import Fitness, make_fitness
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.xla import LANES, compiler_options, on_cpu
+
+AUTORESET_MODES = ("NextStep", "SameStep")
+"""When an episode that is over begins anew, by Gymnasium's names."""
+
+
+def _pick(mask: jax.Array, new: Any, old: Any) -> Any:
+    """Pytrees `[..., lanes]`, the new one where the mask is true."""
+    return jax.tree.map(lambda a, b: jnp.where(mask, a, b), new, old)
+
+
+def _begin(
+    environment: Environment, seed: jax.Array, episode: jax.Array
+) -> tuple[EnvironmentState, jax.Array]:
+    """Episodes at their starts, and what is seen there."""
+    return environment.observe(environment.start(seed, episode))
+
+
+def _next_step(
+    environment: Environment, state: EnvironmentState, action: jax.Array
+) -> tuple[EnvironmentState, jax.Array, Outcome, jax.Array]:
+    """A control period; what was over before it begins anew instead, without a reward.
+
+    Returns:
+        The state, `[k, lanes]` observations, what came of it, and the observations again.
+    """
+    over = state.ended
+    moved, outcome = environment.step(state, action)
+    nothing = jax.tree.map(jnp.zeros_like, outcome)
+    state, outcome = jax.lax.cond(
+        jnp.any(over),
+        lambda: _pick(
+            over, (environment.start(state.seed, state.episode + 1), nothing), (moved, outcome)
+        ),
+        lambda: (moved, outcome),
+    )
+    state, seen = environment.observe(state)
+    return state, seen, outcome, seen
+
+
+def _same_step(
+    environment: Environment, state: EnvironmentState, action: jax.Array
+) -> tuple[EnvironmentState, jax.Array, Outcome, jax.Array]:
+    """A control period; what is over after it begins anew at once.
+
+    Returns:
+        The state, `[k, lanes]` observations, what came of it, and the observations before any
+        began anew.
+    """
+    moved, outcome = environment.step(state, action)
+    moved, last = environment.observe(moved)
+    state, seen = jax.lax.cond(
+        jnp.any(moved.ended),
+        lambda: _pick(
+            moved.ended, _begin(environment, moved.seed, moved.episode + 1), (moved, last)
+        ),
+        lambda: (moved, last),
+    )
+    return state, seen, outcome, last
+
+
+@lru_cache(maxsize=1)
+def _make_class() -> type:
+    """The class, whose base is Gymnasium's."""
+    from gymnasium.error import ResetNeeded
+    from gymnasium.spaces import Box
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+
+    class WaterVectorEnv(VectorEnv):
+        """Environments of one robot in one water; see `make_vector_env`."""
+
+        def __init__(self, fitness: Fitness, environment: Environment, num_envs: int, mode: str):
+            self.fitness, self.environment, self.num_envs = fitness, environment, num_envs
+            self.autoreset_mode = AutoresetMode(mode)
+            self.control_rate = environment.control_rate
+            self.observation_names = environment.observation_names
+            self.action_names = environment.action_names
+            self.metadata = {
+                "render_modes": [],
+                "render_fps": self.control_rate,
+                "autoreset_mode": self.autoreset_mode,
+            }
+            seen, done = len(self.observation_names), len(self.action_names)
+            self.single_observation_space = Box(-1.0, 1.0, (seen,), np.float32)
+            self.single_action_space = Box(-1.0, 1.0, (done,), np.float32)
+            self.observation_space = batch_space(self.single_observation_space, num_envs)
+            self.action_space = batch_space(self.single_action_space, num_envs)
+            # Chunks of fixed shape, as those of a fitness: what an environment does depends
+            # neither on how many there are nor on which others there are.
+            self._lanes = LANES if on_cpu() else num_envs
+            self._chunks = -(-num_envs // self._lanes)
+            self._state: EnvironmentState | None = None
+            self._seen = np.zeros((num_envs, seen), np.float32)
+            advance = _same_step if mode == "SameStep" else _next_step
+
+            def step(state: EnvironmentState, actions: jax.Array) -> Any:
+                found = jax.lax.map(
+                    lambda given: advance(environment, *given), (state, self._split(actions))
+                )
+                state, seen, outcome, last = found
+                return state, self._join(seen), jax.tree.map(self._join, outcome), self._join(last)
+
+            def begin(seed: jax.Array, episode: jax.Array) -> Any:
+                given = self._split(seed), self._split(episode)
+                state, seen = jax.lax.map(lambda given: _begin(environment, *given), given)
+                return state, self._join(seen)
+
+            def resume(mask: jax.Array, new: Any, old: Any) -> Any:
+                pick = jax.vmap(_pick)
+                return pick(self._split(mask), new, old)
+
+            options = compiler_options()
+            self._step = jax.jit(step, compiler_options=options, donate_argnums=0)
+            self._begin = jax.jit(begin, compiler_options=options)
+            self._resume = jax.jit(resume, compiler_options=options)
+
+        def _split(self, x: jax.Array) -> jax.Array:
+            """`[num_envs, ...]` as `[chunks, ..., lanes]`, copies of the first behind them."""
+            padding = self._chunks * self._lanes - self.num_envs
+            if padding:
+                x = jnp.concatenate([x, jnp.repeat(x[:1], padding, 0)])
+            return jnp.moveaxis(x.reshape(self._chunks, self._lanes, *x.shape[1:]), 1, -1)
+
+        def _join(self, x: jax.Array) -> jax.Array:
+            """The way back."""
+            x = jnp.moveaxis(x, -1, 1)
+            return x.reshape(-1, *x.shape[2:])[: self.num_envs]
+
+        def reset(
+            self, *, seed: Any = None, options: dict[str, Any] | None = None
+        ) -> tuple[np.ndarray, dict[str, Any]]:
+            """Begins episodes.
+
+            Args:
+                seed: a whole number, of the first environment, the next one's is one higher; or one
+                    for each; None: the next episode of each environment's own seed, at first drawn
+                    by the operating system.
+                options: `{"reset_mask": [num_envs] of bool}` for some of them only.
+
+            Returns:
+                `[num_envs, k]` observations, and {}.
+
+            Raises:
+                InputError: the seed or the mask is none.
+            """
+            mask = self._read_mask(options)
+            if seed is None and self._state is None:
+                seed = int(self.np_random.integers(2**32))
+            if seed is None:
+                assert self._state is not None
+                seeds = np.asarray(self._join(self._state.seed))
+                episodes = self._join(self._state.episode) + 1
+            else:
+                seeds = self._read_seeds(seed)
+                episodes = jnp.zeros(self.num_envs, jnp.int32)
+                super().reset(seed=int(seeds[0]))
+            state, seen = self._begin(jnp.asarray(seeds), episodes)
+            if mask is not None and self._state is not None:
+                chosen = jnp.asarray(mask)
+                old = self._state, self._split(jnp.asarray(self._seen))
+                both = self._resume(chosen, (state, self._split(seen)), old)
+                state, seen = both[0], self._join(both[1])
+            self._state, self._seen = state, np.array(seen, np.float32)
+            return self._seen.copy(), {}
+
+        def _read_seeds(self, seed: Any) -> np.ndarray:
+            found = np.asarray(seed)
+            whole = np.issubdtype(found.dtype, np.integer) and found.shape in ((), (self.num_envs,))
+            if not whole or not np.all((found >= 0) & (found < 2**32)):
+                raise InputError(
+                    f"seed: expected a whole number from 0 to {2**32 - 1}, or {self.num_envs} of "
+                    f"them; found {seed!r}"
+                )
+            if found.shape == ():
+                found = (int(found) + np.arange(self.num_envs, dtype=np.int64)) % 2**32
+            return found.astype(np.uint32)
+
+        def _read_mask(self, options: Mapping[str, Any] | None) -> np.ndarray | None:
+            if not options or "reset_mask" not in options:
+                return None
+            mask = np.asarray(options["reset_mask"])
+            if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+                raise InputError(
+                    f"options: reset_mask: expected [{self.num_envs}] of bool; found "
+                    f"{list(mask.shape)} of {mask.dtype}"
+                )
+            return mask
+
+        def step(
+            self, actions: Any
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+            """A control period of all environments.
+
+            Args:
+                actions: `[num_envs, n]` between -1 and 1; see `Environment.step`.
+
+            Returns:
+                `[num_envs, k]` observations, `[num_envs]` rewards, which blew up (terminated),
+                whose time is over (truncated), and infos: `score` where one of these is true, in
+                `final_info` beside `final_obs` in mode SameStep.
+
+            Raises:
+                InputError: the actions have another shape.
+                gymnasium.error.ResetNeeded: `reset` was not called.
+            """
+            if self._state is None:
+                raise ResetNeeded("expected a call of reset before step")
+            given = np.asarray(actions, np.float32)
+            shape = (self.num_envs, len(self.action_names))
+            if given.shape != shape:
+                raise InputError(f"actions: expected {list(shape)}; found {list(given.shape)}")
+            self._state, seen, outcome, last = self._step(self._state, given)
+            self._seen = np.array(seen)
+            terminated, truncated = np.array(outcome.terminated), np.array(outcome.truncated)
+            infos: dict[str, Any] = {}
+            over = terminated | truncated
+            if over.any():
+                score = np.where(over, np.asarray(outcome.score), 0.0)
+                infos = {"score": score, "_score": over.copy()}
+                if self.autoreset_mode == AutoresetMode.SAME_STEP:
+                    final = np.where(over[:, None], np.asarray(last), np.float32(0))
+                    infos = {"final_obs": final, "_final_obs": over.copy(),
+                             "final_info": infos, "_final_info": over.copy()}  # fmt: skip
+            rewards = np.asarray(outcome.reward).astype(np.float64)
+            return self._seen.copy(), rewards, terminated, truncated, infos
+
+        def close_extras(self, **kwargs: Any) -> None:
+            """Lets go of the state."""
+            self._state = None
+
+        def __repr__(self) -> str:
+            """A line: `WaterVectorEnv(directed_swim in lake, 64 of them at 20 Hz)`."""
+            config = self.fitness.config
+            where = f"{config.task.name} in {Path(config.world_name).stem}"
+            return f"WaterVectorEnv({where}, {self.num_envs} of them at {self.control_rate:g} Hz)"
+
+    return WaterVectorEnv
+
+
+def make_vector_env(
+    config: Config | str | Path | Mapping[str, Any],
+    num_envs: int = LANES,
+    *,
+    sensors: Sequence[Any] | None = None,
+    control_rate: float | None = None,
+    autoreset_mode: str = "NextStep",
+    **overrides: Any,
+) -> Any:
+    """A `gymnasium.vector.VectorEnv` of a configuration: its robot, its water, its task.
+
+    Observations `[num_envs, k]` are what sensors tell, each between -1 and 1: the robot's as a
+    whole, then joint after joint; `observation_names` has them. Actions `[num_envs, n]` between -1
+    and 1 are the ranges of hinges' targets and thrusters' commands, as `action_names` has them.
+    Rewards add up to the task's score (see `environment`). An episode is truncated after
+    `task.duration`, and terminated if it blows up, which costs `scoring.WORST`. `task.trials` and
+    the rest of `controller` do not matter.
+
+    Args:
+        config: a `Config`, the path of a YAML file, a shipped configuration's name, or a mapping.
+        num_envs: how many environments; on a CPU, multiples of 64 make the most of it.
+        sensors: what is seen, kinds' names or mappings, as in `controller.sensors`; by default
+            these, or else the robot's own, or else `sensors.USUAL`.
+        control_rate: actions in a second [Hz]; by default the possible one nearest to 20.
+        autoreset_mode: `NextStep`, Gymnasium's own: an episode that is over begins anew at the next
+            step, whose action is not used; or `SameStep`: at once, its last observation in infos.
+        **overrides: as `make_fitness` takes them.
+
+    Returns:
+        The environments. The same seed gives the same numbers, bit for bit, on one kind of
+        processor; what environment i does depends on its seed and its actions alone.
+
+    Raises:
+        InputError: gymnasium is not installed, the configuration is wrong, or it has no one body.
+    """
+    if importlib.util.find_spec("gymnasium") is None:
+        raise InputError(
+            "make_vector_env: expected the package gymnasium (pip install 'mjx_revolve[gym]'); "
+            "found none"
+        )
+    whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
+    if not whole or num_envs < 1:
+        raise InputError(f"num_envs: expected a whole number >= 1; found {num_envs!r}")
+    if autoreset_mode not in AUTORESET_MODES:
+        raise InputError(
+            f"autoreset_mode: expected one of {', '.join(AUTORESET_MODES)}; found "
+            f"{autoreset_mode!r}"
+        )
+    fitness = make_fitness(config, **overrides)
+    environment = make_environment(fitness, control_rate, sensors)
+    return _make_class()(fitness, environment, int(num_envs), autoreset_mode)
