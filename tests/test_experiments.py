@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from experiments import (
     bench,
     falling_spider,
     optimisers,
+    policy_gradient,
     sensitivity,
     validation,
     validation_cases,
@@ -355,3 +357,27 @@ def test_only_gaits_that_sense_nothing_can_be_played_to_mujoco(tmp_path):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(InputError, match="sense nothing"):
         sensitivity.read_champion(tmp_path)
+
+
+# ------------------------------------------------------------------ policy gradient
+
+
+def test_advantages_by_hand():
+    """Two environments; the first one's episode is over after the second of three steps."""
+    settings = policy_gradient.Settings(discount=0.5, trace=0.5)
+    rewards = np.array([[1.0, 1.0], [2.0, 2.0], [4.0, 4.0]])
+    values = np.array([[1.0, 1.0], [1.0, 1.0], [2.0, 2.0], [4.0, 4.0]])
+    over = np.array([[0, 0], [1, 0], [0, 0]], bool)
+    found = np.asarray(
+        policy_gradient.advantages(*map(jnp.asarray, (rewards, values, over)), settings)
+    )
+    # Errors r + v'/2 - v of single steps: 0.5, 2 (1 where it is over), 4; each with a quarter of
+    # the later one's advantage.
+    assert found[:, 1].tolist() == [0.5 + 0.25 * 3.0, 2.0 + 0.25 * 4.0, 4.0]
+    assert found[:, 0].tolist() == [0.5 + 0.25 * 1.0, 1.0, 4.0]
+
+
+def test_the_policy_gradients_options_are_checked():
+    for words in (["--seconds", "0"], ["--seed", "-1"]):
+        with pytest.raises(InputError, match="found"):
+            policy_gradient.main(words)
