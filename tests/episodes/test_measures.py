@@ -298,7 +298,7 @@ def test_one_body_and_many_are_measured_alike(tmp_path, quick_compiles):
                  "measures": [name for name in MEASURES if name not in ALWAYS]},
     }  # fmt: skip
     one = make_fitness(config)
-    assert {*one.task.records} == {"core", "joints", "contacts"}
+    assert {*one.task.records} == {"core", "joints", "contacts", "water"}
     genes, lag = np.zeros((1, 7), np.float32), np.pi / 3
     genes[0, :4] = 0.5, 0.5 * np.cos(lag), 0.0, -0.5 * np.sin(lag)  # f = f_max (1 + sin 0) / 2
     key = jax.random.key(0)

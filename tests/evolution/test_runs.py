@@ -402,7 +402,7 @@ def test_fitness_plot(generations):
     figure = plots.plot_fitness(metrics, "title", "fitness (m/s)")
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels[0] == "fitness (m/s)"
-    assert labels[1].startswith("speed\n(body lengths/s)")
+    assert labels[1].startswith("speed over ground\n(body lengths/s)")
     assert figure.axes[0].get_xlabel() == "generation"
     assert plots.figure_png(figure).startswith(b"\x89PNG")
 

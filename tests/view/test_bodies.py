@@ -249,7 +249,7 @@ def test_sizes_over_the_generations(run):
     population, _ = read_population(run)
     figure = plot_sizes(population, ("speed_m_s",))
     panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
-    assert list(panels)[:3] == ["speed (m/s)", "modules", "hinges"]
+    assert list(panels)[:3] == ["speed over ground (m/s)", "modules", "hinges"]
     mean, best = panels["hinges"].lines
     assert mean.get_xdata().tolist() == [1, 2, 3]
     assert np.allclose(mean.get_ydata(), [2.0, 5 / 3, 2.0])
