@@ -156,9 +156,9 @@ class Setup:
         starts = self._starts_as(population, key)
         if population.ndim == 2:
             return self._score(bodies, population, starts, bodies is None)
-        if self.capacity is not None and not self.capacity.hinges:
-            # Of bodies without hinges, the program for one body has loops over nothing, over which
-            # XLA:CPU aborts (see `xla`); the one for different bodies does as well.
+        if self.capacity is not None and self.capacity.rows < 2:
+            # The program for one body of less than two rows has loops over nothing or over one,
+            # over which XLA:CPU aborts (see `xla`); the one for different bodies does as well.
             count, size, n = population.shape
             beside = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), size, -1), bodies)
             found = self._score(beside, population.reshape(count * size, n), starts, False)
