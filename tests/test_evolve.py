@@ -171,6 +171,7 @@ def test_a_damaged_checkpoint_costs_only_time(folder, capsys):
     assert contents(folder / "part") == contents(folder / "whole")
 
 
+@pytest.mark.slow
 def test_a_finished_run(folder, capsys):
     assert run_main("toy.yaml", "--out", "run", "--set", "evolution.generations=4") == 0
     before = contents(folder / "run")

@@ -235,6 +235,7 @@ def test_a_quick_benchmark_runs_and_keeps_its_numbers(tmp_path, capsys, monkeypa
     assert 1e8 < ours["peak_bytes"] < 4 * 2**30
 
 
+@pytest.mark.slow
 def test_a_case_that_fails_says_why():
     with pytest.raises(RuntimeError, match="nonsense: KeyError"):
         bench.start(bench.Row("no such case", "nonsense", "default"), 1)

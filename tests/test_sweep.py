@@ -197,6 +197,7 @@ def test_a_run_without_a_checkpoint_is_begun_again(folder, no_pictures):
     assert "resuming toy/seed_0 from the start: it has no checkpoint yet\n" in log
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
     class Pressed(toys.Toy):
         def evaluate(self, population, key):

@@ -111,7 +111,7 @@ def test_commands_of_the_installed_package(installed, tmp_path):
     code, said = run(tmp_path, command, "evolve", "lake_swimm")
     assert code == 2
     assert said.startswith("error: lake_swimm: expected a file, or one of auv_follow_bed, ")
-    assert "lake_swim, smoke, which come with the package; found none\n" in said
+    assert "lake_target, smoke, which come with the package; found none\n" in said
     code, said = run(tmp_path, command, "dance")
     assert (code, said.count("\n")) == (2, 1)
     assert said.startswith("error: expected one of evolve, sweep, inspect, ")

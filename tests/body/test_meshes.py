@@ -519,6 +519,7 @@ def test_the_experiment_recomputes_the_table(capsys):
     assert "Erratum" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_meshes_knows_nothing_of_jax():
     import subprocess
 

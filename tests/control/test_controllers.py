@@ -172,6 +172,7 @@ def test_what_does_not_swing_has_no_gait():
 # ------------------------------------------------------------------------- targets
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MAKERS)
 def test_zero_genes_keep_still(kind):
     robot = robot_of("spider")

@@ -102,6 +102,7 @@ def mujocos(robot, states):
     return {name: np.stack([row[name] for row in rows], -1) for name in rows[0]}
 
 
+@pytest.mark.slow
 def test_the_core_feels_what_mujocos_sensors_do(felt, mujocos, states):
     sense, _ = felt
     axes = mujocos["axes"].reshape(3, 3, LANES)
@@ -136,6 +137,7 @@ def of_many(robots, capacity):
     return make_step_engine(rows, jax.tree.map(jnp.asarray, bodies.plant))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["alike", "different", "mjx"])
 def test_one_body_many_bodies_and_mjx_feel_the_same(kind, robot, felt, states):
     if kind == "mjx":
@@ -186,6 +188,7 @@ def test_an_accelerometer_in_a_spinning_vacuum_is_mujocos():
     assert np.abs(data.sensordata).max() > 0.05
 
 
+@pytest.mark.slow
 def test_touch_is_the_beds_force_on_each_body(robot):
     """At rest in still lanes above, in and on the bed: as `push` has it of the whole robot."""
     qpos, qvel = random_states(robot, LANES, seed=5, speed=0.0)
@@ -210,6 +213,7 @@ def test_touch_is_the_beds_force_on_each_body(robot):
     assert found.touch.sum(0) == pytest.approx(np.asarray(bed[2]), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_waters_surface_is_what_heights_are_measured_from(robot, states):
     lifted = Water(1.5, TANK.current)
     found, _ = senses(TANK, lambda: make_engine(robot), *states, water=lifted)

@@ -104,6 +104,7 @@ def test_order_only_permutes_the_rows(kind):
     assert turned == pytest.approx(straight[:, order], abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", NEW)
 def test_gradients_are_finite_at_zero_genes(kind):
     plant = plant_of(elbow_robot(world()))
@@ -188,6 +189,7 @@ def test_the_shared_network_by_hand(recurrent):
         said = said + DT / 0.05 * (h @ out[1] - said)
 
 
+@pytest.mark.slow
 def test_messages_travel_from_neighbour_to_neighbour():
     """A step per joint: the tail hears of what the head feels as many steps later."""
     robot = robot_of("snake")
@@ -204,6 +206,7 @@ def test_messages_travel_from_neighbour_to_neighbour():
     assert heard[1, 1] and not heard[1, 2] and heard[2, 2] and not heard[2, 3]
 
 
+@pytest.mark.slow
 def test_oscillators_settle_at_their_lags_and_answer_to_sensors():
     robot = elbow_robot(world())
     plant = plant_of(robot)

@@ -115,6 +115,7 @@ def test_plane_below_a_body():
 # ------------------------------------------------------------------------- landing
 
 
+@pytest.mark.slow
 def test_a_core_lands_on_a_flat_bed_and_stays():
     """From half a metre, in eight attitudes: 7 mm deep at most while landing, .5 mm at rest."""
     robot = sink(FLAT)

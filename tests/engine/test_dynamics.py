@@ -428,6 +428,7 @@ def test_convergence_of_a_jointed_body():
 # ------------------------------------------------------------------------- what it refuses
 
 
+@pytest.mark.slow
 def test_an_unknown_engine_is_refused(arm):
     with pytest.raises(InputError, match=r"^engine: expected one of population, mjx; found 'c'$"):
         make_engine(arm, "c")

@@ -20,6 +20,7 @@ def curve(hinges, speed, target):
     return servo(hinges, zero, speed, target, 0.005, zero + 1e-4, zero)
 
 
+@pytest.mark.slow
 def test_the_curve_is_finite_exactly_at_the_top_speed(hinges):
     """For every push from none through the friction that it meets there to full effort."""
     friction, slope, top = (np.float32(np.max(x)) for x in hinges.motor)

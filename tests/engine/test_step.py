@@ -311,6 +311,7 @@ def check_switch(switch, height, speed, engines):
         assert speeds[-1][0, 2, 0] / 0.005 == pytest.approx(force / (mass + carried), rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", SWITCHES)
 def test_switches_of_single_modules(switch):
     """Half out of the water at rest, and deep in it at speed."""

@@ -175,6 +175,7 @@ def test_the_two_engines_agree(name):
     assert other_work == pytest.approx(work, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_auv_surges_without_pitch_and_heaves_without_drift():
     """Pairs of thrusters: what one does across, the other undoes."""
     robot = build_robot(body("auv"), world(**WATER))

@@ -69,6 +69,7 @@ def scores(fitness, population):
     return np.asarray(fitness(population, KEY))
 
 
+@pytest.mark.slow
 def test_one_score_each_and_the_same_again(fitness, population, scores):
     assert scores.shape == (70,) and np.all(np.isfinite(scores))
     np.testing.assert_array_equal(scores, fitness(population, KEY))
@@ -183,6 +184,7 @@ SETTINGS = SimpleNamespace(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "given", "score"),
     [

@@ -66,6 +66,7 @@ def test_what_cannot_be_varied_is_refused(settings, change, words):
         make_fitness(settings, **change)
 
 
+@pytest.mark.slow
 def test_draws_are_the_keys_and_within_their_ranges(settings):
     fitness = make_fitness(settings, **{"task.trials": 200})
     drawn = fitness.setup.starts(KEY).variation

@@ -57,6 +57,7 @@ def still(elbow):
 # ------------------------------------------------------------------------- surfaces
 
 
+@pytest.mark.slow
 def test_depths_are_below_the_surface_of_the_water_that_is_given():
     """What is sensed, floats and is told of depth moves with the surface, all of it alike.
 

@@ -138,6 +138,7 @@ def righted(settings, **task):
     }
 
 
+@pytest.mark.slow
 def test_a_righted_body_starts_with_its_centre_of_mass_below_that_of_its_volume(settings):
     config = righted(settings, start_attitude="righted", start_tilt=0.0, start_yaw=1.0)
     many = make_mixed_fitness(config, [lopsided(), body("core")])
@@ -212,6 +213,7 @@ def test_what_starts_on_the_bed_starts_level(settings):
 # ------------------------------------------------------------------------- targets
 
 
+@pytest.mark.slow
 def test_targets_are_drawn_anew_for_each_episode_and_move():
     settings = TaskConfig(type="reach_target", target_distance=1.5, target_speed=0.2, trials=64)
     starts = draw_starts(settings, load_world("lake"), jax.random.key(0), 10)

@@ -71,6 +71,7 @@ def score(pool, one, key):
     return evaluate(pool, [one], [genes], key)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lake_coevolve", "bed_coevolve", "lake_map_elites"])
 def test_shipped_configurations(name):
     """They are whole, and there is room for all bodies that they grow."""

@@ -199,11 +199,13 @@ def test_workers_of_another_source_are_refused(cluster, pool, config, caplog, tm
     assert worker.blocks == []
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_ends_the_run_which_goes_on_elsewhere(
     cluster, pool, config, capsys, monkeypatch, tmp_path
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TOY_TROUBLE", str(tmp_path / "none"))
+    monkeypatch.setattr("mjx_revolve.evolution.cluster._FETCH", 3.0)  # it waits so long, in vain
     toys.write_config(tmp_path / "toy.yaml", population_size=10, generations=5000)
 
     def run(*argv):

@@ -149,6 +149,7 @@ def test_another_version_is_mentioned(folder, capsys, monkeypatch):
     assert "this process differs: versions.jax: expected" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_clock_that_goes_backwards(folder, monkeypatch):
     assert run_main("toy.yaml", "--out", "whole") == 0
 
@@ -202,6 +203,7 @@ def test_the_largest_population_fits(tmp_path, folder, monkeypatch):
                     memory.check_memory(config_of(strategy, most + 1), 5)
 
 
+@pytest.mark.slow
 def test_bodies_beyond_the_memory_are_refused_beforehand(folder, capsys, monkeypatch):
     toys.write_bodies_config(folder / "bodies.yaml")
 

@@ -155,6 +155,7 @@ def crowd(tmp_path_factory):
             yield config, pool
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 4, 5, 10, 33])
 def test_scores_do_not_depend_on_the_workers(crowd, size):
     _, pool = crowd

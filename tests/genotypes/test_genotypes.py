@@ -90,6 +90,7 @@ def distance(a, b):
 # ------------------------------------------------------------------------- properties
 
 
+@pytest.mark.slow
 @kinds
 @pairs
 def test_bodies_are_valid_and_in_the_space(families, name, space):

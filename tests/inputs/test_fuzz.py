@@ -445,6 +445,7 @@ def test_run_folders(folder, whole, name, kind, data):
     look_around(folder)
 
 
+@pytest.mark.slow
 @fuzz(12)
 @given(RUNS, st.data())
 def test_checkpoints_that_hold_something_else(folder, whole, name, data):

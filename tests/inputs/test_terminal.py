@@ -72,6 +72,7 @@ def test_every_program_prints_so():
         assert "run_command(" in text or all(p.isascii() for p in printed), path
 
 
+@pytest.mark.slow
 def test_files_are_read_and_written_as_utf8():
     """No file of ours is opened in the encoding of the terminal."""
     opens = ("open", "read_text", "write_text")

@@ -96,6 +96,7 @@ def test_what_one_has_evolved_oneself_is_known(folder):
         own_code.load_own(f"{folder / 'copy.py'}:rise", "task.type")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("argv", [["--resume", "run"], ["run/config.yaml", "--out", "out"]])
 def test_a_command_runs_what_is_trusted_and_remembers(folder, argv, capsys):
     shutil.rmtree("run")

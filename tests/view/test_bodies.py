@@ -300,6 +300,7 @@ def test_cells_of_the_archive_are_links(tmp_path, still):
     assert "<?xml" not in page and page.count("<svg") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_browser() is None, reason="needs Chromium or Chrome")
 def test_a_click_on_a_cell_shows_who_lives_there(tmp_path, still):
     run = make_run(tmp_path / "run", ARCHIVE)

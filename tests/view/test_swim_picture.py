@@ -97,6 +97,7 @@ def test_the_page_says_how_fast_and_how_far(elbow):
     assert "water surface" not in said
 
 
+@pytest.mark.slow
 def test_getting_under_way_does_not_count(small):
     """Twice as fast after two seconds: the page says how fast from then on, as the scores do."""
     late = swim(small)
@@ -151,6 +152,7 @@ def adrift(small, **changes):
     return build_robot(small.morphology, replace(small.world, **changes))
 
 
+@pytest.mark.slow
 def test_currents_are_drawn_and_speeds_told_apart(small):
     """Over ground at 0.05 m/s, in water that comes towards it or goes along."""
     length = small.morphology.length
@@ -168,6 +170,7 @@ def test_currents_are_drawn_and_speeds_told_apart(small):
     assert not any("current" in w or "over ground" in w for w in still)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "words"),
     [((0.4, 0.05, -1.0), "target"), ((5.3, 0.0, -1.0), "target, 5 m on"), (None, None)],

@@ -150,6 +150,7 @@ def test_kirchhoff_impulse_and_energy_are_conserved():
         assert gained / 2e-5 == pytest.approx(0.0, abs=1e-5 * lagrangian.energy(q, v))
 
 
+@pytest.mark.slow
 def test_conservation_over_a_rollout():
     """A second of tumbling: energy to rounding at any step; impulse drifts less as it halves."""
     drift = []

@@ -523,6 +523,7 @@ def part_buoyancy(robot, qpos, qvel):
         return np.asarray(run(state, water_of(robot.world), thrusts)[0])
 
 
+@pytest.mark.slow
 def test_the_shipped_auv_is_cut_where_its_core_is():
     """Its ballast's volume puts the core's centre of volume 4.7 mm off the box's.
 

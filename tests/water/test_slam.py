@@ -183,6 +183,7 @@ def test_a_jointed_body_gains_none_either():
 # ------------------------------------------------------------------------- momentum
 
 
+@pytest.mark.slow
 def test_a_plate_slams_as_von_karman_has_it():
     """Without weight, v (m + m_a s) = m v₀ with the wet share s = depth / height of a level plate.
 
@@ -213,6 +214,7 @@ def test_a_plate_slams_as_von_karman_has_it():
     assert error[0] / error[1] == pytest.approx(2.0, abs=0.4)
 
 
+@pytest.mark.slow
 def test_impulse_is_kept_when_a_tilted_box_enters():
     """Linear and angular, of body and water, whatever turns on the way: first order in the step."""
     moved = []

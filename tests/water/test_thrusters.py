@@ -150,6 +150,7 @@ def test_jax_and_numpy_agree_and_keep_the_precision(name, x64):
     assert found == pytest.approx(expected, abs=1e-14 if x64 else 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_gradients_are_finite_everywhere_and_true_off_the_corners(name):
     thruster = curve(name)

@@ -349,6 +349,7 @@ WORLDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x64", [False, True])
 @pytest.mark.parametrize("name", WORLDS)
 def test_values_and_gradients_are_finite_and_of_the_inputs_type(name, x64):
