@@ -136,6 +136,7 @@ def test_the_tables_of_measures_are_the_codes():
     assert {*descriptors.UNITS} <= said
 
 
+@pytest.mark.slow
 def test_the_page_of_settings_is_what_the_code_reads():
     """Every task, controller and setting, with what it takes; `make docs` writes it anew."""
     place = {"PYTHONPATH": str(ROOT)}

@@ -57,6 +57,7 @@ def contents(folder):
     return kept, (folder / "champion" / "genes.yaml").read_text(), run.info["champion"]
 
 
+@pytest.mark.slow
 def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures, capsys):
     made = []
 

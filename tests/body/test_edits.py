@@ -318,6 +318,7 @@ def random_edit(body: Morphology, draw: np.random.Generator) -> list[Morphology]
     return list(found) if isinstance(found, tuple) else [found]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(OURS))
 @pytest.mark.parametrize("seed", range(4))
 def test_random_edits_make_valid_bodies_or_say_why_not(seed, name):

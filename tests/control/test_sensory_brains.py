@@ -69,6 +69,7 @@ def drawn(controller, lanes=1, seed=0, scale=1.0):
 # ------------------------------------------------------------------------- what all promise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", NEW)
 @pytest.mark.parametrize("name", ["spider", "auv"])
 def test_zero_genes_keep_still_whatever_is_felt(kind, name):

@@ -326,6 +326,7 @@ def test_lanes_do_not_know_of_each_other(elbow):
     assert np.array_equal(rolled, q[..., turned])
 
 
+@pytest.mark.slow
 def test_a_population_against_one_at_a_time(elbow):
     """The same up to rounding: another shape is another program."""
     qpos, qvel, ctrl = drawn(elbow, 8)

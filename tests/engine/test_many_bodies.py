@@ -107,9 +107,8 @@ def alike_acceleration(robot, capacity, arrays):
         return np.asarray(jitted(pack([robot], capacity, 1), *map(jnp.asarray, arrays)))
 
 
-@pytest.mark.parametrize(
-    "name", ["default", *(pytest.param(n, marks=pytest.mark.slow) for n in list(WORLDS)[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WORLDS)
 def test_accelerations_are_those_of_each_body_alone(name):
     robots = zoo(name)
     capacity = fit_capacity(robots)

@@ -40,6 +40,7 @@ def push(robot, states, variation=None, ctrl=None) -> np.ndarray:
         return np.asarray(jax.jit(run, compiler_options=QUICK)(*arrays))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drag", ["faces", pytest.param("lift_drag", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("factors", "part", "fields"),

@@ -93,6 +93,7 @@ def test_an_individual_adds_little_memory_however_long_it_lives(settings):
     assert compiled.memory_analysis().temp_size_in_bytes / count < 200
 
 
+@pytest.mark.slow
 def test_a_blown_up_individual_scores_worst_and_spreads_nothing(fitness, population, scores):
     broken = population.at[3].set(jnp.nan)
     found = np.asarray(fitness(broken, KEY))

@@ -118,6 +118,7 @@ def test_the_default_duration_is_five_seconds(core):
     assert not trajectory.power.any()
 
 
+@pytest.mark.slow
 def test_xpos_is_mujocos(elbow):
     rows = np.random.default_rng(0).uniform(-0.7, 0.7, (STEPS, 2))
     trajectory = simulate(elbow, rows)
@@ -247,6 +248,7 @@ def test_water_of_its_own():
     assert np.asarray(same.qpos) == pytest.approx(np.asarray(plain.qpos), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_simulate_is_the_population_step_with_one_lane(elbow):
     trajectory = simulate(elbow, [0.3, -0.2], SPAN)
     qpos, qvel = elbow.start_qpos()[:, None], np.zeros((8, 1))

@@ -163,6 +163,7 @@ SCHEMES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("selection", SCHEMES, ids=lambda s: s["type"])
 def test_generations(folder, selection):
     """The bookkeeping of all schemes, and that the same seed gives the same bits."""

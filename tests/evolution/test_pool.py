@@ -169,6 +169,7 @@ def test_scores_do_not_depend_on_the_workers(crowd, size):
     assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
 
 
+@pytest.mark.slow
 def test_workers_know_other_kinds_of_keys(crowd):
     _, pool = crowd
     population = np.random.default_rng(0).normal(size=(6, 5)).astype(np.float32)

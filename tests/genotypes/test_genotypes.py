@@ -119,6 +119,7 @@ def test_bodies_come_back_from_yaml(families, tmp_path, name):
             assert load_morphology(tmp_path / "body.yaml") == body
 
 
+@pytest.mark.slow
 @kinds
 @pairs
 def test_genomes_come_back_from_json(families, name, space):

@@ -204,6 +204,7 @@ timestep: 0.005
 )
 
 
+@pytest.mark.slow
 @fuzz(50)
 @given(mutants(*WORLDS))
 @example(Mutant(b"{density: !!int ''}"))
@@ -434,6 +435,7 @@ def copy_run(whole, folder, name):
     return folder / "run"
 
 
+@pytest.mark.slow
 @fuzz(20)
 @given(RUNS, KINDS, st.data())
 def test_run_folders(folder, whole, name, kind, data):

@@ -391,6 +391,7 @@ def test_frames_show_the_robot_in_its_colours_in_blue_water(frames):
     assert np.abs(drawn[0].astype(int) - drawn[9]).max() > 50
 
 
+@pytest.mark.slow
 def test_light_falls_from_above_in_a_film(frames):
     _, drawn = frames
     assert drawn[0][20:40].mean() > drawn[0][90:105].mean() + 10

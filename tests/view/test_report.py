@@ -198,6 +198,7 @@ def test_seeds_are_grouped_and_configurations_told_apart(lab, tmp_path):
     assert (alone.name, alone.task, alone.unit) == ("swim", "speed", "body lengths/s")
 
 
+@pytest.mark.slow
 def test_curves_go_as_far_as_all_runs_do(lab, tmp_path):
     config = make_config(lab["config"].model_dump(), "/", ["evolution.generations=9"], "swim.yaml")
     for seed, generations in enumerate((9, 4, 7)):
@@ -289,6 +290,7 @@ DAMAGES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("damage", "state", "text"), DAMAGES)
 def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
     damage(copy)
@@ -637,6 +639,7 @@ def test_text_is_escaped():
     assert "none" not in page.text
 
 
+@pytest.mark.slow
 def test_a_page_about_one_run(copy, quick, capsys):
     assert run_main("run") == 0
     captured = capsys.readouterr()

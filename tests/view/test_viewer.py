@@ -107,6 +107,7 @@ def test_poses(episode, data):
     assert np.concatenate(corners) == pytest.approx(expected, abs=5e-5)
 
 
+@pytest.mark.slow
 def test_forces(episode, data):
     """Arrows are the forces on modules; their usual length is a share of the body's."""
     forces = module_forces(episode.robot, episode.trajectory, 4)

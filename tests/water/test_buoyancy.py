@@ -100,6 +100,7 @@ def assert_exact(up, depth, half):
         assert np.abs((moment - [m for _, m in exact]) / half).max() < ERROR[x64]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOXES)
 def test_share_and_moment_of_a_cut_box(name):
     half, n = BOXES[name], 300

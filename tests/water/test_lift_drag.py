@@ -321,6 +321,7 @@ def test_slopes_against_finite_differences(plate):
         assert np.abs(found[:, :, i].T - expected).max() < 1e-5 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("plate", PLATES)
 def test_finite_everywhere(plate, dtype):

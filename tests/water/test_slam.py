@@ -97,6 +97,7 @@ def tilted(lanes, height):
 # ------------------------------------------------------------------------- energy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.02, 0.01, 0.005, 0.002])
 def test_a_box_that_bobs_and_tumbles_gains_no_energy(dt):
     """Relative density .6, no drag, for a minute: kinetic and potential energy never exceed the

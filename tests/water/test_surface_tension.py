@@ -97,6 +97,7 @@ def test_the_reference_itself_against_counting_points():
             assert exact == pytest.approx(counted, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 1.2, np.pi / 2, 2.5])
 @pytest.mark.parametrize("axis", range(3))
 def test_upright_walls_are_pulled_by_the_length_of_their_waterline(angle, axis):
@@ -219,6 +220,7 @@ def test_nothing_without_tension_weight_or_wetting():
     assert np.abs(force).max() < 1e-15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOXES)
 @pytest.mark.parametrize("tilt", [0.0, 5e-3, 0.3])
 def test_force_and_torque_are_continuous_through_the_surface(name, tilt):

@@ -396,6 +396,7 @@ def test_single_precision(name):
             assert np.abs(wide - a).max() <= tolerance * max(np.abs(a).max(), 1e-30)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WORLDS)
 def test_gradients_against_differences(name):
     world, place = make_world(**WORLDS[name]), places(50)
