@@ -51,15 +51,15 @@ class SensorKind(NamedTuple):
     feels: str = ""
 
 
-def _distance(sense: Any) -> Any:
-    x, y, z = sense.target
+def _distance(toward: Any) -> Any:
+    x, y, z = toward
     # The tiny term keeps the gradient finite where the target is reached.
     return (x * x + y * y + z * z + 1e-12) ** 0.5
 
 
-def _bearing(sense: Any) -> tuple[Any, ...]:
-    scale = 1 / _distance(sense)
-    return tuple(scale * component for component in sense.target)
+def _bearing(toward: Any) -> tuple[Any, ...]:
+    scale = 1 / _distance(toward)
+    return tuple(scale * component for component in toward)
 
 
 _ONE, _THREE = ("",), ("x", "y", "z")
@@ -108,10 +108,51 @@ SENSORS: Mapping[str, SensorKind] = {
         _THREE, "m", "robot", (-5, 5), lambda s: s.target, "from the core to the target, core frame"
     ),
     "bearing": SensorKind(
-        _THREE, "-", "robot", (-1, 1), _bearing, "direction of the target, core frame"
+        _THREE,
+        "-",
+        "robot",
+        (-1, 1),
+        lambda s: _bearing(s.target),
+        "direction of the target, core frame",
     ),
     "distance": SensorKind(
-        _ONE, "m", "robot", (0, 10), lambda s: (_distance(s),), "of the target from the core"
+        _ONE, "m", "robot", (0, 10), lambda s: (_distance(s.target),), "of the target from the core"
+    ),
+    "nearest": SensorKind(
+        _THREE,
+        "m",
+        "robot",
+        (-5, 5),
+        lambda s: s.nearest.toward,
+        "from the core to the nearest other robot's, core frame",
+        "nearest",
+    ),
+    "nearest_bearing": SensorKind(
+        _THREE,
+        "-",
+        "robot",
+        (-1, 1),
+        lambda s: _bearing(s.nearest.toward),
+        "direction of the nearest other robot, core frame",
+        "nearest",
+    ),
+    "nearest_distance": SensorKind(
+        _ONE,
+        "m",
+        "robot",
+        (0, 10),
+        lambda s: (_distance(s.nearest.toward),),
+        "of the nearest other robot",
+        "nearest",
+    ),
+    "nearest_tag": SensorKind(
+        _ONE,
+        "-",
+        "robot",
+        (-1, 1),
+        lambda s: (s.nearest.tag,),
+        "by which the nearest other robot can be told apart",
+        "nearest",
     ),
     "battery": SensorKind(
         _ONE,

@@ -14,7 +14,7 @@ from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.feedback import make_feedback
 from mjx_revolve.control.joint_network import make_joint_network
 from mjx_revolve.control.neurons import make_network
-from mjx_revolve.control.sense import FEELS, Sense
+from mjx_revolve.control.sense import FEELS, Other, Sense
 from mjx_revolve.control.sensory_cpg import make_sensory_cpg
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.control.splines import make_splines
@@ -164,6 +164,7 @@ def _example_sense(hinges: int, lanes: int, feels: Sequence[str]) -> Sense:
     one, joint, touch = given(), given(hinges), given(1 + hinges)
     three = (one, one, one)
     asked: dict[str, Any] = {"force": three, "load": joint, "work": one, "touch": touch}
+    asked["nearest"] = Other(three, one)
     return Sense(
         height=one,
         climb=one,

@@ -8,18 +8,24 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_revolve.engine.collisions import ALONE, Meeting
 from mjx_revolve.engine.state import Engine, Root
 from mjx_revolve.numerics.spatial import Vec, matTvec, quat_to_rows, vadd, vscale, vsub
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.flow import Water, flow
 from mjx_revolve.water.world import World
 
-FEELS = ("force", "load", "work", "touch")
+FEELS = ("force", "load", "work", "touch", "nearest")
 """Fields of `Sense` that are there only for a `Controller` that names them in `feels`.
 
-The first three need a memory, which travels with the state, and touch a sweep over the body; all
-others cost nothing unless they are used, as the compiler leaves out what nobody reads.
+The first three need a memory, which travels with the state, touch a sweep over the body, and who is
+nearest a look at all others; what is left costs nothing unless it is used, as the compiler leaves
+out what nobody reads.
 """
+
+
+NOBODY = Meeting()
+"""Where each robot has a world to itself."""
 
 
 class Cues(NamedTuple):
@@ -44,6 +50,19 @@ class Cues(NamedTuple):
         if self.drift is None:
             return tuple(self.target)
         return vadd(self.target, vscale(time, self.drift))
+
+
+class Other(NamedTuple):
+    """Another robot, as one may see it.
+
+    Attributes:
+        toward: from core to core, core frame, three of `[lanes]` [m]; `ALONE` far where there is
+            nobody.
+        tag: by which it can be told apart, `[lanes]` [-]; 0 likewise.
+    """
+
+    toward: Any
+    tag: Any
 
 
 class Memory(NamedTuple):
@@ -84,6 +103,7 @@ class Sense(NamedTuple):
         work: done by servos and propellers so far [J]; likewise.
         touch: how hard the bed pushes the core's rigid body, then what each hinge carries,
             `[1 + hinge rows, lanes]` [N]; likewise.
+        nearest: an `Other`, the nearest other robot in the same world; likewise.
     """
 
     height: jax.Array
@@ -101,6 +121,7 @@ class Sense(NamedTuple):
     load: Any = None
     work: Any = None
     touch: Any = None
+    nearest: Any = None
 
 
 def feel(
@@ -112,6 +133,7 @@ def feel(
     cues: Cues,
     memory: Memory,
     feels: Sequence[str] = (),
+    meeting: Meeting = NOBODY,
 ) -> Sense:
     """What robots feel.
 
@@ -124,6 +146,7 @@ def feel(
         cues: of the episode.
         memory: from `start_memory` or `remember`.
         feels: which of `FEELS` are asked for.
+        meeting: with the other robots of the same world.
 
     Returns:
         The senses.
@@ -142,6 +165,11 @@ def feel(
     target: Any = (zero, zero, zero)
     if cues.target is not None:
         target = matTvec(turn, vsub(cues.target_at(time), root.position))
+    nearest = None
+    if "nearest" in feels:
+        lone = meeting.nearest is None
+        toward = (zero, zero, zero + ALONE) if lone else meeting.nearest
+        nearest = Other(matTvec(turn, toward), zero if lone else meeting.tag)
     force = None
     if memory.acceleration is not None:
         gravity = 9.81 if world is None else world.gravity
@@ -163,6 +191,7 @@ def feel(
         load=None if memory.ctrl is None else engine.load(state, memory.ctrl),
         work=memory.work,
         touch=engine.touch(state, water) if "touch" in feels else None,
+        nearest=nearest,
     )
 
 

@@ -132,10 +132,12 @@ def own_inertia(
     gravity: Vec,
     dt: float,
     wet: Any,
+    push: Any = (),
 ) -> tuple[Block, tuple[Vec, Vec], Any]:
     """Each body's inertia with its carried water, and the bias force that needs no acceleration.
 
     Takes the submerged shares of the step before, as `State.wet` has them, and gives those of now.
+    `push` is a torque and a force about the body's origin from elsewhere, or nothing.
     Where water is carried, the whole momentum h turns by K(h) ν in the middle of the step (see
     `accelerate`), which makes the inertia's matrix unsymmetric.
     """
@@ -144,6 +146,8 @@ def own_inertia(
     weight = tuple(neg(g) for g in gravity)
     force = vadd(outer.force, vscale(level.mass, weight))
     torque = vadd(outer.torque, cross(level.moment, weight))
+    if push:
+        torque, force = vadd(torque, push[0]), vadd(force, push[1])
     _, inertia, momentum = with_water(level, outer, swirling)
     if outer.damping is not None and dt:
         inertia = add_inertia(inertia, scale_inertia(dt, outer.damping))
@@ -291,7 +295,13 @@ _NO_BIAS = ((0.0,) * 3, (0.0,) * 3)
 
 
 def accelerate(
-    bodies: Bodies, state: State, targets: Any, water: Water, thrusts: Any, dt: float
+    bodies: Bodies,
+    state: State,
+    targets: Any,
+    water: Water,
+    thrusts: Any,
+    dt: float,
+    pushes: Any = (),
 ) -> tuple[Vec, Vec, Any, Scalar, Any]:
     """Accelerations, by the articulated-body algorithm.
 
@@ -308,6 +318,7 @@ def accelerate(
         water: surface and current.
         thrusts: of the thrusters, `[nthruster, lanes]` [N].
         dt: for which turning, damping, drag and end stops are implicit [s]; 0 for none.
+        pushes: what else pushes the bodies, as `collisions.Meeting.push`; () for nothing.
 
     Returns:
         Root: linear and angular, body frame, as rates of the body-frame components [m/s², rad/s²];
@@ -317,11 +328,11 @@ def accelerate(
     symmetric = not (bodies.carries and dt)
     root, moved, midway = move_bodies(bodies, state, _is_located(bodies, water), dt)
 
-    def own_of(level: Level, moving: Moving, wet: Any) -> Any:
+    def own_of(level: Level, moving: Moving, wet: Any, push: Any = ()) -> Any:
         gravity = felt_gravity(bodies.world, water, moving.motion)
         block, bias, wet = own_inertia(
             bodies.world, bodies.carries, level, moving.motion, moving.swirling, water, thrusts,
-            gravity, dt, wet,
+            gravity, dt, wet, push,
         )  # fmt: skip
         return _flatten(block, bias, symmetric), wet
 
@@ -333,9 +344,10 @@ def accelerate(
 
     def lift(level: Level, gathered: Any, *x: Any) -> tuple[Any, Any, Scalar]:
         """Tips to root: articulated inertias."""
-        (moving, turn), angle, speed, midway, target, *before = x
+        (moving, turn), angle, speed, midway, target, *more = x
         hinges = level.hinges
-        own, wet = own_of(level, moving, *(before or ((),)))
+        push = more.pop() if pushes else ()
+        own, wet = own_of(level, moving, more[0] if more else (), push)
         assert hinges is not None
         load, inertia = hold(hinges, angle, speed)
         block, bias = _unflatten(
@@ -368,9 +380,10 @@ def accelerate(
     gathered, kept, power = bodies.up(
         lift,
         (_flatten(_NO_BLOCK, _NO_BIAS, symmetric), 0.0),
-        moved, state.angle, state.speed, midway, targets, *state.wet[1:],
+        moved, state.angle, state.speed, midway, targets, *state.wet[1:], *pushes[1:],
     )  # fmt: skip
-    whole, wet = own_of(bodies.root, root, state.wet[0] if state.wet else ())
+    own_wet = state.wet[0] if state.wet else ()
+    whole, wet = own_of(bodies.root, root, own_wet, pushes[0] if pushes else ())
     if gathered is not None:
         whole = jax.tree.map(add, whole, gathered)
     angular, linear = solve_root(*_unflatten(whole, symmetric), symmetric)

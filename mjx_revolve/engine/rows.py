@@ -156,6 +156,11 @@ class Rows:
         groups = which(jax.tree.unflatten(kept.tree, range(count)))
         return tuple(columns[:, own[0] : own[-1] + 1] for own in groups)
 
+    def unfold(self, kept: Joined) -> Any:
+        """What `down` has kept, `[rows, lanes]` each."""
+        columns = kept.data.reshape(-1, kept.tree.num_leaves, self.lanes)
+        return jax.tree.unflatten(kept.tree, list(jnp.moveaxis(columns, 1, 0)))
+
     def all_wet(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
         """`State.wet` of parts that are wholly under water."""
         row, count = _whole(self.capacity.row, self.bodies.rows), self.capacity.rows

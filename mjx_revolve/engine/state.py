@@ -96,10 +96,13 @@ class Engine(NamedTuple):
         fuses: whether a step is element-wise, so that it may be compiled as one function.
         varied: a `variation.Variation` → the same engine with those coefficients; None where it
             cannot.
+        meet: state → `collisions.Meeting`, what robots of one world do to each other, whose `push`
+            is a fourth argument of `step`; None where each has a world to itself. It is no
+            element-wise function.
     """
 
     init: Callable[[jax.Array, jax.Array], Any]
-    step: Callable[[Any, jax.Array, Water], tuple[Any, jax.Array]]
+    step: Callable[..., tuple[Any, jax.Array]]
     observe: Callable[[Any], tuple[jax.Array, jax.Array]]
     root: Callable[[Any], Root]
     joints: Callable[[Any], tuple[jax.Array, jax.Array]]
@@ -110,6 +113,7 @@ class Engine(NamedTuple):
     plant: Plant
     fuses: bool
     varied: Callable[[Any], Engine] | None = None
+    meet: Callable[[Any], Any] | None = None
 
 
 def root_of(state: State) -> Root:

@@ -6,12 +6,14 @@ compared step by step. `bodies` says how trees are traversed, `dynamics` what ac
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from mjx_revolve.engine.collisions import Meeting
 from mjx_revolve.engine.dynamics import Bodies, accelerate
 from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.levels import Levels, make_levels
@@ -110,7 +112,9 @@ def _drive(bodies: Bodies, state: State, ctrl: jax.Array) -> tuple[Any, Any, Any
     return targets, command, thrusts, total(*[pumped[k] for k in range(count)])
 
 
-def step(bodies: Bodies, state: State, ctrl: jax.Array, water: Water) -> tuple[State, jax.Array]:
+def step(
+    bodies: Bodies, state: State, ctrl: jax.Array, water: Water, pushes: Any = ()
+) -> tuple[State, jax.Array]:
     """One step.
 
     Args:
@@ -118,6 +122,7 @@ def step(bodies: Bodies, state: State, ctrl: jax.Array, water: Water) -> tuple[S
         state: the population.
         ctrl: `[n, lanes]` targets [rad] and commands [-] in the plant's order.
         water: surface and current.
+        pushes: of other robots, as `collisions.Meeting.push`; () for none.
 
     Returns:
         The state after it, and the power of servos and ideal propellers, `[lanes]` [W].
@@ -126,18 +131,24 @@ def step(bodies: Bodies, state: State, ctrl: jax.Array, water: Water) -> tuple[S
     targets, command, thrusts, pumped = _drive(bodies, state, ctrl)
     # The whole step is seen from the uniform current: there, no current is left.
     relative = state._replace(velocity=vsub(state.velocity, water.current))
-    *pace, power, wet = accelerate(bodies, relative, targets, water, thrusts, dt)
+    *pace, power, wet = accelerate(bodies, relative, targets, water, thrusts, dt, pushes)
     new = advance(state, water, tuple(pace), dt, bodies.carries, wet)
     return new._replace(command=command), add(power, pumped)
 
 
-def make_step_engine(bodies: Bodies, plant: Plant, variation: Variation | None = None) -> Engine:
+def make_step_engine(
+    bodies: Bodies,
+    plant: Plant,
+    variation: Variation | None = None,
+    meet: Callable[[State], Meeting] | None = None,
+) -> Engine:
     """The population step as an engine; its functions are pure, and run under jit, vmap and grad.
 
     Args:
         bodies: the robots.
         plant: their actuators.
         variation: factors on their coefficients; None for none.
+        meet: what robots of one world do to each other, from `make_meeting`; None for nothing.
 
     Returns:
         The engine.
@@ -159,7 +170,7 @@ def make_step_engine(bodies: Bodies, plant: Plant, variation: Variation | None =
 
     return Engine(
         init=partial(init, bodies),
-        step=lambda state, ctrl, water: step(own(), state, ctrl, water),
+        step=lambda state, ctrl, water, pushes=(): step(own(), state, ctrl, water, pushes),
         observe=partial(observe, bodies),
         root=root_of,
         joints=partial(joints, bodies),
@@ -169,7 +180,8 @@ def make_step_engine(bodies: Bodies, plant: Plant, variation: Variation | None =
         push=push,
         plant=plant,
         fuses=True,
-        varied=lambda variation: make_step_engine(bodies, plant, variation),
+        varied=lambda variation: make_step_engine(bodies, plant, variation, meet),
+        meet=meet,
     )
 
 

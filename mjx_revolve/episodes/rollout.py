@@ -3,18 +3,53 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from mjx_revolve.control.sense import Cues, Sense, feel, remember, start_memory
+from mjx_revolve.control.sense import NOBODY, Cues, Sense, feel, remember, start_memory
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.numerics.xla import fused_scan, share_once
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
 
 _NO_CUES = Cues()
+
+
+class Passage(NamedTuple):
+    """What travels from step to step.
+
+    Attributes:
+        state: of the engine.
+        drive_state: of the controller.
+        memory: of what is felt.
+        energy: since the last record, `[lanes]` [J].
+        count: how many steps there were, int32: time is exact however long the run.
+    """
+
+    state: Any
+    drive_state: Any
+    memory: Any
+    energy: Any
+    count: Any
+
+
+def begin(engine: Engine, state: Any, drive_state: Any, feels: Sequence[str] = ()) -> Passage:
+    """What travels before the first step.
+
+    Args:
+        engine: what steps.
+        state: from `engine.init`.
+        drive_state: of the controller.
+        feels: which of `sense.FEELS` are asked for.
+
+    Returns:
+        The start of a rollout.
+    """
+    energy = jnp.zeros_like(engine.root(state).spin[0])
+    memory = start_memory(feels, engine, state)
+    return Passage(state, drive_state, memory, energy, jnp.zeros((), jnp.int32))
 
 
 def roll_out(
@@ -26,6 +61,38 @@ def roll_out(
     drive_state: Any,
     inputs: Any,
     *,
+    feels: Sequence[str] = (),
+    **settings: Any,
+) -> tuple[Any, Any]:
+    """Steps a chunk of a population from its start and records it now and then.
+
+    Args:
+        engine: what steps it.
+        drive: as in `go_on`.
+        flow: likewise.
+        record: likewise.
+        state: from `engine.init`.
+        drive_state: initial controller state.
+        inputs: as in `go_on`.
+        feels: which of `sense.FEELS` are asked for.
+        **settings: of `go_on`.
+
+    Returns:
+        The last state, and the records, `[records, ...]` each.
+    """
+    start = begin(engine, state, drive_state, feels)
+    last, kept = go_on(engine, drive, flow, record, start, inputs, feels=feels, **settings)
+    return last.state, kept
+
+
+def go_on(
+    engine: Engine,
+    drive: Callable[[Any, jax.Array, Any, Sense], tuple[Any, jax.Array]],
+    flow: Callable[[jax.Array, Any], Water],
+    record: Callable[[Any, jax.Array, jax.Array, Water], Any],
+    passage: Passage,
+    inputs: Any,
+    *,
     records: int,
     every: int,
     timestep: float,
@@ -33,8 +100,9 @@ def roll_out(
     world: World | None = None,
     cues: Cues = _NO_CUES,
     feels: Sequence[str] = (),
-) -> tuple[Any, Any]:
-    """Steps a chunk of a population and records it now and then.
+    since: Any = None,
+) -> tuple[Passage, Any]:
+    """Steps a chunk of a population on and records it now and then.
 
     Args:
         engine: what steps it.
@@ -43,8 +111,7 @@ def roll_out(
         flow: (time [s], inputs of this step) → the water.
         record: (state, ctrl, energy since the last record `[lanes]` [J], the water of the last
             step) → what to keep.
-        state: from `engine.init`.
-        drive_state: initial controller state.
+        passage: from `begin`, or what the steps before have left.
         inputs: None, or arrays `[records * every, ...]`, one row for each step.
         records: how many records.
         every: steps between them.
@@ -54,53 +121,58 @@ def roll_out(
         world: whose water and bed the robots feel; None where they feel neither.
         cues: what else they are given to feel.
         feels: which of `sense.FEELS` are asked for.
+        since: `[lanes]` int32 step at which each robot's own time began; None: all at the first.
 
     Returns:
-        The last state, and the records, `[records, ...]` each.
+        What travels on, and the records, `[records, ...]` each.
     """
+    clock = lambda count, like: count.astype(like.dtype) * timestep  # noqa: E731
 
     def step(carry: Any, now: Any) -> tuple[Any, jax.Array]:
-        state, drive_state, memory, energy, count = carry
-        # The step counter travels as an integer, so that time is exact however long the run.
-        time = count.astype(energy.dtype) * timestep
+        (state, drive_state, memory, energy, count), (now, meeting) = carry, now
+        time = clock(count, energy)
         water = flow(time, now)
-        felt = feel(world, engine, state, water, time, cues, memory, feels)
-        drive_state, ctrl = drive(drive_state, time, now, felt)
+        felt = feel(world, engine, state, water, time, cues, memory, feels, meeting)
+        own = time if since is None else clock(count - since, energy)
+        drive_state, ctrl = drive(drive_state, own, now, felt)
         before = engine.root(state)
-        state, power = engine.step(state, ctrl, water)
+        pushes = () if engine.meet is None else (meeting.push,)
+        state, power = engine.step(state, ctrl, water, *pushes)
         work = timestep * power
         memory = remember(memory, before, engine.root(state), ctrl, work, timestep)
-        return (state, drive_state, memory, energy + work, count + 1), ctrl
+        return Passage(state, drive_state, memory, energy + work, count + 1), ctrl
 
-    energy = jnp.zeros_like(engine.root(state).spin[0])
-    memory = start_memory(feels, engine, state)
-    carry = (state, drive_state, memory, energy, jnp.zeros((), jnp.int32))
     first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)
+    # What robots do to each other is no element-wise function of them, so it stays outside.
+    meet = (lambda state: NOBODY) if engine.meet is None else engine.meet
     pack = unpack = lambda x: x
     if engine.fuses and not derived:
-        step, pack, unpack = fused_scan(step, carry, first)
+        step, pack, unpack = fused_scan(step, passage, (first, meet(passage.state)))
     else:
         step = share_once(step)
         if derived:
             step = jax.checkpoint(step, prevent_cse=False)
 
+    def meet_and_step(packed: Any, row: Any) -> tuple[Any, jax.Array]:
+        return step(packed, (row, meet(unpack(packed).state)))
+
     def block(packed: Any, rows: Any) -> tuple[Any, Any]:
-        state, drive_state, memory, energy, count = unpack(packed)
-        start = pack((state, drive_state, memory, jnp.zeros_like(energy), count))
+        start = unpack(packed)
+        start = pack(start._replace(energy=jnp.zeros_like(start.energy)))
         last = None if rows is None else jax.tree.map(lambda x: x[-1], rows)
         if every == 1:
-            packed, ctrl = step(start, last)
+            packed, ctrl = meet_and_step(start, last)
         else:
-            packed, ctrls = jax.lax.scan(step, start, rows, length=every)
+            packed, ctrls = jax.lax.scan(meet_and_step, start, rows, length=every)
             ctrl = jax.tree.map(lambda x: x[-1], ctrls)
         state, _, _, energy, count = unpack(packed)
-        water = flow((count - 1).astype(energy.dtype) * timestep, last)
+        water = flow(clock(count - 1, energy), last)
         return packed, record(state, ctrl, energy, water)
 
     if inputs is not None:
         inputs = jax.tree.map(lambda x: x.reshape(records, every, *x.shape[1:]), inputs)
-    packed, kept = jax.lax.scan(block, pack(carry), inputs, length=records)
-    return unpack(packed)[0], kept
+    packed, kept = jax.lax.scan(block, pack(passage), inputs, length=records)
+    return unpack(packed), kept
 
 
 def flow_at(world: World, water: Water) -> Callable[[jax.Array, Any], Water]:

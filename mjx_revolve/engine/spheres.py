@@ -1,0 +1,179 @@
+"""Spheres that stand for the boxes of robots where these touch each other.
+
+Two spheres touch along the line between their centres, whatever their attitude, so contact between
+robots is a few operations, has no corner cases, and its force is the same, turned round, on both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_revolve.body.placement import turned
+from mjx_revolve.engine.assembly import Assembly
+from mjx_revolve.engine.batch import Capacity, assemble_all, order_rows
+from mjx_revolve.engine.columns import read_columns
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.inputs.errors import InputError
+
+# The least radius as a share of a box's longest half edge, so that a rod has two spheres, and a
+# plate four, which stick out of it by as much. A choice.
+_THICKNESS = 1 / 2
+
+
+class Spheres(NamedTuple):
+    """Spheres of robots, `[S, P]` each, or `[P]`; those past a robot's end have no radius.
+
+    Attributes:
+        row: body that each is fixed to: 0 is the root, k + 1 the traversal's row k; int32.
+        center: body frame, three of `[S, P]` [m].
+        radius: [m]; 0 for padding.
+        mass_center: of that body, its own frame, three of `[S, P]` [m].
+        inverse_mass: of that body, without the water that it carries [1/kg].
+        inverse_inertia: the largest of that body's about its centre of mass [1/(kg m²)].
+        reach: `[P]` how far from the core's origin any sphere can get, however hinges turn [m].
+    """
+
+    row: Any
+    center: Any
+    radius: Any
+    mass_center: Any
+    inverse_mass: Any
+    inverse_inertia: Any
+    reach: Any
+
+
+def sphere_box(half_size: Sequence[float]) -> tuple[np.ndarray, float]:
+    """Spheres for a box, all alike.
+
+    Args:
+        half_size: half edges [m].
+
+    Returns:
+        `[n, 3]` centres, box frame [m], and their radius [m]: half the edge of the cube of equal
+        volume, or a quarter of the longest edge, whichever is more. They fill the box like a grid;
+        a cube has one, which leaves out its corners.
+    """
+    half = np.asarray(half_size, float)
+    radius = max(float(np.cbrt(half.prod())), float(half.max()) * _THICKNESS)
+    if radius <= 0:
+        return np.zeros((0, 3)), 0.0
+    counts = np.maximum(np.round(half / radius), 1).astype(int)
+    lines = [h * ((2 * np.arange(n) + 1) / n - 1) for h, n in zip(half, counts, strict=True)]
+    return np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3), radius
+
+
+class _Ball(NamedTuple):
+    """Spheres of robots one behind the other: `[n]` body, `[n, 3]` centre, body frame, radius."""
+
+    body: np.ndarray
+    center: np.ndarray
+    radius: np.ndarray
+
+
+def _balls(assembly: Assembly) -> _Ball:
+    table = assembly.fluid
+    body, center, radius = [], [], []
+    known: dict[tuple[float, ...], tuple[np.ndarray, float]] = {}
+    for k, half in enumerate(map(tuple, table.half_size.tolist())):
+        if half not in known:
+            known[half] = sphere_box(half)
+        places, size = known[half]
+        body += [int(table.body[k])] * len(places)
+        center.append(table.position[k] + places @ table.rotation[k].T)
+        radius += [size] * len(places)
+    return _Ball(np.array(body, int), np.concatenate(center), np.array(radius))
+
+
+def pack_spheres(
+    robots: Sequence[Robot], capacity: Capacity, count: int = 0, dtype: Any = np.float32
+) -> Spheres:
+    """The spheres of robots, as their rows stand in `batch.pack_bodies`.
+
+    Args:
+        robots: one for each individual, from `build_robot`.
+        capacity: of the batch.
+        count: room for so many spheres; by default as many as any of these robots has.
+        dtype: of the tables.
+
+    Returns:
+        The spheres.
+
+    Raises:
+        InputError: a robot has more spheres than there is room for.
+    """
+    unique: dict[int, Robot] = {id(robot): robot for robot in robots}
+    place = {key: k for k, key in enumerate(unique)}
+    pick = np.array([place[id(robot)] for robot in robots], int)
+    assembly = assemble_all(list(unique.values()))
+    columns = read_columns(assembly)
+    order = order_rows(assembly, columns, capacity.groups)
+    balls = _balls(assembly)
+    owner, total = assembly.robot[balls.body], len(unique)
+    counts = np.bincount(owner, minlength=total)
+    room = count or int(counts.max())
+    if np.any(counts > room):
+        k = int(np.argmax(counts > room))
+        raise InputError(
+            f"robot {assembly.morphologies[k].name!r}: expected at most {room} spheres for "
+            f"contact; found {counts[k]}"
+        )
+    back = columns.frame.swapaxes(1, 2)
+    hinged = assembly.parent > 0
+    first = np.zeros(len(hinged), int)
+    first[hinged] = 1 + order.place[order.first[hinged]]
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    rank = np.arange(len(owner)) - starts[owner]
+
+    def table(values: np.ndarray) -> np.ndarray:
+        found = np.zeros((room, total), values.dtype)
+        found[rank, owner] = values
+        return found
+
+    lightest = np.linalg.eigvalsh(assembly.inertia)[:, 0]
+    inverse = lambda x: 1 / np.maximum(x, 1e-12)  # noqa: E731
+    body = balls.body
+    center = turned(back[body], balls.center)
+    middle = turned(back[body], assembly.center[body])
+    reach = np.zeros(total)
+    np.maximum.at(reach, owner, _path(assembly)[body] + _length(balls.center) + balls.radius)
+    found = Spheres(
+        row=table(first[body].astype(np.int32)),
+        center=tuple(table(center[:, i]) for i in range(3)),
+        radius=table(balls.radius),
+        mass_center=tuple(table(middle[:, i]) for i in range(3)),
+        inverse_mass=table(inverse(assembly.mass)[body]),
+        inverse_inertia=table(inverse(lightest)[body]),
+        reach=reach,
+    )
+
+    def wide(x: np.ndarray) -> np.ndarray:
+        return x.astype(dtype if x.dtype.kind == "f" else np.int32)[..., pick]
+
+    return jax.tree.map(wide, found)
+
+
+def count_spheres(robots: Sequence[Robot]) -> int:
+    """The most spheres that any of some robots has."""
+    return max(
+        (int(np.sum([len(sphere_box(h)[0]) for h in robot.fluid.half_size])) for robot in robots),
+        default=0,
+    )
+
+
+def _path(assembly: Assembly) -> np.ndarray:
+    """`[nbody]` how far each body's frame can get from its root's [m]: the links' lengths."""
+    position, _ = assembly.from_parents()
+    length = _length(position)
+    found = np.zeros(len(length))
+    for k in range(1, len(length)):  # preorder
+        if assembly.parent[k]:
+            found[k] = found[assembly.parent[k]] + length[k]
+    return found
+
+
+def _length(x: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(x, axis=-1)

@@ -1,0 +1,330 @@
+"""Robots that touch: force by hand, momentum, no passing through, worlds apart."""
+
+from functools import lru_cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from laboratory import QUICK, body, box_robot, world
+from mjx_revolve.engine.batch import fit_capacity, pack_bodies
+from mjx_revolve.engine.collisions import (
+    ALONE,
+    Touch,
+    contact_force,
+    frames_of,
+    make_meeting,
+    nearest_of,
+)
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.rows import make_rows
+from mjx_revolve.engine.spheres import pack_spheres, sphere_box
+from mjx_revolve.engine.state import State
+from mjx_revolve.engine.step import make_step_engine
+from mjx_revolve.episodes.rollout import begin, flow_at, go_on
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.flow import water_of
+
+NAMES = ("spider", "fish", "snake")
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    """What these tests compare is exact but for rounding."""
+    with jax.enable_x64(True):
+        yield
+
+
+@lru_cache(maxsize=1)
+def crowd_tables():
+    """Eight robots of three kinds in a world of nothing, the last two places empty."""
+    space = world()
+    kinds = [build_robot(body(name), space) for name in NAMES]
+    robots = [kinds[k % 3] for k in range(8)]
+    capacity = fit_capacity(robots)
+    tables = pack_bodies(robots, capacity, np.float64)
+    return space, robots, capacity, tables, pack_spheres(robots, capacity, dtype=np.float64)
+
+
+def crowd(seed: int, spread: float = 0.05):
+    """Random poses and speeds, so near each other that most overlap."""
+    _, robots, capacity, *_ = crowd_tables()
+    draw = np.random.default_rng(seed)
+    lanes, hinges = len(robots), capacity.hinges
+    quat = draw.normal(size=(4, lanes))
+    qpos = np.concatenate(
+        [
+            draw.normal(0, spread, (3, lanes)),
+            quat / np.linalg.norm(quat, axis=0),
+            draw.uniform(-0.7, 0.7, (hinges, lanes)),
+        ]
+    )
+    return jnp.asarray(qpos), jnp.asarray(draw.normal(0, 0.3, (6 + hinges, lanes)))
+
+
+@lru_cache(maxsize=4)
+def meeting_of(worlds: int = 1, tag: bool = False):
+    """(qpos, qvel, present) → frames and meeting of the crowd."""
+    space, robots, capacity, *packed = crowd_tables()
+
+    @partial(jax.jit, compiler_options=QUICK)
+    def find(packed, qpos, qvel, present):
+        tables, spheres = packed
+        rows = make_rows(space, capacity, tables, len(robots))
+        labels = jnp.arange(len(robots), dtype=qpos.dtype) if tag else None
+        meet = make_meeting(rows, spheres, present, worlds, Touch(), labels)
+        state = make_step_engine(rows, tables.plant).init(qpos, qvel)
+        return frames_of(rows, state), meet(state)
+
+    return partial(find, packed)
+
+
+def wrenches(meeting, frames) -> tuple[np.ndarray, np.ndarray]:
+    """`[rows + 1, 3, lanes]` forces and torques about the world's origin, world frame."""
+    (torque, force), (below_torque, below_force) = meeting.push
+    join = lambda a, b: np.concatenate([np.asarray(a), np.asarray(b)[:, 0]])  # noqa: E731
+    force = np.stack([join(a, b) for a, b in zip(force, below_force, strict=True)], 1)
+    torque = np.stack([join(a, b) for a, b in zip(torque, below_torque, strict=True)], 1)
+    axes = np.array(frames.axes).transpose(2, 0, 1, 3)  # world axis, then body component
+    place = np.array(frames.place).transpose(1, 0, 2)
+    force = np.einsum("rwbl,rbl->rwl", axes, force)
+    torque = np.einsum("rwbl,rbl->rwl", axes, torque) + np.cross(place, force, axis=1)
+    return force, torque
+
+
+def by_hand(qpos, qvel, frames, present) -> np.ndarray:
+    """`[lanes, 3]` force on each robot, sphere by sphere, from the law in words."""
+    space, robots, _, _, spheres = crowd_tables()
+    touch, dt, lanes = Touch(), space.timestep, len(robots)
+    axes = np.array(frames.axes).transpose(2, 3, 0, 1)
+    at = lambda x: np.array(x).transpose(1, 2, 0)  # noqa: E731
+    place, velocity, spin = at(frames.place), at(frames.velocity), at(frames.spin)
+    total = np.zeros((lanes, 3))
+
+    def ball(i, s):
+        row = spheres.row[s, i]
+        turn = axes[row, i]
+        center = np.array([x[s, i] for x in spheres.center])
+        middle = np.array([x[s, i] for x in spheres.mass_center])
+        o = place[row, i]
+        return o + turn @ center, o, o + turn @ middle, velocity[row, i], spin[row, i]
+
+    for i in range(lanes):
+        for j in range(i):
+            if not (present[i] and present[j]):
+                continue
+            found = []
+            for s in range(spheres.radius.shape[0]):
+                for t in range(spheres.radius.shape[0]):
+                    r, q = spheres.radius[s, i], spheres.radius[t, j]
+                    if r == 0 or q == 0:
+                        continue
+                    a, b = ball(i, s), ball(j, t)
+                    gap = np.linalg.norm(a[0] - b[0])
+                    if r + q - gap <= 0:
+                        continue
+                    n, d = (a[0] - b[0]) / gap, r + q - gap
+                    point = b[0] + (q - d / 2) * n
+                    v = a[3] + np.cross(a[4], point - a[1]) - b[3] - np.cross(b[4], point - b[1])
+                    inverse, slip_inverse = 0.0, 0.0
+                    for (_, _, middle, *_), k, m in ((a, s, i), (b, t, j)):
+                        arm = point - middle
+                        mass, turn = spheres.inverse_mass[k, m], spheres.inverse_inertia[k, m]
+                        inverse += mass + np.sum(np.cross(arm, n) ** 2) * turn
+                        slip_inverse += mass + arm @ arm * turn
+                    found.append((d, n, v, inverse, slip_inverse))
+            for d, n, v, inverse, slip_inverse in found:
+                share = 0.5 / len(found)
+                m, slip_m = share / inverse, share / slip_inverse
+                c = 2 * touch.damping * np.sqrt(touch.stiffness * m)
+                c = (dt * touch.stiffness + c) * min(d / 5e-4, 1)
+                speed = -v @ n
+                f = (touch.stiffness * d + c * speed) / (1 + dt * c / m)
+                if f <= 0:
+                    continue
+                slip = v + speed * n
+                grip = touch.friction * f / np.sqrt(slip @ slip + 1e-6)
+                force = f * n - grip / (1 + dt * grip / slip_m) * slip
+                total[i] += force
+                total[j] -= force
+    return total
+
+
+def test_spheres_of_known_boxes():
+    centers, radius = sphere_box((0.02, 0.02, 0.02))
+    assert radius == pytest.approx(0.02) and np.allclose(centers, 0)
+    # A rod has two, side by side; a plate four.
+    centers, radius = sphere_box((0.04, 0.01, 0.01))
+    assert radius == pytest.approx(0.02)
+    assert sorted(centers[:, 0]) == pytest.approx([-0.02, 0.02])
+    assert len(sphere_box((0.03, 0.03, 0.001))[0]) == 4
+    assert len(sphere_box((0.0, 0.0, 0.0))[0]) == 0
+
+
+def test_force_at_rest_is_the_springs():
+    """dt to 0, no speed: k d along the normal, and nothing apart."""
+    still = (0.0, 0.0, 0.0)
+    up = (0.0, 0.0, 1.0)
+    force = contact_force(Touch(), jnp.float64(0.003), up, still, 1.0, 1.0, 1e-9)
+    assert np.allclose(force, (0, 0, 2000 * 0.003), rtol=1e-6)
+    assert np.allclose(contact_force(Touch(), jnp.float64(-0.1), up, still, 1.0, 1.0, 1e-3), 0)
+
+
+def test_friction_is_coulombs_against_the_slip():
+    """At 1 m/s the creep speed matters by 5e-7; dt to 0."""
+    slip = (1.0, 0.0, 0.0)
+    force = contact_force(Touch(), jnp.float64(0.003), (0.0, 0.0, 1.0), slip, 1.0, 1.0, 1e-9)
+    assert np.allclose(force, (-0.4 * 6, 0, 6), rtol=1e-5)
+
+
+def test_a_contact_stops_no_more_than_its_mass():
+    """However stiff and long a step: what comes at 1 m/s with 10 g is at most brought to rest,
+    and pushed out of the depth within one step."""
+    for dt in (1e-3, 1e-2, 0.1):
+        hard = Touch(stiffness=1e9)
+        force = contact_force(
+            hard, jnp.float64(0.01), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0), 0.01, 0.01, dt
+        )
+        after = -1 + dt * float(force[2]) / 0.01
+        assert -1e-6 <= after <= 0.01 / dt + 1e-6
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_forces_are_equal_and_opposite_and_as_by_hand(seed):
+    """Sums over all robots vanish to rounding; each robot's is that of a plain double loop."""
+    present = np.array([True] * 6 + [False] * 2)
+    qpos, qvel = crowd(seed)
+    frames, meeting = meeting_of()(qpos, qvel, jnp.asarray(present))
+    force, torque = wrenches(meeting, frames)
+    size = np.abs(force).max()
+    assert size > 1  # they do touch
+    assert np.abs(force.sum((0, 2))).max() < 1e-12 * size
+    assert np.abs(torque.sum((0, 2))).max() < 1e-12 * size
+    expected = by_hand(qpos, qvel, frames, present)
+    assert np.all(expected[6:] == 0) and np.all(np.abs(expected[:6]).max(1) > 0)
+    # 1e-6² under the root of a distance shifts a depth by 1e-11 m.
+    assert np.allclose(force.sum(0).T, expected, atol=1e-6 * size)
+
+
+def test_worlds_do_not_feel_each_other():
+    """Two worlds of four in the same places: each as if the other were not there."""
+    qpos, qvel = crowd(3)
+    every = np.ones(8, bool)
+    frames, both = meeting_of(worlds=2)(qpos, qvel, jnp.asarray(every))
+    force, _ = wrenches(both, frames)
+    for half in (slice(0, 4), slice(4, 8)):
+        alone = np.zeros(8, bool)
+        alone[half] = True
+        frames, one = meeting_of()(qpos, qvel, jnp.asarray(alone))
+        expected, _ = wrenches(one, frames)
+        assert np.abs(expected[..., half]).max() > 1
+        assert np.allclose(force[..., half], expected[..., half], rtol=1e-12, atol=1e-12)
+
+
+def test_who_is_nearest():
+    draw = np.random.default_rng(0)
+    place = draw.normal(size=(3, 12))
+    present = draw.random(12) < 0.7
+    present[6:] = False
+    present[7] = True  # the only one of its world
+    tags = np.arange(12.0) + 1
+    toward, tag = nearest_of(tuple(map(jnp.asarray, place)), 2, present, jnp.asarray(tags))
+    toward = np.array(toward)
+    for k in range(6):
+        others = [j for j in range(6) if present[j] and j != k]
+        best = min(others, key=lambda j: np.sum((place[:, j] - place[:, k]) ** 2))
+        if present[k]:
+            assert np.allclose(toward[:, k], place[:, best] - place[:, k])
+            assert tag[k] == tags[best]
+    assert np.allclose(toward[:, 7], (0, 0, ALONE)) and tag[7] == 0
+
+
+@lru_cache(maxsize=8)
+def duel(dt: float):
+    """Two boxes of .1 m and .3 kg without hinges: (positions and velocities at the start) → along
+    the way, every other step for a second."""
+    space = world(timestep=dt)
+    robots = [box_robot((0.1, 0.1, 0.1), mass, space) for mass in (0.3, 0.6)]
+    capacity = fit_capacity(robots)
+    tables = pack_bodies(robots, capacity, np.float64)
+    spheres = pack_spheres(robots, capacity, dtype=np.float64)
+
+    @partial(jax.jit, compiler_options=QUICK)
+    def run(packed, qpos, qvel):
+        tables, spheres = packed
+        rows = make_rows(space, capacity, tables, 2)
+        meet = make_meeting(rows, spheres, jnp.ones(2, bool), 1, Touch())
+        engine = make_step_engine(rows, tables.plant, meet=meet)
+        still = jnp.zeros((tables.plant.num_rows, 2))
+        state = engine.init(qpos, qvel)
+        _, kept = go_on(
+            engine,
+            lambda state, time, row, sense: (state, still),
+            flow_at(space, water_of(space)),
+            lambda state, ctrl, energy, water: engine.observe(state),
+            begin(engine, state, ()),
+            None,
+            records=round(0.5 / dt),
+            every=2,
+            timestep=dt,
+        )
+        return kept
+
+    return partial(run, (tables, spheres)), np.array([0.3, 0.6])
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.01])
+@pytest.mark.parametrize("speed", [0.1, 0.5])
+def test_boxes_meet_without_passing_and_keep_momentum(dt, speed):
+    """Off centre, so that friction and torque act: momentum kept to rounding, energy only lost."""
+    run, mass = duel(dt)
+    qpos = np.zeros((7, 2))
+    qpos[0], qpos[1], qpos[3] = (-0.06, 0.06), (0.0, 0.03), 1
+    qvel = np.zeros((6, 2))
+    qvel[0] = (speed, -speed)
+    q, v = map(np.asarray, run(jnp.asarray(qpos), jnp.asarray(qvel)))
+    momentum = (mass * v[:, :3]).sum(-1)
+    assert np.allclose(momentum, (mass * qvel[:3]).sum(-1), atol=1e-14)
+    inertia = mass * 0.1**2 / 6  # of cubes, so that attitude does not matter
+    turning = inertia * v[:, 3:6]  # body frame; both turn about z only
+    orbit = np.cross(q[:, :3], mass[None, None] * v[:, :3], axis=1)
+    start = np.cross(qpos[:3], mass * qvel[:3], axis=0).sum(-1)
+    spun = (turning + orbit).sum(-1)
+    # Position steps after velocity: dt v × F dt, of first order in dt.
+    assert np.abs(spun[:, :2]).max() < 1e-14 and np.allclose(spun[:, 2], start[2], atol=1e-12)
+    energy = (0.5 * mass * (v[:, :3] ** 2).sum(1) + 0.5 * inertia * (v[:, 3:] ** 2).sum(1)).sum(-1)
+    assert energy.max() < 0.5 * (mass * qvel[0] ** 2).sum() * (1 + 1e-9)
+    gap = q[:, :3, 1] - q[:, :3, 0]
+    # Never deeper than a third of the two radii together, and apart again at the end.
+    assert np.linalg.norm(gap, axis=1).min() > 0.1 * 2 / 3
+    assert np.dot(gap[-1], (v[-1, :3, 1] - v[-1, :3, 0])) > 0
+
+
+def test_without_others_nothing_changes():
+    """A meeting of robots out of each other's reach leaves every bit as it is."""
+    space, _, capacity, tables, spheres = crowd_tables()
+    qpos, qvel = crowd(0)
+    qpos = qpos.at[0].add(3.0 * jnp.arange(8))
+
+    @partial(jax.jit, static_argnums=1, compiler_options=QUICK)
+    def run(packed, meet: bool):
+        tables, spheres = packed
+        rows = make_rows(space, capacity, tables, 8)
+        meeting = make_meeting(rows, spheres, jnp.ones(8, bool), 1, Touch()) if meet else None
+        engine = make_step_engine(rows, tables.plant, meet=meeting)
+        state = engine.init(qpos, qvel)
+        assert isinstance(state, State)
+        pushes = (engine.meet(state).push,) if meet else ()
+        ctrl = jnp.zeros((tables.plant.num_rows, 8))
+        return engine.observe(engine.step(state, ctrl, water_of(space), *pushes)[0])
+
+    packed = tables, spheres
+    for a, b in zip(run(packed, True), run(packed, False), strict=True):
+        assert np.allclose(a, b, rtol=1e-13, atol=1e-13)
+
+
+def test_too_many_spheres_are_refused_by_name():
+    _, robots, capacity, *_ = crowd_tables()
+    with pytest.raises(InputError, match=r"robot 'spider': expected at most 5 spheres .* found 33"):
+        pack_spheres(robots, capacity, count=5)
