@@ -98,7 +98,7 @@ class Observer:
             if self._keeps(sensor):
                 blank = jax.tree.map(jnp.zeros_like, self._shapes(sensor, like))
                 kept = tuple(blank for _ in range(self._kept(sensor)))
-                found.append((jnp.full((), -1, like.dtype), kept))
+                found.append((jnp.full(like.shape[1:], -1, like.dtype), kept))
         return tuple(found)
 
     def observe(
@@ -188,11 +188,11 @@ class Observer:
 
             fresh.append(jax.tree.map(pick, new, old, values))
         if len(fresh) == 1:
-            return (count, tuple(fresh)), fresh[0]
+            return (jnp.broadcast_to(count, last.shape), tuple(fresh)), fresh[0]
         wanted = jnp.maximum(jnp.floor((time - sensor.delay) * self._rate(sensor) + _DUE), 0)
         oldest = count - wanted > len(fresh) - 1.5
         given = jax.tree.map(lambda a, b: jnp.where(oldest, a, b), fresh[-1], fresh[-2])
-        return (count, tuple(fresh)), given
+        return (jnp.broadcast_to(count, last.shape), tuple(fresh)), given
 
 
 def make_observer(sensors: Sequence[Sensor] | None, timestep: float) -> Observer:
