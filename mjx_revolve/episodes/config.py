@@ -25,7 +25,8 @@ from pydantic import (
 )
 
 from mjx_revolve.body.sensors import SensorRow
-from mjx_revolve.episodes.bodies_config import BodiesConfig
+from mjx_revolve.episodes.bodies_config import BodiesConfig, LearningConfig, SelectionConfig
+from mjx_revolve.episodes.colony_config import ColonyConfig
 from mjx_revolve.episodes.config_paths import resolve_paths
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.episodes.settings import Section, Settings, one_of
@@ -279,10 +280,14 @@ class Config(Settings):
     task: TaskConfig
     bodies: BodiesConfig | None = None
     """How bodies evolve; without it only the controller of the one `morphology` does."""
+    colony: ColonyConfig | None = None
+    """How they live together in one world, without generations; without it each is tried alone."""
     evolution: EvolutionConfig = EvolutionConfig()
 
     @model_validator(mode="after")
     def _check(self) -> Config:
+        if self.colony is not None:
+            self._check_colony()
         if self.bodies is None:
             if self.morphology is None:
                 what = "the path of a morphology YAML, or bodies: how they evolve"
@@ -302,6 +307,21 @@ class Config(Settings):
                 what = f"{usual!r}, as bodies evolve (see bodies.selection and bodies.learning)"
                 raise MisfitError(f"evolution.{name}", what, repr(found))
         return self
+
+    def _check_colony(self) -> None:
+        """Refuses what a colony has no use for."""
+        if self.bodies is None:
+            raise MisfitError("bodies", "how bodies evolve, as there is a colony", "nothing")
+        for name, usual in (("learning", LearningConfig()), ("selection", SelectionConfig())):
+            if getattr(self.bodies, name) != usual:
+                what = "nothing, as in a colony who meets has children, and nobody is taught"
+                raise MisfitError(f"bodies.{name}", what, "some settings")
+        if self.bodies.archive is not None:
+            raise MisfitError("bodies.archive", "none, as there is a colony", "one")
+        assert self.colony is not None
+        if self.colony.birth.initial > self.evolution.population_size:
+            most = f"at most evolution.population_size ({self.evolution.population_size})"
+            raise MisfitError("colony.birth.initial", most, str(self.colony.birth.initial))
 
     _source: str = PrivateAttr("config")
     _written: dict[str, Any] = PrivateAttr(default_factory=dict)

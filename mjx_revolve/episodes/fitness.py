@@ -546,6 +546,8 @@ def make_mixed_fitness(
         figures.append(figures[0]._replace(length=longest, sinks=sinks))
     reach = max(farthest(config.task, world, figure) for figure in figures)
     touches = may_touch_bed(task, config.task, world, reach)
+    if config.colony is not None:  # who lives long gets anywhere
+        touches = world.bed is not None
     shown = [*robots, *_show_kinds(kinds, robots, hinges)]
     capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules)
     example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant

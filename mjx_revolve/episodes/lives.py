@@ -21,6 +21,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import LARGEST
 
 INDIVIDUALS, GENERATIONS = "individuals.jsonl", "generations.jsonl"
+EVENTS = "events.jsonl"
 
 
 @dataclass(frozen=True, eq=False)

@@ -349,13 +349,13 @@ def _best(individuals: Sequence[Individual]) -> tuple[Individual, ...]:
     return tuple(known[k] for k in order(scores, numbers)[:NUM_ELITES])
 
 
-def judge(config: Config, pool: Pool, search: BodySearch) -> Champion:
+def judge(config: Config, pool: Pool, elites: Sequence[Individual]) -> Champion:
     """Judges the elites on fresh starts, as `loop.choose_champion` judges genes.
 
     Args:
         config: the seed.
         pool: as evolution used it.
-        search: the finished search.
+        elites: of the finished search, best first.
 
     Returns:
         The champion.
@@ -364,7 +364,7 @@ def judge(config: Config, pool: Pool, search: BodySearch) -> Champion:
         InputError: every life failed.
     """
     fitness: BodyFitness = pool.fitness
-    if not search.elites:
+    if not elites:
         raise InputError("champion: expected an individual with a score; found none: all failed")
     root = jax.random.key(config.evolution.seed)
 
@@ -382,8 +382,8 @@ def judge(config: Config, pool: Pool, search: BodySearch) -> Champion:
 
         return score_afresh(score, jax.random.fold_in(root, stream), episodes)
 
-    means = fresh(search.elites, CHOOSE_STREAM, CHOOSE_EPISODES)[0].mean(0)
-    winner = search.elites[int(np.argmax(means))]
+    means = fresh(elites, CHOOSE_STREAM, CHOOSE_EPISODES)[0].mean(0)
+    winner = elites[int(np.argmax(means))]
     scores, measures = fresh([winner], REPORT_STREAM, REPORT_EPISODES)
     return Champion(
         genes=np.array(winner.genes, np.float32),

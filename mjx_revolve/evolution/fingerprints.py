@@ -53,6 +53,8 @@ def settings_hash(config: Config) -> str:
             del data[section]["params"]
     if not data["task"]["measures"]:  # likewise
         del data["task"]["measures"]
+    if data["colony"] is None:  # likewise
+        del data["colony"]
     if data["bodies"] is None:
         del data["bodies"]
     else:

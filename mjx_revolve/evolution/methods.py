@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.lives import GENERATIONS, INDIVIDUALS
-from mjx_revolve.evolution import coevolution, loop
-from mjx_revolve.evolution.individuals import to_text
+from mjx_revolve.episodes.lives import EVENTS, GENERATIONS, INDIVIDUALS
+from mjx_revolve.evolution import coevolution, colony, loop
+from mjx_revolve.evolution.individuals import Individual, to_text
 from mjx_revolve.evolution.loop import Champion
 from mjx_revolve.evolution.pool import Pool
 from mjx_revolve.evolution.runs import Run
@@ -53,6 +53,8 @@ def make_method(config: Config, pool: Pool) -> Method:
     Raises:
         InputError: a strategy, a selection or a name of a figure is wrong.
     """
+    if config.colony is not None:
+        return _of_colony(config, pool)
     return _of_genes(config, pool) if config.bodies is None else _of_bodies(config, pool)
 
 
@@ -79,26 +81,33 @@ def _of_genes(config: Config, pool: Pool) -> Method:
     )
 
 
+def _save_best_body(run: Run, best: Individual) -> None:
+    """Writes an individual as the champion so far."""
+    run.save_champion(
+        np.array(best.genes, np.float32), best.body, score=best.score, final=False,
+        origin=f"{coevolution.describe_origin(best)}, {_UNJUDGED}", individual=best.number,
+    )  # fmt: skip
+
+
+def _living_line(search: Any) -> str:
+    """A line of JSON that says who is alive."""
+    living = [individual.number for individual in search.living]
+    return json.dumps({"generation": search.generation, "living": living}, separators=(",", ":"))
+
+
 def _of_bodies(config: Config, pool: Pool) -> Method:
     coevolution.check_bodies(config, pool)
     fitness = pool.fitness
 
     def record(run: Run, search: coevolution.BodySearch) -> None:
         run.append_lines(INDIVIDUALS, (to_text(i, fitness.genotype) for i in search.newborn))
-        living = [individual.number for individual in search.living]
-        line = {"generation": search.generation, "living": living}
-        run.append_lines(GENERATIONS, [json.dumps(line, separators=(",", ":"))])
+        run.append_lines(GENERATIONS, [_living_line(search)])
 
     def save_best(run: Run, search: coevolution.BodySearch) -> None:
         if search.archive is not None:
             run.write("archive.csv", coevolution.archive_table(search).encode())
-        if not search.elites:
-            return
-        best = search.elites[0]
-        run.save_champion(
-            np.array(best.genes, np.float32), best.body, score=best.score, final=False,
-            origin=f"{coevolution.describe_origin(best)}, {_UNJUDGED}", individual=best.number,
-        )  # fmt: skip
+        if search.elites:
+            _save_best_body(run, search.elites[0])
 
     return Method(
         start=lambda: coevolution.start_search(config),
@@ -107,5 +116,37 @@ def _of_bodies(config: Config, pool: Pool) -> Method:
         from_arrays=lambda arrays: coevolution.search_from_arrays(config, fitness, arrays),
         record=record,
         save_best=save_best,
-        judge=lambda search: coevolution.judge(config, pool, search),
+        judge=lambda search: coevolution.judge(config, pool, search.elites),
+    )
+
+
+def _of_colony(config: Config, pool: Pool) -> Method:
+    fitness, last = pool.fitness, config.evolution.generations
+    colony.make_colony_tank(config, fitness)  # says what is wrong with the world
+
+    def record(run: Run, search: colony.Colony) -> None:
+        # A life is written down when it begins, and again when it is over; the later line counts.
+        told = [*search.born, *search.died]
+        if search.generation == last:
+            told += search.living
+        run.append_lines(INDIVIDUALS, (to_text(i, fitness.genotype) for i in told))
+        run.append_lines(GENERATIONS, [_living_line(search)])
+        run.append_lines(EVENTS, (json.dumps(e, separators=(",", ":")) for e in search.events))
+
+    def elites(search: colony.Colony) -> tuple[Individual, ...]:
+        """Where nobody has lived long enough to be known, who seems best."""
+        return search.elites or colony.best_of(search.living)
+
+    def save_best(run: Run, search: colony.Colony) -> None:
+        if best := elites(search):
+            _save_best_body(run, best[0])
+
+    return Method(
+        start=colony.Colony,
+        advance=lambda search: colony.colony_of(config, pool, search),
+        to_arrays=lambda search: colony.colony_to_arrays(config, fitness, search),
+        from_arrays=lambda arrays: colony.colony_from_arrays(config, fitness, arrays),
+        record=record,
+        save_best=save_best,
+        judge=lambda search: coevolution.judge(config, pool, elites(search)),
     )

@@ -198,7 +198,7 @@ def choose_workers(config: Config) -> int:
     from mjx_revolve.evolution.blocks import block_size
 
     block = block_size(config.task.trials)
-    if block is None:
+    if block is None or config.colony is not None:  # a world is stepped as a whole
         return 1
     blocks = -(-config.evolution.population_size // block)
     if config.bodies is not None:

@@ -6,6 +6,7 @@
     checkpoints/       the newest few, one npz each
     individuals.jsonl  where bodies evolve: one line for each individual, as it was born and lived
     generations.jsonl  likewise: one line per generation: who is alive
+    events.jsonl       of a colony: births, matings and deaths, with time and place
     champion/          genes.yaml, morphology.yaml, robot.xml
     fitness.png, trajectory.png, swim.png, bodies.png
 
@@ -28,7 +29,7 @@ import yaml
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.config import Config, dump_config, load_config
-from mjx_revolve.episodes.lives import GENERATIONS, INDIVIDUALS, Life, find_lives
+from mjx_revolve.episodes.lives import EVENTS, GENERATIONS, INDIVIDUALS, Life, find_lives
 from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.evolution.checkpoints import (
     Checkpoint,
@@ -48,7 +49,7 @@ try:
 except ImportError:  # not on Windows: there, nothing keeps two processes off one folder
     fcntl = None  # type: ignore[assignment]
 
-LOGS = (INDIVIDUALS, GENERATIONS)
+LOGS = (INDIVIDUALS, GENERATIONS, EVENTS)
 """Files that only grow, a line at a time; a run that goes on cuts them to its checkpoint."""
 # A folder with nothing else was begun by a process that died while making it.
 _BEGINNING = {"inputs", "checkpoints", ".lock", "run.json"}

@@ -1,0 +1,128 @@
+"""The part of a configuration that says how a colony lives: robots that evolve in one world.
+
+After Revolve's online evolution (the "triangle of life": Eiben et al. 2013, ECAL), whose numbers
+are the order of magnitude of those here: 10 to 75 robots, meeting within 1 m, 2 to 6 children a
+pair, clinics 2 to 4 m across.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Le, Unit
+from pydantic import model_validator
+
+from mjx_revolve.episodes.settings import Settings
+from mjx_revolve.inputs.schema import MisfitError, NonNegative, Positive, Row, Share, Vector, Whole
+
+
+class ArenaConfig(Settings):
+    """Where a colony lives: a square of water around the world's origin."""
+
+    size: Annotated[Positive, Unit("m")] = 16.0
+    """Edge of the square [m]."""
+    depth: Annotated[Positive, Unit("m")] = 6.0
+    """Robots whose cores sink below this are lost [m]."""
+    edge: Literal["wrap", "lost"] = "wrap"
+    """Who leaves the square comes back in on the other side (`wrap`), or is lost."""
+
+
+class BirthConfig(Settings):
+    """Where and when robots are born."""
+
+    radius: Annotated[NonNegative, Unit("m")] = 2.0
+    """Of the clinic, a disc around the world's origin, at the task's depth [m]."""
+    attempts: Annotated[Whole, Ge(1)] = 5
+    """Places that are tried for a new robot; where all are taken it waits for the next interval."""
+    gestation: Annotated[NonNegative, Unit("s")] = 60.0
+    """From mating to birth, while both parents mate with nobody else [s]."""
+    initial: Annotated[Whole, Ge(1)] = 16
+    """Robots at the beginning, all over the arena."""
+    least: Annotated[Whole, Ge(0)] = 8
+    """Where fewer are alive, strangers without parents are born."""
+
+
+class MatingConfig(Settings):
+    """Who has children."""
+
+    distance: Annotated[Positive, Unit("m")] = 1.0
+    """Between cores, at which two robots meet [m]."""
+    likeness: Share = 0.5
+    """The less fit one needs at least this share of the other's fitness [-]."""
+    adult: Annotated[NonNegative, Unit("s")] = 60.0
+    """Age from which robots mate [s]."""
+    children: Annotated[Whole, Ge(1)] = 4
+    """Most children of one pair."""
+
+
+class LifeConfig(Settings):
+    """Fitness, and how long robots live."""
+
+    window: Annotated[Positive, Unit("s")] = 60.0
+    """Fitness is measured over the last so many seconds, or since birth [s]."""
+    net: NonNegative = 5.0
+    """Weight of the net displacement's speed [s/m]."""
+    path: NonNegative = 1.0
+    """Weight of the path's speed [s/m]."""
+    limit: Annotated[Positive, Unit("m/s")] = 1.0
+    """Whoever is faster along its path is thrown about, not swimming: fitness 0 [m/s]."""
+    max_age: Annotated[Positive, Unit("s")] = 1800.0
+    """Nobody lives longer [s]."""
+    full_fitness: Annotated[Positive, Unit("-")] = 0.1
+    """From this fitness c on, robots live that long; with a fitness f below it f/c of it [-]."""
+    childhood: Annotated[NonNegative, Unit("s")] = 120.0
+    """Nobody dies of age before this one [s]."""
+
+
+class EnergyConfig(Settings):
+    """What robots live on: batteries, and places in the water where they are charged."""
+
+    start: Annotated[Positive, Unit("J")] = 20.0
+    """Charge at birth [J]."""
+    capacity: Annotated[Positive, Unit("J")] = 40.0
+    """Of a battery [J]."""
+    idle: Annotated[NonNegative, Unit("W")] = 0.01
+    """What a robot takes beside the work of its motors [W]."""
+    chargers: Row[Vector] = ()
+    """Where they are, world frame [m]; the target that sensors tell of is the nearest."""
+    power: Annotated[NonNegative, Unit("W")] = 2.0
+    """Of a charger, shared by all who are near it [W]."""
+    most: Annotated[NonNegative, Unit("W")] = 0.2
+    """What a robot gets at most [W]."""
+    reach: Annotated[Positive, Unit("m")] = 1.0
+    """Beyond this distance r it gets less, as (r/d)² [m]."""
+
+
+class ColonyConfig(Settings):
+    """How a colony lives.
+
+    `evolution.population_size` is how many there may be at a time, and `evolution.generations` how
+    many intervals it lives.
+    """
+
+    interval: Annotated[Positive, Le(600), Unit("s")] = 10.0
+    """Births, deaths and matings take effect every so often [s]."""
+    look: Annotated[Positive, Unit("s")] = 0.5
+    """How often it is looked who meets, and where everybody is [s]."""
+    touch: bool = True
+    """Whether robots touch each other, or pass through."""
+    arena: ArenaConfig = ArenaConfig()
+    birth: BirthConfig = BirthConfig()
+    mating: MatingConfig = MatingConfig()
+    life: LifeConfig = LifeConfig()
+    energy: EnergyConfig | None = None
+    """What robots live on; without it they need nothing."""
+
+    @model_validator(mode="after")
+    def _check(self) -> ColonyConfig:
+        if self.look > self.interval:
+            raise MisfitError(
+                "look", f"at most the interval ({self.interval:g} s)", f"{self.look:g}"
+            )
+        if 2 * self.birth.radius > self.arena.size:
+            wide = f"at most half of the arena's size ({self.arena.size / 2:g} m)"
+            raise MisfitError("birth.radius", wide, f"{self.birth.radius:g}")
+        if self.energy is not None and self.energy.start > self.energy.capacity:
+            most = f"at most the capacity ({self.energy.capacity:g} J)"
+            raise MisfitError("energy.start", most, f"{self.energy.start:g}")
+        return self
