@@ -509,7 +509,7 @@ class _Commune:
         trail: Trail,
         now: float,
     ) -> tuple[dict[int, Citizen], tuple[Pregnancy, ...]]:
-        """Pairs of those who have met, the nearest first."""
+        """Pairs of those who have met, the nearest first, as long as there is room for a child."""
         mating, birth = self.colony.mating, self.colony.birth
         ready = [
             n for n, c in citizens.items()
@@ -524,11 +524,14 @@ class _Commune:
         first, second = np.nonzero(np.triu(nearest <= mating.distance, 1))
         taken: set[int] = set()
         found = list(pregnancies)
+        room = self.config.evolution.population_size - len(citizens)
         for k in np.lexsort((second, first, nearest[first, second])):
             pair = ready[first[k]], ready[second[k]]
             one, other = (citizens[n] for n in pair)
             scores = one.individual.score, other.individual.score
             have = one.children.get(pair[1], 0)
+            if len(found) >= room:
+                break
             if taken & set(pair) or have >= mating.children:
                 continue
             if min(scores) < mating.likeness * max(scores):
