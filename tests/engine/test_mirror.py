@@ -1,0 +1,185 @@
+"""Mirror images: a robot, its start and its gait mirrored swim the mirror image, to rounding."""
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from laboratory import QUICK, ROOT
+from mjx_revolve import build_robot, load_morphology, load_world
+from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.engine.step import make_population_engine
+from mjx_revolve.numerics.xla import share_once
+from mjx_revolve.water.flow import water_of
+
+# Sines and sums in another order: some hundred steps of float64.
+ROUNDING = 1e-12
+
+
+@lru_cache(maxsize=8)
+def load(name, **world):
+    return build_robot(
+        load_morphology(ROOT / "morphologies" / f"{name}.yaml"), load_world("lake", **world)
+    )
+
+
+class Mirror:
+    """What mirroring about the plane across an axis (0: x, 1: y) does to a robot's coordinates."""
+
+    def __init__(self, robot, axis):
+        model = robot.mj_model
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        self.flip = np.ones(3)
+        self.flip[axis] = -1
+        anchors, axes = data.xanchor[1:] - data.xpos[1], data.xaxis[1:]
+        # An axis of rotation is mirrored as a spin is.
+        apart = np.linalg.norm(anchors * self.flip - anchors[:, None], axis=-1)
+        self.twin = apart.argmin(0)
+        self.sign = np.einsum("ij,ij->i", -axes * self.flip, axes[self.twin])
+        assert apart.min(0).max() < 1e-9, "the robot is not symmetric"
+        np.testing.assert_allclose(abs(self.sign), 1.0, atol=1e-9)
+
+    def hinges(self, x):
+        """`[..., n]` angles, speeds or targets."""
+        image = np.empty_like(x)
+        image[..., self.twin] = x * self.sign
+        return image
+
+    def pose(self, qpos):
+        """`[..., nq]`; a quaternion's vector part is mirrored as a spin is."""
+        moved, w, spun = qpos[..., :3], qpos[..., 3:4], qpos[..., 4:7]
+        return np.concatenate(
+            [moved * self.flip, w, -spun * self.flip, self.hinges(qpos[..., 7:])], -1
+        )
+
+    def velocity(self, qvel):
+        """`[..., nv]`."""
+        moved, spun = qvel[..., :3], qvel[..., 3:6]
+        return np.concatenate(
+            [moved * self.flip, -spun * self.flip, self.hinges(qvel[..., 6:])], -1
+        )
+
+
+@lru_cache(maxsize=8)
+def swimmer(robot):
+    engine, water = make_population_engine(robot, contact=False), water_of(robot.world)
+
+    def step(state, row):
+        state, _ = engine.step(state, row, water)
+        return state, engine.observe(state)[0]
+
+    def run(qpos, qvel, ctrl):
+        return jax.lax.scan(share_once(step), engine.init(qpos, qvel), ctrl)[1]
+
+    return engine, jax.jit(run, compiler_options=QUICK)
+
+
+def swim(robot, qpos, qvel, ctrl):
+    """Lanes side by side, `[lanes, nq]`, `[lanes, nv]`, `[lanes, T, nu]` → `[lanes, T, nq]`."""
+    engine, run = swimmer(robot)
+    with jax.enable_x64(True):
+        own = np.asarray(ctrl)[..., actuators_of(robot)].transpose(2, 1, 0)
+        asked = jnp.moveaxis(engine.plant.arrange(jnp.asarray(own)), 0, 1)  # [T, nu, lanes]
+        way = run(jnp.asarray(qpos).T, jnp.asarray(qvel).T, asked)
+        return np.moveaxis(np.asarray(way), -1, 0)
+
+
+@pytest.mark.parametrize(
+    "name, axes, world",
+    [
+        ("spider", (0, 1), {}),
+        pytest.param("fish", (0,), {"current": (0.0, 0.1, 0.0)}, marks=pytest.mark.slow),
+        pytest.param("gecko", (0,), {"drag": "lift_drag"}, marks=pytest.mark.slow),
+    ],
+)
+def test_the_mirror_image_swims_the_mirror_image(name, axes, world):
+    """From anywhere, tumbling, half out of the water: nothing in the step has a handedness."""
+    robot, draw = load(name, **world), np.random.default_rng(3)
+    count, steps = robot.mj_model.nu, 200
+    qpos = robot.start_qpos(-0.03)
+    qpos[3:7] = draw.normal(size=4)
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    qpos[7:] = 0.5 * draw.normal(size=count)
+    qvel = 0.5 * draw.normal(size=6 + count)
+    phase = 2 * np.pi * 1.5 * robot.world.timestep * np.arange(steps)[:, None]
+    ctrl = draw.uniform(0.3, 1.5, count) * np.sin(phase + draw.uniform(-3, 3, count))
+    mirrors = [Mirror(robot, axis) for axis in axes]
+    ways = swim(
+        robot,
+        np.stack([qpos, *(m.pose(qpos) for m in mirrors)]),
+        np.stack([qvel, *(m.velocity(qvel) for m in mirrors)]),
+        np.stack([ctrl, *(m.hinges(ctrl) for m in mirrors)]),
+    )
+    assert np.abs(ways[0, -1, :3] - qpos[:3]).max() > 0.05
+    for way, mirror in zip(ways[1:], mirrors, strict=True):
+        np.testing.assert_allclose(way, mirror.pose(ways[0]), atol=ROUNDING)
+
+
+def test_mirrored_limbs_keep_a_spider_in_its_plane():
+    """Left limbs beat as the right ones do: no sideways drift, no yaw, no roll."""
+    robot = load("spider")
+    mirror, draw = Mirror(robot, 0), np.random.default_rng(5)
+    time = robot.world.timestep * np.arange(200)
+    # Three gaits, as many lanes as above: they share a program.
+    ctrl = np.sin(2 * np.pi * time[:, None] + draw.uniform(-3, 3, (3, 1, robot.mj_model.nu)))
+    ctrl = (ctrl + mirror.hinges(ctrl)) / 2
+    start = np.repeat(robot.start_qpos()[None], 3, 0)
+    ways = swim(robot, start, np.zeros((3, robot.mj_model.nv)), ctrl)
+    assert np.abs(ways[..., 1:3] - start[0, 1:3]).max() > 0.01
+    # x, and the quaternion's y and z, which turn out of the plane.
+    assert np.abs(ways[..., [0, 5, 6]]).max() < ROUNDING
+
+
+CYCLES, BEAT = 14, 1.0  # [-, s]
+
+
+def beat(robot, share=None):
+    """`[T, 3]` of the fish's tail: each half-period mirrors the one before."""
+    time = robot.world.timestep * np.arange(round(CYCLES * BEAT / robot.world.timestep))
+    ctrl = 0.5 * np.sin(2 * np.pi * time[:, None] / BEAT - 0.6 * np.arange(3))
+    return ctrl if share is None else ctrl * np.minimum(time / share, 1.0)[:, None]
+
+
+def course_of(way, robot):
+    """Ways over the last cycles `[2, 3]` [m], and their angles from straight ahead [rad]."""
+    steps = round(BEAT / robot.world.timestep)
+    ends = way[[-2 * steps - 1, -steps - 1, -1], :3]
+    moved = np.diff(ends, axis=0)
+    return moved, np.arctan2(-moved[:, 0], moved[:, 1])
+
+
+def test_a_symmetric_beat_goes_straight_once_it_has_begun():
+    """Sideways drift is a straight way at the angle that the first strokes from rest have left."""
+    robot = load("fish")
+    steps = round(BEAT / robot.world.timestep)
+    ctrl = np.stack([beat(robot), -beat(robot), beat(robot, share=8.0)])
+    ways = swim(
+        robot, np.repeat(robot.start_qpos()[None], 3, 0), np.zeros((3, robot.mj_model.nv)), ctrl
+    )
+    (moved, course), (_, other), (_, slow) = (course_of(way, robot) for way in ways)
+    # The tail's second half-period mirrors its first; this one's start is all but forgotten.
+    later, hinges = ways[0][-1, 7:], ways[0][-1 - steps // 2, 7:]
+    np.testing.assert_allclose(later, -hinges, atol=1e-4)
+    assert abs(course[1] - course[0]) < 3e-4  # [rad] in a cycle: what is left of the start
+    assert moved[1, 1] > 0.02
+    assert 1e-4 < moved[1, 0] < 1e-3  # .37 mm sideways in a cycle, on a way of 22 mm
+    # Begun with the other stroke, the way is the mirror image; begun gently, straight ahead.
+    np.testing.assert_allclose(other, -course, atol=ROUNDING)
+    assert abs(slow[1]) < abs(course[1]) / 10
+
+
+@pytest.mark.slow
+def test_the_course_converges_with_the_time_step():
+    """It is of the first strokes, not of the step: halved steps change it less and less."""
+    found = []
+    for step in (0.005, 0.0025, 0.00125, 0.000625):
+        robot = load("fish", timestep=step)
+        way = swim(robot, robot.start_qpos()[None], np.zeros((1, 9)), beat(robot)[None])[0]
+        found.append(course_of(way, robot)[1][1])
+    change = np.abs(np.diff(found))
+    assert (change[1:] < 0.8 * change[:-1]).all()
+    assert change[-1] < 0.05 * abs(found[-1])
