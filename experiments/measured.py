@@ -1,0 +1,212 @@
+"""Our water beside what others have measured: tables and pictures, nothing tuned.
+
+``python -m experiments.measured [--quick] [--out DIR]``
+
+Bodies and numbers are published ones (`measured.yaml`, `measured_data.py`); `measured_cases.py`
+asks the engine for the same. `docs/measured.md` discusses the result.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.common import make_folder, make_parser
+from mjx_revolve.body.table import align
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.files import short_path, write_atomic
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from experiments.measured_cases import Found, Row
+
+HEADINGS = ("case", "quantity", "measured", "ours", "ours / measured", "unit")
+_GREY = "#6b7680"
+
+
+def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+    """The table's rows, headings first."""
+    cells = [
+        (r.case, r.what, f"{r.measured:.3g}", f"{r.ours:.3g}", f"{r.ratio:.2f}", r.unit)
+        for r in rows
+    ]
+    return [HEADINGS, *cells]
+
+
+def _pair() -> tuple[Any, Any, Any]:
+    """A figure with two axes beside each other."""
+    from mjx_revolve.view.plots import WIDE, new_figure
+
+    figure = new_figure(WIDE, 3.6)
+    left, right = figure.subplots(1, 2)
+    return figure, left, right
+
+
+def _finish(*all_axes: Any, legends: bool = True) -> None:
+    from mjx_revolve.view.plots import dress
+
+    for axes in all_axes:
+        dress(axes)
+        if legends and axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize=8)
+
+
+def draw_drag(steady: Found, oscillating: Found) -> Any:
+    """C_d of bodies in a steady flow, and of a plate in an oscillating one."""
+    from experiments.measured_data import plate_drag
+    from mjx_revolve.view.plots import COLORS, head
+
+    figure, left, right = _pair()
+    place = np.arange(len(steady.rows))[::-1]
+    left.barh(place + 0.2, [r.measured for r in steady.rows], 0.36, color=_GREY, label="measured")
+    left.barh(place - 0.2, [r.ours for r in steady.rows], 0.36, color=COLORS[0], label="ours")
+    left.set_yticks(place, [r.what for r in steady.rows], fontsize=8)
+    left.set_xlabel("$C_d$ on the frontal area", fontsize=9)
+    head(left, "steady drag")
+    number, ours = oscillating.lines["faces"]
+    fine = np.geomspace(number[0], number[-1], 100)
+    right.plot(fine, [plate_drag(x) for x in fine], color=_GREY, label="measured (fit)")
+    right.plot(number, ours, "o-", color=COLORS[0], label="ours", markersize=4)
+    right.axvspan(5, 15, color=COLORS[4], alpha=0.12, linewidth=0)
+    right.text(8.6, 0.15, "limbs", fontsize=8, ha="center", color="#8a6000")
+    right.set_xscale("log")
+    right.set_xticks([3, 5, 10, 30, 100], ["3", "5", "10", "30", "100"])
+    right.minorticks_off()
+    right.set_ylim(0, None)
+    right.set_xlabel("Keulegan-Carpenter number $U T / b$", fontsize=9)
+    right.set_ylabel("$C_d$", fontsize=9)
+    head(right, "a plate across an oscillating flow")
+    _finish(left, right)
+    left.grid(visible=False, axis="y")
+    return figure
+
+
+def draw_polars(found: Found) -> Any:
+    """Lift and drag coefficients of plates over their angle of attack."""
+    from experiments.measured_data import POLARS
+    from mjx_revolve.view.plots import COLORS, head
+
+    figure, left, right = _pair()
+    for axes, what in ((left, "lift"), (right, "drag")):
+        for color, mark, polar in zip((COLORS[0], COLORS[1]), "os", POLARS, strict=True):
+            angle, ours = found.lines[polar.module, what]
+            shown = angle <= 45
+            name = f"aspect ratio {polar.aspect:g}"
+            axes.plot(angle[shown], ours[shown], color=color, label=f"ours, {name}")
+            axes.plot(polar.angle, getattr(polar, what), mark, color=color, markersize=4.5,
+                      label=f"measured, {name}")  # fmt: skip
+        axes.set_xlabel("angle of attack (deg)", fontsize=9)
+        axes.set_ylabel(f"$C_{what[0]}$", fontsize=9)
+        head(axes, f"{what} of flat plates")
+    _finish(left, right)
+    if len(right.get_lines()) == 4:
+        # Both aspect ratios have the same drag to us.
+        right.get_lines()[2].set_linestyle((0, (4, 4)))
+        right.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def draw_rov(found: Found) -> Any:
+    """Drag over speed, and added mass, of a remotely operated vehicle."""
+    from experiments.measured_data import ROV_DRAG
+    from mjx_revolve.view.plots import COLORS, head
+
+    figure, left, right = _pair()
+    for color, (name, (linear, square)) in zip(COLORS, ROV_DRAG.items(), strict=False):
+        speed, ours = found.lines[name]
+        left.plot(speed, (linear + square * speed) * speed, color=color, linestyle="--",
+                  label=f"identified, {name}")  # fmt: skip
+        left.plot(speed, ours, color=color, label=f"ours, {name}")
+    left.set_xlabel("speed (m/s)", fontsize=9)
+    left.set_ylabel("drag (N)", fontsize=9)
+    head(left, "BlueROV2 Heavy: drag")
+    rows = [r for r in found.rows if r.unit == "kg"]
+    place = np.arange(len(rows))
+    right.bar(place - 0.2, [r.measured for r in rows], 0.36, color=_GREY, label="identified")
+    right.bar(place + 0.2, [r.ours for r in rows], 0.36, color=COLORS[0], label="ours")
+    right.set_xticks(place, [r.what.rsplit(" ", 1)[1] for r in rows], fontsize=9)
+    right.set_ylabel("added mass (kg)", fontsize=9)
+    head(right, "added mass")
+    _finish(left, right)
+    right.grid(visible=False, axis="x")
+    return figure
+
+
+def draw_section(found: Found) -> Any:
+    """Heave and roll of a ship's section in regular waves."""
+    from experiments.measured_data import (
+        SECTION_BREADTH,
+        SECTION_FREE,
+        SECTION_HELD,
+        WAVE_AMPLITUDE,
+    )
+    from mjx_revolve.view.plots import COLORS, head
+
+    figure, left, right = _pair()
+    steepness = lambda xi: np.degrees(2 * xi / SECTION_BREADTH * WAVE_AMPLITUDE)  # noqa: E731
+    scales = {"heave": lambda xi: 1e3 * WAVE_AMPLITUDE, "roll": steepness}
+    words = {"heave": "heave / wave amplitude", "roll": "roll / wave slope"}
+    for axes, (what, scale) in zip((left, right), scales.items(), strict=True):
+        xi, ours = found.lines[what]
+        axes.plot(xi, ours / scale(xi), "-", color=COLORS[0], label="ours")
+        for mark, fill, label, runs in (
+            ("o", "#3b3b3b", "measured, free", SECTION_FREE),
+            ("o", "white", "measured, one motion held", SECTION_HELD),
+        ):
+            some = [(m.xi, getattr(m, what)) for m in runs if getattr(m, what) is not None]
+            at, value = np.array(some).T
+            axes.plot(at, value / scale(at), mark, color="#3b3b3b", markerfacecolor=fill,
+                      markersize=5, label=label)  # fmt: skip
+        axes.set_xlabel("$\\xi = \\omega^2 B / 2 g$", fontsize=9)
+        axes.set_ylabel(words[what], fontsize=9)
+        head(axes, f"a ship's section in waves: {what}")
+    _finish(left, right)
+    return figure
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Asks the engine, prints the table, writes `measured.csv` and the pictures."""
+    parser = make_parser("measured", "Our water beside what others have measured.")
+    parser.add_argument("--quick", action="store_true", help="without the section in waves")
+    options = parser.parse_args(argv)
+    folder = make_folder(options.out, "measured")
+
+    from mjx_revolve.numerics.runtime import prepare_process
+
+    prepare_process()
+    from experiments import measured_cases as cases
+    from mjx_revolve.view.plots import figure_png
+
+    steady, swung = cases.steady_drag(), cases.oscillating()
+    plates, vehicle = cases.polars(), cases.rov()
+    figures = {
+        "measured_drag": draw_drag(steady, swung),
+        "measured_plates": draw_polars(plates),
+        "measured_rov": draw_rov(vehicle),
+    }
+    rows = [*steady.rows, cases.sinking_plate(), *swung.rows, *plates.rows, *vehicle.rows]
+    if not options.quick:
+        floats = cases.section()
+        rows += floats.rows
+        figures["measured_section"] = draw_section(floats)
+    lines = table(rows)
+    print("\n".join(align([lines[0], ("",) * len(HEADINGS), *lines[1:]], left=(0, 1))))
+    for law in cases.LAWS[1:]:
+        numbers = ", ".join(f"{r.ours:.2f} {r.what}" for r in cases.steady_drag(law).rows)
+        print(f"steady C_d by drag: {law}: {numbers}")
+    text = io.StringIO()
+    csv.writer(text).writerows(lines)
+    write_atomic(folder / "measured.csv", text.getvalue().encode())
+    for name, figure in figures.items():
+        write_atomic(folder / f"{name}.png", figure_png(figure))
+    names = ", ".join(["measured.csv", *(f"{name}.png" for name in figures)])
+    print(f"\nwritten: {names} in {short_path(folder)}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main))
