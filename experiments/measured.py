@@ -110,6 +110,34 @@ def draw_polars(found: Found) -> Any:
     return figure
 
 
+def draw_coins(found: Found) -> Any:
+    """Speeds of coins that fall, and where they land."""
+    from experiments.measured_data import COINS, VISCOSITY
+    from mjx_revolve.view.plots import COLORS, head
+
+    figure, left, right = _pair()
+    place = np.arange(len(COINS))
+    names = [f"{coin.module.removeprefix('Coin')} Kč" for coin in COINS]
+    rows = {unit: [r for r in found.rows if r.unit == unit] for unit in ("m/s", "cm")}
+    left.plot(place, [c.speed for c in COINS], "o", color="#3b3b3b", label="measured, mean track")
+    left.plot(place, [c.reynolds * VISCOSITY / c.diameter for c in COINS], "o", color="#3b3b3b",
+              markerfacecolor="white", label="measured, from Reynolds numbers")  # fmt: skip
+    left.plot(place, [r.ours for r in rows["m/s"]], "s", color=COLORS[0], label="ours")
+    left.set_ylim(0, 0.7)
+    left.set_ylabel("speed (m/s)", fontsize=9)
+    head(left, "coins that fall")
+    right.bar(place - 0.2, [c.landing for c in COINS], 0.36, color=_GREY, label="measured")
+    right.bar(place + 0.2, [r.ours for r in rows["cm"]], 0.36, color=COLORS[0], label="ours")
+    right.set_yscale("log")
+    right.set_ylim(0.05, 90)
+    right.set_ylabel("distance from the plumb line (cm)", fontsize=9)
+    head(right, "where they land")
+    for axes in (left, right):
+        axes.set_xticks(place, names, fontsize=9)
+    _finish(left, right)
+    return figure
+
+
 def draw_rov(found: Found) -> Any:
     """Drag over speed, and added mass, of a remotely operated vehicle."""
     from experiments.measured_data import ROV_DRAG
@@ -182,13 +210,21 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.view.plots import figure_png
 
     steady, swung = cases.steady_drag(), cases.oscillating()
-    plates, vehicle = cases.polars(), cases.rov()
+    plates, falls, vehicle = cases.polars(), cases.coins(), cases.rov()
     figures = {
         "measured_drag": draw_drag(steady, swung),
         "measured_plates": draw_polars(plates),
+        "measured_coins": draw_coins(falls),
         "measured_rov": draw_rov(vehicle),
     }
-    rows = [*steady.rows, cases.sinking_plate(), *swung.rows, *plates.rows, *vehicle.rows]
+    rows = [
+        *steady.rows,
+        cases.sinking_plate(),
+        *swung.rows,
+        *plates.rows,
+        *falls.rows,
+        *vehicle.rows,
+    ]
     if not options.quick:
         floats = cases.section()
         rows += floats.rows

@@ -139,7 +139,7 @@ def steady_drag(law: str = "faces", speed: float = 0.3) -> Found:
 
 
 def sinking_plate() -> Row:
-    """Terminal speed of a square plate that falls broadside, 2 kg on 0.1 m, by the steps."""
+    """Terminal speed of a square plate that sinks broadside, 1 kg on 0.1 m, by the steps."""
     world = tank(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
     robot = body("SquarePlate", world)
     edge = sizes(robot)
@@ -173,6 +173,52 @@ def polars(speed: float = 0.5) -> Found:
                     name = f"{what}, aspect {polar.aspect:g}, {angle}°"
                     rows.append(Row("plates at an angle", name, value, ours, "-"))
     return Found(rows, lines)
+
+
+# ------------------------------------------------------------------------- coins that fall
+
+DROPS = 64
+TILT = 5.0  # by which they may be off the level when let go, standard deviation [deg]; a choice
+
+
+def fall(coin: data.Coin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drops of a coin in 38 cm of water.
+
+    Args:
+        coin: which.
+
+    Returns:
+        `[T]` time [s], `[T]` depth of the mean track [m], `[DROPS]` how far from where they were
+        let go they land [m].
+    """
+    world = tank(
+        gravity=G, buoyancy="partial", drag="faces", added_mass=True, density=998.0,
+        timestep=0.001,
+    )  # fmt: skip
+    robot, draw = body(coin.module, world), np.random.default_rng(0)
+    qpos, qvel = start(robot, DROPS, -float(sizes(robot)[2]))
+    qpos[4:6] = np.radians(TILT) / 2 * draw.normal(size=(2, DROPS))
+    qpos[3:7] /= np.linalg.norm(qpos[3:7], axis=0)
+    time, q, _ = march(robot, 1.5, qpos, qvel, every=5)
+    depth, away = -q[:, 2], np.hypot(q[:, 0], q[:, 1])
+    landed = [np.interp(0.38, d, a) for d, a in zip(depth.T, away.T, strict=True)]
+    return time, depth.mean(1), np.array(landed)
+
+
+def coins() -> Found:
+    """How fast coins fall, and how far from the plumb line they land."""
+    rows = []
+    for coin in data.COINS:
+        time, depth, landed = fall(coin)
+        first, last = np.interp((0.1, 0.3), depth, time)
+        name = coin.module.removeprefix("Coin")
+        rows.append(Row(_COIN, f"speed, {name} Kč", coin.speed, 0.2 / (last - first), "m/s"))
+        away = 100 * float(np.median(landed))
+        rows.append(Row(_COIN, f"landing, {name} Kč", coin.landing, away, "cm"))
+    return Found(rows)
+
+
+_COIN = "coins that fall"
 
 
 # ------------------------------------------------------------------------- oscillating plates

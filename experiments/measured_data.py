@@ -68,6 +68,41 @@ ratios .5 and 1, Reynolds number 1.4·10⁵. As read off their figures, rounded,
 thomasfox/boatcalculator, hulls/flatPlate_140000_ar05.txt and _ar1.txt (commit 2a2c776)."""
 
 
+# ------------------------------------------------------------------------- coins that fall
+
+
+class Coin(NamedTuple):
+    """A coin that is let go flat at the surface of a tank.
+
+    Attributes:
+        module: its type in measured.yaml.
+        diameter: [m].
+        speed: downwards between 10 and 30 cm of depth, of the mean track of all drops [m/s].
+        reynolds: with the diameter, as the authors give it from their own speeds [-].
+        landing: median distance from where it was let go, at the bottom in 38 cm [cm].
+    """
+
+    module: str
+    diameter: float
+    speed: float
+    reynolds: float
+    landing: float
+
+
+COINS = (
+    Coin("Coin2", 0.0215, 0.409, 9337, 16.4),
+    Coin("Coin5", 0.0230, 0.440, 10488, 16.1),
+    Coin("Coin10", 0.0245, 0.512, 11760, 15.1),
+    Coin("Coin50", 0.0275, 0.475, 10904, 14.3),
+)
+"""O. Novotný, Autumn Coin, 16 to 19 drops each, in the repository ondrej-cloud/autumn-coin (MIT):
+README.md (masses, diameters, landings), results/*/TRACKING_data_*.csv (mean tracks, from which we
+took the times at 10 and 30 cm), analysis/phase_diagram.py (Reynolds numbers); commits 48096c2 and
+12fee40. Of two more coins, 1 and 20 Kč, tracks and Reynolds numbers differ by a factor of two: left
+out. The tank's walls stood 16 and 19 cm away."""
+VISCOSITY = 1.0e-6  # kinematic, of water at 20 °C [m²/s]
+
+
 # ------------------------------------------------------------------------- oscillating plates
 
 

@@ -60,6 +60,15 @@ def test_plates_drag_too_little_beyond_fifteen_degrees(polars):
             assert 0.4 < share < 0.7
 
 
+@pytest.mark.slow
+def test_coins_fall_as_fast_as_measured_and_far_too_straight():
+    for row in measured_cases.coins().rows:
+        if row.unit == "m/s":
+            assert 0.9 < row.ratio < 1.25
+        else:
+            assert row.ratio < 0.05  # they do not glide: faces have no lift
+
+
 def test_an_oscillating_plate_drags_several_times_too_little():
     found = measured_cases.oscillating((8, 30, 120))
     # Whatever the number: ours knows no vortices that stay with the plate.
@@ -84,10 +93,14 @@ def test_a_vehicles_outer_box_says_its_drag_and_added_mass_within_a_factor_of_fo
 def test_pictures_and_the_table(steady, polars, vehicle):
     swung = measured_cases.Found([], {"faces": (np.array([3.0, 120.0]), np.ones(2))})
     line = np.array([0.5, 1.0]), np.ones(2)
+    coins = [
+        measured_cases.Row("coins", "a coin", 1.0, 1.0, u) for u in ("m/s", "cm") for _ in range(4)
+    ]
     section = measured_cases.Found([], {"heave": line, "roll": line})
     for figure in (
         measured.draw_drag(steady, swung),
         measured.draw_polars(polars),
+        measured.draw_coins(measured_cases.Found(coins)),
         measured.draw_rov(vehicle),
         measured.draw_section(section),
     ):
@@ -116,5 +129,6 @@ def test_the_command(tmp_path, capsys):
     assert "ours / measured" in capsys.readouterr().out
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
-        "measured.csv", "measured_drag.png", "measured_plates.png", "measured_rov.png",
+        "measured.csv", "measured_coins.png", "measured_drag.png", "measured_plates.png",
+        "measured_rov.png",
     }  # fmt: skip
