@@ -1,8 +1,8 @@
 """Contact between robots: a penalty law between spheres, equal and opposite on both.
 
-Side by side in one batch stand one or several worlds with equally many places for robots. Which
-robots are near each other follows from where their cores are; only those are looked at closely, a
-few pairs at a time, however many there are.
+Side by side in one batch stand one or several worlds with equally many places for robots. A list of
+pairs of spheres that are nearer than a skin is made now and then, and is good until something may
+have moved by half of that (Verlet 1967, Physical Review 159); in between, only those are looked at.
 """
 
 from __future__ import annotations
@@ -31,9 +31,17 @@ from mjx_revolve.numerics.spatial import (
 )
 from mjx_revolve.numerics.xla import share_once, small_call
 
-# Pairs of robots that are looked at together: enough for vector registers, few enough that two
-# robots that meet do not pay for a crowd. A choice.
-_PAIRS = 4
+# How far apart spheres may be that are watched [m], and balls around robots. What swims moves half
+# the one way in some tens of milliseconds. Choices, measured to be about the best for a crowd.
+_SKIN, _AURA = 0.08, 0.3
+# By how much faster something may become while nobody looks: within a step. A choice.
+_HASTE = 1.2
+# Pairs of robots that are looked at together, pairs of spheres that they may add to the list, and
+# pairs of spheres that are pushed together: enough for vector registers, few enough that two robots
+# that meet do not pay for a crowd. Choices.
+_PAIRS, _FOUND, _PUSHED = 4, 512, 64
+# Room in the list for so many pairs of spheres to a robot; more than heaps have. A choice.
+_ROOM = 64
 # The damper fades in over this depth [m], so that touching is no jump in force; as for the bed.
 _FADE = 5e-4
 # Below this speed [m/s] friction is viscous, as Coulomb's law has no value at rest; likewise.
@@ -151,7 +159,7 @@ def contact_force(
 
 
 class _Side(NamedTuple):
-    """The spheres of one robot of each pair: `[B, S]` each, world frame.
+    """One sphere of each pair, `[n]` each, world frame.
 
     Attributes:
         place: of the centre [m].
@@ -175,10 +183,6 @@ class _Side(NamedTuple):
     inverse_mass: jax.Array
     inverse_inertia: jax.Array
 
-    def along(self, axis: int) -> _Side:
-        """The same with a further axis, for the other robot's spheres."""
-        return jax.tree.map(lambda x: jnp.expand_dims(x, axis), self)
-
     def velocity_at(self, point: Vec) -> Vec:
         """Of the body where it touches [m/s]."""
         return vadd(self.velocity, cross(self.spin, vsub(point, self.origin)))
@@ -191,50 +195,67 @@ class _Side(NamedTuple):
         return along, self.inverse_mass + dot(arm, arm) * self.inverse_inertia
 
 
-def _side(frames: Frames, spheres: Spheres, lane: jax.Array) -> _Side:
-    own = jax.tree.map(lambda x: jnp.moveaxis(x[..., lane], -1, 0), spheres)
-    pick = lambda x: jnp.take_along_axis(x[:, lane].T, own.row, 1)  # noqa: E731
-    found = jax.tree.map(pick, frames)
-    place = lambda x: vadd(found.place, matvec(found.axes, x))  # noqa: E731
-    return _Side(
-        place(own.center), found.place, place(own.mass_center), found.velocity, found.spin,
-        found.axes, own.radius, own.inverse_mass, own.inverse_inertia,
-    )  # fmt: skip
+def _depth(one: _Side, other: _Side) -> jax.Array:
+    """How deep spheres are in each other [m]."""
+    apart = vsub(one.place, other.place)
+    return one.radius + other.radius - jnp.sqrt(dot(apart, apart) + _TINY**2)
 
 
-def _depth(one: _Side, other: _Side, real: jax.Array) -> jax.Array:
-    """`[B, S, S]` how deep spheres are in each other [m]; -1 where a pair or a sphere is none."""
-    a, b = one.along(2), other.along(1)
-    apart = vsub(a.place, b.place)
-    meet = real[:, None, None] & (a.radius > 0) & (b.radius > 0)
-    return jnp.where(meet, a.radius + b.radius - jnp.sqrt(dot(apart, apart) + _TINY**2), -1.0)
+def _collide(touch: Touch, one: _Side, other: _Side, share: jax.Array, dt: float) -> Any:
+    """Wrenches of spheres on the bodies of both, as `contact_force` has them.
 
-
-def _collide(touch: Touch, one: _Side, other: _Side, depth: jax.Array, dt: float) -> jax.Array:
-    """Wrenches of B pairs of robots on each other, from how deep their spheres are in each other.
-
-    Returns:
-        `[2, B, S, 6]` torque and force about the bodies' origins, their frames.
+    `share` is that of the reduced mass which each contact may stop. Returns torque and force about
+    the bodies' origins, their frames, six of `[n]` for each side.
     """
-    a, b = one.along(2), other.along(1)
-    apart = vsub(a.place, b.place)
+    apart = vsub(one.place, other.place)
     normal = vscale(1 / jnp.sqrt(dot(apart, apart) + _TINY**2), apart)
+    depth = _depth(one, other)
     # Amid what both share; the same point for both, so that angular momentum is kept.
-    point = vadd(b.place, vscale(b.radius - 0.5 * depth, normal))
-    velocity = vsub(a.velocity_at(point), b.velocity_at(point))
-    inverse = vadd(a.inverse_at(point, normal), b.inverse_at(point, normal))
-    # Contacts of two robots share what may be stopped.
-    share = _SHARE / jnp.maximum(jnp.sum(depth > 0, (1, 2), keepdims=True), 1)
+    point = vadd(other.place, vscale(other.radius - 0.5 * depth, normal))
+    velocity = vsub(one.velocity_at(point), other.velocity_at(point))
+    inverse = vadd(one.inverse_at(point, normal), other.inverse_at(point, normal))
     mass, slip_mass = (share / x for x in inverse)
     force = contact_force(touch, depth, normal, velocity, mass, slip_mass, dt)
 
-    def wrench(side: _Side, origin: Vec, axis: int, sign: float) -> jax.Array:
-        torque = cross(vsub(point, origin), force)
-        summed = [sign * jnp.sum(x, axis) for x in (*torque, *force)]
-        turned = matTvec(side.axes, tuple(summed[:3])), matTvec(side.axes, tuple(summed[3:]))
-        return jnp.stack([*turned[0], *turned[1]], -1)
+    def wrench(side: _Side, force: Vec) -> tuple[Scalar, ...]:
+        torque = cross(vsub(point, side.origin), force)
+        return (*matTvec(side.axes, torque), *matTvec(side.axes, force))
 
-    return jnp.stack([wrench(one, a.origin, 2, 1.0), wrench(other, b.origin, 1, -1.0)])
+    return wrench(one, force), wrench(other, tuple(-x for x in force))
+
+
+class Watch(NamedTuple):
+    """Pairs of spheres that are near each other.
+
+    Attributes:
+        first: `[n]` int32 the one of each pair: its robot's place times S and its number.
+        second: `[n]` the other one.
+        many: how many there are, int32.
+        gap: least distance between two of them then [m].
+        close: `[lanes]` robots that others are near to.
+        moved: how far anything of those may have moved since then [m]; infinite before.
+        strayed: likewise of all robots.
+    """
+
+    first: jax.Array
+    second: jax.Array
+    many: jax.Array
+    gap: jax.Array
+    close: jax.Array
+    moved: jax.Array
+    strayed: jax.Array
+
+
+class Meet(NamedTuple):
+    """What robots of one world do to each other.
+
+    Attributes:
+        start: state → what is watched before the first step: nothing.
+        look: (state, what is watched) → (`Meeting`, what is watched).
+    """
+
+    start: Callable[[State], Any]
+    look: Callable[[State, Any], tuple[Meeting, Any]]
 
 
 class Meeting(NamedTuple):
@@ -311,8 +332,8 @@ def make_meeting(
     worlds: int = 1,
     touch: Touch | None = None,
     tag: jax.Array | None = None,
-) -> Callable[[State], Meeting]:
-    """What robots of one world do to each other, as a function of their state.
+) -> Meet:
+    """What robots of one world do to each other, as functions of their state.
 
     Under `jax.jit`, let the robots' tables and spheres be arguments, not constants: XLA:CPU aborts
     over constants here (see `numerics.xla`).
@@ -327,62 +348,260 @@ def make_meeting(
             near.
 
     Returns:
-        state → `Meeting`. A loop of unknown length: it has forward derivatives only.
+        The functions. There are loops of unknown length in them: they have forward derivatives
+        only.
     """
-    dt = rows.world.timestep
+    contact = None if touch is None else _Contact(rows, spheres, present, worlds, touch)
 
-    def meet(state: State) -> Meeting:
-        push = _push(state) if touch is not None else ()
+    def start(state: State) -> Any:
+        return () if contact is None else contact.start(state)
+
+    def look(state: State, watch: Any) -> tuple[Meeting, Any]:
+        push = ()
+        if contact is not None:
+            push, watch = contact.push(state, watch)
         if tag is None:
-            return Meeting(push)
-        return Meeting(push, *nearest_of(state.position, worlds, present, tag))
+            return Meeting(push), watch
+        return Meeting(push, *nearest_of(state.position, worlds, present, tag)), watch
 
-    def _push(state: State) -> Any:
-        assert touch is not None
-        lanes, dtype = rows.lanes, state.position[0].dtype
+    return Meet(start, look)
+
+
+class _Contact:
+    """Contact of robots; arguments as of `make_meeting`."""
+
+    def __init__(
+        self, rows: Rows, spheres: Spheres, present: jax.Array, worlds: int, touch: Touch
+    ) -> None:
+        lanes = rows.lanes
         own = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), spheres)
-        square, reach = distances(state.position, worlds, present), own.reach.reshape(worlds, -1)
-        near = square < (reach[:, :, None] + reach[:, None, :]) ** 2
-        n = near.shape[-1]
+        self.rows, self.own, self.present, self.worlds = rows, own, present, worlds
+        self.touch, self.dt, self.size = touch, rows.world.timestep, own.row.shape[0]
+        self.room = _ROOM * lanes
+        # Of each sphere, robot after robot: the row of its body's frame, and its numbers.
+        lane = jnp.arange(lanes, dtype=jnp.int32)
+        self.frame_of = (own.row * lanes + lane).T.reshape(-1)
+        numbers = (*own.center, *own.mass_center, own.radius, own.inverse_mass, own.inverse_inertia)
+        self.numbers = jnp.stack([x.T.reshape(-1) for x in numbers])
+        far = jnp.sqrt(dot(own.center, own.center))
+        count = rows.capacity.rows + 1
+        # How far from its frame's origin any sphere of a body is.
+        self.radius = jnp.zeros((count, lanes), far.dtype).at[own.row, lane].max(far)
+
+    def start(self, state: State) -> Watch:
+        """Nothing is known yet."""
+        nothing = jnp.zeros(self.room + _FOUND, jnp.int32)
+        moved = jnp.full((), jnp.inf, state.position[0].dtype)
+        return Watch(nothing, nothing, jnp.int32(0), moved, self.present, moved, moved)
+
+    def push(self, state: State, watch: Watch) -> tuple[Any, Watch]:
+        """Pushes of all contacts, as `Meeting.push`, and what is watched."""
+        frames = frames_of(self.rows, state)
+        stale = (watch.moved > _SKIN / 2) | (watch.strayed > _AURA / 2)
+        watch = jax.lax.cond(stale, lambda: self._find(frames, watch), lambda: watch)
+        shape = self.radius.shape
+        nothing = jnp.zeros((6, shape[0] * shape[1]), self.radius.dtype)
+        total = jax.lax.cond(
+            watch.gap < 2 * watch.moved,
+            lambda: self._add_up(frames, watch, nothing),
+            lambda: nothing,
+        )
+        parts = [total[k].reshape(shape) for k in range(6)]
+        root, below = (tuple(x[:1] for x in parts), tuple(x[1:, None] for x in parts))
+        pace = jnp.sqrt(dot(frames.velocity, frames.velocity))
+        pace = jnp.max(pace + self.radius * jnp.sqrt(dot(frames.spin, frames.spin)), 0)
+        # Robots that are no numbers move nobody.
+        way = jnp.where(self.present & jnp.isfinite(pace), _HASTE * self.dt * pace, 0)
+        watch = watch._replace(
+            moved=watch.moved + jnp.max(jnp.where(watch.close, way, 0)),
+            strayed=watch.strayed + jnp.max(way),
+        )
+        return ((root[:3], root[3:]), (below[:3], below[3:])), watch
+
+    # --- which spheres are near each other
+
+    def _find(self, frames: Frames, watch: Watch) -> Watch:
+        """The list anew; where it has no room for what is near, of what touches, at every step."""
+        place, near, close = self._balls(frames)
+        skin = jnp.asarray(_SKIN, self.radius.dtype)
+        found, whole = self._spheres(place, near, skin, watch)
+        zero, never = jnp.zeros_like(watch.moved), jnp.full_like(watch.moved, jnp.inf)
+        found = found._replace(close=close, moved=zero, strayed=zero)
+
+        def only_touching() -> Watch:
+            few, _ = self._spheres(place, near, jnp.zeros_like(skin), watch)
+            return few._replace(close=close, moved=never, strayed=never)
+
+        return jax.lax.cond(whole, lambda: found, only_touching)
+
+    def _balls(self, frames: Frames) -> tuple[Vec, jax.Array, jax.Array]:
+        """Where all spheres are, which robots may touch, and which have others near them.
+
+        Returns:
+            `[S, lanes]` each, `[worlds, n, n]` and `[lanes]`.
+        """
+        own, n = self.own, self.rows.lanes // self.worlds
+        pick = lambda x: jnp.take_along_axis(x, own.row, 0)  # noqa: E731
+        axes = jax.tree.map(pick, frames.axes)
+        place = vadd(jax.tree.map(pick, frames.place), matvec(axes, own.center))
+        real = own.radius > 0
+        # A ball around each robot as it is bent now.
+        count = jnp.maximum(jnp.sum(real, 0), 1)
+        middle = tuple(jnp.sum(jnp.where(real, x, 0), 0) / count for x in place)
+        away = vsub(place, middle)
+        reach = jnp.max(jnp.where(real, jnp.sqrt(dot(away, away)) + own.radius, 0), 0)
+        square, reach = distances(middle, self.worlds, self.present), reach.reshape(-1, n)
+        both = reach[:, :, None] + reach[:, None, :]
+        close = jnp.any(square < (both + _AURA) ** 2, 1).reshape(-1)
+        return place, square < (both + _SKIN) ** 2, close
+
+    def _spheres(
+        self, place: Vec, near: jax.Array, skin: jax.Array, watch: Watch
+    ) -> tuple[Watch, jax.Array]:
+        """The pairs of spheres that are nearer than a skin, and whether these are all."""
+        lanes, n = self.rows.lanes, near.shape[-1]
         near = (near & jnp.triu(jnp.ones((n, n), bool), 1)).reshape(-1)
-        number = jnp.arange(near.size, dtype=jnp.int32)
-        end = jnp.int32(near.size)
+        number, end = jnp.arange(near.size, dtype=jnp.int32), jnp.int32(near.size)
+        # Robot after robot: what is picked of one lies side by side. Padding is far from touching.
+        place = tuple(x.T for x in place)
+        radius = jnp.where(self.own.radius > 0, self.own.radius, -1e3).T
 
         def after(last: jax.Array) -> jax.Array:
             return jnp.min(jnp.where(near & (number > last), number, end))
 
-        def close(state: State) -> jax.Array:
-            frames = frames_of(rows, state)
+        def block(carry: Any) -> Any:
+            start, first, second, total, whole, gap = carry
+            some = [start]
+            for _ in range(_PAIRS - 1):
+                some.append(after(some[-1]))
+            ids = jnp.stack(some)
+            base = ids // (n * n) * n
+            pair = base + ids // n % n, base + ids % n
+            one, other = (jnp.minimum(x, lanes - 1) for x in pair)
+            apart = tuple(x[one][:, :, None] - x[other][:, None, :] for x in place)
+            least = radius[one][:, :, None] + radius[other][:, None, :] + skin
+            square, real = dot(apart, apart), (ids < end)[:, None, None]
+            close = (square < least * jnp.abs(least)) & real
 
-            def block(carry: tuple[jax.Array, jax.Array]) -> Any:
-                found, total = [carry[0]], carry[1]
-                for _ in range(_PAIRS - 1):
-                    found.append(after(found[-1]))
-                ids = jnp.stack(found)
-                real = ids < end
-                ids = jnp.where(real, ids, 0)
-                base = ids // (n * n) * n
-                pair = jnp.stack([base + ids // n % n, base + ids % n])
-                one, other = (_side(frames, own, lane) for lane in pair)
-                depth = _depth(one, other, real)
+            def nearest() -> jax.Array:
+                found = jnp.where(close, jnp.sqrt(square) - (least - skin), jnp.inf)
+                return jnp.minimum(gap, jnp.min(found))
 
-                def collide(total: jax.Array) -> jax.Array:
-                    row = jnp.moveaxis(own.row, -1, 0)[pair]
-                    lane = jnp.broadcast_to(pair[..., None], row.shape)
-                    return total.at[row, lane].add(_collide(touch, one, other, depth, dt))
+            def append() -> Any:
+                row, column, count = _list_true(close.reshape(-1, self.size), _FOUND)
+                k = row // self.size
+                a, b = one[k] * self.size + row % self.size, other[k] * self.size + column
+                room = jnp.minimum(jnp.minimum(count, _FOUND), self.room - total)
+                return (
+                    jax.lax.dynamic_update_slice(first, a, (total,)),
+                    jax.lax.dynamic_update_slice(second, b, (total,)),
+                    total + room,
+                    whole & (room == count),
+                    nearest(),
+                )
 
-                # Most robots that are near each other do not touch.
-                total = jax.lax.cond(jnp.any(depth > 0), collide, lambda x: x, total)
-                return after(found[-1]), total
+            kept = first, second, total, whole, gap
+            kept = jax.lax.cond(jnp.any(close), append, lambda: kept)
+            return after(some[-1]), *kept
 
-            start = after(jnp.int32(-1)), nothing
-            return jax.lax.while_loop(lambda x: x[0] < end, block, start)[1]
+        carry = (
+            after(jnp.int32(-1)), watch.first, watch.second, jnp.int32(0), jnp.bool_(True),
+            jnp.full_like(watch.gap, jnp.inf),
+        )  # fmt: skip
+        _, first, second, total, whole, gap = jax.lax.while_loop(lambda x: x[0] < end, block, carry)
+        return watch._replace(first=first, second=second, many=total, gap=gap), whole
 
-        nothing = jnp.zeros((rows.capacity.rows + 1, lanes, 6), dtype)
-        total = jax.lax.cond(jnp.any(near), close, lambda _: nothing, state)
-        parts = [total[..., k] for k in range(6)]
-        root = tuple(x[:1] for x in parts)
-        below = tuple(x[1:, None] for x in parts)
-        return (root[:3], root[3:]), (below[:3], below[3:])
+    # --- how they push each other
 
-    return meet
+    def _add_up(self, frames: Frames, watch: Watch, nothing: jax.Array) -> jax.Array:
+        """`[6, rows + 1 × lanes]` wrenches on all bodies.
+
+        Sums are products with matrices of zeros and ones: XLA:CPU makes a slow loop of a scatter,
+        and others add in any order.
+        """
+        values = (*frames.place, *frames.velocity, *frames.spin, *sum(frames.axes, ()))
+        table = jnp.concatenate([x.reshape(-1) for x in values])
+        each = jnp.arange(self.radius.size, dtype=jnp.int32)
+        columns = self.radius.size * jnp.arange(len(values), dtype=jnp.int32)[:, None]
+
+        def run(step: Callable[[jax.Array, Any], Any], carry: Any) -> Any:
+            """Over the list, some at a time."""
+
+            def body(state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+                return state[0] + _PUSHED, step(*state)
+
+            start = jnp.int32(0), carry
+            return jax.lax.while_loop(lambda x: x[0] < watch.many, body, start)[1]
+
+        def part(x: jax.Array, start: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_slice(x, (start,), (_PUSHED,))
+
+        def sides(start: jax.Array) -> Any:
+            which = [part(x, start) for x in (watch.first, watch.second)]
+            own = [self.frame_of[x] for x in which]
+            found = [
+                _side(table[frame + columns], self.numbers[:, x])
+                for frame, x in zip(own, which, strict=True)
+            ]
+            return found, own
+
+        def feel(start: jax.Array, pairs: jax.Array) -> jax.Array:
+            real = start + jnp.arange(_PUSHED, dtype=jnp.int32) < watch.many
+            touching = real & (_depth(*sides(start)[0]) > 0)
+            first, second = (part(x, start) // self.size for x in (watch.first, watch.second))
+            pair = jnp.where(touching, first * self.rows.lanes + second, -1)
+            return jax.lax.dynamic_update_slice(pairs, pair, (start,))
+
+        # Which robots touch, for each pair of spheres that do; -1 where they do not.
+        pairs = run(feel, jnp.full(watch.first.shape[0] + _PUSHED, -1, jnp.int32))
+
+        def push(start: jax.Array, total: jax.Array) -> jax.Array:
+            pair = part(pairs, start)
+
+            def collide() -> jax.Array:
+                (one, other), own = sides(start)
+
+                def count(begin: jax.Array, total: jax.Array) -> jax.Array:
+                    same = pair[:, None] == part(pairs, begin)[None]
+                    return total + jnp.sum(same, 1, dtype=total.dtype)
+
+                # Contacts of two robots share what may be stopped.
+                share = _SHARE / jnp.maximum(run(count, jnp.zeros(_PUSHED, total.dtype)), 1)
+                wrenches = _collide(self.touch, one, other, share, self.dt)
+                wide = jnp.concatenate([jnp.stack(x) for x in wrenches], 1)
+                wide = jnp.where(jnp.tile(pair >= 0, 2), wide, 0)
+                on = (jnp.concatenate(own)[:, None] == each).astype(wide.dtype)
+                return total + jnp.matmul(wide, on, precision="highest")
+
+            return jax.lax.cond(jnp.any(pair >= 0), collide, lambda: total)
+
+        return jax.lax.cond(jnp.any(pairs >= 0), lambda: run(push, nothing), lambda: nothing)
+
+
+def _side(frame: jax.Array, numbers: jax.Array) -> _Side:
+    """From `[18, n]` of frames and `[9, n]` of spheres."""
+    f, x = frame, numbers
+    axes = (tuple(f[9:12]), tuple(f[12:15]), tuple(f[15:18]))
+    origin = tuple(f[:3])
+    place = lambda local: vadd(origin, matvec(axes, tuple(local)))  # noqa: E731
+    return _Side(
+        place(x[:3]), origin, place(x[3:6]), tuple(f[3:6]), tuple(f[6:9]), axes, x[6], x[7], x[8]
+    )
+
+
+def _list_true(flags: jax.Array, most: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Where flags `[n, m]` are true, row by row, at most so many places.
+
+    Returns:
+        `[most]` rows and columns, int32, of which as many as there are mean something; and how many
+        are true in all.
+    """
+    counts = jnp.sum(flags, 1, dtype=jnp.int32)
+    ends = jnp.cumsum(counts)
+    slot = jnp.arange(most, dtype=jnp.int32)
+    row = jnp.sum(ends[None] <= slot[:, None], 1, dtype=jnp.int32)
+    row = jnp.minimum(row, len(counts) - 1)
+    rank = slot - (ends[row] - counts[row])
+    seen = jnp.cumsum(flags[row].astype(jnp.int32), 1)
+    column = jnp.sum(seen <= rank[:, None], 1, dtype=jnp.int32)
+    return row, jnp.minimum(column, flags.shape[1] - 1), ends[-1]

@@ -96,8 +96,8 @@ class Engine(NamedTuple):
         fuses: whether a step is element-wise, so that it may be compiled as one function.
         varied: a `variation.Variation` → the same engine with those coefficients; None where it
             cannot.
-        meet: state → `collisions.Meeting`, what robots of one world do to each other, whose `push`
-            is a fourth argument of `step`; None where each has a world to itself. It is no
+        meet: a `collisions.Meet`, what robots of one world do to each other; the `push` of a
+            meeting is a fourth argument of `step`. None where each has a world to itself. It is no
             element-wise function.
     """
 
@@ -113,7 +113,7 @@ class Engine(NamedTuple):
     plant: Plant
     fuses: bool
     varied: Callable[[Any], Engine] | None = None
-    meet: Callable[[Any], Any] | None = None
+    meet: Any = None
 
 
 def root_of(state: State) -> Root:

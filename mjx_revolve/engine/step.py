@@ -6,14 +6,13 @@ compared step by step. `bodies` says how trees are traversed, `dynamics` what ac
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mjx_revolve.engine.collisions import Meeting
+from mjx_revolve.engine.collisions import Meet
 from mjx_revolve.engine.dynamics import Bodies, accelerate
 from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.levels import Levels, make_levels
@@ -140,7 +139,7 @@ def make_step_engine(
     bodies: Bodies,
     plant: Plant,
     variation: Variation | None = None,
-    meet: Callable[[State], Meeting] | None = None,
+    meet: Meet | None = None,
 ) -> Engine:
     """The population step as an engine; its functions are pure, and run under jit, vmap and grad.
 

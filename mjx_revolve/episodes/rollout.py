@@ -144,34 +144,40 @@ def go_on(
 
     first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)
     # What robots do to each other is no element-wise function of them, so it stays outside.
-    meet = (lambda state: NOBODY) if engine.meet is None else engine.meet
+    look = (lambda state, watch: (NOBODY, watch)) if engine.meet is None else engine.meet.look
+    watch = () if engine.meet is None else engine.meet.start(passage.state)
     pack = unpack = lambda x: x
     if engine.fuses and not derived:
-        step, pack, unpack = fused_scan(step, passage, (first, meet(passage.state)))
+        step, pack, unpack = fused_scan(step, passage, (first, look(passage.state, watch)[0]))
     else:
         step = share_once(step)
         if derived:
             step = jax.checkpoint(step, prevent_cse=False)
 
-    def meet_and_step(packed: Any, row: Any) -> tuple[Any, jax.Array]:
-        return step(packed, (row, meet(unpack(packed).state)))
+    def look_and_step(carry: Any, row: Any) -> tuple[Any, jax.Array]:
+        packed, watch = carry
+        meeting, watch = look(unpack(packed).state, watch)
+        packed, ctrl = step(packed, (row, meeting))
+        return (packed, watch), ctrl
 
-    def block(packed: Any, rows: Any) -> tuple[Any, Any]:
+    def block(carry: Any, rows: Any) -> tuple[Any, Any]:
+        packed, watch = carry
         start = unpack(packed)
         start = pack(start._replace(energy=jnp.zeros_like(start.energy)))
         last = None if rows is None else jax.tree.map(lambda x: x[-1], rows)
         if every == 1:
-            packed, ctrl = meet_and_step(start, last)
+            (packed, watch), ctrl = look_and_step((start, watch), last)
         else:
-            packed, ctrls = jax.lax.scan(meet_and_step, start, rows, length=every)
+            (packed, watch), ctrls = jax.lax.scan(look_and_step, (start, watch), rows, length=every)
             ctrl = jax.tree.map(lambda x: x[-1], ctrls)
         state, _, _, energy, count = unpack(packed)
         water = flow(clock(count - 1, energy), last)
-        return packed, record(state, ctrl, energy, water)
+        return (packed, watch), record(state, ctrl, energy, water)
 
     if inputs is not None:
         inputs = jax.tree.map(lambda x: x.reshape(records, every, *x.shape[1:]), inputs)
-    packed, kept = jax.lax.scan(block, pack(passage), inputs, length=records)
+    carry = pack(passage), watch
+    (packed, _), kept = jax.lax.scan(block, carry, inputs, length=records)
     return unpack(packed), kept
 
 

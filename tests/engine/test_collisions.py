@@ -75,7 +75,7 @@ def meeting_of(worlds: int = 1, tag: bool = False):
         labels = jnp.arange(len(robots), dtype=qpos.dtype) if tag else None
         meet = make_meeting(rows, spheres, present, worlds, Touch(), labels)
         state = make_step_engine(rows, tables.plant).init(qpos, qvel)
-        return frames_of(rows, state), meet(state)
+        return frames_of(rows, state), meet.look(state, meet.start(state))[0]
 
     return partial(find, packed)
 
@@ -315,7 +315,7 @@ def test_without_others_nothing_changes():
         engine = make_step_engine(rows, tables.plant, meet=meeting)
         state = engine.init(qpos, qvel)
         assert isinstance(state, State)
-        pushes = (engine.meet(state).push,) if meet else ()
+        pushes = (engine.meet.look(state, engine.meet.start(state))[0].push,) if meet else ()
         ctrl = jnp.zeros((tables.plant.num_rows, 8))
         return engine.observe(engine.step(state, ctrl, water_of(space), *pushes)[0])
 
