@@ -51,6 +51,7 @@ class Row:
         duration: of the episodes [s], ours only.
         limits: whether joint limits are left on (plain MJX).
         each_core: one process pinned to each core, rather than one of all cores.
+        brain: which of `bench_cases.BRAINS`.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Row:
     duration: float = 10.0
     limits: bool = True
     each_core: bool = False
+    brain: str = ""
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,48 @@ GROUPS = (
         (_ours("default", "default water, contact", task="crawl", duration=4.0), *_c("bed")),
         2,
         10.0,
+    ),
+    # A step with its brain may take a third more than one without.
+    Group(
+        "brain of 64 units, spider, default water",
+        (
+            Row("ours, mlp of 64 units", "evaluation", "default", each_core=True, brain="mlp"),
+            Row("ours, bare steps", "bare", "default", each_core=True),
+            Row(
+                "its sensors noisy, at 20 Hz, 0.1 s late",
+                "evaluation",
+                "default",
+                each_core=True,
+                brain="tired",
+            ),
+            Row("ours, oscillators", "evaluation", "default", each_core=True),
+        ),
+        1,
+        0.75,
+    ),
+    Group(
+        "brain of 8 units a hinge, 256 bodies of 4 to 16 hinges, default water",
+        (
+            Row("ours, mlp", "mixed", "default", population=256, each_core=True, brain="mlp"),
+            Row(
+                "ours, a sine a hinge",
+                "mixed",
+                "default",
+                population=256,
+                each_core=True,
+                brain="sine",
+            ),
+            Row(
+                "its sensors noisy, at 20 Hz, 0.1 s late",
+                "mixed",
+                "default",
+                population=256,
+                each_core=True,
+                brain="tired",
+            ),
+        ),
+        1,
+        0.75,
     ),
     Group(
         "whole generation, spider, default water",
@@ -294,6 +338,7 @@ def start(row: Row, threads: int) -> Result:
         "limits": row.limits,
         "task": row.task,
         "duration": row.duration,
+        "brain": row.brain,
     }
     try:
         for number, core in enumerate(cores):

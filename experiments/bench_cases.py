@@ -46,6 +46,19 @@ PHYSICS: dict[str, dict[str, Any]] = {
         "bed": {"kind": "lake", "contact": "mjx"},
     },
 }  # fmt: skip
+# Brains, by the changes to the default controller. Eight units at each of the spider's eight hinges
+# are 64. "tired" has sensors as they are bought.
+_TIRED = {"noise": 0.05, "rate": 20.0, "delay": 0.1}
+BRAINS: dict[str, dict[str, Any]] = {
+    "": {},
+    "sine": {"type": "sine"},
+    "mlp": {"type": "mlp", "hidden": 8},
+    "tired": {
+        "type": "mlp",
+        "hidden": 8,
+        "sensors": [{"type": name} | _TIRED for name in ("tilt", "gyro", "angle", "speed")],
+    },
+}
 # Steps in one call of an engine that is given plain controls.
 STEPS = 200
 DEPTH = 2.0  # of the start [m]
@@ -65,6 +78,7 @@ def _config(job: dict[str, Any]) -> Any:
         job["config"],
         overrides={
             "morphology": job["robot"],
+            **{f"controller.{key}": value for key, value in BRAINS[job["brain"]].items()},
             "world": PHYSICS[job["physics"]],
             "task.type": job["task"],
             "task.duration": job["duration"],
