@@ -226,6 +226,8 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
               1: +x                  # or {position: [...], direction: [...], up: [0, 0, 1]}
             sensor: false            # default
             aliases: [Paddle]        # default: those of the catalogue's type of that name, if any
+            sensors:                 # default: none; on each module of the type, see docs/senses.md
+              - {type: flow, noise: 0.01}
           PectoralFin:
             mount: -x
             parts:

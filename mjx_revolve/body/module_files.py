@@ -11,6 +11,7 @@ from annotated_types import MinLen
 
 from mjx_revolve.body.boxes import union_measure
 from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Name, Part, Slot, Vector
+from mjx_revolve.body.sensors import SensorRow
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import Row, Switch, checked, read, words
 
@@ -32,6 +33,7 @@ class _Written:
     hinge: Hinge | None = None
     sensor: Switch = False
     aliases: Annotated[Row[Name], words("a list of names")] | None = None
+    sensors: SensorRow = ()
 
 
 def read_modules(data: Any, usual: Mapping[str, ModuleType]) -> dict[str, ModuleType]:
@@ -75,6 +77,7 @@ def _read_type(name: str, item: Any, usual: Mapping[str, ModuleType], place: str
         "hinge": written.hinge,
         "sensor": written.sensor,
         "aliases": aliases if written.aliases is None else written.aliases,
+        "sensors": written.sensors,
     }
     return read(ModuleType, values, place)
 

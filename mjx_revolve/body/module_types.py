@@ -18,6 +18,7 @@ from pydantic import StringConstraints
 from mjx_revolve.body.boxes import union_measure
 from mjx_revolve.body.plates import LiftDrag as LiftDrag
 from mjx_revolve.body.propellers import Thruster as Thruster
+from mjx_revolve.body.sensors import SensorRow
 from mjx_revolve.inputs.schema import (
     Direction,
     Law,
@@ -282,6 +283,7 @@ class ModuleType:
         hinge: the motorised hinge, if there is one.
         sensor: a sensor; left out of the descriptors that count a body's size.
         aliases: further names in morphology files.
+        sensors: that sit on each module of the type; see `sensors.Sensor.each`.
 
     Raises:
         InputError: the pieces do not make a module; the message names module and field.
@@ -294,6 +296,7 @@ class ModuleType:
     hinge: Hinge | None = None
     sensor: Switch = False
     aliases: Row[Name] = ()
+    sensors: SensorRow = ()
 
     def __post_init__(self) -> None:
         """Checks that the pieces make a module."""
@@ -304,6 +307,10 @@ class ModuleType:
             raise MisfitError("slots", "numbers >= 1 (0 is where it is attached)", "0")
         if self.mount is None and self.mass <= 0.0:
             raise MisfitError("mass", "a core heavier than 0 kg", f"{self.mass:g}")
+        for k, sensor in enumerate(self.sensors):
+            if sensor.place or sensor.kind.where != "robot" or not sensor.kind.sits:
+                what = "a kind that may sit on modules of a type, without `at` and `each`"
+                raise MisfitError(f"sensors.{k}", what, show(sensor.to_mapping()))
         if self.hinge is None:
             return
         if self.mount is None:

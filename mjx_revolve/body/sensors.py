@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple
 
-from annotated_types import Le, Unit
+from annotated_types import Le, MinLen, Unit
 from pydantic import AfterValidator, BeforeValidator
 
 from mjx_revolve.inputs.schema import (
@@ -33,13 +33,15 @@ class SensorKind(NamedTuple):
     Attributes:
         parts: names of its numbers; one without a name of its own is "".
         unit: of them.
-        where: "robot": once, at the core; "joint": at each hinge; "body": of the core's rigid body
-            and of what each hinge carries.
+        where: "robot": once, at the core, or at modules; "joint": at each hinge; "body": of the
+            core's rigid body and of what each hinge carries; "module": only at a module.
         range: lowest and highest, as most such devices have them; choices.
-        signal: (a `control.sense.Sense`) → its numbers, in the order of `parts`: `[lanes]` each of
-            a robot, `[hinge rows, lanes]` of joints, `[1 + hinge rows, lanes]` of bodies.
+        signal: (a `control.sense.Sense`, or a `control.places.Place`) → its numbers, in the order
+            of `parts`: `[lanes]` each of a robot, `[hinge rows, lanes]` of joints,
+            `[1 + hinge rows, lanes]` of bodies; of a place as that has them.
         what: it is, in words.
         feels: field of the sense that must be asked for, or "".
+        sits: whether it may sit elsewhere than at the core.
     """
 
     parts: tuple[str, ...]
@@ -49,6 +51,7 @@ class SensorKind(NamedTuple):
     signal: Callable[[Any], tuple[Any, ...]]
     what: str
     feels: str = ""
+    sits: bool = True
 
 
 def _distance(toward: Any) -> Any:
@@ -162,6 +165,7 @@ SENSORS: Mapping[str, SensorKind] = {
         lambda s: (s.work,),
         "work that servos and propellers have done so far",
         "work",
+        sits=False,
     ),
     "angle": SensorKind(
         _ONE, "rad", "joint", (-math.pi / 4, math.pi / 4), lambda s: (s.angle,), "of each hinge"
@@ -187,6 +191,15 @@ SENSORS: Mapping[str, SensorKind] = {
         "force of the bed on the core's rigid body and on what each hinge carries",
         "touch",
     ),
+    "touch": SensorKind(
+        ("left", "right"),
+        "N",
+        "module",
+        (0, 1),
+        lambda s: s.cells,
+        "force of the bed on the two halves of a module, along its normal",
+        "cells",
+    ),
 }
 """All kinds of sensors by name."""
 
@@ -197,6 +210,12 @@ def _read_range(value: Any) -> Any:
     return (-value, value) if plain else as_tuple(value)
 
 
+def _read_id(value: Any) -> Any:
+    """Names in YAML may be numbers."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+_Id = Annotated[Text, BeforeValidator(_read_id), MinLen(1), words("a name")]
 _Range = Annotated[
     tuple[Number, Number],
     BeforeValidator(_read_range),
@@ -214,13 +233,15 @@ class Sensor:
 
     Attributes:
         type: its kind, a name in `SENSORS`.
-        name: of its own; by default the type.
+        name: of its own; by default the type, behind the module where it sits on one.
         unit: of range and noise, if it is written: that of the kind.
         range: lowest and highest value, or one number for both signs; by default the kind's.
         noise: standard deviation, of every sample by itself [unit].
         rate: how often it measures; what it has measured stays until the next time. By default
             before every step [Hz].
         delay: how old what it gives is [s].
+        at: id of the module that it sits on, of one robot; by default it sits at the core.
+        each: type of modules that it sits on, wherever there are some.
 
     Raises:
         InputError: there is no such kind, or a number is out of range.
@@ -233,6 +254,8 @@ class Sensor:
     noise: NonNegative = 0.0
     rate: Annotated[Positive, Le(1e4), Unit("Hz")] | None = None
     delay: Annotated[NonNegative, Le(5), Unit("s")] = 0.0
+    at: _Id | None = None
+    each: _Id | None = None
 
     def __post_init__(self) -> None:
         """Checks that there is such a kind, and the range."""
@@ -241,9 +264,47 @@ class Sensor:
         kind = SENSORS[self.type]
         if self.unit is not None and self.unit != kind.unit:
             raise MisfitError("unit", f"{kind.unit!r}, as of {self.type}", show(self.unit))
+        self._check_place()
         low, high = self.limits
         if low >= high:
             raise MisfitError("range", "the lowest below the highest", show(list(self.limits)))
+
+    def _check_place(self) -> None:
+        """Checks that such a sensor may sit where it does."""
+        kind, key = self.kind, "at" if self.at is not None else "each"
+        if self.at is not None and self.each is not None:
+            raise MisfitError("each", "none, as there is `at`", show(self.each))
+        if kind.where == "module" and self.at is None:
+            raise MisfitError("at", f"the id of a module, as {self.type} is felt by one", "none")
+        if self.place and not kind.sits:
+            what = f"none, as {self.type} is of the whole robot"
+            raise MisfitError(key, what, show(getattr(self, key)))
+        if self.each is not None and kind.where != "robot":
+            what = f"none, as {self.type} is at each hinge" if kind.where == "joint" else "none, as"
+            what += "" if kind.where == "joint" else f" {self.type} is of each rigid body"
+            raise MisfitError("each", what, show(self.each))
+
+    @property
+    def place(self) -> str:
+        """Where it sits, as `Controller.feels` names places; "" for the core."""
+        if self.at is not None:
+            return f"at {self.at}"
+        return "" if self.each is None else f"each {self.each}"
+
+    @property
+    def where(self) -> str:
+        """How often there are its numbers: "robot", "joint" or "body", as of a kind."""
+        return "body" if self.each is not None else "robot" if self.place else self.kind.where
+
+    @property
+    def feels(self) -> tuple[str, ...]:
+        """What a `Controller` must name in its `feels`."""
+        own = self.kind.feels
+        if not self.place:
+            return (own,) if own else ()
+        # At modules, a specific force asks for a longer memory.
+        own = "forces" if own == "force" else own
+        return (self.place, own) if own else (self.place,)
 
     @property
     def kind(self) -> SensorKind:
@@ -252,8 +313,8 @@ class Sensor:
 
     @property
     def label(self) -> str:
-        """Its name, or its type."""
-        return self.name or self.type
+        """Its name, or its type behind the module that it sits on."""
+        return self.name or f"{self.at or self.each or ''} {self.type}".strip()
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -275,7 +336,8 @@ class Sensor:
 
     def to_mapping(self) -> dict[str, Any]:
         """As a file has it, without what is usual."""
-        usual = {"name": "", "unit": None, "range": None, "noise": 0.0, "rate": None, "delay": 0.0}
+        usual: dict[str, Any] = {"name": "", "at": None, "each": None}
+        usual |= {"unit": None, "range": None, "noise": 0.0, "rate": None, "delay": 0.0}
         found: dict[str, Any] = {"type": self.type}
         for key, value in usual.items():
             own = getattr(self, key)
@@ -289,7 +351,8 @@ def _read_sensor(value: Any) -> Any:
     return {"type": value} if isinstance(value, str) else value
 
 
-def _check_names(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+def check_names(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+    """The sensors, if their names differ."""
     labels = [sensor.label for sensor in sensors]
     for k, label in enumerate(labels):
         if label in labels[:k]:
@@ -300,7 +363,7 @@ def _check_names(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
 
 SensorRow = Annotated[
     Row[Annotated[Sensor, BeforeValidator(_read_sensor)]],
-    AfterValidator(_check_names),
+    AfterValidator(check_names),
     words("a list of sensors"),
 ]
 """Sensors in a user's file: kinds' names, or mappings with fields of `Sensor`."""

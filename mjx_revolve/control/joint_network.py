@@ -77,7 +77,7 @@ def make_joint_network(
         The controller; all genes are the robot's, so that their number does not depend on it.
     """
     made_for = as_plant(body)
-    observer = make_observer(sensors, made_for.timestep)
+    observer = make_observer(sensors, made_for.timestep, made_for)
     words = [f"message{k + 1}" for k in range(messages)]
     given = [*observer.robot_names, *(f"joint {x}" for x in observer.joint_names)]
     fixed, felt = len(_PLACE), len(observer.robot_names)

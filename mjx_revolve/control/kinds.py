@@ -14,7 +14,8 @@ from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.feedback import make_feedback
 from mjx_revolve.control.joint_network import make_joint_network
 from mjx_revolve.control.neurons import make_network
-from mjx_revolve.control.sense import FEELS, Other, Sense
+from mjx_revolve.control.places import Place
+from mjx_revolve.control.sense import FEELS, Other, Sense, is_place
 from mjx_revolve.control.sensory_cpg import make_sensory_cpg
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.control.splines import make_splines
@@ -123,9 +124,10 @@ def _check_own(name: str, controller: Any, plant: Plant) -> None:
             f"{len(controller.gene_names)}"
         )
     for name_felt in controller.feels:
-        if name_felt not in FEELS:
+        if name_felt not in FEELS and not is_place(name_felt):
             raise InputError(
-                f"{place}: feels: expected any of {', '.join(FEELS)}; found {name_felt!r}"
+                f"{place}: feels: expected any of {', '.join(FEELS)}, or places such as 'at ID' "
+                f"and 'each TYPE'; found {name_felt!r}"
             )
     lanes, rows = 3, plant.num_rows
 
@@ -141,7 +143,7 @@ def _check_own(name: str, controller: Any, plant: Plant) -> None:
         run,
         jax.ShapeDtypeStruct((count, lanes), jnp.float32),
         jax.ShapeDtypeStruct((), jnp.float32),
-        _example_sense(plant.num_hinge_rows, lanes, controller.feels),
+        _example_sense(plant, lanes, controller.feels, place),
     )
     if getattr(targets, "shape", None) != (rows, lanes):
         raise InputError(
@@ -155,8 +157,9 @@ def _check_own(name: str, controller: Any, plant: Plant) -> None:
         )
 
 
-def _example_sense(hinges: int, lanes: int, feels: Sequence[str]) -> Sense:
+def _example_sense(plant: Plant, lanes: int, feels: Sequence[str], place: str) -> Sense:
     """The shapes of what is felt."""
+    hinges = plant.num_hinge_rows
 
     def given(*shape: int) -> Any:
         return jax.ShapeDtypeStruct((*shape, lanes), jnp.float32)
@@ -165,6 +168,25 @@ def _example_sense(hinges: int, lanes: int, feels: Sequence[str]) -> Sense:
     three = (one, one, one)
     asked: dict[str, Any] = {"force": three, "load": joint, "work": one, "touch": touch}
     asked["nearest"] = Other(three, one)
+
+    def at(name: str) -> Place:
+        """The shapes of what is felt at a place."""
+        try:
+            sites = plant.site(name)
+        except InputError as error:
+            raise InputError(f"{place}: feels: {error}") from None
+        x = touch if sites.row is None else one
+        found = Place(x, x, x, (x,) * 3, (x,) * 3, (x,) * 3, (x,) * 3, x, (x,) * 3)
+        if "forces" in feels:
+            found = found._replace(force=(x,) * 3)
+        if sites.hinge is not None:
+            found = found._replace(angle=x, speed=x, load=x if "load" in feels else None)
+        if sites.module is not None:
+            cells = (x, x) if "cells" in feels else None
+            found = found._replace(touch=x if "touch" in feels else None, cells=cells)
+        return found
+
+    places = {name: at(name) for name in feels if is_place(name)}
     return Sense(
         height=one,
         climb=one,
@@ -177,7 +199,8 @@ def _example_sense(hinges: int, lanes: int, feels: Sequence[str]) -> Sense:
         altitude=one,
         target=three,
         noise=jax.ShapeDtypeStruct((lanes,), jnp.uint32),
-        **{name: asked[name] for name in feels},
+        places=places or None,
+        **{name: asked[name] for name in feels if name in asked},
     )
 
 

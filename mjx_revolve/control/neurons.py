@@ -10,8 +10,8 @@ What Revolve leaves open, or does unlike what its words say, and how it is here:
 - An output is clipped to 0 to 1, and that is the hinge's whole range; of several for one hinge, the
   first in the file counts. A hinge without any stays in the middle.
 - The inputs of a module are its input neurons in the file's order: of the core its accelerometer's
-  x, y, z, then its gyro's [m/s², rad/s]; of a touch sensor its two cells, which both give how hard
-  the bed pushes what the sensor is fixed to, as a share of 1 N.
+  x, y, z, then its gyro's [m/s², rad/s]; of a touch sensor its two cells, left and right of the way
+  in which it is attached: how hard the bed pushes each half, as a share of 1 N.
 - Two connections between the same neurons add up. One into an Oscillator does nothing.
 """
 
@@ -27,7 +27,7 @@ import numpy as np
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.control.controller import Controller, Gene
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.sense import Sense, is_place
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import MisfitError, Number, Text, checked, read, words
@@ -253,13 +253,14 @@ def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Contr
     moving.sort(key=lambda k: list(PARAMS).index(neurons[k].type))
     types = [neurons[k].type for k in moving]
     row_of = {str(neurons[k].id): row for row, k in enumerate(moving)}
-    inputs = _find_inputs(network, body, plant, place)
+    inputs = _find_inputs(network, body, place)
     outputs = _find_outputs(network, body, plant, row_of, place)
     changing = _genes_of(network)
     sources = [*(str(neurons[k].id) for k, _ in inputs), *row_of]
     column_of = {name: column for column, name in enumerate(sources)}
     feels = ("force",) * any(x[0] == "force" for _, x in inputs)
-    feels += ("touch",) * any(x[0] == "touch" for _, x in inputs)
+    touched = dict.fromkeys(x[0] for _, x in inputs if is_place(x[0]))
+    feels += ("cells", *touched) if touched else ()
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
         folded, lanes = jnp.sin(genes), genes.shape[1:]
@@ -330,31 +331,19 @@ def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Contr
 
 
 def _feel(sense: Sense, what: tuple[str, int]) -> Any:
-    """An input's value: a component of the core's, or how hard a body is touched."""
+    """An input's value: a component of the core's, or how hard a cell is touched."""
     field, k = what
-    value = getattr(sense, field)[k]
-    return jnp.clip(value, 0, 1) if field == "touch" else value
-
-
-def _carriers(body: Morphology) -> list[int]:
-    """Which hinge moves each module, -1 for none."""
-    found: list[int] = []
-    count = 0
-    for module in body.modules:
-        above = found[module.parent] if module.parent >= 0 else -1
-        if module.kind.hinge is not None:
-            above, count = count, count + 1
-        found.append(above)
-    return found
+    if is_place(field):
+        return jnp.clip(sense.places[field].cells[k], 0, 1)
+    return getattr(sense, field)[k]
 
 
 def _find_inputs(
-    network: Network, body: Morphology, plant: Plant, place: str
+    network: Network, body: Morphology, place: str
 ) -> list[tuple[int, tuple[str, int]]]:
-    """Input neurons, and the field of the sense with its component."""
+    """Input neurons, and the field of the sense, or the place, with its component."""
     modules = {module.name: k for k, module in enumerate(body.modules)}
-    carriers, seen = _carriers(body), dict.fromkeys(modules, 0)
-    rows = np.asarray(plant.source)[: plant.num_hinge_rows, 0].tolist()
+    seen = dict.fromkeys(modules, 0)
     found = []
     for k, neuron in enumerate(network.neurons):
         if neuron.type != "Input":
@@ -369,11 +358,9 @@ def _find_inputs(
         if number >= most:
             has = f"a module with {number + 1} inputs (a core has 6, a touch sensor 2, others none)"
             raise InputError(f"{where}: expected {has}; found {name!r} of type {module.type}")
+        what = (f"at {name}", number)
         if module.parent < 0:
             what = ("force", number) if number < 3 else ("spin", number - 3)
-        else:
-            hinge = carriers[modules[name]]
-            what = ("touch", 0 if hinge < 0 else 1 + rows.index(hinge))
         found.append((k, what))
     return found
 

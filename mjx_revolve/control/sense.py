@@ -8,20 +8,30 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_revolve.control.places import Past, feel_place, past_of
 from mjx_revolve.engine.collisions import ALONE, Meeting
 from mjx_revolve.engine.state import Engine, Root
+from mjx_revolve.numerics.inertia import Motion
 from mjx_revolve.numerics.spatial import Vec, matTvec, quat_to_rows, vadd, vscale, vsub
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.flow import Water, flow
 from mjx_revolve.water.world import World
 
-FEELS = ("force", "load", "work", "touch", "nearest")
-"""Fields of `Sense` that are there only for a `Controller` that names them in `feels`.
+FEELS = ("force", "load", "work", "touch", "nearest", "forces", "cells")
+"""What is there only for a `Controller` that names it in `feels`, beside places.
 
-The first three need a memory, which travels with the state, touch a sweep over the body, and who is
-nearest a look at all others; what is left costs nothing unless it is used, as the compiler leaves
-out what nobody reads.
+The first five are fields of `Sense`, the others of `Place`: `forces` is its specific force. A place
+is named "at ID", a module of one robot, or "each TYPE", modules of a type; `Sense.places` then has
+it by that name. Touch, cells and places need a sweep over the body, who is nearest a look at all
+others, and the rest a memory, which travels with the state; all else costs nothing unless it is
+used, as the compiler leaves out what nobody reads.
 """
+_PLACED = ("at ", "each ")
+
+
+def is_place(name: str) -> bool:
+    """Whether what is asked for is a place."""
+    return name.startswith(_PLACED)
 
 
 NOBODY = Meeting()
@@ -72,11 +82,13 @@ class Memory(NamedTuple):
         acceleration: of the core over the last step, world frame, three of `[lanes]` [m/s²].
         ctrl: the last command, `[n, lanes]` in the plant's order.
         work: done so far `[lanes]` [J].
+        past: how all rigid bodies moved before the last step.
     """
 
     acceleration: Any = None
     ctrl: Any = None
     work: Any = None
+    past: Past | None = None
 
 
 class Sense(NamedTuple):
@@ -104,6 +116,7 @@ class Sense(NamedTuple):
         touch: how hard the bed pushes the core's rigid body, then what each hinge carries,
             `[1 + hinge rows, lanes]` [N]; likewise.
         nearest: an `Other`, the nearest other robot in the same world; likewise.
+        places: what is felt at modules, a `Place` for each name; likewise.
     """
 
     height: jax.Array
@@ -122,6 +135,7 @@ class Sense(NamedTuple):
     work: Any = None
     touch: Any = None
     nearest: Any = None
+    places: Any = None
 
 
 def feel(
@@ -134,6 +148,7 @@ def feel(
     memory: Memory,
     feels: Sequence[str] = (),
     meeting: Meeting = NOBODY,
+    motion: Motion | None = None,
 ) -> Sense:
     """What robots feel.
 
@@ -145,11 +160,15 @@ def feel(
         time: since the episode's start [s].
         cues: of the episode.
         memory: from `start_memory` or `remember`.
-        feels: which of `FEELS` are asked for.
+        feels: which of `FEELS`, and which places, are asked for.
         meeting: with the other robots of the same world.
+        motion: of all rigid bodies, where it is known already.
 
     Returns:
         The senses.
+
+    Raises:
+        InputError: there is no such place.
     """
     root = engine.root(state)
     turn = quat_to_rows(root.quat)
@@ -175,7 +194,7 @@ def feel(
         gravity = 9.81 if world is None else world.gravity
         x, y, z = memory.acceleration
         force = matTvec(turn, (x, y, z + gravity))
-    return Sense(
+    sense = Sense(
         height=root.position[2] - water.surface_height,
         climb=root.velocity[2],
         up=turn[2],
@@ -193,6 +212,29 @@ def feel(
         touch=engine.touch(state, water) if "touch" in feels else None,
         nearest=nearest,
     )
+    names = tuple(filter(is_place, feels))
+    if not names:
+        return sense
+    motion = engine.motions(state) if motion is None else motion
+    goal = None if cues.target is None else cues.target_at(time)
+    dt, places = engine.plant.timestep, {}
+    cells = engine.cells(state, water) if "cells" in feels and engine.cells else None
+    for name in names:
+        sites = engine.plant.site(name)
+        found = feel_place(world, water, goal, motion, memory.past, dt, sites)
+        if sites.module is not None:
+            found = found._replace(
+                touch=None if sense.touch is None else sense.touch[sites.row],
+                cells=None if cells is None else cells[sites.module],
+            )
+        if sites.hinge is not None:
+            found = found._replace(
+                angle=angle[sites.hinge],
+                speed=speed[sites.hinge],
+                load=None if sense.load is None else sense.load[sites.hinge],
+            )
+        places[name] = found
+    return sense._replace(places=places)
 
 
 def start_memory(feels: Sequence[str], engine: Engine, state: Any) -> Memory:
@@ -213,11 +255,18 @@ def start_memory(feels: Sequence[str], engine: Engine, state: Any) -> Memory:
         acceleration=(zero, zero, zero) if "force" in feels else None,
         ctrl=jnp.concatenate([angle, pad]) if "load" in feels else None,
         work=zero if "work" in feels else None,
+        past=past_of(engine.motions(state)) if "forces" in feels else None,
     )
 
 
 def remember(
-    memory: Memory, before: Root, after: Root, ctrl: jax.Array, work: jax.Array, dt: float
+    memory: Memory,
+    before: Root,
+    after: Root,
+    ctrl: jax.Array,
+    work: jax.Array,
+    dt: float,
+    motion: Motion | None = None,
 ) -> Memory:
     """The memory after a step.
 
@@ -228,6 +277,7 @@ def remember(
         ctrl: what was asked for, `[n, lanes]`.
         work: done in the step `[lanes]` [J].
         dt: of the step [s].
+        motion: of all rigid bodies before it, where specific forces are asked for.
 
     Returns:
         The memory.
@@ -239,4 +289,5 @@ def remember(
         acceleration=acceleration,
         ctrl=None if memory.ctrl is None else ctrl,
         work=None if memory.work is None else memory.work + work,
+        past=None if motion is None else past_of(motion),
     )

@@ -8,8 +8,8 @@ as gusts and starts are, and the same whenever the trial is run again.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -17,9 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.body.sensors import Sensor
+from mjx_revolve.body.module_types import ModuleType
+from mjx_revolve.body.sensors import Sensor, check_names
 from mjx_revolve.control.sense import Sense
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.engine.plant import Plant
+from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.schema import MisfitError
 from mjx_revolve.numerics.spatial import sincos
 from mjx_revolve.numerics.xla import keep
 
@@ -70,19 +73,19 @@ class Observer:
     @cached_property
     def robot_names(self) -> tuple[str, ...]:
         """Of what there is once."""
-        found = [name for s in self.sensors if s.kind.where != "joint" for name in s.names]
+        found = [name for s in self.sensors if s.where != "joint" for name in s.names]
         return tuple(found)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Of what there is at each hinge."""
-        found = [name for s in self.sensors if s.kind.where != "robot" for name in s.names]
+        found = [name for s in self.sensors if s.where != "robot" for name in s.names]
         return tuple(found)
 
     @property
     def feels(self) -> tuple[str, ...]:
         """What a `Controller` must name in its `feels`."""
-        return tuple(dict.fromkeys(s.kind.feels for s in self.sensors if s.kind.feels))
+        return tuple(dict.fromkeys(name for sensor in self.sensors for name in sensor.feels))
 
     def init(self, like: jax.Array) -> Any:
         """What sensors with a rate or a delay keep, before the first step.
@@ -144,7 +147,7 @@ class Observer:
 
     def _shapes(self, sensor: Sensor, like: jax.Array) -> Any:
         """Numbers like those of a sample: those of the robot, those of the hinges."""
-        where, count = sensor.kind.where, len(sensor.kind.parts)
+        where, count = sensor.where, len(sensor.kind.parts)
         robot = [jnp.zeros(like.shape[1:], like.dtype)] * count
         joint = [like] * count if where != "robot" and like.shape[0] else []
         return (robot if where != "joint" else [], joint)
@@ -157,20 +160,25 @@ class Observer:
         zero, scale = sensor.scaling
         robot: list[jax.Array] = []
         joints: list[jax.Array] = []
-        for part, value in enumerate(kind.signal(sense)):
-            pieces: list[tuple[list[jax.Array], Any, Any]] = [(robot, value, None)]
-            if kind.where == "joint":
-                pieces = [(joints, value, joint)]
-            elif kind.where == "body":
-                pieces = [(robot, value[0], None), (joints, value[1:], joint)]
+        source: Any = sense.places[sensor.place] if sensor.place else sense
+        # Of a type of modules, what there is none of says 0.
+        there = source.there if sensor.each is not None else None
+        for part, value in enumerate(kind.signal(source)):
+            pieces: list[tuple[list[jax.Array], Any, Any, Any]] = [(robot, value, None, there)]
+            if sensor.where == "joint":
+                pieces = [(joints, value, joint, None)]
+            elif sensor.where == "body":
+                own, hung = (None, None) if there is None else (there[0], there[1:])
+                pieces = [(robot, value[0], None, own), (joints, value[1:], joint, hung)]
             if not joint.shape[0]:  # XLA takes nothing of no size into its loops
                 pieces = [piece for piece in pieces if piece[0] is robot]
-            for found, true, number in pieces:
+            for found, true, number, share in pieces:
                 if sensor.noise > 0:
                     # 0 is the robot's own, so hinges count from 1.
                     which = 16 * place + part, 0 if number is None else number + 1
                     true = true + sensor.noise * draw_normal(sense.noise, *which, count, true.dtype)
-                found.append(scale * (jnp.clip(true, low, high) - zero))
+                told = scale * (jnp.clip(true, low, high) - zero)
+                found.append(told if share is None else share * told)
         return robot, joints
 
     def _hold(
@@ -195,20 +203,73 @@ class Observer:
         return (jnp.broadcast_to(count, last.shape), tuple(fresh)), given
 
 
-def make_observer(sensors: Sequence[Sensor] | None, timestep: float) -> Observer:
+def make_observer(
+    sensors: Sequence[Sensor] | None, timestep: float, plant: Plant | None = None
+) -> Observer:
     """An observer of sensors.
 
     Args:
         sensors: that are declared; None for the usual ones.
         timestep: between observations [s].
+        plant: of the robot, or of the largest one, that they are to sit on; None to look later.
 
     Returns:
         The observer.
 
     Raises:
-        InputError: a delay is too long for what it would have to keep.
+        InputError: a delay is too long for what it would have to keep, or the robot lacks a module
+            that a sensor sits on.
     """
-    return Observer(USUAL if sensors is None else tuple(sensors), timestep)
+    found = Observer(USUAL if sensors is None else tuple(sensors), timestep)
+    for k, sensor in enumerate(found.sensors):
+        if plant is not None and sensor.at is not None:
+            try:
+                sites = plant.site(sensor.place)
+            except InputError as error:
+                raise InputError(f"sensors.{k}.at: {error}") from None
+            if sensor.kind.where == "joint" and sites.hinge is None:
+                raise InputError(
+                    f"sensors.{k}.at: expected a module with a hinge, as {sensor.type} is felt at "
+                    f"one; found {show(sensor.at)}"
+                )
+    return found
+
+
+def with_types(
+    declared: Sequence[Sensor] | None, modules: Mapping[str, ModuleType], source: str = "config"
+) -> tuple[Sensor, ...] | None:
+    """Declared sensors and those that sit on all modules of some types.
+
+    Args:
+        declared: None where none are.
+        modules: all types that there are, by name and alias.
+        source: what messages call the configuration.
+
+    Returns:
+        The sensors; None where none are.
+
+    Raises:
+        InputError: one sits on a type that there is not, or two have one name.
+    """
+    found = []
+    for k, sensor in enumerate(USUAL if declared is None else declared):
+        if sensor.each is not None and sensor.each not in modules:
+            known = ", ".join(dict.fromkeys(kind.name for kind in modules.values()))
+            raise InputError(
+                f"{source}: sensors.{k}.each: expected a type of modules, one of {known}; found "
+                f"{show(sensor.each)}"
+            )
+        found.append(
+            sensor if sensor.each is None else replace(sensor, each=modules[sensor.each].name)
+        )
+    kinds = {kind.name: kind for kind in modules.values()}
+    more = [replace(s, each=name) for name, kind in kinds.items() for s in kind.sensors]
+    if declared is None and not more:
+        return None
+    try:
+        return check_names((*found, *more))
+    except MisfitError as error:
+        raise InputError(f"{source}: sensors.{error}") from None
 
 
 def _mix(x: Any) -> Any:

@@ -59,7 +59,7 @@ def make_sensory_cpg(
         O per thruster. All are sin(gene), but φ = π sin(gene), f = f_max (1 + sin(gene)) / 2.
     """
     made_for = as_plant(body)
-    observer = make_observer(sensors, made_for.timestep)
+    observer = make_observer(sensors, made_for.timestep, made_for)
     own = [*observer.robot_names, *(f"joint {x}" for x in observer.joint_names)]
     of_hinges = ["amplitude", *(f"{what} {x}" for what in ("phase", "amplitude") for x in own)]
     of_hinges += [f"offset joint {x}" for x in observer.joint_names]

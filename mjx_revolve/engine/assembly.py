@@ -106,6 +106,23 @@ class Assembly:
         touching = np.array([part.contact for part in self.layout.parts])[self.layout.kind]
         return np.repeat(np.flatnonzero(touching), 8)
 
+    @property
+    def point_right(self) -> np.ndarray:
+        """`[npoint]` whether the points lie in the right half of their part.
+
+        To the right of the way in which its module is attached, z up; a core looks along its y.
+        """
+        layout, ways = self.layout, []
+        for body in self.morphologies:
+            mounts = [module.kind.mount for module in body.modules]
+            ways += [(0.0, 1.0, 0.0) if mount is None else mount.outward for mount in mounts]
+        right = np.cross(ways, (0.0, 0.0, 1.0))
+        part = np.flatnonzero([part.contact for part in layout.parts])
+        part = np.flatnonzero(np.isin(layout.kind, part))
+        middle = (layout.low[part] + layout.high[part])[:, None] / 2
+        aside = (layout.corners()[part] - middle) @ right[layout.module[part]][:, :, None]
+        return np.asarray(aside.ravel() > 0)
+
     @cached_property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """`[npoint]` body of each point that may touch the bed; `[npoint, 3]` body frame [m]."""

@@ -29,6 +29,7 @@ from mjx_revolve.engine.columns import (
 from mjx_revolve.engine.level import Laws, Level, Parts, Thrusters
 from mjx_revolve.engine.plant import Figure, Plant, figures_of, read_actuators
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.sites import place_types
 from mjx_revolve.engine.thrusters import read_thrusters
 from mjx_revolve.inputs.errors import InputError
 
@@ -68,6 +69,7 @@ class Capacity:
         carries: whether water may be carried along.
         timestep: of the world [s].
         nothing: a part that does nothing, with the numbers of every law.
+        sites: types of modules on which sensors sit.
         row: numbers that are the same in all rows of all robots, in their places; None elsewhere.
         root: likewise of the roots.
     """
@@ -83,6 +85,7 @@ class Capacity:
     carries: bool
     timestep: float
     nothing: Any
+    sites: tuple[str, ...] = ()
     row: Any = None
     root: Any = None
 
@@ -254,6 +257,7 @@ def fit_capacity(
     hinges: int = 0,
     rows: int = 0,
     modules: int = 0,
+    sites: Sequence[str] = (),
 ) -> Capacity:
     """The smallest capacity for bodies of some types of modules, as large as some robots.
 
@@ -265,6 +269,7 @@ def fit_capacity(
         rows: room for at least so many rows.
         modules: room for all bodies of these types with at most so many modules and `hinges`
             hinges, whatever their shape.
+        sites: types of modules on which sensors sit.
 
     Returns:
         The capacity.
@@ -309,6 +314,7 @@ def fit_capacity(
         carries=carries,
         timestep=world.timestep,
         nothing=jax.tree.map(lambda x: x[-1:], columns.parts),
+        sites=tuple(sites),
     )
     one = _pick_rows(assembly, columns, capacity, order)
     known = list(types.values())
@@ -581,7 +587,10 @@ def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.flo
             root=root,
             rows=level,
             thrusters=read_thrusters(assembly, capacity.thrusters),
-            plant=_wire(assembly, hanging["row"], capacity),
+            plant=replace(
+                _wire(assembly, hanging["row"], capacity),
+                mounts=place_types(assembly, _body_rows(order), capacity.sites, capacity.rows),
+            ),
             figure=figures,
             **hanging,
         ),
@@ -737,6 +746,11 @@ def _hang(assembly: Assembly, order: Order, capacity: Capacity) -> dict[str, np.
         "row": row,
         "count": order.length,
     }
+
+
+def _body_rows(order: Order) -> np.ndarray:
+    """`[nbody]` which of its robot's rows each body's first one is; of roots anything."""
+    return order.place[np.clip(order.first, 0, None)] if len(order.place) else order.first
 
 
 def _wire(assembly: Assembly, row: np.ndarray, capacity: Capacity) -> Plant:

@@ -130,8 +130,7 @@ def read_columns(assembly: Assembly) -> Columns:
         The columns.
     """
     table, count = assembly.fluid, len(assembly.parent)
-    frames = {axis: _z_frame(np.array(axis)) for axis in set(map(tuple, assembly.axis.tolist()))}
-    frame = np.array([frames[axis] for axis in map(tuple, assembly.axis.tolist())])
+    frame = hinge_frames(assembly)
     points, touching = None, np.zeros(0, int)
     if assembly.world.bed is not None:
         touching, place = assembly.points
@@ -155,6 +154,12 @@ def read_columns(assembly: Assembly) -> Columns:
         point_body=touching,
         frame=frame,
     )
+
+
+def hinge_frames(assembly: Assembly) -> np.ndarray:
+    """`[nbody, 3, 3]` body frame from ours, whose z is the hinge."""
+    frames = {axis: _z_frame(np.array(axis)) for axis in set(map(tuple, assembly.axis.tolist()))}
+    return np.array([frames[axis] for axis in map(tuple, assembly.axis.tolist())])
 
 
 def _read_hinges(assembly: Assembly, frame: np.ndarray) -> Hinges:

@@ -6,6 +6,8 @@ costs a few operations where a contact solver would cost the whole speed of the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,6 +123,38 @@ def bed_on_level(
     Returns:
         Torque [N·m] and force [N] about each body's origin, body frame, and their damping.
     """
+    k = points.count
+    force, stiff, grip, normal, wide = _at_points(world, level, motion, points, water)
+    torque = cross(points.position, force)
+    gather = lambda x: sum_parts(wide(x), k)  # noqa: E731
+    return (
+        tuple(gather(x) for x in torque),
+        tuple(gather(x) for x in force),
+        _damping(points.position, normal, stiff - grip, grip, gather),
+    )
+
+
+def bed_pushes(world: World, level: Level, motion: Motion, points: Points, water: Water) -> Scalar:
+    """How hard the bed pushes each point along its normal: what a touch sensor feels.
+
+    Args:
+        world: with a bed.
+        level: the bodies.
+        motion: as in `bed_on_level`.
+        points: of them that may touch.
+        water: as there.
+
+    Returns:
+        `[npoint, nbody, lanes]` [N]; friction apart.
+    """
+    force, _, _, normal, wide = _at_points(world, level, motion, points, water)
+    return dot(force, tuple(wide(x) for x in normal))
+
+
+def _at_points(
+    world: World, level: Level, motion: Motion, points: Points, water: Water
+) -> tuple[Vec, Scalar, Scalar, Vec, Callable[[Scalar], jax.Array]]:
+    """Force on each point with its damping, the bed's normal, and what widens to all points."""
     k, n, lanes = points.count, level.count, jnp.shape(motion.height)[-1]
     wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
     assert world.bed is not None  # there are points only above a bed
@@ -137,13 +171,7 @@ def bed_on_level(
     force, stiff, grip = bed_contact(
         world.bed, depth, wide_normal, velocity, points.mass, world.timestep
     )
-    torque = cross(points.position, force)
-    gather = lambda x: sum_parts(wide(x), k)  # noqa: E731
-    return (
-        tuple(gather(x) for x in torque),
-        tuple(gather(x) for x in force),
-        _damping(points.position, normal, stiff - grip, grip, gather),
-    )
+    return force, stiff, grip, normal, wide
 
 
 def _damping(position: Vec, normal: Vec, along: Scalar, alike: Scalar, gather) -> SpatialInertia:

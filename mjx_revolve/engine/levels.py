@@ -38,6 +38,7 @@ class Levels:
         bodies: `[level][nbody]` MuJoCo ids, the root's level first.
         frames: `[nbody, 3, 3]` of each level, MuJoCo's body frame from ours.
         part_rows: `[level][group][npart, nbody]` rows of the fluid table, -1 for padding.
+        point_rows: `[level][npoint, nbody]` of the assembly's points, likewise.
         hinge_order: `[nhinge]` where the hinges, level by level, stand in the robot's own order.
         thrusters: of the robot.
         carries: whether water is carried along by any part.
@@ -51,6 +52,7 @@ class Levels:
     bodies: tuple[tuple[int, ...], ...]
     frames: tuple[np.ndarray, ...]
     part_rows: tuple[tuple[np.ndarray, ...], ...]
+    point_rows: tuple[np.ndarray, ...]
     hinge_order: np.ndarray
     thrusters: Thrusters
     carries: bool
@@ -91,6 +93,21 @@ class Levels:
     def merge(self, values: Sequence[jax.Array], like: jax.Array) -> jax.Array:
         """The way back from `split`; `[0, lanes]` of the kind of `like` without hinges."""
         return jnp.concatenate(values) if self.below else jnp.zeros((0, *like.shape), like.dtype)
+
+    def lay_out(self, kept: Any, which: Callable[[Any], Any], like: jax.Array) -> Any:
+        """What `which` takes of a value that `down` has kept, each number as `merge` has it.
+
+        None without hinges.
+        """
+        if not self.below:
+            return None
+
+        def join(*xs: Any) -> jax.Array:
+            pairs = zip(xs, self.below, strict=True)
+            wide = [jnp.broadcast_to(x, (level.count, *like.shape)) for x, level in pairs]
+            return jnp.concatenate(wide)
+
+        return jax.tree.map(join, *map(which, kept))
 
     # What parts are, group by group.
 
@@ -215,11 +232,12 @@ def make_levels(robot: Robot, contact: bool = True) -> Levels:
     return Levels(
         world=robot.world,
         root=made[0][0],
-        below=tuple(level for level, _ in made[1:]),
+        below=tuple(level for level, _, _ in made[1:]),
         parents=parents,
         bodies=tuple(map(tuple, ids)),
         frames=tuple(columns.frame[bodies] for bodies in ids),
-        part_rows=tuple(rows for _, rows in made),
+        part_rows=tuple(rows for _, rows, _ in made),
+        point_rows=tuple(rows for _, _, rows in made),
         # Hinge k carries body k + 2: the root is 1.
         hinge_order=np.array([b - 2 for bodies in ids[1:] for b in bodies], np.int32),
         thrusters=read_thrusters(assembly, robot.num_thrusters),
@@ -230,8 +248,8 @@ def make_levels(robot: Robot, contact: bool = True) -> Levels:
 
 def _make_level(
     columns: Columns, bodies: list[int], contact: bool, root: bool
-) -> tuple[Level, tuple[np.ndarray, ...]]:
-    """One level, and the rows of the fluid table of each of its groups."""
+) -> tuple[Level, tuple[np.ndarray, ...], np.ndarray]:
+    """One level, and the rows of the fluid table of each of its groups, and of the points."""
     held: dict[Laws, list[list[int]]] = {}
     for k, body in enumerate(bodies):
         for part in np.flatnonzero(columns.part_body == body):
@@ -249,7 +267,9 @@ def _make_level(
         points = _stack(lists) if any(lists) else None
     finish = lambda x: x[..., None] if x.dtype.kind == "i" else fold(x[..., None])  # noqa: E731
     level = pick_level(columns, np.array(bodies), parts, points, root, len(bodies), finish)
-    return level, tuple(parts[laws] for laws in sorted(parts))
+    none = np.zeros((0, len(bodies)), int)
+    rows = tuple(parts[laws] for laws in sorted(parts))
+    return level, rows, none if points is None else points
 
 
 def _stack(lists: list[list[int]]) -> np.ndarray:

@@ -19,8 +19,9 @@ import numpy as np
 from mjx_revolve.engine.dynamics import outer_forces, with_water
 from mjx_revolve.engine.hydrodynamics import Before
 from mjx_revolve.engine.levels import Levels, make_levels
+from mjx_revolve.engine.motions import motions_of
 from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.engine.pushes import push_of, touch_of
+from mjx_revolve.engine.pushes import cells_of, push_of, touch_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
 from mjx_revolve.engine.servos import end_stop, servo
 from mjx_revolve.engine.state import Engine, Root, turn_quat
@@ -189,7 +190,20 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
     def touch(state: Any, water: Water) -> jax.Array:
         qpos, qvel, *_ = state
         found = touch_of(levels, start(levels, qpos, qvel), water)
-        return jnp.concatenate([found[:1], levels.gather(levels.split(found[1:]), qpos[0])])
+        return own_order(found, qpos[0])
+
+    def own_order(found: jax.Array, like: jax.Array) -> jax.Array:
+        # The plant's rows are the robot's own hinges.
+        return jnp.concatenate([found[:1], levels.gather(levels.split(found[1:]), like)])
+
+    def motions(state: Any) -> Motion:
+        qpos, qvel, *_ = state
+        found = motions_of(levels, start(levels, qpos, qvel))
+        return jax.tree.map(lambda x: own_order(x, qpos[0]), found)
+
+    def cells(state: Any, water: Water) -> Any:
+        qpos, qvel, *_ = state
+        return cells_of(levels, start(levels, qpos, qvel), water)
 
     return Engine(
         init=init,
@@ -199,6 +213,8 @@ def make_mjx_engine(robot: Robot, contact: bool = True) -> Engine:
         joints=lambda state: (state[0][7:], state[1][6:]),
         load=load,
         touch=touch,
+        motions=motions,
+        cells=cells,
         command=lambda state: state[3],
         push=push,
         plant=plant,

@@ -7,7 +7,7 @@ have the population on the last axis: so a controller or a task is written once 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,6 +19,8 @@ from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import turned
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.sites import ModuleSites, Sites
+from mjx_revolve.inputs.errors import InputError, show
 
 # Centres of mass and of volume nearer than this are one point [m]: those of symmetric bodies are,
 # but for rounding. A choice.
@@ -102,9 +104,11 @@ def _mean(place: np.ndarray, weight: np.ndarray, owner: np.ndarray, count: int) 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["low", "high", "place", "axis", "source", "first", "second"],
-    meta_fields=["num_hinges", "num_thrusters", "num_pairs", "names", "pairs", "timestep"],
-)
+    data_fields=["low", "high", "place", "axis", "source", "first", "second", "mounts"],
+    meta_fields=[
+        "num_hinges", "num_thrusters", "num_pairs", "names", "pairs", "timestep", "modules",
+    ],
+)  # fmt: skip
 @dataclass(frozen=True)
 class Plant:
     """The actuators of a robot, as controllers see them.
@@ -127,6 +131,8 @@ class Plant:
         source: `[n, lanes]` which of the robot's actuators a row is; past their end: none.
         first: `[num_pairs, lanes]` the row of the pair's earlier hinge; past the end: no pair.
         second: `[num_pairs, lanes]` of the later one.
+        mounts: places of sensors on types of modules, where some are asked for and robots differ.
+        modules: places of all modules of one robot; None where robots differ.
     """
 
     num_hinges: int
@@ -142,6 +148,30 @@ class Plant:
     source: Any = None
     first: Any = None
     second: Any = None
+    mounts: Any = field(default_factory=dict)
+    modules: ModuleSites | None = None
+
+    def site(self, place: str) -> Sites:
+        """Where sensors sit.
+
+        Args:
+            place: "at ID", a module of one robot, or "each TYPE", modules of a type.
+
+        Returns:
+            The place, or one on each rigid body.
+
+        Raises:
+            InputError: there is no such module, or robots differ.
+        """
+        if place in self.mounts:
+            found: Sites = self.mounts[place]
+            return found
+        if self.modules is None:
+            raise InputError(
+                "expected `each` a type of modules in place of `at`, as bodies differ; found "
+                f"{show(place.split(' ', 1)[1])}"
+            )
+        return self.modules.find(place)
 
     @property
     def num_actuators(self) -> int:
@@ -231,6 +261,7 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
         source=source[:, None],
         first=ends[:, :1],
         second=ends[:, 1:],
+        modules=ModuleSites(robot, tuple(source[: robot.num_hinges].tolist())),
     )
 
 

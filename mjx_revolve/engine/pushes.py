@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.contact import bed_on_level
+from mjx_revolve.engine.columns import LOCKED
+from mjx_revolve.engine.contact import bed_on_level, bed_pushes
 from mjx_revolve.engine.dynamics import Bodies, Moving, move_bodies
 from mjx_revolve.engine.hydrodynamics import forces_on_parts, water_on_level
 from mjx_revolve.engine.level import Level
@@ -19,6 +20,9 @@ from mjx_revolve.numerics.spatial import (
     add,
     dot,
     safe_norm,
+    total,
+    vadd,
+    vscale,
     vsub,
 )
 from mjx_revolve.water.flow import Water
@@ -84,17 +88,56 @@ def touch_of(bodies: Bodies, state: State, water: Water) -> jax.Array:
     root, moved, *_ = move_bodies(bodies, relative, True, 0.0)
 
     def pushes(level: Level, gathered: Any, moved: tuple[Moving, Any]) -> tuple[Any, Any, Any]:
-        motion = moved[0].motion
+        motion, force = moved[0].motion, gathered
         size = jnp.zeros((level.count, *like.shape), like.dtype)
         if level.points is not None:
-            size = size + safe_norm(
-                bed_on_level(bodies.world, level, motion, level.points, water)[1]
-            )
-        return (), size, ()
+            own = bed_on_level(bodies.world, level, motion, level.points, water)[1]
+            force = own if force is None else vadd(own, force)
+        if force is not None:
+            size = size + safe_norm(tuple(add(x, jnp.zeros_like(size)) for x in force))
+        # What rides on a body, rigidly, is a row of its own where robots differ, but no body.
+        share: Any = 0.0
+        if level.hinges is not None and isinstance(level.hinges.armature, jax.Array):
+            share = jnp.where(level.hinges.armature > LOCKED / 2, 1, 0).astype(like.dtype)
+        return vscale(share, force or (0.0, 0.0, 0.0)), size, ()
 
-    _, below, _ = bodies.up(pushes, ((), ()), moved)
-    core = pushes(bodies.root, None, (root, None))[1]
+    gathered, below, _ = bodies.up(pushes, ((0.0, 0.0, 0.0), ()), moved)
+    core = pushes(bodies.root, gathered, (root, None))[1]
     return jnp.concatenate([core, bodies.merge(below, like)])
+
+
+def cells_of(levels: Levels, state: State, water: Water) -> tuple[tuple[jax.Array, jax.Array], ...]:
+    """How hard the bed pushes the two halves of each module.
+
+    Halves are told apart as Revolve's touch sensor has its two cells: left and right of the way in
+    which the module is attached, its z up.
+
+    Args:
+        levels: the robot.
+        state: of the population.
+        water: surface and current.
+
+    Returns:
+        Of each module (left, right), the force along the bed's normal, friction apart, `[lanes]`
+        each [N]; 0 where there is no bed within reach.
+    """
+    like, assembly = state.position[0], levels.robot.assembly
+    relative = state._replace(velocity=vsub(state.velocity, water.current))
+    root, moved, *_ = move_bodies(levels, relative, True, 0.0)
+    part, right = assembly.point_part, assembly.point_right
+    modules = levels.robot.morphology.num_modules
+    found: list[tuple[list[Any], list[Any]]] = [([], []) for _ in range(modules)]
+    found_moving = (root, *(moving for moving, _ in moved))
+    for level, moving, rows in zip(levels.all, found_moving, levels.point_rows, strict=True):
+        if level.points is None:
+            continue
+        push = bed_pushes(levels.world, level, moving.motion, level.points, water)
+        for slot, body in zip(*np.nonzero(rows >= 0), strict=True):
+            point = rows[slot, body]
+            module = assembly.layout.module[part[point]]
+            found[module][int(right[point])].append(push[slot, body])
+    none = jnp.zeros_like(like)
+    return tuple((total(none, *left), total(none, *right)) for left, right in found)
 
 
 def part_forces(

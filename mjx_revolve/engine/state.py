@@ -89,6 +89,11 @@ class Engine(NamedTuple):
         load: (state, ctrl) → torque of the servos that are told this, likewise [N·m].
         touch: (state, water) → how hard the bed pushes the core's rigid body, then what each hinge
             carries, `[1 + hinge rows, lanes]` [N]; a sweep over the body, so not for nothing.
+        motions: state → where the core's rigid body is and how it moves, then what each hinge
+            carries: a `Motion` of `[1 + hinge rows, lanes]` each, velocities over ground, each
+            body's frame at its hinge; likewise a sweep.
+        cells: (state, water) → how hard the bed pushes the left and the right half of each module,
+            along its normal, `[lanes]` [N]; likewise. None for many different robots.
         command: state → the thrusters' commands behind their lag, `[nthruster, lanes]` [-].
         push: (state, ctrl, water) → (force of the bed, force of the water) on the whole robot,
             world frame, three of `[lanes]` each [N]; weight and carried water's inertia apart.
@@ -108,6 +113,8 @@ class Engine(NamedTuple):
     joints: Callable[[Any], tuple[jax.Array, jax.Array]]
     load: Callable[[Any, jax.Array], jax.Array]
     touch: Callable[[Any, Water], jax.Array]
+    motions: Callable[[Any], Motion]
+    cells: Callable[[Any, Water], tuple[tuple[jax.Array, jax.Array], ...]] | None
     command: Callable[[Any], jax.Array]
     push: Callable[[Any, jax.Array, Water], tuple[Vec, Vec]]
     plant: Plant

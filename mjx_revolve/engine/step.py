@@ -16,8 +16,9 @@ from mjx_revolve.engine.collisions import Meet
 from mjx_revolve.engine.dynamics import Bodies, accelerate
 from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.levels import Levels, make_levels
+from mjx_revolve.engine.motions import motions_of
 from mjx_revolve.engine.plant import Plant, actuators_of, plant_of
-from mjx_revolve.engine.pushes import push_of, touch_of
+from mjx_revolve.engine.pushes import cells_of, push_of, touch_of
 from mjx_revolve.engine.robot import Robot, check_timestep
 from mjx_revolve.engine.servos import motor_torque
 from mjx_revolve.engine.state import Engine, State, advance, root_of
@@ -167,6 +168,10 @@ def make_step_engine(
     def touch(state: State, water: Water) -> jax.Array:
         return touch_of(bodies, state, water)
 
+    def cells(state: State, water: Water) -> tuple[tuple[jax.Array, jax.Array], ...]:
+        assert isinstance(bodies, Levels)
+        return cells_of(bodies, state, water)
+
     return Engine(
         init=partial(init, bodies),
         step=lambda state, ctrl, water, pushes=(): step(own(), state, ctrl, water, pushes),
@@ -175,6 +180,8 @@ def make_step_engine(
         joints=partial(joints, bodies),
         load=lambda state, ctrl: load(own(), state, ctrl),
         touch=touch,
+        motions=partial(motions_of, bodies),
+        cells=cells if isinstance(bodies, Levels) else None,
         command=command,
         push=push,
         plant=plant,

@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.control.sense import Memory, feel, remember, start_memory
-from mjx_revolve.control.sensors import Observer, make_observer
+from mjx_revolve.control.sensors import Observer, make_observer, with_types
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.evaluation import Setup, make_recorder, record_target
-from mjx_revolve.episodes.fitness import Fitness
+from mjx_revolve.episodes.fitness import Fitness, read_modules
 from mjx_revolve.episodes.rollout import flow_at
 from mjx_revolve.episodes.scoring import WORST, first_counted, score_episodes
 from mjx_revolve.episodes.starts import Starts, cues_of, draw_starts, gusty_water, start_pose
@@ -266,9 +266,10 @@ class Environment:
             time = (state.clock + count).astype(energy.dtype) * dt
             water = flow_at(world, still if row is None else row)(time, None)
             before = engine.root(body)
+            motion = engine.motions(body) if memory.past is not None else None
             body, power = engine.step(body, ctrl, water)
             work = dt * power
-            memory = remember(memory, before, engine.root(body), ctrl, work, dt)
+            memory = remember(memory, before, engine.root(body), ctrl, work, dt, motion)
             return (body, memory, energy + work, count + 1), None
 
         carry = (state.body, state.memory, jnp.zeros_like(state.energy), jnp.zeros((), jnp.int32))
@@ -335,7 +336,8 @@ def make_environment(
         declared = make_config(data, "/", source=config.source).controller.sensors
     elif declared is None:
         declared = body.sensors
-    observer = make_observer(declared, every * setup.world.timestep)
+    declared = with_types(declared, read_modules(config), config.source)
+    observer = make_observer(declared, every * setup.world.timestep, plant)
     hinges = plant.names[: plant.num_hinges]
     joints = [f"{name} {joint}" for joint in hinges for name in observer.joint_names]
     names = (*observer.robot_names, *joints)

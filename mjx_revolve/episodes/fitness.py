@@ -26,6 +26,7 @@ from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutra
 from mjx_revolve.control.controller import Controller, as_plant, bind_genes, gene_places
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.sense import Cues
+from mjx_revolve.control.sensors import with_types
 from mjx_revolve.engine.batch import Bodies, Capacity, fit_capacity, pack_bodies
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_positions
@@ -33,7 +34,7 @@ from mjx_revolve.engine.plant import Plant, actuators_of, figure_of
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.engine.variation import Variation
-from mjx_revolve.episodes.config import Config, load_config, make_config
+from mjx_revolve.episodes.config import Config, ControllerConfig, load_config, make_config
 from mjx_revolve.episodes.evaluation import (
     Setup,
     make_recorder,
@@ -246,10 +247,12 @@ class MixedFitness:
     Attributes:
         setup: what all episodes have in common; its configuration's morphology is not used.
         touches: whether robots may come near the bed.
+        listening: settings of the controller, with all sensors that there are.
     """
 
     setup: Setup
     touches: bool
+    listening: ControllerConfig
 
     @property
     def config(self) -> Config:
@@ -289,7 +292,7 @@ class MixedFitness:
 
     def controller_of(self, body: Plant | Robot) -> Controller:
         """The controller of one body alone, whose genes are named after its own joints."""
-        return _find_controller(self.config, as_plant(body))
+        return _find_controller(self.config, self.listening, as_plant(body))
 
     def pad_genes(self, genes: Any, robot: Robot) -> Any:
         """The genes of one body's own controller as this fitness takes them.
@@ -492,7 +495,8 @@ def fit_body(config: Config, morphology: Morphology) -> Fitness:
     figure = figure_of(robot)
     reach = farthest(config.task, world, figure)
     engine = make_engine(robot, config.engine, may_touch_bed(task, config.task, world, reach))
-    controller = _find_controller(config, engine.plant, morphology)
+    settings = _listening(config, read_modules(config), morphology)
+    controller = _find_controller(config, settings, engine.plant, morphology)
     return Fitness(Setup(config, world, task, controller, engine, figure), robot)
 
 
@@ -549,11 +553,14 @@ def make_mixed_fitness(
     if config.colony is not None:  # who lives long gets anywhere
         touches = world.bed is not None
     shown = [*robots, *_show_kinds(kinds, robots, hinges)]
-    capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules)
-    example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
     _check_alike(config, examples)
-    controller = _find_controller(config, capacity.plant, example=example)
-    return MixedFitness(Setup(config, world, task, controller, capacity=capacity), touches)
+    listening = _listening(config, read_modules(config))
+    sites = dict.fromkeys(s.each for s in listening.sensors or () if s.each is not None)
+    capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules, tuple(sites))
+    example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
+    controller = _find_controller(config, listening, capacity.plant, example=example)
+    setup = Setup(config, world, task, controller, capacity=capacity)
+    return MixedFitness(setup, touches, listening)
 
 
 def _show_kinds(
@@ -661,15 +668,24 @@ def _check_alike(config: Config, bodies: Sequence[Morphology]) -> None:
             )
 
 
+def _listening(
+    config: Config, modules: Mapping[str, ModuleType], body: Morphology | None = None
+) -> ControllerConfig:
+    """Settings of the controller with all that it is told: sensors of types of modules, too."""
+    settings = config.controller
+    declared = settings.sensors
+    if declared is None and body is not None:
+        declared = body.sensors
+    return settings.model_copy(update={"sensors": with_types(declared, modules, config.source)})
+
+
 def _find_controller(
     config: Config,
+    settings: ControllerConfig,
     plant: Plant,
     body: Morphology | None = None,
     example: Plant | None = None,
 ) -> Controller:
-    settings = config.controller
-    if settings.sensors is None and body is not None:
-        settings = settings.model_copy(update={"sensors": body.sensors})
     if settings.depth is None:
         settings = settings.model_copy(update={"depth": config.task.depth})
     return find_controller(plant, settings, config.source, example, body)

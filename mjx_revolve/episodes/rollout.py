@@ -132,14 +132,16 @@ def go_on(
         (state, drive_state, memory, energy, count), (now, meeting) = carry, now
         time = clock(count, energy)
         water = flow(time, now)
-        felt = feel(world, engine, state, water, time, cues, memory, feels, meeting)
+        # One sweep over the body serves what is felt now and what is remembered of it.
+        motion = engine.motions(state) if memory.past is not None else None
+        felt = feel(world, engine, state, water, time, cues, memory, feels, meeting, motion)
         own = time if since is None else clock(count - since, energy)
         drive_state, ctrl = drive(drive_state, own, now, felt)
         before = engine.root(state)
         pushes = () if engine.meet is None else (meeting.push,)
         state, power = engine.step(state, ctrl, water, *pushes)
         work = timestep * power
-        memory = remember(memory, before, engine.root(state), ctrl, work, timestep)
+        memory = remember(memory, before, engine.root(state), ctrl, work, timestep, motion)
         return Passage(state, drive_state, memory, energy + work, count + 1), ctrl
 
     first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)

@@ -14,6 +14,7 @@ from laboratory import WILD, read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.neurons import evolve_brain, make_network, read_network
+from mjx_revolve.control.places import Place
 from mjx_revolve.control.sense import Sense
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
@@ -81,10 +82,14 @@ def play(robot, genes, steps, sense):
 
 
 def felt():
-    """Specific force, spin, and how the bed pushes core, arm, tail and fin."""
+    """Specific force, spin, and how the bed pushes the pad's left cell and its right one."""
     three = lambda *x: tuple(np.array([v]) for v in x)  # noqa: E731
-    touch = np.array([[0.0], [0.6], [3.0], [0.0]])
-    return Sense(0.0, 0.0, (), three(0.5, -1.0, 2.0), force=three(1.0, 3.0, 9.0), touch=touch)
+    zero = three(0.0, 0.0, 0.0)
+    pad = Place(
+        1.0, 0.0, 0.0, zero, zero, zero, zero, 0.0, zero, cells=(zero[0] + 3, zero[0] + 0.6)
+    )
+    places = {"at pad": pad}
+    return Sense(0.0, 0.0, (), three(0.5, -1.0, 2.0), force=three(1.0, 3.0, 9.0), places=places)
 
 
 def test_a_network_by_hand(robot):
@@ -109,7 +114,7 @@ def test_a_network_by_hand(robot):
 
 def test_what_it_asks_to_feel_and_what_may_evolve(robot):
     controller = make_network(plant_of(robot), robot.morphology)
-    assert set(controller.feels) == {"force", "touch"}
+    assert set(controller.feels) == {"force", "cells", "at pad"}
     # Seven weights, as that into the oscillator does nothing; three and three times two numbers.
     assert controller.num_genes == 7 + 3 + 6 == len(set(controller.gene_names))
     assert "weight 8 sum>clock" not in controller.gene_names

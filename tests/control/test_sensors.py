@@ -209,7 +209,7 @@ def test_the_guides_table_of_sensors_is_the_codes():
 
 
 def test_the_guides_examples_are_read():
-    sensed, thinker = (
+    sensed, placed, thinker = (
         yaml.safe_load(x) for x in re.findall(r"```yaml\n(.*?)```", GUIDE, re.DOTALL)
     )
     settings = ControllerConfig(**sensed["controller"])
@@ -219,3 +219,5 @@ def test_the_guides_examples_are_read():
     plant = plant_of(build_robot(body, world()))
     network = find_controller(plant, ControllerConfig(type="brain"), body=body)
     assert network.num_genes == 2 + 3 + 2
+    sensors = schema.read(SensorRow, placed["sensors"], "sensors")
+    assert len(make_observer(sensors, DT, plant).robot_names) == 3 + 3 + 2 + 3

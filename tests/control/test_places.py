@@ -1,0 +1,500 @@
+"""What is felt at modules: MuJoCo's own sensors at sites, for one body, in a batch, and in MJX."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from laboratory import (
+    OAR,
+    QUICK,
+    WATER,
+    arm_robot,
+    at_rest,
+    body,
+    box_robot,
+    elbow_robot,
+    march,
+    read,
+    world,
+)
+from mjx_revolve.body.catalogue import MODULES, load_modules
+from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.body.sensors import Sensor, SensorRow
+from mjx_revolve.control.sense import Cues, feel, start_memory
+from mjx_revolve.control.sensors import USUAL, make_observer, with_types
+from mjx_revolve.engine.batch import fit_capacity, pack_bodies
+from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.rows import make_rows
+from mjx_revolve.engine.step import make_step_engine
+from mjx_revolve.episodes.config import make_config
+from mjx_revolve.episodes.fitness import fit_body, make_mixed_fitness
+from mjx_revolve.inputs import schema
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.flow import water_of
+
+DT, LANES = 1e-4, 2
+# A current along x, and one along y that fades to nothing 20 m down.
+SHEAR = {"velocity": (0.0, 0.5, 0.0), "depth": 20.0, "profile": "linear"}
+SEA = world(**WATER | {
+    "current": (0.3, 0.0, 0.0), "shear": SHEAR, "bed": {"height": -9.0}, "timestep": DT,
+})  # fmt: skip
+TARGET = np.array([1.0, 2.0, -4.0])
+FEET = ("back_foot", "right_thigh", "left_knee", "core")
+PLACES = tuple(f"at {name}" for name in FEET)
+ASKED = ("forces", "load", *PLACES, "each FixedBrick")
+RIGID = ("up", "north", "spin", "flow", "target", "force")  # vectors of a place
+ALONE = ("height", "climb", "altitude")
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return build_robot(body("spider"), SEA)
+
+
+def moving(robot, seed):
+    """Two states, a step apart: `[nq, lanes]`, `[nv, lanes]` twice, and the acceleration."""
+    draw, model = np.random.default_rng(seed), robot.mj_model
+    qpos = np.repeat(model.qpos0[:, None], LANES, 1)
+    qpos[:3] = draw.normal(size=(3, LANES)) - [[0], [0], [5]]
+    qpos[3:7] = draw.normal(size=(4, LANES))
+    qpos[3:7] /= np.linalg.norm(qpos[3:7], axis=0)
+    qpos[7:] = draw.uniform(-0.5, 0.5, (model.nq - 7, LANES))
+    qvel = draw.normal(size=(model.nv, LANES))
+    qacc = 5 * draw.normal(size=qvel.shape)
+    after, speed = qpos.copy(), qvel + DT * qacc
+    for lane in range(LANES):
+        own = after[:, lane].copy()
+        mujoco.mj_integratePos(model, own, speed[:, lane], DT)
+        after[:, lane] = own
+    return (qpos, qvel), (after, speed), qacc
+
+
+def felt(engine_of, before, after, ctrl, feels=ASKED):
+    """The senses after a step, in float64, as NumPy; and the plant's rows."""
+    with jax.enable_x64(True):
+
+        def run(before, after, ctrl):
+            engine = engine_of()
+            memory = start_memory(feels, engine, engine.init(*before))
+            memory = memory._replace(ctrl=engine.plant.arrange(ctrl))
+            state, water = engine.init(*after), water_of(SEA)
+            cues = Cues(target=tuple(TARGET))
+            found = feel(SEA, engine, state, water, jnp.zeros(()), cues, memory, feels)
+            return found._replace(noise=None), engine.plant.source
+
+        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (before, after, ctrl))
+        found, source = jax.jit(run, compiler_options=QUICK)(*arrays)
+        return jax.tree.map(np.asarray, found), np.asarray(source)
+
+
+def mujocos(robot, names, after, qacc, ctrl):
+    """What MuJoCo's sensors say in the middle of modules' main boxes, `[lanes, dim]` by (id, kind).
+
+    Its accelerations are those given: the water's are none of its own.
+    """
+    spec, kinds, objects = robot.mj_spec.copy(), mujoco.mjtSensor, mujoco.mjtObj
+    modules = {module.name: module for module in robot.morphology.modules}
+    for name in names:
+        module, model = modules[name], robot.mj_model
+        part = module.kind.parts[0 if module.kind.hinge is None else -1].name
+        geom = model.geom(f"{name}/{part}")
+        owner = spec.body(model.body(int(geom.bodyid[0])).name)
+        owner.add_site(name=name, pos=geom.pos, quat=geom.quat)
+        # A ray goes along z: this one is turned downwards, state by state.
+        owner.add_site(name=f"{name}/down", pos=geom.pos)
+        site, joint = objects.mjOBJ_SITE, objects.mjOBJ_JOINT
+        frames = ("framepos", "framexaxis", "frameyaxis", "framezaxis", "framelinvel")
+        for kind in ("gyro", "accelerometer", "velocimeter", *frames):
+            what = getattr(kinds, f"mjSENS_{kind.upper()}")
+            spec.add_sensor(name=f"{name} {kind}", type=what, objtype=site, objname=name)
+        what, at = kinds.mjSENS_RANGEFINDER, f"{name}/down"
+        distance = [1, 0, 0]  # of what a ray may tell
+        spec.add_sensor(
+            name=f"{name} rangefinder", type=what, objtype=site, objname=at, intprm=distance
+        )
+        if module.kind.hinge is not None:
+            at = model.joint(int(model.body(name).jntadr[0])).name
+            for kind, what in (
+                ("jointpos", kinds.mjSENS_JOINTPOS),
+                ("jointvel", kinds.mjSENS_JOINTVEL),
+                ("jointactuatorfrc", kinds.mjSENS_JOINTACTFRC),
+            ):
+                spec.add_sensor(name=f"{name} {kind}", type=what, objtype=joint, objname=at)
+    model = spec.compile()
+    model.geom_rgba[[model.geom(k).name != "bed" for k in range(model.ngeom)], 3] = 0  # no ray
+    data, found = mujoco.MjData(model), {}
+    for lane in range(LANES):
+        data.qpos[:], data.qvel[:] = after[0][:, lane], after[1][:, lane]
+        data.ctrl[list(robot.servos)] = ctrl[:, lane]
+        mujoco.mj_kinematics(model, data)
+        for name in names:
+            site, quat = model.site(f"{name}/down"), np.zeros(4)
+            down = data.xmat[int(site.bodyid[0])].reshape(3, 3).T @ (0, 0, -1)
+            mujoco.mju_quatZ2Vec(quat, down)
+            model.site_quat[site.id], model.site_sameframe[site.id] = quat, 0
+        mujoco.mj_forward(model, data)
+        data.qacc[:] = qacc[:, lane]
+        mujoco.mj_rnePostConstraint(model, data)
+        mujoco.mj_sensorAcc(model, data)
+        for k in range(model.nsensor):
+            name, kind = model.sensor(k).name.rsplit(" ", 1)
+            found.setdefault((name, kind), []).append(data.sensor(k).data.copy())
+    return {key: np.array(rows) for key, rows in found.items()}
+
+
+def expected(sensors, name):
+    """The senses at a module, `[lanes, ...]`, from what MuJoCo's sensors say there."""
+    of = lambda kind: sensors[name, kind]  # noqa: E731
+    place, velocity = of("framepos"), of("framelinvel")
+    axes = np.stack([of(f"frame{x}axis") for x in "xyz"], -1)  # world from module
+    seen = lambda x: np.einsum("lij,li->lj", axes, x)  # noqa: E731
+    water = np.array([[0.3, 0.5 * (1 + z / 20), 0.0] for z in place[:, 2]])
+    return {
+        "up": axes[:, 2],
+        "north": axes[:, 0],
+        "spin": of("gyro"),
+        "flow": seen(water) - of("velocimeter"),
+        "target": seen(TARGET - place),
+        "force": of("accelerometer"),
+        "height": place[:, 2],
+        "climb": velocity[:, 2],
+        "altitude": of("rangefinder")[:, 0],
+    }
+
+
+# Rounding alone, but for the specific force: it is the mean over a step, half a step old. In
+# .05 ms a force of 50 m/s2 turns by 3 rad/s and changes by some 100 m/s3: .01 m/s2.
+TOLERANCE = {"force": 0.02}
+
+
+def compare(place, wanted, pick):
+    for name in (*RIGID, *ALONE):
+        value = getattr(place, name)
+        found = np.stack([pick(x) for x in value], -1) if name in RIGID else pick(value)
+        close = TOLERANCE.get(name, 1e-9)
+        assert found == pytest.approx(wanted[name], abs=close), name
+        assert np.abs(found).max() > 20 * close, name
+
+
+@pytest.fixture(scope="module")
+def spiders(robot):
+    """A moving spider, and what MuJoCo's sensors say of its modules."""
+    before, after, qacc = moving(robot, 1)
+    ctrl = after[0][7:] + np.random.default_rng(0).uniform(-0.03, 0.03, (8, LANES))
+    bricks = [m.name for m in robot.morphology.modules if m.type == "FixedBrick"]
+    names = dict.fromkeys((*FEET, *bricks, "left_knee"))
+    return before, after, ctrl, mujocos(robot, names, after, qacc, ctrl)
+
+
+@pytest.mark.parametrize("kind", ["population", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_modules_of_a_moving_spider_feel_what_mujocos_sensors_do(kind, robot, spiders):
+    before, after, ctrl, sensors = spiders
+    found, source = felt(lambda: make_engine(robot, kind), before, after, ctrl)
+    for name in FEET:
+        compare(found.places[f"at {name}"], expected(sensors, name), lambda x: x)
+    knee = found.places["at left_knee"]
+    for name, kind in (("angle", "pos"), ("speed", "vel"), ("load", "actuatorfrc")):
+        wanted = sensors["left_knee", f"joint{kind}"][:, 0]
+        assert getattr(knee, name) == pytest.approx(wanted, abs=1e-9)
+        assert np.abs(wanted).max() > 0.01
+    compare_bricks(found.places["each FixedBrick"], source, sensors, range(LANES))
+
+
+def compare_bricks(place, source, sensors, lanes):
+    """On each body that a hinge of the spider carries, the first brick; none on the core."""
+    limbs = ("back", "front", "right", "left")
+    for lane in lanes:
+        column = source[:, lane if source.shape[1] > 1 else 0]
+        for k in range(8):
+            name = f"{limbs[k // 2]}_{('thigh', 'foot')[k % 2]}"
+            row = 1 + int(np.flatnonzero(column == k)[0])
+            wanted = {key: x[lane] for key, x in expected(sensors, name).items()}
+            assert place.there[row, lane] == 1
+            compare(place, wanted, lambda x, row=row, lane=lane: x[row, lane])
+        assert place.there[:, lane].sum() == 8 and place.there[0, lane] == 0
+
+
+@pytest.mark.slow
+def test_in_a_batch_of_different_bodies_they_feel_the_same(robot, spiders):
+    before, after, ctrl, sensors = spiders
+    robots = [robot, elbow_robot(SEA)]
+    capacity = fit_capacity([*robots, arm_robot(SEA)], sites=("FixedBrick", "Fin"))
+    bodies = pack_bodies(robots, capacity, np.float64)
+
+    def engine():
+        return make_step_engine(
+            make_rows(SEA, capacity, bodies, LANES), jax.tree.map(jnp.asarray, bodies.plant)
+        )
+
+    feels = ("forces", "load", "each FixedBrick", "each Fin")
+    found, source = felt(engine, before, after, ctrl, feels)
+    bricks = found.places["each FixedBrick"]
+    compare_bricks(bricks, source, sensors, [0])
+    # The elbow's are its two, whatever else stands in its rows.
+    assert bricks.there[:, 1].sum() == 2
+    assert not found.places["each Fin"].there.any()
+    # Bodies of a batch have no names of their own.
+    with pytest.raises(InputError, match="expected `each` a type of modules in place of `at`"):
+        capacity.plant.site("at back_foot")
+
+
+@pytest.mark.slow
+def test_sensors_on_modules_reach_the_observation(robot, spiders):
+    before, after, ctrl, sensors = spiders
+    declared = [
+        Sensor(type="flow", at="back_foot", range=100),
+        Sensor(type="accelerometer", at="left_knee", range=100),
+        Sensor(type="angle", at="left_knee", range=100),
+        Sensor(type="depth", each="FixedBrick", range=100),
+    ]
+    plant = make_engine(robot).plant
+    observer = make_observer(declared, DT, plant)
+    assert observer.feels == ("at back_foot", "at left_knee", "forces", "each FixedBrick")
+    assert observer.robot_names == (
+        "back_foot flow x", "back_foot flow y", "back_foot flow z", "left_knee accelerometer x",
+        "left_knee accelerometer y", "left_knee accelerometer z", "left_knee angle",
+        "FixedBrick depth",
+    )  # fmt: skip
+    assert observer.joint_names == ("FixedBrick depth",)
+    sense, source = felt(lambda: make_engine(robot), before, after, ctrl)
+    _, told = observer.observe((), jnp.zeros(()), sense, source[:8])
+    robots = 100 * np.stack(told.robot)
+    assert pytest.approx(expected(sensors, "back_foot")["flow"], abs=1e-4) == robots[:3].T
+    assert pytest.approx(sensors["left_knee", "accelerometer"], abs=0.02) == robots[3:6].T
+    assert robots[6] == pytest.approx(sensors["left_knee", "jointpos"][:, 0], abs=1e-5)
+    assert not robots[7].any()  # there is no brick on the core's rigid body
+    row = int(np.flatnonzero(source[:8, 0] == 1)[0])
+    wanted = -expected(sensors, "back_foot")["height"]
+    assert 100 * np.asarray(told.joint[0])[row] == pytest.approx(wanted, abs=1e-4)
+
+
+# ------------------------------------------------------------------------- touch
+
+PADS = """
+id: padded
+body:
+  id: core
+  type: Core
+  children:
+    0: {id: rear, type: FixedBrick, children: {1: {id: pad, type: TouchSensor}}}
+    1: {id: arm, type: ActiveHinge, children: {1: {id: hand, type: FixedBrick}}}
+    2: {id: side, type: FixedBrick}
+    3: {id: other, type: FixedBrick}
+"""
+GROUND = world(gravity=9.81, bed={"height": -1.0})
+MUD = world(**WATER | {"bed": {"height": -1.0}})
+STIFF = GROUND.bed.stiffness
+
+
+def touched(engine_of, qpos, what):
+    """What the bed does to bodies at rest, in float64."""
+    with jax.enable_x64(True):
+
+        def run(qpos):
+            engine = engine_of()
+            state = engine.init(qpos, jnp.zeros_like(qpos[1:]))
+            return getattr(engine, what)(state, water_of(GROUND)), engine.plant.source
+
+        found = jax.jit(run, compiler_options=QUICK)(jnp.asarray(qpos, jnp.float64))
+        return jax.tree.map(np.asarray, found)
+
+
+@pytest.mark.parametrize("kind", ["population", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_a_pads_cells_are_its_left_and_its_right_half(kind):
+    """Deep in the bed, level; then rolled about the way in which the pad is attached."""
+    robot = build_robot(read(PADS), GROUND)
+    pad = robot.morphology.modules[2]
+    assert pad.name == "pad"
+    half = np.array(pad.kind.parts[0].boxes[0].size) / 2
+    # It looks along -y of the core: its left is +x. At rest in the core's frame.
+    angles = np.array([0.0, 0.05, -0.05])
+    qpos = np.zeros((robot.mj_model.nq, 3))
+    qpos[3], qpos[5] = np.cos(angles / 2), np.sin(angles / 2)  # about y: +x goes down
+    qpos[2] = -1.0 + half[2] - 5e-4
+    cells, _ = touched(lambda: make_engine(robot, kind), qpos, "cells")
+    left, right = cells[2]
+    for lane, angle in enumerate(angles):
+        for found, x in ((left, half[1]), (right, -half[1])):
+            # Both corners of either end, above and below, in front and behind.
+            depth = [-1 - (qpos[2, lane] - x * np.sin(angle) + z * np.cos(angle))
+                     for z in (-half[2], half[2])]  # fmt: skip
+            assert found[lane] == pytest.approx(2 * STIFF * np.maximum(depth, 0).sum(), rel=1e-9)
+    assert left[0] == right[0] > 1 and left[1] > right[1] == 0 and right[2] > left[2] == 0
+
+
+def rest_in_mujoco(robot):
+    """What MuJoCo's touch sensors say of the halves of a box that has come to rest, -x first."""
+    spec = robot.mj_spec.copy()
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 1
+    half = np.array(robot.morphology.modules[0].kind.parts[0].boxes[0].size) / 2
+    for name, x in (("left", -half[0]), ("right", half[0])):
+        spec.bodies[1].add_site(
+            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=[x / 2, 0, 0],
+            size=[half[0] / 2, 1.1 * half[1], 1.1 * half[2]],
+        )  # fmt: skip
+        what, site = mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtObj.mjOBJ_SITE
+        spec.add_sensor(name=name, type=what, objtype=site, objname=name)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[2] = -1 + half[2]
+    for _ in range(400):
+        mujoco.mj_step(model, data)
+    return data.sensordata.copy()
+
+
+@pytest.mark.slow
+def test_a_box_at_rest_presses_its_halves_as_in_mujoco():
+    """A ballast of half the box's weight off its middle: the lever says how the halves share it."""
+    ballast = {"ballast_mass": 0.5, "ballast_position": (0.05, 0.0, 0.0)}
+    robot = box_robot((0.2, 0.1, 0.05), 1.0, GROUND, **ballast)
+    weight = 1.5 * 9.81
+    lever = weight * (0.5 + np.array([-1, 1]) * (0.5 * 0.05 / 1.5) / 0.2)
+    theirs = rest_in_mujoco(robot)
+    assert theirs == pytest.approx(lever, rel=2e-3)  # its solver stops short of rest
+    _, qpos, qvel, _ = march(robot, 1.0, *at_rest(robot, height=-1 + 0.025), every=200)
+    assert np.abs(qvel[-1]).max() < 1e-6
+    [cells], _ = touched(lambda: make_engine(robot), qpos[-1], "cells")
+    # Half a millimetre deeper on one side, it stands a little aslant.
+    assert np.concatenate(cells) == pytest.approx(lever, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_beds_force_on_a_body_counts_what_rides_on_it():
+    """In a batch, bodies of many parts fill several rows; alone, one."""
+    robot, other = build_robot(read(PADS), MUD), elbow_robot(MUD)
+    capacity = fit_capacity([robot, other], hinges=2, modules=8)
+    bodies = pack_bodies([robot, other, robot], capacity, np.float64)
+    qpos = np.zeros((7 + 2, 3))
+    qpos[3], qpos[2] = 1.0, (-0.99, -0.985, -0.987)
+
+    def many():
+        plant = jax.tree.map(jnp.asarray, bodies.plant)
+        return make_step_engine(make_rows(MUD, capacity, bodies, 3), plant)
+
+    assert bodies.count.max() > robot.num_hinges  # some row rides
+    found, source = touched(many, qpos, "touch")
+    alone, _ = touched(lambda: make_engine(robot), qpos[:8, [0, 2]], "touch")
+    for lane, own in ((0, 0), (2, 1)):
+        rows = np.flatnonzero(source[:, lane] == 0)
+        assert found[0, lane] == pytest.approx(alone[0, own], rel=1e-9)
+        assert found[1 + rows[0], lane] == pytest.approx(alone[1, own], rel=1e-9)
+    assert alone.min() > 1
+
+
+# ------------------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize(
+    ("sensor", "message"),
+    [
+        ({"type": "gyro", "at": "a", "each": "Core"}, "0.each: expected none, as there is `at`"),
+        ({"type": "touch"}, "0.at: expected the id of a module, as touch is felt by one; found"),
+        ({"type": "battery", "at": "hand"}, "0.at: expected none, as battery is of the whole"),
+        (
+            {"type": "angle", "each": "Core"},
+            "0.each: expected none, as angle is at each hinge; found",
+        ),
+        ({"type": "contact", "each": "Core"}, "0.each: expected none, as contact is of each rigid"),
+        ({"type": "gyro", "at": []}, "0.at: expected a name; found []"),
+    ],
+)
+def test_sensors_that_cannot_sit_there(sensor, message):
+    with pytest.raises(InputError) as caught:
+        schema.read(SensorRow, [sensor], "sensors")
+    assert f"sensors.{message}" in str(caught.value)
+
+
+def test_a_module_that_is_not_there_is_refused():
+    plant = plant_of(build_robot(read(PADS), GROUND))
+    for sensor, message in (
+        (Sensor(type="flow", at="tail"), "sensors.0.at: expected the id of a module; found 'tail'"),
+        (Sensor(type="angle", at="hand"), "sensors.0.at: expected a module with a hinge, as angle"),
+    ):
+        with pytest.raises(InputError) as caught:
+            make_observer([sensor], DT, plant)
+        assert message in str(caught.value)
+    assert Sensor(type="flow", at=3).to_mapping() == {"type": "flow", "at": "3"}
+
+
+FISHY = """
+modules:
+  FixedBrick:
+    mount: {position: [0, -0.019, 0], outward: [0, 1, 0]}
+    parts: [{size: [0.041, 0.041, 0.0355], mass: 0.0102, volume: 1.07e-5}]
+    slots: {1: +y}
+    sensors: [{type: flow, range: 2}, {type: gyro, name: turn}]
+"""
+
+
+def test_types_of_modules_bring_their_sensors(tmp_path):
+    (tmp_path / "modules.yaml").write_text(FISHY)
+    modules = MODULES | load_modules(tmp_path / "modules.yaml")
+    found = with_types([Sensor(type="tilt")], modules)
+    assert [s.label for s in found] == ["tilt", "FixedBrick flow", "turn"]
+    assert [s.where for s in found] == ["robot", "body", "body"]
+    assert with_types(None, modules)[: len(USUAL)] == USUAL
+    assert with_types(None, MODULES) is None
+    # An alias is as good as a name; what is no type is refused, and so is one name twice.
+    assert with_types([Sensor(type="gyro", each="CoreComponent")], MODULES)[0].each == "Core"
+    with pytest.raises(
+        InputError, match=r"config: sensors.0.each: expected a type of modules, one"
+    ):
+        with_types([Sensor(type="gyro", each="Brick")], MODULES)
+    with pytest.raises(InputError, match=r"config: sensors.2.name: expected names that differ"):
+        with_types([Sensor(type="tilt", name="turn")], modules)
+    (tmp_path / "modules.yaml").write_text(FISHY.replace("type: gyro", "type: angle"))
+    with pytest.raises(InputError, match=r"sensors.1: expected a kind that may sit on modules"):
+        load_modules(tmp_path / "modules.yaml")
+
+
+@pytest.mark.slow
+def test_bodies_that_differ_have_the_sensors_of_their_modules(tmp_path):
+    """One body, alone and beside another one: the same score, to rounding."""
+    (tmp_path / "modules.yaml").write_text(FISHY)
+    (tmp_path / "paddle.yaml").write_text(PADDLE)
+    config = {
+        "morphology": str(tmp_path / "paddle.yaml"),
+        "modules": str(tmp_path / "modules.yaml"),
+        "world": {"name": "lake", "current": [0.1, 0, 0]},
+        "controller": {"type": "mlp", "hidden": 2, "messages": 0, "sensors": [
+            {"type": "accelerometer", "each": "FixedBrick"}, "angle"]},
+        "task": {"type": "directed_swim", "duration": 0.5, "settle": 0.0, "trials": 1},
+    }  # fmt: skip
+    modules = MODULES | load_modules(tmp_path / "modules.yaml")
+    examples = [make_morphology(yaml.safe_load(text), modules) for text in (PADDLE, OAR)]
+    settings = make_config(config, source="run.yaml")
+    mixed = make_mixed_fitness(settings, examples)
+    single = fit_body(settings, examples[0])
+    assert single.num_genes == mixed.num_genes
+    assert "FixedBrick flow x>h1" in single.controller.gene_names
+    genes = np.random.default_rng(0).normal(size=(2, mixed.num_genes)).astype(np.float32)
+    key = jax.random.key(0)
+    together = mixed([mixed.build(own) for own in examples], genes, key)
+    alone = single(genes[:1], key)
+    # Single precision, and hinges that meet their stops; in double, what is felt is the same.
+    assert together[0] == pytest.approx(float(alone[0]), abs=2e-4)
+    # The senses matter: with their weights at 0, it swims otherwise.
+    deaf = genes[:1].copy()
+    deaf[:, [k for k, n in enumerate(single.controller.gene_names) if "FixedBrick" in n]] = 0
+    assert abs(float(single(deaf, key)[0]) - float(alone[0])) > 2e-3
+    # A module's id is one body's alone.
+    named = config | {"controller": {"type": "mlp", "sensors": [{"type": "flow", "at": "hand"}]}}
+    with pytest.raises(InputError, match="expected `each` a type of modules in place of `at`"):
+        make_mixed_fitness(make_config(named, source="run.yaml"), examples)
+
+
+PADDLE = """
+body:
+  type: Core
+  children:
+    1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {1: {type: ActiveHinge}}}}}
+    2: {type: FixedBrick}
+"""
