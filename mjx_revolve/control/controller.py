@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.sensors import Observer
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot
 
@@ -50,6 +51,7 @@ class Controller(NamedTuple):
         genes: `[num_genes]` what each belongs to, or () where that is not known: only needed to
             carry genes from one body to another.
         feels: which of `sense.FEELS` it reads: they are there only for those who ask.
+        observer: of the declared sensors that it is told of; None without, so that nobody looks.
     """
 
     num_genes: int
@@ -59,6 +61,7 @@ class Controller(NamedTuple):
     step: Callable[[Any, Any, jax.Array, Sense], tuple[Any, jax.Array]]
     genes: tuple[Gene, ...] = ()
     feels: tuple[str, ...] = ()
+    observer: Observer | None = None
 
 
 @dataclass(frozen=True)

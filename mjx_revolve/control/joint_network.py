@@ -183,7 +183,7 @@ def make_joint_network(
         return (seen, said, memory), middle + fade * reach * jnp.tanh(command)
 
     found = make_controller(made_for, genes, decode, init, step)
-    return found._replace(feels=observer.feels)
+    return found._replace(feels=observer.feels, observer=observer)
 
 
 def _places(plant: Plant, like: jax.Array) -> list[jax.Array]:

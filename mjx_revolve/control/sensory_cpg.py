@@ -136,4 +136,4 @@ def make_sensory_cpg(
         return (seen, (phase + dt * speed, wide), offset), target
 
     found = make_controller(made_for, genes, decode, init, step)
-    return found._replace(feels=observer.feels)
+    return found._replace(feels=observer.feels, observer=observer)

@@ -16,6 +16,7 @@ from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.felt import Felt, feel_episode
 from mjx_revolve.view.motion import Motion, analyse_motion, count_finite, counted_time
 from mjx_revolve.view.report.record import RunRecord, number
 from mjx_revolve.view.surroundings import target_of
@@ -33,11 +34,13 @@ class Replay:
         motion: what it did, up to the first row that is not finite.
         score: of this episode; NaN where it blew up.
         measures: of this episode, as in `metrics.csv`.
+        felt: what its brain was told of the declared sensors, up to the same row.
     """
 
     motion: Motion
     score: float
     measures: dict[str, float]
+    felt: tuple[Felt, ...] = ()
 
 
 def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
@@ -75,7 +78,8 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
         fitness.robot, trajectory, begin, phases, fitness.water(key),
         target_of(fitness.config.task),
     )  # fmt: skip
-    return Replay(motion, score, measures)
+    finite = jax.tree.map(lambda x: x[:count], trajectory)
+    return Replay(motion, score, measures, feel_episode(fitness, finite, key))
 
 
 def has_phases(fitness: Fitness) -> bool:

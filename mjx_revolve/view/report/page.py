@@ -28,6 +28,7 @@ from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.evolution.fingerprints import model_hash
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.trust import UntrustedError
+from mjx_revolve.view.motion import Motion
 from mjx_revolve.view.plots import COLORS, figure_svg, plot_fitness, plot_way
 from mjx_revolve.view.report import champion_pictures, run_pictures, tables
 from mjx_revolve.view.report.bodies import anchor, inline_svg, show_population, viewer_command
@@ -35,6 +36,7 @@ from mjx_revolve.view.report.champion import Replay, replay_champion
 from mjx_revolve.view.report.groups import Group, group_runs
 from mjx_revolve.view.report.record import RunRecord
 from mjx_revolve.view.report.repeat import environment, repeat_commands, sources
+from mjx_revolve.view.report.sense_pictures import plot_senses
 from mjx_revolve.view.swim_picture import draw_motion
 
 GENERATOR = "mjx_revolve.report"  # tells our pages from others
@@ -267,6 +269,7 @@ def _champion(record: RunRecord, replay: Replay) -> str:
         "phases": None if motion.phases is None else champion_pictures.plot_phases(motion),
         "thrusters": champion_pictures.plot_thrusters(motion) if robot.num_thrusters else None,
         "energy": champion_pictures.plot_energy(motion),
+        "senses": plot_senses(_before(motion), replay.felt) if replay.felt else None,
     }
     pictures = {name: figure and svg_source(figure) for name, figure in drawn.items()}
     pictures["swim"] = _source(_swim_jpeg(replay), "jpeg")
@@ -275,6 +278,11 @@ def _champion(record: RunRecord, replay: Replay) -> str:
         robot.morphology.name, float(motion.time[-1]), motion.counted_from,
         origin if isinstance(origin, str) else "", tables.measures_table(record, replay), pictures,
     )  # fmt: skip
+
+
+def _before(motion: Motion) -> np.ndarray:
+    """`[T]` when each step began [s]."""
+    return motion.time - motion.time[0]
 
 
 def _swim_jpeg(replay: Replay) -> bytes:
