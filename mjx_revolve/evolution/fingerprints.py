@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.inputs.own_code import content_name, parse_own
 from mjx_revolve.numerics import runtime
 
@@ -51,6 +52,15 @@ def settings_hash(config: Config) -> str:
         data[section]["type"] = content_name(data[section]["type"])
         if not data[section]["params"]:  # as runs have it from before there were any
             del data[section]["params"]
+    for sensor in data["controller"]["sensors"] or ():
+        for key in ("at", "each"):  # likewise
+            if sensor[key] is None:
+                del sensor[key]
+    if config.modules is not None:  # which tell brains more than the configuration does
+        kinds = {kind.name: kind.sensors for kind in load_modules(config.modules).values()}
+        brought = {name: [s.to_mapping() for s in own] for name, own in kinds.items() if own}
+        if brought:
+            data["controller"]["brought"] = brought
     if not data["task"]["measures"]:  # likewise
         del data["task"]["measures"]
     if data["colony"] is None:  # likewise

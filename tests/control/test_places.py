@@ -35,6 +35,7 @@ from mjx_revolve.engine.rows import make_rows
 from mjx_revolve.engine.step import make_step_engine
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.fitness import fit_body, make_mixed_fitness
+from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs import schema
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
@@ -498,3 +499,26 @@ body:
     1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {1: {type: ActiveHinge}}}}}
     2: {type: FixedBrick}
 """
+
+
+def test_a_runs_fingerprint_knows_the_sensors_of_types(tmp_path):
+    """And runs from before there were any keep theirs."""
+    (tmp_path / "oar.yaml").write_text(OAR)
+    base = {
+        "morphology": str(tmp_path / "oar.yaml"),
+        "modules": str(tmp_path / "modules.yaml"),
+        "world": "lake",
+        "controller": {"type": "mlp", "sensors": ["tilt", {"type": "gyro", "range": 5}]},
+        "task": {"type": "directed_swim"},
+    }
+
+    def of(text, **changes):
+        (tmp_path / "modules.yaml").write_text(text)
+        return settings_hash(make_config(base | changes, source="run.yaml"))
+
+    bare = FISHY[: FISHY.index("    sensors:")]
+    assert of(bare) == of(bare, modules=None) == "cadb858f78c37cb4"
+    assert of(FISHY) == of(FISHY) != of(bare)
+    assert of(FISHY.replace("range: 2", "range: 3")) != of(FISHY)
+    placed = {"type": "mlp", "sensors": ["tilt", {"type": "gyro", "range": 5, "each": "Core"}]}
+    assert of(bare, controller=placed) != of(bare)
