@@ -129,6 +129,7 @@ SENSORS: Mapping[str, SensorKind] = {
         lambda s: s.nearest.toward,
         "from the core to the nearest other robot's, core frame",
         "nearest",
+        sits=False,
     ),
     "nearest_bearing": SensorKind(
         _THREE,
@@ -138,6 +139,7 @@ SENSORS: Mapping[str, SensorKind] = {
         lambda s: _bearing(s.nearest.toward),
         "direction of the nearest other robot, core frame",
         "nearest",
+        sits=False,
     ),
     "nearest_distance": SensorKind(
         _ONE,
@@ -147,6 +149,7 @@ SENSORS: Mapping[str, SensorKind] = {
         lambda s: (_distance(s.nearest.toward),),
         "of the nearest other robot",
         "nearest",
+        sits=False,
     ),
     "nearest_tag": SensorKind(
         _ONE,
@@ -156,6 +159,7 @@ SENSORS: Mapping[str, SensorKind] = {
         lambda s: (s.nearest.tag,),
         "by which the nearest other robot can be told apart",
         "nearest",
+        sits=False,
     ),
     "battery": SensorKind(
         _ONE,
@@ -277,7 +281,7 @@ class Sensor:
         if kind.where == "module" and self.at is None:
             raise MisfitError("at", f"the id of a module, as {self.type} is felt by one", "none")
         if self.place and not kind.sits:
-            what = f"none, as {self.type} is of the whole robot"
+            what = f"none, as {self.type} is of the robot as a whole"
             raise MisfitError(key, what, show(getattr(self, key)))
         if self.each is not None and kind.where != "robot":
             what = f"none, as {self.type} is at each hinge" if kind.where == "joint" else "none, as"

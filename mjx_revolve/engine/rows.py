@@ -145,11 +145,7 @@ class Rows:
 
     def lay_out(self, kept: Joined, which: Callable[[Any], Any], like: jax.Array) -> Any:
         """What `which` takes of a value that `down` has kept, each number as `merge` has it."""
-        count = kept.tree.num_leaves
-        columns = kept.data.reshape(-1, count, self.lanes)
-        return jax.tree.map(
-            lambda k: columns[:, k], which(jax.tree.unflatten(kept.tree, range(count)))
-        )
+        return which(self.unfold(kept))
 
     # What parts are, group by group.
 

@@ -160,7 +160,9 @@ def _watcher(fitness: Fitness, steps: int) -> Any:
             time = k.astype(qpos.dtype) * dt
             now = flow_at(world, jax.tree.map(lambda x: x[k][None], water))(time, None)
             motion = engine.motions(state) if memory.past is not None else None
-            sense = feel(world, engine, state, now, time, cues, memory, observer.feels, motion)
+            sense = feel(
+                world, engine, state, now, time, cues, memory, observer.feels, motion=motion
+            )
             seen, told = observer.observe(seen, time, sense, number)
             asked = engine.plant.arrange(ctrl[k][:, None])
             memory = remember(

@@ -398,7 +398,7 @@ def test_the_beds_force_on_a_body_counts_what_rides_on_it():
     [
         ({"type": "gyro", "at": "a", "each": "Core"}, "0.each: expected none, as there is `at`"),
         ({"type": "touch"}, "0.at: expected the id of a module, as touch is felt by one; found"),
-        ({"type": "battery", "at": "hand"}, "0.at: expected none, as battery is of the whole"),
+        ({"type": "battery", "at": "hand"}, "0.at: expected none, as battery is of the robot"),
         (
             {"type": "angle", "each": "Core"},
             "0.each: expected none, as angle is at each hinge; found",

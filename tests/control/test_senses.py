@@ -149,7 +149,7 @@ def test_one_body_many_bodies_and_mjx_feel_the_same(kind, robot, felt, states):
     lanes = slice(0, 2 if kind == "different" else LANES)
     one, own = felt
     for name in one._fields:
-        if name not in ("angle", "speed", "load", "touch", "noise", "places"):
+        if name not in ("angle", "speed", "load", "touch", "noise", "nearest", "places"):
             a, b = np.stack(getattr(found, name)), np.stack(getattr(one, name))
             assert a[..., lanes] == pytest.approx(b[..., lanes], abs=1e-12), name
     for name in ("angle", "speed", "load"):
