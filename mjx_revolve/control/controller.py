@@ -14,12 +14,16 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.control.sense import Sense
 from mjx_revolve.control.sensors import Observer
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot
+
+# How long commands take to fade in, so that no joint jumps at the start [s]; a choice.
+_FADE = 0.5
 
 
 class Gene(NamedTuple):
@@ -114,6 +118,18 @@ def make_controller(
         return f"{gene.what} {names[gene.number + shift]}"
 
     return Controller(len(genes), tuple(map(name, genes)), decode, init, step, tuple(genes))
+
+
+def fade_in(time: jax.Array) -> jax.Array:
+    """By what share commands have faded in.
+
+    Args:
+        time: since the start [s].
+
+    Returns:
+        From 0 at the start to 1 after half a second and ever after.
+    """
+    return jnp.minimum(time / _FADE, 1)
 
 
 def gene_places(own: Controller, common: Controller) -> np.ndarray:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.body.sensors import Sensor
-from mjx_revolve.control.controller import Controller, Gene, as_plant, make_controller
+from mjx_revolve.control.controller import Controller, Gene, as_plant, fade_in, make_controller
 from mjx_revolve.control.neighbours import act, mean_of_neighbours
 from mjx_revolve.control.sense import Sense
 from mjx_revolve.control.sensors import make_observer
@@ -28,8 +28,6 @@ from mjx_revolve.numerics.xla import keep
 _WEIGHT = 2.0
 # By which places are divided before they enter the network [m], about two modules; a choice.
 _LENGTH = 0.1
-# How long commands take to fade in [s], so that no joint jumps at the start; as `make_sine`.
-_FADE = 0.5
 # How long messages take to be heard [s]; a choice. At once, joints that contradict each other would
 # chatter at the rate of the steps.
 _HEARD = 0.05
@@ -179,8 +177,7 @@ def make_joint_network(
         share = min(dt / _HEARD, 1.0)
         told = [sum(speech[k, m] * h[k][:rows] for k in range(hidden)) for m in range(len(said))]
         said = tuple(old + share * (new - old) for old, new in zip(said, told, strict=True))
-        fade = jnp.minimum(time / _FADE, 1)
-        return (seen, said, memory), middle + fade * reach * jnp.tanh(command)
+        return (seen, said, memory), middle + fade_in(time) * reach * jnp.tanh(command)
 
     found = make_controller(made_for, genes, decode, init, step)
     return found._replace(feels=observer.feels, observer=observer)

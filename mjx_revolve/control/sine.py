@@ -12,6 +12,7 @@ from mjx_revolve.control.controller import (
     Controller,
     Gene,
     as_plant,
+    fade_in,
     make_controller,
     of_actuators,
 )
@@ -80,8 +81,7 @@ def _decode(
 def _step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
     """The step of a `Controller` made of sines."""
     sizes, offset, rate, center = parameters
-    fade = jnp.minimum(time / 0.5, 1.0)
-    wave = offset
+    fade, wave = fade_in(time), offset
     for k, (u, v) in enumerate(sizes):
         sine, cosine = sincos((k + 1) * rate * time)
         wave = wave + u * sine + v * cosine

@@ -12,14 +12,13 @@ from mjx_revolve.control.controller import (
     Controller,
     Gene,
     as_plant,
+    fade_in,
     make_controller,
     of_actuators,
 )
 from mjx_revolve.control.sense import Sense
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
-
-_FADE = 0.5  # [s], as `make_sine`
 
 
 def make_splines(
@@ -63,7 +62,7 @@ def make_splines(
         wave: Any = 0.0
         for k, row in enumerate(rows):
             wave = wave + _weight(at - k, points, jnp) * row
-        return state, middle + jnp.minimum(time / _FADE, 1) * wave
+        return state, middle + fade_in(time) * wave
 
     return make_controller(made_for, genes, decode, lambda parameters: (), step)
 
