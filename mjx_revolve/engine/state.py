@@ -19,6 +19,7 @@ from mjx_revolve.numerics.spatial import (
     dot,
     matTvec,
     matvec,
+    quat_mul,
     quat_to_rows,
     total,
     vadd,
@@ -139,14 +140,7 @@ def turn_quat(quat: tuple[Scalar, ...], spin: Vec, dt: float) -> tuple[Scalar, .
     else:
         angle = jnp.sqrt(square + 1e-300)
         sine, cosine = jnp.sin(angle) / angle, jnp.cos(angle)
-    a, b, c, d = quat
-    e, (f, g, h) = cosine, vscale(sine, half)
-    turned = (
-        a * e - b * f - c * g - d * h,
-        a * f + b * e + c * h - d * g,
-        a * g - b * h + c * e + d * f,
-        a * h + b * g - c * f + d * e,
-    )
+    turned = quat_mul(quat, (cosine, *vscale(sine, half)))
     scale = 1 / jnp.sqrt(total(*[x * x for x in turned]))
     return tuple(x * scale for x in turned)
 

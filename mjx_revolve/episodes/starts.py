@@ -14,6 +14,7 @@ from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import quat_mul
 from mjx_revolve.water.flow import Water, gust_path, water_of
 from mjx_revolve.water.world import World
 
@@ -177,7 +178,9 @@ def start_pose(
     place = task.start(settings, world, figure, starts.place)
     quat = starts.quat
     if settings.start_attitude == "righted":
-        quat = _after(_righting(figure.up), quat)
+        righting = _righting(figure.up)
+        turned = quat_mul(tuple(quat), righting)
+        quat = jnp.stack([x.astype(quat.dtype) for x in turned])
     return jnp.concatenate([place, quat])
 
 
@@ -189,18 +192,6 @@ def _righting(up: Any) -> tuple[Any, ...]:
     w, x, y = (1 - over) * (1 + z), over + (1 - over) * y, -(1 - over) * x
     norm = jnp.sqrt(w * w + x * x + y * y)
     return w / norm, x / norm, y / norm, jnp.zeros_like(w)
-
-
-def _after(first: tuple[Any, ...], then: jax.Array) -> jax.Array:
-    """`[4, lanes]` one turn after the other."""
-    (a, b, c, d), (e, f, g, h) = then, first
-    product = (
-        a * e - b * f - c * g - d * h,
-        a * f + b * e + c * h - d * g,
-        a * g - b * h + c * e + d * f,
-        a * h + b * g - c * f + d * e,
-    )
-    return jnp.stack([x.astype(then.dtype) for x in product])
 
 
 def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Water:

@@ -227,6 +227,17 @@ def sincos(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     return sine, cosine
 
 
+def quat_mul(p: tuple[Scalar, ...], q: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    """The product p q of quaternions (w, x, y, z): as turns, q first and then p."""
+    (a, b, c, d), (e, f, g, h) = p, q
+    return (
+        a * e - b * f - c * g - d * h,
+        a * f + b * e + c * h - d * g,
+        a * g - b * h + c * e + d * f,
+        a * h + b * g - c * f + d * e,
+    )
+
+
 def quat_to_rows(q: tuple[Scalar, Scalar, Scalar, Scalar]) -> Mat:
     """Rotation matrix (world from body) of a unit quaternion (w, x, y, z)."""
     a, b, c, d = q
