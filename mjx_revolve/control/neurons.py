@@ -28,6 +28,7 @@ import numpy as np
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.control.controller import Controller, Gene
 from mjx_revolve.control.sense import Sense, is_place
+from mjx_revolve.control.sensors import count_samples
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import MisfitError, Number, Text, checked, read, words
@@ -289,7 +290,7 @@ def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Contr
     def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
         columns, tables, middle, reach = parameters
         last, values = state
-        count = jnp.floor(time * RATE + 0.01)
+        count = count_samples(time, RATE)
         given = [_feel(sense, what) for _, what in inputs]
         given += [values[row] for row in range(len(moving))]
         total = jnp.zeros_like(values)

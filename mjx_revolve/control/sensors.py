@@ -35,6 +35,19 @@ _DUE = 0.01
 _LONGEST = 256
 
 
+def count_samples(time: jax.Array, rate: float) -> jax.Array:
+    """How many samples after the first are due at a moment.
+
+    Args:
+        time: since the first [s].
+        rate: of samples [Hz].
+
+    Returns:
+        A whole number, as `time` is.
+    """
+    return jnp.floor(time * rate + _DUE)
+
+
 class Observation(NamedTuple):
     """What a brain is told, each number between -1 and 1.
 
@@ -123,7 +136,7 @@ class Observer:
         robot: list[jax.Array] = []
         joints: list[jax.Array] = []
         for place, sensor in enumerate(self.sensors):
-            count = jnp.floor(time * self._rate(sensor) + _DUE)
+            count = count_samples(time, self._rate(sensor))
             values = self._measure(place, sensor, count, sense, joint)
             if self._keeps(sensor):
                 kept, values = self._hold(sensor, next(before), time, count, values)
@@ -197,7 +210,7 @@ class Observer:
             fresh.append(jax.tree.map(pick, new, old, values))
         if len(fresh) == 1:
             return (jnp.broadcast_to(count, last.shape), tuple(fresh)), fresh[0]
-        wanted = jnp.maximum(jnp.floor((time - sensor.delay) * self._rate(sensor) + _DUE), 0)
+        wanted = jnp.maximum(count_samples(time - sensor.delay, self._rate(sensor)), 0)
         oldest = count - wanted > len(fresh) - 1.5
         given = jax.tree.map(lambda a, b: jnp.where(oldest, a, b), fresh[-1], fresh[-2])
         return (jnp.broadcast_to(count, last.shape), tuple(fresh)), given
