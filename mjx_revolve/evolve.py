@@ -192,7 +192,7 @@ def _describe(start: Start) -> str:
     elif fitness.workers > 1:
         device += f", {fitness.workers} workers"
     return (
-        f"{body}{fitness.num_genes} genes | {config.task.name} in {Path(config.world_name).stem} | "
+        f"{body}{fitness.num_genes} genes | {config.subject} | "
         f"{_search_name(config)} {evolution.population_size} x {evolution.generations}, "
         f"seed {evolution.seed} | {device} | {short_path(start.run.folder)}"
     )

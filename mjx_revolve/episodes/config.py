@@ -351,6 +351,11 @@ class Config(Settings):
         return self.world if isinstance(self.world, str) else self.world["name"]
 
     @property
+    def subject(self) -> str:
+        """What is done and where, in words: `directed_swim in lake`."""
+        return f"{self.task.name} in {Path(self.world_name).stem}"
+
+    @property
     def world_overrides(self) -> dict[str, Any]:
         """Keyword arguments for `load_world(config.world_name, **config.world_overrides)`."""
         if isinstance(self.world, str):

@@ -86,8 +86,7 @@ class Fitness:
 
     def __repr__(self) -> str:
         """A line: `Fitness(directed_swim in lake, Morphology('spider': ...), 57 genes)`."""
-        config = self.config
-        what = f"{config.task.name} in {Path(config.world_name).stem}"
+        what = self.config.subject
         return f"Fitness({what}, {self.robot.morphology!r}, {self.num_genes} genes)"
 
     @property
@@ -272,8 +271,7 @@ class MixedFitness:
 
     def __repr__(self) -> str:
         """A line: `MixedFitness(directed_swim in lake, at most 113 genes)`."""
-        config = self.setup.config
-        what = f"{config.task.name} in {Path(config.world_name).stem}"
+        what = self.config.subject
         return f"MixedFitness({what}, at most {self.num_genes} genes)"
 
     @property

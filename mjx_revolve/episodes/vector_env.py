@@ -258,8 +258,7 @@ def _make_class() -> type:
 
         def __repr__(self) -> str:
             """A line: `WaterVectorEnv(directed_swim in lake, 64 of them at 20 Hz)`."""
-            config = self.fitness.config
-            where = f"{config.task.name} in {Path(config.world_name).stem}"
+            where = self.fitness.config.subject
             return f"WaterVectorEnv({where}, {self.num_envs} of them at {self.control_rate:g} Hz)"
 
     return WaterVectorEnv
