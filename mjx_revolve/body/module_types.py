@@ -6,7 +6,6 @@ part that is fixed to the parent, and further parts that move. `catalogue.py` ho
 
 from __future__ import annotations
 
-import math
 from dataclasses import field
 from functools import cached_property
 from typing import Annotated, Literal
@@ -19,6 +18,7 @@ from mjx_revolve.body.boxes import union_measure
 from mjx_revolve.body.plates import LiftDrag as LiftDrag
 from mjx_revolve.body.propellers import Thruster as Thruster
 from mjx_revolve.body.sensors import SensorRow
+from mjx_revolve.body.servo import EFFORT, REACH, SPEED
 from mjx_revolve.inputs.schema import (
     Direction,
     Law,
@@ -210,10 +210,9 @@ class Hinge:
 
     axis: Direction
     anchor: Annotated[Vector, Unit("m")]
-    # The servo of Revolve, SDF/joint.py.
-    range: Annotated[Pair[Number], Unit("rad")] = (-math.pi / 4, math.pi / 4)
-    effort: Annotated[Positive, Unit("N m")] = 0.17658
-    speed: Annotated[Positive, Unit("rad/s")] = 5.235988
+    range: Annotated[Pair[Number], Unit("rad")] = (-REACH, REACH)
+    effort: Annotated[Positive, Unit("N m")] = EFFORT
+    speed: Annotated[Positive, Unit("rad/s")] = SPEED
 
     def __post_init__(self) -> None:
         """Checks that the rest pose is in the range."""

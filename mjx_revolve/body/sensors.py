@@ -6,13 +6,13 @@ MuJoCo's where it has such a sensor (gyro, accelerometer).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple
 
 from annotated_types import Le, MinLen, Unit
 from pydantic import AfterValidator, BeforeValidator
 
+from mjx_revolve.body.servo import EFFORT, REACH, SPEED
 from mjx_revolve.inputs.schema import (
     MisfitError,
     NonNegative,
@@ -66,7 +66,6 @@ def _bearing(toward: Any) -> tuple[Any, ...]:
 
 
 _ONE, _THREE = ("",), ("x", "y", "z")
-_EFFORT, _SPEED = 0.17658, 5.235988  # of Revolve's servo [N·m, rad/s]
 
 SENSORS: Mapping[str, SensorKind] = {
     "depth": SensorKind(
@@ -172,16 +171,16 @@ SENSORS: Mapping[str, SensorKind] = {
         sits=False,
     ),
     "angle": SensorKind(
-        _ONE, "rad", "joint", (-math.pi / 4, math.pi / 4), lambda s: (s.angle,), "of each hinge"
+        _ONE, "rad", "joint", (-REACH, REACH), lambda s: (s.angle,), "of each hinge"
     ),
     "speed": SensorKind(
-        _ONE, "rad/s", "joint", (-_SPEED, _SPEED), lambda s: (s.speed,), "of each hinge"
+        _ONE, "rad/s", "joint", (-SPEED, SPEED), lambda s: (s.speed,), "of each hinge"
     ),
     "load": SensorKind(
         _ONE,
         "N m",
         "joint",
-        (-_EFFORT, _EFFORT),
+        (-EFFORT, EFFORT),
         lambda s: (s.load,),
         "torque of each servo under its last command",
         "load",
