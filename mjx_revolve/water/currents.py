@@ -303,7 +303,7 @@ def load_current_field(path: str | Path) -> CurrentField:
             return _read_arrays(path)
         if path.suffix.lower() == ".csv":
             return _read_table(path)
-        raise InputError("expected a file .npz or .csv")
+        raise InputError(f"expected a file .npz or .csv; found {path.suffix or 'no suffix'}")
 
 
 def _read_arrays(path: Path) -> CurrentField:

@@ -351,7 +351,10 @@ WRONG = [
         {"current_field": "none.npz"},
         "current_field: none.npz: expected a file; found none",
     ),
-    ({"current_field": "field.txt"}, "current_field: field.txt: expected a file .npz or .csv"),
+    (
+        {"current_field": "field.txt"},
+        "current_field: field.txt: expected a file .npz or .csv; found .txt",
+    ),
 ]
 
 
