@@ -8,17 +8,23 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mjx_revolve.body.module_types import Box, ModuleType, Part
 from mjx_revolve.body.morphology import Module, Morphology, load_morphology
+from mjx_revolve.control.controller import Controller
+from mjx_revolve.control.sense import Sense
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.engine.plant import Plant, actuators_of
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.engine.step import robot_acceleration
 from mjx_revolve.episodes.rollout import flow_at, roll_out
@@ -143,6 +149,19 @@ USUAL = _USUAL if on_cpu() else None  # as users compile
 # A derivative is all calls of small functions; inlined into one another, they take XLA 7 times as
 # long. Its numbers are then compared with differences of a program that was compiled otherwise.
 SLOPE = _CHEAP | {"xla_disable_hlo_passes": "call-inliner"} if on_cpu() else None
+
+
+@contextmanager
+def compiled_quickly(*places: str) -> Iterator[None]:
+    """Leaves out the compiler's optimisations: they cost more than short runs save.
+
+    Args:
+        places: where the options are asked for, `FILE.FUNCTION` of `mjx_revolve/episodes/`.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        for place in places:
+            patch.setattr(f"mjx_revolve.episodes.{place}", lambda: QUICK)
+        yield
 
 
 @lru_cache(maxsize=64)
@@ -280,6 +299,42 @@ def read(text: str) -> Morphology:
         path = Path(folder) / "robot.yaml"
         path.write_text(text)
         return load_morphology(path)
+
+
+def swimmer(folder: Path, robot: str, task: dict[str, Any]) -> dict[str, Any]:
+    """A configuration: a robot that hovers in the lake, and sines that drive it.
+
+    Args:
+        folder: where the robot's file is written.
+        robot: the text of its YAML.
+        task: its settings.
+
+    Returns:
+        What `make_fitness` takes.
+    """
+    path = folder / "robot.yaml"
+    path.write_text(robot)
+    return {
+        "morphology": str(path),
+        "world": "lake",
+        "trim": "neutral",
+        "controller": {"type": "sine"},
+        "task": task,
+    }
+
+
+def check_slope_at_rest(controller: Controller, plant: Plant, sense: Sense) -> None:
+    """The gradient through some steps of a controller is finite where all genes are 0."""
+
+    def last(genes: jax.Array) -> jax.Array:
+        parameters = controller.decode(genes, plant)
+        state = controller.init(parameters)
+        for k in range(3):
+            state, target = controller.step(parameters, state, jnp.asarray(0.3 * k), sense)
+        return jnp.sum(target)
+
+    slope = jax.jit(jax.grad(last))(jnp.zeros((controller.num_genes, 1)))
+    assert jnp.all(jnp.isfinite(slope))
 
 
 def arm_robot(tank: World) -> Robot:

@@ -10,7 +10,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import WATER, at_rest, body, elbow_robot, march, random_states, read, world
+from laboratory import (
+    WATER,
+    at_rest,
+    body,
+    check_slope_at_rest,
+    elbow_robot,
+    march,
+    random_states,
+    read,
+    world,
+)
 from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.gait import UNITS, describe_gait
@@ -265,17 +275,7 @@ def test_order_only_permutes_the_rows(kind):
 @pytest.mark.parametrize("kind", MAKERS)
 def test_gradients_are_finite_at_zero_genes(kind):
     plant = plant_of(elbow_robot(world()))
-    controller = MAKERS[kind](plant)
-
-    def last(genes):
-        parameters = controller.decode(genes, plant)
-        state = controller.init(parameters)
-        for k in range(3):
-            state, target = controller.step(parameters, state, jnp.asarray(0.3 * k), STILL)
-        return jnp.sum(target)
-
-    slope = jax.jit(jax.grad(last))(jnp.zeros((controller.num_genes, 1)))
-    assert jnp.all(jnp.isfinite(slope))
+    check_slope_at_rest(MAKERS[kind](plant), plant, STILL)
 
 
 # ------------------------------------------------------------------------- servos

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from laboratory import body, elbow_robot, world
+from laboratory import body, check_slope_at_rest, elbow_robot, world
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.gait import describe_gait
 from mjx_revolve.control.joint_network import make_joint_network
@@ -109,18 +109,8 @@ def test_order_only_permutes_the_rows(kind):
 @pytest.mark.parametrize("kind", NEW)
 def test_gradients_are_finite_at_zero_genes(kind):
     plant = plant_of(elbow_robot(world()))
-    controller = make(kind, plant)
     sense = jax.tree.map(jnp.asarray, sense_of(2))
-
-    def last(genes):
-        parameters = controller.decode(genes, plant)
-        state = controller.init(parameters)
-        for k in range(3):
-            state, target = controller.step(parameters, state, jnp.asarray(0.3 * k), sense)
-        return jnp.sum(target)
-
-    slope = jax.jit(jax.grad(last))(jnp.zeros((controller.num_genes, 1)))
-    assert jnp.all(jnp.isfinite(slope))
+    check_slope_at_rest(make(kind, plant), plant, sense)
 
 
 @pytest.mark.parametrize("kind", ["mlp", "rnn"])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK, ROOT, SLOPE
+from laboratory import QUICK, ROOT, SLOPE, compiled_quickly, swimmer
 from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.fitness import WORST
 from mjx_revolve.episodes.tasks import TASKS, Track
@@ -36,22 +36,13 @@ TASK = {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 2}
 @pytest.fixture(scope="module", autouse=True)
 def quick_compiles():
     """Leaves out the compiler's optimisations; test_end_to_end.py runs with them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.episodes.evaluation.compiler_options", lambda: QUICK)
+    with compiled_quickly("evaluation.compiler_options"):
         yield
 
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    path = tmp_path_factory.mktemp("fitness") / "oar.yaml"
-    path.write_text(ROBOT)
-    return {
-        "morphology": str(path),
-        "world": "lake",
-        "trim": "neutral",
-        "controller": {"type": "sine"},
-        "task": TASK,
-    }
+    return swimmer(tmp_path_factory.mktemp("fitness"), ROBOT, TASK)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from laboratory import QUICK
+from laboratory import compiled_quickly, swimmer
 from mjx_revolve import InputError, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import RobustConfig, dump_config, load_config, make_config
@@ -24,23 +24,13 @@ WIDE = {"drag": 2.0, "added_mass": 1.5, "density": 1.01, "motor": 1.3}
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_compiles():
-    with pytest.MonkeyPatch.context() as patch:
-        for place in ("evaluation.compiler_options", "simulate.hasty_options"):
-            patch.setattr(f"mjx_revolve.episodes.{place}", lambda: QUICK)
+    with compiled_quickly("evaluation.compiler_options", "simulate.hasty_options"):
         yield
 
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    path = tmp_path_factory.mktemp("robust") / "oar.yaml"
-    path.write_text(ROBOT)
-    return {
-        "morphology": str(path),
-        "world": "lake",
-        "trim": "neutral",
-        "controller": {"type": "sine"},
-        "task": TASK | {"robust": WIDE},
-    }
+    return swimmer(tmp_path_factory.mktemp("robust"), ROBOT, TASK | {"robust": WIDE})
 
 
 def test_what_may_stand_there(settings, tmp_path):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import OAR, QUICK
+from laboratory import OAR, compiled_quickly, swimmer
 from mjx_revolve import InputError, make_fitness, make_vector_env, simulate
 from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.episodes import vector_env
@@ -31,23 +31,14 @@ SENSORS = ["tilt", {"type": "depth", "noise": 0.1}, "accelerometer", "angle", "s
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_compiles():
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("vector_env", "evaluation", "simulate"):
-            patch.setattr(f"mjx_revolve.episodes.{name}.compiler_options", lambda: QUICK)
+    names = "vector_env", "evaluation", "simulate"
+    with compiled_quickly(*(f"{name}.compiler_options" for name in names)):
         yield
 
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
-    path = tmp_path_factory.mktemp("vector") / "oar.yaml"
-    path.write_text(f"id: oar\n{OAR}")
-    return {
-        "morphology": str(path),
-        "world": "lake",
-        "trim": "neutral",
-        "controller": {"type": "sine"},
-        "task": TASK,
-    }
+    return swimmer(tmp_path_factory.mktemp("vector"), f"id: oar\n{OAR}", TASK)
 
 
 @pytest.fixture(scope="module")
