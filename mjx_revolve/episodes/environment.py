@@ -38,7 +38,7 @@ from mjx_revolve.water.flow import Water, water_of
 _USUAL_RATE = 20.0  # control steps in a second, a choice: ten to a stroke of 2 Hz [Hz]
 
 # What stands still has none of: these rows are 0 where the score so far looks ahead.
-_RATES = ("energy", "water_velocity")
+RATES = ("energy", "water_velocity")
 
 
 class EnvironmentState(NamedTuple):
@@ -210,7 +210,7 @@ class Environment:
         )
         row = (state.clock - 1) // setup.record_every
         rows = {
-            name: _fill(state.rows[name], x, row, name in _RATES)
+            name: _fill(state.rows[name], x, row, name in RATES)
             for name, x in self._record(state, ctrl).items()
         }
         whole = state.clock % setup.record_every == 0

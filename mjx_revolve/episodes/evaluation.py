@@ -141,11 +141,9 @@ class Setup:
         run = self._evaluate if traced else self._jitted
         return run(bodies, jnp.asarray(population), key)
 
-    def _starts_as(self, population: jax.Array, key: jax.Array) -> Starts:
+    def starts_as(self, population: jax.Array, key: jax.Array) -> Starts:
         """What a key's episodes start from, in the population's precision."""
-        number = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
-        cast = lambda x: x.astype(population.dtype) if number(x) else x  # noqa: E731
-        return jax.tree.map(cast, self.starts(key))
+        return _as_precise(self.starts(key), population)
 
     @cached_property
     def _jitted(self) -> Any:
@@ -153,7 +151,7 @@ class Setup:
         return jax.jit(self._evaluate, compiler_options=compiler_options())
 
     def _evaluate(self, bodies: Bodies | None, population: Any, key: jax.Array) -> Any:
-        starts = self._starts_as(population, key)
+        starts, bodies = self.starts_as(population, key), _as_precise(bodies, population)
         if population.ndim == 2:
             return self._score(bodies, population, starts, bodies is None)
         if self.capacity is not None and self.capacity.rows < 2:
@@ -234,7 +232,7 @@ class Setup:
             return record
 
         def run(bodies: Bodies, population: jax.Array, key: jax.Array, trial: jax.Array) -> Any:
-            starts = self._starts_as(population, key)
+            starts = self.starts_as(population, key)
 
             def chunk(individual: jax.Array, trial: jax.Array) -> Any:
                 return self._roll(
@@ -320,6 +318,13 @@ class Setup:
             episode = derived_by(episode, partial(run, True))
         recorded = episode(bodies, root, parameters, starts.water, rows, cues, starts.variation)
         return recorded, root, self.figure_of(bodies), cues
+
+
+def _as_precise(tree: Any, like: jax.Array) -> Any:
+    """The tree with its floats in the precision of `like`."""
+    number = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
+    cast = lambda x: x.astype(like.dtype) if number(x) else x  # noqa: E731
+    return jax.tree.map(cast, tree)
 
 
 def vary_engine(engine: Engine, variation: Variation | None) -> Engine:

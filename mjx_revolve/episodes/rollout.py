@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_revolve.control.sense import NOBODY, Cues, Sense, feel, remember, start_memory
+from mjx_revolve.engine.collisions import Meeting
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.numerics.xla import fused_scan, share_once
 from mjx_revolve.water.flow import Water
@@ -50,6 +51,85 @@ def begin(engine: Engine, state: Any, drive_state: Any, feels: Sequence[str] = (
     energy = jnp.zeros_like(engine.root(state).spin[0])
     memory = start_memory(feels, engine, state)
     return Passage(state, drive_state, memory, energy, jnp.zeros((), jnp.int32))
+
+
+def make_drive(
+    engine: Engine,
+    drive: Callable[[Any, jax.Array, Any, Sense], tuple[Any, jax.Array]],
+    flow: Callable[[jax.Array, Any], Water],
+    *,
+    timestep: float,
+    world: World | None = None,
+    cues: Cues = _NO_CUES,
+    feels: Sequence[str] = (),
+    since: Any = None,
+) -> Callable[..., tuple[Any, jax.Array, Water, Any]]:
+    """What a rollout does before each step of the engine: robots feel, brains drive.
+
+    Args:
+        engine: this and all others as of `go_on`.
+        drive: likewise.
+        flow: likewise.
+        timestep: likewise.
+        world: likewise.
+        cues: likewise.
+        feels: likewise.
+        since: likewise.
+
+    Returns:
+        (rollout, inputs of this step, and with whom robots meet, by default nobody) → (controller
+        state, ctrl, water, and how the bodies move where that is remembered, or None).
+    """
+
+    def told(now: Passage, row: Any, meeting: Meeting = NOBODY) -> Any:
+        time = _clock(now.count, now.energy, timestep)
+        water = flow(time, row)
+        # One sweep over the body serves what is felt now and what is remembered of it.
+        motion = engine.motions(now.state) if now.memory.past is not None else None
+        felt = feel(
+            world, engine, now.state, water, time, cues, now.memory, feels, meeting, motion
+        )
+        own = time if since is None else _clock(now.count - since, now.energy, timestep)
+        drive_state, ctrl = drive(now.drive_state, own, row, felt)
+        return drive_state, ctrl, water, motion
+
+    return told
+
+
+def make_step(
+    engine: Engine, told: Callable[..., tuple[Any, jax.Array, Water, Any]], timestep: float
+) -> Callable[..., tuple[Passage, jax.Array]]:
+    """A step of a rollout.
+
+    Args:
+        engine: what steps the robots.
+        told: from `make_drive`.
+        timestep: [s].
+
+    Returns:
+        (rollout, inputs of this step) → (the rollout a step later, ctrl). A third argument is added
+        to ctrl: by it, slopes by commands are found. A fourth says with whom robots meet.
+    """
+
+    def step(
+        now: Passage, row: Any, push: Any = None, meeting: Meeting = NOBODY
+    ) -> tuple[Passage, jax.Array]:
+        drive_state, ctrl, water, motion = told(now, row, meeting)
+        if push is not None:
+            ctrl = ctrl + push
+        before = engine.root(now.state)
+        pushes = () if engine.meet is None else (meeting.push,)
+        state, power = engine.step(now.state, ctrl, water, *pushes)
+        work = timestep * power
+        after = engine.root(state)
+        memory = remember(now.memory, before, after, ctrl, work, timestep, motion)
+        return Passage(state, drive_state, memory, now.energy + work, now.count + 1), ctrl
+
+    return step
+
+
+def _clock(count: Any, like: jax.Array, timestep: float) -> jax.Array:
+    return count.astype(like.dtype) * timestep
 
 
 def roll_out(
@@ -126,24 +206,11 @@ def go_on(
     Returns:
         What travels on, and the records, `[records, ...]` each.
     """
-    clock = lambda count, like: count.astype(like.dtype) * timestep  # noqa: E731
-
-    def step(carry: Any, now: Any) -> tuple[Any, jax.Array]:
-        (state, drive_state, memory, energy, count), (now, meeting) = carry, now
-        time = clock(count, energy)
-        water = flow(time, now)
-        # One sweep over the body serves what is felt now and what is remembered of it.
-        motion = engine.motions(state) if memory.past is not None else None
-        felt = feel(world, engine, state, water, time, cues, memory, feels, meeting, motion)
-        own = time if since is None else clock(count - since, energy)
-        drive_state, ctrl = drive(drive_state, own, now, felt)
-        before = engine.root(state)
-        pushes = () if engine.meet is None else (meeting.push,)
-        state, power = engine.step(state, ctrl, water, *pushes)
-        work = timestep * power
-        memory = remember(memory, before, engine.root(state), ctrl, work, timestep, motion)
-        return Passage(state, drive_state, memory, energy + work, count + 1), ctrl
-
+    told = make_drive(
+        engine, drive, flow, timestep=timestep, world=world, cues=cues, feels=feels, since=since
+    )
+    one = make_step(engine, told, timestep)
+    step: Any = lambda now, given: one(now, given[0], None, given[1])  # noqa: E731
     first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)
     # What robots do to each other is no element-wise function of them, so it stays outside.
     look = (lambda state, watch: (NOBODY, watch)) if engine.meet is None else engine.meet.look
@@ -173,7 +240,7 @@ def go_on(
             (packed, watch), ctrls = jax.lax.scan(look_and_step, (start, watch), rows, length=every)
             ctrl = jax.tree.map(lambda x: x[-1], ctrls)
         state, _, _, energy, count = unpack(packed)
-        water = flow(clock(count - 1, energy), last)
+        water = flow(_clock(count - 1, energy, timestep), last)
         return (packed, watch), record(state, ctrl, energy, water)
 
     if inputs is not None:

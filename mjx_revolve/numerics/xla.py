@@ -358,7 +358,27 @@ def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any
     """
     if not on_cpu():
         return step, lambda x: x, lambda x: x
-    graph = Graph(step, (carry, row))
+    pack, unpack = in_one_array(carry)
+    fused = in_small_calls(
+        step,
+        (carry, row),
+        lambda result: (pack(result[0]), result[1]),
+        lambda packed, row: (unpack(packed), row),
+    )
+    return fused, pack, unpack
+
+
+def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """How to pack what a loop carries.
+
+    Args:
+        carry: an example; its leaves are `[..., lanes]` of one floating-point type, but for
+            scalars.
+
+    Returns:
+        (pack, unpack): between such a carry and `[rows, lanes]` of its leaves, one below the other,
+        with the list of its scalars.
+    """
     leaves, tree = jax.tree.flatten(carry)
     wide = [x.ndim > 0 for x in leaves]
     rows = np.cumsum([0] + [x.size // x.shape[-1] for x, w in zip(leaves, wide, strict=True) if w])
@@ -377,13 +397,27 @@ def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any
         ]
         return jax.tree.unflatten(tree, found)
 
-    def pack_result(result: Any) -> Any:
-        return pack(result[0]), result[1]
+    return pack, unpack
 
-    def unpack_arguments(packed: Any, row: Any) -> Any:
-        return unpack(packed), row
 
-    return graph.in_pieces(_PIECE, pack_result, unpack_arguments), pack, unpack
+def in_small_calls(
+    fun: Callable[..., Any], examples: Any, pack: Callable[[Any], Any], unpack: Callable[..., Any]
+) -> Callable[..., Any]:
+    """A function of packed arguments that packs its results, as few calls of compiled pieces.
+
+    Args:
+        fun: element-wise.
+        examples: arguments like those that it will get.
+        pack: what becomes of its results.
+        unpack: its arguments from what is given instead.
+
+    Returns:
+        A function of what `unpack` takes that returns what `pack` gives.
+    """
+    if not on_cpu():
+        return lambda *args: pack(fun(*unpack(*args)))
+    found: Callable[..., Any] = Graph(fun, examples).in_pieces(_PIECE, pack, unpack)
+    return found
 
 
 def over_chunks(fun: Callable[..., Any], lanes: int | None = None) -> Callable[..., Any]:
