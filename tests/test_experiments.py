@@ -11,6 +11,7 @@ import pytest
 from experiments import (
     bench,
     falling_spider,
+    gradient_learning,
     optimisers,
     policy_gradient,
     sensitivity,
@@ -382,3 +383,20 @@ def test_the_policy_gradients_options_are_checked():
     for words in (["--seconds", "0"], ["--seed", "-1"]):
         with pytest.raises(InputError, match="found"):
             policy_gradient.main(words)
+
+
+# ------------------------------------------------------------------ learning by gradients
+
+
+def test_a_slope_is_no_longer_than_the_median_of_its_individuals():
+    """By hand: lengths 1, 5 and beyond float32; of the other individual all are 2."""
+    slope = np.array([[[1, 0], [3, 4], [3e30, 0]], [[2, 0], [0, 2], [0, -2]]], np.float32)
+    found = np.asarray(gradient_learning.clip_slopes(jnp.asarray(slope)))
+    assert found[0] == pytest.approx(np.array([[1, 0], [0.6, 0.8], [0, 0]]), abs=1e-6)
+    np.testing.assert_array_equal(found[1], slope[1])
+
+
+def test_the_options_of_learning_by_gradients_are_checked():
+    for words in (["--seconds", "0"], ["--seed", "-1"]):
+        with pytest.raises(InputError, match="found"):
+            gradient_learning.main(words)
