@@ -76,7 +76,7 @@ _LONGEST = (
     "test_coevolution", "test_fitness", "test_cluster", "test_studies", "test_surface_tension",
     "test_own_code", "test_buoyancy", "test_bodies", "test_thrust_step", "test_water", "test_docs",
     "test_loop", "test_sweep", "test_forces", "test_swim_picture", "test_lift_drag",
-    "test_bodies_end_to_end", "test_controllers", "test_contact", "test_tasks",
+    "test_bodies_end_to_end", "test_controllers", "test_contact", "test_tasks", "test_windows",
 )  # fmt: skip
 
 

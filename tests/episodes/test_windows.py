@@ -168,9 +168,9 @@ def test_what_blows_up_has_no_slope_and_spreads_none(windows):
         genes = drawn(2, windows.fitness.num_genes)
         broken = genes.at[1].set(jnp.nan)
         (one, _), (other, _) = (windows.climb(x, windows.begin(x, KEY)) for x in (genes, broken))
-    assert np.all(other.gain[1] == WORST) and not np.any(other.slope[1])
-    np.testing.assert_array_equal(one.gain[0], other.gain[0])
-    np.testing.assert_array_equal(one.slope[0], other.slope[0])
+        assert np.all(other.gain[1] == WORST) and not np.any(other.slope[1])
+        np.testing.assert_array_equal(one.gain[0], other.gain[0])
+        np.testing.assert_array_equal(one.slope[0], other.slope[0])
 
 
 def test_what_is_refused(settings):
