@@ -110,7 +110,7 @@ def test_commands_of_the_installed_package(installed, tmp_path):
     assert code == 0 and "hinge" in said, said
     code, said = run(tmp_path, command, "evolve", "lake_swimm")
     assert code == 2
-    assert said.startswith("error: lake_swimm: expected a file, or one of auv_follow_bed, ")
+    assert said.startswith("error: lake_swimm: expected a file, or one of auv_escape, ")
     assert "lake_target, smoke, which come with the package; found none\n" in said
     code, said = run(tmp_path, command, "dance")
     assert (code, said.count("\n")) == (2, 1)

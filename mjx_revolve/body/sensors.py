@@ -54,14 +54,21 @@ class SensorKind(NamedTuple):
     sits: bool = True
 
 
-def _distance(toward: Any) -> Any:
+def _length(toward: Any) -> Any:
     x, y, z = toward
     # The tiny term keeps the gradient finite where the target is reached.
     return (x * x + y * y + z * z + 1e-12) ** 0.5
 
 
+def _distance(sense: Any) -> Any:
+    if getattr(sense, "seen", None) is None:
+        return _length(sense.target)
+    # What is not felt is as far away as the range goes; where it is felt, the factor is 1.
+    return _length(sense.target) + (1.0 - sense.seen) * 1e9
+
+
 def _bearing(toward: Any) -> tuple[Any, ...]:
-    scale = 1 / _distance(toward)
+    scale = 1 / _length(toward)
     return tuple(scale * component for component in toward)
 
 
@@ -118,7 +125,7 @@ SENSORS: Mapping[str, SensorKind] = {
         "direction of the target, core frame",
     ),
     "distance": SensorKind(
-        _ONE, "m", "robot", (0, 10), lambda s: (_distance(s.target),), "of the target from the core"
+        _ONE, "m", "robot", (0, 10), lambda s: (_distance(s),), "of the target from the core"
     ),
     "nearest": SensorKind(
         _THREE,
@@ -145,7 +152,7 @@ SENSORS: Mapping[str, SensorKind] = {
         "m",
         "robot",
         (0, 10),
-        lambda s: (_distance(s.nearest.toward),),
+        lambda s: (_length(s.nearest.toward),),
         "of the nearest other robot",
         "nearest",
         sits=False,
@@ -159,6 +166,9 @@ SENSORS: Mapping[str, SensorKind] = {
         "by which the nearest other robot can be told apart",
         "nearest",
         sits=False,
+    ),
+    "course": SensorKind(
+        _THREE, "-", "robot", (-1, 1), lambda s: s.course, "the direction to keep to, core frame"
     ),
     "battery": SensorKind(
         _ONE,

@@ -198,6 +198,7 @@ def _example_sense(plant: Plant, lanes: int, feels: Sequence[str], place: str) -
         flow=three,
         altitude=one,
         target=three,
+        course=three,
         noise=jax.ShapeDtypeStruct((lanes,), jnp.uint32),
         places=places or None,
         **{name: asked[name] for name in feels if name in asked},

@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_revolve.control.courses import Course
 from mjx_revolve.control.places import Past, feel_place, past_of
+from mjx_revolve.control.pursuit import Chase, Pursuer, pursue, start_chase
 from mjx_revolve.engine.collisions import ALONE, Meeting
 from mjx_revolve.engine.state import Engine, Root
 from mjx_revolve.numerics.inertia import Motion
-from mjx_revolve.numerics.spatial import Vec, matTvec, quat_to_rows, vadd, vscale, vsub
+from mjx_revolve.numerics.spatial import Vec, dot, matTvec, quat_to_rows, vadd, vscale, vsub
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.flow import Water, flow
 from mjx_revolve.water.world import World
@@ -45,14 +47,20 @@ class Cues(NamedTuple):
         target: where the target is at the start, world frame, three of `[lanes]` [m].
         drift: its velocity, likewise [m/s]; None where it keeps still.
         noise: what noise is drawn from, uint32 `[lanes]`; the same for all individuals in a trial.
+        sight: from how far away the target is felt [m]; None for any distance.
+        chase: how the target swims at the robot; None where it does not.
+        course: a direction to keep to.
     """
 
     target: Any = None
     drift: Any = None
     noise: Any = None
+    sight: Any = None
+    chase: Chase | None = None
+    course: Course | None = None
 
     def target_at(self, time: Any) -> Vec:
-        """Where the target is, world frame [m].
+        """Where the target is that does not chase the robot, world frame [m].
 
         Args:
             time: since the episode's start [s].
@@ -60,6 +68,9 @@ class Cues(NamedTuple):
         if self.drift is None:
             return tuple(self.target)
         return vadd(self.target, vscale(time, self.drift))
+
+
+_NO_CUES = Cues()
 
 
 class Other(NamedTuple):
@@ -83,12 +94,14 @@ class Memory(NamedTuple):
         ctrl: the last command, `[n, lanes]` in the plant's order.
         work: done so far `[lanes]` [J].
         past: how all rigid bodies moved before the last step.
+        pursuer: a target that chases the robot; None where it does not.
     """
 
     acceleration: Any = None
     ctrl: Any = None
     work: Any = None
     past: Past | None = None
+    pursuer: Pursuer | None = None
 
 
 class Sense(NamedTuple):
@@ -106,7 +119,8 @@ class Sense(NamedTuple):
         flow: velocity of the water at the core relative to the core, core frame, three of `[lanes]`
             [m/s].
         altitude: of the core's centre above the bed, straight down [m]; infinite without a bed.
-        target: from the core to the target, core frame, three of `[lanes]` [m]; 0 without one.
+        target: from the core to the target, core frame, three of `[lanes]` [m]; 0 without one, and
+            where it is too far away to be felt.
         noise: what noise of sensors is drawn from, uint32 `[lanes]`; None without.
         force: specific force at the core, core frame, three of `[lanes]` [m/s²]: what an
             accelerometer feels, the acceleration over the last step less gravity's. None unless
@@ -117,6 +131,8 @@ class Sense(NamedTuple):
             `[1 + hinge rows, lanes]` [N]; likewise.
         nearest: an `Other`, the nearest other robot in the same world; likewise.
         places: what is felt at modules, a `Place` for each name; likewise.
+        course: the direction to keep to, a unit vector, core frame, three of `[lanes]`; 0 without.
+        seen: whether the target is near enough to be felt, `[lanes]`; None where it always is.
     """
 
     height: jax.Array
@@ -136,6 +152,8 @@ class Sense(NamedTuple):
     touch: Any = None
     nearest: Any = None
     places: Any = None
+    course: Any = None
+    seen: Any = None
 
 
 def feel(
@@ -182,8 +200,16 @@ def feel(
         if world.bed is not None:
             altitude = root.position[2] - bed_height(world.bed, *root.position[:2])
     target: Any = (zero, zero, zero)
+    seen, place = None, None
     if cues.target is not None:
-        target = matTvec(turn, vsub(cues.target_at(time), root.position))
+        place = cues.target_at(time) if memory.pursuer is None else memory.pursuer.place
+        target = matTvec(turn, vsub(place, root.position))
+        if cues.sight is not None:
+            seen = dot(target, target) < cues.sight * cues.sight
+            target = tuple(jnp.where(seen, x, 0.0) for x in target)
+    course: Any = (zero, zero, zero)
+    if cues.course is not None:
+        course = matTvec(turn, cues.course.at(time))
     nearest = None
     if "nearest" in feels:
         lone = meeting.nearest is None
@@ -211,12 +237,14 @@ def feel(
         work=memory.work,
         touch=engine.touch(state, water) if "touch" in feels else None,
         nearest=nearest,
+        course=course,
+        seen=seen,
     )
     names = tuple(filter(is_place, feels))
     if not names:
         return sense
     motion = engine.motions(state) if motion is None else motion
-    goal = None if cues.target is None else cues.target_at(time)
+    goal = place
     dt, places = engine.plant.timestep, {}
     cells = engine.cells(state, water) if "cells" in feels and engine.cells else None
     for name in names:
@@ -237,18 +265,20 @@ def feel(
     return sense._replace(places=places)
 
 
-def start_memory(feels: Sequence[str], engine: Engine, state: Any) -> Memory:
+def start_memory(feels: Sequence[str], engine: Engine, state: Any, cues: Cues = _NO_CUES) -> Memory:
     """What is remembered before the first step: rest, no work, servos told to stay where they are.
 
     Args:
         feels: which of `FEELS` are asked for.
         engine: what steps the robots.
         state: at the start.
+        cues: of the episode.
 
     Returns:
         The memory.
     """
-    zero = jnp.zeros_like(engine.root(state).position[0])
+    place = engine.root(state).position
+    zero = jnp.zeros_like(place[0])
     angle = engine.joints(state)[0]
     pad = jnp.zeros((engine.plant.num_rows - angle.shape[0], *angle.shape[1:]), angle.dtype)
     return Memory(
@@ -256,6 +286,7 @@ def start_memory(feels: Sequence[str], engine: Engine, state: Any) -> Memory:
         ctrl=jnp.concatenate([angle, pad]) if "load" in feels else None,
         work=zero if "work" in feels else None,
         past=past_of(engine.motions(state)) if "forces" in feels else None,
+        pursuer=None if cues.chase is None else start_chase(cues.target, place),
     )
 
 
@@ -267,6 +298,7 @@ def remember(
     work: jax.Array,
     dt: float,
     motion: Motion | None = None,
+    cues: Cues = _NO_CUES,
 ) -> Memory:
     """The memory after a step.
 
@@ -278,16 +310,20 @@ def remember(
         work: done in the step `[lanes]` [J].
         dt: of the step [s].
         motion: of all rigid bodies before it, where specific forces are asked for.
+        cues: of the episode.
 
     Returns:
         The memory.
     """
-    acceleration = memory.acceleration
+    acceleration, pursuer = memory.acceleration, memory.pursuer
     if acceleration is not None:
         acceleration = vscale(1 / dt, vsub(after.velocity, before.velocity))
+    if pursuer is not None and cues.chase is not None:
+        pursuer = pursue(pursuer, cues.chase, before.position, dt)
     return Memory(
         acceleration=acceleration,
         ctrl=None if memory.ctrl is None else ctrl,
         work=None if memory.work is None else memory.work + work,
         past=None if motion is None else past_of(motion),
+        pursuer=pursuer,
     )

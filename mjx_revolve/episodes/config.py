@@ -66,9 +66,14 @@ TASKS: dict[str, tuple[str, ...]] = {
     "reach_target": (),
     "hold_depth": (),
     "hold_heading": (),
+    "follow_course": ("course_spread",),
+    "search": ("sight",),
+    "escape": ("target_turn",),
     "follow_bed": ("height",),
     "crawl": (),
 }
+# Those that have a target.
+_TO_TARGETS = ("reach_target", "search", "escape")
 
 
 def _check_measure(name: str) -> str:
@@ -172,8 +177,8 @@ class TaskConfig(Section):
 
     type: Annotated[str, one_of(TASKS)]
     """`directed_swim` (along `direction`, over ground), `speed` (through the water, any way),
-    `reach_target`, `hold_depth`, `hold_heading`, `follow_bed`, `crawl`, or FILE.py:FUNCTION, a
-    function like those in `tasks`."""
+    `reach_target`, `hold_depth`, `hold_heading`, `follow_course`, `search`, `escape`, `follow_bed`,
+    `crawl`, or FILE.py:FUNCTION, a function like those in `tasks`."""
     duration: Annotated[Positive, Unit("s")] = 10.0
     """Length of an episode [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
@@ -183,7 +188,8 @@ class TaskConfig(Section):
     direction: Annotated[Vector, Unit("-")] = (1.0, 0.0, 0.0)
     """Where to swim, world frame; the length does not matter [-]."""
     target: Annotated[Vector, Unit("m")] | None = None
-    """Where to go, world frame; `reach_target` needs it, or `target_distance` [m]."""
+    """Where to go, world frame; `reach_target`, `search` and `escape` need it, or
+    `target_distance` [m]."""
     target_distance: Annotated[Positive, Unit("m")] | None = None
     """How far from the start the target is, at its depth, in a direction drawn for each episode;
     in place of `target` [m]."""
@@ -191,6 +197,24 @@ class TaskConfig(Section):
     """Within which angle of the world's x axis, to both sides, that direction is drawn [rad]."""
     target_speed: Annotated[NonNegative, Unit("m/s")] = 0.0
     """How fast the target moves away, level, in a direction drawn for each episode [m/s]."""
+    target_turn: Annotated[Positive, Le(100), Unit("rad/s")] | None = None
+    """Makes the target a pursuer, which swims at the robot with `target_speed` and turns this fast
+    at most; `escape` needs it [rad/s]."""
+    sight: Annotated[Positive, Unit("m")] | None = None
+    """From how far away the target is felt, by default from anywhere; `search` needs it [m]."""
+    touch: Annotated[Positive, Unit("m")] = 0.1
+    """How near the target touches the core's centre, for `search` and `escape` [m]."""
+    course_spread: Annotated[Positive, Le(math.pi), Unit("rad")] | None = None
+    """Within which angle of `direction`, seen from above, to both sides, each episode's course is
+    drawn; `follow_course` needs it [rad]."""
+    course_changes: Annotated[Whole, Ge(0), Le(16)] = 0
+    """How often in an episode the course turns at once, at moments drawn between `settle` and
+    `duration` [-]."""
+    course_turn: Annotated[Positive, Le(math.pi), Unit("rad")] = math.pi
+    """By how much at most it then turns, to either side [rad]."""
+    course_rate: Annotated[NonNegative, Le(10), Unit("rad/s")] = 0.0
+    """How fast at most the course turns all the time; rate and side are drawn for each episode
+    [rad/s]."""
     depth: Annotated[NonNegative, Unit("m")] = 2.0
     """Depth of the start below the surface; `crawl` starts on the bed instead, and `follow_bed`
     at `height` above it [m]."""
@@ -233,9 +257,22 @@ class TaskConfig(Section):
         found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
         if len(found) > 1:
             raise MisfitError("target", "none, as there is a target_distance", "one")
-        if not found and self.type == "reach_target":
-            what = "three numbers [m], or target_distance, because task.type is reach_target"
+        if not found and self.type in _TO_TARGETS:
+            what = f"three numbers [m], or target_distance, because task.type is {self.type}"
             raise MisfitError("target", what, "none")
+        if self.target_turn is not None and self.target_speed == 0:
+            what = "a speed > 0 [m/s], as with target_turn the target is a pursuer"
+            raise MisfitError("target_speed", what, "0")
+        if self.target_turn is not None and not found:
+            what = "three numbers [m], or target_distance, as there is a target_turn"
+            raise MisfitError("target", what, "none")
+        if self.course_spread is None and (self.course_changes or self.course_rate):
+            name = "course_changes" if self.course_changes else "course_rate"
+            what = "0, as there is no course without a course_spread"
+            raise MisfitError(name, what, show(getattr(self, name)))
+        if self.course_spread is not None and math.hypot(*self.direction[:2]) < 1e-9:
+            what = "one that is not upright, as there is a course_spread, which is level"
+            raise MisfitError("direction", what, show(list(self.direction)))
         if math.hypot(*self.direction) < 1e-9:
             raise MisfitError("direction", "a vector of some length", show(list(self.direction)))
         return self

@@ -26,7 +26,7 @@ import numpy as np
 from mjx_revolve.control.sense import Memory, feel, remember, start_memory
 from mjx_revolve.control.sensors import Observer, make_observer, with_types
 from mjx_revolve.episodes.config import make_config
-from mjx_revolve.episodes.evaluation import Setup, make_recorder, record_target
+from mjx_revolve.episodes.evaluation import Setup, make_recorder, recall_pursuer, record_cues
 from mjx_revolve.episodes.fitness import Fitness, read_modules
 from mjx_revolve.episodes.rollout import flow_at
 from mjx_revolve.episodes.scoring import WORST, first_counted, score_episodes
@@ -145,8 +145,9 @@ class Environment:
 
         seen = jax.tree.map(lanes_of, self.observer.init(engine.joints(body)[0]))
         count = jnp.zeros(none.shape, jnp.int32)
+        memory = start_memory(feels, engine, body, cues_of(setup.settings, starts, root[:3]))
         state = EnvironmentState(
-            body, start_memory(feels, engine, body), seen, starts, root[:3], {}, none, none, count,
+            body, memory, seen, starts, root[:3], {}, none, none, count,
             seed, episode, count > 0,
         )  # fmt: skip
         still = jnp.zeros((engine.plant.num_rows, *none.shape), none.dtype)
@@ -219,7 +220,7 @@ class Environment:
             setup.task,
             setup.settings,
             setup.world,
-            record_target(setup, rows, cues),
+            record_cues(setup, rows, cues),
             state.place,
             setup.figure_of(None),
         )
@@ -257,6 +258,7 @@ class Environment:
         """Body and memory after a control period, and the work done in it [J]."""
         world, engine = self.setup.world, self.setup.engine_of(None)
         dt, still = world.timestep, self._water(state, state.clock)
+        cues = cues_of(self.setup.settings, state.starts, state.place)
         rows = None
         if state.starts.gusts is not None:
             rows = self._gusts(state, state.clock, self.every)
@@ -269,7 +271,8 @@ class Environment:
             motion = engine.motions(body) if memory.past is not None else None
             body, power = engine.step(body, ctrl, water)
             work = dt * power
-            memory = remember(memory, before, engine.root(body), ctrl, work, dt, motion)
+            after = engine.root(body)
+            memory = remember(memory, before, after, ctrl, work, dt, motion, cues)
             return (body, memory, energy + work, count + 1), None
 
         carry = (state.body, state.memory, jnp.zeros_like(state.energy), jnp.zeros((), jnp.int32))
@@ -289,7 +292,7 @@ class Environment:
         time = last.astype(state.energy.dtype) * setup.world.timestep
         water = flow_at(setup.world, self._water(state, last))(time, None)
         record = make_recorder(engine, setup.task, setup.world)
-        return record(state.body, ctrl, state.energy, water)
+        return recall_pursuer(record(state.body, ctrl, state.energy, water), state.memory)
 
 
 def _fill(rows: jax.Array, now: jax.Array, row: jax.Array, ceases: bool) -> jax.Array:

@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 
 from mjx_revolve.control.controller import Controller
-from mjx_revolve.control.sense import Cues
+from mjx_revolve.control.courses import course_path
+from mjx_revolve.control.sense import Cues, Memory
 from mjx_revolve.engine.batch import Bodies, Capacity
 from mjx_revolve.engine.plant import Figure
 from mjx_revolve.engine.rows import make_rows
@@ -191,7 +192,7 @@ class Setup:
             bodies, alike, population, starts, individual, trial, self.record_every,
             partial(make_recorder, task=self.task, world=self.world),
         )  # fmt: skip
-        recorded = record_target(self, recorded, cues)
+        recorded = record_cues(self, recorded, cues)
         return score_episodes(self.task, self.settings, self.world, recorded, root[:3], figure)
 
     @property
@@ -214,7 +215,7 @@ class Setup:
         Returns:
             Time between rows [s], and `qpos`, `qvel`, `command` (of thrusters, behind their lag),
             `ctrl` in the engine's order, `[T, n, P]` each, and `energy` since the last row `[T, P]`
-            [J].
+            [J]; `target`, where that chases the robots, world frame [m].
         """
         every = self.trace_every
         found = self._traced(bodies, population, key, jnp.full(len(population), trial, jnp.int32))
@@ -310,6 +311,7 @@ class Setup:
                 world=world,
                 cues=cues,
                 feels=controller.feels,
+                recall=recall_pursuer,
             )
             return kept
 
@@ -335,13 +337,25 @@ def vary_engine(engine: Engine, variation: Variation | None) -> Engine:
     return engine.varied(variation)
 
 
-def record_target(setup: Setup, recorded: dict[str, Any], cues: Cues) -> dict[str, Any]:
-    """Records with the target along the way, where the task asks for one and there is one."""
-    if "target" not in setup.task.records or cues.target is None:
+def recall_pursuer(recorded: dict[str, Any], memory: Memory) -> dict[str, Any]:
+    """Records with the place of a target that chases the robot, if there is one."""
+    if memory.pursuer is None:
         return recorded
+    return recorded | {"target": jnp.stack(memory.pursuer.place)}
+
+
+def record_cues(setup: Setup, recorded: dict[str, Any], cues: Cues) -> dict[str, Any]:
+    """Records with target and course along the way, if the task asks for them and they exist."""
     interval = setup.record_every * setup.world.timestep
     time = interval * jnp.arange(1, setup.num_records + 1, dtype=recorded["position"].dtype)
-    return recorded | {"target": target_path(cues, time)}
+    found = dict(recorded)
+    if "target" not in setup.task.records:
+        found.pop("target", None)
+    elif "target" not in found and cues.target is not None:
+        found["target"] = target_path(cues, time)
+    if "course" in setup.task.records and cues.course is not None:
+        found["course"] = course_path(cues.course, time)
+    return found
 
 
 def make_recorder(

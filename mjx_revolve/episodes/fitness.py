@@ -39,7 +39,7 @@ from mjx_revolve.episodes.evaluation import (
     Setup,
     make_recorder,
     pick_water,
-    record_target,
+    record_cues,
     vary_engine,
 )
 from mjx_revolve.episodes.rollout import flow_at
@@ -162,6 +162,7 @@ class Fitness:
             height,
             jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.cues(key)),
             self.variation(key),
+            None if trajectory.target is None else jnp.asarray(trajectory.target)[rows],
         )
         return float(score[0]), {name: float(value[0]) for name, value in measures.items()}
 
@@ -171,7 +172,7 @@ class Fitness:
 
         def run(
             qpos: Any, qvel: Any, ctrl: Any, command: Any, energy: Any, water: Any, height: Any,
-            cues: Any, variation: Any,
+            cues: Any, variation: Any, target: Any,
         ) -> Any:  # fmt: skip
             # The rows of the episode stand side by side, as if they were a population.
             engine = vary_engine(self.engine, variation)
@@ -187,11 +188,13 @@ class Fitness:
                 for name, x in kept.items()
                 if name != "energy"
             }
+            if cues.chase is not None:
+                recorded["target"] = target[..., None]
             return judge_tracks(
                 self.task,
                 self.config.task,
                 self.robot.world,
-                record_target(self.setup, recorded | {"energy": energy}, cues),
+                record_cues(self.setup, recorded | {"energy": energy}, cues),
                 height,
                 self.setup.figure_of(None),
             )
@@ -445,6 +448,7 @@ def _own_trajectory(
         ctrl=jnp.asarray(ctrl),
         power=jnp.asarray(found["energy"] / step),
         command=jnp.asarray(found["command"][:, : robot.num_thrusters]),
+        target=None if "target" not in found else jnp.asarray(found["target"]),
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_revolve.control.sense import NOBODY, Cues, Sense, feel, remember, start_memory
+from mjx_revolve.control.sense import NOBODY, Cues, Memory, Sense, feel, remember, start_memory
 from mjx_revolve.engine.collisions import Meeting
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.numerics.xla import fused_scan, share_once
@@ -36,7 +36,13 @@ class Passage(NamedTuple):
     count: Any
 
 
-def begin(engine: Engine, state: Any, drive_state: Any, feels: Sequence[str] = ()) -> Passage:
+def begin(
+    engine: Engine,
+    state: Any,
+    drive_state: Any,
+    feels: Sequence[str] = (),
+    cues: Cues = _NO_CUES,
+) -> Passage:
     """What travels before the first step.
 
     Args:
@@ -44,12 +50,13 @@ def begin(engine: Engine, state: Any, drive_state: Any, feels: Sequence[str] = (
         state: from `engine.init`.
         drive_state: of the controller.
         feels: which of `sense.FEELS` are asked for.
+        cues: of the episodes.
 
     Returns:
         The start of a rollout.
     """
     energy = jnp.zeros_like(engine.root(state).spin[0])
-    memory = start_memory(feels, engine, state)
+    memory = start_memory(feels, engine, state, cues)
     return Passage(state, drive_state, memory, energy, jnp.zeros((), jnp.int32))
 
 
@@ -86,9 +93,7 @@ def make_drive(
         water = flow(time, row)
         # One sweep over the body serves what is felt now and what is remembered of it.
         motion = engine.motions(now.state) if now.memory.past is not None else None
-        felt = feel(
-            world, engine, now.state, water, time, cues, now.memory, feels, meeting, motion
-        )
+        felt = feel(world, engine, now.state, water, time, cues, now.memory, feels, meeting, motion)
         own = time if since is None else _clock(now.count - since, now.energy, timestep)
         drive_state, ctrl = drive(now.drive_state, own, row, felt)
         return drive_state, ctrl, water, motion
@@ -97,7 +102,10 @@ def make_drive(
 
 
 def make_step(
-    engine: Engine, told: Callable[..., tuple[Any, jax.Array, Water, Any]], timestep: float
+    engine: Engine,
+    told: Callable[..., tuple[Any, jax.Array, Water, Any]],
+    timestep: float,
+    cues: Cues = _NO_CUES,
 ) -> Callable[..., tuple[Passage, jax.Array]]:
     """A step of a rollout.
 
@@ -105,6 +113,7 @@ def make_step(
         engine: what steps the robots.
         told: from `make_drive`.
         timestep: [s].
+        cues: of the episodes.
 
     Returns:
         (rollout, inputs of this step) → (the rollout a step later, ctrl). A third argument is added
@@ -122,7 +131,7 @@ def make_step(
         state, power = engine.step(now.state, ctrl, water, *pushes)
         work = timestep * power
         after = engine.root(state)
-        memory = remember(now.memory, before, after, ctrl, work, timestep, motion)
+        memory = remember(now.memory, before, after, ctrl, work, timestep, motion, cues)
         return Passage(state, drive_state, memory, now.energy + work, now.count + 1), ctrl
 
     return step
@@ -142,6 +151,7 @@ def roll_out(
     inputs: Any,
     *,
     feels: Sequence[str] = (),
+    cues: Cues = _NO_CUES,
     **settings: Any,
 ) -> tuple[Any, Any]:
     """Steps a chunk of a population from its start and records it now and then.
@@ -155,13 +165,16 @@ def roll_out(
         drive_state: initial controller state.
         inputs: as in `go_on`.
         feels: which of `sense.FEELS` are asked for.
+        cues: what else they are given to feel.
         **settings: of `go_on`.
 
     Returns:
         The last state, and the records, `[records, ...]` each.
     """
-    start = begin(engine, state, drive_state, feels)
-    last, kept = go_on(engine, drive, flow, record, start, inputs, feels=feels, **settings)
+    start = begin(engine, state, drive_state, feels, cues)
+    last, kept = go_on(
+        engine, drive, flow, record, start, inputs, feels=feels, cues=cues, **settings
+    )
     return last.state, kept
 
 
@@ -181,6 +194,7 @@ def go_on(
     cues: Cues = _NO_CUES,
     feels: Sequence[str] = (),
     since: Any = None,
+    recall: Callable[[Any, Memory], Any] = lambda kept, memory: kept,
 ) -> tuple[Passage, Any]:
     """Steps a chunk of a population on and records it now and then.
 
@@ -202,6 +216,8 @@ def go_on(
         cues: what else they are given to feel.
         feels: which of `sense.FEELS` are asked for.
         since: `[lanes]` int32 step at which each robot's own time began; None: all at the first.
+        recall: (what `record` keeps, what is remembered of what was felt) → what to keep; by
+            default nothing of the latter.
 
     Returns:
         What travels on, and the records, `[records, ...]` each.
@@ -209,7 +225,7 @@ def go_on(
     told = make_drive(
         engine, drive, flow, timestep=timestep, world=world, cues=cues, feels=feels, since=since
     )
-    one = make_step(engine, told, timestep)
+    one = make_step(engine, told, timestep, cues)
     step: Any = lambda now, given: one(now, given[0], None, given[1])  # noqa: E731
     first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)
     # What robots do to each other is no element-wise function of them, so it stays outside.
@@ -239,9 +255,9 @@ def go_on(
         else:
             (packed, watch), ctrls = jax.lax.scan(look_and_step, (start, watch), rows, length=every)
             ctrl = jax.tree.map(lambda x: x[-1], ctrls)
-        state, _, _, energy, count = unpack(packed)
+        state, _, memory, energy, count = unpack(packed)
         water = flow(_clock(count - 1, energy, timestep), last)
-        return (packed, watch), record(state, ctrl, energy, water)
+        return (packed, watch), recall(record(state, ctrl, energy, water), memory)
 
     if inputs is not None:
         inputs = jax.tree.map(lambda x: x.reshape(records, every, *x.shape[1:]), inputs)

@@ -18,7 +18,7 @@ from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.rollout import flow_at, roll_out
-from mjx_revolve.episodes.starts import gusty_water
+from mjx_revolve.episodes.starts import gusty_water, target_path
 from mjx_revolve.inputs.brief import brief
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import compiler_options, hasty_options
@@ -27,9 +27,11 @@ from mjx_revolve.water.flow import Water, gust_path, water_of
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["time", "qpos", "qvel", "xpos", "ctrl", "power", "command", "surface_height"],
+    data_fields=[
+        "time", "qpos", "qvel", "xpos", "ctrl", "power", "command", "surface_height", "target",
+    ],
     meta_fields=[],
-)
+)  # fmt: skip
 @dataclass(frozen=True, repr=False)
 class Trajectory:
     """What a robot did, one row after each step.
@@ -46,6 +48,7 @@ class Trajectory:
             need for the thrust [W].
         command: `[T, nthruster]` commands of the thrusters behind their lag [-].
         surface_height: `[T]` z of the still surface, world frame [m]; None for the world's.
+        target: `[T, 3]` where the target was, world frame [m]; None without one.
     """
 
     time: jax.Array
@@ -56,6 +59,7 @@ class Trajectory:
     power: jax.Array
     command: jax.Array | None = None
     surface_height: jax.Array | None = None
+    target: jax.Array | None = None
 
     __repr__ = brief
 
@@ -105,7 +109,7 @@ def _compiled(
             moving = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[:, None], moving)
             flow = lambda time, row: flow_at(robot.world, row[1])(time, None)  # noqa: E731
         keep = lambda state, ctrl, energy, water: (state, ctrl, energy)  # noqa: E731
-        _, (states, ctrl, energy) = roll_out(
+        _, (states, ctrl, energy, pursuer) = roll_out(
             simulator,
             drive,
             flow,
@@ -120,7 +124,12 @@ def _compiled(
             world=robot.world,
             cues=cues,
             feels=() if controller is None else controller.feels,
+            recall=lambda kept, memory: (*kept, memory.pursuer),
         )
+        time = dt * jnp.arange(1, steps + 1, dtype=energy.dtype)
+        target = None if pursuer is None else jnp.stack(pursuer.place, 1)
+        if target is None and cues.target is not None:
+            target = target_path(cues, time)
         qs, vs = jax.vmap(simulator.observe)(states)
         return Trajectory(
             time=dt * jnp.arange(1, steps + 1, dtype=qs.dtype),
@@ -131,6 +140,7 @@ def _compiled(
             power=energy[..., 0] / dt,
             command=jax.vmap(simulator.command)(states)[..., 0],
             surface_height=None if moving is None else moving.surface_height[:, 0],
+            target=None if target is None else target[..., 0],
         )
 
     hasty = once and engine == "population"

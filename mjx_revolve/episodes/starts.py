@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.control.courses import Course
+from mjx_revolve.control.pursuit import Chase
 from mjx_revolve.control.sense import Cues
 from mjx_revolve.engine.plant import Figure
 from mjx_revolve.engine.variation import Variation
@@ -33,8 +36,10 @@ class Starts(NamedTuple):
             the world has no gusts.
         noise: `[trials]` uint32 what the sensors' noise is drawn from.
         towards: `[3, trials]` from the start to the target [m]; None where the task draws none.
-        drift: `[3, trials]` velocity of the target [m/s]; None where it keeps still.
+        drift: `[3, trials]` velocity of the target [m/s]; None where it keeps still, or chases the
+            robot.
         variation: `[trials]` each, what is not known exactly; None where nothing is drawn.
+        course: `[trials]` each, the direction to keep to; None where the task has none.
     """
 
     place: jax.Array
@@ -45,6 +50,7 @@ class Starts(NamedTuple):
     towards: jax.Array | None = None
     drift: jax.Array | None = None
     variation: Variation | None = None
+    course: Course | None = None
 
 
 def check_key(key: Any) -> None:
@@ -85,7 +91,7 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
         gusts = gust_path(world.gust, gust_key, steps, world.timestep, trials)
     noise = jax.random.bits(jax.random.fold_in(key, 3), (trials,), "uint32")
     starts = Starts(place, quat, None, gusts, noise, *_draw_target(task, key))
-    starts = starts._replace(variation=_draw_variation(task, key))
+    starts = starts._replace(variation=_draw_variation(task, key), course=_draw_course(task, key))
     if task.current_std == 0 and not world.waves:
         return starts
     extra = task.current_std * jax.random.normal(current_key, (2, trials))
@@ -111,9 +117,28 @@ def _draw_target(task: TaskConfig, key: jax.Array) -> tuple[jax.Array | None, ja
     towards = drift = None
     if task.target_distance is not None:
         towards = level(bearing_key, task.target_distance, task.target_spread)
-    if task.target_speed > 0:
+    if task.target_speed > 0 and task.target_turn is None:
         drift = level(drift_key, task.target_speed, np.pi)
     return towards, drift
+
+
+def _draw_course(task: TaskConfig, key: jax.Array) -> Course | None:
+    """Courses and how they turn, `[trials]` each; None where the task has none."""
+    if task.course_spread is None:
+        return None
+    first_key, rate_key, moment_key, turn_key = jax.random.split(jax.random.fold_in(key, 6), 4)
+    count = task.course_changes
+
+    def within(key: jax.Array, most: float, *shape: int) -> jax.Array:
+        return jax.random.uniform(key, (*shape, task.trials), minval=-most, maxval=most)
+
+    ahead = math.atan2(task.direction[1], task.direction[0])
+    moments = jax.random.uniform(
+        moment_key, (count, task.trials), minval=task.settle, maxval=task.duration
+    )
+    turns = within(turn_key, task.course_turn, count)
+    heading = ahead + within(first_key, task.course_spread)
+    return Course(heading, within(rate_key, task.course_rate), tuple(moments), tuple(turns))
 
 
 def _draw_variation(task: TaskConfig, key: jax.Array) -> Variation | None:
@@ -142,11 +167,16 @@ def cues_of(task: TaskConfig, starts: Starts, place: jax.Array) -> Cues:
     elif task.target is not None:
         target = tuple(jnp.full_like(place[0], x) for x in task.target)
     drift = None if starts.drift is None or target is None else tuple(starts.drift)
-    return Cues(target, drift, starts.noise)
+    chase = sight = None
+    if task.sight is not None:
+        sight = jnp.full_like(place[0], task.sight)
+    if task.target_turn is not None:
+        chase = Chase(*(jnp.full_like(place[0], x) for x in (task.target_speed, task.target_turn)))
+    return Cues(target, drift, starts.noise, sight, chase, starts.course)
 
 
 def target_path(cues: Cues, time: jax.Array) -> jax.Array:
-    """Where the targets are.
+    """Where the targets are that do not chase their robots.
 
     Args:
         cues: of episodes, `[lanes]`.

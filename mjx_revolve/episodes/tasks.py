@@ -26,7 +26,7 @@ from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
 # What a task may have recorded beside the core's position and the energy: see `Track`.
-RECORDS = ("core", "joints", "contacts", "forces", "water", "target")
+RECORDS = ("core", "joints", "contacts", "forces", "water", "target", "course")
 
 
 @partial(
@@ -34,7 +34,7 @@ RECORDS = ("core", "joints", "contacts", "forces", "water", "target")
     data_fields=[
         "position", "clearance", "energy", "start_height", "length", "weight", "surface_height",
         "num_hinges", "quat", "velocity", "spin", "angle", "speed", "bed_force", "water_force",
-        "water_velocity", "target",
+        "water_velocity", "target", "course",
     ],
     meta_fields=["interval"],
 )  # fmt: skip
@@ -67,6 +67,8 @@ class Track:
             there, world frame [m/s]; None unless "water" is recorded.
         target: `[S, 3, lanes]` where the target is, world frame [m]; None unless "target" is
             recorded and there is one.
+        course: `[S, 3, lanes]` the direction to keep to, a unit vector, world frame; None unless
+            "course" is recorded and there is one.
     """
 
     position: jax.Array
@@ -87,6 +89,7 @@ class Track:
     water_force: jax.Array | None = None
     water_velocity: jax.Array | None = None
     target: jax.Array | None = None
+    course: jax.Array | None = None
 
     @property
     def duration(self) -> float:
@@ -207,6 +210,47 @@ def reach_target(track: Track, settings: Any) -> jax.Array:
     return (away[0] - away[1]) / track.length
 
 
+def _left_of_way(track: Track, settings: Any) -> jax.Array:
+    """`[S, lanes]` how near the target has been by then, a share of how near it was at first.
+
+    1 until it comes nearer, 0 from the moment it touches.
+    """
+    assert track.target is not None
+    away = safe_norm(tuple(track.position[:, i] - track.target[:, i] for i in range(3)))
+    beyond = jnp.maximum(away - settings.touch, 0.0)
+    return jax.lax.cummin(beyond) / jnp.maximum(beyond[0], 1e-6)
+
+
+def search(track: Track, settings: Any) -> jax.Array:
+    """How much of the way to the target it has behind it, on average over time [of the way].
+
+    At each moment the most so far: what once was near has that to its credit, and what is touched
+    sooner counts longer. 1 would be to touch it at once.
+    """
+    return 1 - jnp.mean(_left_of_way(track, settings), 0)
+
+
+def escape(track: Track, settings: Any) -> jax.Array:
+    """The pursuer's least distance so far, on average over time [of the first distance].
+
+    1 is never to let it come nearer than it began. From the moment it touches 0 is counted, and
+    where the robot leaves its depth: to dive away would need no senses.
+    """
+    keeps = _keeping(track.position[:, 2] - track.start_height, settings.depth_tolerance)
+    return jnp.mean(_left_of_way(track, settings) * keeps, 0)
+
+
+def follow_course(track: Track, settings: Any) -> jax.Array:
+    """Progress along a course that turns, over ground, at its depth [body lengths/s]."""
+    assert track.course is not None
+    moved = jnp.diff(track.position, axis=0)
+    # Where it turns at once, the mean of before and after counts.
+    course = (track.course[1:] + track.course[:-1]) / 2
+    along = jnp.sum(moved * course, 1)
+    counted = jnp.sum(along * _keeps_depth(track, settings), 0)
+    return counted / (track.duration * track.length)
+
+
 def hold_depth(track: Track, settings: Any) -> jax.Array:
     """Minus the root mean square distance from the start's depth [body lengths]."""
     error = (track.position[:, 2] - track.start_height) / track.length
@@ -254,6 +298,9 @@ TASKS: Mapping[str, Task] = {
     "reach_target": Task(reach_target, "body lengths", records=("target",)),
     "hold_depth": Task(hold_depth, "body lengths"),
     "hold_heading": Task(hold_heading, "body lengths + rad", records=("core",)),
+    "follow_course": Task(follow_course, _SPEED, records=("course",)),
+    "search": Task(search, "of the way", records=("target",)),
+    "escape": Task(escape, "of the first distance", records=("target",)),
     "follow_bed": Task(follow_bed, _SPEED, start=start_above_bed, on_bed=True),
     "crawl": Task(crawl, _SPEED, start=start_on_bed, on_bed=True),
 }
@@ -321,7 +368,7 @@ def _example_track(records: tuple[str, ...]) -> Any:
 
     of = {"core": ("quat", "velocity", "spin"), "joints": ("angle", "speed")}
     of |= {"contacts": ("bed_force",), "forces": ("water_force",), "water": ("water_velocity",)}
-    of |= {"target": ("target",)}
+    of |= {"target": ("target",), "course": ("course",)}
     wide = {"quat": 4, "angle": _HINGES, "speed": _HINGES}
     more = {field: given(_ROWS, wide.get(field, 3), _LANES) for r in records for field in of[r]}
     return Track(

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from mjx_revolve.control.sense import Cues
 from mjx_revolve.engine.state import Engine
 from mjx_revolve.episodes.environment import RATES
-from mjx_revolve.episodes.evaluation import make_recorder, record_target, vary_engine
+from mjx_revolve.episodes.evaluation import make_recorder, record_cues, vary_engine
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.rollout import Passage, begin, flow_at, make_drive, make_step
 from mjx_revolve.episodes.scoring import WORST, first_counted, list_episodes, score_episodes
@@ -297,7 +297,7 @@ class Windows:
                 setup.task,
                 setup.settings,
                 setup.world,
-                record_target(setup, rows, cues),
+                record_cues(setup, rows, cues),
                 episodes.place,
                 setup.figure_of(None),
             )
@@ -336,6 +336,11 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> Windows:
         raise InputError(
             f"{config.source}: engine: expected population, to go back through its steps; found "
             f"{config.engine}"
+        )
+    if config.task.target_turn is not None and config.task.target_turn > 0:
+        raise InputError(
+            f"{config.source}: task.target_turn: expected none, as windows do not carry a pursuer "
+            f"on; found {config.task.target_turn:g}"
         )
     row = fitness.record_every * fitness.robot.world.timestep
     if horizon is None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from laboratory import QUICK, WATER, arm_robot, box_robot, elbow_robot, random_states, world
+from mjx_revolve.control.courses import Course
 from mjx_revolve.control.sense import FEELS, Cues, feel, remember, start_memory
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.engines import make_engine
@@ -21,7 +22,7 @@ from mjx_revolve.water.flow import Water, water_of
 
 LANES = 3
 TANK = world(**WATER | {"current": (0.3, 0.0, 0.0), "bed": {"height": -9.0}})
-CUES = Cues(target=(1.0, 2.0, -4.0), drift=(0.5, 0.0, 0.0))
+CUES = Cues(target=(1.0, 2.0, -4.0), drift=(0.5, 0.0, 0.0), sight=100.0, course=Course(0.3, 0.1))
 
 
 def senses(tank, make, qpos, qvel, ctrl, time=2.0, cues=CUES, water=None):
@@ -117,6 +118,10 @@ def test_the_core_feels_what_mujocos_sensors_do(felt, mujocos, states):
     # After 2 s the target is at (2, 2, -4).
     away = np.array([2.0, 2.0, -4.0])[:, None] - states[0][:3]
     assert np.stack(sense.target) == pytest.approx(np.einsum("ijl,il->jl", axes, away), abs=1e-12)
+    assert sense.seen.all()
+    # The course is 0.3 + 2 × 0.1 from x by then.
+    ahead = [np.cos(0.5), np.sin(0.5), 0.0]
+    assert np.stack(sense.course) == pytest.approx(np.einsum("ijl,i->jl", axes, ahead), abs=1e-12)
     # What stands still feels its weight, and nothing has been done yet.
     assert np.stack(sense.force) == pytest.approx(9.81 * axes[2], abs=1e-12)
     assert not sense.work.any()

@@ -72,7 +72,8 @@ def test_it_is_frozen(folder):
         ("task.trials=0", "task.trials: expected a whole number >= 1; found 0"),
         ("task.trials=2.0", "task.trials: expected a whole number >= 1; found 2.0"),
         ("task.type=swim", "task.type: expected one of directed_swim, speed, reach_target, "
-         "hold_depth, hold_heading, follow_bed, crawl, or FILE.py:FUNCTION; found 'swim'"),
+         "hold_depth, hold_heading, follow_course, search, escape, follow_bed, crawl, or "
+         "FILE.py:FUNCTION; found 'swim'"),
         ("task.type=follow_bed", "task.height: expected a number > 0 [m], because task.type is "
          "follow_bed; found none"),
         ("task.type=tasks.py", "or FILE.py:FUNCTION; found 'tasks.py'"),
@@ -88,6 +89,26 @@ def test_it_is_frozen(folder):
          "because task.type is reach_target; found none"),
         ("task={type: reach_target, target: [1, 0, 0], target_distance: 1}", "task.target: "
          "expected none, as there is a target_distance; found one"),
+        ("task={type: search, sight: 1}", "task.target: expected three numbers [m], or "
+         "target_distance, because task.type is search; found none"),
+        ("task={type: search, target_distance: 1}", "task.sight: expected a number > 0 [m], "
+         "because task.type is search; found none"),
+        ("task={type: escape, target_distance: 1, target_speed: 1}", "task.target_turn: expected "
+         "a number > 0 and <= 100 [rad/s], because task.type is escape; found none"),
+        ("task={type: escape, target_distance: 1, target_turn: 1}", "task.target_speed: expected "
+         "a speed > 0 [m/s], as with target_turn the target is a pursuer; found 0"),
+        ("task={type: speed, target_speed: 1, target_turn: 1}", "task.target: expected three "
+         "numbers [m], or target_distance, as there is a target_turn; found none"),
+        ("task.type=follow_course", "task.course_spread: expected a number > 0 and <= 3.14159 "
+         "[rad], because task.type is follow_course; found none"),
+        ("task.course_changes=2", "task.course_changes: expected 0, as there is no course without "
+         "a course_spread; found 2"),
+        ("task.course_rate=0.5", "task.course_rate: expected 0, as there is no course without "
+         "a course_spread; found 0.5"),
+        ("task={type: follow_course, course_spread: 1, direction: [0, 0, 1]}", "task.direction: "
+         "expected one that is not upright, as there is a course_spread, which is level; found"),
+        ("task={type: follow_course, course_spread: 1, course_changes: 17}",
+         "task.course_changes: expected a whole number >= 0 and <= 16; found 17"),
         ("controller.harmonics=3", "--set controller.harmonics: expected 1, as only type sine has "
          "it (--set controller.harmonics=1); found 3"),
         ("controller.gain=3.5", "--set controller.gain: expected 2, as only types feedback, "

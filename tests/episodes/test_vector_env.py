@@ -204,6 +204,17 @@ TASKS = {
         "task.target_speed": 0.1,
         "sensors": ["bearing", {"type": "gyro", "rate": 10.0, "delay": 0.1}, "load"],
     },
+    "escape": {
+        "task.target_distance": 0.3,
+        "task.target_speed": 0.2,
+        "task.target_turn": 1.0,
+        "sensors": ["bearing", "distance"],
+    },
+    "follow_course": {
+        "task.course_spread": 1.0,
+        "task.course_changes": 2,
+        "sensors": ["course"],
+    },
 }
 
 
