@@ -17,9 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.common import make_folder, make_parser
+from mjx_revolve.evolution.loop import Champion
 from mjx_revolve.evolution.plans import Plan
 from mjx_revolve.evolution.plans import make_plans as plan_runs
 from mjx_revolve.evolution.pool import make_pool
+from mjx_revolve.evolution.start import Start
 from mjx_revolve.evolution.sweeps import choose_steps, run_plans
 from mjx_revolve.inputs.commands import Parser, whole
 from mjx_revolve.inputs.errors import InputError
@@ -139,13 +141,19 @@ def make_plans(
     return folder, plan_runs(folder, BASE, settings, range(options.seeds))
 
 
-def run_study(plans: Sequence[Plan], name: str, argv: Sequence[str]) -> int:
+def run_study(
+    plans: Sequence[Plan],
+    name: str,
+    argv: Sequence[str],
+    draw: Callable[[Start, Champion], None] | None = None,
+) -> int:
     """Runs what is not finished; see `sweeps.run_plans`.
 
     Args:
         plans: the evolutions.
         name: of the experiment's module.
         argv: its arguments, for the hint how to go on.
+        draw: writes the pictures of a run; by default those that each run has.
 
     Returns:
         The exit code.
@@ -157,7 +165,10 @@ def run_study(plans: Sequence[Plan], name: str, argv: Sequence[str]) -> int:
     again = shlex.join(["python", "-m", f"experiments.{name}", *argv])
     steps = choose_steps(plans, MAKE_FITNESS)
     return run_plans(
-        steps, lambda config: make_pool(config, make_fitness=MAKE_FITNESS), save_pictures, again
+        steps,
+        lambda config: make_pool(config, make_fitness=MAKE_FITNESS),
+        draw or save_pictures,
+        again,
     )
 
 

@@ -68,7 +68,7 @@ def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
     low = float((poses.parts[..., 2] - np.linalg.norm(robot.fluid.half_size, axis=1)).min())
     surface = _first(water.surface_height)
     net = qpos[-1, :2] - qpos[0, :2]
-    target = target_of(episode.fitness.config.task) if episode.fitness else None
+    target = target_of(episode.fitness.config.task if episode.fitness else None, trajectory)
     moved = float(np.linalg.norm(net)) > 0.05 * length
     return {
         "length": length,
@@ -82,7 +82,7 @@ def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
         "speed": _f32(speed_over(time, qpos[:, :3], period)),
         "drift": _f32(water_drift(robot, now, center, step)),
         "current": _current(water_velocity(robot, now, center)),
-        "target": None if target is None else target.tolist(),
+        "target": None if target is None else _f32(target[rows]),
         "robot": {
             "bodies": poses.position.shape[1] - 1,
             **_pieces(robot),

@@ -13,7 +13,7 @@ from mjx_revolve.evolution.start import Start
 from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.view import plots
 from mjx_revolve.view.motion import counted_time
-from mjx_revolve.view.surroundings import target_of
+from mjx_revolve.view.surroundings import target_at_last
 from mjx_revolve.view.swim_picture import plot_swim
 from mjx_revolve.view.thumbnails import plot_best
 
@@ -56,7 +56,7 @@ def save_pictures(start: Start, champion: Champion) -> None:
             )
             counted = counted_time(config.task, robot.world.timestep)
             water = fitness.water(champion.key) if hasattr(fitness, "water") else None
-            target = target_of(config.task)
+            target = target_at_last(config.task, trajectory)
             figures["swim.png"] = plot_swim(robot, trajectory, counted, water, target)
     for name, figure in figures.items():
         run.write(name, plots.figure_png(figure))

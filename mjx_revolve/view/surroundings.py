@@ -12,6 +12,7 @@ from mjx_revolve.water.flow import Water, flow, water_of
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
     from mjx_revolve.episodes.config import TaskConfig
+    from mjx_revolve.episodes.simulate import Trajectory
 
 # Slower water is as good as still [m/s].
 _STILL = 1e-3
@@ -39,8 +40,23 @@ def moves(current: np.ndarray) -> bool:
     return bool(np.sqrt(np.mean(np.sum(current**2, axis=-1))) > _STILL)
 
 
-def target_of(task: TaskConfig | None) -> np.ndarray | None:
-    """`[3]` where a task sends robots, world frame [m]; None where it names no place."""
-    if task is None or task.target is None:
-        return None
-    return np.asarray(task.target, float)
+def target_of(task: TaskConfig | None, trajectory: Trajectory) -> np.ndarray | None:
+    """Where a robot was to go, or whom it was to flee.
+
+    Args:
+        task: of the episode, or None.
+        trajectory: of the robot.
+
+    Returns:
+        `[S, 3]` at each of its rows, world frame [m]; None where there is no such place.
+    """
+    found = getattr(trajectory, "target", None)
+    if found is None and task is not None and task.target is not None:
+        found = np.tile(np.asarray(task.target, float), (len(trajectory.time), 1))
+    return None if found is None else np.asarray(found, float)
+
+
+def target_at_last(task: TaskConfig | None, trajectory: Trajectory) -> np.ndarray | None:
+    """`[3]` where `target_of` has it at the end, world frame [m]; None without one."""
+    found = target_of(task, trajectory)
+    return None if found is None else found[-1]

@@ -194,7 +194,15 @@ def test_current_and_target(episode, data):
     velocity = unpack(given["current"]["velocity"], -1, 3)
     assert velocity == pytest.approx(np.tile([0.2, 0, -0.1], (given["count"], 1)), rel=1e-5)
     assert given["current"]["fastest"] == pytest.approx(math.hypot(0.2, 0.1), rel=1e-5)
-    assert given["target"] == [1.0, 2.0, -1.5]
+    target = unpack(given["target"], -1, 3)
+    assert target == pytest.approx(np.tile([1.0, 2.0, -1.5], (given["count"], 1)))
+    # One that moves is shown where the trajectory has it.
+    rows = moving.trajectory
+    way = np.linspace([0, 0, 0], [1, 2, -1], len(rows.time))
+    fled = page_data(replace(moving, trajectory=replace(rows, target=way)), forces=False)
+    assert unpack(fled["target"], -1, 3) == pytest.approx(
+        way[:: len(way) // fled["count"]], rel=1e-6
+    )
     text = make_page(sent, forces=False)
     assert 'id="current"' in text and 'id="target"' in text
     assert 'id="current"' not in make_page(small_episode(world()), forces=False)

@@ -206,7 +206,10 @@ def _make_signs(film: Film, unit: float) -> Callable[[ImageDraw.ImageDraw, int],
     """
     (width, height), shots = film.size, film.shots
     fitness = film.episode.fitness
-    target = target_of(fitness.config.task) if fitness is not None else None
+    way = target_of(None if fitness is None else fitness.config.task, film.episode.trajectory)
+    if way is not None:
+        rows = np.asarray(film.episode.trajectory.time, float)
+        way = np.stack([np.interp(film.time, rows, x) for x in way[: len(rows)].T], axis=-1)
     current = water_velocity(film.robot, film.water, film.center)
     flows, arm, thick = moves(current), 20 * unit, max(2, round(2.5 * unit))
 
@@ -228,7 +231,8 @@ def _make_signs(film: Film, unit: float) -> Callable[[ImageDraw.ImageDraw, int],
                 arrow(draw, middle, along, _FLOW)
             speed = f"current {np.linalg.norm(current[frame]):.2f} m/s"
             words.append((middle[0], 24 * unit, speed, _FLOW))
-        if target is not None:
+        if way is not None:
+            target = way[frame]
             flat, away = shots.project(frame, target[None])
             middle = np.array([width / 2, height / 2])
             at = middle + height / 2 * flat[0] * (1, -1)

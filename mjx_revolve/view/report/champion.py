@@ -19,7 +19,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.felt import Felt, feel_episode
 from mjx_revolve.view.motion import Motion, analyse_motion, count_finite, counted_time
 from mjx_revolve.view.report.record import RunRecord, number
-from mjx_revolve.view.surroundings import target_of
+from mjx_revolve.view.surroundings import target_at_last
 
 # A replay further than this from the recorded mean is another swim: standard deviations over the
 # fresh starts, and a share of the score itself where those hardly differ.
@@ -76,7 +76,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
     begin = counted_time(fitness.config.task, fitness.robot.world.timestep)
     motion = analyse_motion(
         fitness.robot, trajectory, begin, phases, fitness.water(key),
-        target_of(fitness.config.task),
+        target_at_last(fitness.config.task, trajectory),
     )  # fmt: skip
     finite = jax.tree.map(lambda x: x[:count], trajectory)
     return Replay(motion, score, measures, feel_episode(fitness, finite, key))

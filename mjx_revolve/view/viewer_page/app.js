@@ -58,7 +58,8 @@ function start() {
   if (world.bed !== null) scene.add(makeBed(world.bed));
   const current = data.current && makeCurrent(data.current, step, size);
   if (current) scene.add(current.group);
-  if (data.target) scene.add(makeTarget(data.target, size));
+  const goal = data.target && new Track(data.target, 3, step), mark = goal && makeTarget(size);
+  if (mark) scene.add(mark.group);
   const arrows = {};
   for (const name in data.forces) {
     arrows[name] = makeArrows(data.forces[name], data.anchors, robot, step, size);
@@ -234,7 +235,7 @@ function start() {
     if (readings[id].textContent !== text) readings[id].textContent = text;
   }
 
-  const aim = new THREE.Vector3().fromArray(data.target || [0, 0, 0]);
+  const aim = new THREE.Vector3();
 
   function drawInstruments() {
     core.vector(state.time, 0, here);
@@ -245,7 +246,8 @@ function start() {
     const depth = world.surface - here.z;
     write("depth", `${depth.toFixed(2)} m`);
     if (current) write("current", `${current.at(state.time).toFixed(3)} m/s`);
-    if (data.target) write("target", `${here.distanceTo(aim).toFixed(2)} m`);
+    if (goal) goal.vector(state.time, 0, aim);
+    if (goal) write("target", `${here.distanceTo(aim).toFixed(2)} m`);
     write("way", `${Math.hypot(here.x - from[0], here.y - from[1], here.z - from[2]).toFixed(2)} m`);
     scrub.value = state.time;
     byId("clock").textContent = `${(data.start + state.time).toFixed(1)} / ${(data.start + last).toFixed(1)} s`;
@@ -390,6 +392,7 @@ function start() {
       shared.uWaves.value[k].set(wave.k * wave.x, wave.k * wave.y, wave.amplitude, phase % (2 * Math.PI));
     });
     robot.update(time);
+    if (mark) mark.update(goal.vector(time, 0, aim));
     center.vector(time, 0, here);
     if (state.follow) {
       before.copy(target);

@@ -364,22 +364,31 @@ function makeCurrent(data, step, size) {
 }
 
 // A diamond where the robot is to go, that shines through what hides it.
-function makeTarget(place, size) {
-  const group = new THREE.Group(), color = new THREE.Vector3(1.0, 0.25, 0.55);
+function makeTarget(size) {
+  const meshes = [], group = new THREE.Group(), color = new THREE.Vector3(1.0, 0.25, 0.55);
   for (const solid of [true, false]) {
     const options = solid ? {} : { transparent: true, depthTest: false, depthWrite: false };
     const material = makeMaterial(ARROW, { uColor: color, uAlpha: solid ? 1 : 0.35 }, options);
     for (const up of [1, -1]) {
       const half = new THREE.ConeGeometry(0.6, 1, 24).translate(0, 0.5, 0).rotateX((up * Math.PI) / 2);
       const mesh = new THREE.InstancedMesh(half, material, 1);
-      const matrix = new THREE.Matrix4().makeScale(0.12 * size, 0.12 * size, 0.12 * size);
-      mesh.setMatrixAt(0, matrix.setPosition(...place));
       mesh.frustumCulled = false;
       mesh.renderOrder = solid ? 0 : 6;
+      meshes.push(mesh);
       group.add(mesh);
     }
   }
-  return group;
+  const matrix = new THREE.Matrix4();
+  return {
+    group,
+    update(place) {
+      matrix.makeScale(0.12 * size, 0.12 * size, 0.12 * size).setPosition(place);
+      for (const mesh of meshes) {
+        mesh.setMatrixAt(0, matrix);
+        mesh.instanceMatrix.needsUpdate = true;
+      }
+    },
+  };
 }
 
 // --------------------------------------------------------------------- the robot's shadow

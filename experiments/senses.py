@@ -1,0 +1,217 @@
+"""Closed loops beside the best open loop of equal budget, for each shipped task that needs senses.
+
+``python -m experiments.senses [--seeds N] [--only NAME,...] [--generations N] [--report]``
+
+Each configuration evolves as it is shipped; with the same controller that lacks only the sense
+which the task is about; and with each kind of controller that feels nothing. Population,
+generations, episodes and their starts are the same. Champions are then scored anew, all on the same
+fresh starts. Stopped by Ctrl-C, it goes on when it is started again; see `studies.py`.
+`docs/senses.md` has a result.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common import make_folder
+from experiments.studies import Case, fill, given_settings, run_study, study_parser
+from mjx_revolve.episodes.config import ControllerConfig, load_config
+from mjx_revolve.evolution.plans import Plan, make_plans
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.numerics.runtime import prepare_process
+from mjx_revolve.view.outcomes import is_finished, write_csv
+from mjx_revolve.view.statistics import COVERAGE, Interval, difference, interval
+
+CONFIGS: Mapping[str, Case] = {
+    "lake_target": Case("reach a target that moves", ("bearing",)),
+    "auv_follow_course": Case("follow a course that turns", ("course",)),
+    "auv_hold_depth": Case("hold depth in gusts", ()),
+    "auv_hold_heading": Case("hold depth and heading in gusts", ("compass",)),
+    "auv_follow_bed": Case("follow the bed at a height", ("sonar",)),
+    "auv_search": Case("search and touch", ("bearing",)),
+    "auv_escape": Case("escape from a pursuer", ("bearing", "distance")),
+}
+"""What is compared: a shipped configuration's task, and the senses that it is about. (`feedback`
+has no declared sensors that could be taken away.)"""
+OPEN = ("cpg", "sine")
+"""Controllers that feel nothing."""
+CLOSED, WITHOUT, STILL = "closed", "without", "still"
+
+_KEYS, _KEY = 16, 30_000  # of the starts on which champions are compared; choices
+
+
+def make_cases(name: str, settings: Sequence[str] = ()) -> dict[str, tuple[str, ...]]:
+    """How a configuration is varied.
+
+    Args:
+        name: in `CONFIGS`.
+        settings: what replaces values in all of them, `KEY.PATH=VALUE` each.
+
+    Returns:
+        What replaces values of the configuration, by case.
+    """
+    found = {CLOSED: tuple(settings)}
+    sensors = load_config(name).controller.sensors
+    if CONFIGS[name].settings and sensors is not None:
+        left = [s.to_mapping() for s in sensors if s.type not in CONFIGS[name].settings]
+        # A brain that feels nothing is one of the open loops.
+        if left:
+            found[WITHOUT] = (*settings, f"controller.sensors={left}")
+    usual = {key: ControllerConfig.model_fields[key].default for key in ("gain", "sensors")}
+    blind = [f"controller.{key}={'null' if x is None else x}" for key, x in usual.items()]
+    return found | {kind: (*settings, f"controller.type={kind}", *blind) for kind in OPEN}
+
+
+def plan_config(folder: Path, name: str, settings: Sequence[str], seeds: int) -> list[Plan]:
+    """The evolutions of a configuration, their cases named `CONFIGURATION/CASE`."""
+    cases = {f"{name}/{case}": given for case, given in make_cases(name, settings).items()}
+    return make_plans(folder, name, cases, range(seeds))
+
+
+def score_champions(plans: Sequence[Plan]) -> dict[str, list[float]]:
+    """Scores of one configuration's champions, all on the same fresh starts.
+
+    Args:
+        plans: of the configuration; those that are not finished are left out.
+
+    Returns:
+        Scores by case, one for each seed; `STILL`: of the robot at rest.
+    """
+    import jax
+
+    from mjx_revolve.episodes.champion import load_genes
+    from mjx_revolve.episodes.fitness import make_fitness
+
+    keys = jax.random.split(jax.random.key(_KEY), _KEYS)
+    found: dict[str, list[float]] = {}
+    for label in dict.fromkeys(plan.case for plan in plans):
+        case = label.rpartition("/")[2]
+        some = [plan for plan in plans if plan.case == label and is_finished(plan)]
+        if not some:
+            continue
+        fitness = make_fitness(some[0].config)
+        genes = [load_genes(plan.folder) for plan in some]
+        if case == OPEN[0]:
+            genes.append(np.zeros(fitness.num_genes, np.float32))
+        # As many as a generation had, for which the program is compiled already.
+        size = max(some[0].config.evolution.population_size, len(genes))
+        population = np.resize(np.stack(genes), (size, fitness.num_genes))
+        scores = np.mean([np.asarray(fitness(population, key)) for key in keys], 0)
+        found[case] = scores[: len(some)].tolist()
+        if case == OPEN[0]:
+            found[STILL] = [float(scores[len(some)])]
+    return found
+
+
+def best_open(scores: Mapping[str, Sequence[float]]) -> str:
+    """The open loop whose champions score most on average; "" without any."""
+    known = [case for case in (*OPEN, STILL) if case in scores]
+    return max(known, key=lambda case: float(np.mean(scores[case]))) if known else ""
+
+
+def compare(scores: Mapping[str, Sequence[float]]) -> Interval:
+    """By how much the closed loop is better than the best open loop."""
+    ours, best = scores.get(CLOSED, ()), best_open(scores)
+    others = scores.get(best, ())
+    # A robot at rest has no seeds: its score is known.
+    return difference(ours, list(others) * (len(ours) if best == STILL else 1))
+
+
+def describe(name: str, plans: Sequence[Plan], scores: Mapping[str, Sequence[float]]) -> str:
+    """A row of the report's table."""
+    from mjx_revolve.episodes.tasks import score_unit
+
+    config, best, gained = plans[0].config, best_open(scores), compare(scores)
+    evolution = config.evolution
+    budget = f"{evolution.generations} × {evolution.population_size} × {config.task.trials}"
+    verdict = "–"
+    if np.isfinite(gained.low):
+        verdict = "yes" if gained.low > 0 else "no"
+    cells = (
+        f"`{name}` [{score_unit(config.task.type)}]",
+        budget,
+        len(scores.get(CLOSED, ())),
+        interval(scores.get(CLOSED, ())),
+        interval(scores[WITHOUT]) if WITHOUT in scores else "",
+        f"{interval(scores[best])} (`{best}`)" if best else "–",
+        gained,
+        verdict,
+    )
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+_HEAD = (
+    "| task | generations × population × episodes | seeds | closed loop | without the sense "
+    "| best open loop | closed − open | better |",
+    f"|{'---|' * 8}",
+)
+_NOTES = f"""Means over seeds with their 95 % intervals, of champions scored on the same {_KEYS}
+fresh keys, each of as many starts as an individual's evaluation has. "Without the sense" is the
+same controller that has all sensors but those that the task is about: {{taken}}. The best open loop
+is the one with the largest mean of `cpg`, `sine` and the robot at rest (`still`), by the scores
+that are then compared, which is in its favour; it has the same generations, population and
+episodes. "Better": the interval of the difference is above 0. {COVERAGE}"""
+
+
+def write_report(folder: Path, found: Mapping[str, tuple[Sequence[Plan], Any]]) -> list[str]:
+    """Writes `senses.md` and `senses.csv`.
+
+    Args:
+        folder: where.
+        found: plans and scores of each configuration.
+
+    Returns:
+        The table, in lines.
+    """
+    lines = [*_HEAD, *(describe(name, *both) for name, both in found.items())]
+    taken = "; ".join(
+        f"{' and '.join(f'`{sense}`' for sense in CONFIGS[name].settings)} for `{name}`"
+        for name, (_, scores) in found.items()
+        if WITHOUT in scores
+    )
+    text = ["# Closed loops beside open ones", "", *lines, ""]
+    text.append(fill(_NOTES.format(taken=taken or "none")))
+    write_atomic(folder / "senses.md", ("\n".join(text) + "\n").encode())
+    rows = [
+        {"configuration": name, "case": case, "champion": k, "score": score}
+        for name, (_, scores) in found.items()
+        for case, values in scores.items()
+        for k, score in enumerate(values)
+    ]
+    write_csv(folder / "senses.csv", rows)
+    return lines
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the experiment."""
+    argv = sys.argv[1:] if argv is None else argv
+    words = "Evolves closed and open loops for the tasks that need senses, and compares them."
+    options = study_parser("senses", words, CONFIGS).parse_args(argv)
+    folder = make_folder(options.out, "senses").resolve()
+    settings = given_settings(options)
+    plans = {name: plan_config(folder, name, settings, options.seeds) for name in options.only}
+    if not options.report:
+        every = [plan for some in plans.values() for plan in some]
+        if code := run_study(every, "senses", argv, lambda start, champion: None):
+            return code
+    prepare_process()
+    found = {}
+    for name, some in plans.items():
+        if scores := score_champions(some):
+            found[name] = some, scores
+    if not found:
+        raise InputError("--report: expected runs that are finished; found none")
+    print("\n".join(write_report(folder, found)))
+    print(f"written: senses.md and senses.csv in {short_path(folder)}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main))
