@@ -116,3 +116,16 @@ def test_what_is_out_of_sight_is_not_felt(sight, seen):
     assert found["bearing"].ravel() == pytest.approx([0, 1.0 * seen, 0], abs=1e-6)
     (away,) = SENSORS["distance"].signal(felt)
     assert away[0] == pytest.approx(3.0) if seen else away[0] > 1e6
+
+
+@pytest.mark.parametrize("place", [(3.0, 0, 0), (-3.0, 0, 0), (0.0, 0, 0), (1.0, 2, 0)])
+def test_its_way_has_a_slope_everywhere(place):
+    """Ahead, right behind, where it is itself: derivatives are numbers."""
+    can = Chase(jnp.array([0.5]), jnp.array([1.0]))
+
+    def after(prey):
+        pursuer = Pursuer(vec(0, 0, 0), vec(1, 0, 0))
+        found = pursue(pursuer, can, tuple(prey[:, None]), 0.1)
+        return jnp.sum(jnp.stack([*found.place, *found.heading]))
+
+    assert np.isfinite(jax.grad(after)(jnp.array(place, jnp.float32))).all()

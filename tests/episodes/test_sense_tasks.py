@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -93,6 +94,19 @@ def test_a_course_is_followed_from_row_to_row():
     assert judge("follow_course", track(way, course=-np.array(course))) == pytest.approx(-found)
     deep = np.array(way) - [0, 0, 1]
     assert judge("follow_course", track(deep, course=course)) == 0.0  # not at its depth
+
+
+@pytest.mark.parametrize("name", ["search", "escape"])
+def test_scores_have_a_slope_where_nothing_is_left(name):
+    """Touched from the first row on, or never nearer: derivatives are numbers."""
+    for x in ((4.5, 4.5, 0.0), (0.0, 0.0, 0.0)):
+        given = track(along_x(*x), target=along_x(*[4.5] * 3))
+        task = TaskConfig(type="search", target_distance=1.0, sight=1.0, touch=0.5)
+
+        def score(position, given=given, task=task):
+            return TASKS[name].score(replace(given, position=position), task)[0]
+
+        assert np.isfinite(jax.grad(score)(given.position)).all()
 
 
 # ------------------------------------------------------------------ whole episodes
