@@ -488,6 +488,13 @@ def test_current_and_target_are_shown():
     assert 100 < words[1][0] < 220 and 40 < words[1][1] < 180  # not far from the robot
     said, pixels, words = signs((x + 5.0, y, z))
     assert said[1] == "target, 5 m" and pixels > 30
+    # One that moves is where the trajectory has it: 2 m away at the start, and 1 m nearer a second
+    # on.
+    way = qpos[:, :3] + np.array([1.0, 0, 0]) * (2 - time[:, None])
+    film = make_film(Episode("core", robot, replace(rows, target=way)), (320, 240), 10)
+    draw = ImageDraw.Draw(Image.new("RGB", (320, 240)), "RGBA")
+    sign = overlay._make_signs(film, 1.0)
+    assert [sign(draw, frame)[1][2] for frame in (2, 9)] == ["target, 1.8 m", "target, 1.1 m"]
 
 
 # --- the command --------------------------------------------------------------------------------
