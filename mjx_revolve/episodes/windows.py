@@ -337,7 +337,7 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> Windows:
             f"{config.source}: engine: expected population, to go back through its steps; found "
             f"{config.engine}"
         )
-    if config.task.target_turn is not None and config.task.target_turn > 0:
+    if config.task.target_turn is not None:
         raise InputError(
             f"{config.source}: task.target_turn: expected none, as windows do not carry a pursuer "
             f"on; found {config.task.target_turn:g}"
