@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 
 FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard")
 """What may change in `evolution` when a run is resumed; all else would make it another run."""
+# Settings of a task that runs of older versions know nothing of: as they are usually, they are left
+# out of fingerprints, so that such runs can go on.
+_LATER_IN_TASK = (
+    "target_turn", "sight", "touch", "course_spread", "course_changes", "course_turn", "course_rate",
+)  # fmt: skip
 # What must be the same in all processes of a run, besides our own source.
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 
@@ -63,6 +68,9 @@ def settings_hash(config: Config) -> str:
             data["controller"]["brought"] = brought
     if not data["task"]["measures"]:  # likewise
         del data["task"]["measures"]
+    for name in _LATER_IN_TASK:
+        if data["task"][name] == type(config.task).model_fields[name].default:
+            del data["task"][name]
     if data["colony"] is None:  # likewise
         del data["colony"]
     if data["bodies"] is None:

@@ -95,7 +95,7 @@ def test_a_pursuer_travels_with_what_is_remembered():
     assert isinstance(memory.pursuer, Pursuer)
     zero = vec(0.0, 0.0, 0.0)
     root = Root(vec(1.0, 0.0, -2.0), engine.root(state).quat, zero, zero)
-    memory = remember(memory, root, root, jnp.zeros((0, 1)), jnp.zeros(1), 0.5, cues)
+    memory = remember(memory, root, root, jnp.zeros((0, 1)), jnp.zeros(1), 0.5, cues=cues)
     felt = feel(tank, engine, state, water_of(tank), jnp.zeros(()), cues, memory)
     assert np.concatenate(felt.target) == pytest.approx([0, -2, 0], abs=1e-6)  # 3 m less 1 m
     assert start_memory((), engine, state, Cues(target=cues.target)) == Memory()

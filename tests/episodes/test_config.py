@@ -128,7 +128,7 @@ def test_it_is_frozen(folder):
         ("task.durtion=5", "found an unknown key; did you mean task.duration?"),
         ("duration=5", "found an unknown key; did you mean task.duration?"),
         ("wrld=lake", "found an unknown key; did you mean world?"),
-        ("qqqqqq=1", "bodies, evolution; found an unknown key"),
+        ("qqqqqq=1", "bodies, colony, evolution; found an unknown key"),
         ("task=3", "--set task: expected a mapping with type; found 3"),
         ("trim=no", "--set trim: expected one of neutral, none; found False"),
         ("engine=gpu", "--set engine: expected one of population, mjx; found 'gpu'"),
