@@ -21,7 +21,8 @@ FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorb
 # Settings of a task that runs of older versions know nothing of: as they are usually, they are left
 # out of fingerprints, so that such runs can go on.
 _LATER_IN_TASK = (
-    "target_turn", "sight", "touch", "course_spread", "course_changes", "course_turn", "course_rate",
+    "target_turn", "sight", "touch",
+    "course_spread", "course_changes", "course_turn", "course_rate",
 )  # fmt: skip
 # What must be the same in all processes of a run, besides our own source.
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
