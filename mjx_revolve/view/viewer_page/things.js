@@ -92,13 +92,16 @@ function bentNormals(position) {
   return normal;
 }
 
+// Triangles as they are drawn: with normals, and lines along their edges.
+function makeShape(packed) {
+  const position = numbersOf(packed), geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
+  geometry.setAttribute("normal", new THREE.BufferAttribute(bentNormals(position), 3));
+  return { geometry, edges: new THREE.EdgesGeometry(geometry, 32) };
+}
+
 function makeRobot(data, step) {
-  const shapes = data.shapes.map((packed) => {
-    const position = numbersOf(packed), geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
-    geometry.setAttribute("normal", new THREE.BufferAttribute(bentNormals(position), 3));
-    return { geometry, edges: new THREE.EdgesGeometry(geometry, 32) };
-  });
+  const shapes = data.shapes.map(makeShape);
   const bodies = Array.from({ length: data.bodies }, () => new THREE.Group());
   const group = new THREE.Group();
   group.add(...bodies);
