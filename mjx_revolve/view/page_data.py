@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from typing import Any
 
@@ -10,13 +9,12 @@ import numpy as np
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
-from mjx_revolve.view.course import bed_rings, finite_part, pose_robot, water_drift
+from mjx_revolve.view.course import finite_part, pose_robot, water_drift
 from mjx_revolve.view.forces import module_forces, sum_modules, water_at
 from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
-from mjx_revolve.view.pieces import make_pieces, mount_piece
+from mjx_revolve.view.packed import pack_bed, pack_floats, pack_pieces, pack_waves, pack_whole
 from mjx_revolve.view.surroundings import moves, target_of, water_velocity
 from mjx_revolve.water.flow import Water, water_of
-from mjx_revolve.water.world import World
 
 # Poses per second, and how many at most: a long episode gets fewer per second.
 _RATE, _MOST = 50.0, 3000
@@ -32,10 +30,6 @@ _ARROW, _LONGEST = (0.3, 0.1), (0.65, 0.22)
 _LEFT_OUT = "left out here; python -m mjx_revolve.viewer RUN --individual N has them"
 # Forces below this are rounding [N].
 _NOTHING = 1e-5
-# A bed that is further below than this is lost in the water's haze [m].
-_SIGHT = 25.0
-# The bed is drawn on rings from the way's middle to the horizon, of these radii [m].
-_RADIUS = np.concatenate([[0.0], np.geomspace(0.1, 1500.0, 109)])
 
 
 def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
@@ -77,29 +71,29 @@ def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
         "count": len(time),
         # Of the way, from x towards y [deg]; who stays is shown along y.
         "heading": math.degrees(math.atan2(net[1], net[0])) if moved else 90.0,
-        "core": _f32(qpos[:, :3]),
-        "center": _f32(center),
-        "speed": _f32(speed_over(time, qpos[:, :3], period)),
-        "drift": _f32(water_drift(robot, now, center, step)),
+        "core": pack_floats(qpos[:, :3]),
+        "center": pack_floats(center),
+        "speed": pack_floats(speed_over(time, qpos[:, :3], period)),
+        "drift": pack_floats(water_drift(robot, now, center, step)),
         "current": _current(water_velocity(robot, now, center)),
         "target": None if target is None else _f32(target[rows]),
         "robot": {
             "bodies": poses.position.shape[1] - 1,
-            **_pieces(robot),
-            "position": _f32(poses.position[:, 1:]),
-            "quaternion": _i16(poses.quaternion[:, 1:]),
+            **pack_pieces(robot),
+            "position": pack_floats(poses.position[:, 1:]),
+            "quaternion": pack_whole(poses.quaternion[:, 1:]),
         },
         "anchors": _anchors(robot),
         "forces": _forces(episode, every, water)
         if forces
         else {
-            name: {"color": color, "scale": 0, "force": _i16(np.zeros(0)), "why": _LEFT_OUT}
+            name: {"color": color, "scale": 0, "force": pack_whole(np.zeros(0)), "why": _LEFT_OUT}
             for name, color in _COLORS.items()
         },
         "world": {
             "surface": surface,
-            "waves": _waves(world, _first(water.time)),
-            "bed": _bed(world, center, low),
+            "waves": pack_waves(world, _first(water.time)),
+            "bed": pack_bed(world, center, low),
         },
         "floor": low - 0.1 * length,  # below the robot: where the grid is drawn
         "deepest": max(1.3 * (surface - float(qpos[:, 2].min())), surface - low, 1.5 * length),
@@ -120,36 +114,16 @@ def _current(velocity: np.ndarray) -> dict[str, Any] | None:
     """The water's velocity around the robot, waves apart `[S, 3]` [m/s]; None where it is still."""
     if not moves(velocity):
         return None
-    return {"fastest": float(np.linalg.norm(velocity, axis=1).max()), "velocity": _f32(velocity)}
+    return {
+        "fastest": float(np.linalg.norm(velocity, axis=1).max()),
+        "velocity": pack_floats(velocity),
+    }
 
 
 def _stride(time: np.ndarray) -> int:
     """Rows from one pose that is kept to the next."""
     dt = float(time[-1] - time[0]) / (len(time) - 1) if len(time) > 1 else 1.0
     return max(1, round(1 / (_RATE * dt)), math.ceil(len(time) / _MOST))
-
-
-def _pieces(robot: Robot) -> dict[str, Any]:
-    """Meshes of the parts, and on which bodies they are."""
-    shapes: dict[int, int] = {}  # modules of a kind share their parts' triangles
-    packed: list[Any] = []
-    pieces: list[Any] = []
-    for piece in make_pieces(robot.morphology):
-        if piece.mark:  # rods and arrows are for pictures at rest
-            continue
-        if id(piece.corners) not in shapes:
-            shapes[id(piece.corners)] = len(packed)
-            packed.append(_i16(piece.corners))
-        body, position, rotation = mount_piece(robot, piece)
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = rotation, position
-        pieces.append({
-            "body": body - 1,
-            "shape": shapes[id(piece.corners)],
-            "color": piece.color.round(4).tolist(),
-            "matrix": matrix.T.ravel().round(7).tolist(),  # by columns
-        })  # fmt: skip
-    return {"shapes": packed, "pieces": pieces}
 
 
 def _anchors(robot: Robot) -> list[dict[str, Any]]:
@@ -169,55 +143,7 @@ def _arrows(color: tuple[float, ...], force: np.ndarray, length: float) -> dict[
     if size.size:
         usual, longest = (max(share * length, least) for share, least in (_ARROW, _LONGEST))
         scale = min(usual / float(np.percentile(size, 75)), longest / float(size.max()))
-    return {"color": color, "scale": scale, "force": _i16(force)}
-
-
-def _waves(world: World, begun: float) -> list[dict[str, float]]:
-    """The world's waves as a cos(k·p - ωt + φ), t of an episode that began at a time."""
-    waves = []
-    for wave in world.waves:
-        if wave.amplitude == 0:
-            continue
-        k = wave.wavenumber(world.gravity, world.water_depth)
-        x, y = math.cos(wave.direction), math.sin(wave.direction)
-        along = k * (x * world.current[0] + y * world.current[1])
-        omega = wave.frequency(world.gravity, world.water_depth) + along
-        phase = math.remainder(wave.phase - omega * begun, 2 * math.pi)
-        waves.append({
-            "k": k, "x": x, "y": y, "amplitude": wave.amplitude, "omega": omega, "phase": phase,
-        })  # fmt: skip
-    return waves
-
-
-def _bed(world: World, center: np.ndarray, low: float) -> dict[str, Any] | None:
-    """The bed on rings around the way, or None where it is out of sight."""
-    if world.bed is None:
-        return None
-    middle = (center[:, :2].min(0) + center[:, :2].max(0)) / 2
-    height = bed_rings(world.bed, middle, _RADIUS)[..., 2]
-    reach = float(np.ptp(center[:, :2], axis=0).max()) + _SIGHT
-    if low - float(height[reach >= _RADIUS].max()) > _SIGHT:
-        return None
-    rings, sectors = height.shape
-    return {
-        "center": middle.tolist(),
-        "rings": rings,
-        "sectors": sectors,
-        "radius": _f32(_RADIUS),
-        "height": _f32(height),
-    }
-
-
-def _f32(values: Any) -> dict[str, str]:
-    """Packs numbers whole."""
-    return {"f32": base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()}
-
-
-def _i16(values: np.ndarray) -> dict[str, Any]:
-    """Packs numbers to 1/32767 of the largest."""
-    scale = float(np.abs(values).max(initial=0.0)) / 32767 or 1.0
-    whole = np.round(values / scale).astype("<i2")
-    return {"i16": base64.b64encode(whole.tobytes()).decode(), "scale": scale}
+    return {"color": color, "scale": scale, "force": pack_whole(force)}
 
 
 def _first(value: Any) -> float:
