@@ -113,3 +113,25 @@ def pack_bed(world: World, center: np.ndarray, low: float) -> dict[str, Any] | N
         "radius": pack_floats(_RADIUS),
         "height": pack_floats(height),
     }
+
+
+def pack_water(world: World, places: np.ndarray, low: float) -> dict[str, Any]:
+    """The water of a page with many robots.
+
+    Args:
+        world: in which they are.
+        places: `[S, 3]` where they get, world frame [m].
+        low: of the lowest of them [m].
+
+    Returns:
+        `world`: surface, waves and bed; `current` [m/s]; `floor`: height of the grid [m].
+    """
+    return {
+        "world": {
+            "surface": float(world.surface_height),
+            "waves": pack_waves(world, 0.0),
+            "bed": pack_bed(world, places, low),
+        },
+        "current": [*world.current],
+        "floor": low,
+    }

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
 
@@ -49,20 +49,34 @@ def make_page(episode: Episode, forces: bool = True) -> str:
     Raises:
         InputError: the episode has no finite row.
     """
-    import jinja2
-
     from mjx_revolve.view.page_data import page_data
+
+    return fill_page(
+        "page.html",
+        title=episode.title,
+        subtitle=_subtitle(episode),
+        data=page_data(episode, forces),
+    )
+
+
+def fill_page(template: str, **values: Any) -> str:
+    """A page of `viewer_page/`, which holds all files that it needs.
+
+    Args:
+        template: its name there.
+        values: what it is filled with: `title`, `subtitle`, and `data` for its scripts.
+
+    Returns:
+        The text of an HTML file.
+    """
+    import jinja2
 
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_PAGE), autoescape=True, undefined=jinja2.StrictUndefined
     )
     pages.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    return pages.get_template("page.html").render(
-        title=episode.title,
-        subtitle=_subtitle(episode),
-        data=page_data(episode, forces),
-        file=lambda name: (_PAGE / name).read_text(encoding="utf-8"),
-    )
+    file = lambda name: (_PAGE / name).read_text(encoding="utf-8")  # noqa: E731
+    return pages.get_template(template).render(file=file, **values)
 
 
 def _subtitle(episode: Episode) -> str:

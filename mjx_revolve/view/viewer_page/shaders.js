@@ -12,6 +12,7 @@ uniform vec3 uEye;        // m
 uniform float uSurface;   // z of the still surface, m
 uniform vec3 uSun;        // unit vector towards the sun, seen under water
 uniform float uSize;      // body length, m: decoration scales with it
+uniform float uHaze;      // 1; less where one looks from far away, or nothing would be seen
 uniform vec4 uWaves[MAX_WAVES];  // kx, ky [rad/m], amplitude [m], phase now [rad]
 uniform float uFade[MAX_WAVES];  // k: orbits fade with e^(k z)
 `;
@@ -19,7 +20,7 @@ uniform float uFade[MAX_WAVES];  // k: orbits fade with e^(k z)
 // Of every fragment shader: light, water, air.
 const LIGHT = /* glsl */ `
 // Light in a clear lake: red is lost first.
-const vec3 ABSORB = vec3(0.34, 0.105, 0.085);  // 1/m
+#define ABSORB (uHaze * vec3(0.34, 0.105, 0.085))  // 1/m
 const vec3 DEEP = vec3(0.0022, 0.020, 0.046);
 const vec3 MID = vec3(0.012, 0.115, 0.190);
 const vec3 BRIGHT = vec3(0.150, 0.520, 0.600);
@@ -196,20 +197,50 @@ void main() {
 }`,
 };
 
+// Where a point of a robot is: moved by its mesh, or, of many robots, by one of the robot's bodies.
+const BENT = /* glsl */ `
+#ifdef BODIES
+uniform vec4 uBodies[2 * BODIES];  // place [m] and quaternion x, y, z, w of each
+attribute float body;
+attribute vec3 tint;
+vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v); }
+vec3 placed() { int k = 2 * int(body + 0.5); return uBodies[k].xyz + turned(uBodies[k + 1], position); }
+vec3 facing() { return turned(uBodies[2 * int(body + 0.5) + 1], normal); }
+#else
+vec3 placed() { return (modelMatrix * vec4(position, 1.0)).xyz; }
+vec3 facing() { return mat3(modelMatrix) * normal; }
+#endif
+`;
+
 const ROBOT = {
-  vertex: /* glsl */ `
+  vertex: BENT + /* glsl */ `
 varying vec3 vPlace, vNormal;
+#ifdef BODIES
+varying vec3 vTint;
+#endif
 void main() {
-  vec4 place = modelMatrix * vec4(position, 1.0);
-  vPlace = place.xyz;
-  vNormal = mat3(modelMatrix) * normal;
-  gl_Position = projectionMatrix * viewMatrix * place;
+  vPlace = placed();
+  vNormal = facing();
+#ifdef BODIES
+  vTint = tint;
+#endif
+  gl_Position = projectionMatrix * viewMatrix * vec4(vPlace, 1.0);
 }`,
   fragment: /* glsl */ `
+#ifdef BODIES
+varying vec3 vTint;
+uniform float uSeen;  // 0 not there, 1 whole: who is born or dies dissolves
+uniform float uGlow;  // of who is pointed at
+#define uColor vTint
+#else
 uniform vec3 uColor;
+#endif
 uniform float uLine;  // 1 for the dark lines along edges
 varying vec3 vPlace, vNormal;
 void main() {
+#ifdef BODIES
+  if (hash(gl_FragCoord.xy * 0.37) >= uSeen) discard;
+#endif
   vec3 n = normalize(vNormal), v = normalize(uEye - vPlace), albedo = 0.02 + 0.98 * linear(uColor);
   float below = uSurface - vPlace.z, under = smoothstep(-0.01, 0.01, below), day = daylight(below);
   if (uLine > 0.5) {
@@ -230,13 +261,16 @@ void main() {
   c += vec3(0.55, 0.65, 0.65) * pow(max(dot(n, h), 0.0), 48.0) * 0.45 * lit * day;
   float rim = pow(1.0 - max(dot(n, v), 0.0), 4.0);
   c += mix(sky(vec3(0.0, 0.0, 1.0)), waterBody(reflect(-v, n)), under) * rim * 0.35;
+#ifdef BODIES
+  c += uGlow * vec3(1.0, 0.45, 0.12) * (0.06 + 0.5 * pow(1.0 - max(dot(n, v), 0.0), 2.0));
+#endif
   gl_FragColor = vec4(finish(throughWater(c, vPlace)), 1.0);
 }`,
 };
 
 // The robot seen from the sun: depth in three bytes.
 const SHADOW = {
-  vertex: "void main() { gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }",
+  vertex: BENT + "void main() { gl_Position = projectionMatrix * viewMatrix * vec4(placed(), 1.0); }",
   fragment: /* glsl */ `
 precision highp float;
 void main() {
@@ -375,7 +409,7 @@ void main() {
   float line = max(0.14 * lines(vPlace.xy / uStep), 0.30 * lines(vPlace.xy / uStep / 5.0));
   float shade = uShade * 0.5 * (1.0 - sunlit(vPlace, vec3(0.0, 0.0, 1.0), 9.0));
   vec3 ray = vPlace - uEye;
-  float clear = exp(-0.10 * length(ray));
+  float clear = exp(-0.10 * uHaze * length(ray));
   vec3 c = mix(vec3(0.002, 0.02, 0.04), vec3(0.55, 0.85, 0.90), line / max(line + shade, 1e-3));
   gl_FragColor = vec4(finish(c), (line + shade * (1.0 - line)) * seen * clear);
 }`,
@@ -443,7 +477,7 @@ varying vec3 vPlace;
 void main() {
   float soft = 1.0 - smoothstep(0.55, 1.0, abs(vSide));
   bool past = vMoment <= uNow;
-  float clear = exp(-0.10 * length(vPlace - uEye));
+  float clear = exp(-0.10 * uHaze * length(vPlace - uEye));
   vec3 c = past ? vec3(1.0, 0.17, 0.02) : vec3(0.65, 0.90, 0.95);
   gl_FragColor = vec4(finish(c), soft * clear * (past ? 0.92 : 0.22));
 }`,

@@ -290,7 +290,7 @@ function openStage(world, size) {
       if (!dirty) return;
       dirty = false;
       update();
-      shadow.render(renderer, scene, here);
+      shadow.render(renderer, scene, here, stage.bent);
       renderer.clear();
       renderer.render(scene, camera);
       told();
@@ -300,7 +300,7 @@ function openStage(world, size) {
   }
 
   const stage = {
-    renderer, scene, camera, controls, target, here, surface, dust, shadow, resized: null,
+    renderer, scene, camera, controls, target, here, surface, dust, shadow, resized: null, bent: [],
     draw, look, zoom, bedAt, pixelsPerMetre, switches, listen, pen, drawAxes, drawGauge, write,
     resize, place, run,
   };

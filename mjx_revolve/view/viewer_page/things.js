@@ -44,6 +44,7 @@ const shared = {
   uSurface: { value: 0 },
   uSun: { value: new THREE.Vector3(-0.32, -0.20, 1).normalize() },
   uSize: { value: 1 },
+  uHaze: { value: 1 },
   uWaves: { value: [] },
   uFade: { value: [] },
   uShadow: { value: null },
@@ -55,12 +56,13 @@ let maxWaves = 1;
 function makeMaterial(shader, uniforms = {}, options = {}) {
   const all = { ...shared };
   for (const name in uniforms) all[name] = { value: uniforms[name] };
+  const { defines, ...rest } = options;
   return new THREE.ShaderMaterial({
-    defines: { MAX_WAVES: maxWaves },
+    defines: { MAX_WAVES: maxWaves, ...defines },
     uniforms: all,
     vertexShader: UNIFORMS + shader.vertex,
     fragmentShader: UNIFORMS + LIGHT + shader.fragment,
-    ...options,
+    ...rest,
   });
 }
 
@@ -400,27 +402,36 @@ function makeShadow(size) {
   const target = new THREE.WebGLRenderTarget(1024, 1024, {
     minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter,
   });
-  const reach = 0.85 * size, camera = new THREE.OrthographicCamera(-reach, reach, reach, -reach, 0, 6 * size);
+  const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, 0, 1);
   camera.layers.set(1);
   const material = new THREE.ShaderMaterial({ vertexShader: SHADOW.vertex, fragmentShader: SHADOW.fragment });
   const half = new THREE.Matrix4().set(0.5, 0, 0, 0.5, 0, 0.5, 0, 0.5, 0, 0, 0.5, 0.5, 0, 0, 0, 1);
   shared.uShadow.value = target.texture;
   return {
-    render(renderer, scene, around) {
-      camera.position.copy(around).addScaledVector(shared.uSun.value, 3 * size);
+    reach: 0.85 * size, // around what is looked at [m]
+    // Robots that are bent by a material of their own bring one for their shadows, too.
+    render(renderer, scene, around, bent = []) {
+      const far = Math.max(3 * size, 1.5 * this.reach);
+      camera.left = camera.bottom = -this.reach;
+      camera.right = camera.top = this.reach;
+      camera.far = 2 * far;
+      camera.updateProjectionMatrix();
+      camera.position.copy(around).addScaledVector(shared.uSun.value, far);
       camera.up.set(0, 1, 0);
       camera.lookAt(around);
       camera.updateMatrixWorld(true);
       shared.uShadowMatrix.value.copy(half).multiply(camera.projectionMatrix).multiply(camera.matrixWorldInverse);
       // A texture cannot be read while it is drawn.
       shared.uShadow.value = null;
-      scene.overrideMaterial = material;
+      if (bent.length) for (const robot of bent) robot.mesh.material = robot.dark;
+      else scene.overrideMaterial = material;
       renderer.setRenderTarget(target);
       renderer.setClearColor(0xffffff, 1);
       renderer.clear();
       renderer.render(scene, camera);
       renderer.setRenderTarget(null);
       scene.overrideMaterial = null;
+      for (const robot of bent) robot.mesh.material = robot.light;
       shared.uShadow.value = target.texture;
     },
   };
