@@ -8,7 +8,7 @@ import sys
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
-_COMMANDS = ("evolve", "sweep", "inspect", "viewer", "replay", "report", "export")
+_COMMANDS = ("evolve", "sweep", "inspect", "viewer", "replay", "live", "report", "export")
 _USAGE = f"usage: mjx-revolve {{{','.join(_COMMANDS)}}} ... (each explains itself with --help)"
 
 

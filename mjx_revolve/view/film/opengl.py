@@ -62,16 +62,21 @@ def find_opengl() -> str:
     )
 
 
-def check_screen() -> None:
-    """Refuses `--view` where nobody could see it.
+def check_screen(
+    option: str = "--view", hint: str = "without --view a film is written, which needs none"
+) -> None:
+    """Refuses an option where nobody could see what it shows.
+
+    Args:
+        option: what asked for a screen.
+        hint: what to do without one.
 
     Raises:
         InputError: there is no screen.
     """
-    hint = "(without --view a film is written, which needs none)"
     if sys.platform.startswith("linux") and not _has_display():
         raise InputError(
-            f"--view: expected a screen; found neither DISPLAY nor WAYLAND_DISPLAY set {hint}"
+            f"{option}: expected a screen; found neither DISPLAY nor WAYLAND_DISPLAY set ({hint})"
         )
     # MuJoCo's viewer would end the process with a complaint of its own.
     import glfw
@@ -80,7 +85,7 @@ def check_screen() -> None:
         warnings.simplefilter("ignore")
         if not glfw.init():
             raise InputError(
-                f"--view: expected a screen; found none that lets us open a window {hint}"
+                f"{option}: expected a screen; found none that lets us open a window ({hint})"
             )
 
 

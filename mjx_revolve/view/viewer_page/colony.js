@@ -313,7 +313,7 @@ async function start() {
 
   // ------------------------------------------------------------------ instruments
 
-  const changes = [...byBirth.map((t) => [t, 1]), ...byDeath.map((t) => [t, -1])].sort((a, b) => a[0] - b[0] || b[1] - a[1]);
+  const changes = [...byBirth.map((t) => [t, 1]), ...byDeath.map((t) => [t, -1])].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
   const curve = [];
   let alive = 0, most = 1;
   for (const [t, by] of changes) {
@@ -430,7 +430,7 @@ async function start() {
     } else focus.copy(swimmer && !swimmer.leaving ? swimmer.place : target);
     const going = swimmer && !swimmer.leaving;
     stage.place(state.time, focus, going);
-    widen(stage, size);
+    widen(stage, size, grid);
     dust.material.uniforms.uDrift.value.fromArray(data.current).multiplyScalar(state.time);
     if (trail) trail.material.uniforms.uNow.value = state.time - trail.from;
   }

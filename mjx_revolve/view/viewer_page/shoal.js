@@ -74,9 +74,9 @@ class Swimmer {
     this.name = name;
     this.place = new THREE.Vector3();
     const count = body.defines.BODIES;
-    this.poses = new Float32Array(8 * count);
-    for (let k = 0; k < count; k++) this.poses[8 * k + 7] = 1;
-    const uniforms = { uBodies: this.poses, uSeen: 1, uGlow: 0, uLine: 0 };
+    this.bones = new Float32Array(8 * count);
+    for (let k = 0; k < count; k++) this.bones[8 * k + 7] = 1;
+    const uniforms = { uBodies: this.bones, uSeen: 1, uGlow: 0, uLine: 0 };
     const { defines } = body;
     this.light = makeMaterial(ROBOT, uniforms, { defines });
     this.dark = makeMaterial(SHADOW, uniforms, { defines });
@@ -102,7 +102,7 @@ class Swimmer {
 
   // qpos in MuJoCo's order, from a place in an array on.
   pose(q, from = 0) {
-    const { tree } = this.body, p = this.poses, v = [0, 0, 0], turn = [0, 0, 0, 1];
+    const { tree } = this.body, p = this.bones, v = [0, 0, 0], turn = [0, 0, 0, 1];
     for (let k = 0; k < tree.length; k++) {
       const { parent, place, turn: rest, axis } = tree[k], at = 8 * k;
       if (parent < 0) {
@@ -257,9 +257,18 @@ class Chart {
     for (const mark of marks) this.ring(c, mark);
     for (const swimmer of this.shoal.there.values()) {
       const told = this.named || swimmer.key === followed || swimmer.key === this.shoal.pointed;
-      if (!told || swimmer.leaving) continue;
       const at = this.shoal.onScreen(swimmer.place);
       if (!at || at.x < 0 || at.y < 0 || at.x > w || at.y > h) continue;
+      const small = 1 - (swimmer.body.length * at.pixels) / 24; // too far away to be made out: a dot
+      if (small > 0) {
+        c.globalAlpha = swimmer.seen * Math.min(1, 2 * small);
+        c.fillStyle = swimmer.color;
+        c.beginPath();
+        c.arc(at.x, at.y, 3, 0, 2 * Math.PI);
+        c.fill();
+        c.globalAlpha = 1;
+      }
+      if (!told || swimmer.leaving) continue;
       const reach = Math.min(Math.max(0.62 * swimmer.body.length * at.pixels, 9), 0.42 * h);
       const top = Math.max(at.y - Math.max(0.45 * reach, 9), 14);
       c.font = swimmer.key === followed ? "600 13px system-ui, sans-serif" : "12px system-ui, sans-serif";
@@ -355,8 +364,9 @@ class Chart {
 }
 
 // Shadows reach as far, and the water is as clear, as what is looked at is far away.
-function widen(stage, size) {
+function widen(stage, size, grid) {
   const far = stage.camera.position.distanceTo(stage.target);
   stage.shadow.reach = Math.min(Math.max(0.85 * size, 0.5 * far), 12 * size);
   shared.uHaze.value = Math.min(1, Math.max(4, 9 * size) / far);
+  grid.material.uniforms.uReach.value = Math.max(24 * size, 1.1 * far);
 }

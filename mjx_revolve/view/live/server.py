@@ -1,0 +1,193 @@
+"""A small HTTP server, for this machine alone: one page, a stream of what happens, and wishes.
+
+Whoever knows the page's address may watch and ask: it holds a random token, and is printed for the
+user only. Other web pages that the user's browser shows do not know it; and what they post all the
+same is refused by its `Origin`, as is what reaches us under another name (`Host`).
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import secrets
+import threading
+from concurrent.futures import TimeoutError as NotYet
+from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.live.keeper import Keeper
+from mjx_revolve.view.live.wishes import read_wish
+
+HOST = "127.0.0.1"
+_LONGEST = 4096  # of what is posted [bytes]
+_PATIENCE = 1.5  # for an answer; what takes longer is announced on the page [s]
+_BEAT = 0.5  # how often pages are told the state, at least [s]
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",  # the address is a secret
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+class LiveServer(ThreadingHTTPServer):
+    """Serves a keeper's world.
+
+    Attributes:
+        keeper: who runs it.
+        page: the text of the page.
+        token: what all paths begin with.
+    """
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, keeper: Keeper, page: str, port: int = 0) -> None:
+        super().__init__((HOST, port), _Handler)
+        self.keeper, self.page = keeper, page.encode()
+        self.token = secrets.token_urlsafe(16)
+        self.closing = threading.Event()
+
+    @property
+    def origins(self) -> tuple[str, ...]:
+        """What a browser calls us."""
+        port = self.server_address[1]
+        return tuple(f"http://{name}:{port}" for name in (HOST, "localhost"))
+
+    @property
+    def address(self) -> str:
+        """Of the page."""
+        return f"{self.origins[0]}/{self.token}/"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Says nothing of pages that were closed."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: LiveServer
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "mjx_revolve", ""
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Says nothing of what was asked for."""
+
+    def do_GET(self) -> None:
+        place = self._place()
+        if place == "":
+            self._send(self.server.page, "text/html; charset=utf-8")
+        elif place == "events":
+            self._stream()
+        elif place is not None and place.startswith("body/"):
+            self._body(place.removeprefix("body/"))
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, "expected the page's own address; found another")
+
+    def do_POST(self) -> None:
+        length = self.headers.get("Content-Length", "")
+        size = int(length) if length.isascii() and length.isdigit() and len(length) < 9 else -1
+        if not 0 <= size <= _LONGEST:
+            self.close_connection = True
+            self._refuse(HTTPStatus.BAD_REQUEST, f"expected at most {_LONGEST} bytes; found others")
+            return
+        text = self.rfile.read(size)
+        if self._place() != "wish":
+            self._refuse(HTTPStatus.NOT_FOUND, "expected the page's own address; found another")
+            return
+        origin = self.headers.get("Origin")
+        if origin is not None and origin not in self.server.origins:
+            self._refuse(HTTPStatus.FORBIDDEN, f"Origin: expected our own page; found {origin!r}")
+            return
+        kind = self.headers.get_content_type()
+        if kind != "application/json":  # what another page may post without asking first
+            self._refuse(
+                HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"expected application/json; found {kind}"
+            )
+            return
+        try:
+            wish = read_wish(_read_json(text))
+            answer = self.server.keeper.ask(wish).result(_PATIENCE)
+        except NotYet:
+            self._send(b'{"ok":true,"later":true}', "application/json", HTTPStatus.ACCEPTED)
+        except InputError as error:
+            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+        else:
+            self._send(json.dumps({"ok": True, "key": answer}).encode(), "application/json")
+
+    def _place(self) -> str | None:
+        """What is asked for, without the token; None where that is wrong, or our name is."""
+        hosts = {origin.removeprefix("http://") for origin in self.server.origins}
+        first, _, rest = self.path.lstrip("/").partition("/")
+        known = secrets.compare_digest(first.encode(), self.server.token.encode())
+        return rest if known and self.headers.get("Host") in hosts else None
+
+    def _body(self, text: str) -> None:
+        """A body and the shapes of its pieces."""
+        bodies = self.server.keeper.bodies
+        number = int(text) if text.isascii() and text.isdigit() and len(text) < 9 else -1
+        if not 0 <= number < len(bodies.data):
+            self._refuse(HTTPStatus.NOT_FOUND, "expected a body's number; found another")
+            return
+        data = bodies.data[number]
+        shapes = {piece[1]: bodies.shapes.packed[piece[1]] for piece in data["pieces"]}
+        self._send(json.dumps({**data, "shapes": shapes}).encode(), "application/json")
+
+    def _stream(self) -> None:
+        """Events until the page is closed, or the world ends."""
+        keeper = self.server.keeper
+        self.close_connection = True
+        self._head(HTTPStatus.OK, "text/event-stream")
+        listener = keeper.listen()
+        try:
+            while not self.server.closing.is_set():
+                try:
+                    text = listener.get(timeout=_BEAT)
+                except queue.Empty:
+                    text = keeper.state_now()
+                if text is None:
+                    break
+                self.wfile.write(text.encode())
+                self.wfile.flush()
+        except OSError:  # the page was closed
+            pass
+        finally:
+            keeper.leave(listener)
+
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
+        self._send(json.dumps({"error": why}).encode(), "application/json", status)
+
+    def _send(self, content: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        with suppress(OSError):
+            self._head(status, kind, len(content))
+            self.wfile.write(content)
+
+    def _head(self, status: HTTPStatus, kind: str, length: int | None = None) -> None:
+        self.send_response(status)
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", kind)
+        if length is not None:
+            self.send_header("Content-Length", str(length))
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+
+
+def _read_json(text: bytes) -> Any:
+    """What was posted.
+
+    Raises:
+        InputError: it is no JSON.
+    """
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"expected JSON; found none: {reason}") from None
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number of JSON")
