@@ -7,6 +7,7 @@ place of the boxes that the physics weighs. It is for looking at (`draw`); its g
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -20,6 +21,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.view.course import bed_rings
 from mjx_revolve.view.film.camera import FOVY
 from mjx_revolve.view.pieces import make_pieces, mount_piece
+from mjx_revolve.water.world import World
 
 # What is hidden of the model by default in MuJoCo's viewer is drawn in none of these groups.
 MODULES, SURFACE, _WEIGHTS = 0, 1, 4
@@ -59,8 +61,42 @@ def build_stage(
     Returns:
         The model; `qpos` means the same as in `robot.mj_model`, but for the origin.
     """
-    spec = robot.mj_spec.copy()
+    spec = _dressed(robot)
     spec.modelname = f"{robot.morphology.name} to look at"
+    _add_surroundings(spec, robot.world, size, np.asarray(origin, float), way, sight, plain)
+    return spec.compile()
+
+
+def build_shared_stage(
+    robots: Mapping[int, Robot], world: World, way: float, sight: float
+) -> mujoco.MjModel:
+    """Builds what is drawn of many robots and the world around them.
+
+    Args:
+        robots: from `build_robot`, by number; they stay as they are.
+        world: around them.
+        way: how far from the world's origin they get [m].
+        sight: see `build_stage`.
+
+    Returns:
+        The model; robot k's free joint is called `k/root`, and its qpos begins there.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = "robots to look at"
+    spec.compiler.degree = False
+    # As robots' own, or attaching them complains.
+    spec.option.timestep, spec.option.gravity = world.timestep, [0.0, 0.0, -world.gravity]
+    spec.nuser_jnt = 1
+    for number, robot in robots.items():
+        frame = spec.worldbody.add_frame()
+        spec.attach(_dressed(robot), prefix=f"{number}/", frame=frame)
+    _add_surroundings(spec, world, (640, 480), np.zeros(3), way, sight, plain=False)
+    return spec.compile()
+
+
+def _dressed(robot: Robot) -> mujoco.MjSpec:
+    """A robot in meshes, without any world."""
+    spec = robot.mj_spec.copy()
     for geom in list(spec.geoms):
         if geom.name == "bed":
             spec.delete(geom)
@@ -68,23 +104,34 @@ def build_stage(
             geom.group = _WEIGHTS
     for field in list(spec.hfields):
         spec.delete(field)
-    place = np.asarray(origin, float)
     _add_pieces(spec, robot)
-    _add_bed(spec, robot, place, way, sight)
+    return spec
+
+
+def _add_surroundings(
+    spec: mujoco.MjSpec,
+    world: World,
+    size: tuple[int, int],
+    place: np.ndarray,
+    way: float,
+    sight: float,
+    plain: bool,
+) -> None:
+    """Bed, surface and light; nothing touches anything."""
+    _add_bed(spec, world, place, way, sight)
     # The still surface is for MuJoCo's viewer; films draw their own, which moves.
     spec.add_material(name="surface", specular=0.9, shininess=0.9, rgba=[0.55, 0.85, 0.95, 0.22])
     spec.worldbody.add_geom(
         name="surface",
         type=mujoco.mjtGeom.mjGEOM_BOX,  # a plane is invisible from below
         size=[way + 4.0 * sight, way + 4.0 * sight, 5e-4],
-        pos=[0.0, 0.0, robot.world.surface_height - place[2]],
+        pos=[0.0, 0.0, world.surface_height - place[2]],
         material="surface",
         group=SURFACE,
     )
     _add_light(spec, size, way, sight, plain)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
-    return spec.compile()
 
 
 def _add_pieces(spec: mujoco.MjSpec, robot: Robot) -> None:
@@ -138,15 +185,15 @@ def smooth_mesh(corners: np.ndarray) -> trimesh.Trimesh:
 
 
 def _add_bed(
-    spec: mujoco.MjSpec, robot: Robot, origin: np.ndarray, way: float, sight: float
+    spec: mujoco.MjSpec, world: World, origin: np.ndarray, way: float, sight: float
 ) -> None:
     """The bed, if it is in sight, on rings that widen from the middle of the way."""
-    if robot.world.bed is None:
+    if world.bed is None:
         return
     near, far = max(way, 1.0), max(way, 1.0) + 4.0 * sight
     inner = np.linspace(0.0, near, _RINGS // 2, endpoint=False)
     radius = np.concatenate([inner, np.geomspace(near, far, _RINGS // 2)])
-    rings = bed_rings(robot.world.bed, origin[:2], radius)
+    rings = bed_rings(world.bed, origin[:2], radius)
     if rings[..., 2].max() - origin[2] < -way - 4.0 * sight:
         return
     a = np.arange(rings[..., 0].size).reshape(rings.shape[:2])

@@ -13,6 +13,7 @@ import math
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -157,6 +158,8 @@ class Keeper:
         self.inmates: tuple[Inmate, ...] = ()
         self.qpos: dict[int, np.ndarray] = {}
         self.time = 0.0
+        # The last poses of all, oldest first: time [s] and qpos by key.
+        self.recent: deque[tuple[float, dict[int, np.ndarray]]] = deque(maxlen=8)
 
     # ------------------------------------------------------------------ from any thread
 
@@ -193,6 +196,26 @@ class Keeper:
     def stop(self) -> None:
         """Ends `run` after the slice that is being stepped."""
         self._stopped.set()
+
+    @property
+    def current(self) -> tuple[float, float, float]:
+        """The water's velocity, as it was last asked for [m/s]."""
+        return self._state.current
+
+    @property
+    def rate(self) -> float:
+        """Seconds in the water for each real one [-]."""
+        return self._state.rate
+
+    @property
+    def ended(self) -> bool:
+        """Whether the world has ended, or is about to."""
+        return self._stopped.is_set()
+
+    @property
+    def paused(self) -> bool:
+        """Whether time stands still."""
+        return self._state.paused
 
     @property
     def busy(self) -> float:
@@ -278,6 +301,8 @@ class Keeper:
             for one in self.inmates
         }
         self.qpos = {key: poses[-1] for key, poses in rows.items()}
+        for k, moment in enumerate(times):
+            self.recent.append((float(moment), {key: poses[k] for key, poses in rows.items()}))
         numbers = np.concatenate([x.ravel() for x in rows.values()]) if rows else np.zeros(0, "<f4")
         self._poses = _event(
             "poses",
