@@ -78,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
         stock = load_stock(arguments.paths, arguments.world)
         room = arguments.robots
         keeper = Keeper(
-            lambda: make_tank(stock.config, room),
+            make_tank(stock.mixed, room, spheres=stock.spheres),
             stock.world,
             stock.entries,
             waits=not arguments.mujoco,

@@ -16,21 +16,21 @@ class StandIn:
     """Has the interface of `mjx_revolve.episodes.tank.Tank`, and no physics."""
 
     def __init__(self, world, lanes=4):
-        self.world, self.places, self.time = world, [None] * lanes, 0.0
+        self.world, self.robots, self.time = world, [None] * lanes, 0.0
         self.current = np.array(world.current, float)
         self.lost = set()  # lanes that are to blow up
         self.poses = {}
 
     def add(self, robot, genes, position, quat=(1, 0, 0, 0)):
-        if None not in self.places:
-            raise InputError(f"expected a free lane; found all {len(self.places)} taken")
-        lane = self.places.index(None)
-        self.places[lane] = robot
+        if None not in self.robots:
+            raise InputError(f"tank: expected a free place; found all {len(self.robots)} taken")
+        lane = self.robots.index(None)
+        self.robots[lane] = robot
         self.poses[lane] = (np.array(position, float), np.array(quat, float), genes is not None)
         return lane
 
     def remove(self, lane):
-        self.places[lane] = None
+        self.robots[lane] = None
         self.poses.pop(lane)
         self.lost.discard(lane)
 
@@ -40,18 +40,18 @@ class StandIn:
     def advance(self, duration, every):
         count = round(duration / every)
         times = self.time + every * np.arange(1, count + 1)
-        most = max([robot.num_hinges for robot in self.places if robot is not None], default=0)
-        qpos = np.zeros((count, 7 + most, len(self.places)))
-        alive = np.zeros(len(self.places), bool)
+        most = max([robot.num_hinges for robot in self.robots if robot is not None], default=0)
+        qpos = np.zeros((count, 7 + most, len(self.robots)))
+        alive = np.zeros(len(self.robots), bool)
         for lane, (place, quat, swims) in self.poses.items():
-            robot, (w, _, _, z) = self.places[lane], quat
+            robot, (w, _, _, z) = self.robots[lane], quat
             ahead = np.array([w * w - z * z, 2 * w * z, 0.0]) * SPEED * swims
             rows = place + np.outer(times - self.time, ahead + self.current)
             qpos[:, :3, lane], qpos[:, 3:7, lane] = rows, quat
             phase = 2 * math.pi * times[:, None] + np.arange(robot.num_hinges)
             qpos[:, 7 : 7 + robot.num_hinges, lane] = 0.5 * swims * np.sin(phase)
             self.poses[lane] = (rows[-1], quat, swims)
-            alive[lane] = lane not in self.lost
+            alive[lane] = True
             if lane in self.lost:
                 qpos[-1, :, lane] = np.nan
         self.time = float(times[-1])

@@ -43,40 +43,24 @@ _BACKLOG = 100  # messages that a listener may be behind; then it is given up
 _SPREAD = 0.6  # robots are dropped so far apart, in shares of their two lengths
 
 
-class Stepped(Protocol):
-    """A slice of a running world, as `tank.Trail` has it.
-
-    Attributes:
-        time: `[T]` [s].
-        qpos: `[T, nq, lanes]`; a lane's robot has its numbers first.
-        alive: `[lanes]` whether who is there is still finite.
-    """
-
-    time: Any
-    qpos: Any
-    alive: Any
-
-
 class TankLike(Protocol):
     """A running world, as `tank.Tank` is one: robots come and go, all are stepped together."""
 
-    world: World
-    places: list[Robot | None]
-    time: float
+    @property
+    def time(self) -> float:
+        """Since its beginning [s]."""
 
-    def add(
-        self, robot: Robot, genes: np.ndarray | None, position: Any, quat: Any = (1, 0, 0, 0)
-    ) -> int:
-        """Puts a robot there and returns its lane."""
+    def add(self, robot: Robot, genes: Any, position: Any, quat: Any = (1, 0, 0, 0)) -> int:
+        """Puts a robot there and returns its place."""
 
-    def remove(self, lane: int) -> None:
+    def remove(self, place: int) -> None:
         """Takes it away."""
 
-    def set_current(self, current: tuple[float, float, float]) -> None:
+    def set_current(self, current: Any) -> None:
         """Makes the water flow so everywhere [m/s]."""
 
     def advance(self, duration: float, every: float) -> Any:
-        """Steps all for some time [s], with a row each so often [s]."""
+        """Steps all for some time [s], with a row each so often [s]: a `tank.Trail`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +71,15 @@ class Entry:
         name: in a few words.
         short: what it is called once it is in the water.
         group: where they come from.
-        make: builds the body, and finds the genes of its controller; None: it holds still.
+        robot: its body in the world.
+        genes: finds the genes of its controller; None: it keeps still.
     """
 
     name: str
     short: str
     group: str
-    make: Callable[[], tuple[Robot, np.ndarray | None]]
+    robot: Robot
+    genes: Callable[[], np.ndarray | None] = lambda: None
 
 
 class Inmate(NamedTuple):
@@ -102,14 +88,14 @@ class Inmate(NamedTuple):
     Attributes:
         key: a number that nobody else ever has.
         name: what it is called.
-        lane: its place in the tank.
+        place: its place in the tank.
         body: number of its body, see `shoal_data.Bodies`.
         robot: it.
     """
 
     key: int
     name: str
-    lane: int
+    place: int
     body: int
     robot: Robot
 
@@ -129,14 +115,14 @@ class Keeper:
     """Runs a tank.
 
     Attributes:
-        open_tank: makes the tank; called in the keeper's own thread.
+        tank: nobody else touches it from now on.
         world: of the tank.
         stock: who may be dropped.
         first: who is there at the beginning.
         waits: whether time stands still while nobody listens.
     """
 
-    open_tank: Callable[[], TankLike]
+    tank: TankLike
     world: World
     stock: Sequence[Entry]
     first: Sequence[Drop] = (Drop(0),)
@@ -151,7 +137,6 @@ class Keeper:
         self._busy: float | None = None  # since when a slice is being stepped
         self._stopped = threading.Event()
         self._poses = ""
-        self._made: dict[int, tuple[Robot, np.ndarray | None]] = {}
         self._count = 0  # of all who were ever dropped
         self._named: dict[str, int] = {}  # of each name
         self._random = np.random.default_rng()
@@ -234,7 +219,6 @@ class Keeper:
         """Runs the world until it is told to stop."""
         try:
             self._busy = time.monotonic()
-            self._tank = self.open_tank()
             for drop in self.first:
                 self._drop(drop)
             self._busy = None
@@ -287,19 +271,19 @@ class Keeper:
 
     def _step(self) -> None:
         self._busy = time.monotonic()
-        trail = self._tank.advance(SLICE, EVERY)
-        times, qpos, alive = (np.asarray(x) for x in (trail.time, trail.qpos, trail.alive))
+        trail = self.tank.advance(SLICE, EVERY)
+        times, qpos = np.asarray(trail.time), np.asarray(trail.qpos)
         waited = self.busy > 0
         self._busy = None
-        self.time = float(self._tank.time)
-        lost = [one for one in self.inmates if not alive[one.lane]]
-        for one in lost:
-            self._remove(one)
-            self._publish(_event("note", f"{one.name} has blown up, and was taken out"))
-        rows = {
-            one.key: qpos[:, : 7 + one.robot.num_hinges, one.lane].astype("<f4")
-            for one in self.inmates
-        }
+        self.time = float(self.tank.time)
+        rows = {}
+        for one in self.inmates:
+            own = qpos[:, : 7 + one.robot.num_hinges, one.place].astype("<f4")
+            if np.isfinite(own).all():
+                rows[one.key] = own
+            else:
+                self._remove(one)
+                self._publish(_event("note", f"{one.name} has blown up, and was taken out"))
         self.qpos = {key: poses[-1] for key, poses in rows.items()}
         for k, moment in enumerate(times):
             self.recent.append((float(moment), {key: poses[k] for key, poses in rows.items()}))
@@ -344,7 +328,7 @@ class Keeper:
         return None
 
     def _flow(self, velocity: Any) -> None:
-        self._tank.set_current(velocity)
+        self.tank.set_current(velocity)
         self._state.current = tuple(velocity)
 
     def _drop(self, wish: Drop) -> int:
@@ -353,9 +337,7 @@ class Keeper:
                 f"drop.who: expected a number below {len(self.stock)}; found {wish.who}"
             )
         entry = self.stock[wish.who]
-        if wish.who not in self._made:
-            self._made[wish.who] = entry.make()
-        robot, genes = self._made[wish.who]
+        robot = entry.robot
         body = self.bodies.number(robot)
         x, y = self._free_place(wish.place or (0.0, 0.0), robot)
         z = self.world.surface_height - wish.depth
@@ -364,19 +346,20 @@ class Keeper:
             z = max(z, ground + 0.5 * robot.morphology.length)
         turn = self._random.uniform(-180, 180) if wish.heading is None else wish.heading
         half = math.radians(turn) / 2
-        lane = self._tank.add(robot, genes, (x, y, z), (math.cos(half), 0.0, 0.0, math.sin(half)))
+        turned = (math.cos(half), 0.0, 0.0, math.sin(half))
+        place = self.tank.add(robot, entry.genes(), (x, y, z), turned)
         key, self._count = self._count, self._count + 1
         self._named[entry.short] = number = self._named.get(entry.short, 0) + 1
         name = entry.short if number == 1 else f"{entry.short} #{number}"
         pose = np.zeros(7 + robot.num_hinges, "<f4")
-        pose[:7] = x, y, z, math.cos(half), 0.0, 0.0, math.sin(half)
+        pose[:7] = x, y, z, *turned
         self.qpos[key] = pose
-        self.inmates = (*self.inmates, Inmate(key, name, lane, body, robot))
+        self.inmates = (*self.inmates, Inmate(key, name, place, body, robot))
         self._publish(self._tell_cast())
         return key
 
     def _remove(self, one: Inmate) -> None:
-        self._tank.remove(one.lane)
+        self.tank.remove(one.place)
         self.inmates = tuple(other for other in self.inmates if other is not one)
         self.qpos.pop(one.key, None)
         self._publish(self._tell_cast())

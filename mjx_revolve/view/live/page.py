@@ -48,6 +48,6 @@ def live_page(stock: Stock, room: int) -> str:
         "stock": [{"name": entry.name, "group": entry.group} for entry in stock.entries],
     }
     name = world.name.replace("_", " ")
-    words = [name, f"{stock.config.controller.type} brains", "live"]
-    title = "A running world" if stock.title == "live" else stock.title
+    words = [name, f"{stock.mixed.config.controller.type} brains", "live"]
+    title = stock.title or "A running world"
     return fill_page("live.html", title=title, subtitle=" \u00b7 ".join(words), data=data)

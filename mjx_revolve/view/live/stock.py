@@ -7,15 +7,17 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
-from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.spheres import count_spheres
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import Config, load_config, override_config
-from mjx_revolve.episodes.fitness import fit_body, read_modules
-from mjx_revolve.episodes.lives import INDIVIDUALS, Life, read_lives
+from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness, read_modules
+from mjx_revolve.episodes.lives import INDIVIDUALS, read_lives
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.errors import InputError, load_yaml, show
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
@@ -24,8 +26,32 @@ from mjx_revolve.water.world import World, load_world
 
 # Whose water and controller, where nobody names one.
 _USUAL = "lake_swim"
+_FIRST = "spider"  # of the shipped robots
+# Robots live on, and may come to a bed that they could not reach in an episode [s]. A choice.
+_WHILE = 600.0
 # How many of those who lived in a run are offered, the best first. A choice.
 _MOST_LIVES = 12
+
+
+_Genes = Callable[[int], np.ndarray | None]
+
+
+class _Draft(NamedTuple):
+    """An entry, before it is known what there must be room for.
+
+    Attributes:
+        name: see `keeper.Entry`.
+        short: likewise.
+        group: likewise.
+        body: trimmed.
+        genes: from how many there must be; None: drawn as evolution draws its first ones.
+    """
+
+    name: str
+    short: str
+    group: str
+    body: Morphology
+    genes: _Genes | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,16 +59,24 @@ class Stock:
     """What a user has named, and what is always there.
 
     Attributes:
-        config: controller and world of all.
-        world: the same world.
+        mixed: controller, world, and room for all.
         entries: who may be dropped; the first is there at the beginning.
         title: what is shown, in a few words.
     """
 
-    config: Config
-    world: World
+    mixed: MixedFitness
     entries: tuple[Entry, ...]
     title: str
+
+    @property
+    def world(self) -> World:
+        """Around all."""
+        return self.mixed.world
+
+    @property
+    def spheres(self) -> int:
+        """Most that stand for one of them in contact."""
+        return count_spheres([entry.robot for entry in self.entries])
 
 
 def load_stock(paths: Sequence[str], world: str | None = None) -> Stock:
@@ -63,15 +97,13 @@ def load_stock(paths: Sequence[str], world: str | None = None) -> Stock:
     named = [(path, _kind(path)) for path in paths]
     sources = [path for path, kind in named if kind != "body"]
     config = _read_config(sources[0] if sources else _USUAL)
-    if world is not None:
-        config = override_config(config, {"world": world})
-    if config.engine != "population":
-        config = override_config(config, {"engine": "population"})
+    changes: dict[str, Any] = {"engine": "population", "task.duration": _WHILE}
+    config = override_config(config, changes | ({} if world is None else {"world": world}))
     water = load_world(config.world_name, **config.world_overrides)
-    entries: list[Entry] = []
+    drafts: list[_Draft] = []
     for path, kind in named:
         if kind == "body":
-            entries += _bodies(config, water, find_shipped(path, "morphologies"))
+            drafts += _bodies(config, water, find_shipped(path, "morphologies"))
             continue
         own = _read_config(path)
         if own.controller != config.controller:
@@ -79,21 +111,37 @@ def load_stock(paths: Sequence[str], world: str | None = None) -> Stock:
                 f"{path}: controller: expected that of {sources[0]}, as all robots of a world have "
                 f"one kind; found another ({own.controller.type})"
             )
-        place = Path(path)
         if kind == "run":
-            entries += _lives(config, own, place)
-        elif own.morphology is not None:
-            entries += _bodies(config, water, Path(own.morphology))
+            drafts += _lives(own, water, Path(path))
+        elif own.bodies is None:
+            assert own.morphology is not None
+            drafts += _bodies(config, water, Path(own.morphology))
         else:
-            assert own.bodies is not None
             for seed in own.bodies.seeds:
-                entries += _bodies(config, water, Path(seed))
-    usual = "spider"
+                drafts += _bodies(config, water, Path(seed))
     shipped = list_shipped("morphologies")
-    for name in sorted(shipped, key=lambda name: (name != usual, name)):
-        entries += _bodies(config, water, shipped[name], "shipped")
-    title = " and ".join(Path(path).stem or path for path in paths) if paths else "live"
-    return Stock(config, water, tuple(_distinct(entries)), title)
+    for name in sorted(shipped, key=lambda name: (name != _FIRST, name)):
+        known = {(draft.short, draft.name) for draft in drafts}
+        more = _bodies(config, water, shipped[name], "shipped")
+        alike = config.controller.sensors is not None or more[0].body.sensors is None
+        drafts += [x for x in more if alike and (x.short, x.name) not in known]
+    title = " and ".join(Path(path).stem or path for path in paths)
+    mixed = make_mixed_fitness(config, [draft.body for draft in drafts])
+    return Stock(mixed, tuple(_entry(mixed, draft) for draft in drafts), title)
+
+
+def _entry(mixed: MixedFitness, draft: _Draft) -> Entry:
+    """A draft with its body in the world of all."""
+    robot = build_robot(draft.body, mixed.world)
+
+    def genes() -> np.ndarray | None:
+        count = mixed.controller_of(robot).num_genes
+        if draft.genes is not None:
+            return draft.genes(count)
+        draw = np.random.default_rng().standard_normal(count)
+        return (mixed.config.evolution.std_init * draw).astype(np.float32)
+
+    return Entry(draft.name, draft.short, draft.group, robot, genes)
 
 
 def _kind(path: str) -> str:
@@ -133,110 +181,75 @@ def _read_config(path: str) -> Config:
     return load_config(place / "config.yaml" if place.is_dir() else path)
 
 
-def _distinct(entries: Sequence[Entry]) -> list[Entry]:
-    """Of those with one name the first."""
-    found: dict[tuple[str, str], Entry] = {}
-    for entry in entries:
-        found.setdefault((entry.group, entry.name), entry)
-    return list(found.values())
-
-
 # --- morphologies ---------------------------------------------------------------------------------
 
 
-def _bodies(config: Config, water: World, path: Path, group: str = "") -> list[Entry]:
-    """A morphology whose genes are drawn, and one that holds still."""
+def _bodies(config: Config, water: World, path: Path, group: str = "") -> list[_Draft]:
+    """A morphology whose genes are drawn, and one that keeps still."""
     morphology = load_morphology(path, read_modules(config), config.allow_overlap)
     with suppress(InputError):  # what floats, floats
         morphology = trim_neutral(morphology, water.density)
     name = path.stem
     group = group or name
-
-    def still() -> tuple[Robot, np.ndarray | None]:
-        return build_robot(morphology, water), None
-
-    def moving() -> tuple[Robot, np.ndarray | None]:
-        return build_robot(morphology, water), _draw_genes(config, morphology)
-
-    entries = [Entry(f"{name}, still", name, group, still)]
+    drafts = [_Draft(f"{name}, still", name, group, morphology, lambda _: None)]
     if morphology.num_hinges + morphology.num_thrusters > 0:
-        entries.insert(0, Entry(f"{name}, a brain by chance", name, group, moving))
-    return entries
-
-
-def _draw_genes(config: Config, morphology: Morphology) -> np.ndarray:
-    """Genes as evolution draws its first ones."""
-    count = fit_body(config, morphology).num_genes
-    draw = np.random.default_rng().standard_normal(count)
-    return (config.evolution.std_init * draw).astype(np.float32)
+        drafts.insert(0, _Draft(f"{name}, a brain by chance", name, group, morphology, None))
+    return drafts
 
 
 # --- runs -----------------------------------------------------------------------------------------
 
 
-def _lives(config: Config, own: Config, folder: Path) -> list[Entry]:
+def _lives(own: Config, water: World, folder: Path) -> list[_Draft]:
     """A run's champion, and, where bodies evolve, the best of those who lived."""
-    unit = score_unit(own.task.type)
-    entries = []
-    champion = next(
-        (p for p in (folder / "genes.yaml", folder / "champion" / "genes.yaml") if p.is_file()),
-        None,
-    )
+    unit, group = score_unit(own.task.type), folder.absolute().name
+    drafts = []
+    places = (folder / "genes.yaml", folder / "champion" / "genes.yaml")
+    champion = next((place for place in places if place.is_file()), None)
     if champion is not None:
         data = load_yaml(champion)
         score = data.get("score") if isinstance(data, dict) else None
         words = f": {score:.3g} {unit}" if isinstance(score, float) else ""
-        entries.append(
-            Entry(f"champion{words}", "champion", folder.name, _champion(config, own, champion))
-        )
+        body = _trimmed(own, _champion_body(own, champion, data), water)
+        genes = _known(load_genes(champion), str(champion))
+        drafts.append(_Draft(f"champion{words}", "champion", group, body, genes))
     if own.bodies is not None and (folder / INDIVIDUALS).is_file():
         lives, _ = read_lives(folder)
         scored = [life for life in lives.values() if math.isfinite(life.score)]
-        best = sorted(scored, key=lambda life: (-life.score, life.number))[:_MOST_LIVES]
-        for life in best:
+        for life in sorted(scored, key=lambda life: (-life.score, life.number))[:_MOST_LIVES]:
             short = f"individual {life.number}"
+            body = _trimmed(own, life.grow(read_modules(own)), water)
             name = f"{short}: {life.score:.3g} {unit}"
-            entries.append(Entry(name, short, folder.name, _life(config, own, life)))
-    if not entries:
+            drafts.append(_Draft(name, short, group, body, _known(life.genes, short)))
+    if not drafts:
         raise InputError(f"{folder}: expected a champion, or somebody who lived; found nobody yet")
-    return entries
+    return drafts
 
 
-def _champion(
-    config: Config, own: Config, path: Path
-) -> Callable[[], tuple[Robot, np.ndarray | None]]:
-    def make() -> tuple[Robot, np.ndarray | None]:
-        genes, data = load_genes(path), load_yaml(path)
-        body = own.morphology
-        if own.bodies is not None:
-            named = data.get("morphology")
-            if not isinstance(named, str) or not (path.parent / named).is_file():
-                raise InputError(
-                    f"{path}: morphology: expected the path of the champion's body, as bodies have "
-                    f"evolved; found {show(named)}"
-                )
-            body = str((path.parent / named).absolute())
-        assert body is not None
-        morphology = load_morphology(body, read_modules(own), allow_overlap=own.allow_overlap)
-        return _fit(config, own, morphology, genes, str(path))
-
-    return make
+def _champion_body(own: Config, path: Path, data: Any) -> Morphology:
+    body = own.morphology
+    if own.bodies is not None:
+        named = data.get("morphology") if isinstance(data, dict) else None
+        if not isinstance(named, str) or not (path.parent / named).is_file():
+            raise InputError(
+                f"{path}: morphology: expected the path of the champion's body, as bodies have "
+                f"evolved; found {show(named)}"
+            )
+        body = str((path.parent / named).absolute())
+    assert body is not None
+    return load_morphology(body, read_modules(own), allow_overlap=True)
 
 
-def _life(config: Config, own: Config, life: Life) -> Callable[[], tuple[Robot, np.ndarray | None]]:
-    def make() -> tuple[Robot, np.ndarray | None]:
-        return _fit(
-            config, own, life.grow(read_modules(own)), life.genes, f"individual {life.number}"
-        )
-
-    return make
+def _trimmed(own: Config, morphology: Morphology, water: World) -> Morphology:
+    return trim_neutral(morphology, water.density) if own.trim == "neutral" else morphology
 
 
-def _fit(
-    config: Config, own: Config, morphology: Morphology, genes: np.ndarray | None, place: str
-) -> tuple[Robot, np.ndarray | None]:
-    """A robot as its run has it, in the world of all."""
-    fitness = fit_body(own.model_copy(update={"world": config.world}), morphology)
-    if genes is not None and len(genes) != fitness.num_genes:
-        raise InputError(f"{place}: genes: expected {fitness.num_genes}; found {len(genes)}")
-    return fitness.robot, genes
+def _known(genes: np.ndarray | None, place: str) -> _Genes:
+    """Genes that must be as many as a body's controller takes."""
+
+    def find(count: int) -> np.ndarray | None:
+        if genes is not None and len(genes) != count:
+            raise InputError(f"{place}: genes: expected {count}; found {len(genes)}")
+        return genes
+
+    return find
