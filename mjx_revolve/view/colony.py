@@ -31,7 +31,7 @@ _STEPS = (1e-3, 5e-4, 2e-3)
 _MOST = 24_000_000
 # Poses that are closer than this are none the smoother [s].
 _CLOSEST = 0.02
-_TRIES = 4  # at guessing how many poses fit
+_TRIES = 12  # at guessing how many poses fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ def write_colony_page(
         _check(actor)
     data = _scene(actors, marks)
     bare = len(fill_page("colony.html", title=title, subtitle="", data=data).encode())
-    poses, gap, packed = _fit(actors, window, max(most - bare, most // 10))
+    poses, gap, packed = _fit(actors, window, max(most - bare, most // 50))
     data |= packed
     text = fill_page("colony.html", title=title, subtitle=_subtitle(actors, gap), data=data)
     content = text.encode()
@@ -214,7 +214,7 @@ def _fit(
         count, size = sum(map(len, kept)), len(packed["poses"])
         if size <= room:
             break
-        gap = 1.02 * max(gap, usual) * size / room
+        gap = max(gap, usual) * max(1.1, size / room)
     return count, gap if count < total else 0.0, packed
 
 
@@ -262,7 +262,7 @@ def pack_poses(actors: Sequence[Actor], rows: Sequence[np.ndarray]) -> dict[str,
     low_high = np.concatenate(numbers).astype("<i2").view(np.uint8).reshape(-1, 2)
     raw = np.concatenate(times).tobytes() + low_high.T.tobytes()
     return {
-        "poses": base64.b64encode(zlib.compress(raw, 9)).decode(),
+        "poses": base64.b64encode(zlib.compress(raw, 6)).decode(),
         "steps": steps,
         "origins": [origin.tolist() for origin in origins],
         "rows": [len(own) for own in rows],

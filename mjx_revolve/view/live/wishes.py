@@ -105,7 +105,8 @@ def read_wish(data: Any) -> Wish:
         raise InputError(f"expected a mapping with `do`; found {show(data)}")
     name = data.get("do")
     if not isinstance(name, str) or name not in _WISHES:
-        raise InputError(f"do: expected one of {', '.join(_WISHES)}; found {show(name)}")
+        found = show(name) if "do" in data else "nothing"
+        raise InputError(f"do: expected one of {', '.join(_WISHES)}; found {found}")
     told = {key: value for key, value in data.items() if key != "do"}
     if told and not fields(_WISHES[name]):
         raise InputError(f"{name}: expected nothing beside `do`; found {show(told)}")

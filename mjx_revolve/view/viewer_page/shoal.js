@@ -308,6 +308,7 @@ class Chart {
   // From above, north (y) up; reach: what must be seen, [x, y] lowest and highest [m].
   drawMap(low, high, followed, extra = () => {}) {
     const { context: c, w, h } = this.stage.pen("map"), pad = 12;
+    if (w <= 2 * pad || h <= 2 * pad) return; // there is no room for it
     const span = Math.max(high[0] - low[0], high[1] - low[1], 2);
     const scale = (Math.min(w, h) - 2 * pad) / span, mx = (low[0] + high[0]) / 2, my = (low[1] + high[1]) / 2;
     const x = (a) => w / 2 + (a - mx) * scale, y = (b) => h / 2 - (b - my) * scale;

@@ -1,0 +1,591 @@
+"""A running world in a browser: its keeper, its server, its page, and who may be dropped."""
+
+from __future__ import annotations
+
+import _thread
+import base64
+import http.client
+import json
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_bodies import make_run
+
+from browser import Browser, find_browser
+from laboratory import body
+from mjx_revolve import live
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.fitness import make_mixed_fitness
+from mjx_revolve.episodes.tank import make_tank
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.course import pose_robot
+from mjx_revolve.view.live.keeper import Entry, Keeper
+from mjx_revolve.view.live.page import live_page
+from mjx_revolve.view.live.server import LiveServer
+from mjx_revolve.view.live.stock import load_stock
+from mjx_revolve.view.live.window import Hands, make_scene, poses_at
+from mjx_revolve.view.live.wishes import Current, Drop, Pause, Rate, Remove, Reset, read_wish
+from mjx_revolve.water.world import load_world
+from standin import SPEED, StandIn
+
+PATIENCE = 60.0  # s, for a machine that does other things; nothing waits that long otherwise
+
+
+@pytest.fixture(scope="module")
+def entries():
+    world = load_world("lake")
+    robots = {name: build_robot(body(name), world) for name in ("spider", "snake")}
+    swims = [Entry(f"{n}, swims", n, "group", r, lambda: np.zeros(3)) for n, r in robots.items()]
+    return [*swims, Entry("spider, still", "spider", "group", robots["spider"])]
+
+
+class Running:
+    """A keeper in a thread, and a listener."""
+
+    def __init__(self, entries, lanes=4, **more):
+        world = entries[0].robot.world
+        self.tank = StandIn(world, lanes)
+        self.keeper = Keeper(self.tank, world, entries, **more)
+        self.thread = threading.Thread(target=self.keeper.run, daemon=True)
+
+    def __enter__(self):
+        self.listener = self.keeper.listen()
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.keeper.stop()
+        self.thread.join(PATIENCE)
+        assert not self.thread.is_alive()
+
+    def ask(self, wish):
+        return self.keeper.ask(wish).result(PATIENCE)
+
+    def hear(self, wanted, check=lambda data: True):
+        """The next event of a name that passes a check."""
+        while True:
+            name, data = read_event(self.listener.get(timeout=PATIENCE))
+            if name == wanted and check(data):
+                return data
+
+
+def read_event(text):
+    name, data = text.rstrip("\n").split("\n")
+    return name.removeprefix("event: "), json.loads(data.removeprefix("data: "))
+
+
+def poses_of(data):
+    """Rows `[T, width]` by key."""
+    numbers = np.frombuffer(base64.b64decode(data["q"]), "<f4")
+    ends = np.cumsum([len(data["t"]) * width for width in data["widths"]])
+    parts = np.split(numbers, ends[:-1])
+    return {
+        key: part.reshape(len(data["t"]), -1) for key, part in zip(data["keys"], parts, strict=True)
+    }
+
+
+# --------------------------------------------------------------------- the keeper
+
+
+def test_poses_are_those_of_the_tank(entries):
+    """The stand-in swims along its heading, and with the water."""
+    first = (Drop(0, (1.0, 2.0), 1.5, 90.0), Drop(2, (-1.0, 0.0), 0.5, 0.0))
+    with Running(entries, first=first) as running:
+        cast = running.hear("cast", lambda data: len(data) == 2)
+        assert [one["name"] for one in cast] == ["spider", "spider #2"]
+        assert [one["body"] for one in cast] == [0, 0]
+        data = running.hear("poses")
+        time_, poses = np.array(data["t"]), poses_of(data)
+        assert np.diff(time_) == pytest.approx(0.05)
+        assert poses[0].shape == poses[1].shape == (2, 15)
+        expected = np.c_[np.full(2, 1.0), 2.0 + SPEED * time_, np.full(2, -1.5)]
+        assert poses[0][:, :3] == pytest.approx(expected, abs=1e-5)
+        assert poses[1][:, :3] == pytest.approx(np.tile([-1.0, 0.0, -0.5], (2, 1)), abs=1e-5)
+        running.ask(Current((0.0, 0.0, 0.25)))
+        assert running.hear("state", lambda data: data["current"][2])["current"] == [0, 0, 0.25]
+        first, second = (poses_of(running.hear("poses"))[1] for _ in range(2))
+        assert second[0, 2] - first[0, 2] == pytest.approx(0.25 * 0.1, abs=1e-5)
+
+
+def test_time_stops_and_goes_on(entries):
+    with Running(entries) as running:
+        running.hear("poses")
+        running.ask(Pause(True))
+        stopped = running.tank.time
+        assert running.hear("state", lambda data: data["paused"])["time"] == stopped
+        running.ask(Rate(4.0))
+        assert running.tank.time == stopped
+        running.ask(Pause(False))
+        assert running.hear("poses", lambda data: data["t"][0] > stopped)
+        assert running.hear("state", lambda data: not data["paused"])["rate"] == 4
+
+
+def test_nothing_moves_while_nobody_looks(entries):
+    running = Running(entries)
+    with running:
+        running.hear("poses")
+        running.keeper.leave(running.listener)
+        running.ask(Rate(1.0))  # the slice that was under way is over
+        before = running.tank.time
+        running.ask(Rate(1.0))
+        assert running.tank.time <= before + 0.11
+        other = running.keeper.listen()
+        names = [read_event(other.get(timeout=PATIENCE))[0] for _ in range(3)]
+        assert names == ["state", "cast", "poses"]  # what there is comes first
+
+
+def test_robots_find_room_beside_others(entries):
+    with Running(entries, first=()) as running:
+        running.ask(Pause(True))
+        keys = [running.ask(Drop(who)) for who in (0, 1, 2)]
+        assert keys == [0, 1, 2]
+        places = np.array([running.keeper.qpos[key][:2] for key in keys])
+        apart = np.linalg.norm(places[:, None] - places, axis=-1)[np.triu_indices(3, 1)]
+        lengths = [entries[who].robot.morphology.length for who in (0, 1, 2)]
+        least = 0.6 * (min(lengths) * 2)
+        assert apart.min() >= least - 1e-9 and apart.max() < 3 * sum(lengths)
+        running.ask(Drop(0, (20.0, 0.0), 3.0))
+        with pytest.raises(InputError, match=r"tank: expected a free place; found all 4 taken"):
+            running.ask(Drop(0))
+        running.ask(Remove(1))
+        assert [one.key for one in running.keeper.inmates] == [0, 2, 3]
+        with pytest.raises(InputError, match=r"remove\.key: expected a robot's; found 1"):
+            running.ask(Remove(1))
+        with pytest.raises(InputError, match=r"drop\.who: expected a number below 3; found 3"):
+            running.ask(Drop(3))
+        running.ask(Current((0.1, 0, 0)))
+        running.ask(Reset())
+        assert (running.keeper.inmates, running.keeper.current) == ((), (0, 0, 0))
+        assert not running.keeper.paused
+
+
+def test_nobody_is_dropped_into_the_bed():
+    world = load_world("lake", bed={"kind": "flat", "height": -2.0})
+    robot = build_robot(body("snake"), world)
+    with Running([Entry("snake", "snake", "", robot)], first=()) as running:
+        running.ask(Pause(True))
+        key = running.ask(Drop(0, depth=50.0))
+        assert running.keeper.qpos[key][2] == pytest.approx(-2 + robot.morphology.length / 2)
+
+
+def test_who_blows_up_is_taken_out(entries):
+    with Running(entries, first=(Drop(0), Drop(1, (9.0, 0.0)))) as running:
+        running.hear("poses")
+        running.tank.lost.add(0)
+        assert running.hear("note") == "spider has blown up, and was taken out"
+        running.hear("poses", lambda data: data["keys"] == [1])
+        assert running.tank.robots[0] is None
+
+
+def test_a_sleeping_listener_is_given_up(entries):
+    """It is told that this is the end; its page comes again. Others are told on."""
+    keeper = Keeper(StandIn(entries[0].robot.world), entries[0].robot.world, entries)
+    sleeping = keeper.listen()
+    for _ in range(150):
+        keeper._publish("event: note\ndata: 1\n\n")
+    assert [*sleeping.queue][-1] is None and sleeping.qsize() == 100
+    other = keeper.listen()
+    keeper._publish("event: note\ndata: 2\n\n")
+    assert [read_event(text) for text in other.queue][-1] == ("note", 2)
+
+
+@pytest.mark.parametrize(
+    "data, match",
+    [
+        ([1], r"expected a mapping with `do`; found \[1\]"),
+        ({}, "do: expected one of drop, remove, current, pause, rate, reset; found nothing"),
+        ({"do": ["drop"]}, "do: expected one of drop"),
+        ({"do": "drop"}, r"drop\.who: expected"),
+        ({"do": "drop", "who": True}, r"drop\.who: expected a whole number >= 0; found True"),
+        ({"do": "drop", "who": 0, "place": [0]}, r"drop\.place: expected"),
+        ({"do": "drop", "who": 0, "place": [0, 1e6]}, r"drop\.place\.1: expected a number >= -500"),
+        ({"do": "current", "velocity": [0, 9, 0]}, r"current\.velocity\.1: expected"),
+        ({"do": "rate", "factor": 0}, r"rate\.factor: expected a number >= 0\.02"),
+        ({"do": "pause", "on": 1}, r"pause\.on: expected true or false; found 1"),
+        ({"do": "reset", "now": 1}, "reset: expected nothing beside `do`"),
+        ({"do": "remove", "key": 0, "who": 1}, r"remove\.who: expected"),
+    ],
+)
+def test_wishes_are_checked(data, match):
+    with pytest.raises(InputError, match=match) as error:
+        read_wish(data)
+    assert "\n" not in str(error.value)
+
+
+# --------------------------------------------------------------------- the server
+
+
+@pytest.fixture(scope="module")
+def served(entries):
+    """A server, with its keeper at work."""
+    world = entries[0].robot.world
+    setup = SimpleNamespace(controller=SimpleNamespace(type="cpg"))
+    stock = SimpleNamespace(
+        world=world, entries=entries, title="a </script> title", mixed=SimpleNamespace(config=setup)
+    )
+    with Running(entries) as running:
+        server = LiveServer(running.keeper, live_page(stock, 4))
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield server
+        server.closing.set()
+        server.shutdown()
+        server.server_close()
+        thread.join(PATIENCE)
+
+
+def request(server, method, place, content=None, token=None, **headers):
+    """Status, headers and text of an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=PATIENCE)
+    path = f"/{server.token if token is None else token}/{place}"
+    names = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path, content, names)
+    answer = connection.getresponse()
+    found = answer.status, answer.headers, answer.read().decode()
+    connection.close()
+    return found
+
+
+def wish(server, data, **more):
+    """Status and answer of a wish."""
+    content = data if isinstance(data, str) else json.dumps(data)
+    given = {"Content_Type": "application/json", "Origin": server.origins[0]} | more
+    status, _, text = request(server, "POST", "wish", content, **given)
+    return status, json.loads(text)
+
+
+def test_the_page(served):
+    """All in one file but for what happens; it asks nobody else."""
+    assert served.address.startswith("http://127.0.0.1:") and served.address.endswith("/")
+    assert served.server_address[0] == "127.0.0.1"
+    status, headers, text = request(served, "GET", "")
+    assert status == 200 and headers["Content-Type"] == "text/html; charset=utf-8"
+    assert headers["Referrer-Policy"] == "no-referrer" and headers["X-Frame-Options"] == "DENY"
+    assert "connect-src 'self'" in text and "default-src 'none'" in text
+    assert "<title>a &lt;/script&gt; title</title>" in text
+    assert "spider, still" in text and 'id="compass"' in text and "three.js authors" in text
+    assert served.token not in text
+
+
+def test_strangers_are_refused(served):
+    """Neither another token, nor another name for this machine, nor another page's posts."""
+    assert request(served, "GET", "", token="wrong")[0] == 404
+    assert request(served, "GET", "events", token="")[0] == 404
+    assert request(served, "GET", "", Host="evil.example")[0] == 404
+    assert request(served, "POST", "wish", "{}", token="wrong")[0] == 404
+    stop = {"do": "pause", "on": True}
+    status, answer = wish(served, stop, Origin="http://evil.example")
+    assert (status, answer["error"].partition(";")[0]) == (403, "Origin: expected our own page")
+    assert wish(served, stop, Origin="null")[0] == 403
+    assert wish(served, stop, Content_Type="text/plain")[0] == 415
+    assert wish(served, stop, Host="evil.example")[0] == 404
+    assert not served.keeper.paused
+    assert request(served, "PUT", "wish", "{}")[0] == 501
+
+
+def test_malformed_wishes(served):
+    """One line, status 400."""
+    for data in ("", "{", "[" * 3000, "nan", '{"do": "rate", "factor": NaN}', "[]", '{"do": 1}'):
+        status, answer = wish(served, data)
+        assert status == 400 and "\n" not in answer["error"], data
+        assert "expected" in answer["error"]
+    assert wish(served, "x" * 5000)[0] == 400
+    assert wish(served, {"do": "drop", "who": 99})[1]["error"].startswith("drop.who: expected")
+
+
+def test_wishes_come_true(served):
+    before = len(served.keeper.inmates)
+    status, answer = wish(served, {"do": "drop", "who": 1, "place": [4, 5], "depth": 2})
+    assert status == 200 and answer["ok"]
+    assert len(served.keeper.inmates) == before + 1
+    place = served.keeper.qpos[answer["key"]][:3]
+    assert np.linalg.norm(place - [4, 5, -2]) < 1
+    assert wish(served, {"do": "remove", "key": answer["key"]})[0] == 200
+    assert len(served.keeper.inmates) == before
+    other = served.origins[1]
+    assert wish(served, {"do": "current", "velocity": [0.1, 0, 0]}, Origin=other)[0] == 200
+    assert served.keeper.current == (0.1, 0, 0)
+    assert wish(served, {"do": "reset"})[0] == 200
+
+
+def test_bodies(served):
+    """With the shapes of their pieces; of nobody else."""
+    status, _, text = request(served, "GET", "body/0")
+    data = json.loads(text)
+    assert status == 200 and len(data["tree"]) == 9
+    assert {str(piece[1]) for piece in data["pieces"]} == {*data["shapes"]}
+    for place in ("body/", "body/-1", "body/99", "body/x", "body/9999999999", "bodies", "../etc"):
+        assert request(served, "GET", place)[0] == 404
+
+
+def test_the_stream(served):
+    """What there is, then poses as time goes on."""
+    wish(served, {"do": "reset"})
+    connection = http.client.HTTPConnection("127.0.0.1", served.server_address[1], timeout=PATIENCE)
+    connection.request("GET", f"/{served.token}/events")
+    answer = connection.getresponse()
+    assert answer.headers["Content-Type"] == "text/event-stream"
+    found = []
+    while sum(name == "poses" for name, _ in found) < 4:
+        lines = [answer.readline().decode() for _ in range(3)]
+        assert lines[2] == "\n"
+        found.append(read_event("".join(lines)))
+    connection.close()
+    names = [name for name, _ in found]
+    assert names[:2] == ["state", "cast"]
+    moments = np.concatenate([data["t"] for name, data in found if name == "poses"][1:])
+    assert np.diff(moments) == pytest.approx(0.05, abs=1e-3)
+    for data in (data for name, data in found if name == "poses"):
+        assert all(np.isfinite(rows).all() for rows in poses_of(data).values())
+        assert all(rows[:, 2] == pytest.approx(-1, abs=1e-5) for rows in poses_of(data).values())
+
+
+# --------------------------------------------------------------------- who may be dropped
+
+
+def test_the_stock_of_a_run(tmp_path):
+    """Champion and individuals, the best first, with their genes; then shipped robots."""
+    stock = load_stock([str(make_run(tmp_path / "run"))])
+    names = [entry.name for entry in stock.entries]
+    assert names[0] == "champion: 0.4 body lengths/s"
+    assert names[1].startswith("individual 5: 0.5") and names[2].startswith("individual 3: 0.3")
+    assert "individual 2" not in " ".join(names)  # every trial of its life failed
+    assert "spider, a brain by chance" in names and "core, still" in names
+    assert "core, a brain by chance" not in names  # it has nothing to move
+    champion = stock.entries[0]
+    assert champion.group == "run" and champion.robot.num_hinges == 3
+    assert champion.genes() == pytest.approx(0.1 * np.arange(10))
+    drawn = stock.entries[names.index("spider, a brain by chance")]
+    assert drawn.genes().shape == (3 * 8 + 1,) and drawn.genes().std() > 0.1
+    assert stock.entries[names.index("spider, still")].genes() is None
+    assert stock.world.name == "empty_underwater" and stock.title == "run"
+    assert stock.mixed.capacity.hinges >= 8
+
+
+def test_the_stock_of_configurations_and_bodies(tmp_path):
+    stock = load_stock(["snake", "lake_swim"], "empty_underwater")
+    names = [entry.name for entry in stock.entries]
+    assert names[:3] == ["snake, a brain by chance", "snake, still", "spider, a brain by chance"]
+    assert len(set(names)) == len(names)
+    assert stock.world.name == "empty_underwater"
+    assert stock.title == "snake and lake_swim"
+
+
+@pytest.mark.parametrize(
+    "paths, match",
+    [
+        (["nosuch"], "nosuch: expected a run folder, a configuration or a morphology; found none"),
+        (["empty"], r"empty: expected a run folder; found no config\.yaml in it"),
+        (["other.yaml"], "found a file with neither task nor body"),
+        (["lake_swim", "run"], "run: controller: expected that of lake_swim"),
+    ],
+)
+def test_what_cannot_be_dropped(tmp_path, monkeypatch, paths, match):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "other.yaml").write_text("a: 1\n")
+    settings = make_run(tmp_path / "run") / "config.yaml"
+    settings.write_text(settings.read_text().replace('"sine"', '"cpg"'))
+    with pytest.raises(InputError, match=match):
+        load_stock(paths)
+
+
+# --------------------------------------------------------------------- the command
+
+
+def test_ctrl_c_ends_it(monkeypatch, capsys):
+    """With the page's address on the first line, and code 0."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    made = []
+
+    def stand_in(mixed, places, spheres):
+        made.append(StandIn(mixed.world, places))
+        threading.Timer(0.5, _thread.interrupt_main).start()
+        return made[0]
+
+    monkeypatch.setattr("mjx_revolve.episodes.tank.make_tank", stand_in)
+    assert run_command(live.main, ["snake", "--robots", "3"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("http://127.0.0.1:") and said[-1] == "ended"
+    assert len(made[0].robots) == 3
+
+
+@pytest.mark.parametrize(
+    "argv, said",
+    [
+        (["nosuch"], "nosuch: expected a run folder, a configuration or a morphology"),
+        (["--port", "70000"], "--port: expected a whole number from 0 to 65535; found '70000'"),
+        (["--robots", "0"], "--robots: expected a whole number from 1 to 64; found '0'"),
+        (["--mujoco"], "--mujoco: expected a screen; found neither DISPLAY nor WAYLAND_DISPLAY"),
+    ],
+)
+def test_mistakes_end_in_one_line(monkeypatch, capsys, argv, said):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    assert run_command(live.main, argv) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {said}") and error.count("\n") == 1
+
+
+def test_a_port_that_is_taken(entries, served, monkeypatch, capsys):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    port = str(served.server_address[1])
+    assert run_command(live.main, ["snake", "--port", port]) == 1
+    assert f"port {port}: " in capsys.readouterr().err
+
+
+# --------------------------------------------------------------------- MuJoCo's viewer
+
+
+def test_the_scene_has_everybody_where_they_are(entries):
+    """One model of all: bodies where each robot's own model has them."""
+    with Running(entries, first=(Drop(0), Drop(1, (3.0, 0.0)))) as running:
+        running.hear("poses")
+        running.ask(Pause(True))
+        keeper = running.keeper
+        scene = make_scene(keeper, {})
+        poses = poses_at(keeper, keeper.time)
+        scene.pose(poses)
+        import mujoco
+
+        mujoco.mj_kinematics(scene.model, scene.data)
+        assert scene.keys == (0, 1)
+        for one in keeper.inmates:
+            expected = pose_robot(one.robot, poses[one.key][None].astype(float))
+            for k in range(1, one.robot.mj_model.nbody):
+                name = f"{one.key}/{one.robot.mj_model.body(k).name}"
+                assert scene.data.body(name).xpos == pytest.approx(
+                    expected.position[0, k], abs=1e-9
+                )
+        middle = poses_at(keeper, keeper.time - 0.025)[0]
+        rows = [poses[0] for _, poses in list(keeper.recent)[-2:]]
+        assert middle[:3] == pytest.approx((rows[0][:3] + rows[1][:3]) / 2, abs=1e-6)
+
+
+def test_keys_of_the_window(entries):
+    with Running(entries) as running:
+        running.hear("poses")
+        keeper, hands = running.keeper, Hands(running.keeper)
+
+        def press(key):
+            hands.press(key)
+            running.ask(Rate(1.0))  # wishes are done in turn
+
+        press(ord("."))
+        assert "snake, swims" in hands.words()[1]
+        press(257)
+        assert [one.name for one in keeper.inmates] == ["spider", "snake"]
+        press(262)
+        press(265)
+        assert keeper.current == pytest.approx((0.05, 0.05, 0.0))
+        press(261)
+        assert [one.name for one in keeper.inmates] == ["spider"]
+        press(ord(" "))
+        assert keeper.paused and "(paused)" in hands.words()[1]
+        for _ in range(4):
+            press(257)
+        assert "tank: expected a free place" in hands.words()[1]
+        press(268)
+        assert len(keeper.inmates) == 1 and not keeper.paused
+
+
+# --------------------------------------------------------------------- the true tank
+
+
+@pytest.mark.slow
+def test_a_true_tank(monkeypatch):
+    """A neutral snake that keeps still goes with the water, once that has taken it along."""
+    config = {"morphology": "snake", "world": "empty_underwater", "trim": "neutral",
+              "controller": {"type": "sine"}, "task": {"type": "speed"}}  # fmt: skip
+    mixed = make_mixed_fitness(config, [body("snake")])
+    entry = Entry("snake", "snake", "", mixed.build(body("snake")))
+    keeper = Keeper(make_tank(mixed, 2), mixed.world, [entry], first=(Drop(0, None, 1.0, 0.0),))
+    listener = keeper.listen()
+    thread = threading.Thread(target=keeper.run, daemon=True)
+    thread.start()
+    try:
+        keeper.ask(Rate(8.0))
+        start = keeper.ask(Current((0.0, 0.2, 0.0)))
+        name, data = "", {}
+        while name != "poses" or data["t"][-1] < 8:
+            name, data = read_event(listener.get(timeout=300))
+        start.result(PATIENCE)
+        rows = poses_of(data)[0]
+        assert np.isfinite(rows).all()
+        # Nothing holds it level or at its depth exactly, but nothing pushes it elsewhere.
+        assert rows[-1, 1] > 0.8 and abs(rows[-1, 0]) < 0.3 and abs(rows[-1, 2] + 1) < 0.3
+    finally:
+        keeper.stop()
+        thread.join(300)
+
+
+# --------------------------------------------------------------------- in a browser
+
+needs_browser = pytest.mark.skipif(
+    find_browser() is None, reason="no chromium or chrome on the path to open the page with"
+)
+FACTS = "(document.documentElement?.dataset ?? {})"
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_user_plays(served):
+    """Drops a robot in the middle and another where they click; makes a current; takes one out."""
+    wish(served, {"do": "reset"})
+    with Browser(900, 600) as browser:
+        browser.send("Page.navigate", url=f"{served.address}#plain")
+        browser.wait(f"{FACTS}.poses && {FACTS}.busy === 'false' && {FACTS}.frames > 2")
+        assert browser.evaluate(f"{FACTS}.robots") == "1"
+        first = float(browser.evaluate(f"{FACTS}.time"))
+        browser.wait(f"{FACTS}.time > {first + 0.2}")
+        browser.press("d")
+        browser.wait(f"{FACTS}.robots === '2' && {FACTS}.followed === String({_last(served)})")
+        browser.press("Escape")
+        browser.click("#aim")
+        browser.mouse("mouseMoved", 450, 400)
+        browser.mouse("mousePressed", 450, 400, button="left", clickCount=1)
+        browser.mouse("mouseReleased", 450, 400, button="left", clickCount=1)
+        browser.wait(f"{FACTS}.robots === '3'")
+        assert np.linalg.norm(served.keeper.qpos[_last(served)][:2]) < 10
+        box = browser.evaluate(
+            "(b => [b.x + b.width / 2, b.y + b.height / 2])"
+            "(document.getElementById('compass').getBoundingClientRect())"
+        )
+        at = (box[0] + 20, box[1])
+        browser.mouse("mousePressed", *at, button="left", buttons=1, clickCount=1)
+        browser.mouse("mouseReleased", *at, button="left", clickCount=1)
+        browser.wait(f"{FACTS}.current && {FACTS}.current.split(',')[0] > 0.1")
+        x, y, z = served.keeper.current
+        assert x > 0.1 and abs(y) < 0.03 and z == 0
+        browser.click("#list li button")
+        browser.wait(f"{FACTS}.robots === '2'")
+        browser.press(" ")
+        browser.wait(f"{FACTS}.paused === 'true'")
+        assert served.keeper.paused
+        browser.click("#reset")
+        browser.wait(f"{FACTS}.robots === '1' && {FACTS}.paused === 'false'")
+        boxes = (
+            "[...document.querySelectorAll('.glass:not([hidden])')]"
+            ".map((e) => e.getBoundingClientRect())"
+            ".filter((b) => b.width > 0).map((b) => [b.left, b.top, b.right, b.bottom])"
+        )
+        for size in ((900, 600), (1280, 760), (390, 760)):
+            browser.resize(*size)
+            panels = np.array(browser.evaluate(boxes))
+            low = np.maximum(panels[:, None, :2], panels[:, :2])
+            high = np.minimum(panels[:, None, 2:], panels[:, 2:])
+            assert ((low < high).all(-1) == np.eye(len(panels), dtype=bool)).all(), size
+        assert browser.errors == []
+        ours = served.origins[0]
+        assert all(
+            address.startswith(ours) for address in browser.requests if "about:" not in address
+        )
+
+
+def _last(server):
+    return server.keeper.inmates[-1].key
