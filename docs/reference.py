@@ -25,7 +25,7 @@ DOCS = ROOT / "docs"
 PACKAGE = "mjx_revolve"
 # The order in which a user meets the pages; those not named here follow.
 FIRST = (
-    "tutorial", "settings", "evolution", "viewer", "replay", "report", "sweeps", "measures",
+    "tutorial", "settings", "evolution", "viewer", "replay", "live", "report", "sweeps", "measures",
     "interchange", "physics", "parallel",
 )  # fmt: skip
 # The package's rooms in reading order: each imports only from itself and from those before it.

@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING
 
 from mjx_revolve.inputs.commands import Parser, read_path, run_command, whole
-from mjx_revolve.inputs.errors import plain
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 
 if TYPE_CHECKING:
@@ -93,13 +93,12 @@ def main(argv: list[str] | None = None) -> int:
         print("open it in a browser on this machine; Ctrl-C ends it", flush=True)
         try:
             _watch(keeper, arguments.mujoco)
-        except KeyboardInterrupt:
-            print("ended")
         finally:
             keeper.stop()
             server.closing.set()
             server.shutdown()
             server.server_close()
+    print("ended")
     return 0
 
 
@@ -123,13 +122,18 @@ def _watch(keeper: Keeper, window: bool) -> None:
             keeper.stop()
         while thread.is_alive():
             time.sleep(0.1)
-    finally:
-        keeper.stop()
-        thread.join(_PATIENCE)
-        if thread.is_alive():
-            # XLA compiles, and cannot be asked to stop; nothing is left that would be lost.
-            print("ended", flush=True)
-            os._exit(0)
+    except KeyboardInterrupt:
+        pass
+    except InputError as error:  # no screen, after all
+        wrong.append(error)
+    keeper.stop()
+    thread.join(_PATIENCE)
+    if thread.is_alive():
+        # XLA compiles, and cannot be asked to stop; nothing is left that would be lost.
+        said, code = (f"error: {wrong[0]}", 2) if wrong else ("ended", 0)
+        print(said, file=sys.stderr if wrong else sys.stdout, flush=True)
+        sys.stderr.flush()
+        os._exit(code)
     if wrong:
         raise wrong[0]
 

@@ -115,7 +115,7 @@ def test_commands_of_the_installed_package(installed, tmp_path):
     code, said = run(tmp_path, command, "dance")
     assert (code, said.count("\n")) == (2, 1)
     assert said.startswith("error: expected one of evolve, sweep, inspect, ")
-    for name in ("replay", "report", "export", "viewer"):
+    for name in ("replay", "report", "export", "viewer", "live"):
         code, said = run(tmp_path, installed / "bin" / "python", "-m", f"mjx_revolve.{name}", "-h")
         assert code == 0 and "usage" in said, said
     assert not list(tmp_path.iterdir())

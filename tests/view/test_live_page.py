@@ -97,7 +97,7 @@ def test_poses_are_those_of_the_tank(entries):
         cast = running.hear("cast", lambda data: len(data) == 2)
         assert [one["name"] for one in cast] == ["spider", "spider #2"]
         assert [one["body"] for one in cast] == [0, 0]
-        data = running.hear("poses")
+        data = running.hear("poses", lambda data: len(data["t"]) == 2)
         time_, poses = np.array(data["t"]), poses_of(data)
         assert np.diff(time_) == pytest.approx(0.05)
         assert poses[0].shape == poses[1].shape == (2, 15)

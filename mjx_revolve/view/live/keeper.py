@@ -91,6 +91,8 @@ class Inmate(NamedTuple):
         place: its place in the tank.
         body: number of its body, see `shoal_data.Bodies`.
         robot: it.
+        born: when it was dropped [s].
+        start: where its core was then, world frame [m].
     """
 
     key: int
@@ -98,6 +100,8 @@ class Inmate(NamedTuple):
     place: int
     body: int
     robot: Robot
+    born: float
+    start: tuple[float, float, float]
 
 
 @dataclass
@@ -136,7 +140,6 @@ class Keeper:
         self._state = _State(current=self.world.current)
         self._busy: float | None = None  # since when a slice is being stepped
         self._stopped = threading.Event()
-        self._poses = ""
         self._count = 0  # of all who were ever dropped
         self._named: dict[str, int] = {}  # of each name
         self._random = np.random.default_rng()
@@ -165,9 +168,11 @@ class Keeper:
         """All that happens from now on, after what there is: events as they are sent; None ends."""
         listener: queue.Queue[str | None] = queue.Queue(_BACKLOG)
         with self._lock:
-            for text in (self._tell_state(), self._tell_cast(), self._poses):
-                if text:
-                    listener.put(text)
+            there = {key: pose[None] for key, pose in dict(self.qpos).items()}
+            listener.put(self._tell_state())
+            listener.put(self._tell_cast())
+            if there:
+                listener.put(_tell_poses([self.time], there))
             self._listeners.append(listener)
             if self._stopped.is_set():
                 listener.put(None)
@@ -287,17 +292,7 @@ class Keeper:
         self.qpos = {key: poses[-1] for key, poses in rows.items()}
         for k, moment in enumerate(times):
             self.recent.append((float(moment), {key: poses[k] for key, poses in rows.items()}))
-        numbers = np.concatenate([x.ravel() for x in rows.values()]) if rows else np.zeros(0, "<f4")
-        self._poses = _event(
-            "poses",
-            {
-                "t": [round(float(t), 4) for t in times],
-                "keys": list(rows),
-                "widths": [x.shape[1] for x in rows.values()],
-                "q": base64.b64encode(numbers.astype("<f4").tobytes()).decode(),
-            },
-        )
-        self._publish(self._poses)
+        self._publish(_tell_poses(times, rows))
         if waited:
             self._publish(self._tell_state())
 
@@ -354,8 +349,9 @@ class Keeper:
         pose = np.zeros(7 + robot.num_hinges, "<f4")
         pose[:7] = x, y, z, *turned
         self.qpos[key] = pose
-        self.inmates = (*self.inmates, Inmate(key, name, place, body, robot))
+        self.inmates = (*self.inmates, Inmate(key, name, place, body, robot, self.time, (x, y, z)))
         self._publish(self._tell_cast())
+        self._publish(_tell_poses([self.time], {key: pose[None]}))
         return key
 
     def _remove(self, one: Inmate) -> None:
@@ -411,8 +407,31 @@ class Keeper:
     def _tell_cast(self) -> str:
         return _event(
             "cast",
-            [{"key": one.key, "name": one.name, "body": one.body} for one in self.inmates],
+            [
+                {
+                    "key": one.key,
+                    "name": one.name,
+                    "body": one.body,
+                    "born": round(one.born, 3),
+                    "start": [round(x, 4) for x in one.start],
+                }
+                for one in self.inmates
+            ],
         )
+
+
+def _tell_poses(times: Any, rows: dict[int, np.ndarray]) -> str:
+    """Poses `[T, width]` by key, at times `[T]` [s]."""
+    numbers = np.concatenate([x.ravel() for x in rows.values()]) if rows else np.zeros(0)
+    return _event(
+        "poses",
+        {
+            "t": [round(float(t), 4) for t in times],
+            "keys": list(rows),
+            "widths": [x.shape[1] for x in rows.values()],
+            "q": base64.b64encode(numbers.astype("<f4").tobytes()).decode(),
+        },
+    )
 
 
 def _event(name: str, data: Any) -> str:

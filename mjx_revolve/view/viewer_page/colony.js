@@ -250,7 +250,7 @@ async function start() {
     for (const p of there) low.min(p), high.max(p);
     target.copy(low).add(high).multiplyScalar(0.5);
     const wide = Math.max(high.distanceTo(low), 2 * size) / size;
-    stage.look({ azimuth: 118, elevation: 34, distance: Math.max(0.4 * wide, 1.6) }, 90);
+    stage.look({ azimuth: 118, elevation: 34, distance: Math.max(0.47 * wide, 1.6) }, 90);
   }
   byId("all").addEventListener("click", all);
   for (const button of document.querySelectorAll("[data-view]")) {

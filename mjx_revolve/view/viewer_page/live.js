@@ -112,8 +112,10 @@ function start() {
     const body = await bodyOf(one.body);
     if (shoal.there.has(one.key) || !cast.some(({ key }) => key === one.key)) return;
     const swimmer = shoal.add(one.key, body, one.name, chipOf(one.key));
-    Object.assign(swimmer, { times: [], poses: [], born: null, way: [], from: null });
+    Object.assign(swimmer, { times: [], poses: [], born: one.born, way: [], from: one.start });
     swimmer.group.visible = false;
+    if (early.has(one.key)) take(swimmer, ...early.get(one.key));
+    early.delete(one.key);
     if (state.wanted === one.key) {
       follow(one.key);
       state.wanted = null;
@@ -122,20 +124,27 @@ function start() {
     draw();
   }
 
+  const early = new Map(); // the last pose of who is still being drawn up: [time, pose]
+
+  function take(swimmer, time, pose) {
+    const { times, poses } = swimmer;
+    if (times.length && time <= times[times.length - 1]) return;
+    times.push(time);
+    poses.push(pose);
+  }
+
   on("poses", (now) => {
     const numbers = new Float32Array(bytesOf(now.q)), count = now.t.length;
     let at = 0;
     now.keys.forEach((key, k) => {
       const width = now.widths[k], swimmer = shoal.there.get(key);
       for (let row = 0; row < count; row++, at += width) {
-        if (!swimmer) continue;
-        swimmer.times.push(now.t[row]);
-        swimmer.poses.push(numbers.subarray(at, at + width));
+        const pose = numbers.subarray(at, at + width);
+        if (swimmer) take(swimmer, now.t[row], pose);
+        else early.set(key, [now.t[row], pose]);
       }
       if (!swimmer) return;
       const last = swimmer.poses[swimmer.poses.length - 1];
-      swimmer.from ??= swimmer.poses[0].slice(0, 3);
-      swimmer.born ??= swimmer.times[0];
       const way = swimmer.way, t = now.t[count - 1];
       if (!way.length || t - way[way.length - 1][0] >= 0.25) way.push([t, last[0], last[1], last[2]]);
       if (way.length > 480) way.shift();
