@@ -76,7 +76,7 @@ def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
         "speed": pack_floats(speed_over(time, qpos[:, :3], period)),
         "drift": pack_floats(water_drift(robot, now, center, step)),
         "current": _current(water_velocity(robot, now, center)),
-        "target": None if target is None else _f32(target[rows]),
+        "target": None if target is None else pack_floats(target[rows]),
         "robot": {
             "bodies": poses.position.shape[1] - 1,
             **pack_pieces(robot),
