@@ -26,6 +26,11 @@ class Settings(BaseModel):
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
     )
 
+    def __repr_args__(self) -> Any:
+        """What is not as usual."""
+        usual = {name: field.default for name, field in type(self).model_fields.items()}
+        return [(k, v) for k, v in super().__repr_args__() if k not in usual or usual[k] != v]
+
 
 class Section(Settings):
     """A section whose `type` names one of ours, or a function in a file of the user's own."""
