@@ -1,7 +1,8 @@
 """Who lived in a run in which bodies evolved: its logs, read back as far as they are whole.
 
 `individuals.jsonl` has a line for each individual ever born, `generations.jsonl` one for each
-generation. What writes them is in `evolution/`.
+generation, and in a colony `events.jsonl` one for each birth, mating and death. What writes them is
+in `evolution/`.
 """
 
 from __future__ import annotations
@@ -80,6 +81,29 @@ class Life:
             raise InputError(f"individual {self.number}: {error}") from None
 
 
+@dataclass(frozen=True, eq=False)
+class Event:
+    """What happened in a colony.
+
+    Attributes:
+        time: when [s].
+        kind: "birth", "mating" or "death".
+        number: of the individual to whom it happened.
+        place: `[3]` where, world frame [m]; NaN where that is not known.
+        other: of a mating, the number of the second one.
+        cause: of a death, what of; else "".
+        parents: of a birth.
+    """
+
+    time: float
+    kind: str
+    number: int
+    place: np.ndarray = field(repr=False)
+    other: int | None = None
+    cause: str = ""
+    parents: tuple[int, ...] = ()
+
+
 def read_lives(folder: Path) -> tuple[dict[int, Life], list[str]]:
     """Everybody who was born in a run.
 
@@ -147,6 +171,27 @@ def read_generations(folder: Path) -> tuple[dict[int, tuple[int, ...]], list[str
     return dict(sorted(found.items())), _complain(GENERATIONS, bad)
 
 
+def read_events(folder: Path) -> tuple[list[Event], list[str]]:
+    """What happened in a colony.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        The events in the order of time, and a line about each thing that is wrong.
+    """
+    found: list[Event] = []
+    bad = 0
+    for text in _lines(folder / EVENTS):
+        event = _read_event(text)
+        if event is None:
+            bad += 1
+        else:
+            found.append(event)
+    # Within an interval they are as they were written.
+    return sorted(found, key=lambda event: event.time), _complain(EVENTS, bad)
+
+
 def _lines(path: Path) -> Iterator[bytes]:
     """All lines that have an end; a last one without is being written, or was cut there."""
     if path.is_file():
@@ -172,6 +217,26 @@ def _read_life(text: bytes) -> Life | None:
             return None
         origin = str(line["origin"])
         return Life(number, tuple(parents), born, origin, float(score), figures, text)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        return None
+
+
+def _read_event(text: bytes) -> Event | None:
+    """An event from its line; None where that is damaged."""
+    try:
+        line = json.loads(text)
+        time, kind, number, place = line["time"], line["event"], line["id"], line["place"]
+        other = line["other"] if kind == "mating" else None
+        cause = line["cause"] if kind == "death" else ""
+        parents = tuple(line["parents"]) if kind == "birth" else ()
+        wrong = kind not in ("birth", "mating", "death") or not isinstance(cause, str)
+        wrong |= not _is_number(time) or time < 0 or len(place) != 3
+        wrong |= not all(_is_number(x) for x in place if x is not None)
+        numbers = (number, *parents, *(() if other is None else (other,)))
+        if wrong or not all(map(_is_whole, numbers)) or any(p >= number for p in parents):
+            return None
+        where = np.array([math.nan if x is None else x for x in place], float)
+        return Event(float(time), kind, number, where, other, cause, parents)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         return None
 

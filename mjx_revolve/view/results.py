@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.fitness import read_modules
@@ -12,6 +13,9 @@ from mjx_revolve.evolution.loop import Champion
 from mjx_revolve.evolution.start import Start
 from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.view import plots
+from mjx_revolve.view.colony_curves import plot_colony, plot_population
+from mjx_revolve.view.colony_history import read_history
+from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives
 from mjx_revolve.view.motion import counted_time
 from mjx_revolve.view.surroundings import target_at_last
 from mjx_revolve.view.swim_picture import plot_swim
@@ -41,7 +45,11 @@ def save_pictures(start: Start, champion: Champion) -> None:
         fitness = fitness.single(champion.body)
     title = f"{run.folder.name}: {describe_score(champion, config)}"
     label = f"fitness ({unit})" if unit else "fitness"
-    figures = {"fitness.png": plots.plot_fitness(run.load_metrics(), title, label)}
+    if config.colony is None:
+        figures = {"fitness.png": plots.plot_fitness(run.load_metrics(), title, label)}
+    else:
+        title = f"{run.folder.name}: the champion swims {describe_score(champion, config)}"
+        figures = _draw_colony(start, champion)
     if config.bodies is not None:
         figures["bodies.png"] = plot_best(run.folder, read_modules(config), title)
     if hasattr(fitness, "replay"):
@@ -60,3 +68,19 @@ def save_pictures(start: Start, champion: Champion) -> None:
             figures["swim.png"] = plot_swim(robot, trajectory, counted, water, target)
     for name, figure in figures.items():
         run.write(name, plots.figure_png(figure))
+
+
+def _draw_colony(start: Start, champion: Champion) -> dict[str, Figure]:
+    """Pictures of a colony by the names of their files."""
+    run, config = start.run, start.config
+    assert config.colony is not None
+    metrics = run.load_metrics()
+    history, _ = read_history(run.folder, float(metrics["time"][-1]))
+    title = f"{run.folder.name}: {len(history.spans)} robots lived"
+    return {
+        "fitness.png": plot_colony(metrics, title),
+        "population.png": plot_population(history, config.evolution.population_size, title),
+        "lives.png": plot_lives(history, title),
+        "families.png": plot_families(history, champion.individual, title),
+        "arena.png": plot_arena(history, config.colony, title),
+    }
