@@ -97,7 +97,7 @@ def show_population(record: RunRecord, at: Path) -> dict[str, Any]:
             {"card": make(kin.life), "mate": kin.mate and make(kin.mate), "skipped": kin.skipped}
             for kin in family
         ],
-        "sizes": _draw(plot_sizes(population, _named(record)), figure_svg),
+        "sizes": _draw(plot_sizes(population, _named(record), record.round), figure_svg),
         "archive": None if archive is None else _draw_archive(record, archive, elites, at),
         "elites": [make(life) for life in elites],
     }
@@ -134,7 +134,7 @@ def _make_cards(record: RunRecord, lives: Iterable[Life], at: Path) -> Callable[
             pictures.get(life.number),
             format_number(life.score),
             count_modules(life),
-            f"generation {life.born}, {life.origin}",
+            f"{record.round} {life.born}, {life.origin}",
             life.parents,
             _page(record, life, at),
         )

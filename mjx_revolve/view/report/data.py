@@ -21,17 +21,18 @@ from pydantic import BaseModel
 import mjx_revolve
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import Config, make_config
-from mjx_revolve.episodes.lives import GENERATIONS, INDIVIDUALS
+from mjx_revolve.episodes.lives import EVENTS, GENERATIONS, INDIVIDUALS
 from mjx_revolve.evolution.checkpoints import DamageError, read_checkpoint
 from mjx_revolve.evolution.runs import Run
 from mjx_revolve.inputs.errors import InputError, load_yaml, reading
 from mjx_revolve.inputs.files import resolve_inside
+from mjx_revolve.view.colony_history import read_history
 from mjx_revolve.view.population import read_population
 from mjx_revolve.view.report.record import Problem, RunRecord
 
 # Read one way or another, and shown; none of them may be a link to a file elsewhere.
 _FILES = ("config.yaml", "run.json", "metrics.csv", "champion/genes.yaml",
-          "champion/morphology.yaml", INDIVIDUALS, GENERATIONS)  # fmt: skip
+          "champion/morphology.yaml", INDIVIDUALS, GENERATIONS, EVENTS)  # fmt: skip
 # Whose version decides what a replay gives.
 _PACKAGES = ("mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax")
 
@@ -235,6 +236,12 @@ def _read_population(record: RunRecord) -> None:
     record.population, problems = read_population(record.folder)
     for problem in problems:
         record.note("damaged", problem)
+    if record.settings.get("colony") or (record.folder / EVENTS).is_file():
+        time = record.metrics.get("time", np.zeros(0))
+        until = time[np.isfinite(time)].max(initial=0.0)
+        record.history, problems = read_history(record.folder, float(until))
+        for problem in problems:
+            record.note("damaged", problem)
     if not record.population.lives:
         record.note("missing", f"{INDIVIDUALS} has nobody: neither bodies nor families")
 
@@ -315,7 +322,7 @@ def _check_end(record: RunRecord) -> None:
     if record.info and "finished" not in record.info:
         done = f"{max(record.generations, newest)}"
         done += f" of {planned}" if isinstance(planned, int) else ""
-        record.note("unfinished", f"stopped or still running after {done} generations: its "
+        record.note("unfinished", f"stopped or still running after {done} {record.round}s: its "
                     "champion is not judged on fresh starts")  # fmt: skip
 
 

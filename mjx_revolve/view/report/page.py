@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import datetime
 import io
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,8 +29,11 @@ from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.evolution.fingerprints import model_hash
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.trust import UntrustedError
+from mjx_revolve.view.colony_curves import plot_colony, plot_population
+from mjx_revolve.view.colony_history import History
+from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives
 from mjx_revolve.view.motion import Motion
-from mjx_revolve.view.plots import COLORS, figure_svg, plot_fitness, plot_way
+from mjx_revolve.view.plots import COLORS, figure_png, figure_svg, plot_fitness, plot_way
 from mjx_revolve.view.report import champion_pictures, run_pictures, tables
 from mjx_revolve.view.report.bodies import anchor, inline_svg, show_population, viewer_command
 from mjx_revolve.view.report.champion import Replay, replay_champion
@@ -86,6 +90,7 @@ def make_report(
     if single:
         robot = f"{robots[0][1].name}: " if robots else ""
         robot = robot if first.population is None else "evolved bodies: "
+        robot = robot if first.history is None else "a colony, its champion's "
         title = f"{robot}{first.task.replace('_', ' ') or 'evolution'} ({Path(first.label).name})"
     else:
         title = f"{len(records)} runs"
@@ -93,6 +98,7 @@ def make_report(
     content = [
         ("results", "Results", _results(groups)),
         ("convergence", "Convergence", _convergence(groups)),
+        *_colonies(groups, every_champion),
         *_populations(groups, every_champion, Path(at)),
         ("champions", "Champions side by side", _side_by_side(groups, replays)),
         *_champions(groups, replays, every_champion),
@@ -163,6 +169,38 @@ def _heading(word: str, groups: Sequence[Group], k: int, record: RunRecord, best
 # --- who lived ------------------------------------------------------------------------------------
 
 
+def _colonies(groups: Sequence[Group], every: bool) -> list[tuple[str, str, str]]:
+    """A section about each colony that is shown in full: who lived when, of whom, and where."""
+    found = []
+    for k, group in enumerate(groups):
+        best = group.best()
+        for record in group.records:
+            if record.history is None or not (record is best or every):
+                continue
+            heading = _heading("The colony", groups, k, record, best)
+            found.append((f"colony-{k}-{record.seed}", heading, _colony(record, record.history)))
+    return found
+
+
+def _colony(record: RunRecord, history: History) -> str:
+    """All about one colony."""
+    if not history.spans:
+        return ""
+    colony = None if record.config is None else record.config.colony
+    room = record.setting("evolution.population_size")
+    pictures = {
+        "population": plot_population(history, room if isinstance(room, int) else None),
+        "lives": plot_lives(history),
+        "families": plot_families(history, record.individual),
+        "arena": None if colony is None else plot_arena(history, colony),
+    }
+    # Thousands of lines and dots take less room as points of a picture.
+    sources = {name: figure and _source(figure_png(figure), "png")
+               for name, figure in pictures.items()}  # fmt: skip
+    command = shlex.join(["python", "-m", "mjx_revolve.viewer", record.label, "--colony"])
+    return sections.colony(tables.colony_table(history), sources, command)
+
+
 def _populations(groups: Sequence[Group], every: bool, at: Path) -> list[tuple[str, str, str]]:
     """A section about the bodies of each run that is shown in full."""
     found = []
@@ -173,7 +211,7 @@ def _populations(groups: Sequence[Group], every: bool, at: Path) -> list[tuple[s
                 continue
             shown = show_population(record, at)
             content = sections.population(
-                shown, partial(anchor, record), partial(viewer_command, record)
+                shown, partial(anchor, record), partial(viewer_command, record), record.round
             )
             heading = _heading("Bodies", groups, k, record, best)
             found.append((f"bodies-{k}-{record.seed}", heading, content))
@@ -339,7 +377,7 @@ def _convergence(groups: Sequence[Group]) -> str:
     entries = []
     for group in shown:
         record, several = group.shown[0], len(group.shown) > 1
-        label = f"fitness ({record.unit})" if record.unit else "fitness"
+        label = record.fitness
         quartiles = "lower_quartile" in record.metrics
         entries.append({
             "name": group.name,
@@ -349,9 +387,18 @@ def _convergence(groups: Sequence[Group]) -> str:
             else "how full the archive is, or how large the living are",
             "band": "quartiles" if quartiles else "mean and standard deviation",
             "seeds": svg_source(run_pictures.plot_seeds(group)) if several else None,
-            "fitness": None if several else svg_source(plot_fitness(record.metrics, "", label)),
+            "fitness": None if several else svg_source(_plot_fitness(record, label)),
+            "colony": record.history is not None,
         })  # fmt: skip
     return sections.convergence(comparisons, entries)
+
+
+def _plot_fitness(record: RunRecord, label: str) -> Figure:
+    """One run's fitness: over generations, or over a colony's time."""
+    needed = ("time", "best", "median", "lower_quartile", "upper_quartile", "champion")
+    if record.history is not None and all(name in record.metrics for name in needed):
+        return plot_colony(record.metrics)
+    return plot_fitness(record.metrics, "", label)
 
 
 def _side_by_side(groups: Sequence[Group], replays: Mapping[Path, Replay]) -> str:

@@ -16,6 +16,8 @@ from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.own_code import content_name
 from mjx_revolve.inputs.trust import UntrustedError
+from mjx_revolve.view.colony_curves import LABEL
+from mjx_revolve.view.colony_history import History
 from mjx_revolve.view.population import Population
 
 # Kinds of problems, gravest first, and what they make of the run.
@@ -56,6 +58,7 @@ class RunRecord:
         metrics: columns of `metrics.csv`, `[T]` each, one row per generation; empty without any.
         genes: `[G]` of the champion; None without one.
         population: all who lived, where bodies have evolved; else None.
+        history: when and where they lived, in a colony; else None.
         champion: facts about it: score, score_std, origin, final, measures, individual.
         stand_in: where the genes are from, if they are not the champion's own.
         problems: what is missing, damaged or otherwise to be known.
@@ -69,6 +72,7 @@ class RunRecord:
     metrics: dict[str, np.ndarray] = field(default_factory=dict)
     genes: np.ndarray | None = None
     population: Population | None = None
+    history: History | None = None
     champion: dict[str, Any] = field(default_factory=dict)
     stand_in: str = ""
     problems: list[Problem] = field(default_factory=list)
@@ -116,6 +120,18 @@ class RunRecord:
     def _task_type(self) -> str:
         task = self.setting("task.type", "")
         return task if isinstance(task, str) else ""
+
+    @property
+    def fitness(self) -> str:
+        """What evolution goes by, with its unit: in a colony not what its champion's score is."""
+        if self.history is not None:
+            return LABEL
+        return f"fitness ({self.unit})" if self.unit else "fitness"
+
+    @property
+    def round(self) -> str:
+        """What its generations are called, one of them."""
+        return "generation" if self.history is None else "interval"
 
     @property
     def generations(self) -> int:

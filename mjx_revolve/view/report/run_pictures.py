@@ -75,8 +75,8 @@ def plot_seeds(group: Group) -> Figure:
             axes.plot(x, median, color=_BLUE, linewidth=1.8, label="median")
             axes.plot(x, best, color=_ORANGE, linewidth=1.3, label="best")
             axes.plot([], [], color=_PALE, linewidth=0.9, label="each run")
-        axes.set_xlabel("generation")
-        axes.set_ylabel(f"fitness ({group.unit})" if group.unit else "fitness")
+        axes.set_xlabel(group.shown[0].round)
+        axes.set_ylabel(group.shown[0].fitness)
         head(axes, f"{words}, over {len(group.shown)} seeds")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10], nbins=6))
         dress(axes)
@@ -131,9 +131,12 @@ def plot_comparison(groups: Sequence[Group], styles: Mapping[str, int]) -> Figur
     else:
         left.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10], nbins=7))
     left.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-    left.set_xlabel(over if over == "generation" else "evaluated individuals")
+    left.set_xlabel(
+        shown[0].shown[0].round if over == "generation" and shown else "evaluated individuals"
+    )
     unit = shown[0].unit if shown else ""
-    left.set_ylabel(f"best fitness so far ({unit})" if unit else "best fitness so far")
+    what = shown[0].shown[0].fitness if shown else "fitness"
+    left.set_ylabel(f"best {what.replace('fitness', 'fitness so far', 1)}")
     head(left, "mean over seeds and 95 % confidence band")
     dress(left)
     limit_to_most(left, core, core)

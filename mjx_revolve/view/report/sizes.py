@@ -21,12 +21,15 @@ _FIRST = (
 _BLUE, _ORANGE = COLORS[:2]
 
 
-def plot_sizes(population: Population, named: Sequence[str] = ()) -> Figure | None:
+def plot_sizes(
+    population: Population, named: Sequence[str] = (), over: str = "generation"
+) -> Figure | None:
     """Draws how bodies changed over the generations.
 
     Args:
         population: of a run.
         named: figures that are shown in any case.
+        over: what the generations are called.
 
     Returns:
         The figure, None where there is nothing to draw: of those who were alive after each
@@ -68,7 +71,7 @@ def plot_sizes(population: Population, named: Sequence[str] = ()) -> Figure | No
     for k, axes in enumerate(figure.axes):
         if k + columns >= len(shown):  # nothing below it
             axes.tick_params(labelbottom=True)
-            axes.set_xlabel("generation", fontsize=9)
+            axes.set_xlabel(over, fontsize=9)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", fontsize=8.5, ncols=3, frameon=False)
     return figure

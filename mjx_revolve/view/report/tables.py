@@ -11,6 +11,8 @@ import numpy as np
 from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
+from mjx_revolve.view.colony_curves import death_looks
+from mjx_revolve.view.colony_history import History
 from mjx_revolve.view.plots import LABELS
 from mjx_revolve.view.report.champion import Replay
 from mjx_revolve.view.report.groups import (
@@ -84,18 +86,46 @@ def headline(groups: Sequence[Group]) -> list[tuple[str, str]]:
             pairs.append((_score(record), f"score{unit}, {starts}"))
         elif "champion" in record.metrics:
             best = format_number(float(record.metrics["champion"][-1]))
-            pairs.append((best, f"best so far{unit}"))
+            own = unit if record.history is None else ", fitness in the colony"
+            pairs.append((best, f"best so far{own}"))
         known = [name for name in ("speed_m_s", "cost_of_transport") if _measure(record, name)]
         pairs += [(format_number(_measure(record, name)), _label(name)) for name in known]
-        pairs.append((str(record.generations), "generations"))
+        pairs.append((str(record.generations), f"{record.round}s"))
         pairs.append(("1", "seed"))
     for name, words, scale in (
-        ("evaluations", "evaluated individuals", 1), ("seconds", "minutes of evolution", 60)
+        ("evaluations", _counted(group), 1), ("seconds", "minutes of evolution", 60)
     ):  # fmt: skip
         totals = [r.metrics[name][-1] / scale for r in group.shown if name in r.metrics]
         if totals:
             pairs.append((f"{sum(totals):,.{0 if sum(totals) >= 10 else 1}f}", words))
     return pairs
+
+
+def _counted(group: Group) -> str:
+    """What the evaluations of a group's runs are."""
+    colonies = all(record.history is not None for record in group.records)
+    return "robots lived" if colonies else "evaluated individuals"
+
+
+def colony_table(history: History) -> list[tuple[str, str]]:
+    """What became of a colony in numbers: rows of words and a value."""
+    births, deaths = history.of_kind("birth"), history.of_kind("death")
+    strangers = sum(not event.parents for event in births)
+    ages = [span.age for span in history.spans.values() if span.cause]
+    now = int(history.count_living(np.array([history.end]))[0])
+    causes = Counter(event.cause for event in deaths)
+    died = {words: causes[name] for name, (_, words) in death_looks(causes).items()}
+    alive = {s.founder for s in history.spans.values() if not s.cause}
+    rows = [
+        ("time that it has lived", f"{history.end:,.0f} s"),
+        ("born", f"{len(births)}, {strangers} of them without parents"),
+        ("matings", str(len(history.of_kind("mating")))),
+        ("dead", ", ".join([str(len(deaths)), *(f"{n} {words}" for words, n in died.items())])),
+        ("alive in the end", f"{now}, of {len(alive)} families"),
+    ]
+    if ages:
+        rows.append(("age of the dead, median", f"{format_number(float(np.median(ages)))} s"))
+    return rows
 
 
 def task_tables(groups: Sequence[Group]) -> list[dict[str, Any]]:
