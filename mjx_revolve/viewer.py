@@ -1,10 +1,12 @@
 """Command line: one HTML file that replays an episode in any browser.
 
-``python -m mjx_revolve.viewer runs/mine``
+``python -m mjx_revolve.viewer runs/mine``, and of a run in which a colony lives, all of it:
+``python -m mjx_revolve.viewer runs/mine --colony``
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from pathlib import Path
@@ -15,7 +17,9 @@ from mjx_revolve.inputs.commands import (
     check_episode_path,
     check_place,
     individual_name,
+    opening_episode,
     read_path,
+    read_seconds,
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
@@ -45,13 +49,29 @@ def main(argv: list[str] | None = None) -> int:
         "--out",
         type=read_path,
         metavar="FILE.html",
-        help="default: viewer.html in the run folder (of an individual, individuals/N.html there), "
-        "or the morphology's name in the current folder",
+        help="default: viewer.html in the run folder (of an individual, individuals/N.html there; "
+        "with --colony, colony.html), or the morphology's name in the current folder",
+    )
+    parser.add_argument(
+        "--colony",
+        action="store_true",
+        help="a run's whole colony, which lives on for --duration (default: 60 s) from its newest "
+        "checkpoint",
+    )
+    parser.add_argument(
+        "--time",
+        type=read_seconds,
+        metavar="S",
+        help="with --colony: from this time of its life on [s]",
     )
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_place(check_name(arguments.out, PAGES), arguments.out)
     check_episode_path(arguments.path)
+    if arguments.colony:
+        return _write_colony(arguments)
+    if arguments.time is not None:
+        raise InputError("--time: expected --colony with it; found none")
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.numerics.runtime import prepare_process
@@ -64,6 +84,28 @@ def main(argv: list[str] | None = None) -> int:
     size = Path(out).stat().st_size / 1e6
     length = f"{episode.trajectory.time[-1]:.4g} s"
     print(plain(f"{out}: {length}, {size:.2f} MB; open it in a browser"))
+    return 0
+
+
+def _write_colony(arguments: argparse.Namespace) -> int:
+    """Writes the page of a whole colony."""
+    for name in ("individual", "seed", "world", "modules"):
+        if getattr(arguments, name) is not None:
+            raise InputError(f"--{name}: expected none with --colony; found one")
+    folder = Path(arguments.path)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected the run folder of a colony; found a file")
+    out = Path(arguments.out) if arguments.out else _usual_path(folder, "colony", "colony")
+    from mjx_revolve.numerics.runtime import prepare_process
+    from mjx_revolve.view.colony_replay import DURATION, write_colony_replay
+
+    prepare_process()
+    with opening_episode(arguments):
+        written, begin, end, count = write_colony_replay(
+            folder, out, arguments.time, arguments.duration or DURATION
+        )
+    span = f"{count} robots, {begin:.4g} to {end:.4g} s"
+    print(plain(f"{out}: {span}, {written.bytes / 1e6:.2f} MB; open it in a browser"))
     return 0
 
 

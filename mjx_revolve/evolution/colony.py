@@ -206,7 +206,11 @@ def robots_in(fitness: BodyFitness, search: Colony) -> dict[int, Robot]:
 
 
 class _Commune:
-    """A colony and its tank."""
+    """A colony and its tank.
+
+    Whoever watches sets `finer`, how many rows trails have from look to look, and finds in `seen`
+    who lived through the last interval, and its trail.
+    """
 
     def __init__(self, config: Config, fitness: BodyFitness) -> None:
         assert config.colony is not None
@@ -219,6 +223,8 @@ class _Commune:
         self.looks = max(1, round(self.colony.interval / self.look))
         self.interval = self.looks * self.look
         self.kept = 1 + max(1, round(self.colony.life.window / self.look))
+        self.finer = 1
+        self.seen: tuple[Mapping[int, Citizen], Trail] | None = None
 
     def load(self, search: Colony) -> None:
         """Fills the tank as it was."""
@@ -236,7 +242,9 @@ class _Commune:
         if not search.generation:
             search = self._found(search, rng)
         self._point_out(search.citizens)
-        trail = self.tank.advance(self.interval, self.look)
+        trail = self.tank.advance(self.interval, self.look / self.finer)
+        self.seen = search.citizens, trail
+        trail = _every(trail, self.finer)
         now = self.tank.time
         citizens = {
             number: self._age(citizen, trail) for number, citizen in search.citizens.items()
@@ -603,6 +611,15 @@ def best_of(individuals: Sequence[Individual]) -> tuple[Individual, ...]:
     scores = np.array([[i.score] for i in rows]).reshape(-1, 1)
     numbers = np.array([i.number for i in rows], int)
     return tuple(rows[k] for k in order(scores, numbers)[:NUM_ELITES])
+
+
+def _every(trail: Trail, stride: int) -> Trail:
+    """A trail of every so many of its rows, with all of its energy."""
+    if stride == 1:
+        return trail
+    energy = trail.energy.reshape(-1, stride, trail.energy.shape[1]).sum(1)
+    k = slice(stride - 1, None, stride)
+    return trail._replace(time=trail.time[k], qpos=trail.qpos[k], energy=energy)
 
 
 def _reach(robot: Robot) -> float:

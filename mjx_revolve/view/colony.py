@@ -95,6 +95,7 @@ def write_colony_page(
     title: str,
     *,
     marks: Sequence[Mark] = (),
+    leap: float | None = None,
     window: tuple[float, float] | None = None,
     most: int = _MOST,
 ) -> Written:
@@ -107,6 +108,8 @@ def write_colony_page(
         path: of the file, which ends in `.html`; its folder is made if need be.
         title: its heading.
         marks: places to show.
+        leap: who is farther than this from its pose before has been put there, and is not seen on
+            the way [m]; None: nobody is.
         window: from when to when no pose is left out, however large that makes the page [s].
         most: about how large the page may be [bytes]; where there are too many poses for that,
             each robot keeps those that are some time apart.
@@ -124,7 +127,7 @@ def write_colony_page(
         raise InputError("actors: expected at least one robot to show; found none")
     for actor in actors:
         _check(actor)
-    data = _scene(actors, marks)
+    data = _scene(actors, marks) | {"leap": leap}
     bare = len(fill_page("colony.html", title=title, subtitle="", data=data).encode())
     poses, gap, packed = _fit(actors, window, max(most - bare, most // 50))
     data |= packed

@@ -67,13 +67,20 @@ async function start() {
     return (track.row = low);
   }
 
+  // Whether somebody was put elsewhere between a row and the next, as beyond the edge of an arena.
+  function leaps(v, a, width) {
+    const far = (k) => v[a + width + k] - v[a + k];
+    return data.leap !== null && Math.hypot(far(0), far(1), far(2)) > data.leap;
+  }
+
   // Between poses places go along a curve, as what swims does; all else goes straight.
   function poseAt(track, time) {
     const { time: t, values: v, width } = track, i = rowAt(track, time);
     if (i + 1 >= t.length || time <= t[i]) return mixPoses(v, i * width, v, i * width, 0, width, pose);
     const span = t[i + 1] - t[i], share = (time - t[i]) / span, a = i * width, b = a + width;
+    if (leaps(v, a, width)) return mixPoses(v, a, v, a, 0, width, pose);
     mixPoses(v, a, v, b, share, width, pose);
-    if (i > 0 && i + 2 < t.length) {
+    if (i > 0 && i + 2 < t.length && !leaps(v, a - width, width) && !leaps(v, b, width)) {
       const s2 = share * share, s3 = s2 * share;
       const before = span / (t[i + 1] - t[i - 1]), after = span / (t[i + 2] - t[i]);
       for (let k = 0; k < 3; k++) {

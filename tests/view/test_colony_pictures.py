@@ -1,0 +1,229 @@
+"""What is shown of a colony: its history from logs, pictures, report, and the page of a replay."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from matplotlib.collections import LineCollection
+
+from laboratory import QUICK
+from mjx_revolve import report, viewer
+from mjx_revolve.episodes.colony_config import ColonyConfig, EnergyConfig
+from mjx_revolve.episodes.lives import Event, read_events
+from mjx_revolve.evolution.colony_watch import open_colony, watch_colony
+from mjx_revolve.evolve import main
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.colony_curves import plot_colony, plot_population, scale_time
+from mjx_revolve.view.colony_history import put_together
+from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives
+from mjx_revolve.view.plots import figure_png
+from mjx_revolve.view.report.data import read_run
+
+NOWHERE = np.zeros(3)
+# Two founders; 2 and 3 are of the first one's family, 4 is a stranger. 0 and 3 die.
+EVENTS = [
+    Event(0.0, "birth", 0, np.array([1.0, 0, -1])),
+    Event(0.0, "birth", 1, NOWHERE),
+    Event(10.0, "mating", 0, NOWHERE, other=1),
+    Event(20.0, "birth", 2, NOWHERE, parents=(0, 1)),
+    Event(30.0, "death", 0, NOWHERE, cause="age"),
+    Event(40.0, "birth", 3, NOWHERE, parents=(2, 1)),
+    Event(40.0, "birth", 4, NOWHERE),
+    Event(50.0, "death", 3, np.full(3, np.nan), cause="a new one"),
+]
+
+
+@pytest.fixture
+def history():
+    return put_together(EVENTS, {0: 0.1, 2: 0.3}, 60.0)
+
+
+# --- logs ---
+
+
+def test_events_are_read_back(tmp_path):
+    """Damaged lines are left out and counted; one that is being written is no damage."""
+    good = [
+        {
+            "time": 0.0,
+            "event": "birth",
+            "id": 0,
+            "place": [1, 2, None],
+            "parents": [],
+            "origin": "",
+        },
+        {"time": 2.0, "event": "mating", "id": 0, "place": [1, 2, -1], "other": 1},
+        {"time": 1.0, "event": "death", "id": 0, "place": [1, 2, -1], "cause": "age", "age": 1.0},
+    ]
+    bad = [
+        "{", "[]", "\\x00", json.dumps(good[0] | {"id": -1}),
+        json.dumps(good[0] | {"parents": [3]}),
+        json.dumps(good[0] | {"place": [1, 2]}), json.dumps(good[0] | {"place": [1, 2, 1e999]}),
+        json.dumps(good[0] | {"time": None}), json.dumps(good[0] | {"event": "feast"}),
+        json.dumps(good[1] | {"other": "one"}), json.dumps(good[2] | {"cause": 3}),
+    ]  # fmt: skip
+    lines = [*map(json.dumps, good), *bad]
+    (tmp_path / "events.jsonl").write_text("".join(f"{x}\n" for x in lines) + lines[0])
+    events, problems = read_events(tmp_path)
+    assert [(e.time, e.kind) for e in events] == [(0, "birth"), (1, "death"), (2, "mating")]
+    assert events[1].cause == "age" and events[2].other == 1 and np.isnan(events[0].place[2])
+    assert problems == [f"events.jsonl: {len(bad)} lines are damaged and left out"]
+    assert read_events(tmp_path / "none") == ([], [])
+
+
+def test_history_by_hand(history):
+    ends = {n: (s.founder, s.born, s.end, s.cause) for n, s in history.spans.items()}
+    assert ends == {
+        0: (0, 0, 30, "age"), 1: (1, 0, 60, ""), 2: (0, 20, 60, ""), 3: (0, 40, 50, "a new one"),
+        4: (4, 40, 60, ""),
+    }  # fmt: skip
+    # Whose birth and death it is at that moment: the one counts, the other no more.
+    times = np.array([0.0, 20.0, 30.0, 40.0, 50.0, 60.0])
+    assert history.count_living(times).tolist() == [2, 3, 2, 4, 3, 3]
+    assert history.count_living(times, 0).tolist() == [1, 2, 1, 2, 1, 1]
+    assert history.families == [0, 1, 4]  # 80, 60 and 20 s together
+    assert history.line(3) == [0, 2, 3] and history.children[0] == [2]
+    assert history.spans[2].score == 0.3 and np.isnan(history.spans[1].score)
+
+
+# --- pictures ---
+
+
+def test_time_axes_have_units_that_suit():
+    assert [scale_time(x) for x in (100.0, 7200.0, 20000.0)] == [
+        (1.0, "time (s)"), (60.0, "time (min)"), (3600.0, "time (h)")
+    ]  # fmt: skip
+
+
+def test_births_and_deaths_add_up(history):
+    """Bars upwards are the births, those downwards the deaths."""
+    top, low = plot_population(history, 8).axes
+    bars = np.array([patch.get_height() for patch in low.patches])
+    assert bars[bars > 0].sum() == 5 and bars[bars < 0].sum() == -2
+    labels = low.get_legend_handles_labels()[1]
+    assert labels == ["children born", "strangers born", "died of age", "died of something else"]
+    assert top.lines[0].get_ydata().max() == 4
+
+
+def test_every_life_is_a_line(history):
+    lines = [c for c in plot_lives(history).axes[0].collections if isinstance(c, LineCollection)]
+    rows = [tuple(map(tuple, segment)) for segment in lines[0].get_segments()]
+    born = [0, 0, 20, 40, 40]
+    assert [row[0] for row in rows] == [(t, k) for k, t in enumerate(born)]
+    assert [row[1][0] for row in rows] == [30, 60, 60, 50, 60]
+
+
+def test_families_stand_together(history):
+    """Down the tree: 0, its child 2 and grandchild 3, then the others; the champion's line."""
+    top, low = plot_families(history, champion=3).axes
+    line = next(x for x in low.lines if len(x.get_xdata()) > 1)
+    assert line.get_xdata().tolist() == [0, 20, 20, 40, 40, 50]
+    assert line.get_ydata().tolist() == [0, 0, 1, 1, 2, 2]
+    assert top.get_legend_handles_labels()[1] == ["of #0", "others"]
+
+
+def test_empty_and_odd_histories_are_drawn():
+    """Nobody was born, or in one moment only: no picture complains."""
+    colony = ColonyConfig(energy=EnergyConfig(chargers=((1, 0, -2),)))
+    for history in (put_together([], {}, 0.0), put_together(EVENTS[:1], {}, 0.0)):
+        for figure in (plot_population(history), plot_lives(history), plot_families(history),
+                       plot_arena(history, colony)):  # fmt: skip
+            assert figure_png(figure).startswith(b"\x89PNG")
+
+
+def test_fitness_with_what_is_not_known_yet():
+    """In the first intervals nobody has lived for long enough to be a champion."""
+    row = np.array([1.0, 2.0])
+    metrics = {"time": 10 * row, "champion": row * np.nan, "mean_age": row}
+    metrics |= dict.fromkeys(("best", "median", "lower_quartile", "upper_quartile"), row)
+    assert figure_png(plot_colony(metrics, "a $x title"))
+
+
+# --- a run ---
+
+SETTINGS = {
+    "trim": "neutral",
+    "world": {"name": "empty_underwater", "bed": False, "drag": "ellipsoid", "timestep": 0.0125},
+    "controller": {"type": "sine"},
+    "task": {"type": "speed", "duration": 0.5, "settle": 0.1, "trials": 1, "depth": 1.0},
+    "bodies": {"max_modules": 4, "max_hinges": 2, "brains": {"inheritance": "darwinian"}},
+    "colony": {
+        "interval": 2.0,
+        "look": 0.5,
+        "arena": {"size": 2.0, "depth": 3.0},
+        "birth": {"radius": 0.9, "gestation": 2.0, "initial": 5, "least": 3},
+        "mating": {"distance": 1.0, "likeness": 0.0, "adult": 2.0, "children": 2},
+        "life": {"window": 2.0, "max_age": 12.0, "childhood": 4.0, "full_fitness": 0.2},
+    },
+    "evolution": {"population_size": 8, "generations": 8, "checkpoint_every": 4, "seed": 3},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A colony of eight places, from the command."""
+    folder = tmp_path_factory.mktemp("colony")
+    (folder / "colony.yaml").write_text(yaml.safe_dump(SETTINGS))
+    with pytest.MonkeyPatch.context() as patch:
+        for place in ("tank", "evaluation"):
+            patch.setattr(f"mjx_revolve.episodes.{place}.compiler_options", lambda: QUICK)
+        assert main([str(folder / "colony.yaml"), "--out", str(folder / "run")]) == 0
+        yield folder / "run"
+
+
+@pytest.mark.slow
+def test_a_run_leaves_its_pictures(run):
+    for name in ("fitness", "population", "lives", "families", "arena", "bodies"):
+        assert (run / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_the_report_of_a_colony(run, tmp_path):
+    """Its own section, its own words, nothing that speaks of generations' starts."""
+    page = tmp_path / "page.html"
+    assert run_command(report.main, [str(run), "--out", str(page)]) == 0
+    text = page.read_text()
+    assert "<h2>The colony</h2>" in text or ">The colony</a>" in text
+    assert "own generation's starts" not in text and "After generation" not in text
+    assert "intervals" in text and "fitness in the colony" in text
+    assert read_run(run).history.spans.keys() == read_run(run).population.lives.keys()
+
+
+@pytest.mark.slow
+def test_what_is_watched_is_what_happened(run):
+    """From the checkpoint in the middle to the end, as the run's own log has it."""
+    config, fitness, search, begin = open_colony(run, 8.0)
+    assert begin == 8.0 and search.generation == 4
+    sights, events = watch_colony(config, fitness, search, begin, 8.0, 0.05)
+    logged = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
+    same = [(e["event"], e["id"]) for e in logged if e["time"] > 8.0]
+    assert [(e["event"], e["id"]) for e in events] == same and same
+    for sight in sights:
+        assert sight.qpos.shape == (len(sight.time), 7 + sight.robot.num_hinges)
+        assert np.all(np.diff(sight.time) == pytest.approx(0.05))  # divides the looks' 0.5 s
+        assert sight.time[0] >= sight.born and (sight.end or 16.0) >= sight.time[-1] - 1e-6
+        assert np.isfinite(sight.qpos).all()
+
+
+@pytest.mark.slow
+def test_the_page_of_a_run(run, capsys):
+    argv = [str(run), "--colony", "--duration", "2"]
+    assert run_command(viewer.main, argv) == 0
+    assert "16 to 18 s" in capsys.readouterr().out
+    text = (run / "colony.html").read_text()
+    assert '"leap":1.0' in text and "clinic" in text
+    assert run_command(viewer.main, argv) == 2  # it is there already
+    for wrong in (["--individual", "1"], ["--seed", "1"]):
+        assert run_command(viewer.main, [*argv, *wrong, "--out", str(run / "x.html")]) == 2
+    assert run_command(viewer.main, [str(run), "--time", "3"]) == 2
+
+
+def test_other_runs_have_no_colony(tmp_path):
+    plain = {"morphology": "spider", "world": "lake", "task": {"type": "speed"}}
+    (tmp_path / "config.yaml").write_text(json.dumps(plain))
+    with pytest.raises(InputError, match="expected the run of a colony"):
+        open_colony(tmp_path)
+    with pytest.raises(InputError, match="expected a run folder"):
+        open_colony(tmp_path / "none")
