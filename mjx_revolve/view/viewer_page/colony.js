@@ -219,7 +219,7 @@ async function start() {
       const p = poseAt(actor.track, from + (span * k) / (count - 1));
       path.set([p[0], p[1], p[2]], 3 * k);
     }
-    return { ...makeTrail({ values: path, count }, { step: span / (count - 1) }), from };
+    return { ...makeTrail({ values: path, count }, { step: span / (count - 1) }, data.leap ?? Infinity), from };
   }
 
   // ------------------------------------------------------------------ switches

@@ -262,7 +262,8 @@ function makeDust(size) {
   return { points, material };
 }
 
-function makeTrail(track, time) {
+// Where a point is farther than `leap` from the one before, the trail is cut.
+function makeTrail(track, time, leap = Infinity) {
   const n = track.count, at = (k, out) => track.values.slice(3 * k, 3 * k + 3).forEach((x, i) => (out[i] = x));
   const fields = { position: 3, before: 3, after: 3, side: 1, moment: 1 }, arrays = {};
   for (const name in fields) arrays[name] = new Float32Array(2 * n * fields[name]);
@@ -277,7 +278,9 @@ function makeTrail(track, time) {
       arrays.side[v] = 2 * half - 1;
       arrays.moment[v] = k * time.step;
     }
-    if (k + 1 < n) index.push(2 * k, 2 * k + 1, 2 * k + 2, 2 * k + 1, 2 * k + 3, 2 * k + 2);
+    const here = 3 * k, next = here + 3, v = track.values;
+    const far = k + 1 < n ? Math.hypot(v[next] - v[here], v[next + 1] - v[here + 1], v[next + 2] - v[here + 2]) : Infinity;
+    if (far < leap) index.push(2 * k, 2 * k + 1, 2 * k + 2, 2 * k + 1, 2 * k + 3, 2 * k + 2);
   }
   const geometry = new THREE.BufferGeometry();
   for (const name in fields) geometry.setAttribute(name, new THREE.BufferAttribute(arrays[name], fields[name]));
