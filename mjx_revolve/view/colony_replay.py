@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 from mjx_revolve.evolution.colony_watch import Sight, open_colony, watch_colony
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.colony import Actor, Mark, Written, write_colony_page
 
 _GAP = 0.05  # from pose to pose [s]; what lies between is interpolated. A choice.
@@ -30,13 +31,15 @@ def write_colony_replay(
         What the page holds, from when to when it goes [s], and how many robots are on it.
 
     Raises:
-        InputError: it is no run of a colony, or it has no checkpoint.
+        InputError: it is no run of a colony, it has no checkpoint, or nobody lives then.
         OSError: the page cannot be written.
     """
     config, fitness, search, begin = open_colony(folder, begin)
     colony = config.colony
     assert colony is not None
     sights, _ = watch_colony(config, fitness, search, begin, duration, _GAP)
+    if not sights:
+        raise InputError(f"{folder}: expected somebody alive from {begin:g} s on; found nobody")
     start = min(float(sight.time[0]) for sight in sights) - _GAP
     actors = [_actor(sight, start) for sight in sights]
     depth = fitness.mixed.world.surface_height - config.task.depth

@@ -389,7 +389,7 @@ async function start() {
       const [a, b] = [Math.max(time - 0.5, t[0]), Math.min(time + 0.5, t[t.length - 1])];
       const from = poseAt(track, a).slice(0, 3), to = poseAt(track, b).slice(0, 3);
       const way = Math.hypot(...from.map((p, k) => to[k] - p));
-      fact("speed").textContent = b > a ? `${(way / (b - a)).toFixed(3)} m/s` : "–";
+      fact("speed").textContent = b > a && way < (data.leap ?? Infinity) ? `${(way / (b - a)).toFixed(3)} m/s` : "–";
       fact("depth").textContent = `${(world.surface - swimmer.place.z).toFixed(2)} m`;
     }
     drawCurve();
