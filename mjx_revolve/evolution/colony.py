@@ -605,8 +605,12 @@ class _Commune:
 
 
 def best_of(individuals: Sequence[Individual]) -> tuple[Individual, ...]:
-    """Those with the best scores, each once; of equals, the older ones."""
-    known = {i.number: i for i in individuals if np.isfinite(i.score)}
+    """Those with the best scores, each once and at its best; of equals, the older ones."""
+    known: dict[int, Individual] = {}
+    for individual in individuals:
+        if np.isfinite(individual.score):
+            best = known.setdefault(individual.number, individual)
+            known[individual.number] = max(best, individual, key=lambda i: i.score)
     rows = list(known.values())
     scores = np.array([[i.score] for i in rows]).reshape(-1, 1)
     numbers = np.array([i.number for i in rows], int)

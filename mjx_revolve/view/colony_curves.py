@@ -69,7 +69,7 @@ def plot_colony(metrics: Mapping[str, np.ndarray], title: str = "") -> Figure:
     top.plot(time, metrics["median"], color=_GREEN, linewidth=1.1, label="median", marker=dot)
     top.plot(time, metrics["best"], color=_ORANGE, linewidth=1.0, label="best alive", marker=dot)
     top.step(time, metrics["champion"], where="post", color=_DEEP, linewidth=1.4,
-             linestyle=(0, (5, 2)), label="fittest ever, as last measured")  # fmt: skip
+             linestyle=(0, (5, 2)), label="fittest ever")  # fmt: skip
     top.set_ylabel(LABEL)
     limit_to_most(top, [low], [metrics["best"], metrics["champion"]])
     legend_above(top, 0.0)
