@@ -6,6 +6,7 @@ import _thread
 import base64
 import http.client
 import json
+import signal
 import threading
 from types import SimpleNamespace
 
@@ -399,6 +400,8 @@ def test_what_cannot_be_dropped(tmp_path, monkeypatch, paths, match):
 def test_ctrl_c_ends_it(monkeypatch, capsys):
     """With the page's address on the first line, and code 0."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    # Tests in the background ignore it.
+    heard = signal.signal(signal.SIGINT, signal.default_int_handler)
     made = []
 
     def stand_in(mixed, places, spheres):
@@ -407,7 +410,10 @@ def test_ctrl_c_ends_it(monkeypatch, capsys):
         return made[0]
 
     monkeypatch.setattr("mjx_revolve.episodes.tank.make_tank", stand_in)
-    assert run_command(live.main, ["snake", "--robots", "3"]) == 0
+    try:
+        assert run_command(live.main, ["snake", "--robots", "3"]) == 0
+    finally:
+        signal.signal(signal.SIGINT, heard)
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("http://127.0.0.1:") and said[-1] == "ended"
     assert len(made[0].robots) == 3
