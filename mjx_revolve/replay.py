@@ -1,8 +1,8 @@
-"""Command line: a film of a champion, or of a morphology in the water.
+"""Command line: a film of a champion, of a morphology in the water, or of a colony.
 
 ``python -m mjx_revolve.replay runs/mine`` writes `swim.mp4`, `swim.gif` and `viewer.html` into
-the run folder, with `--ancestors 5` a film of the champion and those it comes of. MuJoCo draws,
-with a screen or without; see `docs/replay.md`.
+the run folder, with `--ancestors 5` a film of the champion and those it comes of, with `--colony`
+one of all robots of a colony. MuJoCo draws, with a screen or without; see `docs/replay.md`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 
 from mjx_revolve.inputs.commands import (
     Parser,
+    add_colony_arguments,
     add_episode_arguments,
+    check_colony_arguments,
     check_episode_path,
     check_place,
     individual_name,
@@ -29,10 +31,12 @@ from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.view.film.opengl import check_screen, find_opengl
 
 if TYPE_CHECKING:
+    from mjx_revolve.view.film.crowd import Crowd
     from mjx_revolve.view.film.film import Film
 
 _KINDS: tuple[str, ...] = (".mp4", ".gif", ".html")
 _SMALLEST, _LARGEST = (64, 64), (3840, 2160)  # pixels
+_USUAL, _WIDE = (640, 480), (960, 540)  # pixels; the robots of a colony are small in its sea
 _MOST_FPS = 120
 _MOST_ANCESTORS = 30
 _EACH = 5.0  # of each in a film of ancestors, where no duration is given [s]
@@ -42,7 +46,8 @@ _VIEW_FPS = 60  # in MuJoCo's viewer
 def _parser() -> Parser:
     parser = Parser(
         prog="python -m mjx_revolve.replay",
-        description="Film a champion, or a morphology in the water: MP4, GIF and viewer.html.",
+        description="Film a champion, or a morphology in the water: MP4, GIF and viewer.html; or a "
+        "whole colony: colony.mp4.",
     )
     add_episode_arguments(parser)
     parser.add_argument(
@@ -55,9 +60,8 @@ def _parser() -> Parser:
     parser.add_argument(
         "--size",
         type=_size,
-        default="640x480",
         metavar="WIDTHxHEIGHT",
-        help="of the film [pixels], both even (default: %(default)s)",
+        help="of the film [pixels], both even (default: 640x480, of a colony 960x540)",
     )
     parser.add_argument(
         "--fps",
@@ -73,6 +77,7 @@ def _parser() -> Parser:
         help="a film, ancestors.mp4, of so many ancestors and the champion, or the individual, one "
         "after the other, the oldest first",
     )
+    add_colony_arguments(parser)
     parser.add_argument(
         "--html", action="store_true", help="only the page for a browser; needs no OpenGL"
     )
@@ -100,14 +105,17 @@ def _paths_in(place: Path, name: str, kinds: Sequence[str]) -> dict[str, Path]:
     return paths
 
 
-def _named_paths(out: str, kinds: Sequence[str]) -> dict[str, Path]:
-    """Where `--out` wants which kind of file."""
+def _named_paths(out: str, kinds: Sequence[str], name: str) -> dict[str, Path]:
+    """Where `--out` wants which kind of file; in a folder, of this name."""
     path = Path(out)
     kind = path.suffix.lower()
     check_place(path / "any" if path.is_dir() else path, f"--out {out}")
     if kind in _KINDS and not path.is_dir():
         if kind not in kinds:
-            raise InputError(f"--out {out}: expected a name that ends in .html, with --html")
+            asked = "--html" if kinds == (".html",) else "a film of several robots"
+            raise InputError(
+                f"--out {out}: expected a name that ends in {' or '.join(kinds)}, with {asked}"
+            )
         return {kind: path}
     # A new folder may have a dot in its name (v0.2), but x.avi is a slip.
     slip = re.fullmatch(r"\.[a-z][a-z0-9]{1,4}", kind) and not out.endswith("/")
@@ -116,7 +124,7 @@ def _named_paths(out: str, kinds: Sequence[str]) -> dict[str, Path]:
             f"--out {out}: expected a folder, or a name that ends in {', '.join(_KINDS)}; "
             f"found {'another file' if path.exists() else repr(path.suffix)}"
         )
-    return _paths_in(path, "swim", kinds)
+    return _paths_in(path, name, kinds)
 
 
 def _usual_paths(place: Path, name: str, kinds: Sequence[str]) -> dict[str, Path]:
@@ -163,7 +171,14 @@ def main(argv: list[str] | None = None) -> int:
         kinds = (".mp4", ".gif")
         if view or arguments.html:
             raise InputError("--ancestors: expected neither --view nor --html: it makes a film")
-    paths = None if out is None else _named_paths(out, kinds)
+    if arguments.colony:
+        kinds = (".mp4", ".gif")
+        if view or arguments.html or arguments.ancestors is not None:
+            raise InputError("--colony: expected none of --view, --html, --ancestors; found one")
+    arguments.size = arguments.size or (_WIDE if arguments.colony else _USUAL)
+    paths = (
+        None if out is None else _named_paths(out, kinds, "colony" if arguments.colony else "swim")
+    )
     folder = _run_folder(path)
     if view:
         if out is not None or arguments.html:
@@ -173,8 +188,11 @@ def main(argv: list[str] | None = None) -> int:
         name = individual_name(arguments.individual) or "swim"
         if arguments.ancestors is not None:
             name, kinds = f"{name}-ancestors".removeprefix("swim-"), kinds[:1]
+        if arguments.colony:
+            name, kinds = "colony", kinds[:1]
         paths = _usual_paths(folder, name, kinds)
     check_episode_path(path)
+    check_colony_arguments(arguments)
     # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
     films = not view and set(kinds if paths is None else paths) != {".html"}
     opengl = find_opengl() if films else ""
@@ -184,6 +202,9 @@ def main(argv: list[str] | None = None) -> int:
     prepare_process()
     from mjx_revolve.episodes.champion import load_asked
 
+    if arguments.colony:
+        with opening_episode(arguments):
+            return _film_colony(arguments, opengl, paths or {})
     if arguments.ancestors is not None:
         with opening_episode(arguments):
             return _film_ancestors(arguments, folder, opengl, paths or {})
@@ -239,6 +260,22 @@ def _film_ancestors(
     return 0
 
 
+def _film_colony(arguments: argparse.Namespace, opengl: str, paths: dict[str, Path]) -> int:
+    """Films all robots of a colony."""
+    from mjx_revolve.view.colony_replay import DURATION, watch_run
+    from mjx_revolve.view.film.crowd import make_crowd
+    from mjx_revolve.view.film.video import write_film
+
+    seen = watch_run(Path(arguments.path), arguments.time, arguments.duration or DURATION)
+    crowd = make_crowd(
+        seen.actors, seen.title, span=(seen.start, seen.end), marks=seen.marks, leap=seen.leap,
+        size=arguments.size, fps=arguments.fps,
+    )  # fmt: skip
+    write_film(crowd, opengl, paths.get(".mp4"), paths.get(".gif"))
+    _say_film(paths, [crowd])
+    return 0
+
+
 def _warn(film: Film) -> None:
     """Says what is not shown."""
     if film.lost is not None:
@@ -248,11 +285,12 @@ def _warn(film: Film) -> None:
         )
 
 
-def _say_film(paths: dict[str, Path], films: Sequence[Film]) -> None:
+def _say_film(paths: dict[str, Path], films: Sequence[Film | Crowd]) -> None:
     """Says what was written of films in one file."""
     film, frames = films[0], sum(len(film.time) for film in films)
     length = f"{frames / film.fps:.3g} s"
-    length += f", {len(films)} robots" if len(films) > 1 else ""
+    count = sum(film.cast for film in films)
+    length += f", {count} robots" if count > 1 else ""
     _say(paths, ".mp4", f"{length}, {film.size[0]} x {film.size[1]}, {film.fps} frames/s")
     _say(paths, ".gif", length)
 

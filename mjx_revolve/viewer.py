@@ -13,13 +13,14 @@ from pathlib import Path
 
 from mjx_revolve.inputs.commands import (
     Parser,
+    add_colony_arguments,
     add_episode_arguments,
+    check_colony_arguments,
     check_episode_path,
     check_place,
     individual_name,
     opening_episode,
     read_path,
-    read_seconds,
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
@@ -52,26 +53,14 @@ def main(argv: list[str] | None = None) -> int:
         help="default: viewer.html in the run folder (of an individual, individuals/N.html there; "
         "with --colony, colony.html), or the morphology's name in the current folder",
     )
-    parser.add_argument(
-        "--colony",
-        action="store_true",
-        help="a run's whole colony, which lives on for --duration (default: 60 s) from its newest "
-        "checkpoint",
-    )
-    parser.add_argument(
-        "--time",
-        type=read_seconds,
-        metavar="S",
-        help="with --colony: from this time of its life on [s]",
-    )
+    add_colony_arguments(parser)
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_place(check_name(arguments.out, PAGES), arguments.out)
     check_episode_path(arguments.path)
+    check_colony_arguments(arguments)
     if arguments.colony:
         return _write_colony(arguments)
-    if arguments.time is not None:
-        raise InputError("--time: expected --colony with it; found none")
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.numerics.runtime import prepare_process
@@ -89,12 +78,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _write_colony(arguments: argparse.Namespace) -> int:
     """Writes the page of a whole colony."""
-    for name in ("individual", "seed", "world", "modules"):
-        if getattr(arguments, name) is not None:
-            raise InputError(f"--{name}: expected none with --colony; found one")
     folder = Path(arguments.path)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: expected the run folder of a colony; found a file")
     out = Path(arguments.out) if arguments.out else _usual_path(folder, "colony", "colony")
     from mjx_revolve.numerics.runtime import prepare_process
     from mjx_revolve.view.colony_replay import DURATION, write_colony_replay

@@ -111,6 +111,46 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
     add_trust_argument(parser)
 
 
+def add_colony_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds what names a whole colony instead of an episode: `--colony` and `--time`.
+
+    Args:
+        parser: of a command that shows an episode.
+    """
+    parser.add_argument(
+        "--colony",
+        action="store_true",
+        help="a run's whole colony, which lives on for --duration (default: 60 s) from its newest "
+        "checkpoint",
+    )
+    parser.add_argument(
+        "--time",
+        type=read_seconds,
+        metavar="S",
+        help="with --colony: from this time of its life on [s]",
+    )
+
+
+def check_colony_arguments(arguments: argparse.Namespace) -> None:
+    """Refuses what does not go with a colony, or without one.
+
+    Args:
+        arguments: with what `add_episode_arguments` and `add_colony_arguments` add.
+
+    Raises:
+        InputError: one was given, or `--colony` without a run folder.
+    """
+    if not arguments.colony:
+        if arguments.time is not None:
+            raise InputError("--time: expected --colony with it; found none")
+        return
+    for name in ("individual", "seed", "world", "modules"):
+        if getattr(arguments, name) is not None:
+            raise InputError(f"--{name}: expected none with --colony; found one")
+    if not Path(arguments.path).is_dir():
+        raise InputError(f"{arguments.path}: expected the run folder of a colony; found a file")
+
+
 def opening_episode(arguments: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
     """Asks for what the path names, as `trust.opening` does, while it is entered.
 

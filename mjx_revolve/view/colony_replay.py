@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from mjx_revolve.evolution.colony_watch import Sight, open_colony, watch_colony
@@ -14,25 +15,42 @@ DURATION = 60.0
 """For how long a colony is watched, where nothing else is asked for [s]."""
 
 
-def write_colony_replay(
-    folder: Path, path: Path, begin: float | None = None, duration: float = DURATION
-) -> tuple[Written, float, float, int]:
-    """Lets a run's colony live on from a checkpoint, and writes a page of that.
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """A colony that was looked at.
+
+    Attributes:
+        actors: who lived then, by birth.
+        marks: the clinic and chargers.
+        start: from when on it was looked at [s].
+        end: until when [s].
+        leap: who is farther than this from its pose before has been put there [m]; None: nobody is.
+        title: what it is called.
+    """
+
+    actors: list[Actor]
+    marks: list[Mark]
+    start: float
+    end: float
+    leap: float | None
+    title: str
+
+
+def watch_run(folder: Path, begin: float | None = None, duration: float = DURATION) -> Watched:
+    """Lets a run's colony live on from a checkpoint.
 
     Up to the run's end, what is seen is what has happened; from there on, what would have.
 
     Args:
-        folder: the run folder; it stays as it is, but for the page.
-        path: of the page.
+        folder: the run folder; it stays as it is.
         begin: from when on it is watched [s]; None: from its newest checkpoint on.
         duration: for how long, to the end of an interval [s].
 
     Returns:
-        What the page holds, from when to when it goes [s], and how many robots are on it.
+        What was seen.
 
     Raises:
         InputError: it is no run of a colony, it has no checkpoint, or nobody lives then.
-        OSError: the page cannot be written.
     """
     config, fitness, search, begin = open_colony(folder, begin)
     colony = config.colony
@@ -50,8 +68,33 @@ def write_colony_replay(
     # Nobody swims half of the arena from one pose to the next.
     leap = colony.arena.size / 2 if colony.arena.edge == "wrap" else None
     title = f"{folder.resolve().name}: a colony"
-    written = write_colony_page(actors, path, title, marks=marks, leap=leap, window=(start, end))
-    return written, start, end, len(actors)
+    return Watched(actors, marks, start, end, leap, title)
+
+
+def write_colony_replay(
+    folder: Path, path: Path, begin: float | None = None, duration: float = DURATION
+) -> tuple[Written, float, float, int]:
+    """Lets a run's colony live on from a checkpoint, and writes a page of that.
+
+    Args:
+        folder: the run folder; it stays as it is, but for the page.
+        path: of the page.
+        begin: see `watch_run`.
+        duration: see `watch_run`.
+
+    Returns:
+        What the page holds, from when to when it goes [s], and how many robots are on it.
+
+    Raises:
+        InputError: it is no run of a colony, it has no checkpoint, or nobody lives then.
+        OSError: the page cannot be written.
+    """
+    seen = watch_run(folder, begin, duration)
+    window = (seen.start, seen.end)
+    written = write_colony_page(
+        seen.actors, path, seen.title, marks=seen.marks, leap=seen.leap, window=window
+    )
+    return written, seen.start, seen.end, len(seen.actors)
 
 
 def _actor(sight: Sight, start: float) -> Actor:

@@ -37,6 +37,15 @@ _HEADROOM = 0.07
 _STEEP = math.radians(42.0)
 # Between camera and surface or bed, in shares of the distance to the robot.
 _AIR = 0.16
+# Of many robots: how steeply they are looked down at [rad], how fast the camera goes around them
+# [rad/s], and over how long their middle is averaged [s].
+_DOWN, _ROUND, _DRIFT = math.radians(45.0), math.radians(3.0), 4.0
+# The share of them within the disc that fills the frame, and the least that it is across [m].
+_MOST, _LEAST = 0.75, 1.0
+# The camera's distance in radii of that disc, and how far before its middle the camera looks, in
+# distances: the near edge, seen larger, then is as far below the frame's middle as the far one
+# above, 19.5 degrees by tan a = sin 45 / (2.2 - cos 45) and tan b = sin 45 / (2.2 + cos 45).
+_WIDE, _BEFORE = 2.2, 0.13
 # A robot whose middle is less deep than this for most of the time is filmed from the air [radii].
 _AFLOAT = 0.8
 
@@ -145,6 +154,59 @@ def plan_shots(
     position = np.concatenate([target[:, :2] + level[:, None] * stand, height[:, None]], axis=1)
     target = target + np.array([0.0, 0.0, _HEADROOM * 2 * distance * math.tan(FOVY / 2)])
     return Shots(position, target, above, distance)
+
+
+def plan_circle(
+    time: np.ndarray,
+    places: np.ndarray,
+    alive: np.ndarray,
+    *,
+    reach: float,
+    aspect: float,
+    surface: float,
+    waves: float = 0.0,
+    bed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+) -> Shots:
+    """Plans a camera that circles over many robots, and looks down at them.
+
+    Args:
+        time: `[F]` of the frames, equally spaced [s].
+        places: `[N, F, 3]` of the robots, world frame [m].
+        alive: `[N, F]` whether they are there.
+        reach: how far a robot reaches from its place [m].
+        aspect: width of the frame over its height.
+        surface: z of the still surface [m].
+        waves: the most that waves rise above it [m].
+        bed: height of the bed at x and y `[n]` [m], or None.
+
+    Returns:
+        The camera; most robots are inside every frame. It stands in the air or in the water,
+        whichever takes it less from its height.
+    """
+    step = float(time[1] - time[0]) if len(time) > 1 else 1.0
+    there = np.where(alive[..., None], places, np.nan)
+    some = alive.any(axis=0)
+    middle = np.zeros((len(time), 3))
+    middle[some] = np.nanmedian(there[:, some], axis=0)
+    # Where nobody is left, the camera stays.
+    rows = np.maximum.accumulate(np.where(some, np.arange(len(time)), 0))
+    target = _smooth(middle[rows], _DRIFT / step)
+    away = np.linalg.norm((there - target)[..., :2], axis=-1)[alive]
+    half = (float(np.quantile(away, _MOST)) if away.size else 0.0) + reach
+    # A frame that is less wide than high has to be farther off.
+    distance = max(half, _LEAST / 2) * _WIDE * max(1.0, 1.3 / aspect)
+    margin = _AIR * distance
+    height = target[:, 2] + distance * math.sin(_DOWN)
+    low, high = surface + waves + margin, surface - waves - margin
+    above = bool(np.median(height) > (low + high) / 2)
+    height = np.maximum(height, low) if above else np.minimum(height, high)
+    angle = _ROUND * (time - time[0]) - math.pi / 3
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    foot = target[:, :2] + distance * math.cos(_DOWN) * around
+    if bed is not None:
+        height = np.maximum(height, bed(*foot.T) + margin)
+    target = target + _BEFORE * distance * np.c_[around, np.zeros(len(time))]
+    return Shots(np.c_[foot, height], target, above, distance)
 
 
 def _smooth(path: np.ndarray, sigma: float) -> np.ndarray:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,18 +21,19 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.film.film import Film
-from mjx_revolve.view.film.overlay import make_overlay
+from mjx_revolve.view.film.film import Film, Shown
+from mjx_revolve.view.film.overlay import Overlay, make_overlay
 from mjx_revolve.view.film.stage import SUN, SURFACE, build_stage
 from mjx_revolve.view.film.waterlight import make_shader
 
 # How far one sees, in distances of the camera from the robot.
-_SIGHT = 9.0
+SIGHT = 9.0
 # The bed, the robot's parts, and what a user adds in the viewer.
 _MOST_GEOMS = 4000
 # The sky is a cube about so large, in shares of the far plane's distance; nothing else is that far.
 _SKY = 0.3
 
+_Pose = Callable[[mujoco.MjData, int], None]
 _Paint = Callable[[mujoco.MjvScene], tuple[np.ndarray, np.ndarray]]
 
 
@@ -45,17 +47,41 @@ def draw_frames(film: Film, way: str) -> Iterator[np.ndarray]:
     Yields:
         `[height, width, 3]` uint8, one frame after the other.
     """
-    shots, world = film.shots, film.robot.world
     model = _stage_of(film, plain=True)
-    shade = make_shader(world, film.size, shots.distance, shots.above, film.origin.tolist())
-    overlay = make_overlay(film)
+    pose = partial(_pose, film)
+    yield from draw_staged(film, model, pose, make_overlay(film), way)
+
+
+def draw_staged(
+    film: Shown,
+    model: mujoco.MjModel,
+    pose: _Pose,
+    overlay: Overlay,
+    way: str,
+    fine: float = 1.0,
+) -> Iterator[np.ndarray]:
+    """Draws a film of whoever is in a model.
+
+    Args:
+        film: where the camera stands in what water, frame by frame.
+        model: what is drawn, counted from the film's origin.
+        pose: sets a model's data to a frame.
+        overlay: what is laid over frames, as from `overlay.make_overlay`.
+        way: see `draw_frames`.
+        fine: how fine the surface is and how thick the haze, next to films of one robot.
+
+    Yields:
+        See `draw_frames`.
+    """
+    shots, world = film.shots, film.robot.world
+    shade = make_shader(world, film.size, shots.distance / fine, shots.above, film.origin.tolist())
     waiting: tuple[Any, np.ndarray, int] | None = None
     with _open_painter(model, film.size, way) as paint:
-        data, scene = mujoco.MjData(model), mujoco.MjvScene(model, _MOST_GEOMS)
+        data, scene = mujoco.MjData(model), mujoco.MjvScene(model, _MOST_GEOMS + model.ngeom)
         for flag in (mujoco.mjtRndFlag.mjRND_FOG, mujoco.mjtRndFlag.mjRND_HAZE):
             scene.flags[flag] = 0
         for frame in range(len(film.time)):
-            _arrange(model, data, scene, film, frame)
+            _arrange(model, data, scene, film, pose, frame)
             color, depth = paint(scene)
             water = jax.tree.map(lambda x, frame=frame: np.float32(x[frame]), film.water)
             # JAX works on this frame while MuJoCo draws the next.
@@ -77,10 +103,10 @@ def _stage_of(film: Film, plain: bool) -> mujoco.MjModel:
     """What is drawn of a film's robot and the world around its way."""
     distance = film.shots.distance
     reach = float(np.linalg.norm(np.ptp(film.center[:, :2], axis=0))) / 2 + distance
-    return build_stage(film.robot, film.size, film.origin, reach, _SIGHT * distance, plain)
+    return build_stage(film.robot, film.size, film.origin, reach, SIGHT * distance, plain)
 
 
-def _aim(camera: mujoco.MjvCamera, film: Film, frame: int) -> None:
+def _aim(camera: mujoco.MjvCamera, film: Shown, frame: int) -> None:
     """Puts MuJoCo's camera where the film's stands."""
     shots = film.shots
     x, y, z = shots.axes(frame)[2]
@@ -90,17 +116,22 @@ def _aim(camera: mujoco.MjvCamera, film: Film, frame: int) -> None:
     camera.elevation = math.degrees(math.asin(np.clip(z, -1.0, 1.0)))
 
 
-def _pose(data: mujoco.MjData, film: Film, frame: int) -> None:
+def _pose(film: Film, data: mujoco.MjData, frame: int) -> None:
     """Puts the robot where it is in a frame."""
     data.qpos[:] = film.qpos[frame]
     data.qpos[:3] -= film.origin
 
 
 def _arrange(
-    model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene, film: Film, frame: int
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    scene: mujoco.MjvScene,
+    film: Shown,
+    pose: _Pose,
+    frame: int,
 ) -> None:
-    """Poses the robot, and puts camera and light in their places."""
-    _pose(data, film, frame)
+    """Poses who is shown, and puts camera and light in their places."""
+    pose(data, frame)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
@@ -183,7 +214,7 @@ def show_film(film: Film) -> None:
         while window.is_running():
             frame = int((time.monotonic() - begun) * film.fps) % len(film.time)
             with window.lock():
-                _pose(data, film, frame)
+                _pose(film, data, frame)
                 # The user may turn the camera; it goes along with the robot.
                 window.cam.lookat[:] += target[frame] - target[last]
                 mujoco.mj_forward(model, data)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 
@@ -17,6 +18,42 @@ from mjx_revolve.view.film.camera import Shots, plan_shots
 from mjx_revolve.view.forces import water_at
 from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
 from mjx_revolve.water.flow import Water
+
+
+class Shown(Protocol):
+    """What films of one robot and of many have in common; see `Film`."""
+
+    @property
+    def robot(self) -> Robot:
+        """One whose world it is."""
+
+    @property
+    def fps(self) -> int:
+        """Frames per second."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [pixels]."""
+
+    @property
+    def time(self) -> np.ndarray:
+        """`[F]` of the frames [s]."""
+
+    @property
+    def center(self) -> np.ndarray:
+        """`[F, 3]` the middle of who is shown [m]."""
+
+    @property
+    def water(self) -> Water:
+        """Of `[F]` each."""
+
+    @property
+    def shots(self) -> Shots:
+        """The camera."""
+
+    @property
+    def origin(self) -> np.ndarray:
+        """`[3]` from where OpenGL counts [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +92,16 @@ class Film:
     def robot(self) -> Robot:
         """The robot."""
         return self.episode.robot
+
+    @property
+    def cast(self) -> int:
+        """How many robots there are."""
+        return 1
+
+    @property
+    def title(self) -> str:
+        """What is shown."""
+        return self.episode.title
 
     @property
     def origin(self) -> np.ndarray:

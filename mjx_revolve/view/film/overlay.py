@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mjx_revolve.view.course import bed_at, water_drift
 from mjx_revolve.view.film.camera import FOVY
-from mjx_revolve.view.film.film import Film
+from mjx_revolve.view.film.film import Film, Shown
 from mjx_revolve.view.surroundings import moves, target_of, water_velocity
 
 # Motes in a cube around the camera, and its edge in camera distances.
@@ -25,16 +25,17 @@ _MOTES, _CUBE = 1500, 6.0
 # The trail: a mark every so often, for so long [s].
 _MARK, _TRAIL = 0.25, 12.0
 # Red, green, blue of both.
-_PALE, _YELLOW = (0.86, 0.97, 1.0), (1.0, 0.88, 0.45)
+PALE, YELLOW = (0.86, 0.97, 1.0), (1.0, 0.88, 0.45)
 _REACH = 7  # of a dot [pixels]
-_WHITE, _SHADE, _SOFT = (255, 255, 255, 245), (4, 28, 44, 150), (226, 240, 246, 235)
+WHITE, _SHADE, SOFT = (255, 255, 255, 245), (4, 28, 44, 150), (226, 240, 246, 235)
 
 _AIM, _FLOW = (255, 92, 150, 255), (122, 255, 220, 255)  # target, current
 
+Overlay = Callable[[Any, np.ndarray, int], np.ndarray]
 _Dots = Callable[[np.ndarray, np.ndarray, int], None]
 
 
-def make_overlay(film: Film) -> Callable[[Any, np.ndarray, int], np.ndarray]:
+def make_overlay(film: Film) -> Overlay:
     """Prepares what is laid over frames.
 
     Args:
@@ -44,7 +45,7 @@ def make_overlay(film: Film) -> Callable[[Any, np.ndarray, int], np.ndarray]:
         A function of a picture `[height, width, 3]` uint8, its depths along the view `[height,
         width]` [m] and the frame's number, which returns a new picture.
     """
-    layers = (_make_motes(film), _make_marks(film))
+    layers = (make_motes(film), _make_marks(film))
     write = _make_captions(film)
 
     def overlay(picture: Any, depth: np.ndarray, frame: int) -> np.ndarray:
@@ -56,7 +57,7 @@ def make_overlay(film: Film) -> Callable[[Any, np.ndarray, int], np.ndarray]:
     return overlay
 
 
-def _make_motes(film: Film) -> _Dots:
+def make_motes(film: Shown) -> _Dots:
     """Motes that go where the water goes that is around the robot, waves apart."""
     random = np.random.default_rng(3)
     edge = _CUBE * film.shots.distance
@@ -74,7 +75,7 @@ def _make_motes(film: Film) -> _Dots:
         # Not in the lens, and none that stands in the air.
         surface = np.asarray(film.water.surface_height)[frame]
         alpha *= np.clip(8.0 * off - 1.2, 0.0, 1.0) * (motes[:, 2] < surface - 0.02)
-        _add_dots(picture, depth, film, frame, motes, alpha, size, _PALE)
+        add_dots(picture, depth, film, frame, motes, alpha, size, PALE)
 
     return (lambda picture, depth, frame: None) if film.shots.above else draw
 
@@ -92,15 +93,15 @@ def _make_marks(film: Film) -> _Dots:
         alpha = 0.85 * (1.0 - age / _TRAIL)
         alpha *= np.clip(4.0 * away / film.radius[frame] - 2.0, 0.0, 1.0)
         size = np.full(len(marks), 0.0065 * film.shots.distance)
-        _add_dots(picture, depth, film, frame, marks, alpha, size, _YELLOW)
+        add_dots(picture, depth, film, frame, marks, alpha, size, YELLOW)
 
     return draw
 
 
-def _add_dots(
+def add_dots(
     picture: np.ndarray,
     depth: np.ndarray,
-    film: Film,
+    film: Shown,
     frame: int,
     points: np.ndarray,
     alpha: np.ndarray,
@@ -134,20 +135,40 @@ def _add_dots(
     picture[place] = np.round(old + share * (255 * np.asarray(color) - old)).astype(np.uint8)
 
 
+def make_fonts(unit: float) -> tuple[Any, Any]:
+    """The bold and the plain font of captions, for a unit of so many pixels."""
+    fonts = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    bold = ImageFont.truetype(fonts / "DejaVuSans-Bold.ttf", round(15 * unit))
+    return bold, ImageFont.truetype(fonts / "DejaVuSans.ttf", round(12.5 * unit))
+
+
+def shorten(title: str, font: Any, room: float) -> str:
+    """A title that fits into so many pixels."""
+    if font.getlength(title) > room:
+        while title and font.getlength(title + "…") > room:
+            title = title[:-1]
+        title += "…"
+    return title
+
+
+def write_shaded(
+    draw: ImageDraw.ImageDraw, unit: float, x: float, y: float, words: str,
+    anchor: str, font: Any, color: Any,
+) -> None:  # fmt: skip
+    """Words with a shadow, at a place [pixels]."""
+    shift = max(1, round(unit))
+    draw.text((x + shift, y + shift), words, font=font, anchor=anchor, fill=_SHADE)
+    draw.text((x, y), words, font=font, anchor=anchor, fill=color)
+
+
 def _make_captions(film: Film) -> Callable[[np.ndarray, int], np.ndarray]:
     """Words over a frame; they take a picture and a frame's number and return a new picture."""
     (width, height), episode, shots = film.size, film.episode, film.shots
     unit = max(min(film.size) / 480, 0.4)
-    fonts = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
-    bold = ImageFont.truetype(fonts / "DejaVuSans-Bold.ttf", round(15 * unit))
-    plain = ImageFont.truetype(fonts / "DejaVuSans.ttf", round(12.5 * unit))
+    bold, plain = make_fonts(unit)
     edge, line, tick = round(14 * unit), round(19 * unit), 4 * unit
     base, below = height - edge, _bed_words(film)
-    title = episode.title
-    if bold.getlength(title) > width - 2 * edge:
-        while title and bold.getlength(title + "…") > width - 2 * edge:
-            title = title[:-1]
-        title += "…"
+    title = shorten(episode.title, bold, width - 2 * edge)
     score = ""
     if episode.score is not None:
         score = f"score {episode.score:.3g} {episode.score_unit}".rstrip()
@@ -161,15 +182,13 @@ def _make_captions(film: Film) -> Callable[[np.ndarray, int], np.ndarray]:
         draw = ImageDraw.Draw(image, "RGBA")
 
         def write(x: float, y: float, words: str, anchor: str, font: Any, color: Any) -> None:
-            shift = max(1, round(unit))
-            draw.text((x + shift, y + shift), words, font=font, anchor=anchor, fill=_SHADE)
-            draw.text((x, y), words, font=font, anchor=anchor, fill=color)
+            write_shaded(draw, unit, x, y, words, anchor, font, color)
 
         for x, y, words, color in sign(draw, frame):
             write(x, y, words, "mm", plain, color)
-        write(edge, edge, title, "la", bold, _WHITE)
-        write(edge, edge + line, score, "la", plain, _SOFT)
-        write(edge, base - line, f"{film.time[frame]:.1f} s", "ls", bold, _WHITE)
+        write(edge, edge, title, "la", bold, WHITE)
+        write(edge, edge + line, score, "la", plain, SOFT)
+        write(edge, base - line, f"{film.time[frame]:.1f} s", "ls", bold, WHITE)
         away = float(np.linalg.norm(shots.position[frame] - shots.target[frame]))
         metre = height / 2 / (away * math.tan(FOVY / 2))
         length = _round_length(min(110 * unit, 0.25 * width) / metre)
@@ -178,13 +197,13 @@ def _make_captions(film: Film) -> Callable[[np.ndarray, int], np.ndarray]:
         # In small pictures the last facts have no room beside the scale.
         while len(facts) > 1 and plain.getlength("   ".join(facts)) > left - 3 * edge:
             facts.pop()
-        write(edge, base, "   ".join(facts), "ls", plain, _SOFT)
-        for shift, color in ((1, _SHADE), (0, _WHITE)):
+        write(edge, base, "   ".join(facts), "ls", plain, SOFT)
+        for shift, color in ((1, _SHADE), (0, WHITE)):
             bar = [(left, base - tick), (left, base), (right, base), (right, base - tick)]
             bar = [(x + shift, y + shift) for x, y in bar]
             draw.line(bar, fill=color, width=max(1, round(1.5 * unit)))
         named = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
-        write((left + right) / 2, base - 2 * tick, named, "ms", plain, _SOFT)
+        write((left + right) / 2, base - 2 * tick, named, "ms", plain, SOFT)
         return np.asarray(image)
 
     return caption

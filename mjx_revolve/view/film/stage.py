@@ -68,7 +68,12 @@ def build_stage(
 
 
 def build_shared_stage(
-    robots: Mapping[int, Robot], world: World, way: float, sight: float
+    robots: Mapping[int, Robot],
+    world: World,
+    way: float,
+    sight: float,
+    size: tuple[int, int] = (640, 480),
+    plain: bool = False,
 ) -> mujoco.MjModel:
     """Builds what is drawn of many robots and the world around them.
 
@@ -77,6 +82,8 @@ def build_shared_stage(
         world: around them.
         way: how far from the world's origin they get [m].
         sight: see `build_stage`.
+        size: see `build_stage`.
+        plain: see `build_stage`.
 
     Returns:
         The model; robot k's free joint is called `k/root`, and its qpos begins there.
@@ -90,7 +97,7 @@ def build_shared_stage(
     for number, robot in robots.items():
         frame = spec.worldbody.add_frame()
         spec.attach(_dressed(robot), prefix=f"{number}/", frame=frame)
-    _add_surroundings(spec, world, (640, 480), np.zeros(3), way, sight, plain=False)
+    _add_surroundings(spec, world, size, np.zeros(3), way, sight, plain)
     return spec.compile()
 
 

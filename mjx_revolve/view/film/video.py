@@ -18,6 +18,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.film.crowd import Crowd
+from mjx_revolve.view.film.crowd_draw import draw_crowd
 from mjx_revolve.view.film.draw import draw_frames
 from mjx_revolve.view.film.film import Film
 
@@ -31,7 +33,7 @@ _MAIN = 150
 
 
 def write_film(
-    film: Film | Sequence[Film],
+    film: Film | Crowd | Sequence[Film],
     opengl: str,
     mp4: str | Path | None = None,
     gif: str | Path | None = None,
@@ -41,7 +43,8 @@ def write_film(
     Files appear whole or not at all. On a terminal a bar shows how far it is.
 
     Args:
-        film: from `film.make_film`; or several of one size, to be shown one after the other.
+        film: from `film.make_film` or `crowd.make_crowd`; or several of one size, to be shown one
+            after the other.
         opengl: from `opengl.find_opengl`.
         mp4: where to write the MP4 (H.264), or None.
         gif: where to write the GIF, or None.
@@ -49,14 +52,14 @@ def write_film(
     Raises:
         OSError: a file cannot be written.
     """
-    films = [film] if isinstance(film, Film) else list(film)
+    films: list[Any] = [film] if isinstance(film, Film | Crowd) else list(film)
     (size,), (fps,) = {film.size for film in films}, {film.fps for film in films}
     count = sum(len(film.time) for film in films)
     every = gif_stride(fps, count)
     small: list[Image.Image] = []
 
     def draw() -> Iterator[np.ndarray]:
-        frames = (frame for film in films for frame in draw_frames(film, opengl))
+        frames = (frame for film in films for frame in _frames_of(film, opengl))
         bar = tqdm(frames, "drawing", count, leave=False, disable=None, unit="frame")
         for number, frame in enumerate(bar):
             if gif is not None and number % every == 0:
@@ -64,13 +67,17 @@ def write_film(
             yield frame
 
     if mp4 is not None:
-        title = films[-1].episode.title
+        title = films[-1].title
         write_atomic(Path(mp4), lambda path: write_mp4(path, draw(), size, fps, title))
     else:
         for _ in draw():
             pass
     if gif is not None:
         write_atomic(Path(gif), make_gif(small, every / fps))
+
+
+def _frames_of(film: Film | Crowd, opengl: str) -> Iterator[np.ndarray]:
+    return draw_crowd(film, opengl) if isinstance(film, Crowd) else draw_frames(film, opengl)
 
 
 def write_mp4(
