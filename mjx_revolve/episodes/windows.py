@@ -224,7 +224,7 @@ class Windows:
         root = jax.ShapeDtypeStruct((7, genes.shape[-1]), genes.dtype)
         now = _narrow(episodes.under_way, jax.eval_shape(self._rest, genes, root))
 
-        def told(parameters: Any, now: Passage, row: Any) -> Any:
+        def told(parameters: Any, now: Passage, row: Any, *meeting: Any) -> Any:
             return make_drive(
                 engine,
                 lambda state, time, row, sense: controller.step(parameters, state, time, sense),
@@ -233,7 +233,7 @@ class Windows:
                 world=setup.world,
                 cues=cues,
                 feels=controller.feels,
-            )(now, row)
+            )(now, row, *meeting)
 
         then, kept, pull = roll_out_taped(
             told,

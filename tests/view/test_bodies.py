@@ -425,7 +425,7 @@ def test_a_film_of_ancestors(run, monkeypatch, capsys):
         return [Episode(number) for number in numbers]
 
     class Film:
-        lost, fps, size, time = None, 10, (64, 64), range(30)
+        lost, fps, size, time, cast = None, 10, (64, 64), range(30), 1
 
     def write(films, opengl, mp4, gif):
         made.append((len(films), mp4, gif))
