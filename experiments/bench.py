@@ -173,7 +173,7 @@ GROUPS = (
                 each_core=True,
                 brain="tired",
             ),
-            Row("ours, oscillators", "evaluation", "default", each_core=True),
+            Row("ours, three sines a hinge", "evaluation", "default", each_core=True),
         ),
         1,
         0.75,

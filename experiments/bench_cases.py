@@ -51,10 +51,11 @@ PHYSICS: dict[str, dict[str, Any]] = {
 _TIRED = {"noise": 0.05, "rate": 20.0, "delay": 0.1}
 BRAINS: dict[str, dict[str, Any]] = {
     "": {},
-    "sine": {"type": "sine"},
-    "mlp": {"type": "mlp", "hidden": 8},
+    "sine": {"type": "sine", "harmonics": 1},
+    "mlp": {"type": "mlp", "hidden": 8, "harmonics": 1},
     "tired": {
         "type": "mlp",
+        "harmonics": 1,
         "hidden": 8,
         "sensors": [{"type": name} | _TIRED for name in ("tilt", "gyro", "angle", "speed")],
     },
