@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_revolve.engine.contact import CREEP, FADE
 from mjx_revolve.engine.dynamics import move_bodies
 from mjx_revolve.engine.rows import Rows
 from mjx_revolve.engine.spheres import Spheres
@@ -42,10 +43,6 @@ _HASTE = 1.2
 _PAIRS, _FOUND, _PUSHED = 4, 512, 64
 # Room in the list for so many pairs of spheres to a robot; more than heaps have. A choice.
 _ROOM = 64
-# The damper fades in over this depth [m], so that touching is no jump in force; as for the bed.
-_FADE = 5e-4
-# Below this speed [m/s] friction is viscous, as Coulomb's law has no value at rest; likewise.
-_CREEP = 0.001
 # Share of the mass that a contact may stop in a step, so that a body between several others does
 # not get more than it takes: stable up to four at a time. A choice.
 _SHARE = 0.5
@@ -148,12 +145,12 @@ def contact_force(
     """
     k = touch.stiffness
     inwards = -dot(velocity, normal)
-    fade = jnp.clip(depth / _FADE, 0, 1)
+    fade = jnp.clip(depth / FADE, 0, 1)
     damper = (dt * k + 2 * touch.damping * jnp.sqrt(k * mass)) * fade
     force = (k * depth + damper * inwards) / (1 + dt * damper / mass)
     force = jnp.where((depth > 0) & (force > 0), force, 0)
     slip = tuple(v + inwards * n for v, n in zip(velocity, normal, strict=True))
-    grip = touch.friction * force / jnp.sqrt(dot(slip, slip) + _CREEP**2)
+    grip = touch.friction * force / jnp.sqrt(dot(slip, slip) + CREEP**2)
     grip = grip / (1 + dt * grip / slip_mass)
     return tuple(force * n - grip * s for n, s in zip(normal, slip, strict=True))
 

@@ -39,9 +39,9 @@ from mjx_revolve.water.world import World
 # Damping of a point as a share of the critical one, 2 √(k m). A choice: no bouncing.
 _DAMPING_RATIO = 1.0
 # The damper fades in over this depth [m], so that touching down is no jump in force.
-_FADE = 5e-4
+FADE = 5e-4
 # Below this speed [m/s] friction is viscous, as Coulomb's law has no value at rest.
-_CREEP = 0.001
+CREEP = 0.001
 
 
 def bed_plane(bed: Bed, place: tuple[Scalar, Scalar]) -> tuple[Scalar, Vec]:
@@ -97,13 +97,13 @@ def bed_contact(
         damper = np.asarray(2 * _DAMPING_RATIO * np.sqrt(bed.stiffness * np.asarray(point_mass)))
     outward = dot(velocity, normal)
     ahead = jnp.maximum(depth - timestep * outward, 0)
-    damping = mul(damper, jnp.minimum(ahead / _FADE, 1))
+    damping = mul(damper, jnp.minimum(ahead / FADE, 1))
     push = sub(mul(stiffness, ahead), damping * outward)
     touching = (ahead > 0) & (push > 0)
     push = jnp.where(touching, push, 0)
     resistance = jnp.where(touching, add(mul(timestep, stiffness), damping), 0)
     sliding = tuple(v - outward * n for v, n in zip(velocity, normal, strict=True))
-    grip = bed.friction * push / jnp.sqrt(dot(sliding, sliding) + _CREEP**2)
+    grip = bed.friction * push / jnp.sqrt(dot(sliding, sliding) + CREEP**2)
     force = tuple(push * n - grip * s for n, s in zip(normal, sliding, strict=True))
     return force, resistance, grip
 

@@ -25,7 +25,7 @@ _THICKNESS = 1 / 2
 
 
 class Spheres(NamedTuple):
-    """Spheres of robots, `[S, P]` each, or `[P]`; those past a robot's end have no radius.
+    """Spheres of robots, `[S, P]` each; those past a robot's end have no radius.
 
     Attributes:
         row: body that each is fixed to: 0 is the root, k + 1 the traversal's row k; int32.
@@ -34,7 +34,6 @@ class Spheres(NamedTuple):
         mass_center: of that body, its own frame, three of `[S, P]` [m].
         inverse_mass: of that body, without the water that it carries [1/kg].
         inverse_inertia: the largest of that body's about its centre of mass [1/(kg m²)].
-        reach: `[P]` how far from the core's origin any sphere can get, however hinges turn [m].
     """
 
     row: Any
@@ -43,7 +42,6 @@ class Spheres(NamedTuple):
     mass_center: Any
     inverse_mass: Any
     inverse_inertia: Any
-    reach: Any
 
 
 def sphere_box(half_size: Sequence[float]) -> tuple[np.ndarray, float]:
@@ -138,8 +136,6 @@ def pack_spheres(
     body = balls.body
     center = turned(back[body], balls.center)
     middle = turned(back[body], assembly.center[body])
-    reach = np.zeros(total)
-    np.maximum.at(reach, owner, _path(assembly)[body] + _length(balls.center) + balls.radius)
     found = Spheres(
         row=table(first[body].astype(np.int32)),
         center=tuple(table(center[:, i]) for i in range(3)),
@@ -147,7 +143,6 @@ def pack_spheres(
         mass_center=tuple(table(middle[:, i]) for i in range(3)),
         inverse_mass=table(inverse(assembly.mass)[body]),
         inverse_inertia=table(inverse(lightest)[body]),
-        reach=reach,
     )
 
     def wide(x: np.ndarray) -> np.ndarray:
@@ -162,18 +157,3 @@ def count_spheres(robots: Sequence[Robot]) -> int:
         (int(np.sum([len(sphere_box(h)[0]) for h in robot.fluid.half_size])) for robot in robots),
         default=0,
     )
-
-
-def _path(assembly: Assembly) -> np.ndarray:
-    """`[nbody]` how far each body's frame can get from its root's [m]: the links' lengths."""
-    position, _ = assembly.from_parents()
-    length = _length(position)
-    found = np.zeros(len(length))
-    for k in range(1, len(length)):  # preorder
-        if assembly.parent[k]:
-            found[k] = found[assembly.parent[k]] + length[k]
-    return found
-
-
-def _length(x: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(x, axis=-1)

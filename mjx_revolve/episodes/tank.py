@@ -256,8 +256,7 @@ class Tank:
             self.spheres += more
             if self._spheres is not None:
                 room = lambda x: np.concatenate([x, np.zeros_like(x[:1]).repeat(more, 0)])  # noqa: E731
-                grown = jax.tree.map(room, self._spheres._replace(reach=None))
-                self._spheres = grown._replace(reach=self._spheres.reach)
+                self._spheres = jax.tree.map(room, self._spheres)
         spheres = pack_spheres([robot], self.mixed.capacity, self.spheres)
         if self._bodies is None:
             wide = lambda x: np.repeat(x, self.places, -1)  # noqa: E731
@@ -290,11 +289,7 @@ class Tank:
             time = (self.steps - stride * np.arange(rows)[::-1]) * step
             blank = np.zeros((rows, 7 + self.mixed.capacity.hinges, self.places), np.float32)
             return Trail(time, blank, np.zeros((rows, self.places), np.float32), alive)
-        given = _Given(
-            self._bodies, self._spheres, self._genes, self._start, self._new, alive,
-            (self._since - self.steps).astype(np.int32), self.tag, self.target, self._noise,
-            self._current, np.float32(self.time),
-        )  # fmt: skip
+        given = self._given()
         passage = self._passage
         if passage is None:
             passage = self._blank(given)
@@ -306,6 +301,14 @@ class Tank:
         self.steps += rows * stride
         self._new[:] = False
         return Trail(time, np.asarray(qpos), np.asarray(energy), alive)
+
+    def _given(self) -> _Given:
+        """What is computed from now."""
+        return _Given(
+            self._bodies, self._spheres, self._genes, self._start, self._new, self.alive,
+            (self._since - self.steps).astype(np.int32), self.tag, self.target, self._noise,
+            self._current, np.float32(self.time),
+        )  # fmt: skip
 
     def _engine(self, given: _Given) -> Engine:
         setup = self.mixed.setup
@@ -422,12 +425,7 @@ class Tank:
         self.target = arrays["target"].copy() if "target" in arrays else None
         leaves = sum(name.startswith("passage.") for name in arrays)
         if leaves and self._bodies is not None:
-            given = _Given(
-                self._bodies, self._spheres, self._genes, self._start, self._new, alive,
-                self._since.astype(np.int32), self.tag, self.target, self._noise,
-                self._current, np.float32(0),
-            )  # fmt: skip
-            blank = self._blank(given)
+            blank = self._blank(self._given())
             wanted, tree = jax.tree.flatten(blank)
             found = [arrays.get(f"passage.{k}") for k in range(len(wanted))]
             for want, have in zip(wanted, found, strict=True):

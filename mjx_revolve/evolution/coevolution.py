@@ -40,7 +40,7 @@ from mjx_revolve.evolution.selection import SCHEMES, Candidates, check_selection
 from mjx_revolve.inputs.errors import InputError
 
 # Descriptors whose mean over the living goes into the metrics.
-_SHOWN = ("num_modules", "num_hinges", "length", "mass", "branching", "limbs", "symmetry")
+SHOWN = ("num_modules", "num_hinges", "length", "mass", "branching", "limbs", "symmetry")
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class _Step:
             everybody = self._candidates(together, new, len(search.living))
             stay = self.scheme.survivors(everybody, self.selection, mu, generation)
             living = [together[k] for k in stay]
-        elites = _best([*search.elites, *born])
+        elites = best_of([*search.elites, *born])
         seconds = time.perf_counter() - began
         found = BodySearch(
             generation=generation,
@@ -306,12 +306,12 @@ class _Step:
             "champion": champion,
             "failed": int(np.sum(~np.isfinite(scores))),
             "living": len(search.living),
-            "living_mean": _mean(_figures(search.living, "score")),
+            "living_mean": mean_known(_figures(search.living, "score")),
         }
         for name in self.fitness.measured:
             row[name] = float(best.measures[name]) if best is not None else float("nan")
-        for name in _SHOWN:
-            row[f"mean_{name}"] = _mean(_figures(search.living, name))
+        for name in SHOWN:
+            row[f"mean_{name}"] = mean_known(_figures(search.living, name))
         if search.archive is not None:
             row["coverage"] = archives.coverage(search.archive)
             row["qd_score"] = archives.qd_score(search.archive)
@@ -337,11 +337,13 @@ def _points(individuals: Sequence[Individual], names: Sequence[str]) -> np.ndarr
     return np.stack(columns, -1) if columns else np.zeros((len(individuals), 0))
 
 
-def _mean(values: np.ndarray) -> float:
-    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+def mean_known(values: Any) -> float:
+    """The mean of what is known; NaN where nothing is."""
+    found = np.asarray(values, float)
+    return float(np.nanmean(found)) if np.isfinite(found).any() else float("nan")
 
 
-def _best(individuals: Sequence[Individual]) -> tuple[Individual, ...]:
+def best_of(individuals: Sequence[Individual]) -> tuple[Individual, ...]:
     """Those with the best scores; of equals, the older ones."""
     known = [individual for individual in individuals if np.isfinite(individual.score)]
     scores = np.array([[individual.score] for individual in known]).reshape(-1, 1)
@@ -434,6 +436,17 @@ def search_to_arrays(config: Config, fitness: BodyFitness, search: BodySearch) -
     return found
 
 
+def check_seed(config: Config, arrays: Mapping[str, np.ndarray]) -> None:
+    """Refuses the arrays of a run with another seed.
+
+    Raises:
+        InputError: it is another one.
+    """
+    wanted, found = config.evolution.seed, int(arrays["seed"])
+    if found != wanted:
+        raise InputError(f"seed: expected evolution.seed {wanted}; found {found}")
+
+
 def search_from_arrays(
     config: Config, fitness: BodyFitness, arrays: Mapping[str, np.ndarray]
 ) -> BodySearch:
@@ -443,11 +456,7 @@ def search_from_arrays(
         InputError: the arrays are damaged, or those of another run.
     """
     try:
-        if int(arrays["seed"]) != config.evolution.seed:
-            raise InputError(
-                f"seed: expected evolution.seed {config.evolution.seed}; found "
-                f"{int(arrays['seed'])}"
-            )
+        check_seed(config, arrays)
         modules = read_modules(config)
         records = json.loads(arrays["individuals"].tobytes())
         found = [from_record(r, fitness.genotype, modules, fitness.brains.check) for r in records]

@@ -28,14 +28,12 @@ from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.episodes.tank import Tank, Trail, make_tank
 from mjx_revolve.evolution.body_fitness import BodyFitness
+from mjx_revolve.evolution.coevolution import SHOWN, best_of, check_seed, mean_known
 from mjx_revolve.evolution.individuals import Individual, from_record, to_record
-from mjx_revolve.evolution.loop import NUM_ELITES, summarize
+from mjx_revolve.evolution.loop import summarize
 from mjx_revolve.evolution.pool import Pool
-from mjx_revolve.evolution.selection import order
 from mjx_revolve.inputs.errors import InputError
 
-# Descriptors whose mean over the living goes into the metrics.
-_SHOWN = ("num_modules", "num_hinges", "length", "mass", "branching", "limbs", "symmetry")
 # By how much of their reach more robots are kept apart where they are born. A choice.
 _ROOM = 1.0
 CAUSES = ("age", "energy", "lost", "failed")
@@ -255,7 +253,7 @@ class _Commune:
         citizens, pregnancies = self._deliver(rng, citizens, pregnancies, generation, now)
         # Only who has lived for as long as fitness is measured counts.
         known = [c.individual for c in citizens.values() if len(c.track) >= self.kept]
-        elites = best_of([*search.elites, *(i for i in died if self._is_known(i)), *known])
+        elites = fittest([*search.elites, *(i for i in died if self._is_known(i)), *known])
         seconds = time.perf_counter() - began
         found = Colony(
             generation=generation,
@@ -586,35 +584,32 @@ class _Commune:
             "champion": search.elites[0].score if search.elites else float("nan"),
             "failed": causes["failed"],
             "living": len(living),
-            "living_mean": _mean(scores),
+            "living_mean": mean_known(scores),
             "time": now,
             "births": count["birth"],
             "matings": count["mating"],
             **{f"died_of_{name}": causes[name] for name in CAUSES},
             "expected": len(search.pregnancies),
-            "mean_age": _mean(ages),
+            "mean_age": mean_known(ages),
         }
         if self.colony.energy is not None:
-            row["mean_charge"] = _mean(charges)
-        for name in _SHOWN:
-            row[f"mean_{name}"] = _mean([float(i.descriptors[name]) for i in living])
+            row["mean_charge"] = mean_known(charges)
+        for name in SHOWN:
+            row[f"mean_{name}"] = mean_known([float(i.descriptors[name]) for i in living])
         row["seconds"] = search.seconds
         row["times_real_time"] = self.interval / seconds
         row["evaluations_per_second"] = len(self.born) / seconds
         return row
 
 
-def best_of(individuals: Sequence[Individual]) -> tuple[Individual, ...]:
+def fittest(individuals: Sequence[Individual]) -> tuple[Individual, ...]:
     """Those with the best scores, each once and at its best; of equals, the older ones."""
     known: dict[int, Individual] = {}
     for individual in individuals:
         if np.isfinite(individual.score):
             best = known.setdefault(individual.number, individual)
             known[individual.number] = max(best, individual, key=lambda i: i.score)
-    rows = list(known.values())
-    scores = np.array([[i.score] for i in rows]).reshape(-1, 1)
-    numbers = np.array([i.number for i in rows], int)
-    return tuple(rows[k] for k in order(scores, numbers)[:NUM_ELITES])
+    return best_of(list(known.values()))
 
 
 def _every(trail: Trail, stride: int) -> Trail:
@@ -630,11 +625,6 @@ def _reach(robot: Robot) -> float:
     """How far a robot's corners are from its core at rest [m]."""
     corners = robot.assembly.layout.core_corners()
     return float(np.linalg.norm(corners, axis=-1).max())
-
-
-def _mean(values: Any) -> float:
-    found = np.asarray(values, float)
-    return float(np.nanmean(found)) if np.isfinite(found).any() else float("nan")
 
 
 # --- to and from a checkpoint ---------------------------------------------------------------------
@@ -686,11 +676,7 @@ def colony_from_arrays(
         InputError: the arrays are damaged, or those of another run.
     """
     try:
-        if int(arrays["seed"]) != config.evolution.seed:
-            raise InputError(
-                f"seed: expected evolution.seed {config.evolution.seed}; found "
-                f"{int(arrays['seed'])}"
-            )
+        check_seed(config, arrays)
         modules = read_modules(config)
         plain = json.loads(arrays["plain"].tobytes())
         people = {}

@@ -135,7 +135,7 @@ def _of_colony(config: Config, pool: Pool) -> Method:
 
     def elites(search: colony.Colony) -> tuple[Individual, ...]:
         """Where nobody has lived long enough to be known, who seems best."""
-        return search.elites or colony.best_of(search.living)
+        return search.elites or colony.fittest(search.living)
 
     def save_best(run: Run, search: colony.Colony) -> None:
         if best := elites(search):
