@@ -2,7 +2,7 @@
 
     python docs/reference.py build/docs
 
-`index.html` is the README; every `docs/*.md` becomes a page; each room of the package and each
+`index.html` is the README; every `docs/*.md` becomes a page; each layer of the package and each
 module has one below `mjx_revolve/`, in reading order. Made by pdoc.
 """
 
@@ -28,9 +28,9 @@ FIRST = (
     "tutorial", "settings", "evolution", "viewer", "replay", "live", "report", "sweeps", "measures",
     "interchange", "physics", "parallel",
 )  # fmt: skip
-# The package's rooms in reading order: each imports only from itself and from those before it.
-ROOMS = (
-    "inputs", "numerics", "body", "genotypes", "water", "engine", "control", "episodes",
+# The package's layers in reading order: each imports only from itself and from those before it.
+LAYERS = (
+    "inputs", "numerics", "water", "body", "genotypes", "engine", "control", "episodes",
     "evolution", "formats", "view",
 )  # fmt: skip
 
@@ -53,27 +53,27 @@ def list_pages() -> list[Path]:
     return sorted(DOCS.glob("*.md"), key=lambda path: (place.get(path.stem, 99), path.stem))
 
 
-def list_rooms() -> dict[str, list[str]]:
-    """The full names of all public modules by room, in reading order; the commands come last."""
+def list_layers() -> dict[str, list[str]]:
+    """The full names of all public modules by layer, in reading order; the commands come last."""
     package = importlib.import_module(PACKAGE)
-    rooms: dict[str, list[str]] = {room: [] for room in ROOMS}
+    layers: dict[str, list[str]] = {layer: [] for layer in LAYERS}
     commands = []
     for found in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."):
-        _, room, *rest = found.name.split(".")
-        if any(part.startswith("_") for part in (room, *rest)):
+        _, layer, *rest = found.name.split(".")
+        if any(part.startswith("_") for part in (layer, *rest)):
             continue
         if rest:
-            rooms.setdefault(room, []).append(found.name)
+            layers.setdefault(layer, []).append(found.name)
         elif not found.ispkg:
             commands.append(found.name)
-    return rooms | {"": commands}
+    return layers | {"": commands}
 
 
-def idea_of(room: str) -> str:
-    """The first line of a room's docstring; "" is the front door."""
-    if not room:
+def summary_of(layer: str) -> str:
+    """The first line of a layer's docstring; "" is the front door."""
+    if not layer:
         return "What users type: arguments in, messages out."
-    return (importlib.import_module(f"{PACKAGE}.{room}").__doc__ or "").partition("\n")[0]
+    return (importlib.import_module(f"{PACKAGE}.{layer}").__doc__ or "").partition("\n")[0]
 
 
 def link_text(text: str, modules: list[str]) -> str:
@@ -115,7 +115,7 @@ def mend_tuples(module: types.ModuleType) -> None:
             new.__annotations__ = typing.get_type_hints(value)
             new.__doc__ = ""
             for name in value._fields:
-                vars(value)[name].__doc__ = ""
+                getattr(value, name).__doc__ = ""
 
 
 def mend_checked(module: types.ModuleType) -> None:
@@ -144,8 +144,8 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     import pdoc.doc
     import pdoc.render
 
-    rooms = list_rooms()
-    modules = [name for found in rooms.values() for name in found]
+    layers = list_layers()
+    modules = [name for found in layers.values() for name in found]
     package = importlib.import_module(PACKAGE)
     for name in package.__all__:  # they are imported when they are first used
         getattr(package, name)
@@ -155,7 +155,7 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
         name: pdoc.doc.Module(make_page(name, link_text(path.read_text(encoding="utf-8"), modules)))
         for name, (_, path) in pages.items()
     }
-    for name in [PACKAGE, *(f"{PACKAGE}.{room}" for room in rooms if room), *modules]:
+    for name in [PACKAGE, *(f"{PACKAGE}.{layer}" for layer in layers if layer), *modules]:
         module = importlib.import_module(name)
         mend_tuples(module)
         mend_checked(module)
@@ -166,8 +166,8 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
         template_directory=DOCS / "pages",
     )
     pdoc.render.env.globals["prose"] = [(name, title) for name, (title, _) in pages.items()]
-    pdoc.render.env.globals["rooms"] = [
-        (room, idea_of(room), found) for room, found in rooms.items()
+    pdoc.render.env.globals["layers"] = [
+        (layer, summary_of(layer), found) for layer, found in layers.items()
     ]
     written = []
     with warnings.catch_warnings(record=True) as complaints:

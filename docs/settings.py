@@ -18,14 +18,17 @@ from typing import Annotated, Any
 
 from pydantic_core import PydanticUndefined
 
-from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.control import joint_network, neurons
+from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.episodes import config as settings
 from mjx_revolve.episodes.tasks import TASKS
 from mjx_revolve.evolution.strategies import STRATEGIES
-from mjx_revolve.inputs.complaints import describe, fields_of
+from mjx_revolve.inputs.validation_messages import describe, fields_of
 from mjx_revolve.water.bed import Bed
+from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
 from mjx_revolve.water.currents import Gust, Shear, Wave
+from mjx_revolve.water.drag import DRAG_LAWS
+from mjx_revolve.water.law_names import list_coefficients
+from mjx_revolve.water.plates import LiftDrag
 from mjx_revolve.water.world import SurfaceTension, World
 
 PAGE = Path(__file__).with_name("settings.md")
@@ -103,6 +106,27 @@ def first_paragraph(function: Any) -> str:
     return " ".join((inspect.getdoc(function) or "").partition("\n\n")[0].split())
 
 
+def law_tables() -> list[str]:
+    """The laws that a world or a module can choose, and their coefficients."""
+    lines = [
+        "### Laws",
+        "",
+        "| law | what it is | in a step | `task.robust` |",
+        "|---|---|---|---|",
+    ]
+    lines += [f"| `buoyancy: {law.name}` | {law.summary} | | |" for law in BUOYANCY_LAWS.values()]
+    for law in DRAG_LAWS.values():
+        step = "explicit" if law.explicit else "implicit"
+        varied = "varied" if law.varied else "refused"
+        lines.append(f"| `drag: {law.name}` | {law.summary} | {step} | {varied} |")
+    lines += ["", "Coefficients of modules; those without a field stand under `coefficients`.", ""]
+    lines += ["| coefficient | law | unit | usual | meaning |", "|---|---|---|---|---|"]
+    for law_name, c in list_coefficients():
+        where = c.name if c.own_field else f"coefficients.{c.name}"
+        lines.append(f"| `{where}` | `{law_name}` | {c.unit} | `{c.default:g}` | {c.meaning} |")
+    return [*lines, ""]
+
+
 def make_page() -> str:
     """The page."""
     lines = [_HEAD, "## Tasks", "", "`task.type`; `docs/tutorial.md` writes one of your own.", ""]
@@ -113,9 +137,9 @@ def make_page() -> str:
         lines.append(f"| `{name}` | {said} | {task.unit} | {', '.join(needs)} |")
     lines += ["", "## Controllers", "", "`controller.type`; likewise.", ""]
     lines += ["| controller | | settings that only it has |", "|---|---|---|"]
-    for name in settings.CONTROLLERS:
-        only = ", ".join(f"`{x}`" for x in settings.CONTROLLERS[name])
-        lines.append(f"| `{name}` | {first_paragraph(_maker(name))} | {only} |")
+    for name, kind in CONTROLLERS.items():
+        only = ", ".join(f"`{x}`" for x in kind.settings)
+        lines.append(f"| `{name}` | {first_paragraph(kind.make)} | {only} |")
     lines += ["", "## A configuration", "", "`docs/evolution.md` tells more of `bodies`.", ""]
     lines += table(settings.Config)
     for name, kind in sections(settings.Config):
@@ -126,20 +150,11 @@ def make_page() -> str:
     lines += ["### Strategies", "", f"{where}, by evosax's names: {strategies}."]
     lines += ["", "## A world", "", "`docs/physics.md` has the laws.", ""]
     lines += table(World)
+    lines += law_tables()
     for name, kind in _PARTS.items():
         lines += [f"### `{name}`: {first_paragraph(kind)}", ""]
         lines += table(kind, f"{name}.")
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _maker(name: str) -> Any:
-    """The function whose docstring tells of a controller."""
-    kinds = {"mlp": joint_network.make_joint_network, "rnn": joint_network.make_joint_network}
-    kinds["brain"] = neurons.make_network
-    if name in kinds:
-        return kinds[name]
-    module = __import__(f"mjx_revolve.control.{name}", fromlist=["_"])
-    return getattr(module, f"make_{name}")
 
 
 if __name__ == "__main__":

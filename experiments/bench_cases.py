@@ -114,12 +114,14 @@ def make_evaluation(job: dict[str, Any]) -> Case:
 
 def make_generation(job: dict[str, Any]) -> Case:
     """A whole generation of the evolution loop on all cores: ask, evaluate, tell, what it keeps."""
-    from mjx_revolve.evolution.loop import evolve
-    from mjx_revolve.evolution.pool import make_pool
+    from mjx_revolve.evolution.executor import make_executor
+    from mjx_revolve.evolution.gene_search import GeneEvolution
+    from mjx_revolve.evolution.generations import run_generations
 
-    pool = make_pool(_config(job))
-    generations = evolve(pool.config.evolution, pool)
-    return lambda: next(generations), job["population"] * _episode_steps(pool)
+    executor = make_executor(_config(job))
+    evolution = executor.fitness.config.evolution
+    generations = run_generations(GeneEvolution(evolution, executor), evolution.generations)
+    return lambda: next(generations), job["population"] * _episode_steps(executor.fitness)
 
 
 def _bodies(job: dict[str, Any], each: int = 1) -> list[Any]:
@@ -170,8 +172,8 @@ def make_bare(job: dict[str, Any]) -> Case:
     import jax
     import jax.numpy as jnp
 
-    from mjx_revolve.episodes.rollout import flow_at, roll_out
-    from mjx_revolve.numerics.xla import compiler_options, over_chunks
+    from mjx_revolve.episodes.rollout import Rollout, held
+    from mjx_revolve.numerics.xla import jit, over_chunks
     from mjx_revolve.water.flow import water_of
 
     fitness = _fitness(job)
@@ -181,21 +183,12 @@ def make_bare(job: dict[str, Any]) -> Case:
 
     def chunk(qpos: Any, ctrl: Any) -> Any:
         qvel = jnp.zeros((robot.mj_model.nv, qpos.shape[-1]), qpos.dtype)
-        state, _ = roll_out(
-            engine,
-            lambda state, time, row, sense: (state, ctrl),
-            flow_at(robot.world, water_of(world)),
-            lambda state, ctrl, energy, water: (),
-            engine.init(qpos, qvel),
-            (),
-            None,
-            records=steps // 20,
-            every=20,
-            timestep=world.timestep,
-        )
-        return jnp.stack(state.position)
+        rollout = Rollout(engine, held(ctrl), world, water_of(world))
+        start = rollout.init(engine.init(qpos, qvel))
+        last, _ = rollout.advance(start, lambda *_: (), steps // 20, 20)
+        return jnp.stack(last.state.position)
 
-    run = jax.jit(over_chunks(chunk), compiler_options=compiler_options())
+    run = jit(over_chunks(chunk))
     qpos = jnp.tile(jnp.asarray(robot.start_qpos(DEPTH), jnp.float32)[:, None], (1, count))
     low, high = engine.plant.low, engine.plant.high
     share = jax.random.uniform(jax.random.key(0), (robot.num_hinges, count))
@@ -208,7 +201,7 @@ def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
     import numpy as np
 
     from mjx_revolve import build_robot, load_morphology, load_world
-    from mjx_revolve.engine.plant import figure_of
+    from mjx_revolve.engine.plant import body_geometry
     from mjx_revolve.episodes.tasks import reach_below
     from mjx_revolve.water.bed import bed_height
 
@@ -223,7 +216,7 @@ def _c_model(job: dict[str, Any], morphology: Any = None) -> Any:
         body = robot.morphology
         model.opt.gravity[2] *= 1 - world.density * body.volume / body.mass
         start = float(bed_height(world.bed, np.zeros(1), np.zeros(1))[0])
-        model.qpos0[2] = start + reach_below(_config(job).task, figure_of(robot))
+        model.qpos0[2] = start + reach_below(_config(job).task, body_geometry(robot))
     return model
 
 

@@ -24,10 +24,11 @@ from experiments.studies import (
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.body_pictures import plot_bodies
+from mjx_revolve.view.convergence import draw_outcomes, draw_scores
 from mjx_revolve.view.outcomes import Outcome, by_case, write_csv
-from mjx_revolve.view.plots import WIDE, figure_png, new_figure
+from mjx_revolve.view.plots import WIDE, figure_png, in_style, new_figure
 from mjx_revolve.view.statistics import COVERAGE, difference, holm, rank_test
-from mjx_revolve.view.sweep_pictures import draw_curves, draw_dots, plot_bodies
 
 ROBOTS = ("spider", "gecko", "snake", "centipede", "fish")
 BRAINS = 64  # CMA-ES's population for one body: as many lanes as the step takes at a time, a choice
@@ -106,6 +107,7 @@ def describe_difference(name: str, values: Sequence[float], others: Sequence[flo
     return f"| `coevolution` − `{name}` | {found} | {zero if np.isfinite(found.low) else '–'} |"
 
 
+@in_style
 def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
     """Writes `budgets.md`, its pictures and `budgets.csv`.
 
@@ -149,8 +151,9 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
     ]
     figure = new_figure(WIDE + 3, 4.4)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    draw_curves(left, cases, "best score so far (body lengths/s)")
-    draw_dots(right, scores, "champions on fresh starts (body lengths/s)")
+    draw_outcomes(left, cases, "best score so far (body lengths/s)")
+    draw_scores(right, scores)
+    right.set_title("champions on fresh starts (body lengths/s)")
     write_atomic(folder / "budgets.png", figure_png(figure))
     bodies = plot_bodies({name: cases[name] for name in EVOLVED if name in cases} or cases)
     write_atomic(folder / "budgets_bodies.png", figure_png(bodies))

@@ -24,8 +24,10 @@ from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.body_pictures import plot_bodies
+from mjx_revolve.view.convergence import plot_curves, plot_scores
 from mjx_revolve.view.outcomes import Figures, Outcome, by_case, write_csv
-from mjx_revolve.view.plots import WIDE, figure_png, new_figure
+from mjx_revolve.view.plots import figure_png
 from mjx_revolve.view.statistics import (
     ALPHA,
     COVERAGE,
@@ -34,7 +36,6 @@ from mjx_revolve.view.statistics import (
     interval,
     smallest_p,
 )
-from mjx_revolve.view.sweep_pictures import draw_curves, plot_bodies, plot_dots
 
 CURRENT = 0.05  # m/s along x, of `current`; about what a small swimmer can keep up with, a choice
 # A pond that bodies of 0.2 to 0.3 m must notice: their core starts 0.15 m from surface and bed, and
@@ -261,10 +262,9 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
         "",
         "![learning curves](environments_curves.png)",
     ]
-    curves = new_figure(WIDE, 4.2)
-    draw_curves(curves.subplots(), cases, "best score so far (body lengths/s)")
+    curves = plot_curves(cases, "best score so far (body lengths/s)")
     panels = {FIGURES[figure.name]: figure.values for figure in compared["champion"]}
-    pictures = {"bodies": plot_bodies(cases), "figures": plot_dots(panels), "curves": curves}
+    pictures = {"bodies": plot_bodies(cases), "figures": plot_scores(panels), "curves": curves}
     for name, picture in pictures.items():
         write_atomic(folder / f"environments_{name}.png", figure_png(picture))
     rows = [

@@ -304,6 +304,7 @@ def read_tables() -> Still:
     import mujoco
 
     from mjx_revolve import build_robot, load_morphology, load_world
+    from mjx_revolve.water.face_drag import FACES
 
     world = load_world("empty_underwater", gravity=GRAVITY)
     robot = build_robot(load_morphology(ROOT / "morphologies" / "spider.yaml"), world)
@@ -317,7 +318,7 @@ def read_tables() -> Still:
     return Still(
         share=water * float(table.volume.sum()) / mass,
         start=net / (mass + water * float(np.sum(table.added_mass * n**2))),
-        terminal=float(np.sqrt(net / (water * np.sum(table.drag_linear * n**3)))),
+        terminal=float(np.sqrt(net / (np.sum(FACES.numbers(table, robot.world).linear * n**3)))),
     )
 
 

@@ -5,9 +5,9 @@
 A fish learns to swim to targets, which its oscillators only know of by a sensor of their direction
 (`sensory_cpg`, the brain and the task of `configs/lake_target.yaml`). Four brains learn side by
 side, each in 16 episodes: every 2 s of an episode (`make_windows`), Adam goes a step along the mean
-slope. Slopes are clipped episode by episode, to the median length of those of the same brain, as
-where the motion is chaotic single ones are longer by orders of magnitude. The rate falls to 0 with
-the time. Then CMA-ES has as long. Time is that of processors, and compilation is left out of it.
+gradient. Gradients are clipped episode by episode, to the median length of those of the same brain,
+as where the motion is chaotic single ones are longer by orders of magnitude. The rate falls to 0
+with the time. Then CMA-ES has as long. Time is that of processors, without compilation.
 The best brain by gradient goes into a run folder, which replay, viewer and report can read.
 """
 
@@ -27,8 +27,8 @@ from experiments.common import ROOT, make_folder, make_parser
 from mjx_revolve.episodes.config import EvolutionConfig, load_config
 from mjx_revolve.episodes.fitness import Fitness, make_fitness
 from mjx_revolve.episodes.scoring import REPORT_STREAM
-from mjx_revolve.episodes.windows import Windows, make_windows
-from mjx_revolve.evolution.runs import create_run
+from mjx_revolve.episodes.windows import TruncatedBPTT, make_windows
+from mjx_revolve.evolution.run_folder import create_run_folder
 from mjx_revolve.evolution.strategies import make_strategy
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
@@ -50,25 +50,25 @@ POPULATION, TRIALS = 64, 8
 FRESH = 4  # keys of 16 starts each that nobody learnt from
 
 
-def clip_slopes(slope: jax.Array) -> jax.Array:
-    """Makes no slope longer than the median of those of the same individual.
+def clip_gradients(gradient: jax.Array) -> jax.Array:
+    """Makes no gradient longer than the median of those of the same individual.
 
     Args:
-        slope: `[P, trials, num_genes]`.
+        gradient: `[P, trials, num_genes]`.
 
     Returns:
         Likewise.
     """
-    size = jnp.linalg.norm(slope, axis=-1, keepdims=True)
+    size = jnp.linalg.norm(gradient, axis=-1, keepdims=True)
     # Squares of very long ones overflow: what has no length any more says nothing.
-    slope = jnp.where(jnp.isfinite(size), slope, 0.0)
+    gradient = jnp.where(jnp.isfinite(size), gradient, 0.0)
     size = jnp.where(jnp.isfinite(size), size, 0.0)
     most = jnp.median(size, axis=1, keepdims=True)
-    return slope * jnp.minimum(1.0, most / jnp.maximum(size, 1e-12))
+    return gradient * jnp.minimum(1.0, most / jnp.maximum(size, 1e-12))
 
 
 def learn(
-    windows: Windows, seconds: float, seed: int, say: Callable[[str], None]
+    windows: TruncatedBPTT, seconds: float, seed: int, say: Callable[[str], None]
 ) -> tuple[np.ndarray, float]:
     """Learns by gradients for a while.
 
@@ -87,23 +87,23 @@ def learn(
     memory = optimiser.init(genes)
 
     @jax.jit
-    def improve(genes: jax.Array, memory: Any, slope: jax.Array) -> Any:
-        change, memory = optimiser.update(-clip_slopes(slope).mean(1), memory)
+    def improve(genes: jax.Array, memory: Any, gradient: jax.Array) -> Any:
+        change, memory = optimiser.update(-clip_gradients(gradient).mean(1), memory)
         return optax.apply_updates(genes, change), memory
 
     began = time.perf_counter()
-    slopes, _ = windows.climb(genes, windows.begin(genes, key))
-    jax.block_until_ready(improve(genes, memory, slopes.slope))
+    gradients, _ = windows.step(genes, windows.init(genes, key))
+    jax.block_until_ready(improve(genes, memory, gradients.gradient))
     compiling, start, number, spent = time.perf_counter() - began, time.process_time(), 0, 0.0
     told = 0.0
     while spent < seconds:
-        episodes, score = windows.begin(genes, jax.random.fold_in(key, number)), 0.0
+        episodes, score = windows.init(genes, jax.random.fold_in(key, number)), 0.0
         for _ in range(windows.count):
-            slopes, episodes = windows.climb(genes, episodes)
-            score += np.asarray(slopes.gain).mean(1)
+            gradients, episodes = windows.step(genes, episodes)
+            score += np.asarray(gradients.gain).mean(1)
             left = max(0.0, 1 - (time.process_time() - start) / seconds)
             memory.hyperparams["learning_rate"] = jnp.asarray(RATE * left, jnp.float32)
-            genes, memory = improve(genes, memory, slopes.slope)
+            genes, memory = improve(genes, memory, gradients.gradient)
         number, spent = number + 1, time.process_time() - start
         if spent >= told:
             told += seconds / 8
@@ -152,7 +152,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not 0 <= args.seed < 2**31:
         raise InputError(f"--seed: expected 0 to {2**31 - 1}; found {args.seed}")
     config = load_config(CONFIG, CHANGES | {"task.trials": EPISODES})
-    run, config = create_run(make_folder(args.out, "gradient_learning"), config, seed=args.seed)
+    run, config = create_run_folder(
+        make_folder(args.out, "gradient_learning"), config, seed=args.seed
+    )
     prepare_process()
     say = partial(print, flush=True)
     fitness = make_fitness(config)
@@ -176,7 +178,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     other = float(judge(fitness, evolve(few, args.seconds, args.seed, say), args.seed)[0])
     unit = fitness.task.unit
     say(f"On {FRESH * EPISODES} fresh starts: gradients {score:.3f}, CMA-ES {other:.3f} {unit}")
-    say(f"written: {short_path(run.folder)}")
+    say(f"written: {short_path(run.path)}")
     return 0
 
 

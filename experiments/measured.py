@@ -18,6 +18,7 @@ from experiments.common import make_folder, make_parser
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.view.plots import WIDE, in_style, new_figure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,26 +40,22 @@ def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
 
 def _pair() -> tuple[Any, Any, Any]:
     """A figure with two axes beside each other."""
-    from mjx_revolve.view.plots import WIDE, new_figure
-
     figure = new_figure(WIDE, 3.6)
     left, right = figure.subplots(1, 2)
     return figure, left, right
 
 
 def _finish(*all_axes: Any, legends: bool = True) -> None:
-    from mjx_revolve.view.plots import dress
-
     for axes in all_axes:
-        dress(axes)
         if legends and axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize=8)
 
 
+@in_style
 def draw_drag(steady: Found, oscillating: Found) -> Any:
     """C_d of bodies in a steady flow, and of a plate in an oscillating one."""
     from experiments.measured_data import plate_drag
-    from mjx_revolve.view.plots import COLORS, head
+    from mjx_revolve.view.plots import COLORS
 
     figure, left, right = _pair()
     place = np.arange(len(steady.rows))[::-1]
@@ -66,7 +63,7 @@ def draw_drag(steady: Found, oscillating: Found) -> Any:
     left.barh(place - 0.2, [r.ours for r in steady.rows], 0.36, color=COLORS[0], label="ours")
     left.set_yticks(place, [r.what for r in steady.rows], fontsize=8)
     left.set_xlabel("$C_d$ on the frontal area", fontsize=9)
-    head(left, "steady drag")
+    left.set_title("steady drag")
     number, ours = oscillating.lines["faces"]
     fine = np.geomspace(number[0], number[-1], 100)
     right.plot(fine, [plate_drag(x) for x in fine], color=_GREY, label="measured (fit)")
@@ -79,16 +76,17 @@ def draw_drag(steady: Found, oscillating: Found) -> Any:
     right.set_ylim(0, None)
     right.set_xlabel("Keulegan-Carpenter number $U T / b$", fontsize=9)
     right.set_ylabel("$C_d$", fontsize=9)
-    head(right, "a plate across an oscillating flow")
+    right.set_title("a plate across an oscillating flow")
     _finish(left, right)
     left.grid(visible=False, axis="y")
     return figure
 
 
+@in_style
 def draw_polars(found: Found) -> Any:
     """Lift and drag coefficients of plates over their angle of attack."""
     from experiments.measured_data import POLARS
-    from mjx_revolve.view.plots import COLORS, head
+    from mjx_revolve.view.plots import COLORS
 
     figure, left, right = _pair()
     for axes, what in ((left, "lift"), (right, "drag")):
@@ -101,7 +99,7 @@ def draw_polars(found: Found) -> Any:
                       label=f"measured, {name}")  # fmt: skip
         axes.set_xlabel("angle of attack (deg)", fontsize=9)
         axes.set_ylabel(f"$C_{what[0]}$", fontsize=9)
-        head(axes, f"{what} of flat plates")
+        axes.set_title(f"{what} of flat plates")
     _finish(left, right)
     if len(right.get_lines()) == 4:
         # Both aspect ratios have the same drag to us.
@@ -110,10 +108,11 @@ def draw_polars(found: Found) -> Any:
     return figure
 
 
+@in_style
 def draw_coins(found: Found) -> Any:
     """Speeds of coins that fall, and where they land."""
     from experiments.measured_data import COINS, VISCOSITY
-    from mjx_revolve.view.plots import COLORS, head
+    from mjx_revolve.view.plots import COLORS
 
     figure, left, right = _pair()
     place = np.arange(len(COINS))
@@ -125,23 +124,24 @@ def draw_coins(found: Found) -> Any:
     left.plot(place, [r.ours for r in rows["m/s"]], "s", color=COLORS[0], label="ours")
     left.set_ylim(0, 0.7)
     left.set_ylabel("speed (m/s)", fontsize=9)
-    head(left, "coins that fall")
+    left.set_title("coins that fall")
     right.bar(place - 0.2, [c.landing for c in COINS], 0.36, color=_GREY, label="measured")
     right.bar(place + 0.2, [r.ours for r in rows["cm"]], 0.36, color=COLORS[0], label="ours")
     right.set_yscale("log")
     right.set_ylim(0.05, 90)
     right.set_ylabel("distance from the plumb line (cm)", fontsize=9)
-    head(right, "where they land")
+    right.set_title("where they land")
     for axes in (left, right):
         axes.set_xticks(place, names, fontsize=9)
     _finish(left, right)
     return figure
 
 
+@in_style
 def draw_rov(found: Found) -> Any:
     """Drag over speed, and added mass, of a remotely operated vehicle."""
     from experiments.measured_data import ROV_DRAG
-    from mjx_revolve.view.plots import COLORS, head
+    from mjx_revolve.view.plots import COLORS
 
     figure, left, right = _pair()
     for color, (name, (linear, square)) in zip(COLORS, ROV_DRAG.items(), strict=False):
@@ -151,19 +151,20 @@ def draw_rov(found: Found) -> Any:
         left.plot(speed, ours, color=color, label=f"ours, {name}")
     left.set_xlabel("speed (m/s)", fontsize=9)
     left.set_ylabel("drag (N)", fontsize=9)
-    head(left, "BlueROV2 Heavy: drag")
+    left.set_title("BlueROV2 Heavy: drag")
     rows = [r for r in found.rows if r.unit == "kg"]
     place = np.arange(len(rows))
     right.bar(place - 0.2, [r.measured for r in rows], 0.36, color=_GREY, label="identified")
     right.bar(place + 0.2, [r.ours for r in rows], 0.36, color=COLORS[0], label="ours")
     right.set_xticks(place, [r.what.rsplit(" ", 1)[1] for r in rows], fontsize=9)
     right.set_ylabel("added mass (kg)", fontsize=9)
-    head(right, "added mass")
+    right.set_title("added mass")
     _finish(left, right)
     right.grid(visible=False, axis="x")
     return figure
 
 
+@in_style
 def draw_section(found: Found) -> Any:
     """Heave and roll of a ship's section in regular waves."""
     from experiments.measured_data import (
@@ -172,7 +173,7 @@ def draw_section(found: Found) -> Any:
         SECTION_HELD,
         WAVE_AMPLITUDE,
     )
-    from mjx_revolve.view.plots import COLORS, head
+    from mjx_revolve.view.plots import COLORS
 
     figure, left, right = _pair()
     steepness = lambda xi: np.degrees(2 * xi / SECTION_BREADTH * WAVE_AMPLITUDE)  # noqa: E731
@@ -191,7 +192,7 @@ def draw_section(found: Found) -> Any:
                       markersize=5, label=label)  # fmt: skip
         axes.set_xlabel("$\\xi = \\omega^2 B / 2 g$", fontsize=9)
         axes.set_ylabel(words[what], fontsize=9)
-        head(axes, f"a ship's section in waves: {what}")
+        axes.set_title(f"a ship's section in waves: {what}")
     _finish(left, right)
     return figure
 

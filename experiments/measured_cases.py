@@ -17,11 +17,13 @@ import numpy as np
 
 from experiments import measured_data as data
 from experiments.common import ROOT
-from experiments.validation_cases import QUICK, carried, frequency, march, start, tank
+from experiments.validation_cases import carried, frequency
+from experiments.water_tank import at_rest, march, quick_options
+from experiments.water_tank import world as tank
 from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.engine.population import robot_acceleration
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.engine.step import robot_acceleration
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
 
@@ -103,7 +105,7 @@ def forces(robot: Robot, velocity: Any, degrees: Any = 0.0, flow: Water | None =
     """
     velocity = np.asarray(velocity, float)
     lanes = velocity.shape[1]
-    qpos, qvel = start(robot, lanes)
+    qpos, qvel = at_rest(robot, lanes, -5.0)
     qpos[3:7] = np.broadcast_to(tilt(degrees), (4, lanes))
     qvel[:3] = velocity
     still = Water(0.0, (0.0, 0.0, 0.0))
@@ -113,7 +115,9 @@ def forces(robot: Robot, velocity: Any, degrees: Any = 0.0, flow: Water | None =
 
     with jax.enable_x64(True):
         water = jax.tree.map(jnp.asarray, still if flow is None else flow)
-        found = jax.jit(run, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel), water)
+        found = jax.jit(run, compiler_options=quick_options())(
+            jnp.asarray(qpos), jnp.asarray(qvel), water
+        )
         return float(robot.mj_model.body_mass.sum()) * np.asarray(found)[:3]
 
 
@@ -143,7 +147,7 @@ def sinking_plate() -> Row:
     world = tank(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
     robot = body("SquarePlate", world)
     edge = sizes(robot)
-    qpos, qvel = start(robot)
+    qpos, qvel = at_rest(robot, 1, -5.0)
     qpos[3:7] = tilt(90.0)  # its face down
     speed = -march(robot, 3.0, qpos, qvel, every=100)[2][-1, 2, 0]
     weight = G * (float(robot.mj_model.body_mass.sum()) - world.density * float(np.prod(edge)))
@@ -196,10 +200,10 @@ def fall(coin: data.Coin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         timestep=0.001,
     )  # fmt: skip
     robot, draw = body(coin.module, world), np.random.default_rng(0)
-    qpos, qvel = start(robot, DROPS, -float(sizes(robot)[2]))
+    qpos, qvel = at_rest(robot, DROPS, -float(sizes(robot)[2]))
     qpos[4:6] = np.radians(TILT) / 2 * draw.normal(size=(2, DROPS))
     qpos[3:7] /= np.linalg.norm(qpos[3:7], axis=0)
-    time, q, _ = march(robot, 1.5, qpos, qvel, every=5)
+    time, q, *_ = march(robot, 1.5, qpos, qvel, every=5)
     depth, away = -q[:, 2], np.hypot(q[:, 0], q[:, 1])
     landed = [np.interp(0.38, d, a) for d, a in zip(depth.T, away.T, strict=True)]
     return time, depth.mean(1), np.array(landed)
@@ -306,9 +310,9 @@ def section_periods() -> list[Row]:
     robot = body("ShipSection", _flume())
     rows = []
     for name, height, turn in (("heave", 0.02, 0.0), ("roll", 0.0, 8.0)):
-        qpos, qvel = start(robot, 1, height - _SUNK)
+        qpos, qvel = at_rest(robot, 1, height - _SUNK)
         qpos[3:7] = tilt(turn)
-        time, q, _ = march(robot, 12.0, qpos, qvel)
+        time, q, *_ = march(robot, 12.0, qpos, qvel)
         way = q[:, 2, 0] if name == "heave" else _pitch(q)
         ours = 2 * np.pi / frequency(time, way)
         rows.append(Row(_SHIP, f"period in {name}", data.SECTION_PERIODS[name], ours, "s"))
@@ -320,7 +324,7 @@ def section_in_waves(xi: float, duration: float = 90.0) -> tuple[float, float]:
     waves = [{"amplitude": data.WAVE_AMPLITUDE, "wavelength": wavelength(xi)}]
     robot = body("ShipSection", _flume(waves=waves, water_depth=data.FLUME_DEPTH))
     omega = np.sqrt(2 * xi * G / data.SECTION_BREADTH)
-    time, q, _ = march(robot, duration, *start(robot, 1, -_SUNK), every=4)
+    time, q, *_ = march(robot, duration, *at_rest(robot, 1, -_SUNK), every=4)
     last = time > duration - 10 * 2 * np.pi / omega
     # What drifts meets the waves a little less often: their frequency is fitted, too.
     best = (np.inf, 0.0, 0.0)

@@ -21,8 +21,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from experiments.meshes import Mesh, check_mesh, mesh_center_of_volume, mesh_volume
 from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.meshes import Mesh, check_mesh, mesh_center_of_volume, mesh_volume
 from mjx_revolve.body.solids import part_mesh
 
 # Table 1 of the thesis as Revolve's code has it (the thesis prints the two hinge masses the other
@@ -42,7 +42,7 @@ def signed_volume(
     """Volume of a mesh by the formula of the thesis [m³].
 
     Args:
-        mesh: as for `mjx_revolve.body.meshes.mesh_volume`.
+        mesh: as for `experiments.meshes.mesh_volume`.
         shift: moves the mesh first [m]; a volume does not change.
         printed: as the thesis prints the formula, with x1 y2 z2 for x1 y2 z3.
     """

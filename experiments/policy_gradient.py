@@ -25,13 +25,13 @@ import numpy as np
 import optax
 
 from experiments.common import make_folder, make_parser
-from mjx_revolve.episodes.rollout import flow_at, roll_out
+from mjx_revolve.episodes.rollout import Rollout, held
 from mjx_revolve.episodes.vector_env import make_vector_env
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
 from mjx_revolve.numerics.runtime import prepare_process
-from mjx_revolve.numerics.xla import compiler_options
+from mjx_revolve.numerics.xla import jit
 from mjx_revolve.water.flow import water_of
 
 CONFIG = "fish_swim"
@@ -285,23 +285,14 @@ def time_both(env: Any, rounds: int = 8, steps: int = 100) -> tuple[float, float
     lanes, every = min(env.num_envs, 64), env.environment.every
 
     def run(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> Any:
-        state, _ = roll_out(
-            engine,
-            lambda state, time, row, sense: (state, ctrl),
-            flow_at(world, water_of(world)),
-            lambda state, ctrl, energy, water: energy,
-            engine.init(qpos, qvel),
-            (),
-            None,
-            records=steps,
-            every=every,
-            timestep=world.timestep,
-        )
-        return engine.root(state).position
+        rollout = Rollout(engine, held(ctrl), world, water_of(world))
+        start = rollout.init(engine.init(qpos, qvel))
+        last, _ = rollout.advance(start, lambda now, ctrl, water: now.energy, steps, every)
+        return engine.root(last.state).position
 
     qpos = jnp.repeat(jnp.asarray(fitness.robot.start_qpos(), jnp.float32)[:, None], lanes, 1)
     given = qpos, jnp.zeros((model.nv, lanes)), jnp.zeros((engine.plant.num_rows, lanes))
-    jitted = jax.jit(run, compiler_options=compiler_options())
+    jitted = jit(run)
     jax.block_until_ready(jitted(*given))
     env.reset(seed=0)
     action, best = env.action_space.sample(), [np.inf, np.inf]

@@ -21,12 +21,13 @@ import numpy as np
 from experiments.common import make_folder
 from experiments.studies import Case, fill, given_settings, run_study, study_parser
 from mjx_revolve.episodes.config import ControllerConfig, load_config
-from mjx_revolve.evolution.plans import Plan, make_plans
+from mjx_revolve.episodes.run_reader import RunReader
+from mjx_revolve.evolution.sweeps import Plan, make_plans
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.numerics.runtime import prepare_process
-from mjx_revolve.view.outcomes import is_finished, write_csv
+from mjx_revolve.view.outcomes import write_csv
 from mjx_revolve.view.statistics import COVERAGE, Interval, difference, interval
 
 CONFIGS: Mapping[str, Case] = {
@@ -93,7 +94,7 @@ def score_champions(plans: Sequence[Plan]) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for label in dict.fromkeys(plan.case for plan in plans):
         case = label.rpartition("/")[2]
-        some = [plan for plan in plans if plan.case == label and is_finished(plan)]
+        some = [plan for plan in plans if plan.case == label and RunReader(plan.folder).is_finished]
         if not some:
             continue
         fitness = make_fitness(some[0].config)

@@ -8,6 +8,7 @@ varied by what is not known of them. `docs/sensitivity.md` discusses the result.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -21,6 +22,7 @@ from mjx_revolve.episodes.config import RobustConfig
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.view.plots import COLORS, WIDE, in_style, new_figure
 
 STARTS = 16  # from which each case of the table swims; the same for all
 DRAWS = 256  # of uncertain numbers, for each interval
@@ -147,47 +149,39 @@ def make_swimmer(champion: Champion, changes: Mapping[str, Any], varied: bool = 
     Returns:
         (start poses `[nq, n]`, a `Variation` of `[n]` each or None) → `Swim`.
     """
-    import jax
     import jax.numpy as jnp
 
     from mjx_revolve import make_fitness
-    from mjx_revolve.engine.step import make_population_engine
+    from mjx_revolve.engine.population import make_population_engine
     from mjx_revolve.engine.variation import Variation
-    from mjx_revolve.episodes.rollout import flow_at, roll_out
-    from mjx_revolve.numerics.xla import compiler_options, hasty_options, over_chunks
+    from mjx_revolve.episodes.rollout import Rollout, controlled
+    from mjx_revolve.numerics.xla import jit, over_chunks
     from mjx_revolve.water.flow import water_of
 
     settings = {key: value for key, value in changes.items() if key != "servos"}
     fitness = make_fitness(champion.config, **settings)
     robot, controller, task = fitness.robot, fitness.controller, champion.config.task
     if "servos" in changes:
-        robot.mj_model.jnt_user[:] = np.inf
+        model = copy.copy(robot.mj_model)
+        model.jnt_user[:] = np.inf
+        robot = robot.with_model(model)
     # The bed is out of reach.
     still = make_population_engine(robot, contact=False)
 
     def chunk(qpos: Any, *factors: Any) -> Any:
-        engine = still.varied(Variation(*factors)) if varied else still  # type: ignore[misc]
+        engine = still.with_variation(Variation(*factors)) if varied else still
         lanes = qpos.shape[-1]
         genes = jnp.broadcast_to(jnp.asarray(champion.genes, qpos.dtype)[:, None],
                                  (len(champion.genes), lanes))  # fmt: skip
         parameters = controller.decode(genes, engine.plant)
-        _, kept = roll_out(
-            engine,
-            lambda state, time, row, sense: controller.step(parameters, state, time, sense),
-            flow_at(robot.world, water_of(robot.world)),
-            lambda state, ctrl, energy, water: jnp.stack(engine.root(state).position),
-            engine.init(qpos, jnp.zeros((robot.mj_model.nv, lanes), qpos.dtype)),
-            controller.init(parameters),
-            None,
-            records=fitness.num_records,
-            every=fitness.record_every,
-            timestep=robot.world.timestep,
-            world=robot.world,
-        )
-        return kept
+        policy, world = controlled(controller, parameters), robot.world
+        rollout = Rollout(engine, policy, world, water_of(world))
+        state = engine.init(qpos, jnp.zeros((robot.mj_model.nv, lanes), qpos.dtype))
+        record = lambda now, ctrl, water: jnp.stack(engine.root(now.state).position)  # noqa: E731
+        start = rollout.init(state, controller.init(parameters))
+        return rollout.advance(start, record, fitness.num_records, fitness.record_every)[1]
 
-    options = compiler_options() if varied else hasty_options()
-    run = jax.jit(over_chunks(chunk), compiler_options=options)
+    run = jit(over_chunks(chunk), fast=not varied)
 
     def swim(qpos: np.ndarray, variation: Any = None) -> Swim:
         factors = () if variation is None else [jnp.asarray(x, jnp.float32) for x in variation]
@@ -332,6 +326,7 @@ def interval_of(speed: np.ndarray) -> tuple[float, float, float]:
     return tuple(float(x) for x in np.percentile(speed, (50, 5, 95)))  # type: ignore[return-value]
 
 
+@in_style
 def draw(found: Sensitivity, others: Mapping[str, Sensitivity] = MappingProxyType({})) -> Any:
     """Curves of one number at a time, and intervals of what is drawn, as a figure.
 
@@ -342,8 +337,6 @@ def draw(found: Sensitivity, others: Mapping[str, Sensitivity] = MappingProxyTyp
     Returns:
         The figure.
     """
-    from mjx_revolve.view.plots import COLORS, WIDE, dress, head, new_figure
-
     figure = new_figure(WIDE, 4.2)
     one, many = figure.subplots(1, 2, width_ratios=(1.15, 1))
     for color, (name, (factor, swim)) in zip(COLORS, found.curves.items(), strict=False):
@@ -361,7 +354,7 @@ def draw(found: Sensitivity, others: Mapping[str, Sensitivity] = MappingProxyTyp
     one.set_xlabel("factor on the number (thick: the range in which it is not known)", fontsize=9)
     one.set_ylabel("speed / speed as evolved", fontsize=9)
     one.legend(frameon=False, fontsize=9)
-    head(one, "one at a time, from a level start")
+    one.set_title("one at a time, from a level start")
     rng = np.random.default_rng(0)
     names = [*reversed(found.draws)]
     everybody = {"the champion": found} | dict(others)
@@ -378,11 +371,9 @@ def draw(found: Sensitivity, others: Mapping[str, Sensitivity] = MappingProxyTyp
                       markersize=7)  # fmt: skip
     many.set_yticks(range(len(names)), names)
     many.set_xlabel("speed (cm/s): median, 5 to 95 %", fontsize=9)
-    head(many, f"{DRAWS} draws from the ranges")
+    many.set_title(f"{DRAWS} draws from the ranges")
     if others:
         many.legend(frameon=False, fontsize=9, loc="upper left")
-    for axes in (one, many):
-        dress(axes)
     return figure
 
 

@@ -1,6 +1,6 @@
 """Many evolutions that are one study, run as a sweep is: stopped and continued as one.
 
-A study is a folder as `mjx_revolve.evolution.plans` describes it; what is compared, and how it is
+A study is a folder as `mjx_revolve.evolution.sweeps` describes it; what is compared, and how it is
 reported, is for the experiments to say.
 """
 
@@ -17,12 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.common import make_folder, make_parser
-from mjx_revolve.evolution.loop import Champion
-from mjx_revolve.evolution.plans import Plan
-from mjx_revolve.evolution.plans import make_plans as plan_runs
-from mjx_revolve.evolution.pool import make_pool
-from mjx_revolve.evolution.start import Start
-from mjx_revolve.evolution.sweeps import choose_steps, run_plans
+from mjx_revolve.evolution.executor import make_executor
+from mjx_revolve.evolution.generations import Champion
+from mjx_revolve.evolution.run import Run
+from mjx_revolve.evolution.sweeps import Plan, choose_steps, run_plans
+from mjx_revolve.evolution.sweeps import make_plans as plan_runs
 from mjx_revolve.inputs.commands import Parser, whole
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path
@@ -32,7 +31,7 @@ from mjx_revolve.view.results import save_pictures
 from mjx_revolve.view.statistics import interval
 
 BASE = Path(__file__).with_name("studies.yaml")
-MAKE_FITNESS = None  # the real one; see `pool.make_pool`
+MAKE_FITNESS = None  # the real one; see `executor.make_executor`
 _STILL_KEY, _STARTS = 20_000, 8  # of the starts from which champions are scored at rest; a choice
 
 
@@ -145,7 +144,7 @@ def run_study(
     plans: Sequence[Plan],
     name: str,
     argv: Sequence[str],
-    draw: Callable[[Start, Champion], None] | None = None,
+    draw: Callable[[Run, Champion], None] | None = None,
 ) -> int:
     """Runs what is not finished; see `sweeps.run_plans`.
 
@@ -166,7 +165,7 @@ def run_study(
     steps = choose_steps(plans, MAKE_FITNESS)
     return run_plans(
         steps,
-        lambda config: make_pool(config, make_fitness=MAKE_FITNESS),
+        lambda config: make_executor(config, make_fitness=MAKE_FITNESS),
         draw or save_pictures,
         again,
     )
@@ -224,9 +223,9 @@ def _still_scores(outcomes: Sequence[Outcome]) -> np.ndarray:
 
     from mjx_revolve.episodes.fitness import make_fitness
     from mjx_revolve.evolution.body_fitness import make_body_fitness
+    from mjx_revolve.evolution.executor import Executor
     from mjx_revolve.evolution.individuals import Individual
-    from mjx_revolve.evolution.life import evaluate
-    from mjx_revolve.evolution.pool import Pool
+    from mjx_revolve.evolution.learning import score_brains
 
     config = outcomes[0].plan.config
     keys = jax.random.split(jax.random.key(_STILL_KEY), _STARTS)
@@ -236,10 +235,10 @@ def _still_scores(outcomes: Sequence[Outcome]) -> np.ndarray:
         score = np.mean([fitness.evaluate(still, key)[0][0] for key in keys])
         return np.full(len(outcomes), score)
     bodies = make_body_fitness(config)
-    pool = Pool(bodies, bodies.block_size)
+    executor = Executor(bodies, bodies.block_size)
     who = [Individual(k, (), 0, "champion", None, o.body, None) for k, o in enumerate(outcomes)]
     genes = [np.zeros((1, bodies.num_genes), np.float32)] * len(who)
-    return np.mean([[s[0] for s, _ in evaluate(pool, who, genes, key)] for key in keys], 0)
+    return np.mean([[s[0] for s, _ in score_brains(executor, who, genes, key)] for key in keys], 0)
 
 
 def describe_runs(cases: Mapping[str, Sequence[Outcome]], known: Mapping[str, Case]) -> list[str]:

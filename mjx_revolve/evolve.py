@@ -4,7 +4,7 @@
     python -m mjx_revolve.evolve --resume DIR
 
 The population is spread over this machine's cores, or over the workers of a Dask cluster with
-`--cluster` (see `mjx_revolve.evolution.pool`); results do not depend on it.
+`--cluster` (see `mjx_revolve.evolution.executor`); results do not depend on it.
 
 Heavy imports stand inside functions: thread settings must be made before NumPy and JAX are loaded,
 and `--help` is there at once.
@@ -24,22 +24,22 @@ from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.evolution.jobs import WorkerError
 from mjx_revolve.inputs.commands import (
     Parser,
+    add_run_arguments,
+    check_run_arguments,
     describe_refusal,
     read_path,
     read_seed,
     run_command,
-    whole,
 )
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
-from mjx_revolve.inputs.trust import add_trust_argument, is_run_config, opening, remembering
+from mjx_revolve.inputs.trust import add_trust_argument, opening, opening_config
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.pool import Pool
-    from mjx_revolve.evolution.runs import Run
-    from mjx_revolve.evolution.start import Start
+    from mjx_revolve.evolution.executor import Executor
+    from mjx_revolve.evolution.run import Run
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -55,10 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--resume", type=read_path, metavar="DIR", help="continue this run folder, bit for bit")
     add("--set", action="append", default=[], metavar="KEY.PATH=VALUE", dest="settings",
         help="replace one value of the configuration; may be repeated")  # fmt: skip
-    add("--workers", type=whole(1), metavar="N",
-        help="processes on this machine (default: its cores)")  # fmt: skip
-    add("--cluster", metavar="SCHEDULER",
-        help="a Dask scheduler's address, or its scheduler file: its workers score")  # fmt: skip
+    add_run_arguments(parser)
     add_trust_argument(parser)
     return parser
 
@@ -68,8 +65,8 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
 
     Args:
         argv: the arguments; None: `sys.argv[1:]`.
-        make_fitness: makes a fitness (see `loop.Fitness`) from a `Config`; None: the real one. See
-            `pool.make_pool`.
+        make_fitness: makes a fitness from a `Config` (see `executor.make_executor`); None: the real
+            one.
 
     Returns:
         The exit code: 0 when the run is finished, 130, 143 or 129 when it was interrupted, 1 when
@@ -79,15 +76,14 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
         InputError: the arguments, the configuration or the run folder are wrong.
     """
     arguments = _parser().parse_args(argv)
-    if arguments.cluster is not None and arguments.workers is not None:
-        raise InputError("--cluster: expected no --workers beside it; found both")
+    check_run_arguments(arguments)
     if arguments.seed is not None:
         arguments.settings.append(f"evolution.seed={arguments.seed}")
     try:
         # From the first heavy import on: some of them swallow a KeyboardInterrupt, or die of it.
-        with Interrupts() as interrupts, contextlib.ExitStack() as open_pools:
+        with Interrupts() as interrupts, contextlib.ExitStack() as executors:
             runtime.prepare_process()
-            return _lead(arguments, make_fitness, open_pools, interrupts)
+            return _lead(arguments, make_fitness, executors, interrupts)
     except WorkerError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -96,17 +92,17 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
 def _lead(
     arguments: argparse.Namespace,
     make_fitness: Callable | None,
-    open_pools: contextlib.ExitStack,
+    executors: contextlib.ExitStack,
     interrupts: Interrupts,
 ) -> int:
-    """A whole run; `open_pools` ends its workers."""
-    from mjx_revolve.evolution.start import begin_run, continue_run
+    """A whole run; `executors` ends its workers."""
+    from mjx_revolve.evolution.run import Run
 
-    def make(config: Config) -> Pool:
-        from mjx_revolve.evolution.pool import make_pool
+    def make(config: Config) -> Executor:
+        from mjx_revolve.evolution.executor import make_executor
 
         workers, cluster = arguments.workers, arguments.cluster
-        return open_pools.enter_context(make_pool(config, workers, make_fitness, cluster))
+        return executors.enter_context(make_executor(config, workers, make_fitness, cluster))
 
     path, folder, settings = arguments.config, arguments.resume, arguments.settings
     if path is None and folder is None:
@@ -115,70 +111,65 @@ def _lead(
         raise InputError(f"--resume {folder}: expected no --out beside it; found {arguments.out}")
     trust = arguments.trust
     if folder is None:
-        # Who names a configuration wants what it names; that of a run folder may be a stranger's.
-        theirs = is_run_config(Path(path)) and not trust
-        with opening(path, trust=False) if theirs else remembering():
-            start = begin_run(path, settings, arguments.out, make, interrupts.writing)
+        with opening_config(path, trust):
+            run = Run.begin(path, settings, arguments.out, make, interrupts.writing)
     else:
         with opening(folder, *([path] if path else []), trust=trust):
-            start = continue_run(folder, path, settings, make)
-    run = start.run
+            run = Run.resume(folder, path, settings, make)
     try:
-        return _evolve(start, interrupts)
+        return _evolve(run, interrupts)
     except WorkerError as error:
         raise WorkerError(f"{error}\n{_resume_hint(run)}") from None
     except BrokenPipeError:
-        raise  # nobody listens to what is printed: no fault of the disk
+        raise  # standard output is closed: no fault of the disk
     except OSError as error:
         print(f"error: {describe_refusal(error)}", file=sys.stderr)
-        if run.checkpoints():
-            last = f"the last checkpoint, {short_path(run.checkpoints()[0])}, is intact; make room"
+        if saved := run.folder.checkpoints():
+            last = f"the last checkpoint, {short_path(saved[0])}, is intact; make room"
             print(f"{last}, then\n{_resume_hint(run)}", file=sys.stderr)
         return 1
     finally:
         run.close()
 
 
-def _evolve(start: Start, interrupts: Interrupts) -> int:
-    """Everything after the arguments are known to be right."""
-    from mjx_revolve.evolution import session
+def _evolve(run: Run, interrupts: Interrupts) -> int:
+    """Evolves a run whose arguments are right."""
     from mjx_revolve.view.results import describe_score, save_pictures
 
-    run, config = start.run, start.config
-    done = start.search.generation if start.search else 0
-    if start.is_finished:
+    config, place = run.config, short_path(run.folder.path)
+    if run.is_finished:
         print(
-            f"{short_path(run.folder)}: finished after {done} generations; to go on: "
-            f"--set evolution.generations={2 * done}"
+            f"{place}: finished after {run.generation} generations; to go on: "
+            f"--set evolution.generations={2 * run.generation}"
         )
         return 0
-    print(plain(_describe(start)), flush=True)
-    if start.resumed:
-        print(f"resuming {start.resumption}", flush=True)
+    print(plain(_describe(run)), flush=True)
+    if run.resumed:
+        print(f"resuming {run.resumption}", flush=True)
     interrupts.be_patient("finishing what is under way")
-    search, champion = session.run_to_end(
-        start, interrupts, lambda champion: save_pictures(start, champion)
-    )
+    champion = run.evolve(interrupts, save_pictures)
     if champion is None:
-        saved = f"stopped after generation {search.generation}; all of it is saved"
+        saved = f"stopped after generation {run.generation}; all of it is saved"
         print(f"{saved}\n{_resume_hint(run)}", flush=True)
         return interrupts.exit_code
     print(f"champion: {describe_score(champion, config)} ({champion.origin})")
     if champion.measures:
         figures = (f"{name} {value:.3g}" for name, value in champion.measures.items())
         print(f"measures: {', '.join(figures)}")
-    print(f"run folder: {short_path(run.folder)}")
+    print(f"run folder: {place}")
     return 0
 
 
-def _describe(start: Start) -> str:
-    """The first line: what runs."""
+def _describe(run: Run) -> str:
+    """The first line of a run."""
     import jax
 
-    fitness, config = start.fitness, start.config
-    robot = getattr(fitness, "robot", None)
+    from mjx_revolve.episodes.fitness import Fitness
+
+    executor, config = run.executor, run.config
     body = ""
-    if robot is not None:
+    if isinstance(executor.fitness, Fitness):
+        robot = executor.fitness.robot
         counts = f"{robot.num_hinges} hinges, {robot.morphology.num_modules} modules"
         body = f"{robot.morphology.name} ({counts}), "
     if config.bodies is not None:
@@ -187,14 +178,14 @@ def _describe(start: Start) -> str:
     device = jax.devices()[0].device_kind
     if device == "cpu":
         device = f"cpu with {runtime.usable_cores()} cores"
-    if fitness.place:
-        device = f"workers at {fitness.place}"
-    elif fitness.workers > 1:
-        device += f", {fitness.workers} workers"
+    if executor.place:
+        device = f"workers at {executor.place}"
+    elif executor.num_workers > 1:
+        device += f", {executor.num_workers} workers"
     return (
-        f"{body}{fitness.num_genes} genes | {config.subject} | "
+        f"{body}{executor.num_genes} genes | {config.subject} | "
         f"{_search_name(config)} {evolution.population_size} x {evolution.generations}, "
-        f"seed {evolution.seed} | {device} | {short_path(start.run.folder)}"
+        f"seed {evolution.seed} | {device} | {short_path(run.folder.path)}"
     )
 
 
@@ -210,7 +201,7 @@ def _search_name(config: Config) -> str:
 def _resume_hint(run: Run) -> str:
     python = Path(sys.executable)
     name = short_path(python) if python.is_relative_to(Path.cwd()) else "python"
-    words = [name, "-m", "mjx_revolve.evolve", "--resume", short_path(run.folder)]
+    words = [name, "-m", "mjx_revolve.evolve", "--resume", short_path(run.folder.path)]
     return f"resume: {shlex.join(words)}"
 
 

@@ -16,7 +16,7 @@ from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 
 if TYPE_CHECKING:
-    from mjx_revolve.view.live.keeper import Keeper
+    from mjx_revolve.view.live.simulation import LiveSimulation
 
 _ROOM = 8  # robots in the water at once: two cores keep them in real time
 _PATIENCE = 3.0  # for the slice that is being stepped, at the end [s]
@@ -42,7 +42,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument(
         "paths", nargs="*", type=read_path, metavar="RUN|CONFIG|MORPHOLOGY",
-        help="who may be dropped, the first of them at once: run folders, configurations, "
+        help="robots that may be dropped, the first of them at once: run folders, configurations, "
         "morphologies, or shipped ones' names; the first run or configuration says how robots are "
         "controlled, and where (default: lake_swim's)",
     )  # fmt: skip
@@ -68,23 +68,23 @@ def main(argv: list[str] | None = None) -> int:
 
     prepare_process()
     from mjx_revolve.episodes.tank import make_tank
-    from mjx_revolve.view.live.keeper import Keeper
     from mjx_revolve.view.live.page import live_page
+    from mjx_revolve.view.live.robot_catalogue import load_catalogue
     from mjx_revolve.view.live.server import LiveServer
-    from mjx_revolve.view.live.stock import load_stock
+    from mjx_revolve.view.live.simulation import LiveSimulation
 
     named = [*arguments.paths, *([arguments.world] if arguments.world else [])]
     with opening(*named, trust=arguments.trust):
-        stock = load_stock(arguments.paths, arguments.world)
+        catalogue = load_catalogue(arguments.paths, arguments.world)
         room = arguments.robots
-        keeper = Keeper(
-            make_tank(stock.mixed, room, spheres=stock.spheres),
-            stock.world,
-            stock.entries,
+        simulation = LiveSimulation(
+            make_tank(catalogue.mixed, room, spheres=catalogue.spheres),
+            catalogue.world,
+            catalogue.entries,
             waits=not arguments.mujoco,
         )
         try:
-            server = LiveServer(keeper, live_page(stock, room), arguments.port)
+            server = LiveServer(simulation, live_page(catalogue, room), arguments.port)
         except OSError as error:
             raise OSError(error.errno, f"port {arguments.port}: {error.strerror}") from None
         serving = threading.Thread(target=server.serve_forever, daemon=True)
@@ -92,9 +92,9 @@ def main(argv: list[str] | None = None) -> int:
         print(plain(server.address))
         print("open it in a browser on this machine; Ctrl-C ends it", flush=True)
         try:
-            _watch(keeper, arguments.mujoco)
+            _watch(simulation, arguments.mujoco)
         finally:
-            keeper.stop()
+            simulation.stop()
             server.closing.set()
             server.shutdown()
             server.server_close()
@@ -102,13 +102,13 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def _watch(keeper: Keeper, window: bool) -> None:
-    """Runs the world in a thread of its own, until it ends or somebody interrupts."""
+def _watch(simulation: LiveSimulation, window: bool) -> None:
+    """Runs the world in a thread of its own, until it ends or is interrupted."""
     wrong: list[BaseException] = []
 
     def run() -> None:
         try:
-            keeper.run()
+            simulation.run()
         except BaseException as error:
             wrong.append(error)
 
@@ -118,18 +118,18 @@ def _watch(keeper: Keeper, window: bool) -> None:
         if window:
             from mjx_revolve.view.live.window import show_window
 
-            show_window(keeper)
-            keeper.stop()
+            show_window(simulation)
+            simulation.stop()
         while thread.is_alive():
             time.sleep(0.1)
     except KeyboardInterrupt:
         pass
     except InputError as error:  # no screen, after all
         wrong.append(error)
-    keeper.stop()
+    simulation.stop()
     thread.join(_PATIENCE)
     if thread.is_alive():
-        # XLA compiles, and cannot be asked to stop; nothing is left that would be lost.
+        # XLA compiles, and cannot be stopped; nothing is left that would be lost.
         said, code = (f"error: {wrong[0]}", 2) if wrong else ("ended", 0)
         print(said, file=sys.stderr if wrong else sys.stdout, flush=True)
         sys.stderr.flush()

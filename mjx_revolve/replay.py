@@ -31,7 +31,6 @@ from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.view.film.opengl import check_screen, find_opengl
 
 if TYPE_CHECKING:
-    from mjx_revolve.view.film.crowd import Crowd
     from mjx_revolve.view.film.film import Film
 
 _KINDS: tuple[str, ...] = (".mp4", ".gif", ".html")
@@ -202,29 +201,34 @@ def main(argv: list[str] | None = None) -> int:
     prepare_process()
     from mjx_revolve.episodes.champion import load_asked
 
-    if arguments.colony:
+    episode = None
+    if arguments.colony or arguments.ancestors is not None:
         with opening_episode(arguments):
-            return _film_colony(arguments, opengl, paths or {})
-    if arguments.ancestors is not None:
-        with opening_episode(arguments):
-            return _film_ancestors(arguments, folder, opengl, paths or {})
-    episode = load_asked(arguments)
-    if paths is None:
-        name = Path(f"{episode.robot.morphology.name}.").name[:-1]  # it may lead elsewhere
-        paths = {} if view else _usual_paths(Path(), name, kinds)
-    if view or films:
+            make = _colony_films if arguments.colony else _ancestor_films
+            made = make(arguments, folder)
+    else:
+        episode = load_asked(arguments)
+        made = []
+        if paths is None:
+            name = Path(f"{episode.robot.morphology.name}.").name[:-1]  # it may lead elsewhere
+            paths = {} if view else _usual_paths(Path(), name, kinds)
+        if view or films:
+            from mjx_revolve.view.film.film import make_film
+
+            made = [make_film(episode, arguments.size, _VIEW_FPS if view else arguments.fps)]
+    paths = paths or {}
+    for film in made:
+        _warn(film)
+    if view:
         from mjx_revolve.view.film.draw import show_film
-        from mjx_revolve.view.film.film import make_film
+
+        show_film(made[0])
+    elif made:
         from mjx_revolve.view.film.video import write_film
 
-        film = make_film(episode, arguments.size, _VIEW_FPS if view else arguments.fps)
-        _warn(film)
-        if view:
-            show_film(film)
-        else:
-            write_film(film, opengl, paths.get(".mp4"), paths.get(".gif"))
-        _say_film(paths, [film])
-    if ".html" in paths:
+        write_film(made, opengl, paths.get(".mp4"), paths.get(".gif"))
+        _say_films(paths, made)
+    if episode is not None and ".html" in paths:
         from mjx_revolve.view.viewer import write_viewer
 
         write_viewer(episode, paths[".html"])
@@ -232,15 +236,12 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def _film_ancestors(
-    arguments: argparse.Namespace, folder: Path | None, opengl: str, paths: dict[str, Path]
-) -> int:
-    """Films an individual and its ancestors, one after the other."""
+def _ancestor_films(arguments: argparse.Namespace, folder: Path | None) -> list[Film]:
+    """Films of an individual and its ancestors, the oldest first."""
     from mjx_revolve.episodes.champion import champion_number, load_individuals, refuse_world
-    from mjx_revolve.view.course import cut_episode
     from mjx_revolve.view.film.film import make_film
-    from mjx_revolve.view.film.video import write_film
     from mjx_revolve.view.population import pick_ancestors, read_population
+    from mjx_revolve.view.poses import cut_episode
 
     refuse_world(arguments.world, arguments.modules)
     if folder is None:
@@ -248,32 +249,23 @@ def _film_ancestors(
     number = arguments.individual
     number = champion_number(folder) if number is None else number
     family = pick_ancestors(read_population(folder)[0], number, arguments.ancestors)
-    numbers = [life.number for life in family] or [number]
+    numbers = [one.number for one in family] or [number]
     films = []
     for episode in load_individuals(folder, numbers, arguments.duration, arguments.seed):
         if arguments.duration is None:
             episode = cut_episode(episode, _EACH)
         films.append(make_film(episode, arguments.size, arguments.fps))
-        _warn(films[-1])
-    write_film(films, opengl, paths.get(".mp4"), paths.get(".gif"))
-    _say_film(paths, films)
-    return 0
+    return films
 
 
-def _film_colony(arguments: argparse.Namespace, opengl: str, paths: dict[str, Path]) -> int:
-    """Films all robots of a colony."""
-    from mjx_revolve.view.colony_replay import DURATION, watch_run
-    from mjx_revolve.view.film.crowd import make_crowd
-    from mjx_revolve.view.film.video import write_film
+def _colony_films(arguments: argparse.Namespace, _: Path | None) -> list[Film]:
+    """A film of all robots of a colony."""
+    from mjx_revolve.view.colony import DURATION, record_colony
+    from mjx_revolve.view.film.film import make_colony_film
 
-    seen = watch_run(Path(arguments.path), arguments.time, arguments.duration or DURATION)
-    crowd = make_crowd(
-        seen.actors, seen.title, span=(seen.start, seen.end), marks=seen.marks, leap=seen.leap,
-        size=arguments.size, fps=arguments.fps,
-    )  # fmt: skip
-    write_film(crowd, opengl, paths.get(".mp4"), paths.get(".gif"))
-    _say_film(paths, [crowd])
-    return 0
+    path, duration = Path(arguments.path), arguments.duration or DURATION
+    recording = record_colony(path, arguments.time, duration)
+    return [make_colony_film(recording, arguments.size, arguments.fps)]
 
 
 def _warn(film: Film) -> None:
@@ -285,11 +277,11 @@ def _warn(film: Film) -> None:
         )
 
 
-def _say_film(paths: dict[str, Path], films: Sequence[Film | Crowd]) -> None:
+def _say_films(paths: dict[str, Path], films: Sequence[Film]) -> None:
     """Says what was written of films in one file."""
     film, frames = films[0], sum(len(film.time) for film in films)
     length = f"{frames / film.fps:.3g} s"
-    count = sum(film.cast for film in films)
+    count = sum(len(film.robots) for film in films)
     length += f", {count} robots" if count > 1 else ""
     _say(paths, ".mp4", f"{length}, {film.size[0]} x {film.size[1]}, {film.fps} frames/s")
     _say(paths, ".gif", length)

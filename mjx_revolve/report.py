@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from mjx_revolve.inputs.commands import Parser, read_path, run_command
@@ -37,17 +36,17 @@ def _parser() -> argparse.ArgumentParser:
         help="show each run's champion in full, not only the best of each configuration",
     )  # fmt: skip
     parser.add_argument(
-        "--individuals", type=_read_individuals, metavar="WHO",
-        help="where bodies evolve: pages on which they swim, RUN/individuals/N.html, to which the "
-        "report leads: best (of the last generation, and the champion's family), archive (all who "
-        "live there), or numbers such as 17,42; a minute or two",
+        "--individuals", type=_read_individuals, metavar="NUMBERS",
+        help="where bodies evolve: pages on which individuals swim, RUN/individuals/N.html, with "
+        "links from the report: best (of the last generation, and the champion's family), archive "
+        "(all in it), or numbers such as 17,42; a minute or two",
     )  # fmt: skip
     add_trust_argument(parser)
     return parser
 
 
 def _read_individuals(text: str) -> str | list[int]:
-    """Reads whose pages are asked for."""
+    """Reads the option --individuals."""
     if text in ("best", "archive"):
         return text
     numbers = text.split(",")
@@ -58,28 +57,32 @@ def _read_individuals(text: str) -> str | list[int]:
     return [int(n) for n in numbers]
 
 
-def _named_file(out: str) -> Path:
-    """The page that was asked for, whatever is there."""
-    path = check_name(out, PAGES, f"--out {out}")
+def _named_page(arguments: argparse.Namespace, usual: Path) -> Path:
+    """The page that --out names; without it the default in the folder `usual`."""
+    from mjx_revolve.view.report.page import default_page
+
+    if arguments.out is None:
+        return default_page(usual)
+    path = check_name(arguments.out, PAGES, f"--out {arguments.out}")
     if not path.parent.is_dir():
         raise InputError(f"--out {path}: expected the folder {path.parent}; found none")
     return path
 
 
-def _report_sweep(sweeps: Sequence[str], arguments: argparse.Namespace) -> int:
+def _report_sweep(sweep: str, arguments: argparse.Namespace) -> int:
     """The page about a sweep, as far as it has got."""
     from mjx_revolve.view.report.sweep import write_report
 
     if len(arguments.runs) > 1:
         raise InputError(
-            f"{sweeps[0]}: expected nothing beside a sweep; found {len(arguments.runs)} folders"
+            f"{sweep}: expected nothing beside a sweep; found {len(arguments.runs)} folders"
         )
-    for option in ("every_champion", "individuals"):
-        if getattr(arguments, option):
-            name = option.replace("_", "-")
-            raise InputError(f"--{name}: expected run folders; found the sweep {sweeps[0]}")
-    page = None if arguments.out is None else _named_file(arguments.out)
-    report = write_report(sweeps[0], page)
+    for option, value in (
+        ("every-champion", arguments.every_champion), ("individuals", arguments.individuals)
+    ):  # fmt: skip
+        if value:
+            raise InputError(f"--{option}: expected run folders; found the sweep {sweep}")
+    report = write_report(sweep, arguments.out and _named_page(arguments, Path(sweep)))
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)
     print(f"report: {report.page}; {report.table}")
@@ -108,28 +111,24 @@ def main(argv: list[str] | None = None) -> int:
 def _report(arguments: argparse.Namespace) -> int:
     """Writes the page, and those of individuals."""
     from mjx_revolve.evolution.sweeps import FILE
-    from mjx_revolve.view.report.bodies import INDIVIDUALS, choose_individuals, write_pages
+    from mjx_revolve.view.report.bodies import PAGE_FOLDER, choose_individuals, write_pages
     from mjx_revolve.view.report.data import read_runs
-    from mjx_revolve.view.report.page import make_report, usual_place
+    from mjx_revolve.view.report.page import make_report
 
-    if sweeps := [name for name in arguments.runs if (Path(name) / FILE).is_file()]:
-        return _report_sweep(sweeps, arguments)
+    for name in arguments.runs:
+        if (Path(name) / FILE).is_file():
+            return _report_sweep(name, arguments)
     records, lost = read_runs(arguments.runs)
-    if arguments.out is not None:
-        path = _named_file(arguments.out)
-    elif len(arguments.runs) > 1:
-        path = usual_place(Path("."))
-    else:
-        folder = Path(records[0].label)
-        path = usual_place(folder if folder.is_dir() else records[0].folder)
+    folder = Path(records[0].label)
+    folder = folder if folder.is_dir() else records[0].folder
+    path = _named_page(arguments, folder if len(arguments.runs) == 1 else Path("."))
     which = arguments.individuals
-    if which is not None and len(records) > 1 and not isinstance(which, str):
+    if isinstance(which, list) and len(records) > 1:
         raise InputError(f"--individuals: expected numbers of one run; found {len(records)} runs")
-    for record, numbers in [
-        (record, choose_individuals(record, which)) for record in records if which is not None
-    ]:
+    chosen = [(r, choose_individuals(r, which)) for r in records] if which is not None else []
+    for record, numbers in chosen:
         written = write_pages(record, numbers)
-        print(f"{record.label}/{INDIVIDUALS}: {len(numbers)} pages, {written} of them new")
+        print(f"{record.label}/{PAGE_FOLDER}: {len(numbers)} pages, {written} of them new")
     page = make_report(records, lost, arguments.every_champion, path.parent).encode()
     for line in lost:
         print(f"warning: nothing could be read: {plain(line)}", file=sys.stderr)

@@ -16,8 +16,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mjx_revolve.inputs.commands import Parser, read_path, run_command, whole
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.commands import (
+    Parser,
+    add_run_arguments,
+    check_run_arguments,
+    read_path,
+    run_command,
+    whole,
+)
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.grids import MOST_SEEDS
 from mjx_revolve.inputs.shipped import find_shipped
@@ -43,10 +49,7 @@ def _parser() -> argparse.ArgumentParser:
         "are run")  # fmt: skip
     add("--out", type=read_path, metavar="DIR",
         help="the sweep's folder (default: runs/CONFIG-sweep-X, X by --set)")  # fmt: skip
-    add("--workers", type=whole(1), metavar="N",
-        help="processes on this machine (default: its cores)")  # fmt: skip
-    add("--cluster", metavar="SCHEDULER",
-        help="a Dask scheduler's address, or its scheduler file: its workers score")  # fmt: skip
+    add_run_arguments(parser)
     return parser
 
 
@@ -66,10 +69,9 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     """
     argv = sys.argv[1:] if argv is None else argv
     arguments = _parser().parse_args(argv)
-    if arguments.cluster is not None and arguments.workers is not None:
-        raise InputError("--cluster: expected no --workers beside it; found both")
+    check_run_arguments(arguments)
     runtime.prepare_process()
-    from mjx_revolve.evolution.pool import make_pool
+    from mjx_revolve.evolution.executor import make_executor
     from mjx_revolve.evolution.sweeps import (
         Sweep,
         check_folder,
@@ -77,7 +79,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
         run_plans,
         write_sweep,
     )
-    from mjx_revolve.view.report.page import usual_place
+    from mjx_revolve.view.report.page import default_page
     from mjx_revolve.view.report.sweep import write_report
     from mjx_revolve.view.results import save_pictures
 
@@ -85,7 +87,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     sweep = Sweep(str(path), arguments.seeds, tuple(arguments.settings))
     folder = Path(arguments.out) if arguments.out else _usual_folder(sweep)
     check_folder(folder)
-    usual_place(folder)  # refuses now what it would refuse after days
+    default_page(folder)  # refuses now what it would refuse after days
     steps = choose_steps(sweep.plans(folder.absolute()), make_fitness)
     write_sweep(folder, sweep)
     cases = len(sweep.cases)
@@ -95,7 +97,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     workers, cluster = arguments.workers, arguments.cluster
     code = run_plans(
         steps,
-        lambda config: make_pool(config, workers, make_fitness, cluster),
+        lambda config: make_executor(config, workers, make_fitness, cluster),
         save_pictures,
         again,
     )

@@ -25,7 +25,7 @@ from mjx_revolve.inputs.commands import (
 )
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import PAGES, check_name
-from mjx_revolve.view.viewer import write_viewer
+from mjx_revolve.view.viewer import write_colony_page, write_viewer
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
     check_colony_arguments(arguments)
     if arguments.colony:
         return _write_colony(arguments)
-    # JAX takes seconds to import: not for those who ask for help.
+    # JAX takes seconds to import: not for `--help`.
     from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.numerics.runtime import prepare_process
 
@@ -81,14 +81,16 @@ def _write_colony(arguments: argparse.Namespace) -> int:
     folder = Path(arguments.path)
     out = Path(arguments.out) if arguments.out else _usual_path(folder, "colony", "colony")
     from mjx_revolve.numerics.runtime import prepare_process
-    from mjx_revolve.view.colony_replay import DURATION, write_colony_replay
+    from mjx_revolve.view.colony import DURATION, record_colony
 
     prepare_process()
     with opening_episode(arguments):
-        written, begin, end, count = write_colony_replay(
-            folder, out, arguments.time, arguments.duration or DURATION
-        )
-    span = f"{count} robots, {begin:.4g} to {end:.4g} s"
+        seen = record_colony(folder, arguments.time, arguments.duration or DURATION)
+    written = write_colony_page(
+        seen.robots, out, seen.title, marks=seen.marks, leap=seen.leap,
+        window=(seen.start, seen.end),
+    )  # fmt: skip
+    span = f"{len(seen.robots)} robots, {seen.start:.4g} to {seen.end:.4g} s"
     print(plain(f"{out}: {span}, {written.bytes / 1e6:.2f} MB; open it in a browser"))
     return 0
 

@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -49,6 +50,15 @@ def _pipe() -> tuple[int, int]:
 def find_browser() -> str | None:
     """Path of a browser, or None."""
     return next((path for name in _NAMES if (path := shutil.which(name))), None)
+
+
+_PANELS = (
+    "[...document.querySelectorAll('.glass:not([hidden])')].map((e) => e.getBoundingClientRect())"
+    ".filter((b) => b.width > 0).map((b) => [b.left, b.top, b.right, b.bottom])"
+)
+needs_browser = pytest.mark.skipif(
+    find_browser() is None, reason="no chromium or chrome on the path to open the page with"
+)
 
 
 class Browser:
@@ -204,6 +214,25 @@ class Browser:
         self.mouse("mouseReleased", *box, button="left", clickCount=1)
 
     def picture(self) -> np.ndarray:
-        """What the page shows, `[rows, columns, 3]` from 0 to 255."""
+        """What the page shows once all is drawn, `[rows, columns, 3]` from 0 to 255."""
+        self.evaluate(
+            "window.done = false;"
+            "requestAnimationFrame(() => requestAnimationFrame(() => window.done = true))"
+        )
+        self.wait("window.done")
         data = base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), float)
+
+    def fact(self, name: str) -> str | None:
+        """What the page says of itself: time, frames, playing, and others."""
+        return self.evaluate(f"document.documentElement.dataset.{name} ?? null")
+
+    def check_panels(self, *sizes: tuple[int, int]) -> None:
+        """Panels lie in the window and not over each other, in windows of these sizes."""
+        for size in sizes:
+            self.resize(*size)
+            panels = np.array(self.evaluate(_PANELS))
+            low = np.maximum(panels[:, None, :2], panels[:, :2])
+            high = np.minimum(panels[:, None, 2:], panels[:, 2:])
+            assert ((low < high).all(-1) == np.eye(len(panels), dtype=bool)).all(), size
+            assert panels.min() >= 0 and (panels[:, 2:] <= size).all(), size

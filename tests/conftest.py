@@ -23,7 +23,7 @@ if "mjx_revolve_state_" not in os.environ.get("XDG_STATE_HOME", ""):
 import jax
 import pytest
 
-from laboratory import WATER, arm_robot, body, elbow_robot, world
+from laboratory import WATER, arm_robot, body, compiled_quickly, elbow_robot, world
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.water.world import load_world
 
@@ -61,6 +61,13 @@ def elbow():
     return elbow_robot(world(**WATER))
 
 
+@pytest.fixture(scope="module")
+def quick_compiles():
+    """Leaves out the compiler's optimisations: they cost more than short runs save."""
+    with compiled_quickly():
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def fresh_traces():
     """Forgets traces after each file, and with them the memory that they hold."""
@@ -72,7 +79,7 @@ def fresh_traces():
 # no worker is left alone with one at the end.
 _LONGEST = (
     "test_many_bodies", "test_tutorial", "test_end_to_end", "test_experiments", "test_dynamics",
-    "test_mjx_contact", "test_rollout", "test_pool", "test_step", "test_evolve", "test_report",
+    "test_mjx_contact", "test_rollout", "test_executor", "test_step", "test_evolve", "test_report",
     "test_coevolution", "test_fitness", "test_cluster", "test_studies", "test_surface_tension",
     "test_own_code", "test_buoyancy", "test_bodies", "test_thrust_step", "test_water", "test_docs",
     "test_loop", "test_sweep", "test_forces", "test_swim_picture", "test_lift_drag",

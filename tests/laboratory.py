@@ -6,11 +6,11 @@ discretisation errs by and not what float32 rounds to.
 
 from __future__ import annotations
 
+import copy
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +19,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_revolve.body.module_types import Box, ModuleType, Part
-from mjx_revolve.body.morphology import Module, Morphology, load_morphology
+from experiments.water_tank import (
+    CHEAP,
+    accelerate,
+    at_rest,
+    box_robot,
+    march,
+    quick_options,
+    world,
+)
+from mjx_revolve.body.morphology import Morphology, load_morphology
 from mjx_revolve.control.controller import Controller
-from mjx_revolve.control.sense import Sense
-from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.plant import Plant, actuators_of
+from mjx_revolve.control.readings import SensorReadings
+from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.engine.step import robot_acceleration
-from mjx_revolve.episodes.rollout import flow_at, roll_out
-from mjx_revolve.numerics.xla import on_cpu, share_once
-from mjx_revolve.water.flow import water_of
-from mjx_revolve.water.world import World, load_world
+from mjx_revolve.numerics.xla import on_cpu
+from mjx_revolve.water.face_drag import FACES, FaceNumbers
+from mjx_revolve.water.world import World
+
+__all__ = ["accelerate", "at_rest", "box_robot", "march", "world"]
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = sorted((ROOT / "morphologies").glob("*.yaml"))
@@ -38,13 +45,6 @@ WILD = sorted((ROOT.parent / "shared" / "revolve_robots").glob("*.yaml"))
 
 # What real water does, for `world`.
 WATER = {"gravity": 9.81, "buoyancy": "partial", "drag": "faces", "added_mass": True}
-# Nothing but inertia: what a test does not name is off.
-EMPTY = {"gravity": 0.0, "buoyancy": "off", "drag": "off", "added_mass": False, "bed": None}
-
-
-def world(**fields) -> World:
-    """A world in which only what is named acts."""
-    return load_world("empty_underwater", **EMPTY | fields)
 
 
 def body(name: str) -> Morphology:
@@ -62,22 +62,10 @@ def tree(body: Morphology) -> list[tuple[tuple[int, ...], str, float]]:
     ]
 
 
-def box_robot(size, mass: float, tank: World, volume: float | None = None, **part) -> Robot:
-    """A single box; without `volume`, it displaces what its box holds."""
-    volume = float(np.prod(size)) if volume is None else volume
-    only = Part("box", (Box(tuple(size)),), mass=mass, volume=volume, **part)
-    module = Module(
-        name="box",
-        type="Core",
-        parent=-1,
-        slot=-1,
-        orientation=0.0,
-        rgb=None,
-        position=np.zeros(3),
-        rotation=np.eye(3),
-        kind=ModuleType("Core", (only,)),
-    )
-    return build_robot(Morphology("box", (module,)), tank)
+def face_drag(robot: Robot) -> FaceNumbers:
+    """Drag of the faces of all parts, `[npart, 3]` each."""
+    numbers: FaceNumbers = FACES.numbers(robot.fluid, robot.world)
+    return numbers
 
 
 def limp(robot):
@@ -86,14 +74,6 @@ def limp(robot):
     model.actuator_gainprm[:, 0], model.actuator_biasprm[:] = 1e-12, 0.0
     model.dof_damping[:], model.jnt_limited[:], model.jnt_user[:] = 0.0, 0, np.inf
     return robot
-
-
-def at_rest(robot: Robot, lanes: int = 1, height: float = 0.0):
-    """`[nq, lanes]` rest pose at a height of the core, and `[nv, lanes]` zeros."""
-    model = robot.mj_model
-    qpos = np.repeat(model.qpos0[:, None], lanes, 1)
-    qpos[2] = height
-    return qpos, np.zeros((model.nv, lanes))
 
 
 def random_states(robot: Robot, lanes: int, seed: int = 0, speed: float = 1.0, depth: float = 5.0):
@@ -111,14 +91,6 @@ def random_states(robot: Robot, lanes: int, seed: int = 0, speed: float = 1.0, d
     return qpos, qvel
 
 
-# A test runs a program once: what the compiler's optimisations cost is more than they save. These
-# two leave them out; together with `xla_disable_hlo_passes=fusion` they would give wrong numbers.
-# Nor does one program have both cores: in one piece, it takes the compiler a fifth less.
-_CHEAP = {
-    "xla_backend_optimization_level": 0,
-    "xla_cpu_use_fusion_emitters": False,
-    "xla_cpu_parallel_codegen_split_count": 1,
-}
 _USUAL = {
     "xla_backend_optimization_level": 3,
     "xla_cpu_use_fusion_emitters": True,
@@ -127,7 +99,7 @@ _USUAL = {
 
 
 def _compile_quickly() -> None:
-    """Makes `_CHEAP` this process's default, but not that of processes which tests start.
+    """Makes `CHEAP` this process's default, but not that of processes which tests start.
 
     XLA reads its flags once, when its first client is made. Who sets XLA_FLAGS, be it to nothing,
     has the tests compiled as they say.
@@ -140,111 +112,30 @@ def _compile_quickly() -> None:
 
 XLA_FLAGS = {
     "XLA_FLAGS": os.environ.get(
-        "XLA_FLAGS", " ".join(f"--{name}={str(value).lower()}" for name, value in _CHEAP.items())
+        "XLA_FLAGS", " ".join(f"--{name}={str(value).lower()}" for name, value in CHEAP.items())
     )
 }
 _compile_quickly()
-QUICK = _CHEAP if on_cpu() else None
+QUICK = quick_options()
 USUAL = _USUAL if on_cpu() else None  # as users compile
 # A derivative is all calls of small functions; inlined into one another, they take XLA 7 times as
 # long. Its numbers are then compared with differences of a program that was compiled otherwise.
-SLOPE = _CHEAP | {"xla_disable_hlo_passes": "call-inliner"} if on_cpu() else None
+SLOPE = CHEAP | {"xla_disable_hlo_passes": "call-inliner"} if on_cpu() else None
 
 
 @contextmanager
-def compiled_quickly(*places: str) -> Iterator[None]:
-    """Leaves out the compiler's optimisations: they cost more than short runs save.
-
-    Args:
-        places: where the options are asked for, `FILE.FUNCTION` of `mjx_revolve/episodes/`.
-    """
+def compiled_quickly() -> Iterator[None]:
+    """Leaves out the compiler's optimisations: they cost more than short runs save."""
     with pytest.MonkeyPatch.context() as patch:
-        for place in places:
-            patch.setattr(f"mjx_revolve.episodes.{place}", lambda: QUICK)
+        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         yield
 
 
-@lru_cache(maxsize=64)
-def _accelerator(robot: Robot, still: bool):
-    def run(qpos, qvel, ctrl, water):
-        water = water_of(robot.world) if still else water
-        return robot_acceleration(robot, qpos, qvel, ctrl, water)
-
-    return jax.jit(share_once(run), compiler_options=QUICK)
-
-
-def accelerate(robot: Robot, qpos, qvel, ctrl=None, water=None, x64: bool = True) -> np.ndarray:
-    """`step.acceleration` of lanes of states, as NumPy: `[nv, lanes]`."""
-    with jax.enable_x64(x64):
-        kind = jnp.float64 if x64 else jnp.float32
-        ctrl = np.zeros((robot.mj_model.nu, np.shape(qpos)[-1])) if ctrl is None else ctrl
-        arrays = [jnp.asarray(x, kind) for x in (qpos, qvel, ctrl)]
-        return np.asarray(_accelerator(robot, water is None)(*arrays, water))
-
-
-@lru_cache(maxsize=64)
-def _marcher(robot: Robot, records: int, every: int, engine: str, still: bool):
-    simulator = make_engine(robot, engine)
-
-    def run(qpos, qvel, targets, water):
-        _, kept = roll_out(
-            simulator,
-            lambda state, time, row, sense: (state, targets),
-            flow_at(robot.world, water_of(robot.world) if still else water),
-            lambda state, ctrl, energy, water: (*simulator.observe(state), energy),
-            simulator.init(qpos, qvel),
-            (),
-            None,
-            records=records,
-            every=every,
-            timestep=robot.world.timestep,
-        )
-        return kept
-
-    return jax.jit(run, compiler_options=QUICK)
-
-
-def march(
-    robot: Robot,
-    duration: float,
-    qpos,
-    qvel,
-    ctrl=None,
-    *,
-    water=None,
-    every: int = 1,
-    engine: str = "population",
-    x64: bool = True,
-):
-    """Steps lanes of one robot with held joint targets.
-
-    Args:
-        robot: from `build_robot`.
-        duration: [s].
-        qpos: `[nq, lanes]`.
-        qvel: `[nv, lanes]`.
-        ctrl: `[nu, lanes]`, by default 0.
-        water: surface and current, by default the world's.
-        every: steps between the rows of the result.
-        engine: "population" or "mjx".
-        x64: in float64.
-
-    Returns:
-        `[T]` time, `[T, nq, lanes]`, `[T, nv, lanes]` and `[T, lanes]` servo work since the row
-        before, the start not among them.
-    """
-    dt = robot.world.timestep
-    records = round(duration / dt / every)
-    with jax.enable_x64(x64):
-        kind = jnp.float64 if x64 else jnp.float32
-        lanes = np.shape(qpos)[-1]
-        ctrl = np.zeros((robot.mj_model.nu, lanes)) if ctrl is None else ctrl
-        own = np.asarray(ctrl)[actuators_of(robot)]
-        asked = make_engine(robot, engine).plant.arrange(jnp.asarray(own, kind))
-        arrays = [*(jnp.asarray(x, kind) for x in (qpos, qvel)), asked]
-        run = _marcher(robot, records, every, engine, water is None)
-        kept = [np.asarray(x, np.float64) for x in run(*arrays, water)]
-    return (dt * every * np.arange(1, records + 1), *kept)
+def with_motors(robot: Robot, factor: float) -> Robot:
+    """The robot with other top speeds of its motors."""
+    model = copy.copy(robot.mj_model)
+    model.jnt_user[:] *= factor
+    return robot.with_model(model)
 
 
 # Small bodies without symmetry. The arm has two crooked limbs of different length: five moving
@@ -323,7 +214,7 @@ def swimmer(folder: Path, robot: str, task: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def check_slope_at_rest(controller: Controller, plant: Plant, sense: Sense) -> None:
+def check_slope_at_rest(controller: Controller, plant: Plant, sense: SensorReadings) -> None:
     """The gradient through some steps of a controller is finite where all genes are 0."""
 
     def last(genes: jax.Array) -> jax.Array:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import builtins
+import collections
+import graphlib
 import importlib
 import inspect
 import os
@@ -55,19 +58,19 @@ def imports_of(path):
             yield from (name.name for name in node.names if name.name.startswith("mjx_revolve"))
 
 
-def imports_between_rooms(rooms):
-    """Pairs of rooms of which the first imports from the second."""
+def imports_between_layers(layers):
+    """Pairs of layers of which the first imports from the second."""
     found = set()
-    for room in rooms:
-        for path in (PACKAGE / room).rglob("*.py"):
+    for layer in layers:
+        for path in (PACKAGE / layer).rglob("*.py"):
             others = {name.split(".")[1] for name in imports_of(path) if "." in name}
-            found |= {(room, other) for other in others & {*rooms} - {room}}
+            found |= {(layer, other) for other in others & {*layers} - {layer}}
     return found
 
 
-def below(room, pairs):
-    """All rooms that a room imports from, directly or not."""
-    found = {b for a, b in pairs if a == room}
+def below(layer, pairs):
+    """All layers that a layer imports from, directly or not."""
+    found = {b for a, b in pairs if a == layer}
     return found.union(*(below(b, pairs) for b in found))
 
 
@@ -77,49 +80,43 @@ def architecture():
 
 
 @pytest.fixture(scope="module")
-def rooms(architecture):
+def layers(architecture):
     """In the order of the table."""
     return re.findall(r"^\| `(\w+)/` \|", architecture, re.MULTILINE)
 
 
-def test_rooms_import_only_from_rooms_above_them(rooms):
-    assert {*rooms} == {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
-    pairs = imports_between_rooms(rooms)
+def test_layers_import_only_from_layers_above_them(layers):
+    assert {*layers} == {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    pairs = imports_between_layers(layers)
     assert len(pairs) > 20
-    assert [(a, b) for a, b in pairs if rooms.index(a) < rooms.index(b)] == []
+    assert [(a, b) for a, b in pairs if layers.index(a) < layers.index(b)] == []
     shown = re.search(
-        r"^ROOMS = \((.*?)\)", (ROOT / "docs" / "reference.py").read_text(), re.M | re.S
+        r"^LAYERS = \((.*?)\)", (ROOT / "docs" / "reference.py").read_text(), re.M | re.S
     )
-    assert re.findall(r"\w+", shown[1]) == rooms
+    assert re.findall(r"\w+", shown[1]) == layers
 
 
-def test_the_picture_of_the_rooms_is_that_of_their_imports(architecture, rooms):
+def test_the_picture_of_the_layers_is_that_of_their_imports(architecture, layers):
     """No arrow that is not there, and none missing that does not follow from others."""
     drawn = {*re.findall(r"^ +(\w+) --> (\w+)$", architecture, re.MULTILINE)}
-    pairs = imports_between_rooms(rooms)
+    pairs = imports_between_layers(layers)
     assert drawn <= pairs
-    for room in rooms:
-        assert below(room, drawn) - {"inputs"} == below(room, pairs) - {"inputs"}
+    for layer in layers:
+        assert below(layer, drawn) - {"inputs"} == below(layer, pairs) - {"inputs"}
         # None follows from the others.
-        for other in (b for a, b in drawn if a == room):
-            assert other not in below(room, drawn - {(room, other)})
-        assert ((room, "inputs") in pairs) == (room not in ("inputs", "numerics"))
+        for other in (b for a, b in drawn if a == layer):
+            assert other not in below(layer, drawn - {(layer, other)})
+        assert ((layer, "inputs") in pairs) == (layer not in ("inputs", "numerics"))
 
 
-def test_every_file_stands_in_its_room_behind_those_that_it_imports(architecture, rooms):
-    for room in rooms:
-        text = re.search(rf"^`{room}/`\n\n((?:- .*\n)+)", architecture, re.MULTILINE)[1]
-        listed = re.findall(r"^- `([\w/]+)\.py`", text, re.MULTILINE)
-        folder = PACKAGE / room
-        assert {*listed} == {
-            path.relative_to(folder).with_suffix("").as_posix()
-            for path in folder.rglob("*.py")
-            if path.name != "__init__.py"
+def test_no_layer_has_a_circle_of_imports(layers):
+    for layer in layers:
+        names = {
+            ".".join(path.relative_to(ROOT).with_suffix("").parts): path
+            for path in (PACKAGE / layer).rglob("*.py")
         }
-        dotted = [f"mjx_revolve.{room}.{name.replace('/', '.')}" for name in listed]
-        for k, name in enumerate(listed):
-            later = {*dotted[k + 1 :]} & {*imports_of(folder / f"{name}.py")}
-            assert later == set(), f"{room}/{name}.py imports from files listed behind it"
+        graph = {name: {*imports_of(path)} & {*names} for name, path in names.items()}
+        graphlib.TopologicalSorter(graph).prepare()  # raises CycleError
 
 
 def test_the_tables_of_measures_are_the_codes():
@@ -153,10 +150,10 @@ def test_the_page_of_settings_is_what_the_code_reads():
 
 
 @pytest.mark.parametrize(
-    "room", ["inputs", "body", "genotypes"], ids=lambda room: f"{room} without JAX and MuJoCo"
+    "layer", ["inputs", "body", "genotypes"], ids=lambda layer: f"{layer} without JAX and MuJoCo"
 )
-def test_rooms_know_nothing_of_what_they_need_not(room):
-    for path in (PACKAGE / room).rglob("*.py"):
+def test_layers_do_not_import_what_they_must_not(layer):
+    for path in (PACKAGE / layer).rglob("*.py"):
         assert not re.search(r"^\s*(?:import|from) (?:jax|mujoco)", path.read_text(), re.MULTILINE)
 
 
@@ -176,6 +173,21 @@ def exists(name):
     return False
 
 
+SCRIPTS = [*sorted((ROOT / "examples").glob("*.py"))]
+
+
+@pytest.mark.parametrize("path", [*TEXTS, *SCRIPTS], ids=lambda path: path.name)
+def test_texts_and_examples_import_public_names_only(path):
+    """From the package, a subpackage or a command; never from a module in a subpackage."""
+    for module, names in re.findall(
+        r"^\s*from (mjx_revolve[\w.]*) import (\([^)]*\)|.*)$", path.read_text(), re.MULTILINE
+    ):
+        assert module.count(".") <= 1, module
+        public = importlib.import_module(module)
+        for name in re.findall(r"\w+", names.partition("#")[0]):
+            assert name == "main" or name in public.__all__, f"{module}.{name}"
+
+
 @pytest.mark.parametrize("path", [*TEXTS, *COMMENTED], ids=lambda path: path.name)
 def test_every_file_and_name_that_a_text_mentions_exists(path):
     """`mjx_revolve/…` and dotted names anywhere; paths of Python files between backticks."""
@@ -189,6 +201,72 @@ def test_every_file_and_name_that_a_text_mentions_exists(path):
         for name in re.findall(r"`((?:\w+/)+\w+\.py)\b", text):
             ours = any((place / name.partition("/")[0]).is_dir() for place in places)
             assert not ours or any((place / name).is_file() for place in places), name
+
+
+def docstrings(path):
+    """All docstrings of a file, with their line."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            text = ast.get_docstring(node)
+            if text:
+                yield getattr(node, "lineno", 1), text
+
+
+# Names of other programs, whose laws or formats ours follow.
+FOREIGN = {
+    "Dynamics.cc", "Renderer", "ThrusterConversionFcn.cc", "ThrusterPlugin.cc", "cm_delta",
+    "control_joint_rad_to_cl", "cosf", "fluidcoef", "invweight", "joint_position_controller",
+    "mj_ellipsoidFluidModel", "mj_inertiaBoxFluidModel", "sinf", "uuv_gazebo_plugins",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def identifiers():
+    """Every name and every word that is a whole string in our Python files."""
+    found = {*dir(builtins), *sys.stdlib_module_names, "jax", "numpy", "mujoco"}
+    for folder in ("mjx_revolve", "tests", "experiments"):
+        for path in (ROOT / folder).rglob("*.py"):
+            found.add(path.stem)
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                match node:
+                    case ast.Name(id=name) | ast.arg(arg=name) | ast.Attribute(attr=name):
+                        found.add(name)
+                    case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+                        found.add(name)
+                    case ast.alias(name=name):
+                        found.update(name.split("."))
+                    case ast.keyword(arg=str(name)) | ast.Constant(value=str(name)):
+                        found.add(name)
+    found |= {path.name for path in PACKAGE.rglob("*")}
+    return found | FOREIGN
+
+
+def test_every_file_and_name_that_a_docstring_mentions_exists(identifiers):
+    """Paths and names between backticks; a name need not be in the same file."""
+    wrong = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        places = (ROOT, PACKAGE, path.parent, PACKAGE / "view")
+        for line, text in docstrings(path):
+            for said in re.findall(r"`([^`\n]+)`", text):
+                if re.fullmatch(r"[\w/]+\.py", said):
+                    ours = any((place / said.partition("/")[0]).exists() for place in places)
+                    known = not ours or any((place / said).is_file() for place in places)
+                else:
+                    dotted = re.fullmatch(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)(?:\(.*\))?", said)
+                    known = dotted is None or said in identifiers
+                    known = known or {*dotted[1].split(".")} <= identifiers
+                if not known:
+                    wrong.append(f"{path.relative_to(ROOT)}:{line}: {said}")
+    assert wrong == []
+
+
+def test_no_two_public_classes_have_one_name():
+    homes = collections.defaultdict(list)
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes[node.name].append(str(path.relative_to(PACKAGE)))
+    assert {name: files for name, files in homes.items() if len(files) > 1} == {}
 
 
 # ------------------------------------------------------------------ pages
@@ -222,19 +300,19 @@ def test_every_module_and_every_promised_name_has_its_place(site):
 
 
 @pytest.mark.slow
-def test_rooms_are_listed_in_the_order_in_which_they_are_imported(site):
-    """Each room in the table of contents, with its idea; none imports from those behind it."""
+def test_layers_are_listed_in_the_order_in_which_they_are_imported(site):
+    """Each layer in the table of contents, with its idea; none imports from those behind it."""
     front = (site / "index.html").read_text()
     listed = re.findall(
         r'<p class="idea">\s*<a href="mjx_revolve/(\w+)\.html">.*?</a>\s*(\S)', front
     )
-    rooms = [room for room, _ in listed]
-    assert {*rooms} == {name.split(".")[1] for name in MODULES if name.count(".") > 1}
+    layers = [layer for layer, _ in listed]
+    assert {*layers} == {name.split(".")[1] for name in MODULES if name.count(".") > 1}
     for name in MODULES:
-        room = name.split(".")[1]
-        if room not in rooms:  # a command
+        layer = name.split(".")[1]
+        if layer not in layers:  # a command
             continue
-        behind = rooms[rooms.index(room) + 1 :]
+        behind = layers[layers.index(layer) + 1 :]
         code = inspect.getsource(importlib.import_module(name))
         for other in re.findall(r"^\s*(?:from|import) mjx_revolve\.(\w+)", code, re.MULTILINE):
             assert other not in behind, f"{name} imports from {other}"

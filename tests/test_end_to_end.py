@@ -131,22 +131,6 @@ def test_the_film_of_a_run(smoke):
     [
         (["configs/lake_swim.yaml", "--set", "world=laek"], "expected one of empty_underwater"),
         pytest.param(
-            ["configs/lake_swim.yaml", "--set", "world.drag=facs"],
-            "drag: expected one of faces",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            ["configs/lake_swim.yaml", "--set", "morphology=README.md"],
-            "README.md",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            ["configs/lake_swim.yaml", "--set", "task.duration=-1"],
-            "expected a number > 0",
-            marks=pytest.mark.slow,
-        ),
-        (["configs/none.yaml"], "expected a file; found none"),
-        pytest.param(
             ["configs/smoke.yaml", "--set", "task.type=crawl", "--set", "world.bed=off"],
             "a bed",
             marks=pytest.mark.slow,

@@ -280,22 +280,14 @@ def test_drawing_leaves_matplotlib_alone():
     [
         (("--density", "heavy"),
          "--density: expected a number > 0 [kg/m3]; found 'heavy' (see --help)"),
-        (("--density", "0"),
-         "--density: expected a number > 0 [kg/m3]; found '0' (see --help)"),
-        (("--density", "nan"),
-         "--density: expected a number > 0 [kg/m3]; found 'nan' (see --help)"),
         (("--gravity", "-9.81"),
          "--gravity: expected a number > 0 [m/s2]; found '-9.81' (see --help)"),
-        (("--gravity", "inf"),
-         "--gravity: expected a number > 0 [m/s2]; found 'inf' (see --help)"),
         (("--picture", "{tmp}/none/a.png"),
          "{tmp}/none/a.png: expected the folder {tmp}/none to exist; found none"),
         (("--picture", "{tmp}/a.jpg"), "{tmp}/a.jpg: expected a name that ends in .png; found "
          "'.jpg'"),
         (("--picture", "{tmp}/folder.png"), "{tmp}/folder.png: expected a file; found a folder"),
         (("--modules", "{tmp}/none.yaml"), "{tmp}/none.yaml: expected a file; found none"),
-        (("--colour", "red"), "unrecognized arguments: --colour red (see --help)"),
-        (("--density",), "--density: expected one argument (see --help)"),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_one_line_and_code_2(spider, tmp_path, capsys, arguments, message):

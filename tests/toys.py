@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.evolution.body_fitness import BodyFitness, make_body_fitness
+from mjx_revolve.evolution.run_folder import RunFolder
 
 # In metrics.csv, all but these is reproducible.
 CLOCK = ("seconds", "evaluations_per_second")
@@ -39,6 +41,48 @@ def enter_folder(path: Path, monkeypatch) -> Path:
     monkeypatch.chdir(path)
     write_config(path / "toy.yaml", population_size=8, checkpoint_every=2)
     return path
+
+
+def contents(folder: Path) -> tuple:
+    """What must be the same, to the last bit, for two runs of the same seed."""
+    run = RunFolder(folder)
+    tables = [
+        {name: a.tobytes() for name, a in table.items() if name not in CLOCK}
+        for table in (run.load_metrics(), run.load_checkpoint().arrays)
+    ]
+    genes = (folder / "champion" / "genes.yaml").read_text()
+    return tables, genes, run.info.get("champion")
+
+
+class DroppedError(Exception):
+    """Stands for kill -9: nothing that the program does at its end happens."""
+
+
+def dropping(evaluation: int, make=None):
+    """Makes a fitness that drops the process at an evaluation; by default a noisy `Quadratic`."""
+    count = itertools.count(1)
+
+    def make_fitness(config):
+        fitness = make(config) if make else Quadratic(noise=0.1)
+        evaluate = fitness.evaluate
+
+        def drop(population, key):
+            if next(count) == evaluation:
+                raise DroppedError
+            return evaluate(population, key)
+
+        fitness.evaluate = drop
+        return fitness
+
+    return make_fitness
+
+
+def wait_for(condition, seconds=300.0) -> None:
+    """Waits until a condition holds."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def read_until(process, words: str) -> list[str]:
@@ -174,11 +218,11 @@ class BodyToy(BodyFitness):
             own[row, self.layout(bodies[k]).columns] = True
         away = np.sum(np.where(own, np.asarray(genes) - 0.5, 0) ** 2, 1) / own.sum(1)
         noise = 0.01 * np.asarray(jax.random.normal(key))
-        names = dict.fromkeys(self.measured, np.asarray(hinges, np.float32))
+        names = dict.fromkeys(self.measure_names, np.asarray(hinges, np.float32))
         return -((hinges - 3.0) ** 2) - away + noise, names
 
-    def single(self, body):
-        """What nothing can be replayed with."""
+    def body_fitness(self, body):
+        """An object that no replay can use."""
         return object()
 
 

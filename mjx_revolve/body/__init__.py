@@ -1,1 +1,8 @@
-"""What a robot is: types of modules, their tree, its rest pose, its measures. No worlds, no JAX."""
+"""What a robot is: types of modules, their tree, its rest pose, its measures. No worlds, no JAX.
+
+Public names are those in `__init__.pyi`; the modules are private and may move between releases.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,9 +20,10 @@ from pathlib import Path
 
 from mjx_revolve.body.module_files import read_modules
 from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Part, Slot
-from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.body.propellers import Thruster
-from mjx_revolve.inputs.errors import load_yaml, reading
+from mjx_revolve.inputs.errors import reading
+from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.water.plates import LiftDrag
+from mjx_revolve.water.propellers import Thruster
 
 # ------------------------------------------------------------------------- the catalogue
 
@@ -219,6 +220,7 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
                 drag: lift_drag                   # or faces, ellipsoid, off; default: the world's,
                                                   # of a fin lift_drag
                 added_mass: true                  # default: the world's
+                coefficients: {}                  # default; of laws, by name
                 drag_coefficient: 1.05            # default
                 added_mass_coefficient: 1.0       # default
                 contact: true                     # default

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_revolve.body.placement import Layout, pairs_within, turned
+from mjx_revolve.body.placement import RestPose, pairs_within, turned
 
 # A face is covered where a neighbour is found at one of these distances in front of it [m]:
 # Revolve's joints leave up to 2 mm, or sink a plate of 1 mm into the neighbour's face; limbs keep
@@ -23,7 +23,7 @@ _BESIDE = ((1, 2), (0, 2), (0, 1))
 _SLACK = 1e-6
 
 
-def exposed_shares(parts: Layout) -> np.ndarray:
+def exposed_shares(parts: RestPose) -> np.ndarray:
     """The share of each part's faces that no other part covers, at rest.
 
     A choice: the pose at rest stands for all poses; a bent hinge opens a little more. Opposite
@@ -71,7 +71,7 @@ def exposed_shares(parts: Layout) -> np.ndarray:
     return 1 - hidden.sum(axis=1) / (2 * whole)
 
 
-def _near(parts: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _near(parts: RestPose) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Parts and boxes of other parts that may cover a face of theirs.
 
     Returns:
@@ -94,7 +94,7 @@ def _near(parts: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     return part, box, center, back @ parts.rotation[parts.box_part[box]]
 
 
-def _spans(parts: Layout, part: np.ndarray, center: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def _spans(parts: RestPose, part: np.ndarray, center: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Which points along each edge of parts some boxes reach.
 
     Args:

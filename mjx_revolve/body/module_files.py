@@ -13,7 +13,7 @@ from mjx_revolve.body.boxes import union_measure
 from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Name, Part, Slot, Vector
 from mjx_revolve.body.sensors import SensorRow
 from mjx_revolve.inputs.errors import InputError, show
-from mjx_revolve.inputs.schema import Row, Switch, checked, read, words
+from mjx_revolve.inputs.schema import Boolean, TupleOf, checked, read, words
 
 
 @checked
@@ -27,12 +27,12 @@ class _File:
 class _Written:
     """A module type. Its parts may be single boxes, its mount and slots names of faces."""
 
-    parts: Annotated[Row[dict[str, Any]], MinLen(1), words("a list of parts")]
+    parts: Annotated[TupleOf[dict[str, Any]], MinLen(1), words("a list of parts")]
     mount: Annotated[Any, words("a face such as -x, a mapping with position, or null for a core")]
     slots: Annotated[dict[Any, Any], words("a mapping from numbers to faces")] | None = None
     hinge: Hinge | None = None
-    sensor: Switch = False
-    aliases: Annotated[Row[Name], words("a list of names")] | None = None
+    sensor: Boolean = False
+    aliases: Annotated[TupleOf[Name], words("a list of names")] | None = None
     sensors: SensorRow = ()
 
 
@@ -89,7 +89,7 @@ def _read_part(item: dict[str, Any], index: int, place: str) -> Part:
     if "size" in item:
         boxes = (read(Box, {"size": item["size"]}, place),)
     else:
-        several = Annotated[Row[Box], MinLen(1), words("a list of boxes")]
+        several = Annotated[TupleOf[Box], MinLen(1), words("a list of boxes")]
         boxes = read(several, item["boxes"], f"{place}.boxes")
     center = np.array([box.position for box in boxes])
     half = np.array([box.size for box in boxes]) / 2

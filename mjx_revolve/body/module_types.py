@@ -8,50 +8,42 @@ from __future__ import annotations
 
 from dataclasses import field
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Unit
 from pydantic import StringConstraints
 
 from mjx_revolve.body.boxes import union_measure
-from mjx_revolve.body.plates import LiftDrag as LiftDrag
-from mjx_revolve.body.propellers import Thruster as Thruster
 from mjx_revolve.body.sensors import SensorRow
 from mjx_revolve.body.servo import EFFORT, REACH, SPEED
 from mjx_revolve.inputs.schema import (
+    Boolean,
+    ConstraintError,
     Direction,
-    Law,
-    MisfitError,
+    Integer,
     NonNegative,
     Number,
     Pair,
     Positive,
-    Row,
     Share,
-    Switch,
     Text,
     Triple,
+    TupleOf,
     Vector,
-    Whole,
     checked,
     show,
     words,
 )
-
-# Drag of a cube that faces the flow: Hoerner, Fluid-Dynamic Drag, 1965, chapter 3.
-CUBE_DRAG = 1.05
+from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag
+from mjx_revolve.water.plates import CUBE_DRAG
+from mjx_revolve.water.plates import LiftDrag as LiftDrag
+from mjx_revolve.water.propellers import Thruster as Thruster
 
 Name = Annotated[
     Text,
     StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$"),
     words("letters, digits, _ or -, beginning with a letter"),
-]
-# What a part may choose. MuJoCo's inertia box is missing: it stands for a whole body, not a part.
-PartBuoyancy = Law[Literal["partial", "mask", "off"]]
-PartDrag = Annotated[
-    Law[Literal["faces", "lift_drag", "ellipsoid", "off"]],
-    words("one of faces, lift_drag, ellipsoid, off (inertia_box is a law of whole bodies)"),
 ]
 
 
@@ -89,13 +81,14 @@ class Part:
         electronics_volume: sealed volume that the mesh lacks [m³]; displaces water too.
         center_of_volume: of mesh and electronics, part frame [m].
         position: of the part's frame, module frame [m].
+        coefficients: of laws, by name; by default the world's.
         drag_coefficient: of a face that meets the flow [-].
         added_mass_coefficient: multiplies the main box's added mass [-].
         contact: whether it touches the bed.
-        buoyancy: "partial", "mask" or "off"; by default the world's choice. What a world switches
-            off stays off, here and below.
-        drag: "faces", "lift_drag", "ellipsoid" or "off"; by default "lift_drag" for a fin, else the
-            world's choice.
+        buoyancy: name of a buoyancy law; by default the world's choice. What a world switches off
+            stays off, here and below.
+        drag: name of a drag law of parts; by default "lift_drag" for a fin, else the world's
+            choice.
         added_mass: false for none; by default the world's choice.
         entrained_water: share of the room in the main box that mesh, electronics and ballast leave
             free, whose water is carried along, 0 to 1 [-].
@@ -110,18 +103,19 @@ class Part:
     """
 
     name: Name
-    boxes: Row[Box]
+    boxes: TupleOf[Box]
     mass: Annotated[NonNegative, Unit("kg")]
     volume: Annotated[NonNegative, Unit("m3")]
     electronics_volume: Annotated[NonNegative, Unit("m3")] = 0.0
     center_of_volume: Annotated[Vector, Unit("m")] = (0.0, 0.0, 0.0)
     position: Annotated[Vector, Unit("m")] = (0.0, 0.0, 0.0)
+    coefficients: Coefficients = ()
     drag_coefficient: Annotated[NonNegative, Unit("-")] = CUBE_DRAG
     added_mass_coefficient: Annotated[NonNegative, Unit("-")] = 1.0
-    contact: Switch = True
-    buoyancy: PartBuoyancy | None = None
+    contact: Boolean = True
+    buoyancy: BuoyancyName | None = None
     drag: PartDrag | None = None
-    added_mass: Switch | None = None
+    added_mass: Boolean | None = None
     entrained_water: Share = 0.0
     ballast_mass: Annotated[NonNegative, Unit("kg")] = 0.0
     ballast_volume: Annotated[NonNegative, Unit("m3")] = 0.0
@@ -132,9 +126,9 @@ class Part:
     def __post_init__(self) -> None:
         """Checks that there is a main box in the middle."""
         if not self.boxes:
-            raise MisfitError("boxes", "at least one box", "0")
+            raise ConstraintError("boxes", "at least one box", "0")
         if any(self.boxes[0].position):
-            raise MisfitError(
+            raise ConstraintError(
                 "boxes.0.position",
                 "[0, 0, 0] (the part's frame lies at the centre of its main box: move the part)",
                 show(list(self.boxes[0].position)),
@@ -219,7 +213,7 @@ class Hinge:
         low, high = self.range
         if not low <= 0.0 <= high or low == high:
             around = "[lowest, highest] around the rest angle 0 [rad]"
-            raise MisfitError("range", around, show([low, high]))
+            raise ConstraintError("range", around, show([low, high]))
 
 
 @checked
@@ -244,7 +238,7 @@ class Slot:
         """Checks that the directions fit."""
         if abs(np.dot(self.direction, self.up)) > 1e-9:
             across = f"a vector perpendicular to direction {list(self.direction)}"
-            raise MisfitError("up", across, show(list(self.up)))
+            raise ConstraintError("up", across, show(list(self.up)))
 
 
 @checked
@@ -266,7 +260,7 @@ class Mount:
         """Checks that it looks out level."""
         if abs(self.outward[2]) > 1e-9:
             level = "a vector perpendicular to the module's z"
-            raise MisfitError("outward", level, show(list(self.outward)))
+            raise ConstraintError("outward", level, show(list(self.outward)))
 
 
 @checked
@@ -289,34 +283,34 @@ class ModuleType:
     """
 
     name: Name
-    parts: Row[Part]
+    parts: TupleOf[Part]
     mount: Mount | None = None
-    slots: dict[Annotated[Whole, Ge(0)], Slot] = field(default_factory=dict)
+    slots: dict[Annotated[Integer, Ge(0)], Slot] = field(default_factory=dict)
     hinge: Hinge | None = None
-    sensor: Switch = False
-    aliases: Row[Name] = ()
+    sensor: Boolean = False
+    aliases: TupleOf[Name] = ()
     sensors: SensorRow = ()
 
     def __post_init__(self) -> None:
         """Checks that the pieces make a module."""
         names = [part.name for part in self.parts]
         if not names or len(set(names)) < len(names):
-            raise MisfitError("parts", "parts, each name once", show(names))
+            raise ConstraintError("parts", "parts, each name once", show(names))
         if self.mount is not None and 0 in self.slots:
-            raise MisfitError("slots", "numbers >= 1 (0 is where it is attached)", "0")
+            raise ConstraintError("slots", "numbers >= 1 (0 is where it is attached)", "0")
         if self.mount is None and self.mass <= 0.0:
-            raise MisfitError("mass", "a core heavier than 0 kg", f"{self.mass:g}")
+            raise ConstraintError("mass", "a core heavier than 0 kg", f"{self.mass:g}")
         for k, sensor in enumerate(self.sensors):
             if sensor.place or sensor.kind.where != "robot" or not sensor.kind.sits:
                 what = "a kind that may sit on modules of a type, without `at` and `each`"
-                raise MisfitError(f"sensors.{k}", what, show(sensor.to_mapping()))
+                raise ConstraintError(f"sensors.{k}", what, show(sensor.to_mapping()))
         if self.hinge is None:
             return
         if self.mount is None:
-            raise MisfitError("mount", "one, since it has a hinge", "none")
+            raise ConstraintError("mount", "one, since it has a hinge", "none")
         moving = sum(part.total_mass for part in self.parts[1:])
         if moving <= 0.0:
-            raise MisfitError(
+            raise ConstraintError(
                 "parts",
                 "a moving part (the second or later) heavier than 0 kg, since it has a hinge",
                 f"{moving:g} kg in {len(self.parts) - 1} moving parts",

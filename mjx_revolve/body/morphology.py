@@ -22,9 +22,10 @@ from mjx_revolve.body.params import apply_overrides, check_overrides, read_numbe
 from mjx_revolve.body.placement import Module, attach, check_overlaps, frozen
 from mjx_revolve.body.sensors import Sensor, SensorRow
 from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
-from mjx_revolve.inputs.errors import InputError, load_yaml, show
+from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import Positive, read, words
 from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.inputs.yaml_reader import load_yaml
 
 __all__ = [
     "Module",
@@ -103,6 +104,7 @@ def make_morphology(
       the part's own;
     - `drag_coefficient`, `added_mass_coefficient`, `entrained_water` (share of the box's free
       volume, 0 to 1) of every part [-];
+    - `coefficients`: a mapping of coefficients of laws that have no key of their own;
     - `buoyancy`, `drag` (a law's name or `off`) and `added_mass` (true or false): the module's own
       choice where the world's does not suit it;
     - `lift_drag`: a mapping with fields of `LiftDrag`, such as `{cla: 2.0}`; it changes a fin and

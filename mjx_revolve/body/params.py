@@ -14,12 +14,13 @@ from typing import Annotated, Any
 from annotated_types import MinLen, Unit
 from pydantic import AfterValidator, BeforeValidator
 
-from mjx_revolve.body.module_types import ModuleType, PartBuoyancy, PartDrag
-from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.body.propellers import Thruster
+from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.tree import COLORS
 from mjx_revolve.inputs.errors import InputError, show
-from mjx_revolve.inputs.schema import NonNegative, Number, Share, Switch, Text, Triple, read, words
+from mjx_revolve.inputs.schema import Boolean, NonNegative, Number, Share, Text, Triple, read, words
+from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag
+from mjx_revolve.water.plates import LiftDrag
+from mjx_revolve.water.propellers import Thruster
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
@@ -42,9 +43,10 @@ _PLAIN: dict[str, Any] = {
     "drag_coefficient": Annotated[_Amount, Unit("-")],
     "added_mass_coefficient": Annotated[_Amount, Unit("-")],
     "entrained_water": Annotated[Share, _Loose],
-    "buoyancy": PartBuoyancy,
+    "coefficients": Coefficients,
+    "buoyancy": BuoyancyName,
     "drag": PartDrag,
-    "added_mass": Switch,
+    "added_mass": Boolean,
 }
 # The others; colours are no overrides, and checked beside them.
 _OVERRIDES: dict[str, Any] = _PLAIN | {

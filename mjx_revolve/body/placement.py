@@ -129,7 +129,7 @@ def attach(
 # ------------------------------------------------------------------------- all parts together
 
 
-class Layout(NamedTuple):
+class RestPose(NamedTuple):
     """All parts at rest and all of their boxes, part after part, of one body or several.
 
     Attributes:
@@ -208,7 +208,7 @@ def pairs_within(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.
 
 
 class _Parts(NamedTuple):
-    """The first fields of a `Layout`."""
+    """The first fields of a `RestPose`."""
 
     parts: tuple[Part, ...]
     kind: np.ndarray
@@ -240,7 +240,7 @@ def _place_parts(bodies: Sequence[Sequence[Module]]) -> _Parts:
     )
 
 
-def lay_out(*bodies: Sequence[Module]) -> Layout:
+def rest_pose(*bodies: Sequence[Module]) -> RestPose:
     """Where all parts and boxes lie at rest.
 
     Args:
@@ -256,7 +256,7 @@ def lay_out(*bodies: Sequence[Module]) -> Layout:
     bounds = np.array([part.bounds for part in parts])
     box_part, rank = counted(size[kind])
     box = (np.cumsum(size) - size)[kind[box_part]] + rank
-    return Layout(
+    return RestPose(
         *placed,
         low=bounds[kind, 0],
         high=bounds[kind, 1],

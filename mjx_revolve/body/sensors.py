@@ -7,6 +7,7 @@ MuJoCo's where it has such a sensor (gyro, accelerometer).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 from typing import Annotated, Any, NamedTuple
 
 from annotated_types import Le, MinLen, Unit
@@ -14,12 +15,12 @@ from pydantic import AfterValidator, BeforeValidator
 
 from mjx_revolve.body.servo import EFFORT, REACH, SPEED
 from mjx_revolve.inputs.schema import (
-    MisfitError,
+    ConstraintError,
     NonNegative,
     Number,
     Positive,
-    Row,
     Text,
+    TupleOf,
     as_tuple,
     checked,
     show,
@@ -31,17 +32,17 @@ class SensorKind(NamedTuple):
     """What a sensor measures.
 
     Attributes:
-        parts: names of its numbers; one without a name of its own is "".
+        parts: names of its numbers; "" for a single one.
         unit: of them.
         where: "robot": once, at the core, or at modules; "joint": at each hinge; "body": of the
             core's rigid body and of what each hinge carries; "module": only at a module.
-        range: lowest and highest, as most such devices have them; choices.
-        signal: (a `control.sense.Sense`, or a `control.places.Place`) → its numbers, in the order
+        range: lowest and highest, as of most such devices; choices.
+        signal: `SensorReadings` → its numbers, in the order
             of `parts`: `[lanes]` each of a robot, `[hinge rows, lanes]` of joints,
-            `[1 + hinge rows, lanes]` of bodies; of a place as that has them.
+            `[1 + hinge rows, lanes]` of bodies; of modules as their readings have them.
         what: it is, in words.
-        feels: field of the sense that must be asked for, or "".
-        sits: whether it may sit elsewhere than at the core.
+        signals: the one of `OPTIONAL_SIGNALS` that it needs, or "".
+        sits: whether it may sit on modules.
     """
 
     parts: tuple[str, ...]
@@ -50,7 +51,7 @@ class SensorKind(NamedTuple):
     range: tuple[float, float]
     signal: Callable[[Any], tuple[Any, ...]]
     what: str
-    feels: str = ""
+    signals: str = ""
     sits: bool = True
 
 
@@ -61,9 +62,9 @@ def _length(toward: Any) -> Any:
 
 
 def _distance(sense: Any) -> Any:
-    if getattr(sense, "seen", None) is None:
+    if sense.seen is None:
         return _length(sense.target)
-    # What is not felt is as far away as the range goes; where it is felt, the factor is 1.
+    # A target that is not visible is as far away as the range goes; where it is, the factor is 1.
     return _length(sense.target) + (1.0 - sense.seen) * 1e9
 
 
@@ -72,148 +73,71 @@ def _bearing(toward: Any) -> tuple[Any, ...]:
     return tuple(scale * component for component in toward)
 
 
-_ONE, _THREE = ("",), ("x", "y", "z")
+_Range = tuple[float, float]
 
+
+def _number(field: str, unit: str, limits: _Range, what: str, **more: Any) -> SensorKind:
+    """A kind whose signal is a field of the readings."""
+    read = attrgetter(field)
+    return SensorKind(("",), unit, "robot", limits, lambda s: (read(s),), what)._replace(**more)
+
+
+def _vector(field: str, unit: str, most: float, what: str, **more: Any) -> SensorKind:
+    """A kind whose signal is a field of three components, each from -most to most."""
+    kind = SensorKind(("x", "y", "z"), unit, "robot", (-most, most), attrgetter(field), what)
+    return kind._replace(**more)
+
+
+_NEAREST = {"signals": "nearest", "sits": False}
 SENSORS: Mapping[str, SensorKind] = {
-    "depth": SensorKind(
-        _ONE, "m", "robot", (0, 10), lambda s: (-s.height,), "of the core below the still surface"
+    "depth": _number("height", "m", (0, 10), "of the core below the still surface",
+                     signal=lambda s: (-s.height,)),
+    "climb": _number("climb", "m/s", (-1, 1), "vertical velocity"),
+    "tilt": _vector("up", "-", 1, "the world's vertical, core frame"),
+    "compass": _vector("north", "-", 1, "the world's x axis, core frame"),
+    "gyro": _vector("angular_velocity", "rad/s", 10, "angular velocity, core frame"),
+    "accelerometer": _vector(
+        "force", "m/s2", 20, "specific force at the core over the last step, core frame",
+        signals="force",
     ),
-    "climb": SensorKind(_ONE, "m/s", "robot", (-1, 1), lambda s: (s.climb,), "vertical velocity"),
-    "tilt": SensorKind(
-        _THREE, "-", "robot", (-1, 1), lambda s: s.up, "the world's vertical, core frame"
+    "flow": _vector("flow", "m/s", 1, "velocity of the water relative to the core, core frame"),
+    "sonar": _number("altitude", "m", (0, 10), "height of the core above the bed, straight down"),
+    "target": _vector("target", "m", 5, "from the core to the target, core frame"),
+    "bearing": _vector("target", "-", 1, "direction of the target, core frame",
+                       signal=lambda s: _bearing(s.target)),
+    "distance": _number("target", "m", (0, 10), "of the target from the core",
+                        signal=lambda s: (_distance(s),)),
+    "nearest": _vector("nearest.toward", "m", 5,
+                       "from the core to the nearest other robot's, core frame", **_NEAREST),
+    "nearest_bearing": _vector(
+        "nearest.toward", "-", 1, "direction of the nearest other robot, core frame",
+        signal=lambda s: _bearing(s.nearest.toward), **_NEAREST,
     ),
-    "compass": SensorKind(
-        _THREE, "-", "robot", (-1, 1), lambda s: s.north, "the world's x axis, core frame"
+    "nearest_distance": _number(
+        "nearest.toward", "m", (0, 10), "of the nearest other robot",
+        signal=lambda s: (_length(s.nearest.toward),), **_NEAREST,
     ),
-    "gyro": SensorKind(
-        _THREE, "rad/s", "robot", (-10, 10), lambda s: s.spin, "angular velocity, core frame"
+    "nearest_tag": _number("nearest.tag", "-", (-1, 1),
+                           "by which the nearest other robot can be told apart", **_NEAREST),
+    "course": _vector("course", "-", 1, "the direction to keep to, core frame"),
+    "battery": _number(
+        "work", "J", (0, 100), "work that servos and propellers have done so far",
+        signals="work", sits=False,
     ),
-    "accelerometer": SensorKind(
-        _THREE,
-        "m/s2",
-        "robot",
-        (-20, 20),
-        lambda s: s.force,
-        "specific force at the core over the last step, core frame",
-        "force",
-    ),
-    "flow": SensorKind(
-        _THREE,
-        "m/s",
-        "robot",
-        (-1, 1),
-        lambda s: s.flow,
-        "velocity of the water relative to the core, core frame",
-    ),
-    "sonar": SensorKind(
-        _ONE,
-        "m",
-        "robot",
-        (0, 10),
-        lambda s: (s.altitude,),
-        "height of the core above the bed, straight down",
-    ),
-    "target": SensorKind(
-        _THREE, "m", "robot", (-5, 5), lambda s: s.target, "from the core to the target, core frame"
-    ),
-    "bearing": SensorKind(
-        _THREE,
-        "-",
-        "robot",
-        (-1, 1),
-        lambda s: _bearing(s.target),
-        "direction of the target, core frame",
-    ),
-    "distance": SensorKind(
-        _ONE, "m", "robot", (0, 10), lambda s: (_distance(s),), "of the target from the core"
-    ),
-    "nearest": SensorKind(
-        _THREE,
-        "m",
-        "robot",
-        (-5, 5),
-        lambda s: s.nearest.toward,
-        "from the core to the nearest other robot's, core frame",
-        "nearest",
-        sits=False,
-    ),
-    "nearest_bearing": SensorKind(
-        _THREE,
-        "-",
-        "robot",
-        (-1, 1),
-        lambda s: _bearing(s.nearest.toward),
-        "direction of the nearest other robot, core frame",
-        "nearest",
-        sits=False,
-    ),
-    "nearest_distance": SensorKind(
-        _ONE,
-        "m",
-        "robot",
-        (0, 10),
-        lambda s: (_length(s.nearest.toward),),
-        "of the nearest other robot",
-        "nearest",
-        sits=False,
-    ),
-    "nearest_tag": SensorKind(
-        _ONE,
-        "-",
-        "robot",
-        (-1, 1),
-        lambda s: (s.nearest.tag,),
-        "by which the nearest other robot can be told apart",
-        "nearest",
-        sits=False,
-    ),
-    "course": SensorKind(
-        _THREE, "-", "robot", (-1, 1), lambda s: s.course, "the direction to keep to, core frame"
-    ),
-    "battery": SensorKind(
-        _ONE,
-        "J",
-        "robot",
-        (0, 100),
-        lambda s: (s.work,),
-        "work that servos and propellers have done so far",
-        "work",
-        sits=False,
-    ),
-    "angle": SensorKind(
-        _ONE, "rad", "joint", (-REACH, REACH), lambda s: (s.angle,), "of each hinge"
-    ),
-    "speed": SensorKind(
-        _ONE, "rad/s", "joint", (-SPEED, SPEED), lambda s: (s.speed,), "of each hinge"
-    ),
-    "load": SensorKind(
-        _ONE,
-        "N m",
-        "joint",
-        (-EFFORT, EFFORT),
-        lambda s: (s.load,),
-        "torque of each servo under its last command",
-        "load",
-    ),
-    "contact": SensorKind(
-        _ONE,
-        "N",
-        "body",
-        (0, 1),
-        lambda s: (s.touch,),
+    "angle": _number("angle", "rad", (-REACH, REACH), "of each hinge", where="joint"),
+    "speed": _number("speed", "rad/s", (-SPEED, SPEED), "of each hinge", where="joint"),
+    "load": _number("load", "N m", (-EFFORT, EFFORT),
+                    "torque of each servo under its last command", where="joint", signals="load"),
+    "contact": _number(
+        "touch", "N", (0, 1),
         "force of the bed on the core's rigid body and on what each hinge carries",
-        "touch",
+        where="body", signals="touch",
     ),
-    "touch": SensorKind(
-        ("left", "right"),
-        "N",
-        "module",
-        (0, 1),
-        lambda s: s.cells,
-        "force of the bed on the two halves of a module, along its normal",
-        "cells",
+    "touch": _vector(
+        "cells", "N", 1, "force of the bed on the two halves of a module, along its normal",
+        parts=("left", "right"), range=(0, 1), where="module", signals="cells",
     ),
-}
+}  # fmt: skip
 """All kinds of sensors by name."""
 
 
@@ -229,7 +153,7 @@ def _read_id(value: Any) -> Any:
 
 
 _Id = Annotated[Text, BeforeValidator(_read_id), MinLen(1), words("a name")]
-_Range = Annotated[
+_Limits = Annotated[
     tuple[Number, Number],
     BeforeValidator(_read_range),
     words("a number, or the lowest and the highest"),
@@ -240,7 +164,7 @@ _Range = Annotated[
 class Sensor:
     """A sensor of a robot.
 
-    What it gives is a number between -1 and 1: the true value, with noise, clipped to the range. A
+    Its output is a number between -1 and 1: the true value, with noise, clipped to the range. A
     range that holds 0 is divided by its larger end, so that 0 stays 0; another one counts from its
     middle, so that its ends are -1 and 1.
 
@@ -250,9 +174,8 @@ class Sensor:
         unit: of range and noise, if it is written: that of the kind.
         range: lowest and highest value, or one number for both signs; by default the kind's.
         noise: standard deviation, of every sample by itself [unit].
-        rate: how often it measures; what it has measured stays until the next time. By default
-            before every step [Hz].
-        delay: how old what it gives is [s].
+        rate: of samples, which are held in between; by default one before every step [Hz].
+        delay: age of its output [s].
         at: id of the module that it sits on, of one robot; by default it sits at the core.
         each: type of modules that it sits on, wherever there are some.
 
@@ -263,7 +186,7 @@ class Sensor:
     type: Text
     name: Text = ""
     unit: Text | None = None
-    range: _Range | None = None
+    range: _Limits | None = None
     noise: NonNegative = 0.0
     rate: Annotated[Positive, Le(1e4), Unit("Hz")] | None = None
     delay: Annotated[NonNegative, Le(5), Unit("s")] = 0.0
@@ -273,49 +196,49 @@ class Sensor:
     def __post_init__(self) -> None:
         """Checks that there is such a kind, and the range."""
         if self.type not in SENSORS:
-            raise MisfitError("type", f"one of {', '.join(SENSORS)}", show(self.type))
+            raise ConstraintError("type", f"one of {', '.join(SENSORS)}", show(self.type))
         kind = SENSORS[self.type]
         if self.unit is not None and self.unit != kind.unit:
-            raise MisfitError("unit", f"{kind.unit!r}, as of {self.type}", show(self.unit))
+            raise ConstraintError("unit", f"{kind.unit!r}, as of {self.type}", show(self.unit))
         self._check_place()
         low, high = self.limits
         if low >= high:
-            raise MisfitError("range", "the lowest below the highest", show(list(self.limits)))
+            raise ConstraintError("range", "the lowest below the highest", show(list(self.limits)))
 
     def _check_place(self) -> None:
         """Checks that such a sensor may sit where it does."""
         kind, key = self.kind, "at" if self.at is not None else "each"
         if self.at is not None and self.each is not None:
-            raise MisfitError("each", "none, as there is `at`", show(self.each))
+            raise ConstraintError("each", "none, as there is `at`", show(self.each))
         if kind.where == "module" and self.at is None:
-            raise MisfitError("at", f"the id of a module, as {self.type} is felt by one", "none")
+            raise ConstraintError("at", f"the id of a module, as {self.type} sits on one", "none")
         if self.place and not kind.sits:
             what = f"none, as {self.type} is of the robot as a whole"
-            raise MisfitError(key, what, show(getattr(self, key)))
+            raise ConstraintError(key, what, show(getattr(self, key)))
         if self.each is not None and kind.where != "robot":
             what = f"none, as {self.type} is at each hinge" if kind.where == "joint" else "none, as"
             what += "" if kind.where == "joint" else f" {self.type} is of each rigid body"
-            raise MisfitError("each", what, show(self.each))
+            raise ConstraintError("each", what, show(self.each))
 
     @property
     def place(self) -> str:
-        """Where it sits, as `Controller.feels` names places; "" for the core."""
+        """The module signal of where it sits; "" for the core."""
         if self.at is not None:
             return f"at {self.at}"
         return "" if self.each is None else f"each {self.each}"
 
     @property
     def where(self) -> str:
-        """How often there are its numbers: "robot", "joint" or "body", as of a kind."""
+        """Whether its numbers are "robot", "joint" or "body", as of a kind."""
         return "body" if self.each is not None else "robot" if self.place else self.kind.where
 
     @property
-    def feels(self) -> tuple[str, ...]:
-        """What a `Controller` must name in its `feels`."""
-        own = self.kind.feels
+    def signals(self) -> tuple[str, ...]:
+        """The `signals` of a `Controller` that uses it."""
+        own = self.kind.signals
         if not self.place:
             return (own,) if own else ()
-        # At modules, a specific force asks for a longer memory.
+        # At modules, a specific force needs a longer memory.
         own = "forces" if own == "force" else own
         return (self.place, own) if own else (self.place,)
 
@@ -336,7 +259,7 @@ class Sensor:
 
     @property
     def scaling(self) -> tuple[float, float]:
-        """Which value is told as 0, and what one more is told as [unit, 1/unit]."""
+        """The value that is observed as 0, and the observed change per unit [unit, 1/unit]."""
         low, high = self.limits
         if low <= 0 <= high:
             return 0.0, 1 / max(-low, high)
@@ -370,12 +293,12 @@ def check_names(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
     for k, label in enumerate(labels):
         if label in labels[:k]:
             unlike = "names that differ (give one of them a `name`)"
-            raise MisfitError(f"{k}.name", unlike, f"{label!r} twice")
+            raise ConstraintError(f"{k}.name", unlike, f"{label!r} twice")
     return sensors
 
 
 SensorRow = Annotated[
-    Row[Annotated[Sensor, BeforeValidator(_read_sensor)]],
+    TupleOf[Annotated[Sensor, BeforeValidator(_read_sensor)]],
     AfterValidator(check_names),
     words("a list of sensors"),
 ]

@@ -20,9 +20,10 @@ import yaml
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.descriptors import describe
 from mjx_revolve.body.module_types import Part, Vector
-from mjx_revolve.body.placement import Layout, Module, frozen, lay_out, same
+from mjx_revolve.body.placement import Module, RestPose, frozen, rest_pose, same
 from mjx_revolve.body.sensors import Sensor
-from mjx_revolve.inputs.errors import InputError, SafeLoader
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.yaml_reader import SafeLoader
 
 COLORS = ("red", "green", "blue")
 
@@ -175,9 +176,9 @@ class Morphology:
         return tuple(sorted(pairs))
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> RestPose:
         """All parts and boxes at rest as arrays."""
-        return lay_out(self.modules)
+        return rest_pose(self.modules)
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:

@@ -1,1 +1,8 @@
-"""What a robot feels, and genes to parameters to commands, from a table of the plant."""
+"""Sensor readings, and controllers: genes to parameters to commands, from a table of the plant.
+
+Public names are those in `__init__.pyi`; the modules are private and may move between releases.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,10 +1,10 @@
-"""What a controller is: genes to parameters to commands. Zero genes keep everything still.
+"""The interface of controllers: genes to parameters to commands.
 
 A controller is four plain functions over a population on the last axis, made from a table of the
 plant, so that one and the same drives one robot or many different ones. The genes are unbounded
 real numbers, folded into physical ranges by sin(gene), so that any optimiser can move them freely.
 Folded, not squashed: with tanh, an optimum at the end of a range lies at infinity, and strategies
-that adapt their step size run after it until their numbers overflow.
+that adapt their step size follow it until their numbers overflow. Zero genes keep all joints still.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import Observer
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot
@@ -25,14 +25,17 @@ from mjx_revolve.engine.robot import Robot
 # How long commands take to fade in, so that no joint jumps at the start [s]; a choice.
 _FADE = 0.5
 
+StepOutput = tuple[Any, jax.Array]
+"""State and commands after a controller's step."""
+
 
 class Gene(NamedTuple):
     """What a gene belongs to.
 
     Attributes:
-        what: the number that it is, such as "w" or "offset".
+        what: the number that it encodes, such as "w" or "offset".
         place: "hinge", "thruster", "pair" (of neighbouring hinges) or "robot".
-        number: which of them.
+        number: index of the hinge, thruster or pair.
     """
 
     what: str
@@ -40,32 +43,47 @@ class Gene(NamedTuple):
     number: int = 0
 
 
-class Controller(NamedTuple):
-    """What turns genes into commands.
-
-    Attributes:
-        num_genes: length of an individual's genes.
-        gene_names: `[num_genes]` what each gene is, for tables and plots.
-        decode: (genes `[num_genes, lanes]`, plant) → parameters; the plant's rows are those of the
-            commands, and `plant.arrange` brings what follows the robot's order into theirs.
-        init: parameters → controller state.
-        step: (parameters, state, time [s], sense) → (state, `[n, lanes]` joint targets [rad] and
-            commands of thrusters [-], in the plant's rows); `sense` is a `Sense`, what the robot
-            feels.
-        genes: `[num_genes]` what each belongs to, or () where that is not known: only needed to
-            carry genes from one body to another.
-        feels: which of `sense.FEELS` it reads: they are there only for those who ask.
-        observer: of the declared sensors that it is told of; None without, so that nobody looks.
-    """
-
+class _Controller(NamedTuple):
     num_genes: int
     gene_names: tuple[str, ...]
     decode: Callable[[jax.Array, Plant], Any]
     init: Callable[[Any], Any]
-    step: Callable[[Any, Any, jax.Array, Sense], tuple[Any, jax.Array]]
+    step: Callable[[Any, Any, jax.Array, SensorReadings], StepOutput]
     genes: tuple[Gene, ...] = ()
-    feels: tuple[str, ...] = ()
+    signals: tuple[str, ...] = ()
     observer: Observer | None = None
+
+
+class Controller(_Controller):
+    """Functions that turn genes into commands.
+
+    Attributes:
+        num_genes: length of an individual's genes.
+        gene_names: `[num_genes]` names for tables and plots.
+        decode: (genes `[num_genes, lanes]`, plant) → parameters. The plant's rows are those of the
+            commands; `plant.arrange` brings values in the robot's order into theirs.
+        init: parameters → controller state.
+        step: (parameters, state, time [s], `SensorReadings`) → (state, `[n, lanes]` joint targets
+            [rad] and commands of thrusters [-], in the plant's rows).
+        genes: `[num_genes]` what each belongs to, or () if unknown: only needed to carry genes
+            from one body to another.
+        signals: which of `OPTIONAL_SIGNALS`, and which modules, it reads.
+        observer: of the declared sensors; None without.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, *args: Any, feels: tuple[str, ...] | None = None, **kwargs: Any) -> Controller:
+        """`feels` is the old name of `signals`, for one more release."""
+        if feels is not None:
+            kwargs["signals"] = feels
+        return super().__new__(cls, *args, **kwargs)
+
+    def _replace(self, **kwargs: Any) -> Controller:
+        """A copy with other fields."""
+        if "feels" in kwargs:
+            kwargs["signals"] = kwargs.pop("feels")
+        return super()._replace(**kwargs)
 
 
 @dataclass(frozen=True)
@@ -77,15 +95,7 @@ class BoundController:
 
 
 def bind_genes(controller: Controller, genes: Any) -> BoundController:
-    """Joins a controller and one individual's genes.
-
-    Args:
-        controller: from `make_cpg` or `make_sine`.
-        genes: `[num_genes]`.
-
-    Returns:
-        What `simulate` takes as `ctrl`.
-    """
+    """Joins a controller and one individual's genes `[num_genes]`, as `ctrl` of `simulate`."""
     return BoundController(controller, genes)
 
 
@@ -94,11 +104,57 @@ def as_plant(body: Plant | Robot) -> Plant:
     return body if isinstance(body, Plant) else plant_of(body)
 
 
-def of_actuators(plant: Plant, *what: str) -> tuple[Gene, ...]:
-    """Genes for each actuator, in the robot's order: all of the first kind, then of the second."""
-    places = [("hinge", k) for k in range(plant.num_hinges)]
-    places += [("thruster", k) for k in range(plant.num_thrusters)]
-    return tuple(Gene(name, *place) for name in what for place in places)
+class GeneBlocks:
+    """The genes of a controller in blocks, one number for each hinge, thruster or pair.
+
+    Attributes:
+        blocks: (what, place) in the order of the genes; `place` is that of a `Gene`, or "actuator"
+            for hinges and then thrusters.
+    """
+
+    def __init__(self, plant: Plant, *blocks: tuple[str, str]) -> None:
+        self.blocks = blocks
+        sizes = {"hinge": plant.num_hinges, "thruster": plant.num_thrusters}
+        self._sizes = sizes | {"pair": plant.num_pairs, "robot": 1}
+
+    @property
+    def genes(self) -> tuple[Gene, ...]:
+        """The genes in order."""
+        parts = {"actuator": ("hinge", "thruster")}
+        return tuple(
+            Gene(what, place, k)
+            for what, block in self.blocks
+            for place in parts.get(block, (block,))
+            for k in range(self._sizes[place])
+        )
+
+    def split(self, values: jax.Array, plant: Plant) -> dict[str, jax.Array]:
+        """Values of all genes, by block.
+
+        Args:
+            values: `[num_genes, lanes]`.
+            plant: of the rows.
+
+        Returns:
+            `[n, lanes]` of actuators, `[hinge rows, lanes]` of hinges, `[thrusters, lanes]`, all in
+            the plant's rows; pairs and "robot" as they stand.
+        """
+        start, found, rows = 0, {}, plant.num_hinge_rows
+        hinges, thrusters = self._sizes["hinge"], self._sizes["thruster"]
+        for what, place in self.blocks:
+            count = hinges + thrusters if place == "actuator" else self._sizes[place]
+            own = values[start : start + count]
+            start += count
+            if place == "actuator":
+                own = plant.arrange(own)
+            elif place == "hinge":
+                none = jnp.zeros((thrusters, *own.shape[1:]), own.dtype)
+                own = plant.arrange(jnp.concatenate([own, none]))[:rows]
+            elif place == "thruster":
+                none = jnp.zeros((hinges, *own.shape[1:]), own.dtype)
+                own = plant.arrange(jnp.concatenate([none, own]))[rows:]
+            found[what] = own
+        return found
 
 
 def make_controller(
@@ -106,7 +162,7 @@ def make_controller(
     genes: Sequence[Gene],
     decode: Callable[[jax.Array, Plant], Any],
     init: Callable[[Any], Any],
-    step: Callable[[Any, Any, jax.Array, Sense], tuple[Any, jax.Array]],
+    step: Callable[[Any, Any, jax.Array, SensorReadings], StepOutput],
 ) -> Controller:
     """A controller whose genes are named after what they belong to; fields as of `Controller`."""
 
@@ -121,26 +177,16 @@ def make_controller(
 
 
 def fade_in(time: jax.Array) -> jax.Array:
-    """By what share commands have faded in.
-
-    Args:
-        time: since the start [s].
-
-    Returns:
-        From 0 at the start to 1 after half a second and ever after.
-    """
+    """Share of the commands that is applied: 0 at the start, 1 after half a second."""
     return jnp.minimum(time / _FADE, 1)
 
 
-def gene_places(own: Controller, common: Controller) -> np.ndarray:
-    """Where the genes of one body's controller stand in those for all bodies.
+def gene_indices(own: Controller, common: Controller) -> np.ndarray:
+    """Indices `[own.num_genes]` of one body's genes in those for all bodies.
 
     Args:
         own: made for the body's plant.
         common: of the same kind, made for the largest body there may be.
-
-    Returns:
-        `[own.num_genes]` indices.
     """
     place = {gene: k for k, gene in enumerate(common.genes)}
     return np.array([place[gene] for gene in own.genes], int)

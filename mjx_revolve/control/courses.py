@@ -1,4 +1,4 @@
-"""Courses: a level direction to keep to, which turns while the episode goes on."""
+"""Courses: a horizontal direction to keep to, which turns during the episode."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Course(NamedTuple):
 
     Attributes:
         heading: at the start, from the world's x axis towards its y axis [rad].
-        rate: at which it turns all the time [rad/s].
-        moments: when it turns at once, one for each of these turns [s].
-        turns: by how much, likewise [rad].
+        rate: constant turning rate [rad/s].
+        moments: times of sudden turns [s].
+        turns: angles of sudden turns [rad].
     """
 
     heading: Any
@@ -26,11 +26,7 @@ class Course(NamedTuple):
     turns: tuple[Any, ...] = ()
 
     def at(self, time: Any) -> Vec:
-        """The course at a moment: a unit vector, world frame.
-
-        Args:
-            time: since the episode's start [s].
-        """
+        """The course at a time since the episode's start [s]: a unit vector, world frame."""
         angle = self.heading + self.rate * time
         for moment, turn in zip(self.moments, self.turns, strict=True):
             angle = angle + jnp.where(time >= moment, turn, 0.0)
@@ -39,5 +35,5 @@ class Course(NamedTuple):
 
 
 def course_path(course: Course, time: jax.Array) -> jax.Array:
-    """`[S, 3, lanes]` the course at moments `[S]` [s], world frame."""
+    """`[S, 3, lanes]` the course at times `[S]` [s], world frame."""
     return jnp.stack(jax.vmap(course.at)(time), 1)

@@ -8,9 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.control.controller import Controller, Gene, as_plant, make_controller
-from mjx_revolve.control.neighbours import join_pairs
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.controller import (
+    Controller,
+    GeneBlocks,
+    StepOutput,
+    as_plant,
+    make_controller,
+)
+from mjx_revolve.control.neighbours import NeighbourMatrix, pair_matrix
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 
@@ -29,31 +35,26 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
     w = 2π f_max sin(gene), c = π f_max sin(gene).
 
     Args:
-        body: whose hinges are driven: a plant or a robot.
+        body: a plant or a robot.
         max_frequency: of an uncoupled oscillator [Hz].
         amplitude: share of the hinges' range used [-].
-
-    Returns:
-        The controller.
     """
     made_for = as_plant(body)
-    n, pairs, dt = made_for.num_hinges, made_for.num_pairs, made_for.timestep
-    genes = [Gene("w", "hinge", k) for k in range(n)]
-    genes += [Gene("c", "pair", k) for k in range(pairs)]
-    genes += [Gene("thrust", "thruster", k) for k in range(made_for.num_thrusters)]
+    dt = made_for.timestep
+    blocks = GeneBlocks(made_for, ("w", "hinge"), ("c", "pair"), ("thrust", "thruster"))
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
-        folded, rows = jnp.sin(genes), plant.num_hinge_rows
-        weights = np.pi * max_frequency * folded[n : n + pairs]
-        coupling = join_pairs(weights, -weights, plant)
-        # Of each row: its oscillator's w, or its thruster's command.
-        values = plant.arrange(jnp.concatenate([folded[:n], folded[n + pairs :]]))
+        values, rows = blocks.split(jnp.sin(genes), plant), plant.num_hinge_rows
+        weights = np.pi * max_frequency * values["c"]
+        coupling = pair_matrix(weights, -weights, plant)
         middle, reach = plant.middle(genes), plant.reach(genes)
-        w = 2 * np.pi * max_frequency * values[:rows]
-        constant = middle[rows:] + reach[rows:] * values[rows:]
+        w = 2 * np.pi * max_frequency * values["w"]
+        constant = middle[rows:] + reach[rows:] * values["thrust"]
         return w, coupling, amplitude * reach[:rows], middle[:rows], constant
 
-    def slope(w: jax.Array, c: Any, x: jax.Array, y: jax.Array) -> tuple[Any, Any]:
+    def derivative(
+        w: jax.Array, c: NeighbourMatrix, x: jax.Array, y: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         coupled = w * y
         for j, column in c.items():  # written out: no reductions inside the compiled loop
             coupled = coupled + column * x[j : j + 1]
@@ -63,13 +64,13 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
         w = parameters[0]
         return jnp.zeros_like(w), jnp.ones_like(w)
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
         w, c, reach, center, constant = parameters
         x, y = state
-        a1, b1 = slope(w, c, x, y)
-        a2, b2 = slope(w, c, x + dt / 2 * a1, y + dt / 2 * b1)
-        a3, b3 = slope(w, c, x + dt / 2 * a2, y + dt / 2 * b2)
-        a4, b4 = slope(w, c, x + dt * a3, y + dt * b3)
+        a1, b1 = derivative(w, c, x, y)
+        a2, b2 = derivative(w, c, x + dt / 2 * a1, y + dt / 2 * b1)
+        a3, b3 = derivative(w, c, x + dt / 2 * a2, y + dt / 2 * b2)
+        a4, b4 = derivative(w, c, x + dt * a3, y + dt * b3)
         x = x + dt / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
         y = y + dt / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
         targets = center + reach * jnp.tanh(x)
@@ -77,4 +78,4 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
             return (x, y), targets
         return (x, y), jnp.concatenate([targets, constant])
 
-    return make_controller(made_for, genes, decode, init, step)
+    return make_controller(made_for, blocks.genes, decode, init, step)

@@ -10,15 +10,16 @@ import jax.numpy as jnp
 from mjx_revolve.control.controller import (
     Controller,
     Gene,
+    GeneBlocks,
+    StepOutput,
     as_plant,
     make_controller,
-    of_actuators,
 )
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 
-# What `make_feedback` multiplies by its genes: names, and the size that counts as 1. Choices: an
+# The features: names, and the size that counts as 1. Choices: an
 # error of 0.2 m or of 0.2 rad, and the speeds at which it matters.
 _FEEDBACK = (
     ("depth error", 0.2),
@@ -32,7 +33,7 @@ _FEEDBACK = (
 
 
 def make_feedback(body: Plant | Robot, depth: float = 1.0, gain: float = 2.0) -> Controller:
-    """Commands that answer to depth and attitude, linearly: what an AUV needs to hold its depth.
+    """Commands that are linear in depth and attitude: what an AUV needs to hold its depth.
 
     command_i = middle + half range × clip(sin(b_i) + gain Σ_k sin(W_ik) feature_k, -1, 1), with
     features depth error (core above `depth` counts positive) [0.2 m], climb [0.1 m/s], roll and
@@ -40,7 +41,7 @@ def make_feedback(body: Plant | Robot, depth: float = 1.0, gain: float = 2.0) ->
     [0.5 rad/s], each divided by the size in brackets. Zero genes: nothing moves.
 
     Args:
-        body: whose hinges and thrusters are driven: a plant or a robot.
+        body: a plant or a robot.
         depth: to hold, of the core's centre below the still surface [m].
         gain: share of the range that a feature of size 1 may command at most [-].
 
@@ -49,7 +50,7 @@ def make_feedback(body: Plant | Robot, depth: float = 1.0, gain: float = 2.0) ->
     """
     made_for = as_plant(body)
     n, count = made_for.num_actuators, len(_FEEDBACK)
-    biases = of_actuators(made_for, "bias")
+    biases = GeneBlocks(made_for, ("bias", "actuator")).genes
     genes = [*biases, *(Gene(f, *b[1:]) for b in biases for f, _ in _FEEDBACK)]
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
@@ -58,9 +59,10 @@ def make_feedback(body: Plant | Robot, depth: float = 1.0, gain: float = 2.0) ->
         rows = tuple(plant.arrange(weights[:, k]) for k in range(count))
         return plant.arrange(folded[:n]), rows, plant.middle(genes), plant.reach(genes)
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
         bias, weights, center, reach = parameters
-        found = (sense.height + depth, sense.climb, sense.up[1], sense.up[0], *sense.spin)
+        level = sense.height + depth, sense.climb, sense.up[1], sense.up[0]
+        found = (*level, *sense.angular_velocity)
         command = bias
         for weight, feature, (_, size) in zip(weights, found, _FEEDBACK, strict=True):
             command = command + weight * (feature / size)

@@ -1,4 +1,4 @@
-"""What a controller's genes say of the gait before anything moves: periods, phases, amplitudes."""
+"""The gait that a controller's genes encode: periods, phases and amplitudes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UNITS: dict[str, str] = {
     for of, unit in (("period", "s"), ("phase_offset", "rad"), ("amplitude", "rad"))
     for name in ("mean", "spread")
 }
-"""All that `describe_gait` gives, in its order, with units."""
+"""The keys of `describe_gait` in order, with units."""
 
 
 def describe_gait(plant: Plant, settings: Any, genes: Any) -> dict[str, float]:
@@ -29,14 +29,14 @@ def describe_gait(plant: Plant, settings: Any, genes: Any) -> dict[str, float]:
     Revolve (`measure_brain.py`) takes medians, over the parameters' ranges, and squashed standard
     deviations; here they are means and standard deviations in the parameters' own units, of phases
     the circular ones: √(-2 ln R), R the length of the mean of exp(i φ). Its recurrence, reach of
-    sensors and synaptic reception are of neural networks, whose gait is in what they do.
+    sensors and synaptic reception belong to neural networks, which encode no gait.
 
-    Each hinge's target is taken for a sin(2π t / T + φ) about its middle. `sine`: its first
+    Each hinge's target is approximated by a sin(2π t / T + φ) about its middle. `sine`: its first
     harmonic; the period is common. `cpg`: its oscillators are coupled linearly, so that each x is a
-    sum of sines whose frequencies are the system matrix's; the greatest of them counts (of equal
+    sum of sines at the eigenfrequencies of the system matrix; the greatest of them counts (of equal
     ones the fastest), with the amplitude that tanh leaves of it. `splines`: its curve's first
-    harmonic. `sensory_cpg`: its oscillators where nothing is felt, once their phases have settled.
-    Hinges whose target keeps still do not count.
+    harmonic. `sensory_cpg`: its oscillators at readings of 0, once their phases have settled.
+    Hinges with a constant target do not count.
 
     Args:
         plant: of one robot, from `plant_of`.
@@ -45,8 +45,8 @@ def describe_gait(plant: Plant, settings: Any, genes: Any) -> dict[str, float]:
 
     Returns:
         mean_period, spread_period [s], mean_phase_offset (-π to π), spread_phase_offset,
-        mean_amplitude, spread_amplitude [rad]: all 0 where nothing moves. Empty for other types of
-        controllers, which have no such parameters.
+        mean_amplitude, spread_amplitude [rad]: all 0 where nothing moves. Empty for other
+        controllers.
     """
     if settings.type not in _WAVES:
         return {}
@@ -77,7 +77,7 @@ def _sine_waves(parameters: Any, hinges: int) -> _Waves:
 
 
 def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
-    """The same of the greatest sine of each oscillator, `[hinges]`."""
+    """As `_sine_waves`, of the greatest sine of each oscillator."""
     w, coupling, reach, _, _ = parameters
     matrix = np.zeros((2 * hinges, 2 * hinges))
     for j, column in coupling.items():
@@ -88,7 +88,7 @@ def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
     turns, modes = np.linalg.eigh(1j * matrix)
     start = np.concatenate([np.zeros(hinges), np.ones(hinges)])
     parts = modes[:hinges] * (modes.conj().T @ start)
-    # What oscillates at one frequency is one sine; of each pair ±λ, one half tells all.
+    # What oscillates at one frequency is one sine; of each pair ±λ, one half is enough.
     near = _SAME_RATE * max(np.abs(turns).max(), 1e-9)
     same = np.abs(turns[:, None] - turns) < near
     parts = np.where(turns < -near, 2 * parts @ same, 0)
@@ -101,7 +101,7 @@ def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
 
 
 def _splines_waves(parameters: Any, hinges: int) -> _Waves:
-    """The same of each curve's first harmonic, `[hinges]`."""
+    """As `_sine_waves`, of each curve's first harmonic."""
     rows, rate = parameters[0], 2 * np.pi * np.asarray(parameters[1], float).item()
     points = len(rows)
     turn = np.exp(-2j * np.pi * np.arange(points) / points)
@@ -112,7 +112,7 @@ def _splines_waves(parameters: Any, hinges: int) -> _Waves:
 
 
 def _sensory_waves(parameters: Any, hinges: int) -> _Waves:
-    """The same of oscillators that feel nothing, once their phases have settled, `[hinges]`."""
+    """As `_sine_waves`, of oscillators at readings of 0, once their phases have settled."""
     (size, *_), _, rate, near, (reach, _), _ = parameters
     lag = np.zeros((hinges, hinges), complex)
     for j in near[0]:

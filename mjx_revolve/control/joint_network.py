@@ -1,8 +1,8 @@
 """One small network that all joints share, with messages between neighbours.
 
 The same weights at each joint, as in Huang, Mordatch & Pathak 2020 (One policy to control them
-all, ICML), so that a brain fits any body, and survives all changes of it. What a joint does differs
-from what another one does by what it feels, where it stands, and what its neighbours say.
+all, ICML), so that a brain fits any body, and survives all changes of it. Joints differ by their
+readings, their positions, and their neighbours' messages.
 """
 
 from __future__ import annotations
@@ -15,22 +15,29 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.body.sensors import Sensor
-from mjx_revolve.control.controller import Controller, Gene, as_plant, fade_in, make_controller
-from mjx_revolve.control.neighbours import act, mean_of_neighbours
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.controller import (
+    Controller,
+    Gene,
+    StepOutput,
+    as_plant,
+    fade_in,
+    make_controller,
+)
+from mjx_revolve.control.neighbours import apply_matrix, neighbour_mean
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import make_observer
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import sincos
-from mjx_revolve.numerics.xla import keep
+from mjx_revolve.numerics.xla import materialize
 
 # A weight of one is sin(gene) times this; a choice, so that tanh can be driven to its ends.
 _WEIGHT = 2.0
-# By which places are divided before they enter the network [m], about two modules; a choice.
+# Unit of the positions that enter the network [m], about two modules; a choice.
 _LENGTH = 0.1
-# How long messages take to be heard [s]; a choice. At once, joints that contradict each other would
+# Time constant of messages [s]; a choice. Without a lag, joints that contradict each other would
 # chatter at the rate of the steps.
-_HEARD = 0.05
+_MESSAGE_LAG = 0.05
 # Slowest and fastest unit of a recurrent network [s]; choices: a step, and a slow stroke.
 _SLOWEST, _FASTEST = 1.0, 0.02
 
@@ -49,36 +56,36 @@ def make_joint_network(
 ) -> Controller:
     """A network with one hidden layer, the same at each hinge and thruster.
 
-    Inputs of joint i are what the robot feels as a whole; what the joint feels; its place at rest
-    (x, y, z and distance from the core, in 0.1 m) and its axis, core frame; two phase hints,
-    sin(2π f t + φ_i) and cos, where φ_i is linear in the place, so that waves can run along the
-    body; and the mean of its neighbours' messages, as they were 0.05 s ago (smoothed by a lag of
-    first order, so that joints do not chatter). With W from the genes,
+    Inputs of joint i are the robot's observations; those of the joint; its position at rest (x, y,
+    z and distance from the core, in 0.1 m) and its axis, core frame; two phase hints,
+    sin(2π f t + φ_i) and cos, where φ_i is linear in the position, so that waves can run along the
+    body; and the mean of its neighbours' messages, smoothed by a lag of first order (0.05 s). With
+    W from the genes,
 
         h = tanh(W x),  message = U h,  target = middle + amplitude × half range × tanh(v·h),
 
-    whose targets fade in over half a second. Recurrent, hidden units are leaky and feel each other,
+    whose targets fade in over half a second. Recurrent, hidden units are leaky and coupled,
     τ_k ḣ_k = -h_k + tanh((W x + R h)_k), τ_k from 0.02 to 1 s (a continuous-time recurrent
     network, Beer 1995, Adaptive Behavior 3, with bounded states). Thrusters have a v of their own,
-    no joint's senses and no neighbours. Weights are 2 sin(gene): zero genes keep everything still.
+    no joint's observations and no neighbours. Weights are 2 sin(gene): zero genes keep all still.
 
     Args:
-        body: whose hinges and thrusters are driven: a plant or a robot.
-        sensors: that tell it what it feels; by default `sensors.USUAL`.
+        body: a plant or a robot.
+        sensors: of the observations; by default `DEFAULT_SENSORS`.
         hidden: units of the hidden layer [-].
-        messages: numbers that a joint tells its neighbours [-].
+        messages: numbers that a joint sends to its neighbours [-].
         max_frequency: of the phase hints [Hz].
         amplitude: share of the ranges used [-].
         recurrent: whether hidden units keep a state.
 
     Returns:
-        The controller; all genes are the robot's, so that their number does not depend on it.
+        The controller; the number of its genes does not depend on the body.
     """
     made_for = as_plant(body)
     observer = make_observer(sensors, made_for.timestep, made_for)
     words = [f"message{k + 1}" for k in range(messages)]
     given = [*observer.robot_names, *(f"joint {x}" for x in observer.joint_names)]
-    fixed, felt = len(_PLACE), len(observer.robot_names)
+    fixed, shared = len(_PLACE), len(observer.robot_names)
     inputs = [*_PLACE, *given, *_HINTS, *words]
     outputs = ["target", *words]
     units = [f"h{k + 1}" for k in range(hidden)]
@@ -111,7 +118,7 @@ def make_joint_network(
             tau = _SLOWEST * jnp.exp(share * np.log(_FASTEST / _SLOWEST))
             pace = jnp.minimum(dt / tau, 1)[:, None]
         rate = 2 * np.pi * max_frequency * (1 + take(1)) / 2
-        slope = np.pi * take(4)
+        phase = np.pi * take(4)
         target = out[:, :1]
         if made_for.num_thrusters:
             counts = plant.num_hinge_rows, plant.num_thrusters
@@ -120,14 +127,14 @@ def make_joint_network(
             target = jnp.concatenate(wide, 1)
         place = _places(plant, genes)
         base = sum(layer[:, k, None] * place[k] for k in range(fixed))
-        late = slope[0, None] * place[1]
+        late = phase[0, None] * place[1]
         for k in range(1, 4):
-            late = late + slope[k, None] * place[k + 1]
+            late = late + phase[k, None] * place[k + 1]
         sine, cosine = sincos(late)
         return (
             (base, layer[:, fixed:], back, pace, target, out[:, 1:]),
             (rate, sine, cosine),
-            mean_of_neighbours(genes, plant),
+            neighbour_mean(genes, plant),
             (amplitude * plant.reach(genes), plant.middle(genes)),
             plant.source[: plant.num_hinge_rows],
         )
@@ -136,35 +143,36 @@ def make_joint_network(
         (base, *_), _, _, _, _ = parameters
         rows = parameters[4].shape[0]
         like = base[0][:rows]
-        said = tuple(jnp.zeros_like(like) for _ in range(messages)) if rows else ()
-        return observer.init(like), said, jnp.zeros_like(base) if recurrent else ()
+        sent = tuple(jnp.zeros_like(like) for _ in range(messages)) if rows else ()
+        return observer.init(like), sent, jnp.zeros_like(base) if recurrent else ()
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
-        (base, layer, back, pace, target, speech), clock, near, (reach, middle), number = parameters
-        seen, said, memory = state
+    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+        network, clock, near, (reach, middle), number = parameters
+        base, layer, back, pace, target, message = network
+        samples, sent, memory = state
         rows, total = number.shape[0], base.shape[1]
-        seen, observation = observer.observe(seen, time, sense, number)
+        samples, observation = observer.observe(samples, time, sense, number)
 
         def of_all(x: jax.Array) -> jax.Array:
-            """What only hinges have, with nothing for thrusters."""
+            """Values of the hinges, with 0 for thrusters."""
             if rows == total:
                 return x
             return jnp.concatenate([x, jnp.zeros((total - rows, *x.shape[1:]), x.dtype)])
 
         activity = base
         if observation.robot:
-            # What is the same for all joints is added up once.
+            # The part that is the same for all joints is summed once.
             alike = layer[:, 0] * observation.robot[0]
             for k, x in enumerate(observation.robot[1:]):  # no reductions inside the loop
                 alike = alike + layer[:, k + 1] * x
-            activity = activity + keep(alike)[:, None]
+            activity = activity + materialize(alike)[:, None]
         rate, sine, cosine = clock
         s, c = sincos(rate * time)
-        hints = keep(sine * c + cosine * s), keep(cosine * c - sine * s)
-        heard = [keep(of_all(act(near, x))) for x in said]
+        hints = materialize(sine * c + cosine * s), materialize(cosine * c - sine * s)
+        received = [materialize(of_all(apply_matrix(near, x))) for x in sent]
         own = [of_all(x) for x in observation.joint]
-        later = felt + len(observer.joint_names)
-        for start, found in ((felt, own), (later, [*hints, *heard])):
+        later = shared + len(observer.joint_names)
+        for start, found in ((shared, own), (later, [*hints, *received])):
             for k, x in enumerate(found):
                 activity = activity + layer[:, start + k, None] * x
         if recurrent:
@@ -174,13 +182,13 @@ def make_joint_network(
         else:
             h = jnp.tanh(activity)
         command = sum(target[k] * h[k] for k in range(hidden))
-        share = min(dt / _HEARD, 1.0)
-        told = [sum(speech[k, m] * h[k][:rows] for k in range(hidden)) for m in range(len(said))]
-        said = tuple(old + share * (new - old) for old, new in zip(said, told, strict=True))
-        return (seen, said, memory), middle + fade_in(time) * reach * jnp.tanh(command)
+        share = min(dt / _MESSAGE_LAG, 1.0)
+        fresh = [sum(message[k, m] * h[k][:rows] for k in range(hidden)) for m in range(len(sent))]
+        sent = tuple(old + share * (new - old) for old, new in zip(sent, fresh, strict=True))
+        return (samples, sent, memory), middle + fade_in(time) * reach * jnp.tanh(command)
 
     found = make_controller(made_for, genes, decode, init, step)
-    return found._replace(feels=observer.feels, observer=observer)
+    return found._replace(signals=observer.signals, observer=observer)
 
 
 def _places(plant: Plant, like: jax.Array) -> list[jax.Array]:

@@ -1,8 +1,9 @@
-"""The controllers by name, and users' own."""
+"""The controller that a configuration names: one of the package's, or a user's own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import inspect
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -10,65 +11,22 @@ import jax.numpy as jnp
 
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.control.controller import Controller
-from mjx_revolve.control.cpg import make_cpg
-from mjx_revolve.control.feedback import make_feedback
-from mjx_revolve.control.joint_network import make_joint_network
-from mjx_revolve.control.neurons import make_network
-from mjx_revolve.control.places import Place
-from mjx_revolve.control.sense import FEELS, Other, Sense, is_place
-from mjx_revolve.control.sensory_cpg import make_sensory_cpg
-from mjx_revolve.control.sine import make_sine
-from mjx_revolve.control.splines import make_splines
+from mjx_revolve.control.neurons import make_neural_network
+from mjx_revolve.control.readings import (
+    OPTIONAL_SIGNALS,
+    SensorReadings,
+    is_module_signal,
+    readings_at_rest,
+)
+from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError, show
-from mjx_revolve.inputs.own_code import call_own, load_own, parse_own, short_name
-
-# By the name that a configuration gives; each takes (plant, settings).
-CONTROLLERS: dict[str, Callable[[Plant, Any], Controller]] = {
-    "cpg": lambda plant, settings: make_cpg(plant, settings.max_frequency, settings.amplitude),
-    "sine": lambda plant, settings: make_sine(
-        plant, settings.max_frequency, settings.amplitude, settings.harmonics
-    ),
-    "feedback": lambda plant, settings: make_feedback(plant, settings.depth, settings.gain),
-    "mlp": lambda plant, settings: _make_network(plant, settings, False),
-    "rnn": lambda plant, settings: _make_network(plant, settings, True),
-    "sensory_cpg": lambda plant, settings: make_sensory_cpg(
-        plant, settings.sensors, settings.max_frequency, settings.amplitude, settings.gain
-    ),
-    "splines": lambda plant, settings: make_splines(
-        plant, settings.points, settings.max_frequency, settings.amplitude
-    ),
-}
-
-
-def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | None) -> Controller:
-    """What a robot's file has under `brain`."""
-    place = f"{source}: controller.type"
-    if body is None:
-        raise InputError(f"{place}: expected another one, as bodies differ; found 'brain'")
-    brain, file = body.brain, body.path or body.name
-    if isinstance(brain, Mapping) and "neurons" in brain:
-        return make_network(plant, body, file)
-    kind = brain.get("type") if isinstance(brain, Mapping) else brain
-    if kind == "rlpower-splines":
-        return CONTROLLERS["splines"](plant, settings)
-    known = "neurons and connections, or type: rlpower-splines"
-    if kind == "bo-cpg":
-        known += " (its oscillators are those of controller.type cpg)"
-    found = "none" if brain is None else show(brain if kind is None else kind)
-    raise InputError(f"{file}: brain: expected {known}; found {found}")
-
-
-def _make_network(plant: Plant, settings: Any, recurrent: bool) -> Controller:
-    return make_joint_network(
-        plant,
-        settings.sensors,
-        settings.hidden,
-        settings.messages,
-        settings.max_frequency,
-        settings.amplitude,
-        recurrent,
-    )
+from mjx_revolve.inputs.user_code import (
+    call_user_function,
+    function_place,
+    load_user_function,
+    short_name,
+)
 
 
 def find_controller(
@@ -81,38 +39,60 @@ def find_controller(
     """The controller that a configuration names, made for a plant.
 
     Args:
-        plant: whose hinges and thrusters are driven.
-        settings: a `config.ControllerConfig`. Its `type` is a name in `CONTROLLERS`, or
-            FILE.py:FUNCTION for a function of the user's own, which takes the plant and these
-            settings and returns a `Controller`.
-        source: what messages call the configuration.
-        example: a plant with its tables, to try a user's own on; by default `plant`.
-        body: whose plant it is, for `type: brain`; None for many.
-
-    Returns:
-        The controller.
+        plant: of the actuators.
+        settings: a `ControllerConfig`. Its `type` is a name in `CONTROLLERS`, or FILE.py:FUNCTION
+            for a user's function, which takes the plant and these settings and returns a
+            `Controller`.
+        source: the configuration, in messages.
+        example: a plant with its tables, to try a user's controller on; by default `plant`.
+        body: of the plant, for `type: brain`; None for many bodies.
 
     Raises:
-        InputError: the file or the function is missing, or what it makes is no controller of this
-            plant; one line says where.
+        InputError: the file or the function is missing, or it makes no controller of this plant.
     """
-    if settings.type == "brain":
-        return _make_brain(plant, settings, source, body)
-    if settings.type in CONTROLLERS:
-        return CONTROLLERS[settings.type](plant, settings)
     name = settings.type
-    function = load_own(name, f"{source}: controller.type")
-    controller = call_own(
-        name, f"{short_name(name)} to make a controller", function, plant, settings
-    )
-    _check_own(name, controller, plant if example is None else example)
+    if name == "brain":
+        return _make_brain(plant, settings, source, body)
+    if name in CONTROLLERS:
+        return _make(name, plant, settings)
+    function = load_user_function(name, f"{source}: controller.type")
+    expected = f"{short_name(name)} to make a controller"
+    controller = call_user_function(name, expected, function, plant, settings)
+    _check_users_controller(name, controller, plant if example is None else example)
     return controller
 
 
-def _check_own(name: str, controller: Any, plant: Plant) -> None:
+def _make(name: str, plant: Plant, settings: Any) -> Controller:
+    """A controller of the package, made with the settings that it takes."""
+    kind = CONTROLLERS[name]
+    takes = inspect.signature(kind.make).parameters
+    given = {key: value for key, value in settings if key in takes}
+    made: Controller = kind.make(plant, **given, **kind.fixed)
+    return made
+
+
+def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | None) -> Controller:
+    """What a robot's file has under `brain`."""
+    if body is None:
+        raise InputError(
+            f"{source}: controller.type: expected another one, as bodies differ; found 'brain'"
+        )
+    brain, file = body.brain, body.path or body.name
+    if isinstance(brain, Mapping) and "neurons" in brain:
+        return make_neural_network(plant, body, file)
+    kind = brain.get("type") if isinstance(brain, Mapping) else brain
+    if kind == "rlpower-splines":
+        return _make("splines", plant, settings)
+    known = "neurons and connections, or type: rlpower-splines"
+    if kind == "bo-cpg":
+        known += " (its oscillators are those of controller.type cpg)"
+    found = "none" if brain is None else show(brain if kind is None else kind)
+    raise InputError(f"{file}: brain: expected {known}; found {found}")
+
+
+def _check_users_controller(name: str, controller: Any, plant: Plant) -> None:
     """Refuses what is no controller of a plant, before anything is compiled."""
-    own = parse_own(name)
-    place = f"{own.path}: {own.function}" if own else name
+    place = function_place(name)
     if not isinstance(controller, Controller):
         raise InputError(f"{place}: expected a Controller; found {type(controller).__name__}")
     count = controller.num_genes
@@ -123,27 +103,27 @@ def _check_own(name: str, controller: Any, plant: Plant) -> None:
             f"{place}: gene_names: expected {count} of them, as num_genes says; found "
             f"{len(controller.gene_names)}"
         )
-    for name_felt in controller.feels:
-        if name_felt not in FEELS and not is_place(name_felt):
+    for signal in controller.signals:
+        if signal not in OPTIONAL_SIGNALS and not is_module_signal(signal):
             raise InputError(
-                f"{place}: feels: expected any of {', '.join(FEELS)}, or places such as 'at ID' "
-                f"and 'each TYPE'; found {name_felt!r}"
+                f"{place}: signals: expected any of {', '.join(OPTIONAL_SIGNALS)}, or modules such "
+                f"as 'at ID' and 'each TYPE'; found {signal!r}"
             )
     lanes, rows = 3, plant.num_rows
+    try:
+        readings = jax.eval_shape(lambda: readings_at_rest(plant, lanes, controller.signals))
+    except InputError as error:
+        raise InputError(f"{place}: signals: {error}") from None
 
-    def run(genes: jax.Array, time: jax.Array, sense: Sense) -> Any:
+    def run(genes: jax.Array, time: jax.Array, sense: SensorReadings) -> Any:
         parameters = controller.decode(genes, plant)
         state = controller.init(parameters)
         return state, *controller.step(parameters, state, time, sense)
 
-    before, after, targets = call_own(
-        name,
-        f"{short_name(name)}'s decode, init and step to give targets",
-        jax.eval_shape,
-        run,
-        jax.ShapeDtypeStruct((count, lanes), jnp.float32),
-        jax.ShapeDtypeStruct((), jnp.float32),
-        _example_sense(plant, lanes, controller.feels, place),
+    genes, time = jnp.zeros((count, lanes), jnp.float32), jnp.zeros((), jnp.float32)
+    expected = f"{short_name(name)}'s decode, init and step to give targets"
+    before, after, targets = call_user_function(
+        name, expected, jax.eval_shape, run, genes, time, readings
     )
     if getattr(targets, "shape", None) != (rows, lanes):
         raise InputError(
@@ -155,54 +135,6 @@ def _check_own(name: str, controller: Any, plant: Plant) -> None:
             f"{place}: step: expected a state of the shapes that init gives, {_shapes(before)}; "
             f"found {_shapes(after)}"
         )
-
-
-def _example_sense(plant: Plant, lanes: int, feels: Sequence[str], place: str) -> Sense:
-    """The shapes of what is felt."""
-    hinges = plant.num_hinge_rows
-
-    def given(*shape: int) -> Any:
-        return jax.ShapeDtypeStruct((*shape, lanes), jnp.float32)
-
-    one, joint, touch = given(), given(hinges), given(1 + hinges)
-    three = (one, one, one)
-    asked: dict[str, Any] = {"force": three, "load": joint, "work": one, "touch": touch}
-    asked["nearest"] = Other(three, one)
-
-    def at(name: str) -> Place:
-        """The shapes of what is felt at a place."""
-        try:
-            sites = plant.site(name)
-        except InputError as error:
-            raise InputError(f"{place}: feels: {error}") from None
-        x = touch if sites.row is None else one
-        found = Place(x, x, x, (x,) * 3, (x,) * 3, (x,) * 3, (x,) * 3, x, (x,) * 3)
-        if "forces" in feels:
-            found = found._replace(force=(x,) * 3)
-        if sites.hinge is not None:
-            found = found._replace(angle=x, speed=x, load=x if "load" in feels else None)
-        if sites.module is not None:
-            cells = (x, x) if "cells" in feels else None
-            found = found._replace(touch=x if "touch" in feels else None, cells=cells)
-        return found
-
-    places = {name: at(name) for name in feels if is_place(name)}
-    return Sense(
-        height=one,
-        climb=one,
-        up=three,
-        spin=three,
-        north=three,
-        angle=joint,
-        speed=joint,
-        flow=three,
-        altitude=one,
-        target=three,
-        course=three,
-        noise=jax.ShapeDtypeStruct((lanes,), jnp.uint32),
-        places=places or None,
-        **{name: asked[name] for name in feels if name in asked},
-    )
 
 
 def _shapes(state: Any) -> str:

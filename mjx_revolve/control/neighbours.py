@@ -1,4 +1,4 @@
-"""How joints that share a rigid body act on each other: matrices, column by column."""
+"""Matrices over pairs of hinges that share a rigid body, column by column."""
 
 from __future__ import annotations
 
@@ -9,20 +9,17 @@ import jax.numpy as jnp
 
 from mjx_revolve.engine.plant import Plant
 
-Columns = Mapping[int, jax.Array]
-"""For each hinge row that may act on others, `[hinge rows, lanes]` how it does."""
+NeighbourMatrix = Mapping[int, jax.Array]
+"""Nonzero columns by hinge row, `[hinge rows, lanes]` each."""
 
 
-def join_pairs(onto_first: jax.Array, onto_second: jax.Array, plant: Plant) -> Columns:
-    """A matrix over hinges from the weights of pairs.
+def pair_matrix(onto_first: jax.Array, onto_second: jax.Array, plant: Plant) -> NeighbourMatrix:
+    """The matrix of weights of pairs.
 
     Args:
-        onto_first: `[num_pairs, lanes]` how the later hinge of a pair acts on the earlier one.
-        onto_second: how the earlier one acts on the later one, likewise.
-        plant: whose pairs.
-
-    Returns:
-        Its columns.
+        onto_first: `[num_pairs, lanes]` from the later hinge of a pair to the earlier one.
+        onto_second: `[num_pairs, lanes]` from the earlier one to the later one.
+        plant: of the pairs.
     """
     rows, lanes = plant.num_hinge_rows, onto_first.shape[1:]
     if not plant.num_pairs:
@@ -41,34 +38,23 @@ def join_pairs(onto_first: jax.Array, onto_second: jax.Array, plant: Plant) -> C
     return {j: matrix[:, j] for j in acting}
 
 
-def mean_of_neighbours(like: jax.Array, plant: Plant) -> Columns:
+def neighbour_mean(like: jax.Array, plant: Plant) -> NeighbourMatrix:
     """The matrix that takes the mean over each hinge's neighbours; 0 for those without.
 
     Args:
         like: `[..., lanes]` of the floating-point type.
-        plant: whose pairs.
-
-    Returns:
-        Its columns.
+        plant: of the pairs.
     """
     ones = jnp.ones((plant.num_pairs, *like.shape[1:]), like.dtype)
-    columns = join_pairs(ones, ones, plant)
+    columns = pair_matrix(ones, ones, plant)
     if not columns:
         return {}
     count = jnp.maximum(sum(columns.values()), 1)
     return {j: column / count for j, column in columns.items()}
 
 
-def act(columns: Columns, values: jax.Array) -> jax.Array:
-    """The matrix times values of the hinges; written out: no reductions inside the compiled loop.
-
-    Args:
-        columns: of the matrix.
-        values: `[hinge rows, lanes]`.
-
-    Returns:
-        `[hinge rows, lanes]`.
-    """
+def apply_matrix(columns: NeighbourMatrix, values: jax.Array) -> jax.Array:
+    """The matrix times `[hinge rows, lanes]`. No reductions inside the compiled loop."""
     found = jnp.zeros_like(values)
     for j, column in columns.items():
         found = found + column * values[j : j + 1]

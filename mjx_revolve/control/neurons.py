@@ -1,6 +1,6 @@
 """Revolve's neural networks, as a robot's YAML has them under `brain`: read, run and evolved.
 
-What Revolve leaves open, or does unlike what its words say, and how it is here:
+Where Revolve's code differs from its documentation, or leaves something open:
 
 - `phase_offset` counts periods, not radians: an Oscillator gives
   1/2 - a/2 + a (sin(2π/T (t - T φ)) + 1)/2, whatever its inputs are.
@@ -10,8 +10,8 @@ What Revolve leaves open, or does unlike what its words say, and how it is here:
 - An output is clipped to 0 to 1, and that is the hinge's whole range; of several for one hinge, the
   first in the file counts. A hinge without any stays in the middle.
 - The inputs of a module are its input neurons in the file's order: of the core its accelerometer's
-  x, y, z, then its gyro's [m/s², rad/s]; of a touch sensor its two cells, left and right of the way
-  in which it is attached: how hard the bed pushes each half, as a share of 1 N.
+  x, y, z, then its gyro's [m/s², rad/s]; of a touch sensor its two cells, the force of the bed on
+  its left and its right half as seen in the direction in which it is attached, as a share of 1 N.
 - Two connections between the same neurons add up. One into an Oscillator does nothing.
 """
 
@@ -19,26 +19,37 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from dataclasses import field
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from annotated_types import Unit
+from pydantic import BeforeValidator
 
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.control.controller import Controller, Gene
-from mjx_revolve.control.sense import Sense, is_place
+from mjx_revolve.control.controller import Controller, Gene, StepOutput
+from mjx_revolve.control.readings import SensorReadings, is_module_signal
 from mjx_revolve.control.sensors import count_samples
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError, show
-from mjx_revolve.inputs.schema import MisfitError, Number, Text, checked, read, words
+from mjx_revolve.inputs.schema import (
+    ConstraintError,
+    Number,
+    Positive,
+    Text,
+    TupleOf,
+    checked,
+    read,
+    words,
+)
 from mjx_revolve.numerics.spatial import sincos
 
 RATE = 8.0
 """How often Revolve's controllers are updated [Hz]."""
 
-# What each type of neuron is told, in the order of its genes, and under which other names files
-# have it.
+# Parameters of each type of neuron, in the order of its genes, and other names for them in files.
 PARAMS: dict[str, tuple[str, ...]] = {
     "Input": (),
     "Simple": ("bias", "gain"),
@@ -46,11 +57,19 @@ PARAMS: dict[str, tuple[str, ...]] = {
     "Oscillator": ("period", "phase_offset", "amplitude"),
 }
 _OTHERWISE = {"amplitude": "gain"}
-# How far a gene may move what is written: weights and parameters by as much, a period by this
-# factor; choices, about the ranges that Revolve draws them from.
-_FAR = {"weight": 2.0, "bias": 1.0, "gain": 1.0, "phase_offset": 0.5, "amplitude": 1.0}
+# Largest change of a written number by its gene, for a period the factor; choices, about the ranges
+# that Revolve draws them from.
+_REACH = {"weight": 2.0, "bias": 1.0, "gain": 1.0, "phase_offset": 0.5, "amplitude": 1.0}
 _PERIODS = 4.0
 _CELLS, _INERTIAL = 2, 6  # inputs of a touch sensor, and of the core
+
+
+def _read_id(value: Any) -> Any:
+    """Names in YAML may be numbers."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+_Id = Annotated[Text, BeforeValidator(_read_id), words("a name")]
 
 
 @checked
@@ -59,137 +78,114 @@ class Neuron:
 
     Attributes:
         id: its name.
-        layer: "input", "hidden" or "output".
+        layer: of the network.
         type: a name in `PARAMS`.
         part_id: the module that it belongs to; hidden ones need none.
     """
 
-    id: Annotated[str | int, words("a name")]
-    layer: Text
-    type: Text
-    part_id: Annotated[str | int | None, words("a module's id")] = None
+    id: _Id
+    layer: Literal["input", "hidden", "output"]
+    type: Literal["Input", "Simple", "Sigmoid", "Oscillator"]
+    part_id: _Id | None = None
 
     def __post_init__(self) -> None:
-        """Checks layer and type."""
-        if self.layer not in ("input", "hidden", "output"):
-            raise MisfitError("layer", "input, hidden or output", show(self.layer))
-        if self.type not in PARAMS:
-            raise MisfitError("type", f"one of {', '.join(PARAMS)}", show(self.type))
+        """Checks that the type fits the layer."""
         if (self.layer == "input") != (self.type == "Input"):
-            raise MisfitError("type", "Input in the layer input, and nowhere else", show(self.type))
+            what = "Input in the layer input, and nowhere else"
+            raise ConstraintError("type", what, show(self.type))
 
 
 @checked
-class Connection:
+class Synapse:
     """A connection of a file."""
 
-    src: Annotated[str | int, words("a neuron's id")]
-    dst: Annotated[str | int, words("a neuron's id")]
+    src: _Id
+    dst: _Id
     weight: Number
 
 
-class Network(NamedTuple):
+def _as_list(neurons: Any) -> Any:
+    """Neurons by id as a list of them; an input's type may be left out."""
+    if isinstance(neurons, Mapping):
+        own = neurons.items()
+        neurons = [{"id": k} | dict(x) if isinstance(x, Mapping) else x for k, x in own]
+    if not isinstance(neurons, list):
+        return neurons
+    is_input = [isinstance(x, Mapping) and x.get("layer") == "input" for x in neurons]
+    return [
+        {"type": "Input"} | dict(x) if own else x for x, own in zip(neurons, is_input, strict=True)
+    ]
+
+
+_OrNone = BeforeValidator(lambda value: value or ())
+
+
+@checked
+class _File:
+    """A network as a file has it."""
+
+    neurons: Annotated[TupleOf[Neuron], BeforeValidator(_as_list)]
+    connections: Annotated[TupleOf[Synapse], _OrNone] = ()
+    params: Annotated[dict[_Id, dict[Text, Any]], BeforeValidator(lambda x: x or {})] = field(
+        default_factory=dict
+    )
+    type: Any = None
+
+    def __post_init__(self) -> None:
+        """Checks names, and the ends of connections."""
+        types: dict[str, str] = {}
+        for k, neuron in enumerate(self.neurons):
+            if neuron.id in types:
+                raise ConstraintError(f"neurons.{k}.id", "each id once", f"{neuron.id!r} twice")
+            types[neuron.id] = neuron.type
+        for k, connection in enumerate(self.connections):
+            if connection.src not in types:
+                what = "the id of a neuron"
+                raise ConstraintError(f"connections.{k}.src", what, show(connection.src))
+            if types.get(connection.dst, "Input") == "Input":
+                what = "the id of a neuron that is no input"
+                raise ConstraintError(f"connections.{k}.dst", what, show(connection.dst))
+
+
+class NeuralNetwork(NamedTuple):
     """A network as it is written.
 
     Attributes:
         neurons: in the file's order.
-        connections: likewise.
-        params: of each neuron, as `PARAMS` has them.
+        connections: in the file's order.
+        params: of each neuron, in the order of `PARAMS`.
     """
 
     neurons: tuple[Neuron, ...]
-    connections: tuple[Connection, ...]
+    connections: tuple[Synapse, ...]
     params: tuple[tuple[float, ...], ...]
 
 
-def read_network(brain: Any, source: str) -> Network:
-    """Reads a network.
-
-    Args:
-        brain: what a morphology file has under `brain`.
-        source: what messages call the file.
-
-    Returns:
-        The network.
+def read_neural_network(brain: Any, source: str) -> NeuralNetwork:
+    """Reads what a morphology file has under `brain`.
 
     Raises:
-        InputError: something in it is wrong, or is nothing that we run.
+        InputError: something in it is wrong, or is not supported.
     """
-    place = f"{source}: brain"
-    for key in brain:
-        if key not in ("type", "neurons", "connections", "params"):
-            known = "type, neurons, connections, params"
-            raise InputError(f"{place}: expected only {known}; found {show(key)}")
-    found = brain["neurons"]
-    if isinstance(found, Mapping):
-        found = [
-            item if not isinstance(item, Mapping) else {"id": key} | dict(item)
-            for key, item in found.items()
-        ]
-    if not isinstance(found, list):
-        raise InputError(f"{place}.neurons: expected neurons by id; found {show(found)}")
-    items = [_with_layer(item) for item in found]
-    neurons = tuple(read(Neuron, x, f"{place}.neurons.{k}") for k, x in enumerate(items))
-    names = [str(neuron.id) for neuron in neurons]
-    for k, name in enumerate(names):
-        if name in names[:k]:
-            raise InputError(f"{place}.neurons: expected each id once; found {name!r} twice")
-    given = brain.get("connections") or []
-    if not isinstance(given, list):
-        raise InputError(f"{place}.connections: expected a list; found {show(given)}")
-    connections = tuple(
-        read(Connection, x, f"{place}.connections.{k}") for k, x in enumerate(given)
-    )
-    for k, connection in enumerate(connections):
-        for end in ("src", "dst"):
-            at = str(getattr(connection, end))
-            if at not in names or (end == "dst" and neurons[names.index(at)].type == "Input"):
-                what = "the id of a neuron" + (" that is no input" if end == "dst" else "")
-                raise InputError(f"{place}.connections.{k}.{end}: expected {what}; found {at!r}")
-    params = brain.get("params") or {}
-    if not isinstance(params, Mapping):
-        raise InputError(f"{place}.params: expected a mapping; found {show(params)}")
-    told = {str(key): value for key, value in params.items()}
-    return Network(
-        neurons,
-        connections,
-        tuple(_read_params(told.get(n), neuron, f"{place}.params.{n}")
-              for n, neuron in zip(names, neurons, strict=True)),
-    )  # fmt: skip
+    file: _File = read(_File, brain, f"{source}: brain")
+    params = []
+    for neuron in file.neurons:
+        given, found = file.params.get(neuron.id, {}), []
+        for name in PARAMS[neuron.type]:
+            kind = Annotated[Positive, Unit("s")] if name == "period" else Number
+            value = given.get(name, given.get(_OTHERWISE.get(name, "")))
+            found.append(read(kind, value, f"{source}: brain.params.{neuron.id}.{name}"))
+        params.append(tuple(found))
+    return NeuralNetwork(file.neurons, file.connections, tuple(params))
 
 
-def _with_layer(item: Any) -> Any:
-    """An input's type is often left out."""
-    if isinstance(item, Mapping) and item.get("layer") == "input":
-        return {"type": "Input"} | dict(item)
-    return item
-
-
-def _read_params(given: Any, neuron: Neuron, place: str) -> tuple[float, ...]:
-    names = PARAMS[neuron.type]
-    if not names:
-        return ()
-    if not isinstance(given, Mapping):
-        raise InputError(f"{place}: expected {', '.join(names)}; found {show(given)}")
-    found = []
-    for name in names:
-        value = given.get(name, given.get(_OTHERWISE.get(name)))
-        if value is None:
-            raise InputError(f"{place}.{name}: expected a number; found none")
-        number: float = read(Number, value, f"{place}.{name}")
-        if name == "period" and number <= 0:
-            raise InputError(f"{place}.period: expected a number > 0 [s]; found {number:g}")
-        found.append(number)
-    return tuple(found)
-
-
-def _genes_of(network: Network) -> list[tuple[str, Any]]:
-    """What may change of a network: (kind, which), connections first, then parameters."""
-    types = {str(neuron.id): neuron.type for neuron in network.neurons}
+def _genes_of(network: NeuralNetwork) -> list[tuple[str, Any]]:
+    """The numbers of a network that evolve: (kind, index), connections first, then parameters."""
+    types = {neuron.id: neuron.type for neuron in network.neurons}
     found: list[tuple[str, Any]] = [
         ("weight", k)
         for k, connection in enumerate(network.connections)
-        if types[str(connection.dst)] != "Oscillator"
+        if types[connection.dst] != "Oscillator"
     ]
     return found + [
         (name, (k, n))
@@ -199,17 +195,17 @@ def _genes_of(network: Network) -> list[tuple[str, Any]]:
 
 
 def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
-    """A robot's brain with the numbers that genes make of it.
+    """A network as a morphology file has it, with its numbers changed by genes.
 
     Args:
-        brain: what a morphology file has under `brain`, a network.
-        genes: `[num_genes]` of `make_network`.
-        source: what messages call the file.
+        brain: under `brain` in the file.
+        genes: `[num_genes]` of `make_neural_network`.
+        source: the file, in messages.
 
     Returns:
-        A new one, to be saved with a robot: run with genes of 0 it does what this one does.
+        A new one: with genes of 0 it does what the given one does with these.
     """
-    network, made = read_network(brain, source), copy.deepcopy(brain)
+    network, made = read_neural_network(brain, source), copy.deepcopy(brain)
     params = {str(key): value for key, value in (made.get("params") or {}).items()}
     folded = np.sin(np.asarray(genes, float))
     for (kind, which), x in zip(_genes_of(network), folded, strict=True):
@@ -218,26 +214,26 @@ def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
             item["weight"] = float(_moved(kind, network.connections[which].weight, x))
         else:
             k, n = which
-            own = params[str(network.neurons[k].id)]
+            own = params[network.neurons[k].id]
             name = kind if kind in own else _OTHERWISE[kind]
             own[name] = float(_moved(kind, network.params[k][n], x))
     return made
 
 
 def _moved(kind: str, written: float, folded: Any) -> Any:
-    """What a gene makes of a written number."""
+    """A written number, changed by a gene."""
     if kind == "period":
         return written * _PERIODS**folded
-    return written + _FAR[kind] * folded
+    return written + _REACH[kind] * folded
 
 
-def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Controller:
+def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -> Controller:
     """A robot's own network. Genes of 0 run it as it is written; they move its numbers.
 
     Args:
         plant: of the robot.
-        body: whose `brain` has neurons and connections.
-        source: what messages call the file.
+        body: the robot, with neurons and connections under `brain`.
+        source: its file, in messages.
 
     Returns:
         The controller; genes: weights of all connections but those into Oscillators, +- 2, then
@@ -247,21 +243,21 @@ def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Contr
     Raises:
         InputError: a neuron is wrong, or belongs to a module that has no such input or output.
     """
-    network = read_network(body.brain, source)
+    network = read_neural_network(body.brain, source)
     neurons, place = network.neurons, f"{source}: brain"
     moving = [k for k, neuron in enumerate(neurons) if neuron.type != "Input"]
     # Of one type side by side.
     moving.sort(key=lambda k: list(PARAMS).index(neurons[k].type))
     types = [neurons[k].type for k in moving]
-    row_of = {str(neurons[k].id): row for row, k in enumerate(moving)}
+    row_of = {neurons[k].id: row for row, k in enumerate(moving)}
     inputs = _find_inputs(network, body, place)
     outputs = _find_outputs(network, body, plant, row_of, place)
     changing = _genes_of(network)
-    sources = [*(str(neurons[k].id) for k, _ in inputs), *row_of]
+    sources = [*(neurons[k].id for k, _ in inputs), *row_of]
     column_of = {name: column for column, name in enumerate(sources)}
-    feels = ("force",) * any(x[0] == "force" for _, x in inputs)
-    touched = dict.fromkeys(x[0] for _, x in inputs if is_place(x[0]))
-    feels += ("cells", *touched) if touched else ()
+    signals = ("force",) * any(x[0] == "force" for _, x in inputs)
+    touched = dict.fromkeys(x[0] for _, x in inputs if is_module_signal(x[0]))
+    signals += ("cells", *touched) if touched else ()
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
         folded, lanes = jnp.sin(genes), genes.shape[1:]
@@ -270,7 +266,7 @@ def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Contr
         for (kind, which), x in zip(changing, folded, strict=True):
             if kind == "weight":
                 one = network.connections[which]
-                at = row_of[str(one.dst)], column_of[str(one.src)]
+                at = row_of[one.dst], column_of[one.src]
                 weights = weights.at[at].add(_moved(kind, one.weight, x))
             else:
                 k, n = which
@@ -287,11 +283,11 @@ def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Contr
         still = jnp.zeros((len(moving), *middle.shape[1:]), middle.dtype)
         return jnp.full((), -1, middle.dtype), still
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
         columns, tables, middle, reach = parameters
         last, values = state
         count = count_samples(time, RATE)
-        given = [_feel(sense, what) for _, what in inputs]
+        given = [_read_input(sense, what) for _, what in inputs]
         given += [values[row] for row in range(len(moving))]
         total = jnp.zeros_like(values)
         for column, x in zip(columns, given, strict=True):  # no reductions inside the loop
@@ -317,8 +313,8 @@ def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Contr
             jnp.zeros_like(middle[0]) if row is None else 2 * jnp.clip(values[row], 0, 1) - 1
             for row in outputs
         ]
-        asked = jnp.stack(rows) if rows else jnp.zeros_like(middle)
-        return (count, values), middle + reach * asked
+        command = jnp.stack(rows) if rows else jnp.zeros_like(middle)
+        return (count, values), middle + reach * command
 
     names = []
     for kind, which in changing:
@@ -328,28 +324,28 @@ def make_network(plant: Plant, body: Morphology, source: str = "robot") -> Contr
         else:
             names.append(f"{kind} {neurons[which[0]].id}")
     genes = tuple(Gene(name, "robot") for name in names)
-    return Controller(len(genes), tuple(names), decode, init, step, genes, feels)
+    return Controller(len(genes), tuple(names), decode, init, step, genes, signals)
 
 
-def _feel(sense: Sense, what: tuple[str, int]) -> Any:
-    """An input's value: a component of the core's, or how hard a cell is touched."""
+def _read_input(sense: SensorReadings, what: tuple[str, int]) -> Any:
+    """The value of an input: a component of a reading of the core, or the force on a cell."""
     field, k = what
-    if is_place(field):
-        return jnp.clip(sense.places[field].cells[k], 0, 1)
+    if is_module_signal(field):
+        return jnp.clip(sense.modules[field].cells[k], 0, 1)
     return getattr(sense, field)[k]
 
 
 def _find_inputs(
-    network: Network, body: Morphology, place: str
+    network: NeuralNetwork, body: Morphology, place: str
 ) -> list[tuple[int, tuple[str, int]]]:
-    """Input neurons, and the field of the sense, or the place, with its component."""
+    """Input neurons, each with the field of the readings, or the module, and its component."""
     modules = {module.name: k for k, module in enumerate(body.modules)}
     seen = dict.fromkeys(modules, 0)
     found = []
     for k, neuron in enumerate(network.neurons):
         if neuron.type != "Input":
             continue
-        name = str(neuron.part_id)
+        name = neuron.part_id
         where = f"{place}.neurons.{neuron.id}.part_id"
         if name not in modules:
             raise InputError(f"{where}: expected a module's id; found {show(neuron.part_id)}")
@@ -361,24 +357,24 @@ def _find_inputs(
             raise InputError(f"{where}: expected {has}; found {name!r} of type {module.type}")
         what = (f"at {name}", number)
         if module.parent < 0:
-            what = ("force", number) if number < 3 else ("spin", number - 3)
+            what = ("force", number) if number < 3 else ("angular_velocity", number - 3)
         found.append((k, what))
     return found
 
 
 def _find_outputs(
-    network: Network, body: Morphology, plant: Plant, row_of: Mapping[str, int], place: str
+    network: NeuralNetwork, body: Morphology, plant: Plant, row_of: Mapping[str, int], place: str
 ) -> list[int | None]:
-    """Which neuron drives each row of the plant."""
+    """The neuron of each row of the plant."""
     driven: dict[int, int] = {}
     for neuron in network.neurons:
         if neuron.layer != "output":
             continue
-        name = str(neuron.part_id)
+        name = neuron.part_id
         if name not in plant.names:
             raise InputError(
                 f"{place}.neurons.{neuron.id}.part_id: expected the id of a hinge or a thruster; "
                 f"found {show(neuron.part_id)}"
             )
-        driven.setdefault(plant.names.index(name), row_of[str(neuron.id)])
+        driven.setdefault(plant.names.index(name), row_of[neuron.id])
     return [driven.get(int(k)) for k in np.asarray(plant.source)[:, 0]]

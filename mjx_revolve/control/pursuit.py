@@ -1,7 +1,7 @@
-"""A pursuer: a point that swims at the robot as fast as it can and turns no faster than it can.
+"""Pure pursuit: a point that heads for the robot at constant speed, its turning rate limited.
 
-It has no body, and knows neither water nor bed. Where it is depends on where the robot was, so it
-is part of what travels with a rollout, `sense.Memory`.
+It has no body and is moved by neither water nor bed. It depends on where the robot was, so its
+state is part of the rollout's, in `SensorMemory`.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from mjx_revolve.numerics.spatial import Vec, dot, safe_norm, sincos, vadd, vscale, vsub
 
 
-class Chase(NamedTuple):
-    """What a pursuer can do, `[lanes]` each.
+class PursuitLimits(NamedTuple):
+    """Capabilities of a pursuer, `[lanes]` each.
 
     Attributes:
         speed: over ground [m/s].
-        turn: how fast it turns at most [rad/s].
+        turn: largest turning rate [rad/s].
     """
 
     speed: Any
@@ -26,66 +26,55 @@ class Chase(NamedTuple):
 
 
 class Pursuer(NamedTuple):
-    """A pursuer on its way, world frame.
+    """State of a pursuer, world frame, three of `[lanes]` each.
 
     Attributes:
-        place: where it is, three of `[lanes]` [m].
-        heading: where it swims, a unit vector, likewise.
+        position: [m].
+        heading: unit vector.
     """
 
-    place: Vec
+    position: Vec
     heading: Vec
 
 
-def start_chase(place: Vec, prey: Vec) -> Pursuer:
-    """A pursuer that heads for its prey.
-
-    Args:
-        place: where it starts, three of `[lanes]` [m].
-        prey: where the robot is, likewise.
-
-    Returns:
-        The pursuer.
-    """
-    place = tuple(p + 0 * x for p, x in zip(place, prey, strict=True))
-    return Pursuer(place, _unit(vsub(prey, place)))
+def init_pursuer(position: Vec, robot: Vec) -> Pursuer:
+    """A pursuer at a position that heads for the robot's, world frame [m]."""
+    position = tuple(p + 0 * x for p, x in zip(position, robot, strict=True))
+    return Pursuer(position, _unit(vsub(robot, position)))
 
 
-def pursue(pursuer: Pursuer, chase: Chase, prey: Vec, dt: float) -> Pursuer:
-    """The pursuer after a step: it turns towards its prey, and swims on.
+def step_pursuer(pursuer: Pursuer, limits: PursuitLimits, robot: Vec, dt: float) -> Pursuer:
+    """The pursuer after a step: it turns towards the robot and moves on.
 
     Args:
         pursuer: before it.
-        chase: what it can do.
-        prey: where the robot was before the step, three of `[lanes]` [m].
-        dt: of the step [s].
-
-    Returns:
-        The pursuer.
+        limits: its speed and turning rate.
+        robot: position before the step, world frame, three of `[lanes]` [m].
+        dt: timestep [s].
     """
-    ahead, wanted = pursuer.heading, vsub(prey, pursuer.place)
+    ahead, wanted = pursuer.heading, vsub(robot, pursuer.position)
     away = safe_norm(wanted)
-    # What is where it is itself is ahead of it.
+    # Where the two coincide, the heading stays.
     wanted = tuple(
         jnp.where(away > 0, w / jnp.maximum(away, 1e-12), a)
         for w, a in zip(wanted, ahead, strict=True)
     )
     along = dot(ahead, wanted)
     aside = vsub(wanted, vscale(along, ahead))
-    # To the left where the prey is right behind, and the world's x axis for who heads up or down.
+    # To the left where the robot is straight behind; x axis of the world if it heads up or down.
     x, y, _ = ahead
     behind = dot(aside, aside) < 1e-12
     steep = x * x + y * y < 1e-12
     left = (jnp.where(steep, 1.0, -y), jnp.where(steep, 0.0, x), jnp.zeros_like(x))
     aside = _unit(tuple(jnp.where(behind, b, a) for a, b in zip(aside, left, strict=True)))
-    sine, cosine = sincos(jnp.asarray(chase.turn * dt))
+    sine, cosine = sincos(jnp.asarray(limits.turn * dt))
     turned = vadd(vscale(cosine, ahead), vscale(sine, aside))
-    # Nearer than one step's turn it heads for the prey itself. (No turn is of more than π.)
-    near = along >= jnp.where(chase.turn * dt < jnp.pi, cosine, -1.0)
+    # Within one step's turn it heads for the robot itself. (No turn is of more than π.)
+    near = along >= jnp.where(limits.turn * dt < jnp.pi, cosine, -1.0)
     heading = _unit(tuple(jnp.where(near, w, t) for w, t in zip(wanted, turned, strict=True)))
-    # It does not swim past what it has caught.
-    gone = jnp.where(near, jnp.minimum(chase.speed * dt, away), chase.speed * dt)
-    return Pursuer(vadd(pursuer.place, vscale(gone, heading)), heading)
+    # It does not overshoot the robot.
+    gone = jnp.where(near, jnp.minimum(limits.speed * dt, away), limits.speed * dt)
+    return Pursuer(vadd(pursuer.position, vscale(gone, heading)), heading)
 
 
 def _unit(a: Vec) -> Vec:

@@ -1,8 +1,8 @@
 """From declared sensors to one observation: noise, range, rate and delay.
 
-Noise is a function of the episode's number (`Cues.noise`), of the sensor's place in the list, of
-the joint and of the sample: it is the same for all individuals in one trial, in whatever company,
-as gusts and starts are, and the same whenever the trial is run again.
+Noise is a function of the episode's seed (`EpisodeContext.noise`), of the sensor's index in the
+list, of the joint and of the sample: it is the same for all individuals in one trial, as gusts and
+starts are, and the same whenever the trial is repeated.
 """
 
 from __future__ import annotations
@@ -19,42 +19,39 @@ import numpy as np
 
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.sensors import Sensor, check_names
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError, show
-from mjx_revolve.inputs.schema import MisfitError
+from mjx_revolve.inputs.schema import ConstraintError
 from mjx_revolve.numerics.spatial import sincos
-from mjx_revolve.numerics.xla import keep
+from mjx_revolve.numerics.xla import materialize
 
-USUAL = tuple(Sensor(type=name) for name in ("tilt", "gyro", "angle", "speed"))
-"""What brains are told where nothing is declared."""
+DEFAULT_SENSORS = tuple(Sensor(type=name) for name in ("tilt", "gyro", "angle", "speed"))
+"""The sensors where none are declared."""
 
-# A moment this share of a sample before it is due counts as due: float32's clock errs by less.
+# A time this share of a sample before it is due counts as due: more than a float32 clock errs by.
 _DUE = 0.01
 # The most samples that a delay may keep; a choice.
 _LONGEST = 256
 
 
 def count_samples(time: jax.Array, rate: float) -> jax.Array:
-    """How many samples after the first are due at a moment.
+    """The number of samples after the first that are due, a whole number in the type of `time`.
 
     Args:
         time: since the first [s].
         rate: of samples [Hz].
-
-    Returns:
-        A whole number, as `time` is.
     """
     return jnp.floor(time * rate + _DUE)
 
 
 class Observation(NamedTuple):
-    """What a brain is told, each number between -1 and 1.
+    """Inputs of a brain, each between -1 and 1.
 
     Attributes:
         robot: of the robot as a whole, `[lanes]` each.
-        joint: of the hinges, `[hinge rows, lanes]` each, in the plant's order; what is no hinge's
-            says nothing of use. Nothing where there are no hinges.
+        joint: of the hinges, `[hinge rows, lanes]` each, in the plant's order; meaningless in rows
+            without a hinge. Empty if there are no hinges.
     """
 
     robot: tuple[jax.Array, ...]
@@ -63,18 +60,13 @@ class Observation(NamedTuple):
 
 @dataclass(frozen=True)
 class Observer:
-    """Makes observations.
-
-    Attributes:
-        sensors: that are declared.
-        timestep: between observations [s].
-    """
+    """Makes observations from readings, with the declared sensors and a timestep [s]."""
 
     sensors: tuple[Sensor, ...]
     timestep: float
 
     def __post_init__(self) -> None:
-        """Refuses a delay of very many samples."""
+        """Refuses a delay that is longer than the samples that are kept."""
         for k, sensor in enumerate(self.sensors):
             if self._kept(sensor) > _LONGEST:
                 rate = self._rate(sensor)
@@ -85,29 +77,24 @@ class Observer:
 
     @cached_property
     def robot_names(self) -> tuple[str, ...]:
-        """Of what there is once."""
-        found = [name for s in self.sensors if s.where != "joint" for name in s.names]
-        return tuple(found)
+        """Names of `Observation.robot`."""
+        return tuple(name for s in self.sensors if s.where != "joint" for name in s.names)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
-        """Of what there is at each hinge."""
-        found = [name for s in self.sensors if s.where != "robot" for name in s.names]
-        return tuple(found)
+        """Names of `Observation.joint`."""
+        return tuple(name for s in self.sensors if s.where != "robot" for name in s.names)
 
     @property
-    def feels(self) -> tuple[str, ...]:
-        """What a `Controller` must name in its `feels`."""
-        return tuple(dict.fromkeys(name for sensor in self.sensors for name in sensor.feels))
+    def signals(self) -> tuple[str, ...]:
+        """The `signals` of a `Controller` that uses it."""
+        return tuple(dict.fromkeys(name for sensor in self.sensors for name in sensor.signals))
 
     def init(self, like: jax.Array) -> Any:
-        """What sensors with a rate or a delay keep, before the first step.
+        """The state: of each sensor with a rate or a delay its last count, and its samples.
 
         Args:
             like: `[hinge rows, lanes]` of the floating-point type.
-
-        Returns:
-            For each of them the number of its last sample, and its samples, the newest first.
         """
         found: list[Any] = []
         for sensor in self.sensors:
@@ -118,19 +105,16 @@ class Observer:
         return tuple(found)
 
     def observe(
-        self, state: Any, time: jax.Array, sense: Sense, joint: Any
+        self, state: Any, time: jax.Array, sense: SensorReadings, joint: Any
     ) -> tuple[Any, Observation]:
-        """What is told before a step.
+        """The state and the observation before a step.
 
         Args:
             state: from `init`, or of the step before.
             time: since the start [s].
-            sense: what is felt.
-            joint: `[hinge rows, lanes]` or `[hinge rows, 1]` which of the robot's hinges each row
-                is, whole numbers: noise belongs to the hinge, not to its row.
-
-        Returns:
-            The state, and the observation.
+            sense: readings.
+            joint: `[hinge rows, lanes]` or `[hinge rows, 1]` number of the robot's hinge in each
+                row: noise belongs to the hinge, not to its row.
         """
         before, after = iter(state), []
         robot: list[jax.Array] = []
@@ -141,17 +125,17 @@ class Observer:
             if self._keeps(sensor):
                 kept, values = self._hold(sensor, next(before), time, count, values)
                 after.append(kept)
-            robot += map(keep, values[0])
-            joints += map(keep, values[1])
+            robot += map(materialize, values[0])
+            joints += map(materialize, values[1])
         return tuple(after), Observation(tuple(robot), tuple(joints))
 
     def _rate(self, sensor: Sensor) -> float:
-        """How often it measures [Hz]."""
+        """Rate of its samples [Hz]."""
         each = 1 / self.timestep
         return each if sensor.rate is None else min(sensor.rate, each)
 
     def _kept(self, sensor: Sensor) -> int:
-        """How many samples it keeps."""
+        """Number of samples that it keeps."""
         return 1 + math.ceil(sensor.delay * self._rate(sensor) - 1e-6)
 
     def _keeps(self, sensor: Sensor) -> bool:
@@ -159,23 +143,23 @@ class Observer:
         return self._rate(sensor) < 1 / self.timestep or self._kept(sensor) > 1
 
     def _shapes(self, sensor: Sensor, like: jax.Array) -> Any:
-        """Numbers like those of a sample: those of the robot, those of the hinges."""
+        """Zeros of the shapes of a sample: of the robot, of the hinges."""
         where, count = sensor.where, len(sensor.kind.parts)
         robot = [jnp.zeros(like.shape[1:], like.dtype)] * count
         joint = [like] * count if where != "robot" and like.shape[0] else []
         return (robot if where != "joint" else [], joint)
 
     def _measure(
-        self, place: int, sensor: Sensor, count: jax.Array, sense: Sense, joint: Any
+        self, place: int, sensor: Sensor, count: jax.Array, sense: SensorReadings, joint: Any
     ) -> tuple[list[jax.Array], list[jax.Array]]:
-        """A sample: numbers of the robot, and of the hinges."""
+        """A sample: of the robot, of the hinges."""
         kind, (low, high) = sensor.kind, sensor.limits
         zero, scale = sensor.scaling
         robot: list[jax.Array] = []
         joints: list[jax.Array] = []
-        source: Any = sense.places[sensor.place] if sensor.place else sense
-        # Of a type of modules, what there is none of says 0.
-        there = source.there if sensor.each is not None else None
+        source: Any = sense.modules[sensor.place] if sensor.place else sense
+        # Where there is no module of the type, the value is 0.
+        there = source.present if sensor.each is not None else None
         for part, value in enumerate(kind.signal(source)):
             pieces: list[tuple[list[jax.Array], Any, Any, Any]] = [(robot, value, None, there)]
             if sensor.where == "joint":
@@ -189,15 +173,15 @@ class Observer:
                 if sensor.noise > 0:
                     # 0 is the robot's own, so hinges count from 1.
                     which = 16 * place + part, 0 if number is None else number + 1
-                    true = true + sensor.noise * draw_normal(sense.noise, *which, count, true.dtype)
-                told = scale * (jnp.clip(true, low, high) - zero)
-                found.append(told if share is None else share * told)
+                    true = true + sensor.noise * hash_normal(sense.noise, *which, count, true.dtype)
+                scaled = scale * (jnp.clip(true, low, high) - zero)
+                found.append(scaled if share is None else share * scaled)
         return robot, joints
 
     def _hold(
         self, sensor: Sensor, state: Any, time: jax.Array, count: jax.Array, values: Any
     ) -> tuple[Any, Any]:
-        """Keeps a sample where one is due, and gives the one that is old enough."""
+        """The samples after this step, and the one that is old enough."""
         last, kept = state
         first, due = last < 0, count != last
         fresh: list[Any] = []
@@ -222,18 +206,14 @@ def make_observer(
     """An observer of sensors.
 
     Args:
-        sensors: that are declared; None for the usual ones.
+        sensors: that are declared; None for the default ones.
         timestep: between observations [s].
-        plant: of the robot, or of the largest one, that they are to sit on; None to look later.
-
-    Returns:
-        The observer.
+        plant: of the robot, or of the largest one; None to leave modules unchecked.
 
     Raises:
-        InputError: a delay is too long for what it would have to keep, or the robot lacks a module
-            that a sensor sits on.
+        InputError: a delay needs too many samples, or the robot lacks a module.
     """
-    found = Observer(USUAL if sensors is None else tuple(sensors), timestep)
+    found = Observer(DEFAULT_SENSORS if sensors is None else tuple(sensors), timestep)
     for k, sensor in enumerate(found.sensors):
         if plant is not None and sensor.at is not None:
             try:
@@ -242,30 +222,27 @@ def make_observer(
                 raise InputError(f"sensors.{k}.at: {error}") from None
             if sensor.kind.where == "joint" and sites.hinge is None:
                 raise InputError(
-                    f"sensors.{k}.at: expected a module with a hinge, as {sensor.type} is felt at "
-                    f"one; found {show(sensor.at)}"
+                    f"sensors.{k}.at: expected a module with a hinge, as {sensor.type} is "
+                    f"measured at one; found {show(sensor.at)}"
                 )
     return found
 
 
-def with_types(
+def resolve_sensors(
     declared: Sequence[Sensor] | None, modules: Mapping[str, ModuleType], source: str = "config"
 ) -> tuple[Sensor, ...] | None:
-    """Declared sensors and those that sit on all modules of some types.
+    """Declared sensors and those of types of modules; None if there are neither.
 
     Args:
-        declared: None where none are.
-        modules: all types that there are, by name and alias.
-        source: what messages call the configuration.
-
-    Returns:
-        The sensors; None where none are.
+        declared: None if none are.
+        modules: all types by name and alias.
+        source: the configuration, in messages.
 
     Raises:
-        InputError: one sits on a type that there is not, or two have one name.
+        InputError: a type is unknown, or two sensors have one name.
     """
     found = []
-    for k, sensor in enumerate(USUAL if declared is None else declared):
+    for k, sensor in enumerate(DEFAULT_SENSORS if declared is None else declared):
         if sensor.each is not None and sensor.each not in modules:
             known = ", ".join(dict.fromkeys(kind.name for kind in modules.values()))
             raise InputError(
@@ -281,22 +258,22 @@ def with_types(
         return None
     try:
         return check_names((*found, *more))
-    except MisfitError as error:
+    except ConstraintError as error:
         raise InputError(f"{source}: sensors.{error}") from None
 
 
 def _mix(x: Any) -> Any:
-    """A hash of 32 bits: Wellons' `lowbias32` (nullprogram.com, 2018)."""
+    """A hash of 32 bits: Wellons' lowbias32 (nullprogram.com, 2018)."""
     x = (x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D)
     x = (x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B)
     return x ^ (x >> np.uint32(16))
 
 
-def draw_normal(seed: Any, number: int, joint: Any, sample: Any, dtype: Any) -> jax.Array:
-    """A normal number that follows from its arguments: no state, and no neighbours.
+def hash_normal(seed: Any, number: int, joint: Any, sample: Any, dtype: Any) -> jax.Array:
+    """A standard normal number that is a function of its arguments alone.
 
-    By a hash of a counter and Box and Muller's method (1958), as `jax.random` inside the step's
-    loop would cost ten times as much.
+    By a hash of a counter and the method of Box and Muller (1958), as `jax.random` inside the
+    step's loop would cost ten times as much.
 
     Args:
         seed: uint32 `[lanes]`; None for 0.
@@ -304,9 +281,6 @@ def draw_normal(seed: Any, number: int, joint: Any, sample: Any, dtype: Any) -> 
         joint: whole numbers that broadcast against the lanes.
         sample: a whole number.
         dtype: of the result.
-
-    Returns:
-        Mean 0 and standard deviation 1.
     """
     whole = lambda x: jnp.asarray(x).astype(jnp.int32).astype(jnp.uint32)  # noqa: E731
     state = jnp.zeros((1,), jnp.uint32) if seed is None else seed

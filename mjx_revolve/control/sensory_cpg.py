@@ -1,4 +1,4 @@
-"""Oscillators that listen: phases, amplitudes and offsets that answer to sensors."""
+"""Phase oscillators with feedback from sensors on phases, amplitudes and offsets."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import (
     Controller,
-    Gene,
+    GeneBlocks,
+    StepOutput,
     as_plant,
     make_controller,
-    of_actuators,
 )
-from mjx_revolve.control.neighbours import act, join_pairs
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.neighbours import apply_matrix, pair_matrix
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import make_observer
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
@@ -48,11 +48,11 @@ def make_sensory_cpg(
     and zero genes keep all still. Thrusters have o only, and of the senses only the robot's.
 
     Args:
-        body: whose hinges and thrusters are driven: a plant or a robot.
-        sensors: that it listens to; by default `sensors.USUAL`.
+        body: a plant or a robot.
+        sensors: of the feedback; by default `DEFAULT_SENSORS`.
         max_frequency: upper end of f [Hz].
         amplitude: share of the ranges used [-].
-        gain: largest answer to a sensor at the end of its range, as a share of the range [-].
+        gain: largest response to a sensor at the end of its range, as a share of the range [-].
 
     Returns:
         The controller; genes: A, B, then P, R and O of each sense, per hinge; φ per pair; f; B and
@@ -60,40 +60,33 @@ def make_sensory_cpg(
     """
     made_for = as_plant(body)
     observer = make_observer(sensors, made_for.timestep, made_for)
-    own = [*observer.robot_names, *(f"joint {x}" for x in observer.joint_names)]
-    of_hinges = ["amplitude", *(f"{what} {x}" for what in ("phase", "amplitude") for x in own)]
-    of_hinges += [f"offset joint {x}" for x in observer.joint_names]
-    of_all = ["offset", *(f"offset {x}" for x in observer.robot_names)]
-    n, m = made_for.num_hinges, made_for.num_actuators
-    genes = [Gene(what, "hinge", k) for what in of_hinges for k in range(n)]
-    genes += [Gene("lag", "pair", k) for k in range(made_for.num_pairs)]
-    genes += [Gene("frequency", "robot"), *of_actuators(made_for, *of_all)]
-    dt, few = made_for.timestep, len(observer.robot_names)
+    robot, joint = observer.robot_names, observer.joint_names
+    own = [*robot, *(f"joint {x}" for x in joint)]
+    # P, R and O: how the observation acts on phase, amplitude and offset.
+    on_phase, on_size = ([f"{what} {x}" for x in own] for what in ("phase", "amplitude"))
+    on_offset, on_bend = (
+        [f"offset {x}" for x in xs] for xs in (own[: len(robot)], own[len(robot) :])
+    )
+    blocks = GeneBlocks(
+        made_for,
+        *((what, "hinge") for what in ("amplitude", *on_phase, *on_size, *on_bend)),
+        ("lag", "pair"),
+        ("frequency", "robot"),
+        *((what, "actuator") for what in ("offset", *on_offset)),
+    )
+    dt, few = made_for.timestep, len(robot)
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
-        folded, rows = jnp.sin(genes), plant.num_hinge_rows
-        none = jnp.zeros((plant.num_thrusters, *genes.shape[1:]), genes.dtype)
-        hinge = [
-            plant.arrange(jnp.concatenate([folded[k * n : (k + 1) * n], none]))[:rows]
-            for k in range(len(of_hinges))
-        ]
-        start = len(of_hinges) * n
-        lag = np.pi * folded[start : start + made_for.num_pairs]
-        start += made_for.num_pairs
-        rate = np.pi * max_frequency * (1 + folded[start : start + 1])
-        start += 1
-        every = [
-            plant.arrange(folded[start + k * m : start + (k + 1) * m]) for k in range(len(of_all))
-        ]
-        sine, cosine = sincos(lag)
-        count = len(own)
+        values = blocks.split(jnp.sin(genes), plant)
+        some = lambda names: [values[name] for name in names]  # noqa: E731
+        sine, cosine = sincos(np.pi * values["lag"])
         return (
-            (hinge[0], hinge[1 : 1 + count], hinge[1 + count : 1 + 2 * count]),
-            (every[0], every[1:], hinge[1 + 2 * count :]),
-            rate,
-            (join_pairs(cosine, cosine, plant), join_pairs(sine, -sine, plant)),
+            (values["amplitude"], some(on_phase), some(on_size)),
+            (values["offset"], some(on_offset), some(on_bend)),
+            np.pi * max_frequency * (1 + values["frequency"]),
+            (pair_matrix(cosine, cosine, plant), pair_matrix(sine, -sine, plant)),
             (amplitude * plant.reach(genes), plant.middle(genes)),
-            plant.source[:rows],
+            plant.source[: plant.num_hinge_rows],
         )
 
     def init(parameters: Any) -> Any:
@@ -101,39 +94,41 @@ def make_sensory_cpg(
         # XLA takes nothing of no size into its loops.
         return observer.init(still), (still, still) if still.shape[0] else (), bias
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
-        (size, quicken, swell), (bias, turn, bend), rate, near, (reach, middle), number = parameters
-        seen, swinging, offset = state
-        seen, observation = observer.observe(seen, time, sense, number)
-        felt = [*observation.robot, *observation.joint]
+    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+        waves, offsets, rate, near, (reach, middle), number = parameters
+        (size, on_phase, on_size), (bias, on_offset, on_bend) = waves, offsets
+        samples, oscillators, offset = state
+        samples, observation = observer.observe(samples, time, sense, number)
+        inputs = [*observation.robot, *observation.joint]
 
-        def answer(weights: Any, felt: Any) -> Any:
-            return gain * sum(w * x for w, x in zip(weights, felt, strict=True)) if felt else 0.0
+        def respond(weights: Any, inputs: Any) -> Any:
+            terms = [w * x for w, x in zip(weights, inputs, strict=True)]
+            return gain * sum(terms) if terms else 0.0
 
         follow = min(_FOLLOW * dt, 1.0)
-        aim = bias + answer(turn, felt[:few])
-        if not swinging:
+        aim = bias + respond(on_offset, inputs[:few])
+        if not oscillators:
             offset = offset + follow * (jnp.clip(aim, -1, 1) - offset)
-            return (seen, (), offset), middle + reach * jnp.clip(offset, -1, 1)
-        phase, wide = swinging
+            return (samples, (), offset), middle + reach * jnp.clip(offset, -1, 1)
+        phase, swing = oscillators
         rows = phase.shape[0]
-        speed = rate + 2 * np.pi * max_frequency * answer(quicken, felt)
+        speed = rate + 2 * np.pi * max_frequency * respond(on_phase, inputs)
         sine, cosine = sincos(phase)
         # sin(θ_j - φ - θ_i), the difference taken apart, so that each phase has one sine.
         along, across = near
-        up = act(along, sine) - act(across, cosine)
-        level = act(along, cosine) + act(across, sine)
+        up = apply_matrix(along, sine) - apply_matrix(across, cosine)
+        level = apply_matrix(along, cosine) + apply_matrix(across, sine)
         speed = speed + _PULL * (cosine * up - sine * level)
-        if bend:
-            more = aim[:rows] + answer(bend, felt[few:])
+        if on_bend:
+            more = aim[:rows] + respond(on_bend, inputs[few:])
             aim = more if rows == aim.shape[0] else jnp.concatenate([more, aim[rows:]])
-        wide_aim = jnp.clip(size + answer(swell, felt), -1, 1)
-        wide = wide + follow * (wide_aim - wide)
+        size_aim = jnp.clip(size + respond(on_size, inputs), -1, 1)
+        swing = swing + follow * (size_aim - swing)
         offset = offset + follow * (jnp.clip(aim, -1, 1) - offset)
-        wave = offset[:rows] + wide * sine
+        wave = offset[:rows] + swing * sine
         command = wave if rows == offset.shape[0] else jnp.concatenate([wave, offset[rows:]])
         target = middle + reach * jnp.clip(command, -1, 1)
-        return (seen, (phase + dt * speed, wide), offset), target
+        return (samples, (phase + dt * speed, swing), offset), target
 
-    found = make_controller(made_for, genes, decode, init, step)
-    return found._replace(feels=observer.feels, observer=observer)
+    found = make_controller(made_for, blocks.genes, decode, init, step)
+    return found._replace(signals=observer.signals, observer=observer)

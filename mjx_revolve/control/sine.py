@@ -10,13 +10,13 @@ import numpy as np
 
 from mjx_revolve.control.controller import (
     Controller,
-    Gene,
+    GeneBlocks,
+    StepOutput,
     as_plant,
     fade_in,
     make_controller,
-    of_actuators,
 )
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import safe_norm, sincos
@@ -36,49 +36,37 @@ def make_sine(
     so that no joint jumps at the start.
 
     Args:
-        body: whose hinges and thrusters are driven: a plant or a robot.
+        body: a plant or a robot.
         max_frequency: upper end of f [Hz].
         amplitude: share of the hinges' range used [-].
-        harmonics: how many sines are added up [-].
+        harmonics: number of sines that are added up [-].
 
     Returns:
         The controller; genes: u and v of the first harmonic (one per hinge each), of the second and
         so on, offsets, then the frequency.
     """
     made_for = as_plant(body)
-    n = made_for.num_actuators
-    waves = [f"{x}{k + 1 if k else ''}" for k in range(harmonics) for x in "uv"]
-    genes = (*of_actuators(made_for, *waves, "offset"), Gene("frequency", "robot"))
+    names = [(f"u{k or ''}", f"v{k or ''}") for k in (0, *range(2, harmonics + 1))]
+    waves = [(name, "actuator") for pair in names for name in pair]
+    blocks = GeneBlocks(made_for, *waves, ("offset", "actuator"), ("frequency", "robot"))
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
-        rows = [plant.arrange(genes[k * n : (k + 1) * n]) for k in range(2 * harmonics + 1)]
+        values = blocks.split(genes, plant)
         reach, center = amplitude * plant.reach(genes), plant.middle(genes)
-        return _decode(rows, genes[-1:], reach, center, max_frequency)
+        rate = 2 * np.pi * max_frequency * (1 + jnp.sin(values["frequency"])) / 2
+        sizes = []
+        for k, (u, v) in enumerate((values[a], values[b]) for a, b in names):
+            size = safe_norm((u, v))
+            # sin(r) / r, and its limit where r = 0.
+            fold = jnp.where(size > 1e-6, jnp.sin(size) / jnp.maximum(size, 1e-6), 1.0)
+            scale = reach * fold / (k + 1)
+            sizes.append((scale * u, scale * v))
+        return tuple(sizes), 0.5 * reach * jnp.sin(values["offset"]), rate, center
 
-    return make_controller(made_for, genes, decode, lambda parameters: (), _step)
-
-
-def _decode(
-    rows: list[jax.Array],
-    frequency: jax.Array,
-    reach: jax.Array,
-    center: jax.Array,
-    max_frequency: float,
-) -> Any:
-    """Parameters of the sines from rows of u, v of each harmonic, then offsets, `[n, lanes]`."""
-    rate = 2 * np.pi * max_frequency * (1 + jnp.sin(frequency)) / 2
-    sizes = []
-    for k in range(len(rows) // 2):
-        u, v = rows[2 * k], rows[2 * k + 1]
-        size = safe_norm((u, v))
-        # sin(r) / r, and its limit where r = 0.
-        fold = jnp.where(size > 1e-6, jnp.sin(size) / jnp.maximum(size, 1e-6), 1.0)
-        scale = reach * fold / (k + 1)
-        sizes.append((scale * u, scale * v))
-    return tuple(sizes), 0.5 * reach * jnp.sin(rows[-1]), rate, center
+    return make_controller(made_for, blocks.genes, decode, lambda parameters: (), _step)
 
 
-def _step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+def _step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
     """The step of a `Controller` made of sines."""
     sizes, offset, rate, center = parameters
     fade, wave = fade_in(time), offset

@@ -10,13 +10,13 @@ import numpy as np
 
 from mjx_revolve.control.controller import (
     Controller,
-    Gene,
+    GeneBlocks,
+    StepOutput,
     as_plant,
     fade_in,
     make_controller,
-    of_actuators,
 )
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 
@@ -33,7 +33,7 @@ def make_splines(
     half second. Between its points a spline may swing beyond them; the servo's range clips it.
 
     Args:
-        body: whose hinges and thrusters are driven: a plant or a robot.
+        body: a plant or a robot.
         points: of each curve, 3 or more [-].
         max_frequency: upper end of f [Hz].
         amplitude: share of the ranges used [-].
@@ -43,19 +43,18 @@ def make_splines(
         frequency.
     """
     made_for = as_plant(body)
-    n = made_for.num_actuators
-    what = [f"point{k + 1}" for k in range(points)]
-    genes = (*of_actuators(made_for, *what), Gene("frequency", "robot"))
+    names = [f"point{k + 1}" for k in range(points)]
+    blocks = GeneBlocks(made_for, *((name, "actuator") for name in names), ("frequency", "robot"))
     solve = np.linalg.inv(_weights_of(np.arange(points), points))
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
-        folded, reach = jnp.sin(genes), amplitude * plant.reach(genes)
-        through = [reach * plant.arrange(folded[k * n : (k + 1) * n]) for k in range(points)]
+        values, reach = blocks.split(jnp.sin(genes), plant), amplitude * plant.reach(genes)
+        through = [reach * values[name] for name in names]
         # The B-spline's coefficients, so that the curve goes through the points.
         rows = [sum(float(w) * x for w, x in zip(row, through, strict=True)) for row in solve]
-        return tuple(rows), max_frequency * (1 + folded[-1:]) / 2, plant.middle(genes)
+        return tuple(rows), max_frequency * (1 + values["frequency"]) / 2, plant.middle(genes)
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: Sense) -> tuple[Any, jax.Array]:
+    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
         rows, rate, middle = parameters
         turns = rate * time
         at = points * (turns - jnp.floor(turns))
@@ -64,7 +63,7 @@ def make_splines(
             wave = wave + _weight(at - k, points, jnp) * row
         return state, middle + fade_in(time) * wave
 
-    return make_controller(made_for, genes, decode, lambda parameters: (), step)
+    return make_controller(made_for, blocks.genes, decode, lambda parameters: (), step)
 
 
 def _weight(way: Any, points: int, xp: Any) -> Any:

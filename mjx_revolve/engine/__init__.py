@@ -1,1 +1,8 @@
-"""A body compiled and stepped in a world: MuJoCo model, tables, contact, servos, the step."""
+"""A body compiled and stepped in a world: MuJoCo model, tables, contact, servos, the step.
+
+Public names are those in `__init__.pyi`; the modules are private and may move between releases.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

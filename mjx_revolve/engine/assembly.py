@@ -14,9 +14,9 @@ import numpy as np
 
 from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.morphology import Morphology
-from mjx_revolve.body.placement import Layout, lay_out, turned
+from mjx_revolve.body.placement import RestPose, rest_pose, turned
 from mjx_revolve.engine.fluid_table import FluidTable, make_fluid_table
-from mjx_revolve.inputs.brief import brief
+from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.water.world import World
 
 # Error at which the servo gives its full torque [rad]. A choice: hobby servos are stiff.
@@ -24,7 +24,7 @@ FULL_TORQUE_ERROR = 0.05
 # Share of the servo's effort that its gears' viscous friction takes at the speed limit [-]. A
 # choice; it is also what damps the servo, which has no velocity gain of its own.
 FRICTION = 1 / 5
-# A ballast is a point mass; MuJoCo wants some size, and a millimetre turns nothing [m].
+# A ballast is a point mass; MuJoCo needs some size, and a millimetre adds no inertia [m].
 BALLAST_RADIUS = 1e-3
 
 
@@ -41,7 +41,7 @@ class Assembly:
         layout: their parts at rest.
         roots: `[robots]` the bodies that hold the cores; the hinges' bodies follow theirs in the
             order of the modules.
-        robot: `[nbody]` whose each body is, -1 for the world.
+        robot: `[nbody]` the robot of each body, -1 for the world.
         names: `[nbody]` of the modules that the bodies are called after.
         parent: `[nbody]` bodies that carry them, 0 for roots.
         end: `[nbody]` behind the last body of each one's subtree.
@@ -61,11 +61,11 @@ class Assembly:
         thruster_row: `[nthruster]` their parts.
     """
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     morphologies: tuple[Morphology, ...]
     world: World
-    layout: Layout
+    layout: RestPose
     roots: np.ndarray
     robot: np.ndarray
     names: tuple[str, ...]
@@ -102,7 +102,7 @@ class Assembly:
 
     @property
     def point_part(self) -> np.ndarray:
-        """`[npoint]` parts whose corners the points are."""
+        """`[npoint]` the part of which each point is a corner."""
         touching = np.array([part.contact for part in self.layout.parts])[self.layout.kind]
         return np.repeat(np.flatnonzero(touching), 8)
 
@@ -165,7 +165,7 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
     end = list(range(1, len(parent) + 1))
     for k in reversed(range(1, len(parent))):
         end[parent[k]] = max(end[parent[k]], end[k])
-    layout = lay_out(*(body.modules for body in morphologies))
+    layout = rest_pose(*(body.modules for body in morphologies))
     # Of a module with a hinge, the first part stays with what it is attached to.
     stays = np.append(True, np.diff(layout.module) > 0)
     carrier = np.where(stays, np.array(below)[layout.module], np.array(above)[layout.module])
@@ -212,7 +212,7 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
 
 
 def _weigh(
-    layout: Layout, carrier: np.ndarray, place: np.ndarray, turn: np.ndarray, count: int
+    layout: RestPose, carrier: np.ndarray, place: np.ndarray, turn: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mass, centre of mass and inertia about it of moving bodies, from their parts."""
     parts, kind = layout.parts, layout.kind
@@ -240,13 +240,15 @@ def _weigh(
 
 def _diagonal(x: np.ndarray) -> np.ndarray:
     """`[n, 3]` to `[n, 3, 3]`."""
-    return x[:, None] * np.eye(3)
+    diagonal: np.ndarray = x[:, None] * np.eye(3)
+    return diagonal
 
 
 def _steiner(mass: np.ndarray, arm: np.ndarray) -> np.ndarray:
     """`[n, 3, 3]` inertias of point masses at `[n, 3]` arms."""
     square = np.sum(arm**2, 1)[:, None, None] * np.eye(3)
-    return mass[:, None, None] * (square - arm[:, :, None] * arm[:, None])
+    about: np.ndarray = mass[:, None, None] * (square - arm[:, :, None] * arm[:, None])
+    return about
 
 
 def _most_stiffness(
@@ -264,4 +266,5 @@ def _most_stiffness(
     are touched.
     """
     about = np.sum(axis * turned(inertia + _steiner(mass, center), axis), 1)
-    return 1.5 * (about / dt**2 + damping / dt)
+    most: np.ndarray = 1.5 * (about / dt**2 + damping / dt)
+    return most

@@ -8,7 +8,7 @@ not from the bodies at hand: products with such numbers fold away while the step
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,19 +19,21 @@ import numpy as np
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.placement import counted
 from mjx_revolve.engine.assembly import FRICTION, Assembly, assemble
-from mjx_revolve.engine.columns import (
-    LIMIT_OVERSHOOT,
-    Columns,
-    motor_line,
-    pick_level,
-    read_columns,
-)
-from mjx_revolve.engine.level import Laws, Level, Parts, Thrusters
-from mjx_revolve.engine.plant import Figure, Plant, figures_of, read_actuators
+from mjx_revolve.engine.level import Level, PartLaws, Parts, Thrusters
+from mjx_revolve.engine.plant import BodyGeometry, Plant, body_geometries, read_actuators
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.sites import place_types
+from mjx_revolve.engine.step_constants import (
+    LIMIT_OVERSHOOT,
+    StepConstants,
+    motor_line,
+    read_constants,
+    select_bodies,
+)
 from mjx_revolve.engine.thrusters import read_thrusters
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.drag import find_drag_law
+from mjx_revolve.water.laws import BodyDragLaw, part_fields
 
 # What a row costs in a step beside its parts, in parts [-]; measured, alike under both drag laws.
 _ROW_COST = 5.0
@@ -39,7 +41,7 @@ _ROW_COST = 5.0
 _ROOT_PARTS = (2, 3, 4, 6, 8, 12)
 
 
-class Group(NamedTuple):
+class PartGroup(NamedTuple):
     """Room for parts that obey the same laws.
 
     Attributes:
@@ -48,7 +50,7 @@ class Group(NamedTuple):
         root_parts: of them on the root.
     """
 
-    laws: Laws
+    laws: PartLaws
     parts: int
     root_parts: int
 
@@ -65,13 +67,13 @@ class Capacity:
         slots: length of the stack.
         groups: room for the parts of a row and of the root.
         points: most contact points of a row, 0 without a bed within reach.
-        root_points: of the root, likewise.
+        root_points: most contact points of the root.
         carries: whether water may be carried along.
         timestep: of the world [s].
         nothing: a part that does nothing, with the numbers of every law.
         sites: types of modules on which sensors sit.
         row: numbers that are the same in all rows of all robots, in their places; None elsewhere.
-        root: likewise of the roots.
+        root: the same for the roots.
     """
 
     hinges: int
@@ -79,7 +81,7 @@ class Capacity:
     pairs: int
     rows: int
     slots: int
-    groups: tuple[Group, ...]
+    groups: tuple[PartGroup, ...]
     points: int
     root_points: int
     carries: bool
@@ -100,12 +102,12 @@ class Capacity:
         )
 
 
-class Bodies(NamedTuple):
+class PackedBodies(NamedTuple):
     """Robots side by side: leaves with the population on the last axis, or one for all of it.
 
     Attributes:
         root: constants of the roots `[1, P]`, None where they are the capacity's.
-        rows: of the rows `[rows, 1, P]`, likewise.
+        rows: of the rows `[rows, 1, P]`, None where they are the capacity's.
         slot: `[rows, P]` where each row stands in the stack, int32; the root stands in slot 0.
         source: `[rows, P]` its parent's slot; -1 for padding, int32.
         inner: `[rows, P]` whether a row has children, bool.
@@ -127,7 +129,7 @@ class Bodies(NamedTuple):
     count: Any
     thrusters: Thrusters
     plant: Plant
-    figure: Figure
+    figure: BodyGeometry
 
     @property
     def alike(self) -> bool:
@@ -135,24 +137,24 @@ class Bodies(NamedTuple):
         return bool(self.slot.shape[-1] == 1)
 
 
-class Order(NamedTuple):
+class RowOrder(NamedTuple):
     """The rows of robots: which bodies and parts they hold, and how they hang together.
 
     Those of a robot stand in preorder, the child with the largest subtree last; all rows stand
     robot after robot, the roots, which are no rows, not among them. Piece 0 of a body is its first
-    row, or the root itself, and the riders are the further ones.
+    row, or the root itself; its overflow rows are the further ones.
 
     Attributes:
         length: `[robots]` how many rows each has.
-        robot: `[row]` whose it is.
+        robot: `[row]` its robot.
         place: `[row]` which of its robot's rows.
         body: `[row]` moving body that it is, or is fixed to.
-        rider: `[row]` whether it is fixed to the body's first row.
+        overflow: `[row]` whether it is fixed to the body's first row.
         slot: `[row]` where it stands in the stack.
         source: `[row]` where its parent stands.
         inner: `[row]` whether it has children.
         first: `[nbody]` the first row of each body, counted through all robots; of a root, where
-            its first rider would stand, less one.
+            its first overflow row would stand, less one.
         piece: `[npart]` which of its body's pieces a part stands in.
         rank: `[npart]` which of the parts there that obey its laws it is.
     """
@@ -161,7 +163,7 @@ class Order(NamedTuple):
     robot: np.ndarray
     place: np.ndarray
     body: np.ndarray
-    rider: np.ndarray
+    overflow: np.ndarray
     slot: np.ndarray
     source: np.ndarray
     inner: np.ndarray
@@ -170,7 +172,7 @@ class Order(NamedTuple):
     rank: np.ndarray
 
 
-def order_rows(assembly: Assembly, columns: Columns, groups: Sequence[Group]) -> Order:
+def order_rows(assembly: Assembly, columns: StepConstants, groups: Sequence[PartGroup]) -> RowOrder:
     """The rows of robots.
 
     Args:
@@ -219,20 +221,20 @@ def order_rows(assembly: Assembly, columns: Columns, groups: Sequence[Group]) ->
     real = (np.array(parent)[bodies[which]] > 0) | (number > 0)  # all but the roots themselves
     body, number = bodies[which][real], number[real]
     leaf = np.array([not below for below in children])[body]
-    base, rider = np.array(slot)[body], number > 0
-    # A rider is its body's last child where it has no other one.
+    base, overflow = np.array(slot)[body], number > 0
+    # An overflow row is its body's last child where it has no other one.
     last = leaf & (number == pieces[body] - 1)
     robot = assembly.robot[body]
     length = np.bincount(robot, minlength=len(assembly.roots))
-    return Order(
+    return RowOrder(
         length=length,
         robot=robot,
         place=counted(length)[1],
         body=body,
-        rider=rider,
-        slot=np.where(rider & ~last, base + 1, base),
-        source=np.where(rider, base, np.array(source)[body]),
-        inner=~rider & ~(leaf & (pieces[body] == 1)),
+        overflow=overflow,
+        slot=np.where(overflow & ~last, base + 1, base),
+        source=np.where(overflow, base, np.array(source)[body]),
+        inner=~overflow & ~(leaf & (pieces[body] == 1)),
         first=np.array(first),
         piece=piece,
         rank=rank,
@@ -278,13 +280,13 @@ def fit_capacity(
         InputError: there are no robots.
     """
     assembly = assemble_all(robots)
-    columns, world = read_columns(assembly), robots[0].world
+    columns, world = read_constants(assembly), robots[0].world
     carries = columns.parts.carried is not None
     sizes = _sizes(assembly, columns)
     types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
     types |= {kind.name: kind for kind in kinds}
     # Nothing acts on what neither floats nor drags nor carries nor pushes.
-    every = [x for x in columns.laws if x[:2] != ("off", "off") or x.pushes or carries]
+    every = [x for x in columns.laws if not x.idle or carries]
     near = contact and world.bed is not None
     groups, order = _choose_groups(assembly, columns, sizes, every, bool(modules))
     count = max(1, rows, hinges, int(order.length.max()))
@@ -324,33 +326,41 @@ def fit_capacity(
 
 
 def _choose_groups(
-    assembly: Assembly, columns: Columns, sizes: _Sizes, every: Sequence[Laws], riding: bool
-) -> tuple[tuple[Group, ...], Order]:
+    assembly: Assembly,
+    columns: StepConstants,
+    sizes: _Sizes,
+    every: Sequence[PartLaws],
+    spilling: bool,
+) -> tuple[tuple[PartGroup, ...], RowOrder]:
     """Room for parts with which a step of these robots costs least, and their rows.
 
-    `riding` says whether the root's parts may overflow into riders, too.
+    `spilling` says whether the root's parts may overflow into rows, too.
     """
     most = {laws: int(sizes.parts[laws].max()) for laws in every}
     most_root = {laws: int(sizes.root_parts[laws].max()) for laws in every}
-    # The inertia box belongs to a body as a whole, and so does its submerged share: no riders.
-    whole = assembly.world.drag == "inertia_box"
+    # The inertia box belongs to a body as a whole, and so does its submerged fraction: no overflow.
+    whole = isinstance(find_drag_law(assembly.world.drag), BodyDragLaw)
     least = max(1, *most.values()) if whole and most else 1
     widest = max(1, *most_root.values()) if most_root else 1
     on_root = [widest]
-    if riding and not whole:
+    if spilling and not whole:
         on_root = [n for n in _ROOT_PARTS if n < widest] + on_root
-    best: tuple[float, tuple[Group, ...], Order] | None = None
+    best: tuple[float, tuple[PartGroup, ...], RowOrder] | None = None
     for limit in range(least, max(9, least + 1)):
         for root_limit in on_root:
             groups = tuple(
-                Group(laws, min(limit, most[laws]) or 1, max(1, min(root_limit, most_root[laws])))
+                PartGroup(
+                    laws, min(limit, most[laws]) or 1, max(1, min(root_limit, most_root[laws]))
+                )
                 for laws in every
             )
             order = order_rows(assembly, columns, groups)
             # A chunk of robots is as slow as its largest; one robot alone as it is itself.
-            count = (order.length.max() + order.length.mean()) / 2 if riding else order.length.max()
+            count = (
+                (order.length.max() + order.length.mean()) / 2 if spilling else order.length.max()
+            )
             cost = max(1, count) * (_ROW_COST + sum(group.parts for group in groups))
-            cost += sum(group.root_parts for group in groups) * riding
+            cost += sum(group.root_parts for group in groups) * spilling
             if best is None or cost < best[0]:
                 best = (cost, groups, order)
     assert best is not None
@@ -358,7 +368,11 @@ def _choose_groups(
 
 
 def _most_rows(
-    assembly: Assembly, columns: Columns, groups: Sequence[Group], modules: int, hinges: int
+    assembly: Assembly,
+    columns: StepConstants,
+    groups: Sequence[PartGroup],
+    modules: int,
+    hinges: int,
 ) -> int:
     """The most rows of bodies of the robots' types of modules, with at most so many of them."""
     all_modules = [module for body in assembly.morphologies for module in body.modules]
@@ -376,14 +390,14 @@ def _most_rows(
             most = [max((int(parts[k]) for k in np.flatnonzero(x)), default=0)
                     for x in (core, turns, rigid)]  # fmt: skip
             total = most[0] + count * most[1] + (modules - 1 - count) * most[2]
-            # Each hinge's body has a part that fills no rider; so has the root, or it is full.
+            # Each hinge's body has a part in no overflow row; so has the root, or it is full.
             spare = total - count * (most[1] > 1)
             rows += max((spare - 1) // group.parts, -((group.root_parts - spare) // group.parts), 0)
         found = max(found, rows)
     return found
 
 
-def _count_points(assembly: Assembly, order: Order) -> tuple[int, int]:
+def _count_points(assembly: Assembly, order: RowOrder) -> tuple[int, int]:
     """The most contact points of a row, and of a root."""
     part = assembly.point_part
     body = assembly.fluid.body[part]
@@ -394,32 +408,6 @@ def _count_points(assembly: Assembly, order: Order) -> tuple[int, int]:
         at_root = int(np.bincount(place[first], minlength=1).max())
         most = int(np.bincount(place[~first], minlength=1).max())
     return most, at_root
-
-
-def resize(capacity: Capacity, **changes: Any) -> Capacity:
-    """A capacity with other room.
-
-    Args:
-        capacity: from `fit_capacity`.
-        **changes: fields of it, numbers of `rows`, `slots`, `hinges` and so on, or `groups` of the
-            same laws.
-
-    Returns:
-        The capacity; what is constant stays so.
-    """
-    found = replace(capacity, **changes)
-
-    def sized(level: Level, count: Callable[[Group], int], points: int) -> Level:
-        pairs = zip(level.parts, found.groups, strict=True)
-        parts = tuple(replace(p, count=count(g)) for p, g in pairs)
-        touching = level.points and replace(level.points, count=points)
-        return replace(level, parts=parts, points=touching)
-
-    return replace(
-        found,
-        row=sized(found.row, lambda group: group.parts, found.points),
-        root=sized(found.root, lambda group: group.root_parts, found.root_points),
-    )
 
 
 def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool) -> Level:
@@ -433,7 +421,10 @@ def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool) -> Level
             carried = parts.carried
             if carried is not None:
                 cross = tuple(tuple(0.0 if i == j else None for j in range(3)) for i in range(3))
-                carried = carried._replace(cross=cross, linear=(None, 0.0, 0.0, None, 0.0, None))
+                about = carried.inertia._replace(
+                    cross=cross, linear=(None, 0.0, 0.0, None, 0.0, None)
+                )
+                carried = replace(carried, inertia=about)
             groups.append(replace(parts, rotation=unit, carried=carried))
         blank = replace(blank, parts=tuple(groups))
     found = {_hinge_numbers(kind) for kind in kinds if kind.hinge is not None}
@@ -483,71 +474,69 @@ def _is_square(kinds: Sequence[ModuleType]) -> bool:
 
 
 def _pick_rows(
-    assembly: Assembly, columns: Columns, capacity: Capacity, order: Order
+    assembly: Assembly, columns: StepConstants, capacity: Capacity, order: RowOrder
 ) -> tuple[Level, Level]:
     """Roots `[1, R]` and rows `[rows, 1, R]` of R robots, all of their numbers."""
     count, rows = len(assembly.roots), capacity.rows
-    whose = assembly.robot[columns.part_body]
-    on_root = (assembly.parent[columns.part_body] == 0) & (order.piece == 0)
     body = np.zeros((rows, count), int)
-    body[order.place, order.robot] = np.where(order.rider, 0, order.body)
+    body[order.place, order.robot] = np.where(order.overflow, 0, order.body)
+
+    def place(
+        which: np.ndarray, held: np.ndarray, piece: np.ndarray, rank: np.ndarray,
+        most: int, most_at_root: int,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Where things on bodies `held` stand: `[rows, most, R]` and `[most_at_root, R]`."""
+        at_root = (assembly.parent[held] == 0) & (piece == 0)
+        # Past the end stands what has no effect.
+        in_rows = np.full((rows, most, count), len(held))
+        k = np.flatnonzero(which & ~at_root)
+        row = order.place[order.first[held[k]] + piece[k]]
+        in_rows[row, rank[k], assembly.robot[held[k]]] = k
+        in_roots = np.full((most_at_root, count), len(held))
+        k = np.flatnonzero(which & at_root)
+        in_roots[rank[k], assembly.robot[held[k]]] = k
+        return in_rows, in_roots
+
     parts, root_parts = {}, {}
     for group in capacity.groups:
-        ours = np.zeros(len(whose), bool)
+        own = np.zeros(len(order.piece), bool)
         if group.laws in columns.laws:
-            ours = columns.part_laws == columns.laws.index(group.laws)
-        # Past the end stands the part that does nothing.
-        index = np.full((rows, group.parts, count), len(whose))
-        k = np.flatnonzero(ours & ~on_root)
-        row = order.place[order.first[columns.part_body[k]] + order.piece[k]]
-        index[row, order.rank[k], whose[k]] = k
-        parts[group.laws] = index
-        index = np.full((group.root_parts, count), len(whose))
-        k = np.flatnonzero(ours & on_root)
-        index[order.rank[k], whose[k]] = k
-        root_parts[group.laws] = index
+            own = columns.part_laws == columns.laws.index(group.laws)
+        parts[group.laws], root_parts[group.laws] = place(
+            own, columns.part_body, order.piece, order.rank, group.parts, group.root_parts
+        )
     points = root_points = None
     if capacity.points or capacity.root_points:
-        held = columns.point_body
-        piece = order.piece[assembly.point_part]
+        held, piece = columns.point_body, order.piece[assembly.point_part]
         rank = _ranks(held * (1 + int(piece.max(initial=0))) + piece)
-        owner, at_root = assembly.robot[held], (assembly.parent[held] == 0) & (piece == 0)
-        if capacity.points:
-            points = np.full((rows, capacity.points, count), len(held))
-            k = np.flatnonzero(~at_root)
-            points[order.place[order.first[held[k]] + piece[k]], rank[k], owner[k]] = k
-        if capacity.root_points:
-            root_points = np.full((capacity.root_points, count), len(held))
-            k = np.flatnonzero(at_root)
-            root_points[rank[k], owner[k]] = k
+        every = np.ones(len(held), bool)
+        points, root_points = place(every, held, piece, rank, capacity.points, capacity.root_points)
+        points = points if capacity.points else None
+        root_points = root_points if capacity.root_points else None
     alike = _alike(columns, capacity.nothing)
     finish = lambda x: x[..., None, :]  # noqa: E731
-    root = pick_level(alike, assembly.roots, root_parts, root_points, True, 1, finish)
-    level = pick_level(alike, body, parts, points, False, 1, finish)
+    root = select_bodies(alike, assembly.roots, root_parts, root_points, True, 1, finish)
+    level = select_bodies(alike, body, parts, points, False, 1, finish)
     return root, level
 
 
-# What parts have only where a law of the robot's asks for it.
-_OPTIONAL = (
-    "bulk", "exposed", "drag_linear", "drag_angular", "carried", "carried_mass", "carried_inertia",
-    "plate", "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid", "mounts",
-)  # fmt: skip
-
-
-def _alike(columns: Columns, nothing: Parts) -> Columns:
-    """Columns whose parts have all the numbers that `nothing` has."""
-    count = len(columns.part_laws) + 1
-    wide = lambda x: np.broadcast_to(x, (count,))  # noqa: E731
+def _alike(columns: StepConstants, nothing: Parts) -> StepConstants:
+    """Constants whose parts have all the numbers that `nothing` has."""
+    wide = partial(jax.tree.map, lambda x: np.broadcast_to(x, (len(columns.part_laws) + 1,)))
+    parts = columns.parts
     missing = {
-        name: jax.tree.map(wide, getattr(nothing, name))
-        for name in _OPTIONAL
-        if getattr(columns.parts, name) is None
+        field: wide(getattr(nothing, field))
+        for field in part_fields(Parts)
+        if getattr(parts, field) is None
     }
-    return columns._replace(parts=replace(columns.parts, count=0, **missing))
+    drag = {name: parts.drag.get(name) or wide(blank) for name, blank in nothing.drag.items()}
+    return columns._replace(parts=replace(parts, count=0, **missing | {"drag": drag}))
 
 
-def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.float32) -> Bodies:
-    """Robots side by side, as `rows.Rows` takes them.
+def pack_bodies(
+    robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.float32
+) -> PackedBodies:
+    """Robots side by side, as `rows.BatchedTrees` takes them.
 
     Args:
         robots: one for each individual; the same object may stand there many times.
@@ -564,26 +553,25 @@ def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.flo
     place = {key: k for k, key in enumerate(unique)}
     pick = np.array([place[id(robot)] for robot in robots], int)
     assembly = assemble_all(list(unique.values()))
-    columns = read_columns(assembly)
-    _check_fit(assembly, columns, capacity)
+    columns = read_constants(assembly)
     order = order_rows(assembly, columns, capacity.groups)
-    _check_rows(assembly, order, capacity)
+    _check_fit(assembly, columns, order, capacity)
     root, level = _pick_rows(assembly, columns, capacity, order)
     names = [str(body.name) for body in assembly.morphologies]
     real = np.zeros((capacity.rows, 1, len(names)), bool)
-    real[order.place, 0, order.robot] = ~order.rider
+    real[order.place, 0, order.robot] = ~order.overflow
     root = _leave_out(root, capacity.root, names, None)
     level = _leave_out(level, capacity.row, names, real)
     hanging = _hang(assembly, order, capacity)
-    figures = Figure(*(x.astype(float) for x in figures_of(assembly)))
+    figures = BodyGeometry(*(x.astype(float) for x in body_geometries(assembly)))
 
     def wide(x: np.ndarray) -> np.ndarray:
         kinds = {"f": dtype, "i": np.int32, "b": bool}
         return x.astype(kinds[x.dtype.kind])[..., pick]
 
-    return jax.tree.map(
+    packed: PackedBodies = jax.tree.map(
         wide,
-        Bodies(
+        PackedBodies(
             root=root,
             rows=level,
             thrusters=read_thrusters(assembly, capacity.thrusters),
@@ -595,12 +583,20 @@ def pack_bodies(robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.flo
             **hanging,
         ),
     )
+    return packed
 
 
 def assemble_all(robots: Sequence[Robot]) -> Assembly:
     """Robots of one world, one behind the other."""
     if not robots:
         raise InputError("robots: expected at least one; found none")
+    for robot in robots:
+        robot.check_model()
+        if robot.edited_model is not None:
+            raise InputError(
+                f"robot {robot.morphology.name!r}: expected it as built, as batches of robots have "
+                "no edited models; found one from with_model"
+            )
     first, *rest = robots
     if not rest:
         return first.assembly
@@ -619,11 +615,11 @@ class _Sizes(NamedTuple):
     hinges: np.ndarray
     thrusters: np.ndarray
     pairs: np.ndarray
-    parts: dict[Laws, np.ndarray]
-    root_parts: dict[Laws, np.ndarray]
+    parts: dict[PartLaws, np.ndarray]
+    root_parts: dict[PartLaws, np.ndarray]
 
 
-def _sizes(assembly: Assembly, columns: Columns) -> _Sizes:
+def _sizes(assembly: Assembly, columns: StepConstants) -> _Sizes:
     """How large robots are."""
     robots, nbody, roots = len(assembly.roots), len(assembly.parent), assembly.roots
 
@@ -646,49 +642,39 @@ def _sizes(assembly: Assembly, columns: Columns) -> _Sizes:
     )
 
 
-def _check_fit(assembly: Assembly, columns: Columns, capacity: Capacity) -> None:
+def _check_fit(
+    assembly: Assembly, columns: StepConstants, order: RowOrder, capacity: Capacity
+) -> None:
     """Refuses robots that are larger than there is room for."""
-    found = _sizes(assembly, columns)
+    found, names = _sizes(assembly, columns), [str(body.name) for body in assembly.morphologies]
     room = {group.laws for group in capacity.groups}
-    sizes = [
+    for k, laws in enumerate(columns.laws):
+        if laws not in room and not laws.idle:
+            part = int(np.argmax(columns.part_laws == k))
+            known = [tuple(x) for x in room]
+            raise InputError(
+                f"robot {names[assembly.layout.body[part]]!r}: expected parts under one of the "
+                f"laws {known} (buoyancy, drag, thruster); found {tuple(laws)}"
+            )
+    slots = np.ones(len(order.length), int)
+    np.maximum.at(slots, order.robot, 1 + order.slot)
+    for what, counts, most in (
         ("hinges", found.hinges, capacity.hinges),
         ("thrusters", found.thrusters, capacity.thrusters),
         ("pairs of neighbouring hinges", found.pairs, capacity.pairs),
-    ]
-    for laws in columns.laws:
-        if laws not in room and (laws[:2] != ("off", "off") or laws.pushes):
-            part = int(np.argmax(columns.part_laws == columns.laws.index(laws)))
-            name = assembly.morphologies[assembly.layout.body[part]].name
-            known = [tuple(x) for x in room]
-            raise InputError(
-                f"robot {name!r}: expected parts under one of the laws {known} (buoyancy, drag, "
-                f"thruster); found {tuple(laws)}"
-            )
-    for what, counts, most in sizes:
+        ("rows", order.length, capacity.rows),
+        ("slots of the stack", slots, capacity.slots),
+    ):
         if np.any(counts > most):
             k = int(np.argmax(counts > most))
             raise InputError(
-                f"robot {assembly.morphologies[k].name!r}: expected at most {most} {what}; found "
-                f"{counts[k]}"
+                f"robot {names[k]!r}: expected at most {most} {what}; found {counts[k]}"
             )
-
-
-def _check_rows(assembly: Assembly, order: Order, capacity: Capacity) -> None:
-    """Refuses robots that need more rows, or a deeper stack, than there is."""
-    deep = np.zeros(len(order.length), int)
-    np.maximum.at(deep, order.robot, order.slot)
     points, root_points = _count_points(assembly, order) if capacity.root_points else (0, 0)
     if points > capacity.points or root_points > capacity.root_points:
         raise InputError(
             f"robots: expected at most {capacity.points} contact points in a row and "
             f"{capacity.root_points} at the core; found {points} and {root_points}"
-        )
-    wrong = (order.length > capacity.rows) | (deep >= capacity.slots)
-    if np.any(wrong):
-        k = int(np.argmax(wrong))
-        raise InputError(
-            f"robot {assembly.morphologies[k].name!r}: expected at most {capacity.rows} rows, "
-            f"{capacity.slots} deep; found {order.length[k]}, {deep[k] + 1} deep"
         )
 
 
@@ -720,20 +706,21 @@ def _leave_out(level: Level, constant: Level, names: list[str], real: Any) -> Le
 
     hinges = jax.tree.map(partial(compare, real), constant.hinges, level.hinges, is_leaf=blank)
     bare = replace(constant, hinges=None), replace(level, hinges=None)
-    return replace(jax.tree.map(partial(compare, True), *bare, is_leaf=blank), hinges=hinges)
+    found: Level = jax.tree.map(partial(compare, True), *bare, is_leaf=blank)
+    return replace(found, hinges=hinges)
 
 
-def _hang(assembly: Assembly, order: Order, capacity: Capacity) -> dict[str, np.ndarray]:
+def _hang(assembly: Assembly, order: RowOrder, capacity: Capacity) -> dict[str, np.ndarray]:
     """How the rows of robots hang together, padded."""
     count = len(assembly.roots)
     at = order.place, order.robot
     slot, inner = np.zeros((capacity.rows, count), int), np.zeros((capacity.rows, count), bool)
-    # Padding writes where nobody reads any more: backwards it comes first, forwards last.
+    # Padding writes where nothing is read any more: backwards it comes first, forwards last.
     source = np.full((capacity.rows, count), -1)
     slot[at], source[at], inner[at] = order.slot, order.source, order.inner
     hinge = np.full((capacity.rows, count), capacity.hinges)
     row = np.full((capacity.hinges, count), capacity.rows)
-    real = ~order.rider
+    real = ~order.overflow
     place, robot = order.place[real], order.robot[real]
     # Behind its root, a robot's bodies stand in the order of its hinges.
     index = order.body[real] - assembly.roots[robot] - 1
@@ -748,7 +735,7 @@ def _hang(assembly: Assembly, order: Order, capacity: Capacity) -> dict[str, np.
     }
 
 
-def _body_rows(order: Order) -> np.ndarray:
+def _body_rows(order: RowOrder) -> np.ndarray:
     """`[nbody]` which of its robot's rows each body's first one is; of roots anything."""
     return order.place[np.clip(order.first, 0, None)] if len(order.place) else order.first
 

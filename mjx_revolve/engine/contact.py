@@ -13,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.level import Level, Points
-from mjx_revolve.numerics.inertia import Motion, SpatialInertia, sum_parts
+from mjx_revolve.numerics.inertia import BodyMotion, SpatialInertia, sum_parts
 from mjx_revolve.numerics.spatial import (
     SYM,
+    Mat,
     Scalar,
+    Sym,
     Vec,
     add,
     cross,
@@ -39,9 +41,9 @@ from mjx_revolve.water.world import World
 # Damping of a point as a share of the critical one, 2 √(k m). A choice: no bouncing.
 _DAMPING_RATIO = 1.0
 # The damper fades in over this depth [m], so that touching down is no jump in force.
-FADE = 5e-4
+DAMPER_DEPTH = 5e-4
 # Below this speed [m/s] friction is viscous, as Coulomb's law has no value at rest.
-CREEP = 0.001
+CREEP_SPEED = 0.001
 
 
 def bed_plane(bed: Bed, place: tuple[Scalar, Scalar]) -> tuple[Scalar, Vec]:
@@ -97,19 +99,19 @@ def bed_contact(
         damper = np.asarray(2 * _DAMPING_RATIO * np.sqrt(bed.stiffness * np.asarray(point_mass)))
     outward = dot(velocity, normal)
     ahead = jnp.maximum(depth - timestep * outward, 0)
-    damping = mul(damper, jnp.minimum(ahead / FADE, 1))
+    damping = mul(damper, jnp.minimum(ahead / DAMPER_DEPTH, 1))
     push = sub(mul(stiffness, ahead), damping * outward)
     touching = (ahead > 0) & (push > 0)
     push = jnp.where(touching, push, 0)
     resistance = jnp.where(touching, add(mul(timestep, stiffness), damping), 0)
     sliding = tuple(v - outward * n for v, n in zip(velocity, normal, strict=True))
-    grip = bed.friction * push / jnp.sqrt(dot(sliding, sliding) + CREEP**2)
+    grip = bed.friction * push / jnp.sqrt(dot(sliding, sliding) + CREEP_SPEED**2)
     force = tuple(push * n - grip * s for n, s in zip(normal, sliding, strict=True))
     return force, resistance, grip
 
 
-def bed_on_level(
-    world: World, level: Level, motion: Motion, points: Points, water: Water
+def bed_forces(
+    world: World, level: Level, motion: BodyMotion, points: Points, water: Water
 ) -> tuple[Vec, Vec, SpatialInertia]:
     """What the bed does to the bodies of a level.
 
@@ -126,7 +128,10 @@ def bed_on_level(
     k = points.count
     force, stiff, grip, normal, wide = _at_points(world, level, motion, points, water)
     torque = cross(points.position, force)
-    gather = lambda x: sum_parts(wide(x), k)  # noqa: E731
+
+    def gather(x: Scalar) -> Scalar:
+        return sum_parts(wide(x), k)
+
     return (
         tuple(gather(x) for x in torque),
         tuple(gather(x) for x in force),
@@ -134,15 +139,17 @@ def bed_on_level(
     )
 
 
-def bed_pushes(world: World, level: Level, motion: Motion, points: Points, water: Water) -> Scalar:
-    """How hard the bed pushes each point along its normal: what a touch sensor feels.
+def bed_normal_force(
+    world: World, level: Level, motion: BodyMotion, points: Points, water: Water
+) -> Scalar:
+    """Force of the bed on each point along its normal: what a touch sensor reads.
 
     Args:
         world: with a bed.
         level: the bodies.
-        motion: as in `bed_on_level`.
+        motion: as in `bed_forces`.
         points: of them that may touch.
-        water: as there.
+        water: as in `bed_forces`.
 
     Returns:
         `[npoint, nbody, lanes]` [N]; friction apart.
@@ -152,19 +159,22 @@ def bed_pushes(world: World, level: Level, motion: Motion, points: Points, water
 
 
 def _at_points(
-    world: World, level: Level, motion: Motion, points: Points, water: Water
+    world: World, level: Level, motion: BodyMotion, points: Points, water: Water
 ) -> tuple[Vec, Scalar, Scalar, Vec, Callable[[Scalar], jax.Array]]:
     """Force on each point with its damping, the bed's normal, and what widens to all points."""
     k, n, lanes = points.count, level.count, jnp.shape(motion.height)[-1]
-    wide = lambda x: jnp.broadcast_to(x, (k, n, lanes))  # noqa: E731
+
+    def wide(x: Scalar) -> jax.Array:
+        return jnp.broadcast_to(x, (k, n, lanes))
+
     assert world.bed is not None  # there are points only above a bed
-    rows = (motion.x_axis, motion.y_axis, motion.up)
-    ground, normal = bed_plane(world.bed, motion.place)
+    rows = (motion.x_axis, motion.y_axis, motion.z_axis)
+    ground, normal = bed_plane(world.bed, motion.xy)
     normal = matTvec(rows, normal)
     # Depth of the body's origin below the tangent plane, then of each point.
-    origin = mul(sub(ground, motion.height), dot(normal, motion.up))
+    origin = mul(sub(ground, motion.height), dot(normal, motion.z_axis))
     depth = wide(sub(origin, dot(normal, points.position)))
-    velocity = vadd(motion.velocity, cross(motion.spin, points.position))
+    velocity = vadd(motion.velocity, cross(motion.angular_velocity, points.position))
     for speed, axis in zip(water.current, rows, strict=True):
         velocity = vadd(velocity, vscale(speed, axis))
     wide_normal, velocity = tuple(wide(x) for x in normal), tuple(wide(x) for x in velocity)
@@ -174,7 +184,9 @@ def _at_points(
     return force, stiff, grip, normal, wide
 
 
-def _damping(position: Vec, normal: Vec, along: Scalar, alike: Scalar, gather) -> SpatialInertia:
+def _damping(
+    position: Vec, normal: Vec, along: Scalar, alike: Scalar, gather: Callable[[Scalar], Scalar]
+) -> SpatialInertia:
     """Σ over points of what resists their motion, b 1 + a n nᵀ at r, about the body's origin.
 
     The points share n, so only moments of a and b over the points are summed: 20 numbers, and no
@@ -201,7 +213,7 @@ def _damping(position: Vec, normal: Vec, along: Scalar, alike: Scalar, gather) -
     return SpatialInertia(angular, across, linear)
 
 
-def _turned(moment, normal: Vec):
+def _turned(moment: Mat, normal: Vec) -> Sym:
     """Σ a (r × n)(r × n)ᵀ from Σ a r rᵀ: [n] M [n]ᵀ."""
     x = skew(normal)
     turned = matmul(matmul(x, moment), tuple(tuple(neg(e) for e in row) for row in x))

@@ -1,8 +1,9 @@
 """The water on a robot: the sum of all laws over the parts of a level of bodies.
 
-The laws are pure functions in files of their own (`buoyancy`, `drag`, `lift_drag`, `added_mass`,
-`thrusters`, `water`); this file puts them together for whole levels of a robot's tree. Vectors are
-tuples of three arrays (see `spatial`), per-part tables are constants `[npart, nbody, 1]`.
+The laws are pure functions in `mjx_revolve/water/`; this file puts them together for whole levels
+of a robot's tree. Vectors are tuples of three arrays (see `spatial`), numbers of parts are
+constants `[npart, nbody, 1]`. A part belongs to one buoyancy law and one drag law, which are looked
+up in their tables while the step is traced.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.level import Level, Mounts, Parts, is_present
+from mjx_revolve.engine.level import Level, Parts, ThrusterMounts, is_present
 from mjx_revolve.numerics.inertia import (
-    Motion,
+    BodyMotion,
     SpatialInertia,
     add_inertia,
     apply_inertia,
@@ -41,30 +42,32 @@ from mjx_revolve.numerics.spatial import (
     vscale,
     vsub,
 )
-from mjx_revolve.water.added_mass import come_aboard, slam
-from mjx_revolve.water.buoyancy import displaced, submersion, surface_tension
-from mjx_revolve.water.drag import ellipsoid, inertia_box, quadratic_drag
+from mjx_revolve.water.added_mass import CarriedWater, slam, wetting_rate
+from mjx_revolve.water.buoyancy import displaced_water, find_buoyancy_law, surface_tension
+from mjx_revolve.water.drag import find_drag_law
+from mjx_revolve.water.face_drag import quadratic_drag
 from mjx_revolve.water.flow import Water, flow, is_uniform, surface, wave_convection
-from mjx_revolve.water.lift_drag import lift_drag_damping, lift_drag_wrench
+from mjx_revolve.water.laws import NO_DRAG, BodyDragLaw, PartDragLaw, PartFlow
 from mjx_revolve.water.world import World
 
 _ZERO = (0.0, 0.0, 0.0)
+Sum = Callable[[Scalar], Scalar]
 
 
-class Outer(NamedTuple):
+class ExternalForces(NamedTuple):
     """What acts on the bodies of a level from outside, about each body's origin, body frame.
 
     Attributes:
         torque: [N·m].
         force: [N].
         carried: inertia of the water that the bodies carry along, or None.
-        momentum: what that water's momentum lacks for where the water flows by itself, (angular,
-            linear) [kg·m²/s, kg·m/s], or None: A (ν - u) is A ν and this. That it turns with the
-            body asks for a force that the step adds.
+        momentum: the part of that water's momentum A (ν - u) that comes from the water's own
+            velocity u, -A u, (angular, linear) [kg·m²/s, kg·m/s], or None. The step adds the force
+            by which it turns with the body.
         damping: how force and torque fall with the bodies' velocity, as a 6×6 [N·s/m ...], for
             the implicit part of a step; or None.
-        wet: submerged shares of each group of parts that carries water, `[npart, nbody, lanes]`
-            each [-].
+        submerged: submerged fractions of each group of parts that carries water, `[npart, nbody,
+            lanes]` each [-].
     """
 
     torque: Vec
@@ -72,18 +75,18 @@ class Outer(NamedTuple):
     carried: SpatialInertia | None
     momentum: tuple[Vec, Vec] | None
     damping: SpatialInertia | None
-    wet: tuple[Scalar, ...] = ()
+    submerged: tuple[Scalar, ...] = ()
 
 
-class Before(NamedTuple):
-    """What a step knows of the one before it, for the water that comes aboard.
+class PreviousStep(NamedTuple):
+    """What a step needs of the one before it, for the slam.
 
     Attributes:
-        wet: submerged shares a step ago, as `Outer.wet`, or those of one group.
+        submerged: submerged fractions then, as in `ExternalForces`, or those of one group.
         dt: of the step [s].
     """
 
-    wet: Any
+    submerged: Any
     dt: float
 
 
@@ -92,6 +95,24 @@ class _Stream(NamedTuple):
 
     velocity: Any
     acceleration: Any
+
+
+class _Immersion(NamedTuple):
+    """How parts lie in the water and move through it, `[npart, nbody, lanes]`, part's axes.
+
+    Attributes:
+        flow: velocities relative to the water, and submerged fraction.
+        stream: the water's own motion, body frame.
+        moment: submerged fraction times centre of the submerged piece, from the box's centre [m].
+        up: the surface's normal.
+        depth: of the box's centre below the surface [m].
+    """
+
+    flow: PartFlow
+    stream: _Stream
+    moment: Vec
+    up: Vec
+    depth: Scalar
 
 
 def _is_array(x: Scalar) -> bool:
@@ -105,75 +126,79 @@ def _some(vector: Any) -> Any:
     return vector
 
 
-def _to_body(motion: Motion, vector: Any) -> Any:
+def _to_body(motion: BodyMotion, vector: Any) -> Any:
     """A vector of the world seen from each body's frame."""
     if vector is None:
         return None
-    axes = (motion.x_axis, motion.y_axis, motion.up)
+    axes = (motion.x_axis, motion.y_axis, motion.z_axis)
     return tuple(
         total(*[mul(c, axis[i]) for c, axis in zip(vector, axes, strict=True)]) for i in range(3)
     )
 
 
-def _world_place(motion: Motion, position: Vec) -> Vec:
-    """World coordinates of places in the bodies' frames."""
+def _world_position(motion: BodyMotion, position: Vec) -> Vec:
+    """World coordinates of points in the bodies' frames."""
     return (
-        add(motion.place[0], dot(motion.x_axis, position)),
-        add(motion.place[1], dot(motion.y_axis, position)),
-        add(motion.height, dot(motion.up, position)),
+        add(motion.xy[0], dot(motion.x_axis, position)),
+        add(motion.xy[1], dot(motion.y_axis, position)),
+        add(motion.height, dot(motion.z_axis, position)),
     )
 
 
-def _stream(world: World, water: Water, motion: Motion, position: Vec) -> _Stream:
-    """The water's motion at places of the bodies, relative to the uniform current."""
+def _stream(world: World, water: Water, motion: BodyMotion, position: Vec) -> _Stream:
+    """The water's motion at points of the bodies, relative to the uniform current."""
     if is_uniform(world):
         return _Stream(None, None)
     rest = water._replace(current=_ZERO, acceleration=_ZERO)
-    place = _world_place(motion, position)
-    velocity, acceleration = flow(world, rest, *place)
+    point = _world_position(motion, position)
+    velocity, acceleration = flow(world, rest, *point)
     if world.waves:
-        acceleration = vadd(acceleration, wave_convection(world, rest, *place))
+        acceleration = vadd(acceleration, wave_convection(world, rest, *point))
     return _Stream(_to_body(motion, _some(velocity)), _to_body(motion, _some(acceleration)))
 
 
-def _of_parts(x: Scalar) -> bool:
-    """Whether a number differs from part to part, `[npart, nbody, lanes]`."""
+def _differs_by_part(x: Scalar) -> bool:
+    """Whether a number is `[npart, nbody, lanes]`."""
     return _is_array(x) and x.ndim == 3
 
 
-def _push(world: World, parts: Parts, v: Vec, w: Vec, share: Scalar) -> tuple[Vec, Vec, Vec | None]:
-    """Force, torque and the force's damping of the drag law, part frame, at the box's centre.
-
-    All but the drag of faces against turning: `_twist`.
-    """
-    if parts.laws.drag == "faces":
-        push = [quadratic_drag(x, c, share) for x, c in zip(v, parts.drag_linear, strict=True)]
-        return tuple(f for f, _ in push), _ZERO, tuple(d for _, d in push)
-    if parts.laws.drag == "lift_drag":
-        assert parts.plate is not None
-        at = vadd(v, cross(w, parts.plate_center))
-        plate = (parts.plate_forward, parts.plate_upward, parts.plate_area, world.density)
-        force, torque = lift_drag_wrench(at, *plate, parts.plate)
-        torque = vadd(torque, cross(parts.plate_center, force))
-        slope = mul(lift_drag_damping(at, *plate, parts.plate), share)
-        # Half of the slope: the step then takes the force in the middle of its velocities.
-        half = mul(0.5, slope)
-        return vscale(share, force), vscale(share, torque), (half, half, half)
-    if parts.laws.drag == "ellipsoid":
-        force, torque = ellipsoid(v, w, parts.ellipsoid, not world.added_mass)
-        return vscale(share, force), vscale(share, torque), None
-    return _ZERO, _ZERO, None
+def _widener(parts: Parts, n: int, motion: BodyMotion) -> Sum:
+    """Broadcasts a number to all parts of n bodies."""
+    lanes = jnp.shape(motion.height)[-1]
+    return lambda x: jnp.broadcast_to(x, (parts.count, n, lanes))
 
 
-def _twist(
-    parts: Parts, w: Vec, share: Scalar, gather: Callable[[Scalar], Scalar]
-) -> tuple[Vec, Sym]:
-    """Torque of the faces' drag against turning on each body, and its damping, body frame.
+def _immerse(world: World, parts: Parts, motion: BodyMotion, water: Water, wide: Sum) -> _Immersion:
+    stream = _stream(world, water, motion, parts.position)
+    velocity = vadd(motion.velocity, cross(motion.angular_velocity, parts.position))
+    relative = velocity if stream.velocity is None else vsub(velocity, stream.velocity)
+    height, slope = water.surface_height, None
+    if world.waves:
+        x, y, _ = _world_position(motion, parts.position)
+        height, slope = surface(world, water, x, y)
+    below = sub(height, add(motion.height, dot(motion.z_axis, parts.position)))
+    normal = motion.z_axis
+    if slope is not None:
+        # Distance to the surface's tangent plane, and its normal.
+        steep = jax.lax.rsqrt(1 + slope[0] * slope[0] + slope[1] * slope[1])
+        below = below * steep
+        normal = _to_body(motion, (-slope[0] * steep, -slope[1] * steep, steep))
+    up, depth = matTvec(parts.rotation, normal), wide(below)
+    law = find_buoyancy_law(parts.laws.buoyancy)
+    submerged, moment = law.submersion(up, depth, parts.half_size)
+    passing = PartFlow(
+        matTvec(parts.rotation, relative),
+        matTvec(parts.rotation, motion.angular_velocity),
+        submerged,
+    )
+    return _Immersion(passing, stream, moment, up, depth)
 
-    `w` is the angular velocity, part frame.
-    """
-    strength = tuple(mul(c, share) for c in parts.drag_angular)
-    together = not any(map(_of_parts, w))
+
+def _angular_drag(parts: Parts, coefficient: Vec, flow: PartFlow, gather: Sum) -> tuple[Vec, Sym]:
+    """Torque of the drag against turning on each body, and its damping, body frame."""
+    w = flow.angular_velocity
+    strength = tuple(mul(c, flow.submerged) for c in coefficient)
+    together = not any(map(_differs_by_part, w))
     if together:  # all parts turn alike about their own axes
         strength = tuple(map(gather, strength))
     drag = [quadratic_drag(x, c, 1.0) for x, c in zip(w, strength, strict=True)]
@@ -185,98 +210,63 @@ def _twist(
     return tuple(map(gather, torque)), tuple(map(gather, damping))
 
 
-def _whirl(parts: Parts, w: Vec, aboard: Scalar, gather: Callable[[Scalar], Scalar]) -> Vec:
-    """Torque of the slam on what turns, on each body, body frame; `w` is in the part frame."""
-    if any(map(_of_parts, w)):
-        torque = matvec(parts.rotation, slam(aboard, parts.carried_inertia, w))
+def _damping(
+    parts: Parts, linear: Vec | None, angular: Sym | None, gather: Sum
+) -> SpatialInertia | None:
+    """Damping of forces along the parts' axes and of torques, about the bodies' origins."""
+    if linear is None:
+        return None if angular is None else SpatialInertia(angular, (_ZERO,) * 3, (0.0,) * 6)
+    x, y, z = linear
+    along = rotate_sym(parts.rotation, (x, 0.0, 0.0, y, 0.0, z))
+    one = shift_inertia(along, (0.0,) * 6, parts.position)
+    turning = tuple(map(gather, one.angular))
+    return SpatialInertia(
+        turning if angular is None else vadd(turning, angular),
+        tuple(tuple(map(gather, row)) for row in one.cross),
+        tuple(map(gather, one.linear)),
+    )
+
+
+def _angular_slam(parts: Parts, carried: CarriedWater, w: Vec, rate: Scalar, gather: Sum) -> Vec:
+    """Torque of the slam on what turns, on each body, body frame; `w` in the part's axes."""
+    if any(map(_differs_by_part, w)):
+        torque = matvec(parts.rotation, slam(rate, carried.angular, w))
         return tuple(map(gather, torque))
     # All parts turn alike about their own axes.
-    together = tuple(gather(mul(aboard, x)) for x in parts.carried_inertia)
+    together = tuple(gather(mul(rate, x)) for x in carried.angular)
     return matvec(parts.rotation, slam(1.0, together, w))
 
 
 def _pressure(
-    world: World,
-    parts: Parts,
-    share: Scalar,
-    moment: Vec,
-    gradient: Vec,
-    gather: Callable[[Scalar], Scalar],
+    world: World, parts: Parts, at: _Immersion, gravity: Vec, gather: Sum
 ) -> tuple[Vec, Vec]:
-    """Torque and force of the water's pressure on each body, body frame.
-
-    Args:
-        world: whose water.
-        parts: of the bodies.
-        share: of each part that is submerged.
-        moment: as from `submersion`, part frame.
-        gradient: of the pressure, over the density, body frame [m/s²].
-        gather: the sum over the parts.
-
-    Returns:
-        About the bodies' origins.
-    """
-    mass, first = displaced(
-        share,
-        matvec(parts.rotation, moment),
+    """Torque and force of the water's pressure about each body's origin, body frame."""
+    # The gradient of the pressure over the density holds up what is still, and pushes along with
+    # moving water [m/s²].
+    moving = at.stream.acceleration
+    gradient = gravity if moving is None else vadd(gravity, moving)
+    mass, first = displaced_water(
+        at.flow.submerged,
+        matvec(parts.rotation, at.moment),
         parts.volume,
         parts.center_position,
         world.density,
     )
-    if not any(map(_of_parts, gradient)):
+    if not any(map(_differs_by_part, gradient)):
         mass, first = gather(mass), tuple(map(gather, first))
         return cross(first, gradient), vscale(mass, gradient)
     torque, force = cross(first, gradient), vscale(mass, gradient)
     return tuple(map(gather, torque)), tuple(map(gather, force))
 
 
-class _Wet(NamedTuple):
-    """How far parts are under water, `[npart, nbody, lanes]`.
-
-    Attributes:
-        share: of each part that is submerged [-].
-        moment: of the submerged share, as from `submersion`, part's axes.
-        up: the surface's normal, part's axes.
-        depth: of the box's centre below the surface [m].
-    """
-
-    share: Scalar
-    moment: Vec
-    up: Vec
-    depth: Scalar
-
-
-def _submerge(
-    world: World, parts: Parts, motion: Motion, water: Water, wide: Callable[[Scalar], Scalar]
-) -> _Wet:
-    height, slope = water.surface_height, None
-    if world.waves:
-        x, y, _ = _world_place(motion, parts.position)
-        height, slope = surface(world, water, x, y)
-    below = sub(height, add(motion.height, dot(motion.up, parts.position)))
-    normal = motion.up
-    if slope is not None:
-        # Distance to the surface's tangent plane, and its normal.
-        steep = jax.lax.rsqrt(1 + slope[0] * slope[0] + slope[1] * slope[1])
-        below = below * steep
-        normal = _to_body(motion, (-slope[0] * steep, -slope[1] * steep, steep))
-    up, depth = matTvec(parts.rotation, normal), wide(below)
-    # Without buoyancy the water still drags what is below its surface.
-    mode = "mask" if parts.laws.buoyancy == "off" else parts.laws.buoyancy
-    share, moment = submersion(up, depth, parts.half_size, mode)
-    return _Wet(share, moment, up, depth)
-
-
-def _pull(
-    world: World, parts: Parts, wet: _Wet, wide: Callable[[Scalar], Scalar]
-) -> tuple[Vec, Vec]:
+def _surface_tension(world: World, parts: Parts, at: _Immersion, wide: Sum) -> tuple[Vec, Vec]:
     """Force and torque of the surface's tension, part's axes, at the box's centre."""
     tension = world.surface_tension
-    if tension is None or parts.laws.buoyancy == "off":
+    if tension is None or not find_buoyancy_law(parts.laws.buoyancy).lifts:
         return _ZERO, _ZERO
     return surface_tension(
-        tuple(map(wide, wet.up)),
-        wet.depth,
+        tuple(map(wide, at.up)),
+        at.depth,
         parts.half_size,
         tension.gamma,
         world.density * world.gravity,
@@ -285,7 +275,7 @@ def _pull(
     )
 
 
-def _thrust(mounts: Mounts, share: Scalar, thrusts: jax.Array) -> tuple[Vec, Vec]:
+def _thrust(mounts: ThrusterMounts, submerged: Scalar, thrusts: jax.Array) -> tuple[Vec, Vec]:
     """Torque and force of the thrusters on each part, about the body's origin, body frame."""
     which = mounts.which
     if isinstance(which, jax.Array):  # robots differ from lane to lane
@@ -294,82 +284,62 @@ def _thrust(mounts: Mounts, share: Scalar, thrusts: jax.Array) -> tuple[Vec, Vec
         none = jnp.zeros_like(thrusts[0])
         rows = [[thrusts[k] if k >= 0 else none for k in row] for row in which[..., 0]]
         push = jnp.stack([jnp.stack(row) for row in rows])
-    # Out of the water a propeller finds nothing to push.
-    force = vscale(mul(push, share), mounts.axis)
+    # Out of the water a propeller pushes nothing.
+    force = vscale(mul(push, submerged), mounts.axis)
     return vsub(cross(mounts.position, force), vscale(mounts.torque_ratio, force)), force
-
-
-def _sizes(parts: Parts, n: int, motion: Motion) -> Callable[[Scalar], Scalar]:
-    """What makes a number of the parts as wide as all of them."""
-    lanes = jnp.shape(motion.height)[-1]
-    return lambda x: jnp.broadcast_to(x, (parts.count, n, lanes))
 
 
 def _water_on_parts(
     world: World,
     parts: Parts,
     n: int,
-    motion: Motion,
+    motion: BodyMotion,
     gravity: Vec,
     water: Water,
     thrusts: Any,
-    before: Before | None,
+    before: PreviousStep | None,
 ) -> tuple[Vec, Vec, SpatialInertia | None, SpatialInertia | None, Scalar]:
-    """Torque, force, carried water, damping and submerged share of one group of parts."""
-    k, wide = parts.count, _sizes(parts, n, motion)
-    gather = lambda x: sum_parts(wide(x) if _is_array(x) else x, k)  # noqa: E731
-    stream = _stream(world, water, motion, parts.position)
-    v, w = _relative(parts, motion, stream)
-    wet = _submerge(world, parts, motion, water, wide)
-    force, torque, damping = _push(world, parts, v, w, wet.share)
-    pull, turn = _pull(world, parts, wet, wide)
+    """Torque, force, carried water, damping and submerged fraction of one group of parts."""
+    k, wide = parts.count, _widener(parts, n, motion)
+
+    def gather(x: Scalar) -> Scalar:
+        return sum_parts(wide(x) if _is_array(x) else x, k)
+
+    at = _immerse(world, parts, motion, water, wide)
+    v, w, submerged = at.flow
+    law, drag = find_drag_law(parts.laws.drag), NO_DRAG
+    if isinstance(law, PartDragLaw):
+        drag = law.force(at.flow, parts.drag, world)
+    force, torque, damping = drag
+    pull, turn = _surface_tension(world, parts, at, wide)
     force, torque = vadd(force, pull), vadd(torque, turn)
-    aboard = None
-    if before is not None:
-        aboard = come_aboard(wet.share, before.wet, before.dt)
-        force = vadd(force, slam(aboard, parts.carried_mass, v))
+    rate = None
+    if before is not None and parts.carried is not None:
+        rate = wetting_rate(submerged, before.submerged, before.dt)
+        force = vadd(force, slam(rate, parts.carried.mass, v))
     force = matvec(parts.rotation, force)
     torque = vadd(matvec(parts.rotation, torque), cross(parts.position, force))
     if parts.mounts is not None:
-        driven = _thrust(parts.mounts, wet.share, thrusts)
+        driven = _thrust(parts.mounts, submerged, thrusts)
         torque, force = vadd(torque, driven[0]), vadd(force, driven[1])
     force, torque = tuple(map(gather, force)), tuple(map(gather, torque))
-    if parts.laws.buoyancy != "off":
-        gradient = _gradient(gravity, stream)
-        righting, lift = _pressure(world, parts, wet.share, wet.moment, gradient, gather)
+    if find_buoyancy_law(parts.laws.buoyancy).lifts:
+        righting, lift = _pressure(world, parts, at, gravity, gather)
         torque, force = vadd(torque, righting), vadd(force, lift)
-    if aboard is not None:
-        torque = vadd(torque, _whirl(parts, w, aboard, gather))
-    resisting = None
-    if damping is not None:
-        x, y, z = damping
-        linear = rotate_sym(parts.rotation, (x, 0.0, 0.0, y, 0.0, z))
-        one = shift_inertia(linear, (0.0,) * 6, parts.position)
-        # No plate knows drag against turning; without one, a free plate spins up for ever.
-        twist, turning = _twist(parts, w, wet.share, gather)
+    if rate is not None and parts.carried is not None:
+        torque = vadd(torque, _angular_slam(parts, parts.carried, w, rate, gather))
+    angular = None
+    if isinstance(law, PartDragLaw) and law.angular is not None:
+        twist, angular = _angular_drag(parts, law.angular(parts.drag), at.flow, gather)
         torque = vadd(torque, twist)
-        resisting = SpatialInertia(
-            vadd(tuple(map(gather, one.angular)), turning),
-            tuple(tuple(map(gather, row)) for row in one.cross),
-            tuple(map(gather, one.linear)),
-        )
     carried = None
-    if parts.carries:
-        weigh = lambda x: sum_parts(mul(x, wet.share), k) if is_present(x) else 0.0  # noqa: E731
-        carried = jax.tree.map(weigh, parts.carried)
-    return torque, force, carried, resisting, wet.share
+    if parts.carries and parts.carried is not None:
 
+        def weigh(x: Scalar) -> Scalar:
+            return sum_parts(mul(x, submerged), k) if is_present(x) else 0.0
 
-def _relative(parts: Parts, motion: Motion, stream: _Stream) -> tuple[Vec, Vec]:
-    """Velocity of the parts' centres relative to the water, and spin, part's axes."""
-    velocity = vadd(motion.velocity, cross(motion.spin, parts.position))
-    relative = velocity if stream.velocity is None else vsub(velocity, stream.velocity)
-    return matTvec(parts.rotation, relative), matTvec(parts.rotation, motion.spin)
-
-
-def _gradient(gravity: Vec, stream: _Stream) -> Vec:
-    """Of the pressure: it holds up what is still, and pushes along with moving water [m/s²]."""
-    return gravity if stream.acceleration is None else vadd(gravity, stream.acceleration)
+        carried = jax.tree.map(weigh, parts.carried.inertia)
+    return torque, force, carried, _damping(parts, damping, angular, gather), submerged
 
 
 class PartForces(NamedTuple):
@@ -388,51 +358,44 @@ class PartForces(NamedTuple):
 
 
 def forces_on_parts(
-    world: World, level: Level, motion: Motion, gravity: Vec, water: Water, thrusts: Any
+    world: World, level: Level, motion: BodyMotion, gravity: Vec, water: Water, thrusts: Any
 ) -> list[PartForces]:
-    """The terms of `water_on_level`, part by part and kind by kind, before they are added up.
+    """The terms of `water_forces`, part by part and kind by kind, before they are added up.
 
     Args:
         world: which laws act.
         level: the bodies.
         motion: where they are and how they move, relative to the uniform current.
-        gravity: as in `water_on_level`.
+        gravity: as in `water_forces`.
         water: surface, current, time.
         thrusts: of the robot's thrusters, `[nthruster, lanes]` [N].
 
     Returns:
-        For each group of the level's parts. MuJoCo's inertia-box law, which knows only whole
-        bodies, is shared out among a body's parts by what of their boxes is submerged.
+        For each group of the level's parts. The force of a drag law of whole bodies is shared out
+        among a body's parts by what of their boxes is submerged.
     """
-    found, shares = [], []
+    found, fractions = [], []
     for parts in level.parts:
-        wide = _sizes(parts, level.count, motion)
-        each = lambda vector, wide=wide: tuple(wide(x) for x in vector)  # noqa: E731
-        stream = _stream(world, water, motion, parts.position)
-        v, w = _relative(parts, motion, stream)
-        wet = _submerge(world, parts, motion, water, wide)
-        shares.append(wet.share)
-        lift = matvec(parts.rotation, _pull(world, parts, wet, wide)[0])
-        if parts.laws.buoyancy != "off":
-            gradient = _gradient(gravity, stream)
-            held = _pressure(world, parts, wet.share, wet.moment, gradient, wide)[1]
-            lift = vadd(lift, held)
-        drag = matvec(parts.rotation, _push(world, parts, v, w, wet.share)[0])
+        wide = _widener(parts, level.count, motion)
+        at = _immerse(world, parts, motion, water, wide)
+        fractions.append(at.flow.submerged)
+        lift = matvec(parts.rotation, _surface_tension(world, parts, at, wide)[0])
+        if find_buoyancy_law(parts.laws.buoyancy).lifts:
+            lift = vadd(lift, _pressure(world, parts, at, gravity, wide)[1])
+        law, drag = find_drag_law(parts.laws.drag), _ZERO
+        if isinstance(law, PartDragLaw):
+            drag = matvec(parts.rotation, law.force(at.flow, parts.drag, world).force)
         push: Vec = _ZERO
         if parts.mounts is not None:
-            push = _thrust(parts.mounts, wet.share, thrusts)[1]
-        found.append(PartForces(each(lift), each(drag), each(push)))
-    if world.drag == "inertia_box":
-        force = _inertia_box(world, level, motion, water, _share_of_body(level, shares))[1]
-        total_wet = total(
-            *[
-                sum_parts(mul(parts.bulk, share), parts.count)
-                for parts, share in zip(level.parts, shares, strict=True)
-            ]
-        )
-        for k, (parts, share) in enumerate(zip(level.parts, shares, strict=True)):
-            part = mul(parts.bulk, share) / jnp.maximum(total_wet, 1e-30)
-            own = tuple(mul(part, x) for x in force)
+            push = _thrust(parts.mounts, at.flow.submerged, thrusts)[1]
+        found.append(PartForces(*(tuple(map(wide, x)) for x in (lift, drag, push))))
+    on_bodies = _body_drag(world, level, motion, water, fractions)
+    if on_bodies is not None:
+        pairs = list(zip(level.parts, fractions, strict=True))
+        whole = total(*[sum_parts(mul(p.bulk, x), p.count) for p, x in pairs])
+        for k, (parts, fraction) in enumerate(pairs):
+            part = mul(parts.bulk, fraction) / jnp.maximum(whole, 1e-30)
+            own = tuple(mul(part, x) for x in on_bodies[1])
             found[k] = found[k]._replace(drag=vadd(found[k].drag, own))
     return found
 
@@ -443,68 +406,68 @@ def _plus(a: SpatialInertia | None, b: SpatialInertia | None) -> SpatialInertia 
     return add_inertia(a, b)
 
 
-def _share_of_body(level: Level, shares: Sequence[Scalar]) -> Scalar:
-    """Submerged share of each body, its parts weighted by their boxes' volume.
+def _body_fraction(level: Level, fractions: Sequence[Scalar]) -> Scalar:
+    """Submerged fraction of each body, its parts weighted by their boxes' volume.
 
     Not by what they displace: a part of no volume of its own is dragged, too.
     """
     n = level.count
     wet, whole = 0.0, 1e-30
-    for parts, share in zip(level.parts, shares, strict=True):
+    for parts, fraction in zip(level.parts, fractions, strict=True):
         k, volume = parts.count, parts.bulk
         if not isinstance(volume, jax.Array):
             volume = np.broadcast_to(np.asarray(volume), (k, n, 1))
-        wet = add(wet, sum_parts(mul(volume, share), k))
+        wet = add(wet, sum_parts(mul(volume, fraction), k))
         whole = add(whole, sum(volume[i] for i in range(k)))
     return mul(1 / whole, wet)
 
 
-def _inertia_box(
-    world: World, level: Level, motion: Motion, water: Water, share: Scalar
-) -> tuple[Vec, Vec]:
-    """Torque and force of MuJoCo's inertia-box law on each body."""
-    box = level.box
-    assert box is not None
+def _body_drag(
+    world: World, level: Level, motion: BodyMotion, water: Water, fractions: Sequence[Scalar]
+) -> tuple[Vec, Vec] | None:
+    """Torque and force of a drag law of whole bodies; None where the world's law is another."""
+    law, box = find_drag_law(world.drag), level.box
+    if not isinstance(law, BodyDragLaw) or box is None:
+        return None
+    fraction = _body_fraction(level, fractions)
     stream = _stream(world, water, motion, box.position)
-    at = vadd(motion.velocity, cross(motion.spin, box.position))
+    at = vadd(motion.velocity, cross(motion.angular_velocity, box.position))
     at = at if stream.velocity is None else vsub(at, stream.velocity)
-    force, torque = inertia_box(
+    force, torque = law.body_force(
         matTvec(box.rotation, at),
-        matTvec(box.rotation, motion.spin),
+        matTvec(box.rotation, motion.angular_velocity),
         box.size,
         world.density,
         world.viscosity,
     )
-    force = vscale(share, matvec(box.rotation, force))
-    torque = vscale(share, matvec(box.rotation, torque))
+    force = vscale(fraction, matvec(box.rotation, force))
+    torque = vscale(fraction, matvec(box.rotation, torque))
     return vadd(torque, cross(box.position, force)), force
 
 
-def water_on_level(
+def water_forces(
     world: World,
     level: Level,
-    motion: Motion,
-    swirling: tuple[Vec, Vec],
+    motion: BodyMotion,
     gravity: Vec,
     water: Water,
     thrusts: Any = (),
-    before: Before | None = None,
-) -> Outer:
+    before: PreviousStep | None = None,
+) -> ExternalForces:
     """What the water does to the bodies of a level.
 
     All of it is seen from a frame that goes with the uniform current, in which the current's
     acceleration adds to gravity. The carried water enters as an inertia A and as a momentum A ν_r
     that turns with the body (Kirchhoff; Fossen 2011, Handbook of Marine Craft Hydrodynamics,
-    § 6.3). Where the water's velocity u differs from place to place (shear, field, waves), drag
-    sees it at each part and the carried water at the body's origin, where d(v - u)/dt in the body's
-    frame is dv/dt + ω × u - Rᵀ du/dt.
+    § 6.3). Where the water's velocity u varies in space (shear, field, waves), drag takes it at
+    each part and the carried water at the body's origin, where d(v - u)/dt in the body's frame is
+    dv/dt + ω × u - Rᵀ du/dt.
 
     Args:
         world: which laws act.
         level: the bodies.
-        motion: where they are and how they move, relative to the uniform current.
-        swirling: their angular and linear velocity [rad/s, m/s] for the carried water's momentum;
-            a step takes them in its middle.
+        motion: pose and velocity relative to the uniform current; the added mass's momentum turns
+            with `midpoint_velocity`.
         gravity: upwards, body frames, with the uniform current's acceleration [m/s²].
         water: surface, current, time.
         thrusts: of the thrusters, `[nthruster, lanes]` [N].
@@ -514,38 +477,36 @@ def water_on_level(
         Forces, torques and inertias.
     """
     torque, force = _ZERO, _ZERO
-    carried, damping, shares = None, None, []
-    wet: list[Scalar] = []
+    carried, damping, fractions = None, None, []
+    submerged: list[Scalar] = []
     for parts in level.parts:
         earlier = None
         if before is not None and parts.carries:
-            earlier = before._replace(wet=before.wet[len(wet)])
-        on_torque, on_force, more_carried, more_damping, share = _water_on_parts(
+            earlier = before._replace(submerged=before.submerged[len(submerged)])
+        on_torque, on_force, more_carried, more_damping, fraction = _water_on_parts(
             world, parts, level.count, motion, gravity, water, thrusts, earlier
         )
         if parts.carries:
-            wet.append(share)
+            submerged.append(fraction)
         torque, force = vadd(torque, on_torque), vadd(force, on_force)
         carried, damping = _plus(carried, more_carried), _plus(damping, more_damping)
-        shares.append(share)
-    if world.drag == "inertia_box":
-        on_torque, on_force = _inertia_box(
-            world, level, motion, water, _share_of_body(level, shares)
-        )
-        torque, force = vadd(torque, on_torque), vadd(force, on_force)
+        fractions.append(fraction)
+    on_bodies = _body_drag(world, level, motion, water, fractions)
+    if on_bodies is not None:
+        torque, force = vadd(torque, on_bodies[0]), vadd(force, on_bodies[1])
     if carried is None:
-        return Outer(torque, force, None, None, damping)
-    spin, velocity = swirling
+        return ExternalForces(torque, force, None, None, damping)
+    angular, velocity = motion.midpoint_velocity
     stream = _stream(world, water, motion, _ZERO)
     if stream.velocity is None:
-        return Outer(torque, force, carried, None, damping, tuple(wet))
+        return ExternalForces(torque, force, carried, None, damping, tuple(submerged))
     momentum = apply_inertia(carried, _ZERO, tuple(map(neg, stream.velocity)))
     # The step turns the momentum with the body's velocity, not with the relative one.
-    linear = apply_inertia(carried, spin, vsub(velocity, stream.velocity))[1]
+    linear = apply_inertia(carried, angular, vsub(velocity, stream.velocity))[1]
     torque = vadd(torque, cross(stream.velocity, linear))
-    change = cross(spin, stream.velocity)
+    change = cross(angular, stream.velocity)
     if stream.acceleration is not None:
         change = vsub(change, stream.acceleration)
     turning = apply_inertia(carried, _ZERO, change)
     torque, force = vsub(torque, turning[0]), vsub(force, turning[1])
-    return Outer(torque, force, carried, momentum, damping, tuple(wet))
+    return ExternalForces(torque, force, carried, momentum, damping, tuple(submerged))

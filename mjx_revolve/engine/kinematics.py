@@ -1,54 +1,170 @@
-"""Where a robot's bodies are, for many configurations at once."""
+"""Forward kinematics: pose and velocity of all bodies from the root to the tips."""
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from mjx_revolve.engine.level import Hinges, Level
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.single_tree import make_single_tree
+from mjx_revolve.engine.state import State
+from mjx_revolve.engine.tree import Tree
+from mjx_revolve.numerics.inertia import BodyMotion
+from mjx_revolve.numerics.spatial import (
+    Mat,
+    Scalar,
+    Vec,
+    add,
+    cross,
+    dot,
+    matTvec,
+    mul,
+    namespace,
+    quat_to_mat,
+    sincos,
+    sub,
+    vadd,
+)
 
 
-def body_positions(robot: Robot, qpos: jax.Array) -> jax.Array:
-    """Where every body is: MuJoCo's `xpos`, for many configurations at once.
+def forward_kinematics(
+    tree: Tree, state: State, located: bool, dt: float = 0.0
+) -> tuple[BodyMotion, Any, Any]:
+    """Pose and velocity of all bodies.
+
+    Args:
+        tree: the robots.
+        state: their velocities relative to the uniform current.
+        located: whether horizontal positions are needed.
+        dt: step whose midpoint velocities are needed [s]; 0 for none.
+
+    Returns:
+        The root's motion; (motion, rotation parent from child) of the bodies below it, as the tree
+        stores them; and the hinges' speeds half a step ahead.
+    """
+    rotation = tuple(map(_row, quat_to_mat(state.quat)))
+    velocity, midpoint_speed, midpoint = _row(state.velocity), state.speed, None
+    root = BodyMotion(
+        angular_velocity=_row(state.angular_velocity),
+        velocity=matTvec(rotation, velocity),
+        z_axis=rotation[2],
+        height=state.position[2][None],
+        x_axis=rotation[0] if located else None,
+        y_axis=rotation[1] if located else None,
+        xy=_row(state.position[:2]) if located else None,
+    )
+    if state.qacc_prev and dt:
+        half = lambda v, a: add(v, mul(0.5 * dt, a))  # noqa: E731
+        linear, angular, hinges = state.qacc_prev
+        midpoint_speed = jax.tree.map(half, state.speed, hinges)
+        pairs = (root.angular_velocity, angular), (root.velocity, linear)
+        midpoint = tuple(tuple(map(half, v, _row(a))) for v, a in pairs)
+        root = root._replace(midpoint=midpoint)
+
+    def move(level: Level, parent: BodyMotion, angle: Scalar, speed: Scalar, ahead: Scalar) -> Any:
+        assert level.hinges is not None
+        rotation, position = hinge_rotation(level.hinges, angle), level.hinges.position
+        angular_velocity, velocity = _child_velocity(
+            rotation, position, (parent.angular_velocity, parent.velocity), speed
+        )
+        x_axis, y_axis, xy = None, None, None
+        if located:
+            x_axis, y_axis = matTvec(rotation, parent.x_axis), matTvec(rotation, parent.y_axis)
+            xy = (
+                add(parent.xy[0], dot(parent.x_axis, position)),
+                add(parent.xy[1], dot(parent.y_axis, position)),
+            )
+        height = add(parent.height, dot(parent.z_axis, position))
+        midpoint = parent.midpoint and _child_velocity(rotation, position, parent.midpoint, ahead)
+        z_axis = matTvec(rotation, parent.z_axis)
+        motion = BodyMotion(
+            angular_velocity, velocity, z_axis, height, x_axis, y_axis, xy, midpoint
+        )
+        return motion, (motion, rotation)
+
+    below = tree.forward_pass(move, root, state.angle, state.speed, midpoint_speed)
+    return root, below, midpoint_speed
+
+
+def _row(xs: Any) -> Any:
+    """The root as a level of one body."""
+    return tuple(x[None] for x in xs)
+
+
+def hinge_rotation(hinges: Hinges, angle: Scalar) -> Mat:
+    """Rotation of each body's frame, parent from child."""
+    sine, cosine = sincos(angle)
+    c, s = hinges.offset
+    cosine, sine = sub(mul(c, cosine), mul(s, sine)), add(mul(s, cosine), mul(c, sine))
+    r = hinges.rotation
+    return tuple(
+        (
+            add(mul(r[i][0], cosine), mul(r[i][1], sine)),
+            sub(mul(r[i][1], cosine), mul(r[i][0], sine)),
+            r[i][2],
+        )
+        for i in range(3)
+    )
+
+
+def _child_velocity(
+    rotation: Mat, position: Vec, velocity: tuple[Vec, Vec], speed: Scalar
+) -> tuple[Vec, Vec]:
+    """Angular and linear velocity of a child from those of its parent."""
+    angular, linear = velocity
+    own = matTvec(rotation, angular)
+    linear = matTvec(rotation, vadd(linear, cross(angular, position)))
+    return (own[0], own[1], add(own[2], speed)), linear
+
+
+def body_motions(tree: Tree, state: State) -> BodyMotion:
+    """Motion of the core's rigid body, then of what each hinge carries.
+
+    Returns:
+        `[1 + nhinge, lanes]` each, in the order of `Tree.join_rows`; velocities over ground. Each
+        body's frame lies at its hinge and has the hinge's axis for its z (see `level`).
+    """
+    like = state.position[0]
+    root, below, _ = forward_kinematics(tree, state, True)
+    root = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, *like.shape)), root)
+    rows = tree.stack_saved(below, lambda saved: saved[0], like)
+    return root if rows is None else jax.tree.map(lambda *x: jnp.concatenate(x), root, rows)
+
+
+def body_poses(
+    robot: Robot, qpos: Float[Array, "n nq"]
+) -> tuple[Float[Array, "n nbody 3"], Float[Array, "n nbody 3 3"]]:
+    """Pose of every body: MuJoCo's `xpos` and `xmat`, for many configurations at once.
 
     Args:
         robot: from `build_robot`.
-        qpos: `[n, nq]`.
+        qpos: of NumPy, then so is the result and nothing is compiled; or of JAX.
 
     Returns:
-        `[n, nbody, 3]` world frame [m].
+        Positions [m] and rotations (world from body) in the world frame; body 0 is the world.
     """
-    m = robot.mj_model
-    place: list[Any] = [jnp.zeros((qpos.shape[0], 3), qpos.dtype)]
-    turn: list[Any] = [jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype), (qpos.shape[0], 3, 3))]
-    cast = partial(jnp.asarray, dtype=qpos.dtype)
-    for body in range(1, m.nbody):
-        joint = int(m.body_jntadr[body])
-        adr = int(m.jnt_qposadr[joint])
-        if body == 1:
-            quat = qpos[:, adr + 3 : adr + 7]
-            place.append(qpos[:, adr : adr + 3])
-            turn.append(_matrix(quat / jnp.linalg.norm(quat, axis=-1, keepdims=True)))
-            continue
-        parent = int(m.body_parentid[body])
-        half = qpos[:, adr : adr + 1] / 2
-        axis = cast(m.jnt_axis[joint])
-        hinge = _matrix(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
-        fixed = _matrix(cast(m.body_quat[body])[None])
-        place.append(place[parent] + turn[parent] @ cast(m.body_pos[body]))
-        turn.append(turn[parent] @ fixed @ hinge)
-    return jnp.stack(place, 1)
-
-
-def _matrix(quat: jax.Array) -> jax.Array:
-    """`[n, 4]` unit quaternions to `[n, 3, 3]`."""
-    w, x, y, z = jnp.moveaxis(quat, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+    xp, tree = namespace(qpos), make_single_tree(robot, contact=False)
+    columns = qpos.T
+    quat = columns[3:7] / xp.linalg.norm(columns[3:7], axis=0)
+    angle = tree.joints_to_tree(columns[7:])
+    zero = tuple(xp.zeros_like(columns[:3]))
+    still = jax.tree.map(xp.zeros_like, angle)
+    state = State(tuple(columns[:3]), tuple(quat), zero, zero, angle, still)
+    root, below, _ = forward_kinematics(tree, state, True)
+    lanes, nbody = len(qpos), len(robot.assembly.parent)
+    place: list[Any] = [xp.zeros((lanes, 3), qpos.dtype)] * nbody
+    turn: list[Any] = [xp.broadcast_to(xp.eye(3, dtype=qpos.dtype), (lanes, 3, 3))] * nbody
+    motions = (root, *(motion for motion, _ in below))
+    for motion, bodies, frames in zip(motions, tree.bodies, tree.frames, strict=True):
+        count = len(bodies)
+        wide = lambda x, n=count: xp.broadcast_to(x, (n, lanes))  # noqa: E731
+        positions = xp.stack([wide(x) for x in (*motion.xy, motion.height)], -1)
+        axes = xp.stack([xp.stack([wide(x) for x in axis], -1) for axis in motion.axes], -2)
+        for k, (body, frame) in enumerate(zip(bodies, frames, strict=True)):
+            # From the hinge's frame to MuJoCo's.
+            place[body], turn[body] = positions[k], axes[k] @ xp.asarray(frame.T, qpos.dtype)
+    return xp.stack(place, 1), xp.stack(turn, 1)

@@ -18,8 +18,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.spatial import Mat, Scalar, Sym, Vec
+from mjx_revolve.water.added_mass import CarriedWater
+from mjx_revolve.water.buoyancy import find_buoyancy_law
+from mjx_revolve.water.drag import OFF, find_drag_law
+from mjx_revolve.water.laws import law_numbers, part_field
+
+# Why no factor of `Variation` multiplies a number.
+_SHAPE = "the robot's shape, which is known"
+_MEASURED = "thrusters keep their curves, which are measured"
+_INSIDE = "its own fields say"
 
 
 def is_present(x: Scalar) -> bool:
@@ -27,8 +35,8 @@ def is_present(x: Scalar) -> bool:
     return isinstance(x, jax.Array) or bool(np.any(x))
 
 
-class Laws(NamedTuple):
-    """What tells groups of parts apart.
+class PartLaws(NamedTuple):
+    """What parts of one group have in common.
 
     Attributes:
         buoyancy: name of the buoyancy law.
@@ -39,6 +47,12 @@ class Laws(NamedTuple):
     buoyancy: str
     drag: str
     pushes: bool = False
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing acts on such parts, unless they carry water along."""
+        lifts = find_buoyancy_law(self.buoyancy).lifts
+        return not (lifts or self.pushes) and find_drag_law(self.drag) is OFF
 
 
 class Hinges(NamedTuple):
@@ -94,7 +108,8 @@ class InertiaBox(NamedTuple):
     size: Vec
 
 
-class Mounts(NamedTuple):
+@law_numbers
+class ThrusterMounts:
     """Where thrusters push, `[npart, nbody, lanes]` or a number each.
 
     Attributes:
@@ -104,29 +119,19 @@ class Mounts(NamedTuple):
         torque_ratio: reaction torque per thrust [m].
     """
 
-    which: Any
-    axis: Vec
-    position: Vec
-    torque_ratio: Scalar
+    which: Any = part_field("-", blank=-1, fixed=_MEASURED)
+    axis: Vec = part_field("-", fixed=_MEASURED)
+    position: Vec = part_field("m", fixed=_MEASURED)
+    torque_ratio: Scalar = part_field("m", fixed=_MEASURED)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "position", "rotation", "half_size", "center_position", "volume", "bulk",
-        "exposed", "drag_linear", "drag_angular", "carried", "carried_mass", "carried_inertia",
-        "plate", "plate_area", "plate_forward", "plate_upward", "plate_center", "ellipsoid",
-        "mounts",
-    ],
-    meta_fields=["laws", "count"],
-)  # fmt: skip
-@dataclass(frozen=True)
+@law_numbers
 class Parts:
     """Those parts of the bodies of a level that obey the same laws.
 
-    `[npart, nbody, lanes]` or a number each, in the bodies' frames; None where no law asks for it.
-    Bodies with fewer parts are padded with parts that do nothing. A part that stands square on its
-    body is described along the body's axes, so that its rotation folds away.
+    `[npart, nbody, lanes]` or a number each, in the bodies' frames; None where no law reads it. A
+    part that stands square on its body is described along the body's axes, so that its rotation
+    folds away. This is the one list of a part's numbers; each law adds its own.
 
     Attributes:
         laws: which they obey.
@@ -136,48 +141,32 @@ class Parts:
         half_size: half edges of the box [m].
         center_position: centre of the displaced volume [m].
         volume: displaced [m³].
-        bulk: volume of the box [m³].
-        exposed: share of each pair of faces that the water reaches [-].
-        drag_linear: ρ ½ C_d A of each pair of faces [kg/m].
-        drag_angular: the same against turning [kg·m²].
-        carried: inertia of the water that they carry along, wholly wet, about the body's origin.
-        carried_mass: of that water along the part's axes [kg].
-        carried_inertia: likewise about them, about the box's centre [kg·m²].
-        plate: coefficients of `lift_drag`, a `PlateTable`.
-        plate_area: [m²].
-        plate_forward: unit vector of zero angle of attack, part's axes.
-        plate_upward: unit vector of the upper surface, part's axes.
-        plate_center: centre of pressure, part's axes [m].
-        ellipsoid: constants of MuJoCo's ellipsoid law.
+        bulk: volume of the box [m³], for drag laws of whole bodies.
+        exposed: share of each pair of faces that the water reaches [-], for surface tension.
+        drag: numbers of their drag law; in `StepConstants`, those of all laws by name.
+        carried: the water that they carry along.
         mounts: where thrusters push.
     """
 
-    laws: Laws
+    laws: PartLaws
     count: int
-    position: Vec
-    rotation: Mat
-    half_size: Vec
-    center_position: Vec
-    volume: Scalar
-    bulk: Any = None
-    exposed: Any = None
-    drag_linear: Any = None
-    drag_angular: Any = None
-    carried: SpatialInertia | None = None
-    carried_mass: Any = None
-    carried_inertia: Any = None
-    plate: Any = None
-    plate_area: Any = None
-    plate_forward: Any = None
-    plate_upward: Any = None
-    plate_center: Any = None
-    ellipsoid: Any = None
-    mounts: Mounts | None = None
+    position: Vec = part_field("m", fixed=_SHAPE)
+    rotation: Mat = part_field("-", blank=np.eye(3), fixed=_SHAPE)
+    half_size: Vec = part_field("m", axes="size", blank=1.0, fixed=_SHAPE)
+    center_position: Vec = part_field("m", fixed=_SHAPE)
+    volume: Scalar = part_field("m3", varied=("density",))
+    bulk: Any = part_field("m3", fixed=_SHAPE, default=None)
+    exposed: Any = part_field("-", axes="size", fixed=_SHAPE, default=None)
+    drag: Any = part_field("-", fixed=_INSIDE, default=None)
+    carried: CarriedWater | None = part_field("-", fixed=_INSIDE, default=None)
+    mounts: ThrusterMounts | None = part_field("-", fixed=_INSIDE, default=None)
 
     @property
     def carries(self) -> bool:
         """Whether any of them may carry water along."""
-        return self.carried is not None and any(map(is_present, jax.tree.leaves(self.carried)))
+        return self.carried is not None and any(
+            map(is_present, jax.tree.leaves(self.carried.inertia))
+        )
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["position", "mass"], meta_fields=["count"])
@@ -250,7 +239,7 @@ class Thrusters:
         kept: share of a command behind its lag that is still there after a step [-].
         delayed: whether there is a lag.
         backward: thrust per command squared, astern [N].
-        forward: likewise, ahead [N].
+        forward: thrust per command squared, ahead [N].
         dead_low: lower end of the dead band [-].
         dead_high: its upper end [-].
         line: (commands, thrusts, whether the curve is such a broken line), points on the first

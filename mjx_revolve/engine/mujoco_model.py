@@ -1,13 +1,12 @@
 """A robot as MuJoCo has it: the assembly written into a spec, and that compiled.
 
 Modules that are welded together become one MuJoCo body, so a spider has 9 moving bodies, but every
-part keeps its own geom. The models are for MJX, viewers and files; our own step knows the numbers
-before there is one.
+part keeps its own geom. The models are for MJX, viewers and files; our own step takes its numbers
+from the assembly.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -19,8 +18,9 @@ from mjx_revolve.body.placement import Module
 from mjx_revolve.engine.assembly import BALLAST_RADIUS, Assembly
 from mjx_revolve.engine.fluid_table import drag_law
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import matrix_to_quat
 from mjx_revolve.water.bed import sample_bed
-from mjx_revolve.water.drag import ELLIPSOID_COEFFICIENTS
+from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.thrusters import thrust as thruster_curve
 from mjx_revolve.water.world import World
 
@@ -69,27 +69,6 @@ def compile_model(assembly: Assembly) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
             f"{morphology.path or morphology.name}: expected a body that MuJoCo can simulate; "
             f"found: {reason}"
         ) from None
-
-
-@lru_cache(maxsize=4096)
-def ellipsoid_fluid(size: tuple[float, float, float]) -> np.ndarray:
-    """`[12]` what MuJoCo's ellipsoid law needs of a box of these edges (`geom_fluid`)."""
-    spec = mujoco.MjSpec()
-    geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[edge / 2 for edge in size])
-    _make_ellipsoid(geom)
-    found: np.ndarray = spec.compile().geom_fluid[0].copy()
-    return found
-
-
-def _make_ellipsoid(geom: Any) -> None:
-    geom.fluid_ellipsoid = 1
-    geom.fluid_coefs = list(ELLIPSOID_COEFFICIENTS)
-
-
-def _quat(rotation: np.ndarray) -> np.ndarray:
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation, np.float64).ravel())
-    return quat
 
 
 def _add_bed(spec: mujoco.MjSpec, morphology: Morphology, world: World) -> None:
@@ -164,7 +143,7 @@ def _add_bodies(spec: mujoco.MjSpec, assembly: Assembly) -> None:
         if module.kind.hinge is not None:
             number = len(bodies)
             above = bodies[assembly.parent[number]]
-            quat = _quat(turn[number])
+            quat = matrix_to_quat(turn[number])
             bodies.append(above.add_body(name=module.name, pos=place[number], quat=quat))
             _add_hinge(spec, assembly, number, bodies[number])
         for part in module.kind.parts:
@@ -187,7 +166,7 @@ def _add_hinge(spec: mujoco.MjSpec, assembly: Assembly, number: int, body: Any) 
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         range=low_high,
         damping=assembly.damping[number],
-        # MuJoCo has no speed limit; those who read the model find ours here.
+        # MuJoCo has no speed limit; ours stands here for readers of the model.
         userdata=[assembly.speed[number]],
     )
     spec.add_actuator(
@@ -246,14 +225,15 @@ def _add_geoms(
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=[edge / 2 for edge in box.size],
             pos=place + turn @ np.asarray(box.position),
-            quat=_quat(turn),
+            quat=matrix_to_quat(turn),
             mass=part.mass if k == 0 else 0.0,
             rgba=[*rgb, 1.0],
             contype=int(part.contact and world.bed is not None and world.bed.contact == "mjx"),
             conaffinity=0,
         )
-        if k == 0 and drag_law(part, world) == "ellipsoid":
-            _make_ellipsoid(geom)
+        own = find_drag_law(drag_law(part, world)).mj_fluidcoef
+        if k == 0 and own:
+            geom.fluid_ellipsoid, geom.fluid_coefs = 1, own
     if part.ballast_mass > 0:
         body.add_geom(
             name=f"{module.name}/{part.name}/ballast",

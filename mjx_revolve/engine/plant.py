@@ -27,7 +27,7 @@ from mjx_revolve.inputs.errors import InputError, show
 _ONE_POINT = 1e-6
 
 
-class Figure(NamedTuple):
+class BodyGeometry(NamedTuple):
     """A body's size and balance, a number or `[lanes]` each.
 
     Attributes:
@@ -51,12 +51,12 @@ class Figure(NamedTuple):
     up: Any
 
 
-def figure_of(robot: Robot) -> Figure:
+def body_geometry(robot: Robot) -> BodyGeometry:
     """The size of a robot, in its world."""
-    return Figure(*(x[..., 0].tolist() for x in figures_of(robot.assembly)))
+    return BodyGeometry(*(x[..., 0].tolist() for x in body_geometries(robot.assembly)))
 
 
-def figures_of(assembly: Assembly) -> Figure:
+def body_geometries(assembly: Assembly) -> BodyGeometry:
     """The sizes of robots, in their world, `[robots]`."""
     layout, table, world = assembly.layout, assembly.fluid, assembly.world
     robots = len(assembly.morphologies)
@@ -71,7 +71,7 @@ def figures_of(assembly: Assembly) -> Figure:
     arm = np.linalg.norm(lever, axis=1, keepdims=True)
     hangs = arm > _ONE_POINT
     displaced = world.density * np.bincount(layout.body, table.volume)
-    return Figure(
+    return BodyGeometry(
         length=extent.max(1),
         weight=mass * max(world.gravity, 1e-9),
         lowest=-np.minimum.reduceat(corners[..., 2].min(1), first),
@@ -118,8 +118,8 @@ class Plant:
 
     Attributes:
         num_hinges: how many hinges; of different robots, the most that one may have.
-        num_thrusters: how many thrusters, likewise.
-        num_pairs: how many pairs of hinges share a rigid body, likewise.
+        num_thrusters: how many thrusters.
+        num_pairs: how many pairs of hinges share a rigid body.
         names: `[num_hinges + num_thrusters]` of the actuators, the robot's order.
         pairs: `[num_pairs]` names of the pairs.
         timestep: of the world [s].
@@ -212,7 +212,7 @@ class Plant:
         return self._wide((self.low + self.high) / 2, like)
 
     def reach(self, like: jax.Array) -> jax.Array:
-        """Half width of each range, likewise."""
+        """Half width of each range, as `middle` has it."""
         return self._wide((self.high - self.low) / 2, like)
 
     def _wide(self, x: Any, like: jax.Array) -> jax.Array:
@@ -275,7 +275,7 @@ def read_actuators(
 
     Returns:
         `[n]` and `[n]` ends of the range [rad] or [-], `[n, 3]` places at rest, core frame [m], and
-        `[n, 3]` axes of hinges and directions of thrust, likewise [-].
+        `[n, 3]` axes of hinges and directions of thrust, core frame [-].
     """
     modules = [module for body in bodies for module in body.modules]
     hinges = [(m, m.kind.hinge) for m in modules if m.kind.hinge is not None]

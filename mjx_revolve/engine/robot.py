@@ -1,10 +1,11 @@
-"""A robot: a body and the world around it, and what follows from the two when somebody asks."""
+"""A robot: a body in a world, and the tables and MuJoCo models that follow from the two."""
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,11 @@ import numpy as np
 from mjx_revolve.body.module_types import ModuleType, Part
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.engine.assembly import Assembly, assemble
+from mjx_revolve.engine.edited_model import check_edit, edited_assembly
 from mjx_revolve.engine.fluid_table import FluidTable
 from mjx_revolve.engine.mujoco_model import compile_model
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.world import World
 
 
@@ -28,19 +31,51 @@ class Robot:
     Attributes:
         morphology: the tree of modules that it is built from.
         world: the water around it.
+        edited_model: MuJoCo's model as a user has edited it, from `with_model`; None as built.
+        edited_spec: the editable form of it, where there is one.
     """
 
     morphology: Morphology
     world: World
+    edited_model: mujoco.MjModel | None = field(default=None, repr=False)
+    edited_spec: mujoco.MjSpec | None = field(default=None, repr=False)
 
     def __reduce__(self) -> Any:
-        """What it is made of; what follows from that is made anew."""
-        return Robot, (self.morphology, self.world)
+        """What it is made of; what follows from that is made anew. A spec cannot be pickled."""
+        return Robot, (self.morphology, self.world, self.edited_model)
+
+    def with_model(self, model: mujoco.MjSpec | mujoco.MjModel) -> Robot:
+        """The robot with an edited MuJoCo model: other masses, inertias, hinges and servos.
+
+        Both engines use these numbers. What follows from the modules' shapes, water and contact
+        points, stays; so bodies, hinges' places and axes, timestep and gravity must stay, too.
+
+        Args:
+            model: `mj_spec` or a copy of `mj_model`, edited.
+
+        Returns:
+            A new robot; this one stays as it is.
+
+        Raises:
+            InputError: MuJoCo refuses the model, or more was edited than that.
+        """
+        spec = model.copy() if isinstance(model, mujoco.MjSpec) else None
+        try:
+            edited = copy.copy(model) if spec is None else spec.compile()
+        except ValueError as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(
+                f"model of {self.morphology.name!r}: expected one that MuJoCo can compile; found: "
+                f"{reason}"
+            ) from None
+        check_edit(edited, self.mj_model, str(self.morphology.name))
+        return Robot(self.morphology, self.world, edited, spec)
 
     @cached_property
     def assembly(self) -> Assembly:
         """Its moving bodies and hinges; the single source of numbers for every engine."""
-        return assemble([self.morphology], self.world)
+        built = assemble([self.morphology], self.world)
+        return built if self.edited_model is None else edited_assembly(built, self.edited_model)
 
     @property
     def fluid(self) -> FluidTable:
@@ -48,27 +83,52 @@ class Robot:
         return self.assembly.fluid
 
     @cached_property
-    def _model(self) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-        return compile_model(self.assembly)
-
-    @property
-    def is_compiled(self) -> bool:
-        """Whether MuJoCo's model was made, and may have been changed by hand."""
-        return "_model" in self.__dict__
+    def _compiled(self) -> tuple[mujoco.MjSpec | None, mujoco.MjModel, bytes]:
+        """The spec, the model, and the model's bytes before any edit in place."""
+        if self.edited_model is None:
+            spec, model = compile_model(self.assembly)
+        else:
+            spec, model = self.edited_spec, self.edited_model
+        return spec, model, _bytes_of(model)
 
     @property
     def mj_spec(self) -> mujoco.MjSpec:
-        """The editable MuJoCo model."""
-        return self._model[0]
+        """A copy of the editable MuJoCo model; edit it and give it to `with_model`.
+
+        Raises:
+            InputError: the robot has the model of an `MjModel`, which has no editable form.
+        """
+        spec = self._compiled[0]
+        if spec is None:
+            raise InputError(
+                f"mj_spec of {self.morphology.name!r}: expected a robot as built, or from "
+                "with_model(spec); found one from with_model(model) or from another process"
+            )
+        return spec.copy()
 
     @property
     def mj_model(self) -> mujoco.MjModel:
-        """The compiled model. Its own fluid (`opt.density`, `opt.viscosity`) is off.
+        """The compiled model, to be read. Its own fluid (`opt.density`, `opt.viscosity`) is off.
 
-        Masses, inertias, hinges and servos may be changed in it before an engine is made of the
-        robot; batches of many robots take bodies as they are built.
+        To change it, edit `mj_spec` or a copy and use `with_model`; engines refuse a model that
+        was edited in place.
         """
-        return self._model[1]
+        return self._compiled[1]
+
+    def check_model(self) -> None:
+        """Refuses a model that was edited in place.
+
+        Raises:
+            InputError: it was.
+        """
+        if "_compiled" in self.__dict__:
+            _, model, before = self._compiled
+            if _bytes_of(model) != before:
+                raise InputError(
+                    f"mj_model of {self.morphology.name!r}: expected it as compiled; found it "
+                    "edited in place, which engines would ignore (edit a copy, model = "
+                    "copy.copy(robot.mj_model), and use robot.with_model(model))"
+                )
 
     @cached_property
     def mjx_model(self) -> Any:
@@ -146,19 +206,22 @@ class Robot:
         return qpos
 
 
-def import_mjx() -> Any:
-    """MJX, imported late because it is slow, and without the lines that it prints about Warp.
+def _bytes_of(model: mujoco.MjModel) -> bytes:
+    """The whole model, binary."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
 
-    Returns:
-        The module `mujoco.mjx`.
-    """
+
+def import_mjx() -> Any:
+    """The module `mujoco.mjx`, imported late because it is slow, without its lines about Warp."""
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
     return mjx
 
 
 def build_robot(morphology: Morphology, world: World) -> Robot:
-    """Puts a body into a world.
+    """A robot: a body in a world.
 
     Args:
         morphology: the robot's modules.
@@ -173,7 +236,7 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
     robot = Robot(morphology, world)
     kinds = {id(module.kind): module.kind for module in morphology.modules}
     if not all(map(_is_sound, kinds.values())):
-        _ = robot.mj_model  # MuJoCo says what it makes of it
+        _ = robot.mj_model  # raises where MuJoCo refuses it
     return robot
 
 
@@ -238,7 +301,7 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
             "mjx, or contact: penalty)"
         )
     table, world, assembly = robot.fluid, robot.world, robot.assembly
-    explicit = np.array([law in ("ellipsoid", "inertia_box") for law in table.drag])
+    explicit = np.array([find_drag_law(name).explicit for name in table.drag])
     for body in np.unique(table.body[explicit]):
         rows = explicit & (table.body == body)
         mass = assembly.mass[body] + world.density * table.carried_mass[rows].min(-1).sum()

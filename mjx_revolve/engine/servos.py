@@ -34,7 +34,7 @@ def servo(
 
         τ ≤ d w + k (w - q̇),   k = (effort - d w) / (w / 4),
 
-    and likewise backwards. Below the knee it is stock MuJoCo. A light limb goes from rest to its
+    and the same backwards. Below the knee it is stock MuJoCo. A light limb goes from rest to its
     top speed within one step, so the curve is taken at the speed at the end of the step: on the
     line, the line itself; below it, where the step may lead onto it, the chord from here to the
     top speed, which lies below the curve, so that no push, however the hinges are coupled, drives
@@ -60,7 +60,10 @@ def servo(
     friction, slope, top = (_cast(x, torque) for x in hinges.motor)
     forward = jnp.sign(torque)
     rate, push = forward * speed, jnp.abs(torque)
-    line = lambda x: friction + slope * (top - x)  # noqa: E731
+
+    def line(x: Scalar) -> Scalar:
+        return friction + slope * (top - x)
+
     # The motor turns its base, too, the other way.
     per_base = dt / _cast(hinges.base_inertia, torque)
     gain = dt * (push + jnp.maximum(forward * load, 0)) / inertia + per_base * push
@@ -78,11 +81,11 @@ def motor_torque(hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar) -
     Args:
         hinges: their numbers.
         angle: `[nbody, lanes]` [rad].
-        speed: likewise [rad/s].
-        target: likewise [rad].
+        speed: of the joints [rad/s].
+        target: of the servos [rad].
 
     Returns:
-        The torque, likewise [N·m].
+        The torque [N·m].
     """
     torque, _ = servo(hinges, angle, speed, target, 0.0, 1.0, 0.0)
     # Beyond the top speed that torque brakes; a motor has no more than its effort.

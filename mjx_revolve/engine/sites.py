@@ -1,4 +1,4 @@
-"""Where modules sit on the rigid bodies of robots: what sensors at modules must know.
+"""Places of modules on the rigid bodies of robots, for sensors at modules.
 
 A place is named "at ID", the module of that name of one robot, or "each TYPE", modules of a type
 wherever there are some, for one robot and for many different ones.
@@ -16,8 +16,8 @@ import numpy as np
 
 from mjx_revolve.body.placement import turned
 from mjx_revolve.engine.assembly import Assembly
-from mjx_revolve.engine.columns import hinge_frames
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.step_constants import hinge_frames
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.numerics.spatial import Mat, Vec, clean
 
@@ -31,11 +31,11 @@ from mjx_revolve.numerics.spatial import Mat, Vec, clean
 class Sites:
     """Places on rigid bodies: one on each, `[1 + hinge rows, lanes]`, or a single one, numbers.
 
-    Rigid bodies stand as `Engine.motions` has them: the core's, then what each hinge carries.
+    Rigid bodies stand as `Engine.body_motions` has them: the core's, then what each hinge carries.
 
     Attributes:
         there: 1 where there is such a place, else 0.
-        position: in the body's frame, that of `Motion` [m].
+        position: in the body's frame, that of `BodyMotion` [m].
         rotation: body from module.
         row: the body of a single place; None where there is one on each.
         hinge: which row of the plant is the module's own hinge; None without one.
@@ -52,7 +52,7 @@ class Sites:
 
 @dataclass(frozen=True, eq=False)
 class ModuleSites:
-    """The places of one robot, read when somebody asks.
+    """The places of one robot, read when they are first used.
 
     Attributes:
         robot: the robot.

@@ -15,8 +15,8 @@ import numpy as np
 from mjx_revolve.body.placement import turned
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.batch import Capacity, assemble_all, order_rows
-from mjx_revolve.engine.columns import read_columns
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.inputs.errors import InputError
 
 # The least radius as a share of a box's longest half edge, so that a rod has two spheres, and a
@@ -107,7 +107,7 @@ def pack_spheres(
     place = {key: k for k, key in enumerate(unique)}
     pick = np.array([place[id(robot)] for robot in robots], int)
     assembly = assemble_all(list(unique.values()))
-    columns = read_columns(assembly)
+    columns = read_constants(assembly)
     order = order_rows(assembly, columns, capacity.groups)
     balls = _balls(assembly)
     owner, total = assembly.robot[balls.body], len(unique)

@@ -20,8 +20,8 @@ from mjx_revolve.water.thrusters import (
     dead_band_thrust,
     ideal_power,
     interpolated_thrust,
-    kept_share,
-    mix_command,
+    lag_decay,
+    lagged_command,
 )
 
 # What stands where a robot has fewer thrusters than others.
@@ -70,7 +70,7 @@ def read_thrusters(assembly: Assembly, count: int) -> Thrusters:
         count=count,
         low=column(lambda t: t.range[0]),
         high=column(lambda t: t.range[1]),
-        kept=kept_share(column(lambda t: t.time_constant), assembly.world.timestep),
+        kept=lag_decay(column(lambda t: t.time_constant), assembly.world.timestep),
         delayed=column(lambda t: t.time_constant > 0, bool),
         backward=column(backward),
         forward=column(lambda t: t.gain),
@@ -100,16 +100,19 @@ def run_thrusters(
     Args:
         thrusters: of the robots.
         lagged: their commands behind the lag, `[nthruster, lanes]` [-].
-        ctrl: what is asked for, likewise.
+        ctrl: their commands, `[nthruster, lanes]` [-].
         density: of the water [kg/m³].
 
     Returns:
         The lagged commands after the step, the thrusts, `[nthruster, lanes]` [N], and the power
-        that ideal propellers need for them, likewise [W] (`water.thrusters.ideal_power`).
+        that ideal propellers need for them, `[nthruster, lanes]` [W] (`ideal_power`).
     """
-    cast = lambda x: x if isinstance(x, jax.Array) else np.asarray(x, ctrl.dtype)  # noqa: E731
+
+    def cast(x: Any) -> Any:
+        return x if isinstance(x, jax.Array) else np.asarray(x, ctrl.dtype)
+
     asked = jnp.clip(ctrl, cast(thrusters.low), cast(thrusters.high))
-    after = mix_command(lagged, asked, thrusters.kept)
+    after = lagged_command(lagged, asked, thrusters.kept)
     acting = jnp.where(thrusters.delayed, lagged, asked)
     push = dead_band_thrust(
         acting,

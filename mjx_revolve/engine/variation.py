@@ -8,15 +8,16 @@ they are and fold away.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.columns import KNEE
-from mjx_revolve.engine.level import Hinges, Level, Parts
-from mjx_revolve.numerics.spatial import Scalar, mul
+from mjx_revolve.engine.level import Hinges, Level
+from mjx_revolve.engine.step_constants import TORQUE_CURVE_KNEE
+from mjx_revolve.numerics.spatial import Scalar
+from mjx_revolve.water.laws import scale_numbers
 
 
 class Variation(NamedTuple):
@@ -39,8 +40,8 @@ class Variation(NamedTuple):
 def vary_level(level: Level, variation: Variation) -> Level:
     """The constants of a step, varied.
 
-    Servos foresee a step's gain in speed with the inertia as it was, which only tells them when to
-    be careful, and MuJoCo's two drag laws and surface tension are not varied.
+    Servos foresee a step's gain in speed with the inertia as it was, which only decides when
+    they are careful, and MuJoCo's two drag laws and surface tension are not varied.
 
     Args:
         level: the constants, numbers or `[..., lanes]`.
@@ -53,7 +54,7 @@ def vary_level(level: Level, variation: Variation) -> Level:
     return replace(
         level,
         hinges=None if level.hinges is None else _vary_hinges(level.hinges, row.motor),
-        parts=tuple(_vary_parts(parts, row) for parts in level.parts),
+        parts=tuple(scale_numbers(parts, row._asdict()) for parts in level.parts),
     )
 
 
@@ -65,7 +66,7 @@ def _vary_hinges(hinges: Hinges, motor: jax.Array) -> Hinges:
         return hinges
     friction, slope, top = (_as(x, motor) for x in (friction, slope, top))
     effort = _as(hinges.effort[1], motor)
-    steeper = jnp.maximum((effort - motor * friction) / ((1 - KNEE) * motor * top), 0)
+    steeper = jnp.maximum((effort - motor * friction) / ((1 - TORQUE_CURVE_KNEE) * motor * top), 0)
     # Where there is no limit, the line lies far above any torque, and stays there.
     return hinges._replace(
         motor=(
@@ -74,25 +75,6 @@ def _vary_hinges(hinges: Hinges, motor: jax.Array) -> Hinges:
             jnp.where(limited, motor * top, top),
         )
     )
-
-
-def _vary_parts(parts: Parts, row: Variation) -> Parts:
-    drag, carried = row.drag * row.density, row.added_mass * row.density
-    return replace(
-        parts,
-        volume=_times(parts.volume, row.density),
-        drag_linear=_times(parts.drag_linear, drag),
-        drag_angular=_times(parts.drag_angular, drag),
-        plate_area=_times(parts.plate_area, drag),
-        carried=_times(parts.carried, carried),
-        carried_mass=_times(parts.carried_mass, carried),
-        carried_inertia=_times(parts.carried_inertia, carried),
-    )
-
-
-def _times(tree: Any, factor: jax.Array) -> Any:
-    """All numbers of a tree times a factor; plain zeros stay so, and None."""
-    return jax.tree.map(lambda x: mul(x, factor), tree)
 
 
 def _as(x: Scalar, like: jax.Array) -> Scalar:

@@ -1,4 +1,4 @@
-"""The part of a configuration that says how bodies evolve, and their brains with them."""
+"""Settings of evolving bodies and brains: `bodies` in a configuration."""
 
 from __future__ import annotations
 
@@ -7,25 +7,32 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, MinLen, Unit
 from pydantic import Field, model_validator
 
-from mjx_revolve.episodes.settings import Settings, one_of
-from mjx_revolve.inputs.own_code import short_name
-from mjx_revolve.inputs.schema import MisfitError, NonNegative, Number, Positive, Row, Share, Whole
+from mjx_revolve.episodes.settings import File, Settings, one_of
+from mjx_revolve.genotypes.table import GENOTYPES
+from mjx_revolve.inputs.schema import (
+    ConstraintError,
+    Integer,
+    NonNegative,
+    Number,
+    Positive,
+    Share,
+    TupleOf,
+)
+from mjx_revolve.inputs.user_code import short_name
 
-# `genotypes.kinds.GENOTYPES` has the functions.
-GENOTYPES = ("tree", "plasticoding", "cppn")
-# How survivors are chosen; `evolution.selection.SCHEMES` has the functions.
-SCHEMES = ("plus", "comma", "generational", "steady", "nsga2", "map_elites", "random")
+Scheme = Literal["plus", "comma", "generational", "steady", "nsga2", "map_elites", "random"]
+"""How survivors are chosen; `evolution.selection.SCHEMES` has the functions."""
 
 
 class BrainsConfig(Settings):
-    """What a child gets of its parents' brains, and in which form brains are evolved."""
+    """Inheritance and encoding of brains."""
 
     type: Literal["joints", "cppn"] = "joints"
     """`joints`: genes of the controller, inherited by the joint's name and completed where the body
     has grown. `cppn`: weights of a network from a joint's place to its genes."""
     inheritance: Literal["lamarckian", "darwinian", "none"] = "lamarckian"
-    """A child's brain comes of what its parents have learnt (`lamarckian`), of what they were born
-    with (`darwinian`), or is drawn anew (`none`)."""
+    """A child's brain is inherited from the brains that its parents have learnt (`lamarckian`), or
+    from those of their birth (`darwinian`), or is drawn anew (`none`)."""
     mutation: Annotated[NonNegative, Unit("-")] = 0.2
     """Standard deviation of the noise on inherited genes [-]."""
     std_init: Annotated[Positive, Unit("-")] = 0.5
@@ -33,7 +40,7 @@ class BrainsConfig(Settings):
 
 
 class LearningConfig(Settings):
-    """What a body learns in its life: a search of its own, around the brain that it was born with.
+    """Learning of each body: a search of its own, around the brain of its birth.
 
     All bodies learn at once. With one generation of one individual nothing is learnt: the brain is
     tried as it is.
@@ -41,9 +48,9 @@ class LearningConfig(Settings):
 
     strategy: Annotated[str, MinLen(1)] = "SNES"
     """Name of an evosax strategy."""
-    population_size: Annotated[Whole, Ge(1)] = 1
-    """Brains that are tried at a time; the first of them is the one that it was born with."""
-    generations: Annotated[Whole, Ge(1)] = 1
+    population_size: Annotated[Integer, Ge(1)] = 1
+    """Brains that are tried at a time; the first of them is the one of its birth."""
+    generations: Annotated[Integer, Ge(1)] = 1
     std_init: Annotated[Positive, Unit("-")] = 0.3
     """Standard deviation of the first brains that are tried [-]."""
     strategy_params: dict[str, Any] = Field({})
@@ -56,30 +63,28 @@ class LearningConfig(Settings):
 
 
 class SelectionConfig(Settings):
-    """Who has children, and who stays."""
+    """Selection of parents and survivors."""
 
-    type: Literal["plus", "comma", "generational", "steady", "nsga2", "map_elites", "random"] = (
-        "plus"
-    )
+    type: Scheme = "plus"
     """`plus` (μ+λ): the best of parents and children stay; `comma` (μ,λ): of the children;
     `generational`: the children, and `elites` of the parents; `steady`: each child takes the place
     of the worst, if it is better; `nsga2`: by dominance and crowding; `map_elites`: the best of
-    each cell of the archive; `random`: nobody inherits anything, for comparison."""
-    offspring: Annotated[Whole, Ge(1)] | None = None
+    each cell of the archive; `random`: nothing is inherited, for comparison."""
+    offspring: Annotated[Integer, Ge(1)] | None = None
     """Children in a generation, λ; as many as `evolution.population_size`, μ, where not given."""
-    tournament: Annotated[Whole, Ge(1)] = 2
-    """Who wins among so many drawn ones becomes a parent."""
-    elites: Annotated[Whole, Ge(0)] = 1
+    tournament: Annotated[Integer, Ge(1)] = 2
+    """The best of so many drawn individuals becomes a parent."""
+    elites: Annotated[Integer, Ge(0)] = 1
     """Parents that stay; `generational` only."""
-    max_age: Annotated[Whole, Ge(1)] | None = None
-    """Generations after which an individual has to go, however good it is."""
-    objectives: Annotated[Row[str], MinLen(1)] = ("score",)
-    """What is better when larger, or with a minus before it when smaller: `score`, `novelty`, or a
-    measure or descriptor by name. `nsga2` takes several, all others one."""
-    novelty: Row[str] = ()
+    max_age: Annotated[Integer, Ge(1)] | None = None
+    """Generations after which an individual is removed, however good it is."""
+    objectives: Annotated[TupleOf[str], MinLen(1)] = ("score",)
+    """Maximised, or with a minus before it minimised: `score`, `novelty`, or a measure or
+    descriptor by name. `nsga2` takes several, all others one."""
+    novelty: TupleOf[str] = ()
     """Descriptors and measures in whose space `novelty` is the mean distance to neighbours."""
-    neighbours: Annotated[Whole, Ge(1)] = 15
-    """How many of them."""
+    neighbours: Annotated[Integer, Ge(1)] = 15
+    """Number of neighbours."""
 
 
 class Axis(Settings):
@@ -87,12 +92,12 @@ class Axis(Settings):
 
     low: Number
     high: Number
-    cells: Annotated[Whole, Ge(1)] = 10
+    cells: Annotated[Integer, Ge(1)] = 10
 
     @model_validator(mode="after")
     def _check(self) -> Axis:
         if self.low >= self.high:
-            raise MisfitError("high", f"a number > low ({self.low:g})", f"{self.high:g}")
+            raise ConstraintError("high", f"a number > low ({self.low:g})", f"{self.high:g}")
         return self
 
 
@@ -102,44 +107,46 @@ class ArchiveConfig(Settings):
     type: Literal["grid", "cvt"] = "grid"
     """`grid`: the product of the axes' cells; `cvt`: centroidal Voronoi cells, `cells` of them."""
     axes: dict[str, Axis]
-    cells: Annotated[Whole, Ge(2)] = 256
+    cells: Annotated[Integer, Ge(2)] = 256
     """Of a `cvt` archive."""
 
     @model_validator(mode="after")
     def _check(self) -> ArchiveConfig:
         if len(self.axes) < 2:
-            raise MisfitError("axes", "at least two descriptors or measures", str(len(self.axes)))
+            raise ConstraintError(
+                "axes", "at least two descriptors or measures", str(len(self.axes))
+            )
         return self
 
 
 class BodiesConfig(Settings):
-    """How bodies evolve."""
+    """Settings of evolving bodies."""
 
-    genotype: Annotated[str, one_of(GENOTYPES)] = "tree"
+    genotype: Annotated[str, one_of(GENOTYPES), File("code")] = "tree"
     """`tree`, `plasticoding`, `cppn`, or FILE.py:FUNCTION, a function like those in `genotypes`."""
-    modules: Annotated[Row[str], MinLen(1)] = ("FixedBrick", "ActiveHinge")
+    modules: Annotated[TupleOf[str], MinLen(1)] = ("FixedBrick", "ActiveHinge")
     """Types of modules that bodies are grown of, beside the core."""
     core: Annotated[str, MinLen(1)] = "Core"
     """Type of the core."""
-    min_modules: Annotated[Whole, Ge(1)] = 2
+    min_modules: Annotated[Integer, Ge(1)] = 2
     """Fewest modules, the core included."""
-    max_modules: Annotated[Whole, Ge(2)] = 16
-    min_hinges: Annotated[Whole, Ge(0)] = 1
-    max_hinges: Annotated[Whole, Ge(1)] = 8
+    max_modules: Annotated[Integer, Ge(2)] = 16
+    min_hinges: Annotated[Integer, Ge(0)] = 1
+    max_hinges: Annotated[Integer, Ge(1)] = 8
     max_length: Annotated[Positive, Unit("m")] | None = None
     """Longest edge of the bounding box at rest [m]."""
     max_mass: Annotated[Positive, Unit("kg")] | None = None
     """Mass [kg]."""
     mutation: Share = 0.8
-    """Share of the children that are mutated; those that are not crossed always are [-]."""
+    """Share of the crossed children that are mutated; those that are not crossed always are [-]."""
     crossover: Share = 0.5
     """Share of the children that have two parents [-]."""
-    seeds: Row[str] = ()
+    seeds: Annotated[TupleOf[str], File("morphology")] = ()
     """Morphologies that begin the population, beside random bodies: paths or shipped names."""
     random: Share = 1.0
     """Share of the first population that is random, where there are seeds; the others are seeds and
     mutants of them [-]."""
-    params: dict[str, Any] = Field({})
+    params: Annotated[dict[str, Any], File("data")] = Field({})
     """Settings of the genotype."""
     brains: BrainsConfig = BrainsConfig()
     learning: LearningConfig = LearningConfig()
@@ -148,7 +155,7 @@ class BodiesConfig(Settings):
 
     @property
     def name(self) -> str:
-        """What titles call the genotype."""
+        """The genotype's name in titles."""
         return short_name(self.genotype)
 
     @model_validator(mode="after")
@@ -156,18 +163,18 @@ class BodiesConfig(Settings):
         for low, high in (("min_modules", "max_modules"), ("min_hinges", "max_hinges")):
             least, most = getattr(self, low), getattr(self, high)
             if most < least:
-                raise MisfitError(high, f"at least {low} ({least})", str(most))
+                raise ConstraintError(high, f"at least {low} ({least})", str(most))
         if self.max_hinges >= self.max_modules:
             most = f"less than max_modules ({self.max_modules}), of which the core is one"
-            raise MisfitError("max_hinges", most, str(self.max_hinges))
+            raise ConstraintError("max_hinges", most, str(self.max_hinges))
         selection = self.selection
         if selection.type == "map_elites" and self.archive is None:
-            raise MisfitError("archive", "axes, because selection.type is map_elites", "none")
+            raise ConstraintError("archive", "axes, because selection.type is map_elites", "none")
         if len(selection.objectives) > 1 and selection.type != "nsga2":
             one = f"one, as only nsga2 takes several (selection.type is {selection.type})"
-            raise MisfitError("selection.objectives", one, ", ".join(selection.objectives))
+            raise ConstraintError("selection.objectives", one, ", ".join(selection.objectives))
         wants = any(name.lstrip("-") == "novelty" for name in selection.objectives)
         if wants and not selection.novelty:
             named = "descriptors or measures, because novelty is an objective"
-            raise MisfitError("selection.novelty", named, "none")
+            raise ConstraintError("selection.novelty", named, "none")
         return self

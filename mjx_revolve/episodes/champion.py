@@ -1,4 +1,4 @@
-"""An episode to look at: of a run's champion, of anybody who lived there, or of a morphology.
+"""An episode to look at: of a run's champion, of one of its individuals, or of a morphology.
 
 Replays, reports and exports all start here, so that each shows the same swim: the first of the
 fresh starts on which the champion was judged.
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology, trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.episodes.config import Config, load_config
+from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.fitness import (
     Fitness,
     fit_body,
@@ -27,16 +28,17 @@ from mjx_revolve.episodes.fitness import (
     make_mixed_fitness,
     read_modules,
 )
-from mjx_revolve.episodes.lives import Life, find_lives
+from mjx_revolve.episodes.individual_log import LoggedIndividual, find_individuals
+from mjx_revolve.episodes.run_reader import ChampionRecord, RunReader, find_run, read_champion
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.episodes.tasks import score_unit
-from mjx_revolve.inputs.brief import brief
 from mjx_revolve.inputs.commands import opening_episode
-from mjx_revolve.inputs.errors import InputError, load_yaml, show
-from mjx_revolve.inputs.schema import LARGEST
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.inputs.short_repr import short_repr
+from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.flow import Water, gust_path
 from mjx_revolve.water.world import load_world
 
@@ -46,7 +48,7 @@ _SECONDS = 10.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Episode:
-    """One life of one robot, with all that is known about it.
+    """An episode of one robot.
 
     Attributes:
         title: a few words to head a picture.
@@ -72,7 +74,7 @@ class Episode:
     folder: Path | None = None
     starts: str = "fresh starts"
 
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 def load_episode(
@@ -83,7 +85,7 @@ def load_episode(
     individual: int | None = None,
     modules: str | Path | None = None,
 ) -> Episode:
-    """Reads a champion, an individual or a morphology, and lets it live.
+    """The episode of a champion, an individual or a morphology.
 
     Args:
         path: a run folder, its `champion` folder, a `genes.yaml`, or a morphology. A morphology is
@@ -93,10 +95,10 @@ def load_episode(
             that it evolved in.
         duration: [s]; by default the task's, or 10.
         seed: draws another start than the first on which the champion was judged.
-        individual: number of one of those who lived in the run, in place of the champion, where
+        individual: number of an individual of the run, in place of the champion, where
             bodies have evolved.
         modules: of a morphology: a YAML of module types of the user's own (see
-            `catalogue.load_modules`); None for a champion, whose run names its own.
+            `catalogue.load_modules`); None for a champion: its run names its own.
 
     Returns:
         The episode.
@@ -111,12 +113,12 @@ def load_episode(
         return _individual(path, individual, duration, seed)
     if path.is_dir():
         refuse_world(world, modules)
-        return _champion(_genes_file(path), duration, seed)
+        return _champion(RunReader(path).load_champion(), duration, seed)
     path = find_shipped(path, "morphologies")
     data = load_yaml(path)
     if isinstance(data, dict) and "genes" in data:
         refuse_world(world, modules)
-        return _champion(path, duration, seed)
+        return _champion(read_champion(path), duration, seed)
     if not (isinstance(data, dict) and "body" in data):
         raise InputError(
             f"{path}: expected a run folder, a champion's genes.yaml or a morphology; found a file "
@@ -140,7 +142,7 @@ def load_episode(
 
 
 def load_asked(arguments: argparse.Namespace) -> Episode:
-    """The episode that a command was asked for; a stranger's files are asked for first.
+    """The episode that a command's arguments name; files that are not trusted are refused.
 
     Args:
         arguments: with what `commands.add_episode_arguments` adds.
@@ -162,58 +164,30 @@ def load_asked(arguments: argparse.Namespace) -> Episode:
         )
 
 
-def _genes_file(folder: Path) -> Path:
-    """Where a run folder, or its champion folder, keeps the champion."""
-    for place in (folder / "genes.yaml", folder / "champion" / "genes.yaml"):
-        if place.is_file():
-            return place
-    if (folder / "config.yaml").is_file():
-        raise InputError(
-            f"{folder / 'champion' / 'genes.yaml'}: expected a champion; found none: this run was "
-            "stopped before its first checkpoint, or the file is lost"
-        )
-    raise InputError(f"{folder}: expected a run folder; found no config.yaml in it")
+def _settings(duration: float | None) -> dict[str, float]:
+    return {} if duration is None else {"task.duration": float(duration)}
 
 
-def _champion(path: Path, duration: float | None, seed: int | None) -> Episode:
-    genes = load_genes(path)
-    data = load_yaml(path)
-    named = data.get("config", "../config.yaml")
-    if not isinstance(named, str):
-        raise InputError(f"{path}: config: expected a path; found {named!r}")
-    source = path.parent / named
-    if not source.is_file():
-        raise InputError(f"{path}: config: expected the run's config.yaml; found no {source}")
-    overrides = {} if duration is None else {"task.duration": float(duration)}
-    config: Config = load_config(source, overrides=overrides)
-    body = data.get("morphology")
-    if config.bodies is not None:
-        if not isinstance(body, str) or not (path.parent / body).is_file():
-            raise InputError(
-                f"{path}: morphology: expected the path of the champion's body, as bodies have "
-                f"evolved; found {show(body)}"
-            )
-        config = config.for_body((path.parent / body).absolute())
+def _champion(champion: ChampionRecord, duration: float | None, seed: int | None) -> Episode:
+    config = champion.load_config(**_settings(duration))
     fitness = make_fitness(config)
-    if len(genes) != fitness.num_genes:
-        raise InputError(
-            f"{path}: genes: expected {fitness.num_genes}, as {source.name} has it; found "
-            f"{len(genes)}"
-        )
+    champion.check_genes(fitness.num_genes, Path(config.source).name)
     key = _key(config, seed)
-    score = data.get("score")
-    folder = source.parent.absolute()
+    return _episode(
+        config, fitness.robot.morphology.name, fitness.robot, fitness.replay(champion.genes, key),
+        water=fitness.water(key), score=champion.score, genes=champion.genes, fitness=fitness,
+    )  # fmt: skip
+
+
+def _episode(
+    config: Config, name: str, robot: Robot, trajectory: Trajectory, **more: Any
+) -> Episode:
+    """An episode of a run."""
     return Episode(
-        title=f"{fitness.robot.morphology.name}: {config.task.name.replace('_', ' ')}",
-        robot=fitness.robot,
-        trajectory=fitness.replay(genes, key),
-        water=fitness.water(key),
-        score=float(score) if isinstance(score, int | float) else None,
+        f"{name}: {config.task.name.replace('_', ' ')}", robot, trajectory,
         score_unit=score_unit(config.task.type),
-        genes=genes,
-        fitness=fitness,
-        folder=folder,
-    )
+        folder=Path(config.source).parent.absolute(), **more,
+    )  # fmt: skip
 
 
 def champion_number(folder: Path) -> int:
@@ -222,19 +196,11 @@ def champion_number(folder: Path) -> int:
     Raises:
         InputError: there is no champion, or bodies did not evolve.
     """
-    path = _genes_file(folder)
-    data = load_yaml(path)
-    found = data.get("individual") if isinstance(data, dict) else None
-    if isinstance(found, bool) or not isinstance(found, int):
-        raise InputError(
-            f"{path}: individual: expected the champion's number, as bodies have evolved; found "
-            f"{show(found)}"
-        )
-    return found
+    return RunReader(folder).load_champion().individual
 
 
 def refuse_world(world: str | None, modules: str | Path | None = None) -> None:
-    """Refuses a world, or modules, for those who swim in their own.
+    """Refuses a world, or modules, for a run, which names its own.
 
     Raises:
         InputError: there is one.
@@ -259,41 +225,36 @@ def _key(config: Config, seed: int | None) -> jax.Array:
 
 def read_individuals(
     path: str | Path, numbers: Sequence[int], duration: float | None = None
-) -> tuple[Config, list[Life]]:
-    """Reads some of those who lived in a run.
+) -> tuple[Config, list[LoggedIndividual]]:
+    """Reads some individuals of a run.
 
     Args:
         path: the run folder, or its `champion` folder.
-        numbers: whom.
+        numbers: of the individuals.
         duration: of their episodes [s]; by default the task's.
 
     Returns:
-        The run's configuration and the lives.
+        The run's configuration and the individuals.
 
     Raises:
-        InputError: the run evolves no bodies, or one of them never lived.
+        InputError: the run evolves no bodies, or has no such individual.
     """
-    folder = Path(path)
-    if folder.name == "champion" and not (folder / "config.yaml").is_file():
-        folder = folder.parent
-    if not (folder / "config.yaml").is_file():
-        raise InputError(f"{path}: expected a run folder; found no config.yaml in it")
-    overrides = {} if duration is None else {"task.duration": float(duration)}
-    config = load_config(folder / "config.yaml", overrides=overrides)
+    folder = find_run(path)
+    config = RunReader(folder).load_config(**_settings(duration))
     if config.bodies is None:
         raise InputError(
             f"{folder}: expected a run in which bodies evolve, to show one of many; found one in "
             "which only genes do"
         )
-    return config, find_lives(folder, numbers)
+    return config, find_individuals(folder, numbers)
 
 
 def _individual(path: Path, number: int, duration: float | None, seed: int | None) -> Episode:
     config, (life,) = read_individuals(path, [number], duration)
     fitness = fit_body(config, life.grow(read_modules(config)))
     key, genes = _key(config, seed), _own_genes(life, fitness.num_genes)
-    trajectory, water = fitness.replay(genes, key), fitness.water(key)
-    return _episode(config, life, fitness.robot, trajectory, water, genes, fitness)
+    facts = _facts(life) | {"genes": genes, "water": fitness.water(key), "fitness": fitness}
+    return _episode(config, robot=fitness.robot, trajectory=fitness.replay(genes, key), **facts)
 
 
 def load_individuals(
@@ -302,11 +263,11 @@ def load_individuals(
     duration: float | None = None,
     seed: int | None = None,
 ) -> list[Episode]:
-    """Lets many live at once: one compiled program serves all.
+    """The episodes of many individuals at once, by one compiled program.
 
     Args:
         path: the run folder.
-        numbers: whose episodes.
+        numbers: of the individuals.
         duration: [s]; by default the task's.
         seed: as for `load_episode`.
 
@@ -325,15 +286,16 @@ def load_individuals(
         _own_genes(life, fitness.controller_of(robot).num_genes)
         for life, robot in zip(lives, robots, strict=True)
     ]
-    found = fitness.replay(robots, genes, key)
+    water = fitness.water(key)
+    found = zip(lives, robots, fitness.replay(robots, genes, key), genes, strict=True)
     return [
-        _episode(config, life, robot, trajectory, fitness.water(key), own)
-        for life, robot, trajectory, own in zip(lives, robots, found, genes, strict=True)
+        _episode(config, robot=robot, trajectory=swim, genes=own, water=water, **_facts(life))
+        for life, robot, swim, own in found
     ]
 
 
-def _own_genes(life: Life, count: int) -> np.ndarray:
-    """`[count]` what somebody has learnt."""
+def _own_genes(life: LoggedIndividual, count: int) -> np.ndarray:
+    """`[count]` the learnt genes of an individual."""
     genes = life.genes
     if genes is None or len(genes) != count:
         found = "none: every trial of its life failed" if genes is None else str(len(genes))
@@ -341,29 +303,13 @@ def _own_genes(life: Life, count: int) -> np.ndarray:
     return genes
 
 
-def _episode(
-    config: Config,
-    life: Life,
-    robot: Robot,
-    trajectory: Trajectory,
-    water: Water | None,
-    genes: np.ndarray,
-    fitness: Fitness | None = None,
-) -> Episode:
-    """An individual's."""
-    return Episode(
-        title=f"individual {life.number}, generation {life.born}: "
-        f"{config.task.name.replace('_', ' ')}",
-        robot=robot,
-        trajectory=trajectory,
-        score=None if math.isnan(life.score) else life.score,
-        starts=f"generation {life.born}'s starts",
-        score_unit=score_unit(config.task.type),
-        water=water,
-        genes=genes,
-        fitness=fitness,
-        folder=Path(config.source).parent.absolute(),
-    )
+def _facts(life: LoggedIndividual) -> dict[str, Any]:
+    """The title, score and starts of an individual's episode."""
+    return {
+        "name": f"individual {life.number}, generation {life.born}",
+        "score": None if math.isnan(life.score) else life.score,
+        "starts": f"generation {life.born}'s starts",
+    }
 
 
 def load_genes(path: str | Path) -> np.ndarray:
@@ -379,17 +325,4 @@ def load_genes(path: str | Path) -> np.ndarray:
         InputError: there is no champion, or its file holds something else.
     """
     path = Path(path)
-    if path.is_dir():
-        inside = path / "genes.yaml"
-        path = inside if inside.exists() else path / "champion" / "genes.yaml"
-    data = load_yaml(path)
-    genes = data.get("genes") if isinstance(data, dict) else None
-    if not isinstance(genes, list):
-        raise InputError(f"{path}: genes: expected a list of numbers; found {show(genes)}")
-    for index, gene in enumerate(genes):
-        number = isinstance(gene, float | int) and not isinstance(gene, bool)
-        if not number or not abs(gene) <= LARGEST:
-            raise InputError(
-                f"{path}: genes: expected a list of finite numbers; found {show(gene)} at {index}"
-            )
-    return np.asarray(genes, np.float32)
+    return (RunReader(path).load_champion() if path.is_dir() else read_champion(path)).genes

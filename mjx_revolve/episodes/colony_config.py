@@ -1,4 +1,4 @@
-"""The part of a configuration that says how a colony lives: robots that evolve in one world.
+"""Settings of a colony, robots that evolve in one world: `colony` in a configuration.
 
 After Revolve's online evolution (the "triangle of life": Eiben et al. 2013, ECAL), whose numbers
 are the order of magnitude of those here: 10 to 75 robots, meeting within 1 m, 2 to 6 children a
@@ -13,18 +13,26 @@ from annotated_types import Ge, Le, Unit
 from pydantic import model_validator
 
 from mjx_revolve.episodes.settings import Settings
-from mjx_revolve.inputs.schema import MisfitError, NonNegative, Positive, Row, Share, Vector, Whole
+from mjx_revolve.inputs.schema import (
+    ConstraintError,
+    Integer,
+    NonNegative,
+    Positive,
+    Share,
+    TupleOf,
+    Vector,
+)
 
 
 class ArenaConfig(Settings):
-    """Where a colony lives: a square of water around the world's origin."""
+    """The arena: a square of water around the world's origin."""
 
     size: Annotated[Positive, Unit("m")] = 16.0
     """Edge of the square [m]."""
     depth: Annotated[Positive, Unit("m")] = 6.0
     """Robots whose cores sink below this are lost [m]."""
     edge: Literal["wrap", "lost"] = "wrap"
-    """Who leaves the square comes back in on the other side (`wrap`), or is lost."""
+    """A robot that leaves the square comes back in on the other side (`wrap`), or is lost."""
 
 
 class BirthConfig(Settings):
@@ -32,18 +40,18 @@ class BirthConfig(Settings):
 
     radius: Annotated[NonNegative, Unit("m")] = 2.0
     """Of the clinic, a disc around the world's origin, at the task's depth [m]."""
-    attempts: Annotated[Whole, Ge(1)] = 5
+    attempts: Annotated[Integer, Ge(1)] = 5
     """Places that are tried for a new robot; where all are taken it waits for the next interval."""
     gestation: Annotated[NonNegative, Unit("s")] = 60.0
-    """From mating to birth, while both parents mate with nobody else [s]."""
-    initial: Annotated[Whole, Ge(1)] = 16
+    """From mating to birth, while neither parent mates again [s]."""
+    initial: Annotated[Integer, Ge(1)] = 16
     """Robots at the beginning, all over the arena."""
-    least: Annotated[Whole, Ge(0)] = 8
-    """Where fewer are alive, strangers without parents are born."""
+    least: Annotated[Integer, Ge(0)] = 8
+    """Where fewer robots are alive, random ones without parents are born."""
 
 
 class MatingConfig(Settings):
-    """Who has children."""
+    """Conditions for mating."""
 
     distance: Annotated[Positive, Unit("m")] = 1.0
     """Between cores, at which two robots meet [m]."""
@@ -51,7 +59,7 @@ class MatingConfig(Settings):
     """The less fit one needs at least this share of the other's fitness [-]."""
     adult: Annotated[NonNegative, Unit("s")] = 60.0
     """Age from which robots mate [s]."""
-    children: Annotated[Whole, Ge(1)] = 4
+    children: Annotated[Integer, Ge(1)] = 4
     """Most children of one pair."""
 
 
@@ -65,64 +73,64 @@ class LifeConfig(Settings):
     path: NonNegative = 1.0
     """Weight of the path's speed [s/m]."""
     limit: Annotated[Positive, Unit("m/s")] = 1.0
-    """Whoever is faster along its path is thrown about, not swimming: fitness 0 [m/s]."""
+    """A robot that is faster along its path is thrown about, not swimming: fitness 0 [m/s]."""
     max_age: Annotated[Positive, Unit("s")] = 1800.0
-    """Nobody lives longer [s]."""
+    """Age at which a robot of full fitness dies [s]."""
     full_fitness: Annotated[Positive, Unit("-")] = 0.1
-    """From this fitness c on, robots live that long; with a fitness f below it f/c of it [-]."""
+    """Fitness c from which robots reach that age; with a fitness f below it, f/c of it [-]."""
     childhood: Annotated[NonNegative, Unit("s")] = 120.0
-    """Nobody dies of age before this one [s]."""
+    """Age before which no robot dies of age [s]."""
 
 
 class EnergyConfig(Settings):
-    """What robots live on: batteries, and places in the water where they are charged."""
+    """Batteries of the robots, and chargers in the water."""
 
     start: Annotated[Positive, Unit("J")] = 20.0
     """Charge at birth [J]."""
     capacity: Annotated[Positive, Unit("J")] = 40.0
     """Of a battery [J]."""
     idle: Annotated[NonNegative, Unit("W")] = 0.01
-    """What a robot takes beside the work of its motors [W]."""
-    chargers: Row[Vector] = ()
-    """Where they are, world frame [m]; the target that sensors tell of is the nearest."""
+    """Power of a robot beside the work of its motors [W]."""
+    chargers: TupleOf[Vector] = ()
+    """Their positions, world frame [m]; the nearest is the target of the robot's sensors."""
     power: Annotated[NonNegative, Unit("W")] = 2.0
-    """Of a charger, shared by all who are near it [W]."""
+    """Of a charger, shared by all robots near it [W]."""
     most: Annotated[NonNegative, Unit("W")] = 0.2
-    """What a robot gets at most [W]."""
+    """Most power that a robot gets [W]."""
     reach: Annotated[Positive, Unit("m")] = 1.0
-    """Beyond this distance r it gets less, as (r/d)² [m]."""
+    """Distance r beyond which it gets less, as (r/d)² [m]."""
 
 
 class ColonyConfig(Settings):
-    """How a colony lives.
+    """Settings of a colony.
 
-    `evolution.population_size` is how many there may be at a time, and `evolution.generations` how
-    many intervals it lives.
+    `evolution.population_size` is the most robots at a time, and `evolution.generations` the number
+    of intervals.
     """
 
     interval: Annotated[Positive, Le(600), Unit("s")] = 10.0
-    """Births, deaths and matings take effect every so often [s]."""
+    """Time between the moments at which births, deaths and matings take effect [s]."""
     look: Annotated[Positive, Unit("s")] = 0.5
-    """How often it is looked who meets, and where everybody is [s]."""
+    """Time between samples of the robots' positions, by which they meet [s]."""
     touch: bool = True
-    """Whether robots touch each other, or pass through."""
+    """Whether robots are in contact with each other, or pass through."""
     arena: ArenaConfig = ArenaConfig()
     birth: BirthConfig = BirthConfig()
     mating: MatingConfig = MatingConfig()
     life: LifeConfig = LifeConfig()
     energy: EnergyConfig | None = None
-    """What robots live on; without it they need nothing."""
+    """Batteries and chargers; without it robots need no energy."""
 
     @model_validator(mode="after")
     def _check(self) -> ColonyConfig:
         if self.look > self.interval:
-            raise MisfitError(
+            raise ConstraintError(
                 "look", f"at most the interval ({self.interval:g} s)", f"{self.look:g}"
             )
         if 2 * self.birth.radius > self.arena.size:
             wide = f"at most half of the arena's size ({self.arena.size / 2:g} m)"
-            raise MisfitError("birth.radius", wide, f"{self.birth.radius:g}")
+            raise ConstraintError("birth.radius", wide, f"{self.birth.radius:g}")
         if self.energy is not None and self.energy.start > self.energy.capacity:
             most = f"at most the capacity ({self.energy.capacity:g} J)"
-            raise MisfitError("energy.start", most, f"{self.energy.start:g}")
+            raise ConstraintError("energy.start", most, f"{self.energy.start:g}")
         return self

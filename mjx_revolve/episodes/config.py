@@ -1,15 +1,16 @@
 """The configuration of a run: a small YAML file, checked before anything expensive starts.
 
-A file names the robot and the world, and says how the robot is controlled, what it has to do and
-how it is evolved. `load_config` reads one, applies overrides, checks every value and resolves the
-paths; `dump_config` writes the resolved values back, so that a run folder documents itself.
+A file names the robot and the world, its controller, its task and how it is evolved. `load_config`
+reads one, applies overrides, checks every value and resolves the paths; `dump_config` writes the
+resolved values back, so that a run folder documents itself.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,40 +26,29 @@ from pydantic import (
 )
 
 from mjx_revolve.body.sensors import SensorRow
+from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.episodes.bodies_config import BodiesConfig, LearningConfig, SelectionConfig
 from mjx_revolve.episodes.colony_config import ColonyConfig
-from mjx_revolve.episodes.config_paths import resolve_paths
 from mjx_revolve.episodes.measure_table import MEASURES
-from mjx_revolve.episodes.settings import Section, Settings, one_of
-from mjx_revolve.inputs.complaints import describe, find_problems, refuse
-from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.episodes.settings import File, NamedFile, Section, Settings, map_files, one_of
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
-from mjx_revolve.inputs.own_code import parse_own
 from mjx_revolve.inputs.schema import (
-    MisfitError,
+    ConstraintError,
+    Integer,
     NonNegative,
     Number,
     Positive,
-    Row,
+    TupleOf,
     Vector,
-    Whole,
     is_off,
     show,
     words,
 )
 from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
+from mjx_revolve.inputs.yaml_reader import load_yaml
 
-# What is of use to one kind of controller only; `control.kinds.CONTROLLERS` has the functions.
-CONTROLLERS: dict[str, tuple[str, ...]] = {
-    "cpg": (),
-    "sine": ("harmonics",),
-    "feedback": ("gain", "depth"),
-    "mlp": ("sensors", "hidden", "messages"),
-    "rnn": ("sensors", "hidden", "messages"),
-    "sensory_cpg": ("sensors", "gain"),
-    "splines": ("points",),
-    "brain": ("points",),
-}
 # What a task cannot do without; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {
     "directed_swim": (),
@@ -80,19 +70,19 @@ def _check_measure(name: str) -> str:
     if name not in MEASURES:
         near = difflib.get_close_matches(name, MEASURES, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
-        raise MisfitError("", f"one of {', '.join(MEASURES)}", show(name) + hint)
+        raise ConstraintError("", f"one of {', '.join(MEASURES)}", show(name) + hint)
     return name
 
 
 def _check_world(value: str | dict[str, Any]) -> str | dict[str, Any]:
     if value == "":
-        raise MisfitError("", "a name or a path", "an empty text")
+        raise ConstraintError("", "a name or a path", "an empty text")
     for key in value if isinstance(value, dict) else ():
         if not isinstance(key, str):
-            raise MisfitError(show(key), "the name of a setting", "a key that is no text")
+            raise ConstraintError(show(key), "the name of a setting", "a key that is no text")
     if isinstance(value, dict) and (not isinstance(value.get("name"), str) or not value["name"]):
         named = "a `name` (a world's name or path) beside the overrides"
-        raise MisfitError("", named, "none")
+        raise ConstraintError("", named, "none")
     return value
 
 
@@ -101,50 +91,52 @@ _World = Annotated[
     AfterValidator(_check_world),
     words("a world's name or path, or a mapping of name and overrides"),
 ]
+_Morphology = Annotated[str, MinLen(1), words("the path of a morphology YAML")]
+_Modules = Annotated[str, MinLen(1), words("the path of a YAML, or nothing")]
 
 
 class ControllerConfig(Section):
     """What turns genes into joint targets."""
 
-    type: Annotated[str, one_of(CONTROLLERS)] = "cpg"
+    type: Annotated[str, one_of(CONTROLLERS), File("code")] = "cpg"
     """`cpg`, `sine`, `feedback`, `mlp`, `rnn`, `sensory_cpg`, `splines`, `brain` (what the
     robot's YAML has under `brain`), or FILE.py:FUNCTION, a function of a plant and this section."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """The fastest oscillation [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0
     """Of each sine at most, as a fraction of the hinge's range, which clips their sum [-]."""
-    harmonics: Annotated[Whole, Ge(1), Le(8)] = 1
+    harmonics: Annotated[Integer, Ge(1), Le(8)] = 1
     """How many sines add up at each hinge; `type: sine` only [-]."""
     gain: Annotated[Positive, Unit("-")] = 2.0
     """Largest answer to an error of normal size, or to a sensor at the end of its range, as a
     share of the range; `type: feedback` and `sensory_cpg` [-]."""
     depth: Annotated[NonNegative, Unit("m")] | None = None
     """Depth that `type: feedback` holds; that of the task's start where none is given [m]."""
-    hidden: Annotated[Whole, Ge(1), Le(64)] = 8
+    hidden: Annotated[Integer, Ge(1), Le(64)] = 8
     """Units of the network that all joints share; `type: mlp` and `rnn` [-]."""
-    messages: Annotated[Whole, Ge(0), Le(8)] = 2
-    """How many numbers a joint tells its neighbours; `type: mlp` and `rnn` [-]."""
-    points: Annotated[Whole, Ge(3), Le(100)] = 8
+    messages: Annotated[Integer, Ge(0), Le(8)] = 2
+    """How many numbers a joint sends to its neighbours; `type: mlp` and `rnn` [-]."""
+    points: Annotated[Integer, Ge(3), Le(100)] = 8
     """Through which each joint's curve goes; `type: splines`, and `brain` where it has them [-]."""
     sensors: SensorRow | None = None
-    """What brains are told, kinds' names or mappings with fields of `Sensor`; by default the
-    robot's own `sensors`, or else `sensors.USUAL`."""
-    params: dict[str, Any] = Field({})
+    """The sensors of controllers, kinds' names or mappings with fields of `Sensor`; by default the
+    robot's own `sensors`, or else `sensors.DEFAULT_SENSORS`."""
+    params: Annotated[dict[str, Any], File("data")] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
         self.refuse_params(self.params)
-        for name in dict.fromkeys(name for names in CONTROLLERS.values() for name in names):
-            kinds = [kind for kind, names in CONTROLLERS.items() if name in names]
+        for name in dict.fromkeys(x for kind in CONTROLLERS.values() for x in kind.settings):
+            kinds = [key for key, kind in CONTROLLERS.items() if name in kind.settings]
             usual, found = type(self).model_fields[name].default, getattr(self, name)
-            if found == usual or self.type in kinds or self.is_own:
+            if found == usual or self.type in kinds or self.is_user_code:
                 continue
             usual = "null" if usual is None else f"{usual:g}"
             have = f"type {kinds[0]} has" if len(kinds) == 1 else f"types {', '.join(kinds)} have"
             only = f"as only {have} it (--set controller.{name}={usual})"
             shown = f"{len(found)} of them" if isinstance(found, tuple) else f"{found:g}"
-            raise MisfitError(name, f"{usual}, {only}", shown)
+            raise ConstraintError(name, f"{usual}, {only}", shown)
         return self
 
 
@@ -175,7 +167,7 @@ def _read_robust(value: Any) -> Any:
 class TaskConfig(Section):
     """What the robot is scored for, and how its episodes start."""
 
-    type: Annotated[str, one_of(TASKS)]
+    type: Annotated[str, one_of(TASKS), File("code")]
     """`directed_swim` (along `direction`, over ground), `speed` (through the water, any way),
     `reach_target`, `hold_depth`, `hold_heading`, `follow_course`, `search`, `escape`, `follow_bed`,
     `crawl`, or FILE.py:FUNCTION, a function like those in `tasks`."""
@@ -183,7 +175,7 @@ class TaskConfig(Section):
     """Length of an episode [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
     """Time at the start of an episode that does not count [s]."""
-    trials: Annotated[Whole, Ge(1)] = 2
+    trials: Annotated[Integer, Ge(1)] = 2
     """Episodes averaged per individual, each from its own start [-]."""
     direction: Annotated[Vector, Unit("-")] = (1.0, 0.0, 0.0)
     """Where to swim, world frame; the length does not matter [-]."""
@@ -201,13 +193,13 @@ class TaskConfig(Section):
     """Makes the target a pursuer, which swims at the robot with `target_speed` and turns this fast
     at most; `escape` needs it [rad/s]."""
     sight: Annotated[Positive, Unit("m")] | None = None
-    """From how far away the target is felt, by default from anywhere; `search` needs it [m]."""
+    """The distance up to which the target is sensed, by default any; `search` needs it [m]."""
     touch: Annotated[Positive, Unit("m")] = 0.1
     """How near the target touches the core's centre, for `search` and `escape` [m]."""
     course_spread: Annotated[Positive, Le(math.pi), Unit("rad")] | None = None
     """Within which angle of `direction`, seen from above, to both sides, each episode's course is
     drawn; `follow_course` needs it [rad]."""
-    course_changes: Annotated[Whole, Ge(0), Le(16)] = 0
+    course_changes: Annotated[Integer, Ge(0), Le(16)] = 0
     """How often in an episode the course turns at once, at moments drawn between `settle` and
     `duration` [-]."""
     course_turn: Annotated[Positive, Le(math.pi), Unit("rad")] = math.pi
@@ -238,9 +230,9 @@ class TaskConfig(Section):
     robust: Annotated[RobustConfig | None, BeforeValidator(_read_robust)] = None
     """`true`, or ranges: coefficients of water and motors are drawn anew in each generation, for
     each trial, the same for all individuals, so that champions do not live on one number."""
-    measures: Row[Annotated[str, AfterValidator(_check_measure)]] = ()
+    measures: TupleOf[Annotated[str, AfterValidator(_check_measure)]] = ()
     """What is measured beside what always is, names of `measure_table.MEASURES`."""
-    params: dict[str, Any] = Field({})
+    params: Annotated[dict[str, Any], File("data")] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 
     @model_validator(mode="after")
@@ -248,33 +240,35 @@ class TaskConfig(Section):
         self.refuse_params(self.params)
         if self.settle >= self.duration:
             below = f"a time below task.duration ({self.duration:g} s)"
-            raise MisfitError("settle", below, f"{self.settle:g}")
+            raise ConstraintError("settle", below, f"{self.settle:g}")
         for name in TASKS.get(self.type, ()):
             if getattr(self, name) is None:
                 field = type(self).model_fields[name]
                 what = describe(Annotated[(field.annotation, field)]).removesuffix(", or nothing")
-                raise MisfitError(name, f"{what}, because task.type is {self.type}", "none")
+                raise ConstraintError(name, f"{what}, because task.type is {self.type}", "none")
         found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
         if len(found) > 1:
-            raise MisfitError("target", "none, as there is a target_distance", "one")
+            raise ConstraintError("target", "none, as there is a target_distance", "one")
         if not found and self.type in _TO_TARGETS:
             what = f"three numbers [m], or target_distance, because task.type is {self.type}"
-            raise MisfitError("target", what, "none")
+            raise ConstraintError("target", what, "none")
         if self.target_turn is not None and self.target_speed == 0:
             what = "a speed > 0 [m/s], as with target_turn the target is a pursuer"
-            raise MisfitError("target_speed", what, "0")
+            raise ConstraintError("target_speed", what, "0")
         if self.target_turn is not None and not found:
             what = "three numbers [m], or target_distance, as there is a target_turn"
-            raise MisfitError("target", what, "none")
+            raise ConstraintError("target", what, "none")
         if self.course_spread is None and (self.course_changes or self.course_rate):
             name = "course_changes" if self.course_changes else "course_rate"
             what = "0, as there is no course without a course_spread"
-            raise MisfitError(name, what, show(getattr(self, name)))
+            raise ConstraintError(name, what, show(getattr(self, name)))
         if self.course_spread is not None and math.hypot(*self.direction[:2]) < 1e-9:
             what = "one that is not upright, as there is a course_spread, which is level"
-            raise MisfitError("direction", what, show(list(self.direction)))
+            raise ConstraintError("direction", what, show(list(self.direction)))
         if math.hypot(*self.direction) < 1e-9:
-            raise MisfitError("direction", "a vector of some length", show(list(self.direction)))
+            raise ConstraintError(
+                "direction", "a vector of some length", show(list(self.direction))
+            )
         return self
 
 
@@ -283,14 +277,14 @@ class EvolutionConfig(Settings):
 
     strategy: Annotated[str, MinLen(1)] = "CMA_ES"
     """Name of an evosax strategy; `mjx_revolve.evolution.strategies.STRATEGIES` lists them."""
-    population_size: Annotated[Whole, Ge(4)] = 64
-    generations: Annotated[Whole, Ge(1)] = 60
-    seed: Annotated[Whole, Ge(0), Lt(2**32)] = 0
+    population_size: Annotated[Integer, Ge(4)] = 64
+    generations: Annotated[Integer, Ge(1)] = 60
+    seed: Annotated[Integer, Ge(0), Lt(2**32)] = 0
     std_init: Annotated[Positive, Unit("-")] = 0.5
     """Standard deviation of the first population's genes [-]."""
-    checkpoint_every: Annotated[Whole, Ge(1)] = 5
+    checkpoint_every: Annotated[Integer, Ge(1)] = 5
     """Generations between checkpoints."""
-    keep_checkpoints: Annotated[Whole, Ge(1)] = 3
+    keep_checkpoints: Annotated[Integer, Ge(1)] = 3
     """How many of the newest checkpoints are kept."""
     tensorboard: bool = False
     """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
@@ -301,15 +295,15 @@ class EvolutionConfig(Settings):
 class Config(Settings):
     """A whole run. Paths are absolute once it went through `make_config` or `load_config`."""
 
-    morphology: Annotated[str, MinLen(1), words("the path of a morphology YAML")] | None = None
+    morphology: Annotated[_Morphology | None, File("morphology")] = None
     """The robot: a morphology YAML; none where bodies evolve."""
-    modules: Annotated[str, MinLen(1), words("the path of a YAML, or nothing")] | None = None
+    modules: Annotated[_Modules | None, File("modules")] = None
     """The user's own module types: a YAML, or None."""
     allow_overlap: bool = False
     """Whether modules may overlap."""
     trim: Literal["neutral", "none"] = "none"
     """`neutral` adds to the core the electronics volume that lets it hover."""
-    world: _World
+    world: Annotated[_World, File("world")]
     """A world's name or path, or a mapping of `name` and overrides for `load_world`."""
     engine: Literal["population", "mjx"] = "population"
     """`population` steps the whole population at once; `mjx` is MJX's own step, the reference."""
@@ -328,40 +322,39 @@ class Config(Settings):
         if self.bodies is None:
             if self.morphology is None:
                 what = "the path of a morphology YAML, or bodies: how they evolve"
-                raise MisfitError("morphology", what, "nothing")
+                raise ConstraintError("morphology", what, "nothing")
             return self
         if self.morphology is not None:
             what = "none, as bodies evolve (bodies.seeds names robots to begin with)"
-            raise MisfitError("morphology", what, self.morphology)
+            raise ConstraintError("morphology", what, self.morphology)
         if self.controller.type == "brain":
             what = "another one, as bodies evolve, and no brain of a file fits them"
-            raise MisfitError("controller.type", what, "brain")
+            raise ConstraintError("controller.type", what, "brain")
         if self.engine != "population":
-            raise MisfitError("engine", "population, as bodies evolve", self.engine)
+            raise ConstraintError("engine", "population, as bodies evolve", self.engine)
         for name in ("strategy", "strategy_params"):
             usual, found = EvolutionConfig.model_fields[name].default, getattr(self.evolution, name)
             if found != usual:
                 what = f"{usual!r}, as bodies evolve (see bodies.selection and bodies.learning)"
-                raise MisfitError(f"evolution.{name}", what, repr(found))
+                raise ConstraintError(f"evolution.{name}", what, repr(found))
         return self
 
     def _check_colony(self) -> None:
         """Refuses what a colony has no use for."""
         if self.bodies is None:
-            raise MisfitError("bodies", "how bodies evolve, as there is a colony", "nothing")
+            raise ConstraintError("bodies", "how bodies evolve, as there is a colony", "nothing")
         for name, usual in (("learning", LearningConfig()), ("selection", SelectionConfig())):
             if getattr(self.bodies, name) != usual:
-                what = "nothing, as in a colony who meets has children, and nobody is taught"
-                raise MisfitError(f"bodies.{name}", what, "some settings")
+                what = "nothing, as in a colony robots that meet have children, and learn nothing"
+                raise ConstraintError(f"bodies.{name}", what, "some settings")
         if self.bodies.archive is not None:
-            raise MisfitError("bodies.archive", "none, as there is a colony", "one")
+            raise ConstraintError("bodies.archive", "none, as there is a colony", "one")
         assert self.colony is not None
         if self.colony.birth.initial > self.evolution.population_size:
             most = f"at most evolution.population_size ({self.evolution.population_size})"
-            raise MisfitError("colony.birth.initial", most, str(self.colony.birth.initial))
+            raise ConstraintError("colony.birth.initial", most, str(self.colony.birth.initial))
 
     _source: str = PrivateAttr("config")
-    _written: dict[str, Any] = PrivateAttr(default_factory=dict)
 
     @property
     def source(self) -> str:
@@ -369,14 +362,20 @@ class Config(Settings):
         return self._source
 
     @property
-    def written(self) -> dict[str, Any]:
-        """The values as they were written, overrides applied, before paths were resolved."""
-        return self._written
-
-    @property
     def name(self) -> str:
         """A short name: the file's name without its suffix."""
         return Path(self._source).stem
+
+    @property
+    def files(self) -> tuple[NamedFile, ...]:
+        """The files that the settings name."""
+        found: list[NamedFile] = []
+        map_files(self.model_dump(), found.append, Config)
+        return tuple(found)
+
+    def with_files(self, change: Callable[[NamedFile], str]) -> Config:
+        """The same with other files; `change` gives a setting's new text."""
+        return make_config(map_files(self.model_dump(), change, Config), "/", source=self.source)
 
     def for_body(self, morphology: str | Path) -> Config:
         """The same for one body alone, from a morphology's path; only its brain would evolve."""
@@ -427,21 +426,34 @@ def make_config(
     merged = copy_plain(data)
     for key, value in settings.items():
         merge_override(merged, key, value, label, named=("world",))
-    written = copy_plain(merged)
 
     def origin(place: str) -> tuple[Path, str]:
         typed = sets(settings, place)
         return (Path.cwd(), f"{label} ") if typed else (Path(folder), f"{source}: ")
 
-    resolve_paths(merged, origin)
+    merged = map_files(merged, lambda file: _resolve(file, *origin(file.place)), Config)
     try:
         config = Config.model_validate(merged)
     except ValidationError as error:
         problems = find_problems(error, Config, merged)
         raise refuse(problems, lambda place: origin(place)[1]) from None
     config._source = source
-    config._written = written
     return config
+
+
+def _resolve(file: NamedFile, folder: Path, before: str) -> str:
+    """The setting with an absolute path; `before` stands before its place in messages."""
+    if file.kind == "data":
+        return file.text
+    found = folder / Path(file.path).expanduser()
+    if file.kind == "morphology":
+        named = Path(file.path).expanduser()
+        found = find_shipped(named, "morphologies", folder, before + file.place)
+    path = Path(os.path.abspath(found))
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "none"
+        raise InputError(f"{before}{file.place}: expected a file; found {what} at {path}")
+    return file.at(path)
 
 
 def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) -> Config:
@@ -497,22 +509,11 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
         The YAML text; `load_config` reads it back equal.
     """
 
-    def shorten(path: str | None) -> str | None:
-        if path and folder is not None and Path(path).is_relative_to(Path(folder).absolute()):
-            return Path(path).relative_to(Path(folder).absolute()).as_posix()
-        return path
+    def shorten(file: NamedFile) -> str:
+        path, root = Path(file.path), Path(folder or "").absolute()
+        if folder is None or file.kind == "data" or not path.is_relative_to(root):
+            return file.text
+        return file.at(path.relative_to(root).as_posix())
 
-    data = copy_plain(config.model_dump())
-    data["morphology"] = shorten(data["morphology"])
-    data["modules"] = shorten(data["modules"])
-    bodies = data["bodies"]
-    if bodies is not None:
-        bodies["seeds"] = [shorten(path) for path in bodies["seeds"]]
-        own = parse_own(bodies["genotype"])
-        if own is not None:
-            bodies["genotype"] = f"{shorten(own.path)}:{own.function}"
-    for section in ("controller", "task"):
-        own = parse_own(data[section]["type"])
-        if own is not None:
-            data[section]["type"] = f"{shorten(own.path)}:{own.function}"
+    data = map_files(copy_plain(config.model_dump()), shorten, Config)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None)

@@ -1,4 +1,4 @@
-"""Episodes step by step, for those who learn while they act: observation, action, reward.
+"""Episodes step by step, for learning while acting: observation, action, reward.
 
 An `Environment` is two pure functions over environments on the last axis: `start` begins episodes,
 `step` holds an action for a control period. Each lane is an episode of its own, with a clock of its
@@ -22,59 +22,44 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
 
-from mjx_revolve.control.sense import Memory, feel, remember, start_memory
-from mjx_revolve.control.sensors import Observer, make_observer, with_types
+from mjx_revolve.control.sensors import Observer, make_observer, resolve_sensors
 from mjx_revolve.episodes.config import make_config
-from mjx_revolve.episodes.evaluation import Setup, make_recorder, recall_pursuer, record_cues
+from mjx_revolve.episodes.evaluation import Episodes, task_recorder
 from mjx_revolve.episodes.fitness import Fitness, read_modules
-from mjx_revolve.episodes.rollout import flow_at
-from mjx_revolve.episodes.scoring import WORST, first_counted, score_episodes
-from mjx_revolve.episodes.starts import Starts, cues_of, draw_starts, gusty_water, start_pose
+from mjx_revolve.episodes.rollout import (
+    Rollout,
+    RolloutState,
+    StepInputs,
+    held,
+    start_at_rest,
+)
+from mjx_revolve.episodes.scoring import extend_track
+from mjx_revolve.episodes.starts import Starts, draw_starts, gust_rows
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import fused_scan, share_once
-from mjx_revolve.water.flow import Water, water_of
 
 _USUAL_RATE = 20.0  # control steps in a second, a choice: ten to a stroke of 2 Hz [Hz]
-
-# What stands still has none of: these rows are 0 where the score so far looks ahead.
-RATES = ("energy", "water_velocity")
 
 
 class EnvironmentState(NamedTuple):
     """Episodes under way, the environments on the last axis of every array.
 
     Attributes:
-        body: the engine's state.
-        memory: what is kept of what is felt.
-        seen: what the observer keeps.
-        starts: of the episodes, `[..., lanes]`.
-        place: `[3, lanes]` where the cores started, world frame [m].
-        rows: the track so far, `[S, ..., lanes]` each; rows to come repeat the present.
-        energy: `[lanes]` work since the last whole row [J].
-        score: `[lanes]` so far.
-        clock: `[lanes]` timesteps since the start, int32.
-        seed: `[lanes]` of the environment, uint32.
-        episode: `[lanes]` which of that seed's, int32.
-        ended: `[lanes]` whether the episode is over.
+        episodes: their rollouts, tracks and scores; the controller state is the observer's.
+        seed: of the environment.
+        episode: which of that seed's.
+        ended: whether the episode is over.
     """
 
-    body: Any
-    memory: Memory
-    seen: Any
-    starts: Starts
-    place: jax.Array
-    rows: dict[str, jax.Array]
-    energy: jax.Array
-    score: jax.Array
-    clock: jax.Array
-    seed: jax.Array
-    episode: jax.Array
-    ended: jax.Array
+    episodes: Episodes
+    seed: UInt[Array, " lanes"]
+    episode: Int[Array, " lanes"]
+    ended: Bool[Array, " lanes"]
 
 
-class Outcome(NamedTuple):
-    """What comes of a control step, `[lanes]` each.
+class StepResult(NamedTuple):
+    """What comes of a control step.
 
     Attributes:
         reward: see this module's head.
@@ -83,10 +68,10 @@ class Outcome(NamedTuple):
         score: so far; the episode's where it is over.
     """
 
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    score: jax.Array
+    reward: Float[Array, " lanes"]
+    terminated: Bool[Array, " lanes"]
+    truncated: Bool[Array, " lanes"]
+    score: Float[Array, " lanes"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +79,7 @@ class Environment:
     """Steps episodes of one body; all functions are pure, for chunks of lanes (see `over_chunks`).
 
     Attributes:
-        setup: what all episodes have in common.
+        fitness: of the body; of its controller only the declared sensors are used.
         observer: of the declared sensors, which are read once in each control period.
         every: timesteps in a control period.
         observation_names: `[k]` of the numbers of an observation: those of the robot as a whole,
@@ -102,7 +87,7 @@ class Environment:
         action_names: `[n]` of the actuators, in the robot's order: hinges, then thrusters.
     """
 
-    setup: Setup
+    fitness: Fitness
     observer: Observer
     every: int
     observation_names: tuple[str, ...]
@@ -111,195 +96,133 @@ class Environment:
     @property
     def control_rate(self) -> float:
         """Control steps in a second [Hz]."""
-        return 1 / (self.every * self.setup.world.timestep)
+        return 1 / (self.every * self.fitness.world.timestep)
 
     @property
     def num_steps(self) -> int:
         """Control steps of an episode."""
-        return self.setup.num_records * self.setup.record_every // self.every
+        return self.fitness.num_timesteps // self.every
 
-    def start(self, seed: jax.Array, episode: jax.Array) -> EnvironmentState:
+    def start(self, seed: UInt[Array, " lanes"], episode: Int[Array, " lanes"]) -> EnvironmentState:
         """Episodes at their starts.
 
         An episode starts as the first of `fold_in(key(seed), episode)` does in a fitness of one
         trial.
 
         Args:
-            seed: `[lanes]` uint32.
-            episode: `[lanes]` which of that seed's, int32.
+            seed: of the environments.
+            episode: which of that seed's.
 
         Returns:
             The state.
         """
-        setup, engine, feels = self.setup, self.setup.engine_of(None), self.observer.feels
+        fitness, engine = self.fitness, self.fitness.engine
         starts = jax.vmap(self._draw, in_axes=-1, out_axes=-1)(seed, episode)
-        figure = setup.figure_of(None)
-        root = start_pose(setup.task, setup.settings, setup.world, figure, starts)
-        hinges = jnp.zeros((engine.plant.num_hinges, root.shape[-1]), root.dtype)
-        qvel = jnp.concatenate([jnp.zeros_like(root[:6]), hinges])
-        body = engine.init(jnp.concatenate([root, hinges]), qvel)
-        none = jnp.zeros_like(root[0])
-
-        def lanes_of(x: jax.Array) -> jax.Array:
-            return jnp.broadcast_to(x, (*x.shape, *none.shape)) if x.ndim == 0 else x
-
-        seen = jax.tree.map(lanes_of, self.observer.init(engine.joints(body)[0]))
-        count = jnp.zeros(none.shape, jnp.int32)
-        memory = start_memory(feels, engine, body, cues_of(setup.settings, starts, root[:3]))
-        state = EnvironmentState(
-            body, memory, seen, starts, root[:3], {}, none, none, count,
-            seed, episode, count > 0,
-        )  # fmt: skip
-        still = jnp.zeros((engine.plant.num_rows, *none.shape), none.dtype)
-        present = jax.eval_shape(lambda: self._record(state, still))
-        shape = (setup.num_records,)
-        rows = {name: jnp.zeros(shape + x.shape, x.dtype) for name, x in present.items()}
-        return state._replace(rows=rows)
+        root = fitness.start_pose(fitness.geometry, starts)
+        still = jnp.zeros((engine.plant.num_rows, root.shape[-1]), root.dtype)
+        rollout = self._rollout(starts, root[:3], still)
+        body = start_at_rest(engine, root)
+        now = rollout.init(body, self.observer.init(engine.joints(body)[0]))
+        row = lambda: task_recorder(engine, fitness.task, fitness.world)(  # noqa: E731
+            now, still, rollout.water_at(now.steps, now, self._inputs(starts, seed * 0))
+        )
+        episodes = fitness.init_episodes(now, starts, root[:3], row)
+        return EnvironmentState(episodes, seed, episode, jnp.zeros(seed.shape, bool))
 
     def _draw(self, seed: jax.Array, episode: jax.Array) -> Starts:
         """The start of one episode."""
-        task = self.setup.settings.model_copy(update={"trials": 1})
+        fitness = self.fitness
+        task = fitness.settings.model_copy(update={"trials": 1})
         key = jax.random.fold_in(jax.random.key(seed), episode)
         steps = self.num_steps * self.every
-        return jax.tree.map(lambda x: x[..., 0], draw_starts(task, self.setup.world, key, steps))
+        return jax.tree.map(lambda x: x[..., 0], draw_starts(task, fitness.world, key, steps))
 
-    def observe(self, state: EnvironmentState) -> tuple[EnvironmentState, jax.Array]:
-        """What the robots are told now; once after each start or step.
+    def _rollout(
+        self, starts: Starts, position: jax.Array, ctrl: jax.Array, clock: Any = None
+    ) -> Rollout:
+        """A rollout under constant commands, `clock` timesteps after the start."""
+        fitness, signals = self.fitness, self.observer.signals
+        return fitness.make_rollout(fitness.engine, held(ctrl), signals, starts, position, clock)
+
+    def _inputs(self, starts: Starts, clock: Int[Array, " lanes"]) -> StepInputs:
+        """The water of a timestep; in gusts, of the last one after the end."""
+        last = jnp.minimum(clock, self.num_steps * self.every - 1)
+        rows = gust_rows(self.fitness.world, starts, 1, last)
+        return StepInputs(jax.tree.map(lambda x: x[0], rows))
+
+    def _at(
+        self, episodes: Episodes, ctrl: Any, clock: Int[Array, " lanes"]
+    ) -> tuple[Rollout, RolloutState]:
+        """The rollout, and its state as that of its first step."""
+        rollout = self._rollout(episodes.starts, episodes.position, ctrl, clock)
+        return rollout, episodes.rollout._replace(steps=jnp.zeros((), jnp.int32))
+
+    def observe(self, state: EnvironmentState) -> tuple[EnvironmentState, Float[Array, "k lanes"]]:
+        """The observations; once after each start or step.
 
         Args:
             state: of the episodes.
 
         Returns:
-            The state, and `[k, lanes]` numbers between -1 and 1 (see `sensors.Observer`); 0 for
-            what is no number, as in a rollout that blew up.
+            The state, and numbers between -1 and 1 (see `sensors.Observer`); 0 for what is no
+            number, as in a rollout that blew up.
         """
-        setup, engine = self.setup, self.setup.engine_of(None)
-        time = state.clock.astype(state.energy.dtype) * setup.world.timestep
-        water = flow_at(setup.world, self._water(state, state.clock))(time, None)
-        cues = cues_of(setup.settings, state.starts, state.place)
-        sense = feel(
-            setup.world, engine, state.body, water, time, cues, state.memory, self.observer.feels
-        )
-        number = jnp.asarray(engine.plant.source[: engine.plant.num_hinge_rows])
-        seen, found = self.observer.observe(state.seen, time, sense, number)
-        told = [jnp.broadcast_to(x, time.shape) for x in found.robot]
-        order = np.argsort(engine.plant.source[: engine.plant.num_hinge_rows, 0])
-        told += [x[row] for row in order for x in found.joint]
-        whole = jnp.stack(told) if told else jnp.zeros((0, *time.shape), time.dtype)
+        plant, episodes = self.fitness.engine.plant, state.episodes
+        clock, seen = episodes.rollout.steps, episodes.rollout.controller_state
+        rollout, now = self._at(episodes, None, clock)
+        time, _, readings = rollout.read(now, self._inputs(episodes.starts, clock))
+        number = jnp.asarray(plant.source[: plant.num_hinge_rows])
+        seen, found = self.observer.observe(seen, time, readings, number)
+        numbers = [jnp.broadcast_to(x, time.shape) for x in found.robot]
+        order = np.argsort(plant.source[: plant.num_hinge_rows, 0])
+        numbers += [x[row] for row in order for x in found.joint]
+        whole = jnp.stack(numbers) if numbers else jnp.zeros((0, *time.shape), time.dtype)
         # Rounding may leave the end of a range by the last bit.
         whole = jnp.where(jnp.isfinite(whole), jnp.clip(whole, -1, 1), 0.0)
-        return state._replace(seen=seen), whole
+        episodes = episodes._replace(rollout=episodes.rollout._replace(controller_state=seen))
+        return state._replace(episodes=episodes), whole
 
-    def step(self, state: EnvironmentState, action: jax.Array) -> tuple[EnvironmentState, Outcome]:
+    def step(
+        self, state: EnvironmentState, action: Float[Array, "n lanes"]
+    ) -> tuple[EnvironmentState, StepResult]:
         """A control period.
 
         Args:
             state: of the episodes.
-            action: `[n, lanes]` between -1 and 1, in the robot's order: ends of each hinge's range
-                of targets and of each thruster's of commands, held for the period. What is beyond
-                is clipped.
+            action: between -1 and 1, in the robot's order: ends of each hinge's range of targets
+                and of each thruster's of commands, held for the period. What is beyond is clipped.
 
         Returns:
-            The state, and what came of it. Episodes that were over go on all the same.
+            The state, and the result. Episodes that were over go on all the same.
         """
-        setup, engine = self.setup, self.setup.engine_of(None)
-        asked = engine.plant.arrange(jnp.clip(action, -1, 1))
-        ctrl = engine.plant.middle(asked) + engine.plant.reach(asked) * asked
-        body, memory, work = self._hold(state, ctrl)
-        state = state._replace(
-            body=body, memory=memory, energy=state.energy + work, clock=state.clock + self.every
+        fitness, episodes, plant = self.fitness, state.episodes, self.fitness.engine.plant
+        share = plant.arrange(jnp.clip(action, -1, 1))
+        ctrl = plant.middle(share) + plant.reach(share) * share
+        before, starts = episodes.rollout, episodes.starts
+        rollout, now = self._at(episodes, ctrl, before.steps)
+        inputs = StepInputs(gust_rows(fitness.world, starts, self.every, before.steps))
+        now = now._replace(controller_state=())
+        now, _ = rollout.advance(now, lambda *_: (), 1, self.every, inputs)
+        clock = before.steps + self.every
+        now = now._replace(
+            controller_state=before.controller_state, energy=before.energy + now.energy, steps=clock
         )
-        row = (state.clock - 1) // setup.record_every
-        rows = {
-            name: _fill(state.rows[name], x, row, name in RATES)
-            for name, x in self._record(state, ctrl).items()
-        }
-        whole = state.clock % setup.record_every == 0
-        cues = cues_of(setup.settings, state.starts, state.place)
-        found = score_episodes(
-            setup.task,
-            setup.settings,
-            setup.world,
-            record_cues(setup, rows, cues),
-            state.place,
-            setup.figure_of(None),
+        episodes = episodes._replace(rollout=now)
+
+        rollout, present = self._at(episodes, ctrl, clock - 1)
+        water = rollout.water_at(present.steps, present, self._inputs(starts, clock - 1))
+        recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
+        row = {name: x[None] for name, x in recorder(present, ctrl, water).items()}
+        track = extend_track(episodes.track, row, (clock - 1) // fitness.record_every)
+        score, sane = fitness.score_so_far(
+            track, episodes.position, fitness.geometry, rollout.context, clock
         )
-        first = first_counted(setup.settings, setup.world.timestep)
-        counts = state.clock >= (first + 1) * setup.record_every
-        score = jnp.where(found.sane, jnp.where(counts, found.score, 0.0), WORST)
-        over = state.clock >= self.num_steps * self.every
-        outcome = Outcome(score - state.score, ~found.sane, over & found.sane, score)
-        state = state._replace(
-            rows=rows,
-            energy=jnp.where(whole, 0.0, state.energy),
-            score=score,
-            ended=over | ~found.sane,
-        )
-        return state, outcome
-
-    def _water(self, state: EnvironmentState, count: jax.Array) -> Water:
-        """The water of a timestep, the sea's own time not added; `count`: `[lanes]`."""
-        world, starts = self.setup.world, state.starts
-        if starts.gusts is None:
-            return water_of(world) if starts.water is None else starts.water
-        rows = self._gusts(state, jnp.minimum(count, starts.gusts.shape[0] - 2), 1)
-        return jax.tree.map(lambda x: x[0], rows)
-
-    def _gusts(self, state: EnvironmentState, count: jax.Array, steps: int) -> Water:
-        """Water `[steps, lanes]` along the paths of gusts."""
-        gusts, shape = state.starts.gusts, (steps, *count.shape)
-        assert gusts is not None
-        index = jnp.minimum(count + jnp.arange(steps + 1)[:, None], gusts.shape[0] - 1)
-        path = jnp.take_along_axis(gusts, index[:, None], 0)
-        water = gusty_water(self.setup.world, path, state.starts.water)
-        return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, path.dtype), shape), water)
-
-    def _hold(self, state: EnvironmentState, ctrl: jax.Array) -> tuple[Any, Memory, jax.Array]:
-        """Body and memory after a control period, and the work done in it [J]."""
-        world, engine = self.setup.world, self.setup.engine_of(None)
-        dt, still = world.timestep, self._water(state, state.clock)
-        cues = cues_of(self.setup.settings, state.starts, state.place)
-        rows = None
-        if state.starts.gusts is not None:
-            rows = self._gusts(state, state.clock, self.every)
-
-        def tick(carry: Any, row: Any) -> tuple[Any, None]:
-            body, memory, energy, count = carry
-            time = (state.clock + count).astype(energy.dtype) * dt
-            water = flow_at(world, still if row is None else row)(time, None)
-            before = engine.root(body)
-            motion = engine.motions(body) if memory.past is not None else None
-            body, power = engine.step(body, ctrl, water)
-            work = dt * power
-            after = engine.root(body)
-            memory = remember(memory, before, after, ctrl, work, dt, motion, cues)
-            return (body, memory, energy + work, count + 1), None
-
-        carry = (state.body, state.memory, jnp.zeros_like(state.energy), jnp.zeros((), jnp.int32))
-        first = None if rows is None else jax.tree.map(lambda x: x[0], rows)
-        if engine.fuses:
-            step, pack, unpack = fused_scan(tick, carry, first)
-            packed, _ = jax.lax.scan(step, pack(carry), rows, length=self.every)
-            body, memory, work, _ = unpack(packed)
-        else:
-            (body, memory, work, _), _ = jax.lax.scan(share_once(tick), carry, rows, self.every)
-        return body, memory, work
-
-    def _record(self, state: EnvironmentState, ctrl: jax.Array) -> dict[str, jax.Array]:
-        """What the task has recorded of the present, `[..., lanes]` each."""
-        setup, engine = self.setup, self.setup.engine_of(None)
-        last = jnp.maximum(state.clock - 1, 0)
-        time = last.astype(state.energy.dtype) * setup.world.timestep
-        water = flow_at(setup.world, self._water(state, last))(time, None)
-        record = make_recorder(engine, setup.task, setup.world)
-        return recall_pursuer(record(state.body, ctrl, state.energy, water), state.memory)
-
-
-def _fill(rows: jax.Array, now: jax.Array, row: jax.Array, ceases: bool) -> jax.Array:
-    """`[S, ..., lanes]` rows, the present in its own and in all that are to come."""
-    index = jnp.arange(rows.shape[0]).reshape(-1, *[1] * (rows.ndim - 1))
-    later = jnp.where(index == row, now, 0.0) if ceases else now
-    return jnp.where(index >= row, later, rows)
+        over = clock >= self.num_steps * self.every
+        result = StepResult(score - episodes.score, ~sane, over & sane, score)
+        whole = clock % fitness.record_every == 0
+        now = now._replace(energy=jnp.where(whole, 0.0, now.energy))
+        episodes = episodes._replace(rollout=now, track=track, score=score)
+        return state._replace(episodes=episodes, ended=over | ~sane), result
 
 
 def make_environment(
@@ -312,7 +235,7 @@ def make_environment(
         control_rate: actions in a second [Hz]; by default the one nearest to 20. Rows of the
             track, which tasks see every 0.1 s or so, hold a whole number of control periods.
         sensors: as `controller.sensors` would have them; by default these, which only some types of
-            controllers may have, or else the robot's own, or else `sensors.USUAL`.
+            controllers may have, or else the robot's own, or else `sensors.DEFAULT_SENSORS`.
 
     Returns:
         The environment.
@@ -321,7 +244,7 @@ def make_environment(
         InputError: such a rate is not possible, a sensor is none, there is nothing to act with, or
             nothing to see.
     """
-    setup, config, body = fitness.setup, fitness.config, fitness.robot.morphology
+    config, body = fitness.config, fitness.robot.morphology
     if config.engine != "population":
         raise InputError(
             f"{config.source}: engine: expected population, to step environments; found "
@@ -332,15 +255,15 @@ def make_environment(
         raise InputError(
             f"{config.source}: morphology: expected a hinge or a thruster to act with; found none"
         )
-    every = _period(control_rate, setup.record_every, setup.world.timestep)
+    every = _period(control_rate, fitness.record_every, fitness.world.timestep)
     declared = config.controller.sensors
     if sensors is not None:
         data = config.model_dump() | {"controller": {"type": "mlp", "sensors": list(sensors)}}
         declared = make_config(data, "/", source=config.source).controller.sensors
     elif declared is None:
         declared = body.sensors
-    declared = with_types(declared, read_modules(config), config.source)
-    observer = make_observer(declared, every * setup.world.timestep, plant)
+    declared = resolve_sensors(declared, read_modules(config), config.source)
+    observer = make_observer(declared, every * fitness.world.timestep, plant)
     hinges = plant.names[: plant.num_hinges]
     joints = [f"{name} {joint}" for joint in hinges for name in observer.joint_names]
     names = (*observer.robot_names, *joints)
@@ -349,7 +272,7 @@ def make_environment(
             f"{config.source}: controller.sensors: expected some that this robot can have; found "
             "none"
         )
-    return Environment(setup, observer, every, names, plant.names)
+    return Environment(fitness, observer, every, names, plant.names)
 
 
 def _period(rate: float | None, record_every: int, timestep: float) -> int:

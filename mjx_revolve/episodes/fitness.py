@@ -23,81 +23,63 @@ from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.edits import add_module, replace_module
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
-from mjx_revolve.control.controller import Controller, as_plant, bind_genes, gene_places
+from mjx_revolve.control.controller import Controller, as_plant, bind_genes, gene_indices
 from mjx_revolve.control.kinds import find_controller
-from mjx_revolve.control.sense import Cues
-from mjx_revolve.control.sensors import with_types
-from mjx_revolve.engine.batch import Bodies, Capacity, fit_capacity, pack_bodies
-from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.kinematics import body_positions
-from mjx_revolve.engine.plant import Plant, actuators_of, figure_of
+from mjx_revolve.control.readings import EpisodeContext, SensorMemory
+from mjx_revolve.control.sensors import resolve_sensors
+from mjx_revolve.engine.batch import Capacity, PackedBodies, fit_capacity, pack_bodies
+from mjx_revolve.engine.batched_trees import make_batched_trees
+from mjx_revolve.engine.engines import Engine, make_engine
+from mjx_revolve.engine.kinematics import body_poses
+from mjx_revolve.engine.plant import BodyGeometry, Plant, actuators_of, body_geometry
+from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
-from mjx_revolve.engine.state import Engine
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import Config, ControllerConfig, load_config, make_config
 from mjx_revolve.episodes.evaluation import (
-    Setup,
-    make_recorder,
-    pick_water,
-    record_cues,
-    vary_engine,
+    EpisodeSpec,
+    as_precise,
+    task_recorder,
 )
-from mjx_revolve.episodes.rollout import flow_at
-from mjx_revolve.episodes.scoring import WORST, farthest, judge_tracks, may_touch_bed
+from mjx_revolve.episodes.rollout import RolloutState, with_variation
+from mjx_revolve.episodes.scoring import average_trials, list_episodes, max_distance, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
-from mjx_revolve.episodes.starts import cues_of, start_pose
+from mjx_revolve.episodes.starts import Starts, episode_context, pick_water
 from mjx_revolve.episodes.tasks import Task, find_task
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.xla import jit, over_chunks
+from mjx_revolve.water.drag import DRAG_LAWS, find_drag_law
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World, load_world
 
+# Greatest time between the rows of a trace: enough for pictures that move [s].
+_TRACE_INTERVAL = 0.02
+
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fitness:
+class Fitness(EpisodeSpec):
     """Scores of a population of one body: `fitness(population, key)`.
 
     Attributes:
-        setup: what all episodes have in common.
-        robot: the compiled robot.
+        robot: the body.
+        engine: steps it.
+        geometry: its size.
     """
 
-    setup: Setup
     robot: Robot
-
-    @property
-    def config(self) -> Config:
-        """What it was made from."""
-        return self.setup.config
-
-    @property
-    def controller(self) -> Controller:
-        """Genes to commands."""
-        return self.setup.controller
-
-    @property
-    def engine(self) -> Engine:
-        """What steps the robot."""
-        return self.setup.engine_of(None)
-
-    @property
-    def task(self) -> Task:
-        """What episodes are about."""
-        return self.setup.task
+    engine: Engine
+    geometry: BodyGeometry
 
     def __repr__(self) -> str:
         """A line: `Fitness(directed_swim in lake, Morphology('spider': ...), 57 genes)`."""
         what = self.config.subject
         return f"Fitness({what}, {self.robot.morphology!r}, {self.num_genes} genes)"
 
-    @property
-    def num_genes(self) -> int:
-        """Length of an individual's genes."""
-        return self.controller.num_genes
+    def _engine(self, bodies: Any, lanes: int, differentiable: bool) -> Engine:
+        return self.engine
 
-    @property
-    def worst_score(self) -> float:
-        """The score of a rollout that blew up."""
-        return WORST
+    def _geometry(self, bodies: Any) -> BodyGeometry:
+        return self.geometry
 
     def __call__(self, population: Any, key: jax.Array) -> jax.Array:
         """Scores a population.
@@ -112,8 +94,23 @@ class Fitness:
         return self.evaluate(population, key)[0]
 
     def evaluate(self, population: Any, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Scores a population and says how it moved; see `evaluation.Setup.evaluate`."""
-        return self.setup.evaluate(None, population, key)
+        """Scores and measures of a population.
+
+        Args:
+            population: `[P, num_genes]`.
+            key: draws the episodes' start poses and water, the same for every individual.
+
+        Returns:
+            `[P]` scores and `[P]` measures (see `measures.measure`), means over the episodes.
+
+        Raises:
+            InputError: the population has another shape, there are no genes to evolve, or the key
+                is none.
+        """
+        population = self.check_population(population)
+        found: tuple[jax.Array, dict[str, jax.Array]]
+        found = self.program(population, key)((), population, key)
+        return found
 
     def replay(self, genes: Any, key: jax.Array, trial: int = 0) -> Trajectory:
         """One episode of one individual, in full.
@@ -129,12 +126,12 @@ class Fitness:
         return simulate(
             self.robot,
             bind_genes(self.controller, genes),
-            self.num_records * self.record_every * self.robot.world.timestep,
+            self.num_timesteps * self.world.timestep,
             qpos=self.starts(key)[0][:, trial],
             water=self.water(key, trial),
             engine=self.config.engine,
             once=True,
-            cues=self.cues(key, trial),
+            context=self.context(key, trial),
             variation=self.variation(key, trial),
         )
 
@@ -143,24 +140,24 @@ class Fitness:
 
         Args:
             trajectory: from `replay(genes, key)`, whole.
-            key: which start.
+            key: draws its start.
 
         Returns:
             The score, NaN where the rollout blew up, and the measures.
         """
-        every, records, dt = self.record_every, self.num_records, self.robot.world.timestep
-        rows = slice(every - 1, every * records, every)
-        water = self.water(key) or water_of(self.robot.world)
-        water = flow_at(self.robot.world, water)(dt * jnp.arange(every * records), None)
-        height = self.starts(key)[0][2, :1]
+        every, steps, dt = self.record_every, self.num_timesteps, self.world.timestep
+        rows = slice(every - 1, steps, every)
+        water = self.water(key) or water_of(self.world)
+        if self.world.waves:
+            water = water._replace(time=water.time + dt * jnp.arange(steps))
         command = trajectory.command
         score, measures = self._judge(
             *(jnp.asarray(x)[rows].T for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)),
-            jnp.zeros((records, 0)).T if command is None else jnp.asarray(command)[rows].T,
-            jnp.asarray(trajectory.power * dt).reshape(records, every).sum(1)[:, None],
-            jax.tree.map(lambda x: jnp.broadcast_to(x, (every * records,))[rows], water),
-            height,
-            jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.cues(key)),
+            jnp.zeros((0, self.num_records)) if command is None else jnp.asarray(command)[rows].T,
+            jnp.asarray(trajectory.power * dt).reshape(-1, every).sum(1)[:, None],
+            jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[rows], water),
+            self.starts(key)[0][2, :1],
+            jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.context(key)),
             self.variation(key),
             None if trajectory.target is None else jnp.asarray(trajectory.target)[rows],
         )
@@ -172,58 +169,35 @@ class Fitness:
 
         def run(
             qpos: Any, qvel: Any, ctrl: Any, command: Any, energy: Any, water: Any, height: Any,
-            cues: Any, variation: Any, target: Any,
+            context: EpisodeContext, variation: Any, target: Any,
         ) -> Any:  # fmt: skip
             # The rows of the episode stand side by side, as if they were a population.
-            engine = vary_engine(self.engine, variation)
+            engine = with_variation(self.engine, variation)
             state = engine.init(qpos, qvel)
             if command.shape[0] and hasattr(state, "command"):
                 state = state._replace(command=command)
-            asked = engine.plant.arrange(ctrl[actuators_of(self.robot)])
-            kept = make_recorder(engine, self.task, self.robot.world)(
-                state, asked, energy[:, 0], water
-            )
-            recorded = {
-                name: jnp.moveaxis(x, -1, 0)[..., None]
-                for name, x in kept.items()
-                if name != "energy"
-            }
-            if cues.chase is not None:
-                recorded["target"] = target[..., None]
-            return judge_tracks(
-                self.task,
-                self.config.task,
-                self.robot.world,
-                record_cues(self.setup, recorded | {"energy": energy}, cues),
-                height,
-                self.setup.figure_of(None),
-            )
+            ctrl = engine.plant.arrange(ctrl[actuators_of(self.robot)])
+            now = RolloutState(state, (), SensorMemory(), energy[:, 0], jnp.zeros((), jnp.int32))
+            rows = task_recorder(engine, self.task, self.world)(now, ctrl, water)
+            track = {name: jnp.moveaxis(x, -1, 0)[..., None] for name, x in rows.items()}
+            if context.pursuit is not None:
+                track["target"] = target[..., None]
+            return self.judge_track(track | {"energy": energy}, height, self.geometry, context)
 
         return jax.jit(run)
 
     def water(self, key: jax.Array, trial: int = 0) -> Water | None:
-        """The water of one of a key's episodes, as `simulate` takes it; None: just the world's."""
-        return pick_water(self.robot.world, self.setup.starts(key), trial)
+        """The water of one of a key's episodes, as `simulate` takes it; None: the world's."""
+        return pick_water(self.world, self.draw_starts(key), trial)
 
-    def cues(self, key: jax.Array, trial: int = 0) -> Cues:
-        """What one of a key's episodes gives its robot to feel, as `simulate` takes it."""
-        starts = self.setup.starts(key)
-        place = self.starts(key)[0][:3, trial]
-        return cues_of(self.config.task, jax.tree.map(lambda x: x[..., trial], starts), place)
+    def context(self, key: jax.Array, trial: int = 0) -> EpisodeContext:
+        """The sensors' context in one of a key's episodes, as `simulate` takes it."""
+        starts = jax.tree.map(lambda x: x[..., trial], self.draw_starts(key))
+        return episode_context(self.settings, starts, self.starts(key)[0][:3, trial])
 
     def variation(self, key: jax.Array, trial: int = 0) -> Variation | None:
         """The coefficients of one of a key's episodes, as `simulate` takes them; None: as given."""
-        return jax.tree.map(lambda x: x[trial], self.setup.starts(key).variation)
-
-    @property
-    def record_every(self) -> int:
-        """Timesteps between the rows of the track that tasks see."""
-        return self.setup.record_every
-
-    @property
-    def num_records(self) -> int:
-        """How many rows the track of an episode has, before the settling time is cut off."""
-        return self.setup.num_records
+        return jax.tree.map(lambda x: x[trial], self.draw_starts(key).variation)
 
     def starts(self, key: jax.Array) -> tuple[jax.Array, Water | None]:
         """Start poses and water of a key's episodes.
@@ -234,58 +208,38 @@ class Fitness:
         Returns:
             `[nq, trials]` qpos, and the water `[trials]` where it varies, else None.
         """
-        setup, starts = self.setup, self.setup.starts(key)
-        figure, world = setup.figure_of(None), self.robot.world
-        root = start_pose(setup.task, setup.settings, world, figure, starts)
+        starts = self.draw_starts(key)
+        root = self.start_pose(self.geometry, starts)
         rest = jnp.asarray(self.robot.qpos0, root.dtype)[7:, None]
         rest = jnp.broadcast_to(rest, (rest.shape[0], root.shape[1]))
         return jnp.concatenate([root, rest]), starts.water
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MixedFitness:
+class MixedFitness(EpisodeSpec):
     """Scores of different bodies: `fitness(robots, population, key)`.
 
     Attributes:
-        setup: what all episodes have in common; its configuration's morphology is not used.
+        capacity: what the bodies must fit.
         touches: whether robots may come near the bed.
-        listening: settings of the controller, with all sensors that there are.
+        controller_settings: of the controller, with all sensors that there are.
     """
 
-    setup: Setup
+    capacity: Capacity
     touches: bool
-    listening: ControllerConfig
-
-    @property
-    def config(self) -> Config:
-        """Task, world and controller."""
-        return self.setup.config
-
-    @property
-    def world(self) -> World:
-        """The world."""
-        return self.setup.world
-
-    @property
-    def capacity(self) -> Capacity:
-        """What the bodies must fit."""
-        assert self.setup.capacity is not None
-        return self.setup.capacity
+    controller_settings: ControllerConfig
 
     def __repr__(self) -> str:
         """A line: `MixedFitness(directed_swim in lake, at most 113 genes)`."""
         what = self.config.subject
         return f"MixedFitness({what}, at most {self.num_genes} genes)"
 
-    @property
-    def num_genes(self) -> int:
-        """Length of an individual's genes: those of the largest body; others leave some unused."""
-        return self.setup.controller.num_genes
+    def _engine(self, bodies: PackedBodies, lanes: int, differentiable: bool) -> Engine:
+        trees = make_batched_trees(self.world, self.capacity, bodies, lanes, steady=differentiable)
+        return PopulationEngine(trees, bodies.plant)
 
-    @property
-    def worst_score(self) -> float:
-        """The score of a rollout that blew up."""
-        return WORST
+    def _geometry(self, bodies: PackedBodies) -> BodyGeometry:
+        return bodies.figure
 
     def build(self, morphology: Morphology) -> Robot:
         """Compiles a body for this world, trimmed as the configuration says."""
@@ -293,51 +247,51 @@ class MixedFitness:
 
     def controller_of(self, body: Plant | Robot) -> Controller:
         """The controller of one body alone, whose genes are named after its own joints."""
-        return _find_controller(self.config, self.listening, as_plant(body))
+        return _find_controller(self.config, self.controller_settings, as_plant(body))
 
     def pad_genes(self, genes: Any, robot: Robot) -> Any:
         """The genes of one body's own controller as this fitness takes them.
 
         Args:
-            genes: `[..., n]` as its own controller has them.
-            robot: whose they are.
+            genes: `[..., n]` of the body's own controller.
+            robot: the body.
 
         Returns:
-            `[..., num_genes]`: what belongs to joints that the body lacks is 0. Of JAX's arrays one
-            of JAX's, of others one of NumPy's.
+            `[..., num_genes]`: genes of joints that the body lacks are 0. A JAX array for a JAX
+            array, else one of NumPy's.
         """
         genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
-        places = self._places(robot)
-        if genes.shape[-1] != len(places):
-            raise InputError(f"genes: expected [..., {len(places)}]; found {list(genes.shape)}")
+        indices = self._indices(robot)
+        if genes.shape[-1] != len(indices):
+            raise InputError(f"genes: expected [..., {len(indices)}]; found {list(genes.shape)}")
         shape = (*genes.shape[:-1], self.num_genes)
         if isinstance(genes, jax.Array):
-            return jnp.zeros(shape, genes.dtype).at[..., places].set(genes)
+            return jnp.zeros(shape, genes.dtype).at[..., indices].set(genes)
         wide = np.zeros(shape, genes.dtype)
-        wide[..., places] = genes
+        wide[..., indices] = genes
         return wide
 
     def own_genes(self, genes: Any, robot: Robot) -> Any:
-        """The way back: those of `[..., num_genes]` that a body's own controller takes."""
+        """The inverse: those of `[..., num_genes]` that a body's own controller takes."""
         genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
-        return genes[..., self._places(robot)]
+        return genes[..., self._indices(robot)]
 
-    def _places(self, robot: Robot) -> np.ndarray:
-        return gene_places(self.controller_of(robot), self.setup.controller)
+    def _indices(self, robot: Robot) -> np.ndarray:
+        return gene_indices(self.controller_of(robot), self.controller)
 
     def __call__(
-        self, robots: Robot | Sequence[Robot] | Bodies, population: Any, key: jax.Array
+        self, robots: Robot | Sequence[Robot] | PackedBodies, population: Any, key: jax.Array
     ) -> Any:
         """Scores a population; arguments as in `evaluate`."""
         return self.evaluate(robots, population, key)[0]
 
     def evaluate(
-        self, robots: Robot | Sequence[Robot] | Bodies, population: Any, key: jax.Array
+        self, robots: Robot | Sequence[Robot] | PackedBodies, population: Any, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Scores a population and says how it moved.
+        """Scores and measures of a population.
 
-        Bodies that come with populations of their own are stepped twice as fast as individuals of
-        different bodies side by side, if a population has 64 episodes or more (on a CPU).
+        Bodies with populations of their own are stepped twice as fast as individuals of different
+        bodies side by side, if a population has 64 episodes or more (on a CPU).
 
         Args:
             robots: a body for each individual, from `build`; one object may stand there many
@@ -347,25 +301,63 @@ class MixedFitness:
             key: draws the episodes' starts and water, the same for every individual.
 
         Returns:
-            Scores `[P]` or `[B, P]` and measures likewise, as `Fitness.evaluate` has them.
+            Scores `[P]` or `[B, P]` and measures of that shape, as `Fitness.evaluate` has them.
 
         Raises:
             InputError: the numbers of bodies and of individuals differ, a body does not fit or is
                 none, or the key is none.
         """
-        shape, n = jnp.shape(population), self.num_genes
-        if len(shape) not in (2, 3) or shape[-1] != n:
-            raise InputError(f"population: expected [P, {n}] or [B, P, {n}]; found {list(shape)}")
+        population = self.check_population(population, (2, 3))
         if isinstance(robots, Robot):
             robots = self.pack([robots])
-        count = robots.count.shape[-1] if isinstance(robots, Bodies) else len(robots)
-        if len(shape) == 2 and isinstance(robots, Bodies) and count == 1:
-            scores, measures = self.setup.evaluate(robots, jnp.asarray(population)[None], key)
-            return scores[0], {name: x[0] for name, x in measures.items()}
-        if count != shape[0]:
-            raise InputError(f"robots: expected {shape[0]}, one each; found {count}")
-        bodies = robots if isinstance(robots, Bodies) else self.pack(robots)
-        return self.setup.evaluate(bodies, population, key)
+        count = robots.count.shape[-1] if isinstance(robots, PackedBodies) else len(robots)
+        single = population.ndim == 2 and isinstance(robots, PackedBodies) and count == 1
+        if single:
+            population = population[None]
+        if count != len(population):
+            raise InputError(f"robots: expected {len(population)}, one each; found {count}")
+        bodies = robots if isinstance(robots, PackedBodies) else self.pack(robots)
+        found: tuple[jax.Array, dict[str, jax.Array]]
+        found = self.program(population, key)(bodies, population, key)
+        return jax.tree.map(lambda x: x[0], found) if single else found
+
+    def _score(self, bodies: PackedBodies, population: jax.Array, key: jax.Array) -> Any:
+        starts, bodies = self.precise_starts(population, key), as_precise(bodies, population)
+        if population.ndim == 2:
+            return self._score_different(bodies, population, starts)
+        if min(self.capacity.rows, self.capacity.slots) < 2:
+            # The program for one body has loops over rows, and a stack of slots; with less than two
+            # of them their indices fold away, over which XLA:CPU aborts (see `xla`). The program
+            # for different bodies does without.
+            count, size, n = population.shape
+            beside = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), size, -1), bodies)
+            found = self._score_different(beside, population.reshape(count * size, n), starts)
+            return jax.tree.map(lambda x: x.reshape(count, size), found)
+        trials = self.settings.trials
+        individual, trial = list_episodes(population.shape[1], trials)
+
+        def run(own: tuple[PackedBodies, jax.Array]) -> Any:
+            chunk = self.chunk_scores(True, *own, starts)
+            return average_trials(over_chunks(chunk)(individual, trial), trials)
+
+        each = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), -1, 0)[..., None], bodies)
+        return jax.lax.map(run, (each, population))
+
+    def _score_different(self, bodies: PackedBodies, population: jax.Array, starts: Starts) -> Any:
+        """Scores and measures `[P]` of a population whose bodies differ."""
+        trials = self.settings.trials
+        individual, trial = list_episodes(len(population), trials)
+        # A chunk takes as long as its largest body: those of a size share chunks.
+        order = jnp.argsort(bodies.count, stable=True).astype(individual.dtype)
+        chunk = self.chunk_scores(False, bodies, population, starts)
+        scores = average_trials(over_chunks(chunk)(order[individual], trial), trials)
+        return jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x), scores)
+
+    @property
+    def trace_every(self) -> int:
+        """Timesteps between the rows of a replay: those of a track share them evenly."""
+        most = max(1, int(_TRACE_INTERVAL / self.world.timestep + 1e-6))
+        return max(n for n in range(1, most + 1) if self.record_every % n == 0)
 
     def replay(
         self, robots: Sequence[Robot], genes: Sequence[Any], key: jax.Array, trial: int = 0
@@ -385,23 +377,51 @@ class MixedFitness:
             [self.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
         )
         bodies = self.pack(robots)
-        step, traced = self.setup.trace(bodies, population, key, trial)
-        found = {name: np.asarray(x) for name, x in traced.items()}
-        source = np.asarray(bodies.plant.source)
+        trials = jnp.full(len(population), trial, jnp.int32)
+        rows = {
+            name: np.asarray(x) for name, x in self._trace(bodies, population, key, trials).items()
+        }
+        source, step = np.asarray(bodies.plant.source), self.trace_every * self.world.timestep
         return [
             _own_trajectory(robot, self.capacity, step, source[:, lane], {
-                name: x[..., lane] for name, x in found.items()
+                name: x[..., lane] for name, x in rows.items()
             })
             for lane, robot in enumerate(robots)
         ]  # fmt: skip
 
+    @cached_property
+    def _trace(self) -> Any:
+        """A function of (bodies, population, key, trials) that records whole episodes."""
+
+        def run(bodies: PackedBodies, population: jax.Array, key: jax.Array, trial: Any) -> Any:
+            starts = self.precise_starts(population, key)
+
+            def trace(individual: jax.Array, trial: jax.Array) -> Any:
+                chunk = self.prepare(False, False, bodies, population, starts, individual, trial)
+                engine, every = chunk.rollout.engine, self.trace_every
+
+                def record(now: RolloutState, ctrl: jax.Array, water: Water) -> Any:
+                    qpos, qvel = engine.observe(now.state)
+                    row = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl, "energy": now.energy,
+                           "command": engine.thruster_command(now.state)}  # fmt: skip
+                    if now.memory.pursuer is not None:
+                        row["target"] = jnp.stack(now.memory.pursuer.position)
+                    return row
+
+                rows = self.num_timesteps // every
+                return chunk.rollout.advance(chunk.state, record, rows, every, chunk.inputs)[1]
+
+            return over_chunks(trace)(jnp.arange(len(population), dtype=jnp.int32), trial)
+
+        return jit(run)
+
     def water(self, key: jax.Array, trial: int = 0) -> Water | None:
-        """The water of one of a key's episodes; see `Fitness.water`."""
-        every = self.setup.trace_every
-        water = pick_water(self.world, self.setup.starts(key), trial)
+        """The water of one of a key's episodes at a replay's rows; see `Fitness.water`."""
+        every = self.trace_every
+        water = pick_water(self.world, self.draw_starts(key), trial)
         return jax.tree.map(lambda x: x[every - 1 :: every] if jnp.ndim(x) else x, water)
 
-    def pack(self, robots: Sequence[Robot]) -> Bodies:
+    def pack(self, robots: Sequence[Robot]) -> PackedBodies:
         """Tables of the bodies, for many evaluations of the same ones."""
         for robot in robots:
             if not isinstance(robot, Robot):
@@ -410,10 +430,9 @@ class MixedFitness:
                 )
         bodies = pack_bodies(robots, self.capacity)
         if not self.touches:
-            task, settings = self.setup.task, self.config.task
-            reach = farthest(settings, self.world, bodies.figure)
+            reach = max_distance(self.settings, self.world, bodies.figure)
             k = int(np.argmax(reach))
-            if may_touch_bed(task, settings, self.world, reach[k]):
+            if may_touch_bed(self.task, self.settings, self.world, reach[k]):
                 raise InputError(
                     f"robot {robots[k].morphology.name!r}: expected a body that cannot reach the "
                     "bed, as the examples cannot; found one that may (give one like it as an "
@@ -423,32 +442,27 @@ class MixedFitness:
 
 
 def _own_trajectory(
-    robot: Robot, capacity: Capacity, step: float, source: np.ndarray, found: dict[str, np.ndarray]
+    robot: Robot, capacity: Capacity, step: float, source: np.ndarray, rows: dict[str, np.ndarray]
 ) -> Trajectory:
-    """A robot's part of what `Setup.trace` returns of many.
+    """The trajectory of one of many robots.
 
-    Args:
-        robot: whose.
-        capacity: of all.
-        step: between rows [s].
-        source: `[n]` which of its actuators each row of `ctrl` is.
-        found: `[T, ...]` each.
+    `step`: between rows [s]; `source`: `[n]` actuator of each row of ctrl; `rows`: `[T, ...]` each.
     """
     count, model = robot.num_hinges, robot.mj_model
-    rows = [*range(count), *range(capacity.hinges, capacity.hinges + robot.num_thrusters)]
-    ctrl = np.zeros((len(found["ctrl"]), model.nu))
-    for row, actuator in zip(rows, actuators_of(robot), strict=True):
-        ctrl[:, actuator] = found["ctrl"][:, np.flatnonzero(source == row)[0]]
-    qpos = found["qpos"][:, : 7 + count]
+    own = [*range(count), *range(capacity.hinges, capacity.hinges + robot.num_thrusters)]
+    ctrl = np.zeros((len(rows["ctrl"]), model.nu))
+    for row, actuator in zip(own, actuators_of(robot), strict=True):
+        ctrl[:, actuator] = rows["ctrl"][:, np.flatnonzero(source == row)[0]]
+    qpos = rows["qpos"][:, : 7 + count]
     return Trajectory(
         time=jnp.asarray(step * np.arange(1, len(qpos) + 1)),
         qpos=jnp.asarray(qpos),
-        qvel=jnp.asarray(found["qvel"][:, : 6 + count]),
-        xpos=body_positions(robot, jnp.asarray(qpos)),
+        qvel=jnp.asarray(rows["qvel"][:, : 6 + count]),
+        xpos=body_poses(robot, jnp.asarray(qpos))[0],
         ctrl=jnp.asarray(ctrl),
-        power=jnp.asarray(found["energy"] / step),
-        command=jnp.asarray(found["command"][:, : robot.num_thrusters]),
-        target=None if "target" not in found else jnp.asarray(found["target"]),
+        power=jnp.asarray(rows["energy"] / step),
+        command=jnp.asarray(rows["command"][:, : robot.num_thrusters]),
+        target=None if "target" not in rows else jnp.asarray(rows["target"]),
     )
 
 
@@ -494,12 +508,12 @@ def fit_body(config: Config, morphology: Morphology) -> Fitness:
     """
     world, task = _place(config)
     robot = _build(config, world, morphology)
-    figure = figure_of(robot)
-    reach = farthest(config.task, world, figure)
+    figure = body_geometry(robot)
+    reach = max_distance(config.task, world, figure)
     engine = make_engine(robot, config.engine, may_touch_bed(task, config.task, world, reach))
     settings = _listening(config, read_modules(config), morphology)
     controller = _find_controller(config, settings, engine.plant, morphology)
-    return Fitness(Setup(config, world, task, controller, engine, figure), robot)
+    return Fitness(config, world, task, controller, robot, engine, figure)
 
 
 def make_mixed_fitness(
@@ -518,7 +532,7 @@ def make_mixed_fitness(
         examples: bodies of the kinds that will come: made of the types of modules that will come,
             and the largest of them sets the size.
         hinges: most hinges that a body may have, if more than the examples'.
-        rows: most rows of tables that a body may need (see `engine.rows`), likewise.
+        rows: most rows of tables that a body may need (see `engine.batched_trees`), if more.
         kinds: types of modules that bodies may be made of, beside those of the examples.
         modules: most modules that a body may have: there is then room for all bodies of these types
             with so many modules and hinges, whatever their shape.
@@ -542,7 +556,7 @@ def make_mixed_fitness(
         check_timestep(robot)
     if not robots:
         raise InputError("examples: expected at least one morphology; found none")
-    figures = [figure_of(robot) for robot in robots]
+    figures = [body_geometry(robot) for robot in robots]
     if modules:  # what will come is no longer than this, and sinks only if one of its types does
         types = {m.kind.name: m.kind for robot in robots for m in robot.morphology.modules}
         types |= {kind.name: kind for kind in kinds}
@@ -550,19 +564,18 @@ def make_mixed_fitness(
         heavy = any(world.density * kind.volume < kind.mass / 2 for kind in types.values())
         sinks = world.buoyancy == "off" or (heavy and config.trim != "neutral")
         figures.append(figures[0]._replace(length=longest, sinks=sinks))
-    reach = max(farthest(config.task, world, figure) for figure in figures)
+    reach = max(max_distance(config.task, world, figure) for figure in figures)
     touches = may_touch_bed(task, config.task, world, reach)
-    if config.colony is not None:  # who lives long gets anywhere
+    if config.colony is not None:  # a long life leads anywhere
         touches = world.bed is not None
     shown = [*robots, *_show_kinds(kinds, robots, hinges)]
     _check_alike(config, examples)
-    listening = _listening(config, read_modules(config))
-    sites = dict.fromkeys(s.each for s in listening.sensors or () if s.each is not None)
+    controller_settings = _listening(config, read_modules(config))
+    sites = dict.fromkeys(s.each for s in controller_settings.sensors or () if s.each is not None)
     capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules, tuple(sites))
     example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
-    controller = _find_controller(config, listening, capacity.plant, example=example)
-    setup = Setup(config, world, task, controller, capacity=capacity)
-    return MixedFitness(setup, touches, listening)
+    controller = _find_controller(config, controller_settings, capacity.plant, example=example)
+    return MixedFitness(config, world, task, controller, capacity, touches, controller_settings)
 
 
 def _show_kinds(
@@ -642,10 +655,11 @@ def _check_robust(config: Config, world: World) -> None:
             f"{config.source}: task.robust: expected off, as engine is {config.engine}, which has "
             "its coefficients as constants; found some ranges"
         )
-    if world.drag in ("ellipsoid", "inertia_box"):
+    if not find_drag_law(world.drag).varied:
+        *most, last = (name for name, law in DRAG_LAWS.items() if law.varied)
         raise InputError(
-            f"{config.source}: task.robust: expected a world whose drag is faces, lift_drag or "
-            f"off, as MuJoCo's laws are not varied; found {world.drag}"
+            f"{config.source}: task.robust: expected a world whose drag is {', '.join(most)} or "
+            f"{last}, as MuJoCo's laws are not varied; found {world.drag}"
         )
 
 
@@ -673,12 +687,14 @@ def _check_alike(config: Config, bodies: Sequence[Morphology]) -> None:
 def _listening(
     config: Config, modules: Mapping[str, ModuleType], body: Morphology | None = None
 ) -> ControllerConfig:
-    """Settings of the controller with all that it is told: sensors of types of modules, too."""
+    """Settings of the controller with all its sensors, those of types of modules, too."""
     settings = config.controller
     declared = settings.sensors
     if declared is None and body is not None:
         declared = body.sensors
-    return settings.model_copy(update={"sensors": with_types(declared, modules, config.source)})
+    return settings.model_copy(
+        update={"sensors": resolve_sensors(declared, modules, config.source)}
+    )
 
 
 def _find_controller(

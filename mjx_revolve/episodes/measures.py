@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_revolve.episodes.measure_table import MEASURES, records_of
 from mjx_revolve.episodes.tasks import Track, moved_through_water
-from mjx_revolve.numerics.spatial import quat_to_rows, safe_norm
+from mjx_revolve.numerics.spatial import quat_to_mat, safe_norm
 
 # All below are choices. Fewer periods than this in the record are no gait, as for the reports.
 _PERIODS = 2
@@ -152,7 +152,7 @@ def _attitude(track: Track) -> dict[str, jax.Array]:
     """
     assert track.quat is not None
     quat = track.quat[:, 0], track.quat[:, 1], track.quat[:, 2], track.quat[:, 3]
-    up = quat_to_rows(quat)[2]  # the vertical, core frame
+    up = quat_to_mat(quat)[2]  # the vertical, core frame
     (a, e), (b, f), (c, g), (d, h) = ((x[:-1], x[1:]) for x in quat)
     # w and z of the turn from row to row, world frame; a quaternion and its opposite are one turn.
     w, z = a * e + b * f + c * g + d * h, a * h - d * e + b * g - c * f

@@ -1,281 +1,308 @@
-"""Rollouts: a scan of steps, from a start to what is recorded of it."""
+"""Rollouts: `Rollout.init` a state, `Rollout.advance` it step by step, recording on the way."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
-from mjx_revolve.control.sense import NOBODY, Cues, Memory, Sense, feel, remember, start_memory
-from mjx_revolve.engine.collisions import Meeting
-from mjx_revolve.engine.state import Engine
-from mjx_revolve.numerics.xla import fused_scan, share_once
+from mjx_revolve.control.controller import Controller
+from mjx_revolve.control.readings import (
+    NO_INTERACTION,
+    EpisodeContext,
+    SensorMemory,
+    SensorReadings,
+    init_memory,
+    read_sensors,
+    update_memory,
+)
+from mjx_revolve.engine.engines import Engine
+from mjx_revolve.engine.interaction import InteractionForces
+from mjx_revolve.engine.variation import Variation
+from mjx_revolve.numerics.inertia import BodyMotion
+from mjx_revolve.numerics.xla import fuse, fuse_step
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
 
-_NO_CUES = Cues()
 
-
-class Passage(NamedTuple):
-    """What travels from step to step.
+class RolloutState(NamedTuple):
+    """State of a chunk of rollouts; of `advance`, all that one step leaves to the next.
 
     Attributes:
         state: of the engine.
-        drive_state: of the controller.
-        memory: of what is felt.
-        energy: since the last record, `[lanes]` [J].
-        count: how many steps there were, int32: time is exact however long the run.
+        controller_state: of the policy.
+        memory: of the sensors.
+        energy: work since the last record [J].
+        steps: since the first one; time is exact however long the rollout.
     """
 
     state: Any
-    drive_state: Any
-    memory: Any
-    energy: Any
-    count: Any
+    controller_state: Any
+    memory: SensorMemory
+    energy: Float[Array, " lanes"]
+    steps: Int[Array, ""]
 
 
-def begin(
-    engine: Engine,
-    state: Any,
-    drive_state: Any,
-    feels: Sequence[str] = (),
-    cues: Cues = _NO_CUES,
-) -> Passage:
-    """What travels before the first step.
+class StepInputs(NamedTuple):
+    """Values given for each step, `[T, ...]` for T steps.
 
-    Args:
-        engine: what steps.
-        state: from `engine.init`.
-        drive_state: of the controller.
-        feels: which of `sense.FEELS` are asked for.
-        cues: of the episodes.
-
-    Returns:
-        The start of a rollout.
-    """
-    energy = jnp.zeros_like(engine.root(state).spin[0])
-    memory = start_memory(feels, engine, state, cues)
-    return Passage(state, drive_state, memory, energy, jnp.zeros((), jnp.int32))
-
-
-def make_drive(
-    engine: Engine,
-    drive: Callable[[Any, jax.Array, Any, Sense], tuple[Any, jax.Array]],
-    flow: Callable[[jax.Array, Any], Water],
-    *,
-    timestep: float,
-    world: World | None = None,
-    cues: Cues = _NO_CUES,
-    feels: Sequence[str] = (),
-    since: Any = None,
-) -> Callable[..., tuple[Any, jax.Array, Water, Any]]:
-    """What a rollout does before each step of the engine: robots feel, brains drive.
-
-    Args:
-        engine: this and all others as of `go_on`.
-        drive: likewise.
-        flow: likewise.
-        timestep: likewise.
-        world: likewise.
-        cues: likewise.
-        feels: likewise.
-        since: likewise.
-
-    Returns:
-        (rollout, inputs of this step, and with whom robots meet, by default nobody) → (controller
-        state, ctrl, water, and how the bodies move where that is remembered, or None).
+    Attributes:
+        water: surface and current, `[T, lanes]`; None: `Rollout.water` in all steps.
+        ctrl: commands of an open loop, the plant's order [rad, -]; None under a controller.
     """
 
-    def told(now: Passage, row: Any, meeting: Meeting = NOBODY) -> Any:
-        time = _clock(now.count, now.energy, timestep)
-        water = flow(time, row)
-        # One sweep over the body serves what is felt now and what is remembered of it.
-        motion = engine.motions(now.state) if now.memory.past is not None else None
-        felt = feel(world, engine, now.state, water, time, cues, now.memory, feels, meeting, motion)
-        own = time if since is None else _clock(now.count - since, now.energy, timestep)
-        drive_state, ctrl = drive(now.drive_state, own, row, felt)
-        return drive_state, ctrl, water, motion
-
-    return told
+    water: Water | None = None
+    ctrl: Float[Array, "T n lanes"] | None = None
 
 
-def make_step(
-    engine: Engine,
-    told: Callable[..., tuple[Any, jax.Array, Water, Any]],
-    timestep: float,
-    cues: Cues = _NO_CUES,
-) -> Callable[..., tuple[Passage, jax.Array]]:
-    """A step of a rollout.
+NO_INPUTS = StepInputs()
+_NO_CONTEXT = EpisodeContext()
 
-    Args:
-        engine: what steps the robots.
-        told: from `make_drive`.
-        timestep: [s].
-        cues: of the episodes.
 
-    Returns:
-        (rollout, inputs of this step) → (the rollout a step later, ctrl). A third argument is added
-        to ctrl: by it, slopes by commands are found. A fourth says with whom robots meet.
+class Policy(Protocol):
+    """Maps sensor readings to commands."""
+
+    def __call__(
+        self,
+        controller_state: Any,
+        time: Float[Array, ...],
+        readings: SensorReadings,
+        ctrl: Float[Array, "n lanes"] | None,
+        /,
+    ) -> tuple[Any, Float[Array, "n lanes"]]:
+        """(its state, time [s], readings, the step's open-loop input) → (its state, ctrl)."""
+
+
+class Recorder(Protocol):
+    """Selects what to keep of a rollout."""
+
+    def __call__(self, now: RolloutState, ctrl: Float[Array, "n lanes"], water: Water, /) -> Any:
+        """(state after a step, its ctrl, its water) → a pytree of arrays."""
+
+
+def controlled(controller: Controller, parameters: Any) -> Policy:
+    """The policy of a controller with decoded parameters."""
+    return lambda state, time, readings, _: controller.step(parameters, state, time, readings)
+
+
+def held(ctrl: Float[Array, "n lanes"]) -> Policy:
+    """The policy of constant commands."""
+    return lambda state, time, readings, _: (state, ctrl)
+
+
+def open_loop(
+    state: Any, time: Float[Array, ...], readings: SensorReadings, ctrl: Any
+) -> tuple[Any, Float[Array, "n lanes"]]:
+    """The policy of the commands in `StepInputs.ctrl`."""
+    return state, ctrl
+
+
+def start_at_rest(engine: Engine, root: Float[Array, "7 lanes"]) -> Any:
+    """An engine's state at root poses, at rest, hinges at 0."""
+    hinges = jnp.zeros((engine.plant.num_hinges, root.shape[-1]), root.dtype)
+    qvel = jnp.concatenate([jnp.zeros_like(root[:6]), hinges])
+    return engine.init(jnp.concatenate([root, hinges]), qvel)
+
+
+def with_variation(engine: Engine, variation: Variation | None) -> Engine:
+    """An engine with the coefficients of an episode; the same one where they are not varied."""
+    if variation is None:
+        return engine
+    return engine.with_variation(variation)
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A simulator with a policy, in a world; its functions are pure.
+
+    Attributes:
+        engine: steps the robots.
+        policy: commands them.
+        world: water and bed of the sensors; its timestep.
+        water: of all steps without one of their own; with waves, its time is at the start.
+        context: of the episodes, for sensors.
+        signals: which of `readings.OPTIONAL_SIGNALS`, and which modules, the policy reads.
+        clock: timesteps of each episode before `steps` 0; None: 0.
+        birth: `steps` at which each robot's own time began, which its policy reads; None: the
+            episode's time.
     """
+
+    engine: Engine
+    policy: Policy
+    world: World
+    water: Water
+    context: EpisodeContext = _NO_CONTEXT
+    signals: Sequence[str] = ()
+    clock: Int[Array, " lanes"] | None = None
+    birth: Int[Array, " lanes"] | None = None
+
+    def init(self, state: Any, controller_state: Any = ()) -> RolloutState:
+        """The state before the first step, of an engine's state and a policy's."""
+        energy = jnp.zeros_like(self.engine.root(state).angular_velocity[0])
+        memory = init_memory(self.signals, self.engine, state, self.context)
+        return RolloutState(state, controller_state, memory, energy, jnp.zeros((), jnp.int32))
+
+    def _seconds(self, steps: Any, like: Float[Array, " lanes"]) -> Float[Array, ...]:
+        return steps.astype(like.dtype) * self.world.timestep
+
+    def water_at(self, steps: Any, now: RolloutState, inputs: StepInputs) -> Water:
+        """The water a number of steps after `steps` 0, under the inputs of that step."""
+        water = self.water if inputs.water is None else inputs.water
+        if not self.world.waves:
+            return water
+        return water._replace(time=water.time + self._episode_time(steps, now))
+
+    def _episode_time(self, steps: Any, now: RolloutState) -> Float[Array, ...]:
+        return self._seconds(steps if self.clock is None else self.clock + steps, now.energy)
+
+    def read(
+        self,
+        now: RolloutState,
+        inputs: StepInputs = NO_INPUTS,
+        forces: InteractionForces = NO_INTERACTION,
+        motion: BodyMotion | None = None,
+    ) -> tuple[Float[Array, ...], Water, SensorReadings]:
+        """Time [s], water and sensor readings; `motion`: of all bodies, where it is known."""
+        time, water = self._episode_time(now.steps, now), self.water_at(now.steps, now, inputs)
+        readings = read_sensors(
+            self.world,
+            self.engine,
+            now.state,
+            water,
+            time,
+            self.context,
+            now.memory,
+            self.signals,
+            forces,
+            motion,
+        )
+        return time, water, readings
+
+    def act(
+        self, now: RolloutState, inputs: StepInputs, forces: InteractionForces = NO_INTERACTION
+    ) -> tuple[Any, Float[Array, "n lanes"], Water, BodyMotion | None]:
+        """The first half of a step: controller state, ctrl, water, and motion if remembered."""
+        # One pass over the tree serves the readings and what is remembered of them.
+        motion = self.engine.body_motions(now.state) if now.memory.past is not None else None
+        time, water, readings = self.read(now, inputs, forces, motion)
+        if self.birth is not None:
+            time = self._seconds(now.steps - self.birth, now.energy)
+        controller_state, ctrl = self.policy(now.controller_state, time, readings, inputs.ctrl)
+        return controller_state, ctrl, water, motion
+
+    def update(
+        self,
+        now: RolloutState,
+        state: Any,
+        power: Float[Array, " lanes"],
+        controller_state: Any,
+        ctrl: Float[Array, "n lanes"],
+        motion: BodyMotion | None,
+    ) -> RolloutState:
+        """The second half of a step: the state after the engine's step and `act`."""
+        root, dt = self.engine.root, self.world.timestep
+        work = dt * power
+        memory = update_memory(
+            now.memory, root(now.state), root(state), ctrl, work, dt, motion, self.context
+        )
+        return RolloutState(state, controller_state, memory, now.energy + work, now.steps + 1)
 
     def step(
-        now: Passage, row: Any, push: Any = None, meeting: Meeting = NOBODY
-    ) -> tuple[Passage, jax.Array]:
-        drive_state, ctrl, water, motion = told(now, row, meeting)
-        if push is not None:
-            ctrl = ctrl + push
-        before = engine.root(now.state)
-        pushes = () if engine.meet is None else (meeting.push,)
-        state, power = engine.step(now.state, ctrl, water, *pushes)
-        work = timestep * power
-        after = engine.root(state)
-        memory = remember(now.memory, before, after, ctrl, work, timestep, motion, cues)
-        return Passage(state, drive_state, memory, now.energy + work, now.count + 1), ctrl
+        self,
+        now: RolloutState,
+        given: tuple[StepInputs, InteractionForces],
+        offset: Float[Array, "n lanes"] | None = None,
+    ) -> tuple[RolloutState, Float[Array, "n lanes"]]:
+        """One step.
 
-    return step
+        Args:
+            now: before it.
+            given: its inputs, and the forces between robots of one world.
+            offset: added to ctrl: the gradient by it is that by the commands.
 
+        Returns:
+            The state after it, and ctrl.
+        """
+        inputs, forces = given
+        controller_state, ctrl, water, motion = self.act(now, inputs, forces)
+        ctrl = ctrl if offset is None else ctrl + offset
+        wrench = () if self.engine.interaction is None else (forces.wrench,)
+        state, power = self.engine.step(now.state, ctrl, water, *wrench)
+        return self.update(now, state, power, controller_state, ctrl, motion), ctrl
 
-def _clock(count: Any, like: jax.Array, timestep: float) -> jax.Array:
-    return count.astype(like.dtype) * timestep
+    def record(self, recorder: Recorder, now: RolloutState, ctrl: Any, inputs: StepInputs) -> Any:
+        """The record after a step with these inputs."""
+        return recorder(now, ctrl, self.water_at(now.steps - 1, now, inputs))
 
+    def advance(
+        self,
+        now: RolloutState,
+        recorder: Recorder,
+        records: int,
+        every: int = 1,
+        inputs: StepInputs = NO_INPUTS,
+        differentiable: bool = False,
+    ) -> tuple[RolloutState, Any]:
+        """Steps the rollouts, and records them at equal intervals.
 
-def roll_out(
-    engine: Engine,
-    drive: Callable[[Any, jax.Array, Any, Sense], tuple[Any, jax.Array]],
-    flow: Callable[[jax.Array, Any], Water],
-    record: Callable[[Any, jax.Array, jax.Array, Water], Any],
-    state: Any,
-    drive_state: Any,
-    inputs: Any,
-    *,
-    feels: Sequence[str] = (),
-    cues: Cues = _NO_CUES,
-    **settings: Any,
-) -> tuple[Any, Any]:
-    """Steps a chunk of a population from its start and records it now and then.
+        Args:
+            now: from `init`, or of an earlier `advance`.
+            recorder: makes a record.
+            records: number of records.
+            every: steps between them.
+            inputs: `[records * every, ...]`.
+            differentiable: whether each step is computed again on the way back, so that memory
+                grows with the state and not with its working.
 
-    Args:
-        engine: what steps it.
-        drive: as in `go_on`.
-        flow: likewise.
-        record: likewise.
-        state: from `engine.init`.
-        drive_state: initial controller state.
-        inputs: as in `go_on`.
-        feels: which of `sense.FEELS` are asked for.
-        cues: what else they are given to feel.
-        **settings: of `go_on`.
+        Returns:
+            The state after the last step, and the records, `[records, ...]` each.
+        """
+        step: Callable[..., Any] = self.step
+        pack: Callable[[Any], Any]
+        pack = unpack = lambda x: x
+        # Interaction between robots is not element-wise, so it stays outside of the fused step.
+        interaction = self.engine.interaction
+        neighbours: Any = () if interaction is None else interaction.init(now.state)
 
-    Returns:
-        The last state, and the records, `[records, ...]` each.
-    """
-    start = begin(engine, state, drive_state, feels, cues)
-    last, kept = go_on(
-        engine, drive, flow, record, start, inputs, feels=feels, cues=cues, **settings
-    )
-    return last.state, kept
+        def detect(state: Any, neighbours: Any) -> tuple[InteractionForces, Any]:
+            if interaction is None:
+                return NO_INTERACTION, neighbours
+            found: tuple[InteractionForces, Any] = interaction.detect(state, neighbours)
+            return found
 
-
-def go_on(
-    engine: Engine,
-    drive: Callable[[Any, jax.Array, Any, Sense], tuple[Any, jax.Array]],
-    flow: Callable[[jax.Array, Any], Water],
-    record: Callable[[Any, jax.Array, jax.Array, Water], Any],
-    passage: Passage,
-    inputs: Any,
-    *,
-    records: int,
-    every: int,
-    timestep: float,
-    derived: bool = False,
-    world: World | None = None,
-    cues: Cues = _NO_CUES,
-    feels: Sequence[str] = (),
-    since: Any = None,
-    recall: Callable[[Any, Memory], Any] = lambda kept, memory: kept,
-) -> tuple[Passage, Any]:
-    """Steps a chunk of a population on and records it now and then.
-
-    Args:
-        engine: what steps it.
-        drive: (controller state, time [s], inputs of this step, what the robot senses) →
-            (controller state, ctrl `[nu, lanes]` in the engine's order).
-        flow: (time [s], inputs of this step) → the water.
-        record: (state, ctrl, energy since the last record `[lanes]` [J], the water of the last
-            step) → what to keep.
-        passage: from `begin`, or what the steps before have left.
-        inputs: None, or arrays `[records * every, ...]`, one row for each step.
-        records: how many records.
-        every: steps between them.
-        timestep: [s].
-        derived: whether it is to be differentiated: each step is then computed again on the way
-            back, so that memory grows with the state and not with its working.
-        world: whose water and bed the robots feel; None where they feel neither.
-        cues: what else they are given to feel.
-        feels: which of `sense.FEELS` are asked for.
-        since: `[lanes]` int32 step at which each robot's own time began; None: all at the first.
-        recall: (what `record` keeps, what is remembered of what was felt) → what to keep; by
-            default nothing of the latter.
-
-    Returns:
-        What travels on, and the records, `[records, ...]` each.
-    """
-    told = make_drive(
-        engine, drive, flow, timestep=timestep, world=world, cues=cues, feels=feels, since=since
-    )
-    one = make_step(engine, told, timestep, cues)
-    step: Any = lambda now, given: one(now, given[0], None, given[1])  # noqa: E731
-    first = None if inputs is None else jax.tree.map(lambda x: x[0], inputs)
-    # What robots do to each other is no element-wise function of them, so it stays outside.
-    look = (lambda state, watch: (NOBODY, watch)) if engine.meet is None else engine.meet.look
-    watch = () if engine.meet is None else engine.meet.start(passage.state)
-    pack = unpack = lambda x: x
-    if engine.fuses and not derived:
-        step, pack, unpack = fused_scan(step, passage, (first, look(passage.state, watch)[0]))
-    else:
-        step = share_once(step)
-        if derived:
-            step = jax.checkpoint(step, prevent_cse=False)
-
-    def look_and_step(carry: Any, row: Any) -> tuple[Any, jax.Array]:
-        packed, watch = carry
-        meeting, watch = look(unpack(packed).state, watch)
-        packed, ctrl = step(packed, (row, meeting))
-        return (packed, watch), ctrl
-
-    def block(carry: Any, rows: Any) -> tuple[Any, Any]:
-        packed, watch = carry
-        start = unpack(packed)
-        start = pack(start._replace(energy=jnp.zeros_like(start.energy)))
-        last = None if rows is None else jax.tree.map(lambda x: x[-1], rows)
-        if every == 1:
-            (packed, watch), ctrl = look_and_step((start, watch), last)
+        if self.engine.elementwise and not differentiable:
+            first = jax.tree.map(lambda x: x[0], inputs)
+            example = first, detect(now.state, neighbours)[0]
+            step, pack, unpack = fuse_step(step, now, example)
         else:
-            (packed, watch), ctrls = jax.lax.scan(look_and_step, (start, watch), rows, length=every)
-            ctrl = jax.tree.map(lambda x: x[-1], ctrls)
-        state, _, memory, energy, count = unpack(packed)
-        water = flow(_clock(count - 1, energy, timestep), last)
-        return (packed, watch), recall(record(state, ctrl, energy, water), memory)
+            step = fuse(step, inline=True)
+            if differentiable:
+                step = jax.checkpoint(step, prevent_cse=False)
 
-    if inputs is not None:
+        def detect_and_step(carry: Any, row: StepInputs) -> tuple[Any, jax.Array]:
+            packed, neighbours = carry
+            forces, neighbours = detect(unpack(packed).state, neighbours)
+            packed, ctrl = step(packed, (row, forces))
+            return (packed, neighbours), ctrl
+
+        def block(carry: Any, rows: StepInputs) -> tuple[Any, Any]:
+            packed, neighbours = carry
+            begun = unpack(packed)
+            begun = pack(begun._replace(energy=jnp.zeros_like(begun.energy)))
+            last = jax.tree.map(lambda x: x[-1], rows)
+            if every == 1:
+                carry, ctrl = detect_and_step((begun, neighbours), last)
+            else:
+                carry, ctrls = jax.lax.scan(
+                    detect_and_step, (begun, neighbours), rows, length=every
+                )
+                ctrl = jax.tree.map(lambda x: x[-1], ctrls)
+            return carry, self.record(recorder, unpack(carry[0]), ctrl, last)
+
         inputs = jax.tree.map(lambda x: x.reshape(records, every, *x.shape[1:]), inputs)
-    carry = pack(passage), watch
-    (packed, _), kept = jax.lax.scan(block, carry, inputs, length=records)
-    return unpack(packed), kept
-
-
-def flow_at(world: World, water: Water) -> Callable[[jax.Array, Any], Water]:
-    """The water at each moment of a rollout whose surface and current do not change.
-
-    Args:
-        world: the world.
-        water: at the start; where there are waves, its time is when the rollout begins.
-
-    Returns:
-        What `roll_out` takes as `flow`.
-    """
-    if not world.waves:
-        return lambda time, row: water
-    return lambda time, row: water._replace(time=water.time + time)
+        (packed, _), kept = jax.lax.scan(block, (pack(now), neighbours), inputs, length=records)
+        return unpack(packed), kept

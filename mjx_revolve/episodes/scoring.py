@@ -1,7 +1,4 @@
-"""Scores of individuals from their episodes.
-
-Which episodes there are, how their tracks are sampled and judged, and what comes of several of one
-individual.
+"""Scores of individuals from their episodes: sampling of tracks, limits, means over trials.
 
 Episodes stand side by side in lanes: individual after individual, and within each the episodes of
 its trials. Each is scored where it was run, chunk by chunk, so that no track outlives its chunk.
@@ -15,11 +12,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
-from mjx_revolve.engine.plant import Figure
+from mjx_revolve.engine.plant import BodyGeometry
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.measures import measure
-from mjx_revolve.episodes.tasks import Task, Track
+from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
@@ -31,6 +28,9 @@ WORST = -1e3
 # it. An individual that gets further than this allows has blown up [m/s].
 _FASTEST = 3.0
 
+# Recorded rates, which are 0 where nothing moves.
+RATES = ("energy", "water_velocity")
+
 # Fresh episodes on which a champion is judged, and the stream of random numbers that draws them,
 # which no generation uses.
 REPORT_EPISODES = 16
@@ -41,7 +41,7 @@ _INTERVAL = 0.1
 
 
 class Scores(NamedTuple):
-    """What is left of episodes.
+    """Results of episodes.
 
     Attributes:
         score: `[lanes]`, higher is better.
@@ -55,128 +55,63 @@ class Scores(NamedTuple):
 
 
 def sample_rows(task: TaskConfig, timestep: float) -> tuple[int, int]:
-    """How the track of an episode is sampled.
-
-    Args:
-        task: its duration.
-        timestep: [s].
-
-    Returns:
-        Timesteps between rows, and how many rows there are, before the settling time is cut off.
-    """
+    """Timesteps between the rows of a track, and their number before the settling time is cut."""
     every = max(1, int(_INTERVAL / timestep + 1e-6))
     return every, max(2, round(task.duration / (every * timestep)))
 
 
 def list_episodes(population: int, trials: int) -> tuple[jax.Array, jax.Array]:
-    """All episodes of a population.
-
-    Args:
-        population: P, how many individuals.
-        trials: episodes of each.
-
-    Returns:
-        `[P trials]` whose each is, and `[P trials]` which of that individual's, int32.
-    """
+    """All episodes of a population: `[P trials]` the individual, and which of its trials."""
     lane = jnp.arange(population * trials, dtype=jnp.int32)
     return lane // trials, lane % trials
 
 
-def first_counted(task: TaskConfig, timestep: float) -> int:
+def first_scored_row(task: TaskConfig, timestep: float) -> int:
     """The row of a track at which the task begins to count; row 0 is one interval late."""
     every, rows = sample_rows(task, timestep)
     return min(round(task.settle / (every * timestep)), rows - 2)
 
 
-def judge_tracks(
-    task: Task,
-    settings: TaskConfig,
-    world: World,
-    recorded: Mapping[str, jax.Array],
-    start_height: jax.Array,
-    figure: Figure,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """What a task says of tracks, blown up or not.
+def extend_track(
+    track: Mapping[str, jax.Array], rows: Mapping[str, jax.Array], first: Int[Array, ...]
+) -> dict[str, jax.Array]:
+    """A track with new rows, the last of which stands in all rows to come.
+
+    What still water and resting robots lack (`RATES`) is 0 in the rows to come.
 
     Args:
-        task: what they are about.
-        settings: of the task.
-        world: the world.
-        recorded: `position` and `energy`, and what else the task has recorded: fields of a `Track`,
-            sampled as `sample_rows` has it, the settling time not cut off.
-        start_height: `[lanes]` z of the core at the start [m].
-        figure: of the bodies, `[lanes]` or one.
+        track: `[S, ..., lanes]` each.
+        rows: `[n, ..., lanes]` each.
+        first: row of the track that the first of them becomes; one for all lanes if there are
+            several.
 
     Returns:
-        `[lanes]` scores, and `[lanes]` measures (see `measures.measure`).
+        The track.
     """
-    first = first_counted(settings, world.timestep)
-    kept = {name: x[first:] for name, x in recorded.items()}
-    place = kept["position"]
-    clearance = jnp.full_like(place[:, 0], jnp.inf)
-    if world.bed is not None:
-        clearance = place[:, 2] - bed_height(world.bed, place[:, 0], place[:, 1])
-    track = Track(
-        clearance=clearance,
-        interval=sample_rows(settings, world.timestep)[0] * world.timestep,
-        start_height=start_height,
-        length=figure.length,
-        weight=figure.weight,
-        surface_height=world.surface_height,
-        num_hinges=figure.num_hinges,
-        **kept,
-    )
-    measures = measure(track, settings.measures)
-    return task.score(track, settings) - settings.energy_weight * measures["energy_j"], measures
+    found = {}
+    for name, new in rows.items():
+        count, old = new.shape[0], track[name]
+        index = jnp.arange(old.shape[0]).reshape(-1, *[1] * (new.ndim - 1)) - first
+        later = new if count == 1 else new[jnp.clip(index.reshape(-1), 0, count - 1)]
+        if name in RATES:
+            later = jnp.where(index < count, later, 0.0)
+        found[name] = jnp.where(index >= 0, later, old)
+    return found
 
 
-def score_episodes(
-    task: Task,
-    settings: TaskConfig,
-    world: World,
-    recorded: Mapping[str, jax.Array],
-    start: jax.Array,
-    figure: Figure,
-) -> Scores:
-    """Scores and measures of episodes from their tracks.
+def max_distance(settings: TaskConfig, world: World, geometry: BodyGeometry) -> Any:
+    """The distance from its start [m] beyond which a rollout counts as blown up.
 
-    Args:
-        task: what they are about.
-        settings: of the task.
-        world: the world.
-        recorded: as of `judge_tracks`.
-        start: `[3, lanes]` of the core [m].
-        figure: of the bodies, `[lanes]` or one.
-
-    Returns:
-        The scores.
-    """
-    score, measures = judge_tracks(task, settings, world, recorded, start[2], figure)
-    away = jnp.max(jnp.abs(recorded["position"] - start), (0, 1))
-    # Written so that NaN counts as too far.
-    sane = jnp.isfinite(score) & (away < farthest(settings, world, figure))
-    return Scores(jnp.where(sane, score, WORST), sane, measures)
-
-
-def farthest(settings: TaskConfig, world: World, figure: Figure) -> Any:
-    """How far from its start an episode may lead; who gets further has blown up.
-
-    Args:
-        settings: of the task.
-        world: the world.
-        figure: of the bodies, `[lanes]` or one.
-
-    Returns:
-        The distance [m].
+    `geometry`: of the bodies, `[lanes]` or one.
     """
     current = np.linalg.norm(world.current) + 4 * settings.current_std
     fall = 0.5 * world.gravity * settings.duration**2
     swum = (_FASTEST + current) * settings.duration + 4 * settings.start_position
-    return swum + figure.sinks * fall + figure.length
+    return swum + geometry.sinks * fall + geometry.length
 
 
 def may_touch_bed(task: Task, settings: TaskConfig, world: World, reach: float) -> bool:
-    """Whether the bed is within `farthest` of an episode; if not, the step needs no contact.
+    """Whether the bed is within `max_distance` of an episode; if not, the step needs no contact.
 
     That is what a robot at `_FASTEST` covers, plus its fall where the water does not carry it. An
     individual that outruns it counts as blown up, so nothing can pass through an absent bed unseen.

@@ -11,18 +11,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.control.controller import BoundController, Controller
-from mjx_revolve.control.sense import Cues
+from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.kinematics import body_positions
+from mjx_revolve.engine.kinematics import body_poses
 from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.variation import Variation
-from mjx_revolve.episodes.rollout import flow_at, roll_out
-from mjx_revolve.episodes.starts import gusty_water, target_path
-from mjx_revolve.inputs.brief import brief
+from mjx_revolve.episodes.rollout import (
+    Policy,
+    Rollout,
+    RolloutState,
+    StepInputs,
+    controlled,
+    open_loop,
+    with_variation,
+)
+from mjx_revolve.episodes.starts import draw_gusts, gusty_water, target_path
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import compiler_options, hasty_options
-from mjx_revolve.water.flow import Water, gust_path, water_of
+from mjx_revolve.inputs.short_repr import short_repr
+from mjx_revolve.numerics.xla import is_traced, jit
+from mjx_revolve.water.flow import Water, water_of
 
 
 @partial(
@@ -61,7 +69,7 @@ class Trajectory:
     surface_height: jax.Array | None = None
     target: jax.Array | None = None
 
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 @lru_cache(maxsize=64)
@@ -72,80 +80,65 @@ def _compiled(
 
     `still` leaves the water's surface and current to the world, as constants that fold away.
     """
-    given = make_engine(robot, engine)
+    unvaried = make_engine(robot, engine)
     dt = robot.world.timestep
     # MuJoCo's actuators in the robot's own order, and where each stands among the engine's rows.
     own = actuators_of(robot)
-    back = np.argsort(own[given.plant.source[:, 0]]).astype(np.int32)
+    back = np.argsort(own[unvaried.plant.source[:, 0]]).astype(np.int32)
 
     def run(
         qpos: Any,
         qvel: Any,
         drive_input: Any,
         water: Water | None,
-        cues: Cues,
+        context: EpisodeContext,
         variation: Variation | None,
-        derived: bool = False,
+        differentiable: bool = False,
     ) -> Trajectory:
-        simulator = given
-        if variation is not None:
-            assert given.varied is not None
-            simulator = given.varied(variation)
-        cues = jax.tree.map(lambda x: x[None], cues)
-        parameters, drive_state, targets = None, (), None
+        simulator = with_variation(unvaried, variation)
+        context = jax.tree.map(lambda x: x[None], context)
+        policy: Policy = open_loop
+        controller_state, targets = (), None
         if controller is None:
             targets = jax.vmap(simulator.plant.arrange)(drive_input[:, own, None])
-            drive = lambda s, time, row, sense: (s, row[0])  # noqa: E731
         else:
             parameters = controller.decode(drive_input[:, None], simulator.plant)
-            drive_state = controller.init(parameters)
-            drive = lambda s, time, row, sense: controller.step(  # noqa: E731
-                parameters, s, time, sense
+            policy, controller_state = (
+                controlled(controller, parameters),
+                controller.init(parameters),
             )
         moving = None if still else water
-        if moving is None:
-            flow = flow_at(robot.world, water_of(robot.world))
-        else:
+        if moving is not None:
             moving = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[:, None], moving)
-            flow = lambda time, row: flow_at(robot.world, row[1])(time, None)  # noqa: E731
-        keep = lambda state, ctrl, energy, water: (state, ctrl, energy)  # noqa: E731
-        _, (states, ctrl, energy, pursuer) = roll_out(
-            simulator,
-            drive,
-            flow,
-            keep,
-            simulator.init(qpos[:, None], qvel[:, None]),
-            drive_state,
-            (targets, moving),
-            records=steps,
-            every=1,
-            timestep=dt,
-            derived=derived,
-            world=robot.world,
-            cues=cues,
-            feels=() if controller is None else controller.feels,
-            recall=lambda kept, memory: (*kept, memory.pursuer),
+        signals = () if controller is None else controller.signals
+        rollout = Rollout(simulator, policy, robot.world, water_of(robot.world), context, signals)
+
+        def record(now: RolloutState, ctrl: jax.Array, water: Water) -> Any:
+            return now.state, ctrl, now.energy, now.memory.pursuer
+
+        now = rollout.init(simulator.init(qpos[:, None], qvel[:, None]), controller_state)
+        inputs = StepInputs(moving, targets)
+        _, (states, ctrl, energy, pursuer) = rollout.advance(
+            now, record, steps, 1, inputs, differentiable
         )
         time = dt * jnp.arange(1, steps + 1, dtype=energy.dtype)
-        target = None if pursuer is None else jnp.stack(pursuer.place, 1)
-        if target is None and cues.target is not None:
-            target = target_path(cues, time)
+        target = None if pursuer is None else jnp.stack(pursuer.position, 1)
+        if target is None and context.target is not None:
+            target = target_path(context, time)
         qs, vs = jax.vmap(simulator.observe)(states)
         return Trajectory(
             time=dt * jnp.arange(1, steps + 1, dtype=qs.dtype),
             qpos=qs[..., 0],
             qvel=vs[..., 0],
-            xpos=body_positions(robot, qs[..., 0]),
+            xpos=body_poses(robot, qs[..., 0])[0],
             ctrl=ctrl[..., 0][:, back],
             power=energy[..., 0] / dt,
-            command=jax.vmap(simulator.command)(states)[..., 0],
+            command=jax.vmap(simulator.thruster_command)(states)[..., 0],
             surface_height=None if moving is None else moving.surface_height[:, 0],
             target=None if target is None else target[..., 0],
         )
 
-    hasty = once and engine == "population"
-    jitted = jax.jit(run, compiler_options=hasty_options() if hasty else compiler_options())
-    return jitted, partial(run, derived=True)
+    return jit(run, fast=once and engine == "population"), partial(run, differentiable=True)
 
 
 def simulate(
@@ -159,7 +152,7 @@ def simulate(
     water: Water | None = None,
     engine: str = "population",
     once: bool = False,
-    cues: Cues | None = None,
+    context: EpisodeContext | None = None,
     variation: Variation | None = None,
 ) -> Trajectory:
     """Simulates one robot.
@@ -181,8 +174,7 @@ def simulate(
         engine: "population" or "mjx".
         once: whether it is compiled in haste, as little is simulated by it: one is sooner done with
             a minute or less.
-        cues: what the robot is given to feel beside its own state, a number each; by default no
-            target, and noise of sensors that `key` draws.
+        context: of the sensors, a number each; by default no target, and noise that `key` draws.
         variation: factors on coefficients of water and motors, a number each; by default none.
 
     Returns:
@@ -223,35 +215,31 @@ def simulate(
             turned = jnp.stack([jnp.cos(half), 0 * half, 0 * half, jnp.sin(half)])
             qpos = jnp.asarray(qpos).at[3:7].set(turned)
     qpos = _array("qpos", qpos, (model.nq,))
-    if not isinstance(qpos, jax.core.Tracer) and not np.any(qpos[3:7]):
+    if not is_traced(qpos) and not np.any(qpos[3:7]):
         raise InputError(
             "qpos[3:7]: expected a quaternion (w, x, y, z) of any length but 0; found zeros "
             "([1, 0, 0, 0] for the rest pose)"
         )
     qvel = jnp.zeros(model.nv) if qvel is None else _array("qvel", qvel, (model.nv,))
     if water is None and robot.world.gust is not None:
-        gust_key = jax.random.fold_in(jax.random.key(0) if key is None else key, 1)
-        path = gust_path(robot.world.gust, gust_key, steps, dt, 1)[..., 0]
-        water = gusty_water(robot.world, path)
+        path = draw_gusts(robot.world, jax.random.key(0) if key is None else key, steps, 1)
+        water = gusty_water(robot.world, path[..., 0])
     if water is not None:
         water = jax.tree.map(lambda x: _array("water", x, None), water)
         for leaf in jax.tree.leaves(water):
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
                 raise InputError(f"water: expected numbers or [{steps}]; found {list(leaf.shape)}")
-    if cues is None:
+    if context is None:
         noise_key = jax.random.fold_in(jax.random.key(0) if key is None else key, 3)
-        cues = Cues(noise=jax.random.bits(noise_key, (), "uint32"))
-    cues = jax.tree.map(jnp.asarray, cues)
+        context = EpisodeContext(noise=jax.random.bits(noise_key, (), "uint32"))
+    context = jax.tree.map(jnp.asarray, context)
     if variation is not None:
         if engine != "population":
             raise InputError(f"variation: expected none, as engine is {engine}; found some")
         variation = Variation(*(_array("variation", x, ()) for x in variation))
     jitted, plain = _compiled(robot, engine, steps, controller, water is None, once)
-    traced = any(
-        isinstance(x, jax.core.Tracer)
-        for x in jax.tree.leaves((qpos, qvel, drive_input, water, cues, variation))
-    )
-    return (plain if traced else jitted)(qpos, qvel, drive_input, water, cues, variation)
+    given = qpos, qvel, drive_input, water, context, variation
+    return (plain if is_traced(given) else jitted)(*given)
 
 
 def _steps(rows: Any, duration: float | None, dt: float) -> int:
@@ -283,6 +271,6 @@ def _array(place: str, value: Any, shape: tuple[int, ...] | None) -> jax.Array:
         or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True))
     ):
         raise InputError(f"{place}: expected shape {list(shape)}; found {list(array.shape)}")
-    if not isinstance(array, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(array))):
+    if not is_traced(array) and not bool(jnp.all(jnp.isfinite(array))):
         raise InputError(f"{place}: expected finite numbers; found NaN or infinity")
     return array

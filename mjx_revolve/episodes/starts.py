@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int, UInt
 
 from mjx_revolve.control.courses import Course
-from mjx_revolve.control.pursuit import Chase
-from mjx_revolve.control.sense import Cues
-from mjx_revolve.engine.plant import Figure
+from mjx_revolve.control.pursuit import PursuitLimits
+from mjx_revolve.control.readings import EpisodeContext
+from mjx_revolve.engine.plant import BodyGeometry
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
@@ -21,40 +22,38 @@ from mjx_revolve.numerics.spatial import quat_mul
 from mjx_revolve.water.flow import Water, gust_path, water_of
 from mjx_revolve.water.world import World
 
-# How long a sea is before it begins again, as episodes see it [s].
+# Period after which the sea of the episodes repeats [s].
 _SEA = 1000.0
 
 
 class Starts(NamedTuple):
-    """Of a key's episodes.
+    """What differs between a key's episodes.
 
     Attributes:
-        place: `[3, trials]` drawn around 0 [m]; the task says where that leads a body.
-        quat: `[4, trials]` of the core, world from body (w, x, y, z).
-        water: `[trials]` where it varies, else None.
-        gusts: `[steps + 1, 3, trials]` velocity around the episode's current [m/s], or None where
-            the world has no gusts.
-        noise: `[trials]` uint32 what the sensors' noise is drawn from.
-        towards: `[3, trials]` from the start to the target [m]; None where the task draws none.
-        drift: `[3, trials]` velocity of the target [m/s]; None where it keeps still, or chases the
-            robot.
-        variation: `[trials]` each, what is not known exactly; None where nothing is drawn.
-        course: `[trials]` each, the direction to keep to; None where the task has none.
+        place: drawn around 0 [m]; the task makes a start position of it.
+        quat: of the core, world from body (w, x, y, z).
+        water: `[trials]`; None where it does not vary.
+        gusts: velocity around the episode's current [m/s]; None without.
+        noise: seed of the sensors' noise.
+        towards: from the start to the target [m]; None where the task draws none.
+        drift: velocity of the target [m/s]; None where it is fixed, or pursues the robot.
+        variation: factors on coefficients, `[trials]` each; None where none is drawn.
+        course: direction to keep to, `[trials]` each; None where the task has none.
     """
 
-    place: jax.Array
-    quat: jax.Array
+    place: Float[Array, "3 trials"]
+    quat: Float[Array, "4 trials"]
     water: Water | None
-    gusts: jax.Array | None
-    noise: jax.Array
-    towards: jax.Array | None = None
-    drift: jax.Array | None = None
+    gusts: Float[Array, "rows 3 trials"] | None
+    noise: UInt[Array, " trials"]
+    towards: Float[Array, "3 trials"] | None = None
+    drift: Float[Array, "3 trials"] | None = None
     variation: Variation | None = None
     course: Course | None = None
 
 
 def check_key(key: Any) -> None:
-    """Refuses what `jax.random` would not draw from, such as a bare seed.
+    """Refuses what `jax.random` does not draw from, such as a bare seed.
 
     Args:
         key: from `jax.random.key`, or one of the older arrays of uint32.
@@ -74,7 +73,7 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
         task: how starts vary.
         world: the world.
         key: draws them.
-        steps: how long episodes are.
+        steps: timesteps of an episode.
 
     Returns:
         The starts.
@@ -85,10 +84,7 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
     tilt = task.start_tilt * jax.random.normal(tilt_key, (2, trials))
     yaw = task.start_yaw * jax.random.normal(yaw_key, (trials,))
     quat = _euler_quat(tilt[0], tilt[1], yaw)
-    gusts = None
-    if world.gust is not None:
-        gust_key = jax.random.fold_in(key, 1)
-        gusts = gust_path(world.gust, gust_key, steps, world.timestep, trials)
+    gusts = None if world.gust is None else draw_gusts(world, key, steps, trials)
     noise = jax.random.bits(jax.random.fold_in(key, 3), (trials,), "uint32")
     starts = Starts(place, quat, None, gusts, noise, *_draw_target(task, key))
     starts = starts._replace(variation=_draw_variation(task, key), course=_draw_course(task, key))
@@ -150,68 +146,64 @@ def _draw_variation(task: TaskConfig, key: jax.Array) -> Variation | None:
     return Variation(*(width**share for width, share in zip(ranges, shares, strict=True)))
 
 
-def cues_of(task: TaskConfig, starts: Starts, place: jax.Array) -> Cues:
-    """What episodes give their robots to feel.
+def episode_context(
+    task: TaskConfig, starts: Starts, position: Float[Array, "3 lanes"]
+) -> EpisodeContext:
+    """The sensors' context of episodes.
 
     Args:
-        task: whose target it is.
+        task: its target and pursuer.
         starts: of the episodes, `[lanes]`.
-        place: `[3, lanes]` where the cores start, world frame [m].
-
-    Returns:
-        The cues.
+        position: of the cores at the start, world frame [m].
     """
+    like = position[0]
+    wide = lambda x: jnp.full_like(like, x)  # noqa: E731
     target: Any = None
     if starts.towards is not None:
-        target = tuple(place + starts.towards)
+        target = tuple(position + starts.towards)
     elif task.target is not None:
-        target = tuple(jnp.full_like(place[0], x) for x in task.target)
-    drift = None if starts.drift is None or target is None else tuple(starts.drift)
-    chase = sight = None
-    if task.sight is not None:
-        sight = jnp.full_like(place[0], task.sight)
+        target = tuple(map(wide, task.target))
+    pursuit = None
     if task.target_turn is not None:
-        chase = Chase(*(jnp.full_like(place[0], x) for x in (task.target_speed, task.target_turn)))
-    return Cues(target, drift, starts.noise, sight, chase, starts.course)
+        pursuit = PursuitLimits(wide(task.target_speed), wide(task.target_turn))
+    return EpisodeContext(
+        target=target,
+        drift=None if starts.drift is None or target is None else tuple(starts.drift),
+        noise=starts.noise,
+        sight=None if task.sight is None else wide(task.sight),
+        pursuit=pursuit,
+        course=starts.course,
+    )
 
 
-def target_path(cues: Cues, time: jax.Array) -> jax.Array:
-    """Where the targets are that do not chase their robots.
-
-    Args:
-        cues: of episodes, `[lanes]`.
-        time: `[S]` since their start [s].
-
-    Returns:
-        `[S, 3, lanes]` world frame [m].
-    """
-    place = jax.vmap(cues.target_at)(time) if cues.drift is not None else cues.target
-    wide = (time.shape[0], *jnp.shape(cues.target[0]))
-    return jnp.stack([jnp.broadcast_to(x, wide) for x in place], 1)
+def target_path(context: EpisodeContext, time: Float[Array, " S"]) -> Float[Array, "S 3 lanes"]:
+    """Positions of targets that do not pursue their robots, world frame [m], at times [s]."""
+    path = jax.vmap(context.target_at)(time) if context.drift is not None else context.target
+    wide = (time.shape[0], *jnp.shape(context.target[0]))
+    return jnp.stack([jnp.broadcast_to(x, wide) for x in path], 1)
 
 
 def start_pose(
-    task: Task, settings: TaskConfig, world: World, figure: Figure, starts: Starts
-) -> jax.Array:
-    """Where the cores of bodies start.
+    task: Task, settings: TaskConfig, world: World, geometry: BodyGeometry, starts: Starts
+) -> Float[Array, "7 lanes"]:
+    """Poses of the cores at the start.
 
     Args:
-        task: which knows.
+        task: places a body in the world.
         settings: of the task.
         world: the world.
-        figure: of the bodies, `[lanes]` or one.
+        geometry: of the bodies, `[lanes]` or one.
         starts: of their episodes, `[lanes]`.
 
     Returns:
-        `[7, lanes]` position, world frame [m], and quaternion (w, x, y, z).
+        Position, world frame [m], and quaternion (w, x, y, z).
     """
-    place = task.start(settings, world, figure, starts.place)
+    position = task.start(settings, world, geometry, starts.place)
     quat = starts.quat
     if settings.start_attitude == "righted":
-        righting = _righting(figure.up)
-        turned = quat_mul(tuple(quat), righting)
+        turned = quat_mul(tuple(quat), _righting(geometry.up))
         quat = jnp.stack([x.astype(quat.dtype) for x in turned])
-    return jnp.concatenate([place, quat])
+    return jnp.concatenate([position, quat])
 
 
 def _righting(up: Any) -> tuple[Any, ...]:
@@ -224,13 +216,21 @@ def _righting(up: Any) -> tuple[Any, ...]:
     return w / norm, x / norm, y / norm, jnp.zeros_like(w)
 
 
+def draw_gusts(
+    world: World, key: jax.Array, steps: int, trials: int
+) -> Float[Array, "rows 3 trials"]:
+    """Paths of gusts around the current, `[steps + 1, 3, trials]` [m/s]; `key`: of the episodes."""
+    assert world.gust is not None
+    return gust_path(world.gust, jax.random.fold_in(key, 1), steps, world.timestep, trials)
+
+
 def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Water:
     """The water along a path of gusts.
 
     Args:
-        world: whose gusts they are.
-        path: `[steps + 1, 3, ...]` from `flow.gust_path` [m/s], around the world's current.
-        water: what else differs from the world; its current is that around which the gusts blow.
+        world: its timestep, and its water by default.
+        path: `[steps + 1, 3, ...]` from `draw_gusts` [m/s].
+        water: its current is that around which the gusts blow.
 
     Returns:
         Water whose current and acceleration are `[steps, ...]`.
@@ -239,6 +239,45 @@ def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Wa
     current = tuple(c + path[:-1, i] for i, c in enumerate(base.current))
     change = jnp.diff(path, axis=0) / world.timestep
     return base._replace(current=current, acceleration=tuple(change[:, i] for i in range(3)))
+
+
+def steady_water(world: World, starts: Starts) -> Water:
+    """The water of episodes, but for gusts."""
+    return water_of(world) if starts.water is None else starts.water
+
+
+def gust_rows(
+    world: World, starts: Starts, steps: int, first: Int[Array, ...] | None = None
+) -> Water | None:
+    """The water of each timestep of episodes in gusts.
+
+    Args:
+        world: the world.
+        starts: of the episodes, `[lanes]`.
+        steps: number of timesteps; after an episode's last one, that is repeated.
+        first: timestep to begin with, of all or of each lane; None: 0.
+
+    Returns:
+        `[steps, lanes]`; None without gusts.
+    """
+    path = starts.gusts
+    if path is None:
+        return None
+    if first is not None:
+        index = jnp.minimum(first + jnp.arange(steps + 1)[:, None], path.shape[0] - 1)
+        index = jnp.broadcast_to(index, (steps + 1, path.shape[-1]))
+        path = jnp.take_along_axis(path, index[:, None], 0)
+    water = gusty_water(world, path, starts.water)
+    shape = steps, path.shape[-1]
+    return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, path.dtype), shape), water)
+
+
+def pick_water(world: World, starts: Starts, trial: int) -> Water | None:
+    """The water of one episode, as `simulate` takes it; None: the world's."""
+    water = jax.tree.map(lambda x: x[trial], starts.water)
+    if starts.gusts is None:
+        return water
+    return gusty_water(world, starts.gusts[..., trial], water)
 
 
 def _euler_quat(roll: Any, pitch: Any, yaw: Any) -> jax.Array:

@@ -1,8 +1,8 @@
-"""A tank: a world that goes on, in which robots come and go, and all in it are stepped together.
+"""A tank: a world without end, in which robots come and go and are stepped together.
 
-It has a fixed number of places, so that one compiled program serves it however many are there; a
-place that nobody has is stepped along, and felt by no one. Several worlds with equally many places
-may stand side by side. Every robot's own time begins when it is put in.
+It has a fixed number of places, so that one compiled program serves any number of robots; an empty
+place is stepped along, and no sensor reads it. Several worlds with equally many places may stand
+side by side. Every robot's own time begins when it is added.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.control.sense import Cues
-from mjx_revolve.engine.collisions import Touch, make_meeting
+from mjx_revolve.control.readings import EpisodeContext
+from mjx_revolve.engine.batched_trees import make_batched_trees
+from mjx_revolve.engine.engines import Engine
+from mjx_revolve.engine.interaction import ContactParameters, make_interaction
+from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.rows import make_rows
 from mjx_revolve.engine.spheres import Spheres, count_spheres, pack_spheres
-from mjx_revolve.engine.state import Engine
-from mjx_revolve.engine.step import make_step_engine
 from mjx_revolve.episodes.fitness import MixedFitness
-from mjx_revolve.episodes.rollout import Passage, begin, flow_at, go_on
+from mjx_revolve.episodes.rollout import Rollout, RolloutState, controlled, start_at_rest
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import compiler_options
+from mjx_revolve.numerics.xla import jit
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
 
 
-class Trail(NamedTuple):
-    """What robots did over a while, sampled at equal intervals; NumPy.
+class TankTrajectory(NamedTuple):
+    """Motion of the robots in a tank, sampled at equal intervals; NumPy.
 
     Attributes:
         time: `[T]` since the tank's beginning [s].
-        qpos: `[T, nq, places]` of each place's robot, in its first 7 + hinges rows: MuJoCo's qpos.
+        qpos: `[T, nq, places]` in its first 7 + hinges rows MuJoCo's qpos of each place's robot.
         energy: `[T, places]` work of its servos and propellers since the row before, summed without
             sign [J].
         alive: `[places]` which places were taken.
@@ -53,8 +53,20 @@ class Trail(NamedTuple):
         return self.qpos[:, :3]
 
 
+@dataclass
+class _Slots:
+    """What a tank knows of each of its places, on the last axis."""
+
+    genes: np.ndarray
+    start: np.ndarray
+    new: np.ndarray
+    since: np.ndarray
+    tag: np.ndarray
+    noise: np.ndarray
+
+
 class _Given(NamedTuple):
-    """What a stretch of time is computed from, beside what travels on; places on the last axis."""
+    """Inputs of a compiled stretch of time; places on the last axis."""
 
     bodies: Any
     spheres: Spheres
@@ -75,40 +87,44 @@ class Tank:
     """A running world; see `make_tank`.
 
     Attributes:
-        mixed: task, world and controller, and room for bodies.
-        places: how many robots there may be, in all worlds together.
-        worlds: how many worlds stand side by side.
-        touch: how robots' surfaces answer each other; None: they pass through each other.
-        spheres: room for so many of them in each place; more is made where a robot needs it.
+        mixed: world, controller, and room for bodies.
+        places: of all worlds together.
+        worlds: how many stand side by side.
+        touch: contact between robots; None: they pass through each other.
+        spheres: room for so many of them in each place; it grows with a robot that needs more.
         steps: since the beginning.
-        robots: `[places]` who is where; None: nobody.
-        tag: `[places]` by which robots can tell each other apart.
+        robots: `[places]`; None: an empty place.
+        state: of the rollout; None before the first `advance`.
+        target: `[3, places]` of each robot, world frame [m]; None without.
     """
 
     mixed: MixedFitness
     places: int
     worlds: int
-    touch: Touch | None
+    touch: ContactParameters | None
     spheres: int = 0
     steps: int = 0
     robots: list[Robot | None] = field(default_factory=list, repr=False)
+    state: RolloutState | None = field(default=None, repr=False)
+    target: np.ndarray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """An empty tank."""
-        self.robots = [None] * self.places
-        self._new = np.zeros(self.places, bool)
-        self._since = np.zeros(self.places, np.int64)
-        self._genes = np.zeros((self.mixed.num_genes, self.places), np.float32)
-        self._start = np.zeros((7, self.places), np.float32)
-        self._start[3] = 1
-        # Far apart, where nobody else is.
-        self._start[0] = 1e3 + 10.0 * np.arange(self.places)
-        self._start[2] = self.world.surface_height - 1
-        self.tag = np.zeros(self.places, np.float32)
-        self.target: np.ndarray | None = None
-        self._noise = np.arange(self.places, dtype=np.uint32)
+        count = self.places
+        self.robots = [None] * count
+        self._slots = _Slots(
+            genes=np.zeros((self.mixed.num_genes, count), np.float32),
+            start=np.zeros((7, count), np.float32),
+            new=np.zeros(count, bool),
+            since=np.zeros(count, np.int64),
+            tag=np.zeros(count, np.float32),
+            noise=np.arange(count, dtype=np.uint32),
+        )
+        # Empty places are far apart.
+        self._slots.start[0] = 1e3 + 10.0 * np.arange(count)
+        self._slots.start[2] = self.world.surface_height - 1
+        self._slots.start[3] = 1
         self._current = np.array(self.world.current, np.float32)
-        self._passage: Passage | None = None
         self._bodies: Any = None
         self._spheres: Any = None
 
@@ -133,20 +149,25 @@ class Tank:
         return self._current.copy()
 
     @property
+    def tag(self) -> np.ndarray:
+        """`[places]` numbers by which sensors can tell robots apart."""
+        return self._slots.tag
+
+    @property
     def alive(self) -> np.ndarray:
         """`[places]` which places are taken."""
         return np.array([robot is not None for robot in self.robots])
 
     @property
     def count(self) -> int:
-        """How many robots there are."""
+        """The number of robots."""
         return int(self.alive.sum())
 
     def age(self, place: int) -> float:
-        """How long a robot has been in the tank [s]."""
-        return float(self.steps - self._since[place]) * self.timestep
+        """The time since a robot was added [s]."""
+        return float(self.steps - self._slots.since[place]) * self.timestep
 
-    # --- who is there
+    # --- robots
 
     def add(
         self,
@@ -157,7 +178,7 @@ class Tank:
         world: int = 0,
         noise: int | None = None,
     ) -> int:
-        """Puts a robot in, at rest, its hinges at 0.
+        """Adds a robot, at rest, its hinges at 0.
 
         Args:
             robot: from `mixed.build`.
@@ -165,7 +186,7 @@ class Tank:
             position: of its core, world frame [m].
             quat: of its core, world from body (w, x, y, z).
             world: in which of the worlds.
-            noise: what its sensors' noise is drawn from; by default its place's number.
+            noise: seed of its sensors' noise; by default its place's number.
 
         Returns:
             Its place.
@@ -190,40 +211,37 @@ class Tank:
         place = free[0]
         self._put(place, robot)
         self.robots[place] = robot
-        self._genes[:, place] = wide
-        self._start[:3, place] = position
-        self._start[3:, place] = np.asarray(quat, float) / size
-        self._since[place] = self.steps
-        self._new[place] = True
-        self._noise[place] = np.uint32(place if noise is None else noise)
+        slots = self._slots
+        slots.genes[:, place] = wide
+        slots.start[:, place] = (*position, *np.asarray(quat, float) / size)
+        slots.since[place] = self.steps
+        slots.new[place] = True
+        slots.noise[place] = np.uint32(place if noise is None else noise)
         return place
 
     def remove(self, place: int) -> None:
-        """Takes a robot out.
-
-        Args:
-            place: its place.
+        """Removes the robot of a place.
 
         Raises:
-            InputError: there is nobody.
+            InputError: the place is empty.
         """
         if not 0 <= place < self.places or self.robots[place] is None:
             raise InputError(f"tank: expected a robot in place {place}; found none")
         self.robots[place] = None
 
     def move(self, shift: np.ndarray) -> None:
-        """Puts robots elsewhere, moving as they were.
+        """Displaces robots, without a change of their velocities.
 
         Args:
-            shift: `[3, places]` by how much, world frame [m].
+            shift: `[3, places]` world frame [m].
         """
-        if self._passage is None:
+        if self.state is None:
             return
-        state = self._passage.state
+        state = self.state.state
         moved = tuple(
             np.asarray(x) + d.astype(np.float32) for x, d in zip(state.position, shift, strict=True)
         )
-        self._passage = self._passage._replace(state=state._replace(position=moved))
+        self.state = self.state._replace(state=state._replace(position=moved))
 
     def set_current(self, current: Sequence[float]) -> None:
         """Changes the water's uniform current.
@@ -240,15 +258,11 @@ class Tank:
         self._current = found
 
     def set_targets(self, target: np.ndarray | None) -> None:
-        """Says where each robot's target is, for sensors that tell of it.
-
-        Args:
-            target: `[3, places]` world frame [m]; None: there is none.
-        """
+        """Sets the target of each robot's sensors, `[3, places]` world frame [m]; None: none."""
         self.target = None if target is None else np.asarray(target, np.float32)
 
     def _put(self, place: int, robot: Robot) -> None:
-        """A robot's tables into its place."""
+        """Writes a robot's tables into its place."""
         bodies = self.mixed.pack([robot])
         if count_spheres([robot]) > self.spheres:
             # Room for some more, as every change of shape has to be compiled for.
@@ -268,70 +282,79 @@ class Tank:
 
         jax.tree.map(write, (self._bodies, self._spheres), (bodies, spheres))
 
-    # --- what they do
+    # --- time
 
-    def advance(self, duration: float, every: float = 0.1) -> Trail:
-        """Lets time pass.
+    def advance(self, duration: float, every: float = 0.1) -> TankTrajectory:
+        """Advances the time.
 
         Args:
-            duration: how long [s], in whole rows.
+            duration: [s], in whole rows.
             every: time between rows [s], in whole steps.
 
         Returns:
-            What the robots did, rows at the end of each interval.
+            The robots' motion, rows at the end of each interval.
         """
         step = self.timestep
         stride = max(1, round(every / step))
         rows = max(1, round(duration / (stride * step)))
         alive = self.alive
-        if self._bodies is None:  # nobody has ever been here
+        if self._bodies is None:  # no robot was ever added
             self.steps += rows * stride
             time = (self.steps - stride * np.arange(rows)[::-1]) * step
             blank = np.zeros((rows, 7 + self.mixed.capacity.hinges, self.places), np.float32)
-            return Trail(time, blank, np.zeros((rows, self.places), np.float32), alive)
+            return TankTrajectory(time, blank, np.zeros((rows, self.places), np.float32), alive)
         given = self._given()
-        passage = self._passage
-        if passage is None:
-            passage = self._blank(given)
+        state = self.state
+        if state is None:
+            state = self._blank(given)
             given = given._replace(new=np.ones(self.places, bool))
         run = self._stretch(rows, stride)
-        passage, qpos, energy = run(given, passage)
-        self._passage = jax.tree.map(np.asarray, passage)
+        state, qpos, energy = run(given, state)
+        self.state = jax.tree.map(np.asarray, state)
         time = (self.steps + stride * np.arange(1, rows + 1)) * step
         self.steps += rows * stride
-        self._new[:] = False
-        return Trail(time, np.asarray(qpos), np.asarray(energy), alive)
+        self._slots.new[:] = False
+        return TankTrajectory(time, np.asarray(qpos), np.asarray(energy), alive)
 
     def _given(self) -> _Given:
-        """What is computed from now."""
+        """The inputs of a stretch that begins now."""
+        slots = self._slots
         return _Given(
-            self._bodies, self._spheres, self._genes, self._start, self._new, self.alive,
-            (self._since - self.steps).astype(np.int32), self.tag, self.target, self._noise,
+            self._bodies, self._spheres, slots.genes, slots.start, slots.new, self.alive,
+            (slots.since - self.steps).astype(np.int32), slots.tag, self.target, slots.noise,
             self._current, np.float32(self.time),
         )  # fmt: skip
 
     def _engine(self, given: _Given) -> Engine:
-        setup = self.mixed.setup
-        rows = make_rows(self.world, self.mixed.capacity, given.bodies, self.places)
-        looks = "nearest" in setup.controller.feels
+        rows = make_batched_trees(self.world, self.mixed.capacity, given.bodies, self.places)
+        looks = "nearest" in self.mixed.controller.signals
         meet = None
         if looks or self.touch is not None:
             tag = given.tag if looks else None
-            meet = make_meeting(rows, given.spheres, given.alive, self.worlds, self.touch, tag)
-        return make_step_engine(rows, given.bodies.plant, meet=meet)
+            meet = make_interaction(rows, given.spheres, given.alive, self.worlds, self.touch, tag)
+        return PopulationEngine(rows, given.bodies.plant, interaction=meet)
 
-    def _begin(self, given: _Given) -> Passage:
-        """What travels, for all places as if all robots were put in now."""
-        controller, engine = self.mixed.setup.controller, self._engine(given)
-        hinges = jnp.zeros((self.mixed.capacity.hinges, self.places), given.start.dtype)
-        qpos = jnp.concatenate([given.start, hinges])
-        state = engine.init(qpos, jnp.zeros_like(qpos[1:]))
+    def _rollout(self, given: _Given) -> tuple[Rollout, RolloutState]:
+        """The rollout, and its state as if all robots were put in now."""
+        controller, engine = self.mixed.controller, self._engine(given)
         parameters = controller.decode(given.genes, given.bodies.plant)
-        return begin(engine, state, controller.init(parameters), controller.feels)
+        target = None if given.target is None else tuple(given.target)
+        rollout = Rollout(
+            engine,
+            controlled(controller, parameters),
+            self.world,
+            Water(self.world.surface_height, tuple(given.current), time=given.time),
+            EpisodeContext(target, None, given.noise),
+            controller.signals,
+            birth=given.since,
+        )
+        return rollout, rollout.init(
+            start_at_rest(engine, given.start), controller.init(parameters)
+        )
 
-    def _blank(self, given: _Given) -> Passage:
+    def _blank(self, given: _Given) -> RolloutState:
         """Zeros of its shapes."""
-        shapes = jax.eval_shape(self._begin, jax.tree.map(jnp.asarray, given))
+        shapes = jax.eval_shape(lambda x: self._rollout(x)[1], jax.tree.map(jnp.asarray, given))
         return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
 
     @cached_property
@@ -343,66 +366,38 @@ class Tank:
         key = rows, stride
         if key not in self._programs:
             run = partial(self._run, rows, stride)
-            self._programs[key] = jax.jit(run, compiler_options=compiler_options())
+            self._programs[key] = jit(run)
         return self._programs[key]
 
-    def _run(self, rows: int, stride: int, given: _Given, passage: Passage) -> Any:
+    def _run(self, rows: int, stride: int, given: _Given, state: RolloutState) -> Any:
         given = jax.tree.map(jnp.asarray, given)
-        world, controller = self.world, self.mixed.setup.controller
-        engine, fresh = self._engine(given), self._begin(given)
-        pick = lambda new, old: jnp.where(given.new, new, old)  # noqa: E731
-        zero = jnp.zeros((), jnp.int32)
-        passage = jax.tree.map(pick, fresh._replace(count=zero), passage._replace(count=zero))
+        rollout, fresh = self._rollout(given)
         # Steps are counted from now, so that float32 can hold every robot's age.
-        passage = passage._replace(count=zero)
-        parameters = controller.decode(given.genes, given.bodies.plant)
-        target = None if given.target is None else tuple(given.target)
-        water = Water(world.surface_height, tuple(given.current), time=given.time)
+        zero = jnp.zeros((), jnp.int32)
+        state, fresh = state._replace(steps=zero), fresh._replace(steps=zero)
+        pick = lambda new, old: jnp.where(given.new, new, old)  # noqa: E731
+        state = jax.tree.map(pick, fresh, state)._replace(steps=zero)
 
-        def record(state: Any, ctrl: jax.Array, energy: jax.Array, water: Water) -> Any:
-            return engine.observe(state)[0], energy
+        def record(now: RolloutState, ctrl: jax.Array, water: Water) -> tuple[jax.Array, jax.Array]:
+            return rollout.engine.observe(now.state)[0], now.energy
 
-        passage, (qpos, energy) = go_on(
-            engine,
-            lambda state, time, row, sense: controller.step(parameters, state, time, sense),
-            lambda time, row: flow_at(world, water)(time, None),
-            record,
-            passage,
-            None,
-            records=rows,
-            every=stride,
-            timestep=world.timestep,
-            world=world,
-            cues=Cues(target, None, given.noise),
-            feels=controller.feels,
-            since=given.since,
-        )
-        return passage, qpos, energy
+        state, (qpos, energy) = rollout.advance(state, record, rows, stride)
+        return state, qpos, energy
 
     # --- to and from a file
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """All but the robots themselves, as named arrays."""
-        found: dict[str, np.ndarray] = {
-            "steps": np.asarray(self.steps),
-            "new": self._new.copy(),
-            "since": self._since.copy(),
-            "genes": self._genes.copy(),
-            "start": self._start.copy(),
-            "tag": self.tag.copy(),
-            "noise": self._noise.copy(),
-            "current": self._current.copy(),
-            "alive": self.alive,
-        }
+        found = {name: x.copy() for name, x in vars(self._slots).items()}
+        found |= {"steps": np.asarray(self.steps), "current": self.current, "alive": self.alive}
         if self.target is not None:
             found["target"] = self.target.copy()
-        if self._passage is not None:
-            for k, leaf in enumerate(jax.tree.leaves(self._passage)):
-                found[f"passage.{k}"] = np.asarray(leaf)
+        for k, leaf in enumerate(jax.tree.leaves(self.state)):
+            found[f"passage.{k}"] = np.asarray(leaf)
         return found
 
     def from_arrays(self, arrays: Mapping[str, np.ndarray], robots: Mapping[int, Robot]) -> None:
-        """The inverse, of a tank that was just made; what goes on is the same bit for bit.
+        """The inverse, of a tank that was just made; what follows is the same bit for bit.
 
         Args:
             arrays: from `to_arrays`.
@@ -417,40 +412,34 @@ class Tank:
         for place, robot in robots.items():
             self._put(place, robot)
             self.robots[place] = robot
-        self.steps = int(arrays["steps"])
-        self._new, self._since = arrays["new"].copy(), arrays["since"].copy()
-        self._genes, self._start = arrays["genes"].copy(), arrays["start"].copy()
-        self.tag, self._noise = arrays["tag"].copy(), arrays["noise"].copy()
-        self._current = arrays["current"].copy()
+        self._slots = _Slots(**{name: arrays[name].copy() for name in vars(self._slots)})
+        self.steps, self._current = int(arrays["steps"]), arrays["current"].copy()
         self.target = arrays["target"].copy() if "target" in arrays else None
-        leaves = sum(name.startswith("passage.") for name in arrays)
-        if leaves and self._bodies is not None:
-            blank = self._blank(self._given())
-            wanted, tree = jax.tree.flatten(blank)
+        if "passage.0" in arrays and self._bodies is not None:
+            wanted, tree = jax.tree.flatten(self._blank(self._given()))
             found = [arrays.get(f"passage.{k}") for k in range(len(wanted))]
             for want, have in zip(wanted, found, strict=True):
                 if have is None or have.shape != want.shape or have.dtype != want.dtype:
                     raise InputError("tank: expected the arrays of one like this; found others")
-            self._passage = jax.tree.unflatten(tree, found)
+            self.state = jax.tree.unflatten(tree, found)
 
 
 def make_tank(
     mixed: MixedFitness,
     places: int,
     worlds: int = 1,
-    touch: Touch | None = Touch(),  # noqa: B008  (frozen)
+    touch: ContactParameters | None = ContactParameters(),  # noqa: B008  (frozen)
     spheres: int = 0,
 ) -> Tank:
     """An empty tank.
 
     Args:
-        mixed: from `make_mixed_fitness`: its world, its controller, and the bodies that there is
-            room for. Its task does not count.
-        places: how many robots there may be in each world.
-        worlds: how many worlds stand side by side.
-        touch: how robots' surfaces answer each other; None: they pass through each other.
-        spheres: most that stand for a robot in contact, if it is known: a robot that needs more
-            has the tank compiled anew.
+        mixed: from `make_mixed_fitness`; its world, its controller, and its room for bodies.
+        places: of each world.
+        worlds: how many stand side by side.
+        touch: contact between robots; None: they pass through each other.
+        spheres: most that stand for a robot in contact, if it is known; a robot that needs more has
+            the tank compiled anew.
 
     Returns:
         The tank.

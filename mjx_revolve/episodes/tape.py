@@ -1,4 +1,4 @@
-"""A rollout that remembers its way, and the way back along it: slopes by what drives it."""
+"""A rollout that keeps its path, and the way back along it: gradients by what drives it."""
 
 from __future__ import annotations
 
@@ -7,54 +7,57 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from mjx_revolve.episodes.rollout import Passage
+from mjx_revolve.control.readings import NO_INTERACTION
+from mjx_revolve.episodes.rollout import Recorder, Rollout, RolloutState, StepInputs
 from mjx_revolve.numerics.adjoint import fused_back
 from mjx_revolve.numerics.xla import in_one_array
 
-Pull = Callable[[Any], tuple[Passage, list[jax.Array]]]
+Pull = Callable[[Any], tuple[RolloutState, list[jax.Array]]]
 
 
-def roll_out_taped(
-    told: Callable[[Any, Passage, Any], tuple[Any, jax.Array, Any]],
-    step: Callable[[Passage, Any, Any], tuple[Passage, jax.Array]],
-    record: Callable[[Passage, jax.Array, Any], Any],
+def advance_taped(
+    make: Callable[[Any], Rollout],
+    recorder: Recorder,
     parameters: Any,
-    now: Passage,
-    still: jax.Array,
-    inputs: Any,
+    now: RolloutState,
+    still: Float[Array, "n lanes"],
+    inputs: StepInputs,
     *,
     records: int,
     every: int,
-) -> tuple[Passage, Any, Pull]:
-    """Steps a chunk of a population on, records it now and then, and can go back, once.
+) -> tuple[RolloutState, Any, Pull]:
+    """`Rollout.advance` with a way back, which may be gone once.
 
-    Each step is kept as what it began from, and computed again on the way back. Slopes by the
+    Each step is kept as its state before, and computed again on the way back. Gradients by the
     parameters are not gathered in the loop, where they would be arrays as large as the parameters
-    at every step, but from all steps of a record at once: the loop only finds the slopes by the
+    at every step, but from all steps of a record at once: the loop only finds the gradients by the
     commands and by the controllers' states.
 
     Args:
-        told: (parameters, rollout, inputs of this step) → (controller state, ctrl, water), as of
-            `rollout.make_drive`.
-        step: from `rollout.make_step`, of these parameters.
-        record: (rollout, ctrl of the last step, its inputs) → what to keep, arrays of floats.
-        parameters: of the controllers; slopes are found by those leaves that are arrays of floats.
-        now: the rollout, before the first step or later; its scalars have no slopes.
-        still: `[n, lanes]` zeros, like ctrl.
-        inputs: None, or arrays `[records, every, ...]`, one row for each step.
-        records: how many.
+        make: parameters of the controllers → rollout.
+        recorder: makes a record, of arrays of floats.
+        parameters: gradients are found by those leaves that are arrays of floats.
+        now: before the first step or later; its scalars have no gradients.
+        still: zeros, like ctrl.
+        inputs: `[records, every, ...]`.
+        records: number of records.
         every: steps between them.
 
     Returns:
-        The rollout at its end; the records, `[records, ...]` each; and the way back, slopes by the
-        records → (slopes by `now`, slopes by `floats_of(parameters)`).
+        The state after the last step; the records, `[records, ...]` each; and the way back:
+        gradients by the records → (gradients by `now`, gradients by `float_leaves(parameters)`).
     """
+    rollout = make(parameters)
     carry = (now, still)
     pack, unpack = in_one_array(carry)
     first = jax.tree.map(lambda x: x[0, 0], inputs)
     ahead, back = fused_back(
-        lambda carry, row, push: step(carry[0], row, push), carry, first, still
+        lambda carry, row, offset: rollout.step(carry[0], (row, NO_INTERACTION), offset),
+        carry,
+        first,
+        still,
     )
 
     def renew(block: Any, scalars: Any) -> Any:
@@ -62,63 +65,66 @@ def roll_out_taped(
         begun, ctrl = unpack((block, scalars))
         return pack((begun._replace(energy=jnp.zeros_like(begun.energy)), ctrl))
 
-    def keep(block: Any, scalars: Any, rows: Any) -> Any:
-        last = jax.tree.map(lambda x: x[-1], rows)
+    def keep(block: Any, scalars: Any, rows: StepInputs) -> Any:
         then, ctrl = unpack((block, scalars))
-        return record(then, ctrl, last)
+        return rollout.record(recorder, then, ctrl, jax.tree.map(lambda x: x[-1], rows))
 
-    def forth(packed: Any, rows: Any) -> tuple[Any, Any]:
+    def forth(packed: Any, rows: StepInputs) -> tuple[Any, Any]:
         go = lambda packed, row: (ahead(packed, row), packed)  # noqa: E731
         packed, path = jax.lax.scan(go, renew(packed[0], packed[1]), rows, every)
         return packed, (path, packed, keep(packed[0], packed[1], rows))
 
     end, (paths, ends, kept) = jax.lax.scan(forth, pack(carry), inputs, records)
-    values = floats_of(parameters)
+    values = float_leaves(parameters)
 
-    def by_parameters(path: Any, rows: Any, after: jax.Array, push: jax.Array) -> list[jax.Array]:
-        """Slopes by the parameters, from those by what they told the steps along a path."""
+    def by_parameters(
+        path: Any, rows: StepInputs, after: jax.Array, offset: jax.Array
+    ) -> list[jax.Array]:
+        """Gradients by the parameters, from those by the controllers' outputs along a path."""
 
-        def tell(values: list[jax.Array]) -> Any:
-            filled = _fill(parameters, values)
+        def act(values: list[jax.Array]) -> Any:
+            filled = make(_fill(parameters, values))
 
-            def one(packed: Any, row: Any) -> Any:
-                drive_state, ctrl, *_ = told(filled, unpack(packed)[0], row)
-                return wide_of(drive_state), ctrl
+            def one(packed: Any, row: StepInputs) -> Any:
+                controller_state, ctrl, *_ = filled.act(unpack(packed)[0], row)
+                return wide_leaves(controller_state), ctrl
 
             return jax.vmap(one)(path, rows)
 
-        _, pull = jax.vjp(tell, values)
-        states = jax.vmap(lambda block, packed: wide_of(unpack((block, packed[1]))[0].drive_state))
-        found: list[jax.Array] = pull((states(after, path), push))[0]
+        def states(block: jax.Array, packed: Any) -> list[jax.Array]:
+            return wide_leaves(unpack((block, packed[1]))[0].controller_state)
+
+        _, pull = jax.vjp(act, values)
+        found: list[jax.Array] = pull((jax.vmap(states)(after, path), offset))[0]
         return found
 
-    def pull(by_kept: Any) -> tuple[Passage, list[jax.Array]]:
+    def pull(by_kept: Any) -> tuple[RolloutState, list[jax.Array]]:
         def retreat(carried: Any, given: Any) -> tuple[Any, None]:
-            slope, total = carried
+            gradient, total = carried
             path, (block, scalars), rows, by_row = given
-            slope = slope + jax.vjp(lambda x: keep(x, scalars, rows), block)[1](by_row)[0]
+            gradient = gradient + jax.vjp(lambda x: keep(x, scalars, rows), block)[1](by_row)[0]
 
-            def one(slope: Any, given: Any) -> Any:
-                before, push = back(slope, *given)
-                return before, (slope, push)
+            def one(gradient: Any, given: Any) -> Any:
+                before, offset = back(gradient, *given)
+                return before, (gradient, offset)
 
-            slope, (after, push) = jax.lax.scan(one, slope, (path, rows), every, reverse=True)
-            found = by_parameters(path, rows, after, push)
-            return (
-                renew(slope, scalars)[0],
-                [a + b for a, b in zip(total, found, strict=True)],
-            ), None
+            gradient, (after, offset) = jax.lax.scan(
+                one, gradient, (path, rows), every, reverse=True
+            )
+            found = by_parameters(path, rows, after, offset)
+            total = [a + b for a, b in zip(total, found, strict=True)]
+            return (renew(gradient, scalars)[0], total), None
 
         begun = jnp.zeros_like(end[0]), [jnp.zeros_like(x) for x in values]
-        (slope, total), _ = jax.lax.scan(
+        (gradient, total), _ = jax.lax.scan(
             retreat, begun, (paths, ends, inputs, by_kept), records, reverse=True
         )
-        return unpack((slope, end[1]))[0], total
+        return unpack((gradient, end[1]))[0], total
 
     return unpack(end)[0], kept, pull
 
 
-def floats_of(tree: Any) -> list[jax.Array]:
+def float_leaves(tree: Any) -> list[jax.Array]:
     """The leaves that are arrays of floats, in order."""
     return [x for x in jax.tree.leaves(tree) if _is_float(x)]
 
@@ -133,6 +139,6 @@ def _fill(tree: Any, values: list[jax.Array]) -> Any:
     return jax.tree.map(lambda x: next(given) if _is_float(x) else x, tree)
 
 
-def wide_of(tree: Any) -> list[jax.Array]:
-    """The leaves that have slopes."""
+def wide_leaves(tree: Any) -> list[jax.Array]:
+    """The leaves that have gradients."""
     return [x for x in jax.tree.leaves(tree) if x.ndim > 0]

@@ -17,10 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.plant import Figure
+from mjx_revolve.engine.plant import BodyGeometry
 from mjx_revolve.episodes.measure_table import records_of
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.own_code import call_own, load_own, parse_own, short_name
+from mjx_revolve.inputs.user_code import (
+    call_user_function,
+    load_user_function,
+    parse_user_function,
+    short_name,
+)
 from mjx_revolve.numerics.spatial import safe_norm
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
@@ -54,11 +59,11 @@ class Track:
         num_hinges: of the robot; a batch of different bodies has rows for more.
         quat: `[S, 4, lanes]` of the core, world from body (w, x, y, z); None unless "core" is
             recorded.
-        velocity: `[S, 3, lanes]` of the core, world frame [m/s], likewise.
-        spin: `[S, 3, lanes]` angular velocity of the core, body frame [rad/s], likewise.
+        velocity: `[S, 3, lanes]` of the core, world frame [m/s]; with quat.
+        spin: `[S, 3, lanes]` angular velocity of the core, body frame [rad/s]; with quat.
         angle: `[S, nhinge, lanes]` of the hinges, the robot's order [rad]; None unless "joints" are
             recorded.
-        speed: `[S, nhinge, lanes]` of the hinges [rad/s], likewise.
+        speed: `[S, nhinge, lanes]` of the hinges [rad/s]; with angle.
         bed_force: `[S, 3, lanes]` of the bed on the robot, world frame [N]; None unless "contacts"
             are recorded.
         water_force: `[S, 3, lanes]` of the water on the robot, buoyancy included, the inertia of
@@ -97,7 +102,9 @@ class Track:
         return self.interval * (self.position.shape[0] - 1)
 
 
-def start_at_depth(settings: Any, world: World, figure: Figure, place: jax.Array) -> jax.Array:
+def start_at_depth(
+    settings: Any, world: World, figure: BodyGeometry, place: jax.Array
+) -> jax.Array:
     """The core at the task's depth below the still surface.
 
     Args:
@@ -112,20 +119,22 @@ def start_at_depth(settings: Any, world: World, figure: Figure, place: jax.Array
     return place.at[2].add(world.surface_height - settings.depth)
 
 
-def start_on_bed(settings: Any, world: World, figure: Figure, place: jax.Array) -> jax.Array:
+def start_on_bed(settings: Any, world: World, figure: BodyGeometry, place: jax.Array) -> jax.Array:
     """The lowest corner 5 mm above the bed, whatever the tilt; arguments of `start_at_depth`."""
     assert world.bed is not None
     below = reach_below(settings, figure)
     return place.at[2].set(bed_height(world.bed, place[0], place[1]) + below + 0.005)
 
 
-def start_above_bed(settings: Any, world: World, figure: Figure, place: jax.Array) -> jax.Array:
+def start_above_bed(
+    settings: Any, world: World, figure: BodyGeometry, place: jax.Array
+) -> jax.Array:
     """The core at the task's height above the bed; arguments of `start_at_depth`."""
     assert world.bed is not None
     return place.at[2].set(bed_height(world.bed, place[0], place[1]) + settings.height)
 
 
-def reach_below(settings: Any, figure: Figure) -> Any:
+def reach_below(settings: Any, figure: BodyGeometry) -> Any:
     """How far the rest pose reaches below the core's centre, in any attitude drawn [m].
 
     A tilt of three standard deviations is taken for the largest.
@@ -136,7 +145,7 @@ def reach_below(settings: Any, figure: Figure) -> Any:
 
 @dataclass(frozen=True)
 class Task:
-    """What robots are asked to do.
+    """What episodes are about.
 
     Attributes:
         score: (track, settings) → `[lanes]` scores, higher is better.
@@ -144,13 +153,15 @@ class Task:
         records: what the track holds beside the core's position and the energy, of `RECORDS`.
         start: where episodes begin, like `start_at_depth`.
         on_bed: whether episodes begin on the bed, so that there must be one.
+        measure: the measure that reports show beside the score.
     """
 
     score: Callable[[Track, Any], jax.Array]
     unit: str = ""
     records: tuple[str, ...] = ()
-    start: Callable[[Any, World, Figure, jax.Array], jax.Array] = start_at_depth
+    start: Callable[[Any, World, BodyGeometry, jax.Array], jax.Array] = start_at_depth
     on_bed: bool = False
+    measure: str = "speed_m_s"
 
     def __post_init__(self) -> None:
         """Checks what a user may have got wrong."""
@@ -190,7 +201,7 @@ def directed_swim(track: Track, settings: Any) -> jax.Array:
 def speed(track: Track, settings: Any) -> jax.Array:
     """Net horizontal speed through the water while the robot keeps its depth [body lengths/s].
 
-    In any direction; who drifts with a current has none.
+    In any direction; drifting with a current counts nothing.
     """
     moved = moved_through_water(track)[:, :2]
     counted = moved * _keeps_depth(track, settings)[:, None]
@@ -266,7 +277,7 @@ def hold_heading(track: Track, settings: Any) -> jax.Array:
     assert track.quat is not None
     w, x, y, z = (track.quat[:, i] for i in range(4))
     ahead, aside = w * w + x * x - y * y - z * z, 2 * (x * y + w * z)
-    # The tiny term: a core that stands upright has no heading, and its angle no slope.
+    # The tiny term: a core that stands upright has no heading, and its angle no gradient.
     level = np.asarray(settings.direction, float)[:2]
     level = level / max(np.linalg.norm(level), 1e-9)
     cosine, sine = float(level[0]), float(level[1])
@@ -296,7 +307,7 @@ TASKS: Mapping[str, Task] = {
     "directed_swim": Task(directed_swim, _SPEED),
     "speed": Task(speed, _SPEED, records=("water",)),
     "reach_target": Task(reach_target, "body lengths", records=("target",)),
-    "hold_depth": Task(hold_depth, "body lengths"),
+    "hold_depth": Task(hold_depth, "body lengths", measure="depth_error_m"),
     "hold_heading": Task(hold_heading, "body lengths + rad", records=("core",)),
     "follow_course": Task(follow_course, _SPEED, records=("course",)),
     "search": Task(search, "of the way", records=("target",)),
@@ -330,7 +341,7 @@ def find_task(settings: Any, source: str = "config") -> Task:
     task = replace(task, records=tuple(records))
     if name in TASKS:
         return task
-    found = call_own(
+    found = call_user_function(
         name,
         f"{short_name(name)} to score a track",
         jax.eval_shape,
@@ -338,7 +349,7 @@ def find_task(settings: Any, source: str = "config") -> Task:
         _example_track(task.records),
     )
     if not isinstance(found, jax.ShapeDtypeStruct) or found.shape != (_LANES,):
-        own = parse_own(name)
+        own = parse_user_function(name)
         assert own is not None
         shown = list(found.shape) if isinstance(found, jax.ShapeDtypeStruct) else type(found)
         raise InputError(
@@ -349,7 +360,7 @@ def find_task(settings: Any, source: str = "config") -> Task:
 
 
 def _load_task(name: str, label: str) -> Task:
-    found = load_own(name, label, Task)
+    found = load_user_function(name, label, Task)
     if isinstance(found, Task):
         return found
     units = re.findall(r"\[([^\[\]]+)\]", (inspect.getdoc(found) or "").partition("\n")[0])
@@ -385,16 +396,21 @@ def _example_track(records: tuple[str, ...]) -> Any:
     )
 
 
-def score_unit(name: str) -> str:
-    """Unit of a task's scores.
-
-    Args:
-        name: `type` of a task.
-
-    Returns:
-        The unit; "" where it is not known.
-    """
+def _find_task(name: str) -> Task | None:
+    """The task of a `type`; None where it cannot be read."""
     try:
-        return TASKS[name].unit if name in TASKS else _load_task(name, "task.type").unit
+        return TASKS[name] if name in TASKS else _load_task(name, "task.type")
     except InputError:
-        return ""
+        return None
+
+
+def score_unit(name: str) -> str:
+    """Unit of the scores of a task's `type`; "" where it is not known."""
+    task = _find_task(name)
+    return "" if task is None else task.unit
+
+
+def shown_measure(name: str) -> str:
+    """Name of the measure that reports show beside the score of a task's `type`."""
+    task = _find_task(name)
+    return Task.measure if task is None else task.measure

@@ -20,12 +20,12 @@ from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.environment import (
     Environment,
     EnvironmentState,
-    Outcome,
+    StepResult,
     make_environment,
 )
 from mjx_revolve.episodes.fitness import Fitness, make_fitness
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import LANES, compiler_options, on_cpu
+from mjx_revolve.numerics.xla import LANES, jit, on_cpu
 
 AUTORESET_MODES = ("NextStep", "SameStep")
 """When an episode that is over begins anew, by Gymnasium's names."""
@@ -45,7 +45,7 @@ def _begin(
 
 def _next_step(
     environment: Environment, state: EnvironmentState, action: jax.Array
-) -> tuple[EnvironmentState, jax.Array, Outcome, jax.Array]:
+) -> tuple[EnvironmentState, jax.Array, StepResult, jax.Array]:
     """A control period; what was over before it begins anew instead, without a reward.
 
     Returns:
@@ -67,7 +67,7 @@ def _next_step(
 
 def _same_step(
     environment: Environment, state: EnvironmentState, action: jax.Array
-) -> tuple[EnvironmentState, jax.Array, Outcome, jax.Array]:
+) -> tuple[EnvironmentState, jax.Array, StepResult, jax.Array]:
     """A control period; what is over after it begins anew at once.
 
     Returns:
@@ -137,10 +137,8 @@ def _make_class() -> type:
                 pick = jax.vmap(_pick)
                 return pick(self._split(mask), new, old)
 
-            options = compiler_options()
-            self._step = jax.jit(step, compiler_options=options, donate_argnums=0)
-            self._begin = jax.jit(begin, compiler_options=options)
-            self._resume = jax.jit(resume, compiler_options=options)
+            self._step = jit(step, donate_argnums=0)
+            self._begin, self._resume = jit(begin), jit(resume)
 
         def _split(self, x: jax.Array) -> jax.Array:
             """`[num_envs, ...]` as `[chunks, ..., lanes]`, copies of the first behind them."""
@@ -286,7 +284,7 @@ def make_vector_env(
         config: a `Config`, the path of a YAML file, a shipped configuration's name, or a mapping.
         num_envs: how many environments; on a CPU, multiples of 64 make the most of it.
         sensors: what is seen, kinds' names or mappings, as in `controller.sensors`; by default
-            these, or else the robot's own, or else `sensors.USUAL`.
+            these, or else the robot's own, or else `sensors.DEFAULT_SENSORS`.
         control_rate: actions in a second [Hz]; by default the possible one nearest to 20.
         autoreset_mode: `NextStep`, Gymnasium's own: an episode that is over begins anew at the next
             step, whose action is not used; or `SameStep`: at once, its last observation in infos.

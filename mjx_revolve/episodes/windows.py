@@ -1,6 +1,6 @@
-"""Slopes of scores by genes through the water, a window of an episode at a time.
+"""Gradients of scores by genes through the water, a window of an episode at a time.
 
-What a robot does now follows from what it did, so the slope of a long episode by its genes is a
+What a robot does now follows from what it did, so the gradient of a long episode by its genes is a
 product of very many matrices: it grows without bound where the motion is chaotic, as a closed loop
 of sensors, network and servos easily is. Truncated backpropagation through time (Williams and Peng
 1990, Neural Computation 2) cuts the episode into windows: each begins where the one before it has
@@ -19,61 +19,44 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from mjx_revolve.control.sense import Cues
-from mjx_revolve.engine.state import Engine
-from mjx_revolve.episodes.environment import RATES
-from mjx_revolve.episodes.evaluation import make_recorder, record_cues, vary_engine
+from mjx_revolve.control.readings import EpisodeContext
+from mjx_revolve.episodes.evaluation import Episodes, narrow, task_recorder, widen
 from mjx_revolve.episodes.fitness import Fitness
-from mjx_revolve.episodes.rollout import Passage, begin, flow_at, make_drive, make_step
-from mjx_revolve.episodes.scoring import WORST, first_counted, list_episodes, score_episodes
-from mjx_revolve.episodes.starts import Starts, check_key, cues_of, gusty_water, start_pose
-from mjx_revolve.episodes.tape import floats_of, roll_out_taped, wide_of
+from mjx_revolve.episodes.rollout import (
+    Rollout,
+    RolloutState,
+    StepInputs,
+    controlled,
+    start_at_rest,
+)
+from mjx_revolve.episodes.scoring import extend_track, list_episodes
+from mjx_revolve.episodes.starts import Starts, check_key, gust_rows
+from mjx_revolve.episodes.tape import advance_taped, float_leaves, wide_leaves
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import compiler_options, over_chunks
-from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.numerics.xla import is_traced, jit, over_chunks
 
 
-class Episodes(NamedTuple):
-    """Episodes between two windows, `[..., lanes]` each.
-
-    Lanes are individual after individual, and within each its trials.
-
-    Attributes:
-        under_way: bodies, brains, and what is kept of what is felt.
-        starts: of the episodes.
-        place: `[3, lanes]` where the cores started, world frame [m].
-        rows: the track so far, `[S, ..., lanes]` each; rows to come repeat the present.
-        score: `[lanes]` so far.
-    """
-
-    under_way: Passage
-    starts: Starts
-    place: jax.Array
-    rows: dict[str, jax.Array]
-    score: jax.Array
-
-
-class Slopes(NamedTuple):
+class Gradients(NamedTuple):
     """What comes of a window.
 
     Attributes:
-        gain: `[P, trials]` the score so far, less that of the window before. Of a rollout that
-            blows up, what brings the sum to `scoring.WORST`.
-        slope: `[P, trials, num_genes]` of the gain by the individual's genes within the window; 0
-            where it is no number.
+        gain: the score so far, less that of the window before. Of a rollout that blows up, what
+            brings the sum to `scoring.WORST`.
+        gradient: of the gain by the individual's genes within the window; 0 where it is no number.
     """
 
-    gain: jax.Array
-    slope: jax.Array
+    gain: Float[Array, "P trials"]
+    gradient: Float[Array, "P trials num_genes"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Windows:
-    """Slopes of one body's scores, window after window.
+class TruncatedBPTT:
+    """Gradients of one body's scores, window after window.
 
     Attributes:
-        fitness: whose episodes they are.
+        fitness: scores the episodes.
         records: rows of the track in a window.
     """
 
@@ -81,21 +64,20 @@ class Windows:
     records: int
 
     def __repr__(self) -> str:
-        """A line: `Windows(directed_swim in lake, 5 of 1 s)`."""
-        return f"Windows({self.fitness.config.subject}, {self.count} of {self.horizon:g} s)"
+        """A line: `TruncatedBPTT(directed_swim in lake, 5 of 1 s)`."""
+        return f"TruncatedBPTT({self.fitness.config.subject}, {self.count} of {self.horizon:g} s)"
 
     @property
     def count(self) -> int:
-        """How many windows an episode has."""
+        """Windows of an episode."""
         return self.fitness.num_records // self.records
 
     @property
     def horizon(self) -> float:
         """Length of a window [s]."""
-        setup = self.fitness.setup
-        return self.records * setup.record_every * setup.world.timestep
+        return self.records * self.fitness.record_every * self.fitness.world.timestep
 
-    def begin(self, population: Any, key: jax.Array) -> Episodes:
+    def init(self, population: Any, key: jax.Array) -> Episodes:
         """Episodes at their starts, those of `fitness(population, key)`.
 
         Args:
@@ -103,230 +85,166 @@ class Windows:
             key: draws the starts, the same for every individual.
 
         Returns:
-            The episodes.
+            The episodes: individual after individual, and within each its trials.
 
         Raises:
             InputError: the population has another shape, or the key is none.
         """
         check_key(key)
-        return self._begin(self._checked(population), key)
+        population = self.fitness.check_population(population)
+        run = self._init if is_traced(population, key) else self._compiled[0]
+        return run(population, key)
 
-    def climb(self, population: Any, episodes: Episodes) -> tuple[Slopes, Episodes]:
-        """Goes a window further, and says how the genes should have been other in it.
+    def step(self, population: Any, episodes: Episodes) -> tuple[Gradients, Episodes]:
+        """Advances episodes by a window.
 
-        The genes need not be those of the window before: that is how one learns on the way.
+        The genes need not be those of the window before: an optimiser may learn on the way.
 
         Args:
             population: `[P, num_genes]`.
-            episodes: from `begin`, or of the window before.
+            episodes: from `init`, or of the window before.
 
         Returns:
-            The slopes, and the episodes at the window's end.
+            The gradients, and the episodes at the window's end.
 
         Raises:
             InputError: the population has another shape than the episodes, or these are over.
         """
-        population = self._checked(population)
-        lanes, trials = episodes.score.shape[0], self.fitness.config.task.trials
+        fitness, lanes = self.fitness, episodes.score.shape[0]
+        population, trials = fitness.check_population(population), fitness.settings.trials
         if len(population) * trials != lanes:
             raise InputError(
-                f"population: expected [{lanes // trials}, {self.fitness.num_genes}], as the "
+                f"population: expected [{lanes // trials}, {fitness.num_genes}], as the "
                 f"episodes began with; found {list(population.shape)}"
             )
-        clock = episodes.under_way.count
-        if not isinstance(clock, jax.core.Tracer):
-            steps = self.fitness.num_records * self.fitness.record_every
-            if int(clock[0]) >= steps:
-                raise InputError("episodes: expected some under way; found their end")
-        return self._climb(population, episodes)
-
-    def _checked(self, population: Any) -> jax.Array:
-        shape, count = jnp.shape(population), self.fitness.num_genes
-        if len(shape) != 2 or shape[-1] != count or 0 in shape:
-            raise InputError(f"population: expected [P, {count}]; found {list(shape)}")
-        return jnp.asarray(population)
+        clock = episodes.rollout.steps
+        if not is_traced(clock) and int(clock[0]) >= fitness.num_timesteps:
+            raise InputError("episodes: expected some under way; found their end")
+        run = self._step if is_traced(population, episodes) else self._compiled[1]
+        return run(population, episodes)
 
     @cached_property
-    def _begin(self) -> Any:
-        def run(population: jax.Array, key: jax.Array) -> Episodes:
-            setup = self.fitness.setup
-            individual, trial = list_episodes(len(population), setup.settings.trials)
-            starts = jax.tree.map(lambda x: x[..., trial], setup.starts_as(population, key))
-            return over_chunks(self._start)(population[individual].T, starts)
+    def _compiled(self) -> tuple[Any, Any]:
+        return jit(self._init), jit(self._step)
 
-        return jax.jit(run, compiler_options=compiler_options())
+    def _init(self, population: jax.Array, key: jax.Array) -> Episodes:
+        individual, trial = list_episodes(len(population), self.fitness.settings.trials)
+        starts = self.fitness.precise_starts(population, key)
+        starts = jax.tree.map(lambda x: x[..., trial], starts)
+        return over_chunks(self._start)(population[individual].T, starts)
 
-    @cached_property
-    def _climb(self) -> Any:
-        def run(population: jax.Array, episodes: Episodes) -> tuple[Slopes, Episodes]:
-            trials = self.fitness.config.task.trials
-            individual, _ = list_episodes(len(population), trials)
-            gain, slope, episodes = over_chunks(self._window)(population[individual].T, episodes)
-            shape = (len(population), trials)
-            return Slopes(gain.reshape(shape), slope.T.reshape(*shape, -1)), episodes
-
-        return jax.jit(run, compiler_options=compiler_options())
+    def _step(self, population: jax.Array, episodes: Episodes) -> tuple[Gradients, Episodes]:
+        trials = self.fitness.settings.trials
+        individual, _ = list_episodes(len(population), trials)
+        gain, gradient, episodes = over_chunks(self._window)(population[individual].T, episodes)
+        shape = (len(population), trials)
+        return Gradients(gain.reshape(shape), gradient.T.reshape(*shape, -1)), episodes
 
     # ------------------------------------------------------------------ one chunk
 
-    def _start(self, genes: jax.Array, starts: Starts) -> Episodes:
-        """Episodes of a chunk at their starts; `genes`: `[num_genes, lanes]`."""
-        setup = self.fitness.setup
-        root = start_pose(setup.task, setup.settings, setup.world, setup.figure_of(None), starts)
-        under_way = self._rest(genes, root)
-        engine = vary_engine(self.fitness.engine, starts.variation)
-        still = self._still(root)
-        first = jax.tree.map(lambda x: x[0, 0], self._gusts(starts, under_way.count))
-        rows = jax.eval_shape(partial(self._record, engine, starts), under_way, still, first)
-        count = setup.num_records
-        blank = {name: jnp.zeros((count, *x.shape), x.dtype) for name, x in rows.items()}
-        wide = _widen(under_way, root[0])
-        return Episodes(wide, starts, root[:3], blank, jnp.zeros_like(root[0]))
+    def _start(self, genes: Float[Array, "num_genes lanes"], starts: Starts) -> Episodes:
+        """Episodes of a chunk at their starts."""
+        fitness = self.fitness
+        root = fitness.start_pose(fitness.geometry, starts)
+        rollout, now = self._at_rest(genes, starts, root)
+        inputs = jax.tree.map(lambda x: x[0, 0], self._inputs(starts, now.steps))
+        recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
+        row = partial(rollout.record, recorder, now, self._still(genes), inputs)
+        return fitness.init_episodes(now, starts, root[:3], row)
 
-    def _rest(self, genes: jax.Array, root: jax.Array) -> Passage:
-        """A chunk's rollout before its first step."""
-        setup, engine = self.fitness.setup, self.fitness.engine
-        hinges = jnp.zeros((engine.plant.num_hinges, root.shape[-1]), root.dtype)
-        qvel = jnp.concatenate([jnp.zeros_like(root[:6]), hinges])
-        state = engine.init(jnp.concatenate([root, hinges]), qvel)
-        drive_state = setup.controller.init(setup.controller.decode(genes, engine.plant))
-        return begin(engine, state, drive_state, setup.controller.feels)
+    def _rollout(self, starts: Starts, position: jax.Array, parameters: Any) -> Rollout:
+        controller, engine = self.fitness.controller, self.fitness.engine
+        policy = controlled(controller, parameters)
+        return self.fitness.make_rollout(engine, policy, controller.signals, starts, position)
 
-    def _still(self, like: jax.Array) -> jax.Array:
-        """`[n, lanes]` no commands."""
-        return jnp.zeros((self.fitness.engine.plant.num_rows, like.shape[-1]), like.dtype)
+    def _at_rest(
+        self, genes: jax.Array, starts: Starts, root: jax.Array
+    ) -> tuple[Rollout, RolloutState]:
+        """A chunk's rollout, and its state before the first step."""
+        controller, engine = self.fitness.controller, self.fitness.engine
+        parameters = controller.decode(genes, engine.plant)
+        rollout = self._rollout(starts, root[:3], parameters)
+        return rollout, rollout.init(start_at_rest(engine, root), controller.init(parameters))
 
-    def _water(self, starts: Starts, row: Any, time: Any) -> Water:
-        """The water of a step."""
-        world = self.fitness.setup.world
-        still = water_of(world) if starts.water is None else starts.water
-        return flow_at(world, still if row is None else row)(time, None)
+    def _still(self, genes: jax.Array) -> Float[Array, "n lanes"]:
+        """No commands."""
+        return jnp.zeros((self.fitness.engine.plant.num_rows, genes.shape[-1]), genes.dtype)
 
-    def _record(
-        self, engine: Engine, starts: Starts, now: Passage, ctrl: jax.Array, row: Any
-    ) -> Any:
-        """What the task has recorded after a step."""
-        setup = self.fitness.setup
-        last = (now.count - 1).astype(now.energy.dtype) * setup.world.timestep
-        record = make_recorder(engine, setup.task, setup.world)
-        return record(now.state, ctrl, now.energy, self._water(starts, row, last))
+    def _inputs(self, starts: Starts, clock: jax.Array) -> StepInputs:
+        """Inputs `[records, every, lanes]` of the steps of a window."""
+        shape = self.records, self.fitness.record_every
+        rows = gust_rows(self.fitness.world, starts, shape[0] * shape[1], clock)
+        return StepInputs(jax.tree.map(lambda x: x.reshape(*shape, -1), rows))
 
     def _window(
-        self, genes: jax.Array, episodes: Episodes
-    ) -> tuple[jax.Array, jax.Array, Episodes]:
-        """Gains `[lanes]`, slopes `[num_genes, lanes]` and the episodes after a window."""
-        setup, starts = self.fitness.setup, episodes.starts
-        controller, plant, every = setup.controller, self.fitness.engine.plant, setup.record_every
-        parameters, like = controller.decode(genes, plant), genes[:1]
-        cues = cues_of(setup.settings, starts, episodes.place)
-        engine = vary_engine(self.fitness.engine, starts.variation)
-        timestep = setup.world.timestep
+        self, genes: Float[Array, "num_genes lanes"], episodes: Episodes
+    ) -> tuple[Float[Array, " lanes"], Float[Array, "num_genes lanes"], Episodes]:
+        """Gains, gradients and the episodes after a window."""
+        fitness, starts, every = self.fitness, episodes.starts, self.fitness.record_every
+        parameters = fitness.controller.decode(genes, fitness.engine.plant)
+        make = partial(self._rollout, starts, episodes.position)
+        rollout = make(parameters)
         root = jax.ShapeDtypeStruct((7, genes.shape[-1]), genes.dtype)
-        now = _narrow(episodes.under_way, jax.eval_shape(self._rest, genes, root))
-
-        def told(parameters: Any, now: Passage, row: Any, *meeting: Any) -> Any:
-            return make_drive(
-                engine,
-                lambda state, time, row, sense: controller.step(parameters, state, time, sense),
-                lambda time, row: self._water(starts, row, time),
-                timestep=timestep,
-                world=setup.world,
-                cues=cues,
-                feels=controller.feels,
-            )(now, row, *meeting)
-
-        then, kept, pull = roll_out_taped(
-            told,
-            make_step(engine, partial(told, parameters), timestep),
-            partial(self._record, engine, starts),
+        like = jax.eval_shape(lambda root: self._at_rest(genes, starts, root)[1], root)
+        now = narrow(episodes.rollout, like)
+        then, rows, pull = advance_taped(
+            make,
+            task_recorder(rollout.engine, fitness.task, fitness.world),
             parameters,
             now,
-            self._still(like),
-            self._gusts(starts, now.count),
+            self._still(genes),
+            self._inputs(starts, now.steps),
             records=self.records,
             every=every,
         )
-        score, by_kept, rows = self._judge(kept, episodes, cues, now.count)
-        by_now, by_parameters = pull(by_kept)
-        # Brains may begin as their genes say.
-        begins = now.count == 0
-        by_brain = [jnp.where(begins, x, 0.0) for x in wide_of(by_now.drive_state)]
-        slope = jax.vjp(self._brains, genes)[1]((by_parameters, by_brain))[0]
-        slope = jnp.where(jnp.all(jnp.isfinite(slope), 0), slope, 0.0)
-        after = Episodes(_widen(then, like[0]), starts, episodes.place, rows, score)
-        return score - episodes.score, slope, after
+        score, by_rows, track = self._judge(rows, episodes, rollout.context, now.steps)
+        by_now, by_parameters = pull(by_rows)
+        # A controller's state at the start may depend on its genes.
+        begins = now.steps == 0
+        by_state = [jnp.where(begins, x, 0.0) for x in wide_leaves(by_now.controller_state)]
+        gradient = jax.vjp(self._decoded, genes)[1]((by_parameters, by_state))[0]
+        gradient = jnp.where(jnp.all(jnp.isfinite(gradient), 0), gradient, 0.0)
+        after = Episodes(widen(then), starts, episodes.position, track, score)
+        return score - episodes.score, gradient, after
 
-    def _brains(self, genes: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
-        """What genes say: parameters, and states at the start."""
+    def _decoded(self, genes: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+        """A controller's parameters, and its state at the start."""
         controller = self.fitness.controller
         parameters = controller.decode(genes, self.fitness.engine.plant)
-        return floats_of(parameters), wide_of(controller.init(parameters))
-
-    def _gusts(self, starts: Starts, clock: jax.Array) -> Any:
-        """Water `[records, every, lanes]` along the paths of gusts in a window; None without."""
-        if starts.gusts is None:
-            return None
-        shape = (self.records, self.fitness.record_every)
-        path = jax.lax.dynamic_slice_in_dim(starts.gusts, clock, shape[0] * shape[1] + 1)
-        water = gusty_water(self.fitness.setup.world, path, starts.water)
-        wide = (shape[0] * shape[1], path.shape[-1])
-        return jax.tree.map(
-            lambda x: jnp.broadcast_to(jnp.asarray(x, path.dtype), wide).reshape(*shape, -1), water
-        )
+        return float_leaves(parameters), wide_leaves(controller.init(parameters))
 
     def _judge(
-        self, kept: dict[str, jax.Array], episodes: Episodes, cues: Cues, clock: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array], dict[str, jax.Array]]:
-        """Scores so far `[lanes]`, their slopes by the window's rows, and the track so far."""
-        setup = self.fitness.setup
-        every, timestep = setup.record_every, setup.world.timestep
-        first = first_counted(setup.settings, timestep)
-        counts = clock + self.records * every >= (first + 1) * every
-        begins, index = clock // every, jnp.arange(setup.num_records)
-        own = jnp.clip(index - begins, 0, self.records - 1)
+        self,
+        rows: dict[str, jax.Array],
+        episodes: Episodes,
+        context: EpisodeContext,
+        clock: jax.Array,
+    ) -> tuple[Float[Array, " lanes"], dict[str, jax.Array], dict[str, jax.Array]]:
+        """Scores so far, their gradients by the window's rows, and the track so far."""
+        fitness, every = self.fitness, self.fitness.record_every
 
-        def run(kept: dict[str, jax.Array]) -> Any:
-            rows = {}
-            for name, x in kept.items():
-                fit = lambda mask, x=x: mask.reshape(-1, *[1] * (x.ndim - 1))  # noqa: E731
-                later = x[own]
-                if name in RATES:
-                    later = jnp.where(fit(index < begins + self.records), later, 0.0)
-                rows[name] = jnp.where(fit(index >= begins), later, episodes.rows[name])
-            found = score_episodes(
-                setup.task,
-                setup.settings,
-                setup.world,
-                record_cues(setup, rows, cues),
-                episodes.place,
-                setup.figure_of(None),
+        def run(rows: dict[str, jax.Array]) -> Any:
+            track = extend_track(episodes.track, rows, clock // every)
+            then = clock + self.records * every
+            score, _ = fitness.score_so_far(
+                track, episodes.position, fitness.geometry, context, then
             )
-            return jnp.where(found.sane, jnp.where(counts, found.score, 0.0), WORST), rows
+            return score, track
 
-        score, pull, rows = jax.vjp(run, kept, has_aux=True)
-        return score, pull(jnp.ones_like(score))[0], rows
-
-
-def _narrow(under_way: Passage, like: Passage) -> Passage:
-    """A rollout whose scalars are scalars: between windows they have lanes, as chunks need them."""
-    return jax.tree.map(lambda x, kind: x[..., 0] if kind.ndim == 0 else x, under_way, like)
+        score, pull, track = jax.vjp(run, rows, has_aux=True)
+        return score, pull(jnp.ones_like(score))[0], track
 
 
-def _widen(under_way: Passage, like: jax.Array) -> Passage:
-    """A rollout whose scalars have lanes, as of `like`."""
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, like.shape) if x.ndim == 0 else x, under_way)
-
-
-def make_windows(fitness: Fitness, horizon: float | None = None) -> Windows:
-    """Slopes of a fitness by genes, window after window.
+def make_windows(fitness: Fitness, horizon: float | None = None) -> TruncatedBPTT:
+    """Gradients of a fitness by genes, window after window.
 
     Args:
         fitness: from `make_fitness`.
-        horizon: length of a window [s]; by default the whole episode, whose slopes are then those
-            of the fitness itself.
+        horizon: length of a window [s]; by default the whole episode, whose gradients are then
+            those of the fitness itself.
 
     Returns:
-        The windows.
+        An optimiser's source of gradients.
 
     Raises:
         InputError: an episode is not a whole number of such windows, or the engine is MJX's.
@@ -342,13 +260,13 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> Windows:
             f"{config.source}: task.target_turn: expected none, as windows do not carry a pursuer "
             f"on; found {config.task.target_turn:g}"
         )
-    row = fitness.record_every * fitness.robot.world.timestep
+    row = fitness.record_every * fitness.world.timestep
     if horizon is None:
-        return Windows(fitness, records)
+        return TruncatedBPTT(fitness, records)
     known = {n: n * row for n in range(1, records + 1) if records % n == 0}
     if isinstance(horizon, int | float) and not isinstance(horizon, bool):
         for n, seconds in known.items():
             if abs(seconds - horizon) < 1e-3 * seconds:
-                return Windows(fitness, n)
+                return TruncatedBPTT(fitness, n)
     shown = ", ".join(f"{seconds:.4g}" for seconds in known.values())
     raise InputError(f"horizon: expected one of {shown} s; found {horizon!r}")

@@ -21,8 +21,6 @@ from scipy.spatial.distance import cdist
 from mjx_revolve.episodes.bodies_config import ArchiveConfig
 from mjx_revolve.inputs.errors import InputError
 
-# What `insert` says of an individual.
-REFUSED, BETTER, NEW = 0, 1, 2
 # Samples per cell, and rounds, with which a tessellation is found: from evenly spread points, more
 # rounds no longer make the cells' volumes more equal (12 to 14 % standard deviation).
 _SAMPLES, _ROUNDS = 50, 10
@@ -30,7 +28,7 @@ _SAMPLES, _ROUNDS = 50, 10
 
 @dataclass(frozen=True)
 class Archive:
-    """Cells and who is in them.
+    """Cells, and the individual in each.
 
     Attributes:
         names: `[D]` of the axes: descriptors and measures.
@@ -39,9 +37,9 @@ class Archive:
         shape: `[D]` cells along each axis of a grid, the last axis running fastest; empty where
             cells are those of a tessellation.
         centers: `[cells, D]` middles of the cells, in the axes' units.
-        ids: `[cells]` who is there; -1: nobody.
-        scores: `[cells]` their scores; NaN: nobody.
-        points: `[cells, D]` their descriptors, which may lie outside the axes; NaN: nobody.
+        ids: `[cells]` numbers of the individuals; -1: the cell is empty.
+        scores: `[cells]` their scores; NaN: empty.
+        points: `[cells, D]` their descriptors, which may lie outside the axes; NaN: empty.
     """
 
     names: tuple[str, ...]
@@ -55,15 +53,7 @@ class Archive:
 
 
 def make_archive(settings: ArchiveConfig, seed: int) -> Archive:
-    """An empty archive.
-
-    Args:
-        settings: axes and cells.
-        seed: of a tessellation; the same seed, the same cells.
-
-    Returns:
-        The archive.
-    """
+    """An empty archive; a tessellation's cells follow from the seed."""
     axes = settings.axes.values()
     lows, highs = (np.array([getattr(axis, end) for axis in axes]) for end in ("low", "high"))
     if settings.type == "grid":
@@ -117,7 +107,7 @@ def scale_points(archive: Archive, points: np.ndarray) -> np.ndarray:
 
 
 def cell_of(archive: Archive, points: np.ndarray) -> np.ndarray:
-    """Whose cells points belong to.
+    """The cells to which points belong.
 
     Args:
         archive: the archive.
@@ -142,47 +132,41 @@ def cell_of(archive: Archive, points: np.ndarray) -> np.ndarray:
     return found
 
 
-def insert(
-    archive: Archive, ids: np.ndarray, scores: np.ndarray, points: np.ndarray
-) -> tuple[Archive, np.ndarray]:
-    """Lets individuals into the archive, one after the other, the oldest first.
+def insert(archive: Archive, ids: np.ndarray, scores: np.ndarray, points: np.ndarray) -> Archive:
+    """The archive with further individuals, inserted one after the other, the oldest first.
 
     Args:
         archive: as it was; it stays so.
         ids: `[N]` from 0 on, unique; lower ones are older.
-        scores: `[N]` higher is better; one that is not finite is never let in.
+        scores: `[N]` higher is better. One that is not finite, or not better than that in its cell,
+            is not inserted.
         points: `[N, D]` descriptors, see `cell_of`.
 
     Returns:
-        The archive, and `[N]` what happened: `NEW` in a cell that was empty, `BETTER` than who was
-        there, or `REFUSED`. Who is as good as who is there is refused. One that was let in may have
-        been replaced by a later one.
+        The archive.
     """
-    cells, status = cell_of(archive, points), np.full(len(ids), REFUSED)
-    cells = np.where(np.isfinite(scores), cells, -1)
+    cells = np.where(np.isfinite(scores), cell_of(archive, points), -1)
     new = replace(
         archive,
         ids=archive.ids.copy(), scores=archive.scores.copy(), points=archive.points.copy(),
     )  # fmt: skip
     for row in np.argsort(ids):
         cell = cells[row]
-        if cell < 0 or new.scores[cell] >= scores[row]:
-            continue
-        status[row] = BETTER if new.ids[cell] >= 0 else NEW
-        new.ids[cell], new.scores[cell], new.points[cell] = ids[row], scores[row], points[row]
-    return new, status
+        if cell >= 0 and not new.scores[cell] >= scores[row]:
+            new.ids[cell], new.scores[cell], new.points[cell] = ids[row], scores[row], points[row]
+    return new
 
 
-# --- what is in it --------------------------------------------------------------------------------
+# --- contents
 
 
 def filled(archive: Archive) -> np.ndarray:
-    """The cells in which somebody is."""
+    """The cells that are not empty."""
     return np.flatnonzero(archive.ids >= 0)
 
 
 def coverage(archive: Archive) -> float:
-    """Share of the cells in which somebody is."""
+    """Share of the cells that are not empty."""
     return len(filled(archive)) / len(archive.ids)
 
 
@@ -195,18 +179,18 @@ def qd_score(archive: Archive, offset: float = 0.0) -> float:
 
 
 def best(archive: Archive) -> int:
-    """The cell with the highest score, of equal ones that of the oldest; -1: nobody is there."""
+    """The cell with the highest score, of equal ones that of the oldest; -1: all are empty."""
     cells = filled(archive)
     if not cells.size:
         return -1
     return int(cells[np.lexsort((archive.ids[cells], -archive.scores[cells]))[0]])
 
 
-# --- to and from elsewhere ------------------------------------------------------------------------
+# --- to and from elsewhere
 
 
 def to_arrays(archive: Archive) -> dict[str, np.ndarray]:
-    """An archive as named arrays, for a checkpoint; nothing is rounded."""
+    """An archive as named arrays, for a checkpoint, without rounding."""
     arrays = {field.name: np.asarray(getattr(archive, field.name)) for field in fields(archive)}
     return arrays | {"shape": np.array(archive.shape, int)}
 
@@ -237,14 +221,10 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> Archive:
 
 
 def rows(archive: Archive) -> list[dict[str, float]]:
-    """Who is in the archive, cell by cell, as lines of a table.
+    """The archive as lines of a table, one for each cell that is not empty.
 
-    Args:
-        archive: the archive.
-
-    Returns:
-        For each cell in which somebody is: cell, id, score, and for each axis its value by its
-        name, NAME_center and, in a grid, NAME_cell.
+    Each has cell, id, score, and for each axis its value by its name, NAME_center and, in a grid,
+    NAME_cell.
     """
     found = []
     for cell in filled(archive).tolist():
@@ -289,6 +269,7 @@ def to_ribs(archive: Archive, solutions: Sequence[object]) -> Any:
         "extra_fields": {"id": ((), np.int64), "descriptors": (len(archive.names), np.float64)},
     }  # fmt: skip
     points = archive.points[cells]
+    found: Any
     if archive.shape:
         ranges = list(zip(archive.lows, archive.highs, strict=True))
         # Without its own margin at the borders, cells are the same as here.

@@ -30,9 +30,9 @@ from mjx_revolve.episodes.fitness import (
 )
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.evolution.blocks import block_size
-from mjx_revolve.evolution.brains import Brains, Layout, lay_out_genes, make_brains
-from mjx_revolve.genotypes.genotype import Genotype, Space, make_space, remember
-from mjx_revolve.genotypes.kinds import make_genotype
+from mjx_revolve.evolution.brains import BrainEncoding, GeneLayout, gene_layout, make_brain_encoding
+from mjx_revolve.genotypes.genotype import Genotype, Space, cached, make_space
+from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.inputs.errors import InputError
 
 # Random bodies by which it is chosen how many parts a row of the tables holds. A choice.
@@ -57,7 +57,7 @@ class BodyFitness:
     config: Config
     genotype: Genotype
     mixed: MixedFitness
-    brains: Brains
+    brains: BrainEncoding
     seeds: tuple[Morphology, ...]
 
     @property
@@ -82,7 +82,7 @@ class BodyFitness:
         return block_size(self.config.task.trials)
 
     @property
-    def alone(self) -> bool:
+    def one_body_per_block(self) -> bool:
         """Whether each block holds one body."""
         tried, block = self.bodies.learning.population_size, self.block_size
         if block is None:
@@ -91,52 +91,52 @@ class BodyFitness:
 
     @cached_property
     def identity(self) -> str:
-        """What scores depend on beside settings: the world and the types of modules."""
-        kinds = [repr(kind) for kind in self.space_types.values()]
+        """Beside the settings, scores depend on this: the world and the types of modules."""
+        kinds = [repr(kind) for kind in self.module_types.values()]
         return "\n".join([repr(self.mixed.world), *kinds, *(repr(s.modules) for s in self.seeds)])
 
     @cached_property
-    def space_types(self) -> Mapping[str, ModuleType]:
+    def module_types(self) -> Mapping[str, ModuleType]:
         """Types of modules that bodies are grown of."""
         modules = read_modules(self.config)
         names = (self.bodies.core, *self.bodies.modules)
         return {name: modules[name] for name in names}
 
     @property
-    def measured(self) -> tuple[str, ...]:
-        """Names of the measures of a life."""
-        asked = self.config.task.measures
-        return tuple(name for name, m in MEASURES.items() if not m.record or name in asked)
+    def measure_names(self) -> tuple[str, ...]:
+        """Names of the measures of an individual."""
+        wanted = self.config.task.measures
+        return tuple(name for name, m in MEASURES.items() if not m.record or name in wanted)
 
     @cached_property
-    def figures(self) -> tuple[str, ...]:
-        """Names of all figures of an individual: the score, measures and descriptors."""
-        return ("score", *self.measured, *self._example.descriptors)
+    def features(self) -> tuple[str, ...]:
+        """Names of all features of an individual: the score, measures and descriptors."""
+        return ("score", *self.measure_names, *self._example.descriptors)
 
     @cached_property
     def _example(self) -> Morphology:
         """A random body, the same in all processes."""
         return self.genotype.develop(self.genotype.random(np.random.default_rng(0)))
 
-    def single(self, body: Morphology) -> Fitness:
+    def body_fitness(self, body: Morphology) -> Fitness:
         """The fitness of one body alone, for replays."""
         return fit_body(self.config, body)
 
     @cached_property
     def build(self) -> Callable[[Morphology], Robot]:
-        """Body → it compiled; those of the last generations are remembered."""
-        return remember(self.mixed.build)
+        """Body → robot, with a cache of the last generations'."""
+        return cached(self.mixed.build)
 
     @cached_property
-    def layout(self) -> Callable[[Morphology], Layout]:
-        """Body → where its genes belong; likewise."""
+    def layout(self) -> Callable[[Morphology], GeneLayout]:
+        """Body → layout of its genes, with the same cache."""
 
-        def lay_out(body: Morphology) -> Layout:
+        def lay_out(body: Morphology) -> GeneLayout:
             plant = plant_of(self.build(body))
             own = self.mixed.controller_of(plant)
-            return lay_out_genes(own, self.mixed.setup.controller, plant)
+            return gene_layout(own, self.mixed.controller, plant)
 
-        return remember(lay_out)
+        return cached(lay_out)
 
     def example_block(self) -> tuple[Any, ...]:
         """A block to compile for."""
@@ -159,19 +159,13 @@ class BodyFitness:
             `[P]` scores and `[P]` measures.
         """
         robots = [self.build(body) for body in bodies]
-        if self.alone:
+        if self.one_body_per_block:
             return self.mixed.evaluate(robots[0], genes, key)
         return self.mixed.evaluate([robots[k] for k in which], genes, key)
 
 
 def make_body_fitness(config: Config) -> BodyFitness:
-    """Builds the fitness of a configuration whose bodies evolve.
-
-    Args:
-        config: the configuration.
-
-    Returns:
-        The fitness.
+    """Builds the fitness of a configuration in which bodies evolve.
 
     Raises:
         InputError: the configuration, a seed or the world is wrong; the message says where.
@@ -183,14 +177,14 @@ def make_body_fitness(config: Config) -> BodyFitness:
     try:
         space = make_space(bodies, modules)
         seeds = tuple(_load_seed(path, modules, config, space) for path in bodies.seeds)
-        genotype = make_genotype(bodies.genotype, space, bodies.params, config.source)
+        genotype = find_genotype(bodies.genotype, space, bodies.params, config.source)
         _check_seeds(bodies, genotype)
         examples = [*seeds, *_examples(genotype)]
         kinds = [modules[name] for name in (bodies.core, *bodies.modules)]
         mixed = make_mixed_fitness(
             config, examples, bodies.max_hinges, modules=bodies.max_modules, kinds=kinds
         )
-        brains = make_brains(bodies.brains, mixed.setup.controller)
+        brains = make_brain_encoding(bodies.brains, mixed.controller)
     except InputError as error:
         text = str(error)
         place = "" if text.startswith(config.source) else f"{config.source}: "

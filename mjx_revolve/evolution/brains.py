@@ -1,32 +1,33 @@
-"""Brains for bodies that change: what is inherited, and how it becomes genes of a controller.
+"""Brains for bodies that change: their inheritance, and their genes for a controller.
 
 A brain is a plain value that JSON can hold: genes by name (`joints`), or the weights of a network
-that tells each joint's genes from its place (`cppn`, after Stanley's HyperNEAT, Artificial Life 15,
-2009). For learning it is a vector, as long as in all other bodies, so that one strategy serves all.
+that computes each joint's genes from its position (`cppn`, after Stanley's HyperNEAT, Artificial
+Life 15, 2009). For learning it is a vector of the same length for all bodies, so that one strategy
+serves all.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
 from annotated_types import Len
 
-from mjx_revolve.control.controller import Controller, Gene, gene_places
+from mjx_revolve.control.controller import Controller, Gene, gene_indices
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.episodes.bodies_config import BrainsConfig
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import Number, read, words
 
-# The network's hidden nodes, one each of these functions in turn, and the length by which places
+# The network's hidden nodes, one each of these functions in turn, and the length by which positions
 # are divided before they enter it [m], about two modules. Choices.
 _HIDDEN = 12
 _LENGTH = 0.1
 # A brain of genes by name. (Of a `dict`, messages would name the gene that is wrong.)
 _NAMED = Annotated[Mapping[str, Number], words("genes by name")]
-# What edits put behind the name of a copy.
+# The suffix that edits give to the name of a copy.
 _COPY = re.compile(r"_\d+$")
 _FUNCTIONS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
     np.sin,
@@ -36,16 +37,16 @@ _FUNCTIONS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
 )
 
 
-class Layout(NamedTuple):
-    """The genes of one body's controller, and where they belong.
+class GeneLayout(NamedTuple):
+    """The genes of one body's controller, and their joints.
 
     Attributes:
         names: `[n]`, after the body's own joints.
-        genes: `[n]` what each belongs to.
-        place: `[n, 3]` of its joint at rest, of a pair the middle, else 0; core frame [m].
+        genes: `[n]` the joint, pair or robot that each belongs to.
+        place: `[n, 3]` position of its joint at rest, of a pair the middle, else 0; core frame [m].
         reach: `[n, 3]` from a pair's earlier joint to the later one, else 0 [m].
-        columns: `[n]` where each stands among the genes for all bodies.
-        width: how many of those there are.
+        columns: `[n]` its index among the genes for all bodies.
+        width: number of the genes for all bodies.
     """
 
     names: tuple[str, ...]
@@ -56,8 +57,8 @@ class Layout(NamedTuple):
     width: int
 
 
-def lay_out_genes(own: Controller, common: Controller, plant: Plant) -> Layout:
-    """Where the genes of a body belong.
+def gene_layout(own: Controller, common: Controller, plant: Plant) -> GeneLayout:
+    """The layout of a body's genes.
 
     Args:
         own: the body's controller.
@@ -77,66 +78,76 @@ def lay_out_genes(own: Controller, common: Controller, plant: Plant) -> Layout:
             place[k], reach[k] = (i + j) / 2, j - i
         elif gene.place != "robot":
             place[k] = at[gene.number + plant.num_hinges * (gene.place == "thruster")]
-    columns = gene_places(own, common)
-    return Layout(own.gene_names, own.genes, place, reach, columns, common.num_genes)
+    columns = gene_indices(own, common)
+    return GeneLayout(own.gene_names, own.genes, place, reach, columns, common.num_genes)
 
 
-class Brains(NamedTuple):
-    """A kind of brain: plain functions, all randomness from NumPy's generator that they are given.
+class BrainEncoding(Protocol):
+    """A kind of brain. All randomness comes from the generators that are passed in."""
 
-    Attributes:
-        draw: (generator, layout) → a brain drawn anew.
-        inherit: (generator, parents' brains, layout) → a child's; the first parent's body is the
-            child's, too, but for mutations.
-        size: length of the vectors.
-        to_vector: (brain, layout) → `[size]`.
-        from_vector: (`[size]`, layout) → the brain.
-        express: (`[..., size]`, layout) → `[..., width]` genes for all bodies.
-        check: (what a file holds) → the brain.
-    """
-
-    draw: Callable[[np.random.Generator, Layout], Any]
-    inherit: Callable[[np.random.Generator, Sequence[Any], Layout], Any]
     size: int
-    to_vector: Callable[[Any, Layout], np.ndarray]
-    from_vector: Callable[[np.ndarray, Layout], Any]
-    express: Callable[[np.ndarray, Layout], np.ndarray]
-    check: Callable[[Any], Any]
+    """Length of the vectors."""
+
+    def draw(self, rng: np.random.Generator, layout: GeneLayout) -> Any:
+        """A brain drawn anew."""
+
+    def inherit(self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout) -> Any:
+        """A child's brain; its body is the first parent's, but for mutations."""
+
+    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+        """The brain as a vector `[size]`."""
+
+    def from_vector(self, vector: np.ndarray, layout: GeneLayout) -> Any:
+        """The inverse of `to_vector`."""
+
+    def express(self, vectors: np.ndarray, layout: GeneLayout) -> np.ndarray:
+        """Vectors `[..., size]` as genes for all bodies `[..., width]`."""
+
+    def check(self, brain: Any) -> Any:
+        """The brain that a file holds; raises `InputError` where it is none."""
 
 
-def make_brains(settings: BrainsConfig, common: Controller) -> Brains:
+def make_brain_encoding(settings: BrainsConfig, common: Controller) -> BrainEncoding:
     """The kind of brain that a configuration names.
 
     Args:
         settings: its type and numbers.
         common: the controller for the largest body there may be.
 
-    Returns:
-        The kind.
-
     Raises:
-        InputError: the controller does not say what its genes belong to.
+        InputError: the controller has no `genes`.
     """
     if common.num_genes and not common.genes:
         raise InputError(
             "bodies: expected a controller that says what its genes belong to (Controller.genes), "
             "so that they can be inherited; found none"
         )
-    return {"joints": _make_joints, "cppn": _make_cppn}[settings.type](settings, common)
+    if settings.type == "joints":
+        return NamedGenes(settings, common)
+    return PatternNetwork(settings, common)
 
 
-# ------------------------------------------------------------------ genes by name
+class NamedGenes:
+    """Brains that are `{name of a gene: value}`."""
 
+    def __init__(self, settings: BrainsConfig, common: Controller) -> None:
+        """See `make_brain_encoding`."""
+        self.settings, self.size = settings, common.num_genes
 
-def _make_joints(settings: BrainsConfig, common: Controller) -> Brains:
-    """A brain is `{name of a gene: value}`."""
+    def draw(self, rng: np.random.Generator, layout: GeneLayout) -> dict[str, float]:
+        """Normally distributed genes."""
+        return _named(layout, self.settings.std_init * rng.standard_normal(len(layout.names)))
 
-    def draw(rng: np.random.Generator, layout: Layout) -> dict[str, float]:
-        return _named(layout, settings.std_init * rng.standard_normal(len(layout.names)))
+    def inherit(
+        self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout
+    ) -> dict[str, float]:
+        """Genes by name, the first parent's first, with noise.
 
-    def inherit(rng: np.random.Generator, parents: Sequence[Any], layout: Layout) -> Any:
-        noise = settings.mutation * rng.standard_normal(len(layout.names))
-        fresh = settings.std_init * rng.standard_normal(len(layout.names))
+        Those of a copied joint are its original's, those of a new one the nearest joint's that are
+        inherited; where there is none, they are drawn.
+        """
+        noise = self.settings.mutation * rng.standard_normal(len(layout.names))
+        fresh = self.settings.std_init * rng.standard_normal(len(layout.names))
         known: Mapping[str, float] = {k: v for p in reversed(parents) for k, v in p.items()}
         # A copy has a number behind its original's name; so has what a second parent gives where
         # the first one has that name, too.
@@ -145,37 +156,33 @@ def _make_joints(settings: BrainsConfig, common: Controller) -> Brains:
         have = np.array([value is not None for value in found], bool)
         values = np.array([0.0 if value is None else value for value in found])
         for k in np.flatnonzero(~have):
-            # Where the body has grown: as the nearest joint does that had a parent.
             alike = [i for i in np.flatnonzero(have) if _alike(layout.genes[i], layout.genes[k])]
             away = np.linalg.norm(layout.place[alike] - layout.place[k], axis=1)
             values[k] = values[alike[int(np.argmin(away))]] if alike else fresh[k]
         return _named(layout, values + noise)
 
-    def to_vector(brain: Any, layout: Layout) -> np.ndarray:
+    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+        """Genes for all bodies, 0 for those that the body lacks."""
         vector = np.zeros(layout.width, np.float32)
         vector[layout.columns] = [brain.get(name, 0.0) for name in layout.names]
         return vector
 
-    def express(vectors: np.ndarray, layout: Layout) -> np.ndarray:
+    def from_vector(self, vector: np.ndarray, layout: GeneLayout) -> dict[str, float]:
+        """The body's own genes by name."""
+        return _named(layout, vector[layout.columns])
+
+    def express(self, vectors: np.ndarray, layout: GeneLayout) -> np.ndarray:
+        """The same genes, 0 for those that the body lacks."""
         genes = np.zeros(vectors.shape, np.float32)
         genes[..., layout.columns] = vectors[..., layout.columns]
         return genes
 
-    def check(brain: Any) -> dict[str, float]:
+    def check(self, brain: Any) -> dict[str, float]:
+        """Genes by name."""
         return read(_NAMED, brain, "brain")
 
-    return Brains(
-        draw,
-        inherit,
-        common.num_genes,
-        to_vector,
-        lambda vector, layout: _named(layout, vector[layout.columns]),
-        express,
-        check,
-    )
 
-
-def _named(layout: Layout, values: Any) -> dict[str, float]:
+def _named(layout: GeneLayout, values: Any) -> dict[str, float]:
     return {n: float(np.float32(x)) for n, x in zip(layout.names, values, strict=True)}
 
 
@@ -183,67 +190,77 @@ def _alike(one: Gene, other: Gene) -> bool:
     return one.what == other.what and one.place == other.place
 
 
-# ------------------------------------------------------------------ a network over places
+class PatternNetwork:
+    """Brains that are the weights of a network over positions.
 
-
-def _make_cppn(settings: BrainsConfig, common: Controller) -> Brains:
-    """A brain is the list of the network's weights.
-
-    Inputs are 1, x, y, z of the gene's place and, for pairs, the way from one joint to the other;
-    there is one output for each kind of gene, and one weight for each gene of the robot as a whole.
+    Inputs are 1, x, y, z of the gene's position and, for pairs, the vector from one joint to the
+    other; there is one output for each kind of gene, and one weight for each gene of the robot as a
+    whole.
     """
-    kinds = list(dict.fromkeys((g.what, g.place) for g in common.genes if g.place != "robot"))
-    whole = [gene for gene in common.genes if gene.place == "robot"]
-    inputs = 7
-    shape_in, shape_out = (_HIDDEN, inputs), (len(kinds), _HIDDEN + inputs)
-    first, second = _HIDDEN * inputs, len(kinds) * (_HIDDEN + inputs)
-    size = first + second + len(whole)
 
-    def express(vectors: np.ndarray, layout: Layout) -> np.ndarray:
-        flat = np.asarray(vectors, np.float64).reshape(-1, size)
+    def __init__(self, settings: BrainsConfig, common: Controller) -> None:
+        """See `make_brain_encoding`."""
+        self.settings, inputs = settings, 7
+        self.kinds = list(
+            dict.fromkeys((g.what, g.place) for g in common.genes if g.place != "robot")
+        )
+        self.whole = [gene for gene in common.genes if gene.place == "robot"]
+        self.shapes = (_HIDDEN, inputs), (len(self.kinds), _HIDDEN + inputs)
+        # Ends of the weights of the first and of the second layer.
+        self.first = _HIDDEN * inputs
+        self.second = self.first + len(self.kinds) * (_HIDDEN + inputs)
+        self.size = self.second + len(self.whole)
+
+    def express(self, vectors: np.ndarray, layout: GeneLayout) -> np.ndarray:
+        """The network's outputs at the genes' positions."""
+        flat = np.asarray(vectors, np.float64).reshape(-1, self.size)
         ones = np.ones((len(layout.names), 1))
         x = np.hstack([ones, layout.place / _LENGTH, layout.reach / _LENGTH])
-        hidden = np.einsum("vhi,ni->vnh", flat[:, :first].reshape(-1, *shape_in), x)
+        hidden = np.einsum("vhi,ni->vnh", flat[:, : self.first].reshape(-1, *self.shapes[0]), x)
         for k in range(_HIDDEN):
             hidden[..., k] = _FUNCTIONS[k % len(_FUNCTIONS)](hidden[..., k])
         seen = np.concatenate([hidden, np.broadcast_to(x, (len(flat), *x.shape))], -1)
-        weights = flat[:, first : first + second].reshape(-1, *shape_out)
+        weights = flat[:, self.first : self.second].reshape(-1, *self.shapes[1])
         outputs = np.einsum("voh,vnh->vno", weights, seen)
         genes = np.zeros((len(flat), layout.width), np.float32)
         for k, gene in enumerate(layout.genes):
             if gene.place == "robot":
-                value = flat[:, first + second + whole.index(gene)]
+                value = flat[:, self.second + self.whole.index(gene)]
             else:
-                value = outputs[:, k, kinds.index((gene.what, gene.place))]
+                value = outputs[:, k, self.kinds.index((gene.what, gene.place))]
             genes[:, layout.columns[k]] = value
         return genes.reshape(*np.shape(vectors)[:-1], layout.width)
 
-    def draw(rng: np.random.Generator, layout: Layout) -> list[float]:
-        weights = rng.standard_normal(size)
+    def draw(self, rng: np.random.Generator, layout: GeneLayout) -> list[float]:
+        """Normally distributed weights."""
+        weights = rng.standard_normal(self.size)
         # So that genes, whatever their number of inputs, come out about as wide as drawn ones.
-        weights[first : first + second] *= settings.std_init / np.sqrt(_HIDDEN / 2)
-        weights[first + second :] *= settings.std_init
+        weights[self.first : self.second] *= self.settings.std_init / np.sqrt(_HIDDEN / 2)
+        weights[self.second :] *= self.settings.std_init
         return _weights(weights)
 
-    def inherit(rng: np.random.Generator, parents: Sequence[Any], layout: Layout) -> list[float]:
+    def inherit(
+        self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout
+    ) -> list[float]:
+        """Each weight is one of the parents', with noise."""
         found = np.array(parents[0])
         if len(parents) > 1:
-            found = np.where(rng.random(size) < 0.5, found, parents[1])
-        return _weights(found + settings.mutation * rng.standard_normal(size))
+            found = np.where(rng.random(self.size) < 0.5, found, parents[1])
+        return _weights(found + self.settings.mutation * rng.standard_normal(self.size))
 
-    def check(brain: Any) -> list[float]:
-        weights = Annotated[list[Number], Len(size, size), words(f"{size} weights")]
+    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+        """The weights."""
+        return np.array(brain, np.float32)
+
+    def from_vector(self, vector: np.ndarray, layout: GeneLayout) -> list[float]:
+        """The weights."""
+        return _weights(vector)
+
+    def check(self, brain: Any) -> list[float]:
+        """As many weights as the network has."""
+        count = self.size
+        weights = Annotated[list[Number], Len(count, count), words(f"{count} weights")]
         return read(weights, brain, "brain")
-
-    return Brains(
-        draw,
-        inherit,
-        size,
-        lambda brain, layout: np.array(brain, np.float32),
-        lambda vector, layout: _weights(vector),
-        express,
-        check,
-    )
 
 
 def _weights(values: Any) -> list[float]:

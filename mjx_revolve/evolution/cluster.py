@@ -2,8 +2,8 @@
 
 Dask carries tasks and scores, has TLS, restarts workers that die, and lets them join and leave at
 any time. A worker gets blocks once it has opened the job, which it keeps, and was found to have the
-same program. When one is lost, its blocks are scored again, as on one machine (`jobs.share_out`);
-Dask is told who is to score what, so that no block is blamed for another's deed.
+same program. When one is lost, its blocks are scored again, as on one machine. Each task names its
+worker, so that no block counts the failures of another.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import faulthandler
 import functools
 import logging
 import os
+import pickle
 import queue
 import threading
 import time
@@ -21,15 +22,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from mjx_revolve.evolution.block_executor import WorkerExecutor
 from mjx_revolve.evolution.fingerprints import find_difference
 from mjx_revolve.evolution.jobs import (
     Job,
-    News,
+    Limits,
+    MakeFitness,
     WorkerError,
     compile_job,
     describe_error,
+    make_job,
     open_job,
-    share_out,
 )
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
@@ -37,9 +40,10 @@ from mjx_revolve.numerics import runtime
 if TYPE_CHECKING:
     import jax
 
+    from mjx_revolve.episodes.config import Config
     from mjx_revolve.evolution.blocks import Block, Scored
 
-# Between two looks at who is there [s].
+# Between two looks at the list of workers [s].
 _TICK = 1.0
 # What fetching a block's scores may take [s].
 _FETCH = 10.0
@@ -66,52 +70,54 @@ def _watched(seconds: float) -> Iterator[None]:
 
 
 @functools.lru_cache(maxsize=4)
-def _open(job: Job) -> tuple[Any, deque[float]]:
+def _open(pickled: bytes) -> tuple[Any, deque[float]]:
+    """The fitness of a job, and the times of its last blocks [s]."""
     os.environ["JAX_PLATFORMS"] = "cpu"  # before JAX is imported
     cache, cores = runtime.prepare_process(), runtime.list_cores()
     # Any core: so that XLA has one thread, as there is a process for each.
     runtime.prepare_worker(cores[0] if cores else None, str(cache) if cache else None)
+    job: Job = pickle.loads(pickled)
     fitness = open_job(job)
     compile_job(job, fitness)
     return fitness, deque(maxlen=101)
 
 
-def prepare(job: Job) -> tuple[dict[str, Any], dict[str, str]]:
+def prepare(limits: Limits, pickled: bytes) -> tuple[dict[str, Any], dict[str, str]]:
     """Opens a job and compiles its fitness, once per process.
 
     Returns:
-        See `fingerprints.identify`; and on what the last bits of scores may depend, besides.
+        See `fingerprints.identify`; and what else the last bits of scores may depend on.
     """
     from mjx_revolve.evolution.fingerprints import identify
 
-    with _watched(job.limits.ready):
-        identity = identify(_open(job)[0])
+    with _watched(limits.ready):
+        identity = identify(_open(pickled)[0])
     return identity, {"CPUs": runtime.cpu_model(), "XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
 
 
-def score(job: Job, block: Block, key: tuple[Any, str]) -> Scored:
+def score(limits: Limits, pickled: bytes, block: Block, key: tuple[Any, str]) -> Scored:
     """Scores a block."""
     from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
 
-    fitness, times = _open(job)
-    with _watched(job.limits.patience(times)):
+    fitness, times = _open(pickled)
+    with _watched(limits.patience(times)):
         began = time.perf_counter()
         result = evaluate_block(fitness, block, key_from_data(key))
         times.append(time.perf_counter() - began)
     return result
 
 
-# ------------------------------------------------------------------ in the leader
+# ------------------------------------------------------------------ in the run's process
 
 
 @dataclass(eq=False)
-class _Worker:
+class ClusterWorker:
     """A worker of the cluster.
 
     Attributes:
-        address: where it is.
-        opening: the future that opens the job; None: it has.
-        refused: why it gets no blocks; nothing: it does.
+        address: its address.
+        opening: the future that opens the job; None: it is open.
+        refused: why it gets no blocks; "": it does.
         blocks: number and future of those that it has.
     """
 
@@ -121,20 +127,21 @@ class _Worker:
     blocks: list[tuple[int, Any]] = field(default_factory=list)
 
 
-class Cluster:
-    """The workers of a Dask scheduler; a `blocks.Workplace`. Whoever makes one closes it.
+class ClusterExecutor(WorkerExecutor[ClusterWorker]):
+    """Scores with the workers of a Dask scheduler.
 
     Attributes:
         place: the scheduler's address, or the path of its scheduler file.
-        identity: what workers must have in common with this process; see `fingerprints.identify`.
+        workers: all workers, also refused ones and those that still open the job, by address.
     """
 
-    def __init__(self, place: str, job: Job) -> None:
-        """Finds the scheduler.
+    def __init__(self, config: Config, make_fitness: MakeFitness | None, place: str) -> None:
+        """Connects to the scheduler.
 
         Args:
-            place: its address, or the path of its scheduler file.
-            job: what to score.
+            config: of the run.
+            make_fitness: see `executor.make_executor`.
+            place: the scheduler's address, or the path of its scheduler file.
 
         Raises:
             InputError: there is none, or Dask is not installed.
@@ -149,58 +156,63 @@ class Cluster:
         if is_file and not os.path.isfile(place):  # Dask would wait for it
             raise InputError(f"--cluster: expected a scheduler file; found none at {place}")
         try:
-            known = {"scheduler_file" if is_file else "address": place}
-            self._client = distributed.Client(**known, set_as_default=False)
-        except Exception as error:  # about addresses, files and TLS Dask complains in any way
+            where = {"scheduler_file" if is_file else "address": place}
+            self._client = distributed.Client(**where, set_as_default=False)
+        except Exception as error:  # Dask raises anything about addresses, files and TLS
             raise InputError(
                 f"--cluster {place}: expected a Dask scheduler; found {describe_error(error)}"
             ) from None
         self.place = place
-        self.identity: dict[str, Any] = {}
-        self._job = job
-        self._workers: dict[str, _Worker] = {}
+        self.workers: dict[str, ClusterWorker] = {}
         self._facts: dict[str, set[str]] = {}
         self._done: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._next_look = 0.0
         self._at_once = _AT_ONCE
         self._deserted = False
+        try:
+            job = make_job(config, make_fitness)
+            self._pickled = pickle.dumps(job)
+            super().__init__(config, job)
+        except BaseException:
+            self.close()
+            raise
 
     @property
-    def workers(self) -> int:
+    def num_workers(self) -> int:
         """How many processes score."""
         return len(self._fit())
 
-    def _fit(self) -> list[_Worker]:
-        return [w for w in self._workers.values() if w.opening is None and not w.refused]
+    def describe(self) -> dict[str, Any]:
+        """See `Executor`; workers of a cluster come and go."""
+        return {"cluster": self.place, "block": self.block}
 
-    def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored | str]:
-        """See `blocks.Workplace`.
+    def _fit(self) -> list[ClusterWorker]:
+        return [w for w in self.workers.values() if w.opening is None and not w.refused]
 
-        Raises:
-            WorkerError: the scheduler is lost, or has had no workers but those of another program.
-        """
+    def _score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored]:
         self._at_once = _AT_ONCE
-        return share_out(self, blocks, key)
+        return super()._score(blocks, key)
 
-    def free(self) -> list[_Worker]:
-        """See `jobs.Crew`; one that has room for two blocks stands there twice."""
+    def free(self) -> list[ClusterWorker]:
+        """See `WorkerExecutor`; one that has room for two blocks stands there twice."""
         return [w for k in range(self._at_once) for w in self._fit() if len(w.blocks) <= k]
 
-    def send(self, worker: _Worker, number: int, block: Block, key: tuple[Any, str]) -> None:
-        """See `jobs.Crew`."""
+    def send(self, worker: ClusterWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+        """See `WorkerExecutor`."""
         worker.blocks.append((number, self._submit(worker.address, score, block, key)))
 
     def _submit(self, address: str, function: Any, *arguments: Any) -> Any:
         with self._lost_if_closed():
             future = self._client.submit(
-                function, self._job, *arguments, workers=[address], pure=False
-            )
+                function, self.job.limits, self._pickled, *arguments,
+                workers=[address], pure=False,
+            )  # fmt: skip
         future.add_done_callback(self._done.put)
         return future
 
     @contextlib.contextmanager
     def _lost_if_closed(self) -> Iterator[None]:
-        """Turns what Dask complains of, once it has given the scheduler up, into our error."""
+        """Turns Dask's errors, once it has given the scheduler up, into a `WorkerError`."""
         try:
             yield
         except Exception:  # of any kind, where the connection breaks
@@ -208,12 +220,12 @@ class Cluster:
                 raise WorkerError(f"the scheduler at {self.place} is lost") from None
             raise
 
-    def attend(self) -> News:
-        """See `jobs.Crew`."""
+    def attend(self) -> list[tuple[int, Scored | str | None]]:
+        """See `WorkerExecutor`; WorkerError where the scheduler is lost, or no worker fits."""
         news = self._look() if time.monotonic() >= self._next_look else []
         with contextlib.suppress(queue.Empty):
             done = self._done.get(timeout=max(0.0, self._next_look - time.monotonic()))
-            for worker in list(self._workers.values()):
+            for worker in list(self.workers.values()):
                 if worker.opening is done:
                     self._admit(worker)
                 for entry in list(worker.blocks):
@@ -222,8 +234,8 @@ class Cluster:
                         news.append((entry[0], self._fetch(worker, done)))
         return news
 
-    def _look(self) -> News:
-        """Who has come; who has gone, and with which blocks."""
+    def _look(self) -> list[tuple[int, Any]]:
+        """Finds workers that have joined or left, and the blocks of the latter."""
         self._next_look = time.monotonic() + _TICK
         while self._client.status == "connecting":  # it gives up after a while
             time.sleep(0.1)
@@ -232,9 +244,9 @@ class Cluster:
             there = self._client.nthreads()
         if there is None:  # it tries to reach the scheduler again
             return []
-        news: News = []
-        for address in [address for address in self._workers if address not in there]:
-            worker = self._workers.pop(address)
+        news: list[tuple[int, Any]] = []
+        for address in [address for address in self.workers if address not in there]:
+            worker = self.workers.pop(address)
             _log.warning("the worker at %s is gone", address)
             # Of two, one is innocent: from here on they get one at a time.
             self._at_once = 1
@@ -244,15 +256,15 @@ class Cluster:
             _log.warning("waiting for workers at %s", self.place)
         self._deserted = not there
         for address in there:
-            if address not in self._workers:
-                self._workers[address] = _Worker(address, self._submit(address, prepare))
+            if address not in self.workers:
+                self.workers[address] = ClusterWorker(address, self._submit(address, prepare))
         return news
 
-    def _admit(self, worker: _Worker) -> None:
-        """Takes in a worker that has opened the job, if it is one of this run's."""
+    def _admit(self, worker: ClusterWorker) -> None:
+        """Accepts a worker that has opened the job, if it has the run's program."""
         opening, worker.opening = worker.opening, None
         if opening.status not in ("finished", "error"):  # the connection broke meanwhile
-            del self._workers[worker.address]
+            del self.workers[worker.address]
             return
         try:
             identity, facts = opening.result(timeout=_FETCH)
@@ -261,20 +273,20 @@ class Cluster:
             worker.refused = describe_error(error)
         if worker.refused:
             words = f"the worker at {worker.address} is refused: {worker.refused}"
-            if not self._facts and all(w.refused for w in self._workers.values()):
+            if not self._facts and all(w.refused for w in self.workers.values()):
                 raise WorkerError(words)  # there never was another
             _log.warning("%s", words)
             return
         for what, value in facts.items():
-            known = self._facts.setdefault(what, set())
-            if known and value not in known:
+            others = self._facts.setdefault(what, set())
+            if others and value not in others:
                 _log.warning(
                     "the workers have different %s (%s): the last bits of scores may depend on "
-                    "which of them computes them", what, "; ".join(sorted(known | {value})),
+                    "which of them computes them", what, "; ".join(sorted(others | {value})),
                 )  # fmt: skip
-            known.add(value)
+            others.add(value)
 
-    def _fetch(self, worker: _Worker, future: Any) -> Scored | str | None:
+    def _fetch(self, worker: ClusterWorker, future: Any) -> Scored | str | None:
         if future.status not in ("finished", "error"):  # the connection broke meanwhile
             return None
         try:
@@ -283,7 +295,8 @@ class Cluster:
             return f"{describe_error(error)} at {worker.address}"
 
     def close(self) -> None:
-        """Leaves; the workers stay for others."""
-        self._workers.clear()
+        """Disconnects; the cluster's workers stay."""
+        self.closed = True
+        self.workers.clear()
         with contextlib.suppress(Exception):  # the scheduler may be lost
             self._client.close(timeout=_FETCH)

@@ -1,30 +1,30 @@
-"""Fingerprints of what a run is made of, by which two processes know that they have the same."""
+"""Fingerprints of a run's configuration and program, which processes of one run must share."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.metadata
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjx_revolve.body.catalogue import load_modules
-from mjx_revolve.inputs.own_code import content_name, parse_own
+from mjx_revolve.inputs.user_code import content_name
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
+    from mjx_revolve.episodes.settings import NamedFile
 
 FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard")
-"""What may change in `evolution` when a run is resumed; all else would make it another run."""
-# Settings of a task that runs of older versions know nothing of: as they are usually, they are left
-# out of fingerprints, so that such runs can go on.
+"""Settings of `evolution` that may change when a run is resumed; others make another run."""
+# Settings of a task that older versions lack: with their default values they are left out of
+# fingerprints, so that older runs can go on.
 _LATER_IN_TASK = (
     "target_turn", "sight", "touch",
     "course_spread", "course_changes", "course_turn", "course_rate",
 )  # fmt: skip
-# What must be the same in all processes of a run, besides our own source.
+# Their versions must be the same in all processes of a run.
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 
 
@@ -49,38 +49,39 @@ def plain_settings(config: Config) -> dict[str, Any]:
 def settings_hash(config: Config) -> str:
     """Of all settings that may not change while a run goes on.
 
-    Files count by their content, not by their place; so do the users' own tasks and controllers.
+    Files count by their content, not by their path; so do the users' own tasks and controllers.
     The robot and the world have a fingerprint of their own (`model_hash`).
     """
+    from mjx_revolve.episodes.config import Config
+    from mjx_revolve.episodes.settings import map_files
+
+    def by_content(file: NamedFile) -> str:
+        if file.kind == "morphology":
+            return hash_text(Path(file.path).read_text("utf-8"))
+        return content_name(file.text) if file.kind == "code" else file.text
+
     data = plain_settings(config)
     del data["morphology"], data["modules"]
+    data["world"]["name"] = Path(data["world"]["name"]).name
+    data = map_files(data, by_content, Config)
     for section in ("controller", "task"):
-        data[section]["type"] = content_name(data[section]["type"])
-        if not data[section]["params"]:  # as runs have it from before there were any
+        if not data[section]["params"]:  # older runs have none
             del data[section]["params"]
     for sensor in data["controller"]["sensors"] or ():
-        for key in ("at", "each"):  # likewise
+        for key in ("at", "each"):  # older runs lack them
             if sensor[key] is None:
                 del sensor[key]
-    if config.modules is not None:  # which tell brains more than the configuration does
+    if config.modules is not None:  # types of modules may have sensors of their own
         kinds = {kind.name: kind.sensors for kind in load_modules(config.modules).values()}
         brought = {name: [s.to_mapping() for s in own] for name, own in kinds.items() if own}
         if brought:
             data["controller"]["brought"] = brought
-    if not data["task"]["measures"]:  # likewise
-        del data["task"]["measures"]
-    for name in _LATER_IN_TASK:
+    for name in ("measures", *_LATER_IN_TASK):
         if data["task"][name] == type(config.task).model_fields[name].default:
             del data["task"][name]
-    if data["colony"] is None:  # likewise
-        del data["colony"]
-    if data["bodies"] is None:
-        del data["bodies"]
-    else:
-        bodies = data["bodies"]
-        bodies["genotype"] = content_name(bodies["genotype"])
-        bodies["seeds"] = [hash_text(Path(path).read_text("utf-8")) for path in bodies["seeds"]]
-    data["world"]["name"] = Path(data["world"]["name"]).name
+    for name in ("colony", "bodies"):
+        if data[name] is None:
+            del data[name]
     return hash_text(_dump(data))
 
 
@@ -98,44 +99,41 @@ def _text_keys(value: Any) -> Any:
 def fitness_hash(config: Config) -> str:
     """Of all settings that a fitness is made of, files by their content.
 
-    Runs that have it in common can share a fitness. It does not know the seed, nor how genes are
-    searched for.
+    Runs that have it in common can share a fitness. It depends neither on the seed nor on how genes
+    are searched for.
     """
+    from mjx_revolve.episodes.config import Config
+    from mjx_revolve.episodes.settings import map_files
+
+    def by_content(file: NamedFile) -> str:
+        digest = hashlib.sha256(Path(file.path).read_bytes()).hexdigest()
+        return f"{Path(file.path).name} {file.function} {digest}"
+
     data = plain_settings(config)
     data["evolution"] = config.evolution.population_size
-    return hash_text(_dump(_by_content(data)))
-
-
-def _by_content(value: Any) -> Any:
-    """The same nested values, absolute paths of files replaced by what is in them."""
-    if isinstance(value, dict):
-        return {key: _by_content(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_by_content(item) for item in value]
-    if not isinstance(value, str) or parse_own(value):
-        return content_name(value) if isinstance(value, str) else value
-    if os.path.isabs(value) and os.path.isfile(value):
-        return f"{Path(value).name} {hashlib.sha256(Path(value).read_bytes()).hexdigest()}"
-    return value
+    return hash_text(_dump(map_files(data, by_content, Config)))
 
 
 def model_hash(fitness: Any) -> str:
-    """Of the compiled robot and the water around it; a fitness without a robot will do."""
-    identity = getattr(fitness, "identity", None)
-    if isinstance(identity, str):
-        return hash_text(identity)
-    robot = getattr(fitness, "robot", None)
-    return hash_text() if robot is None else hash_text(robot.mj_spec.to_xml(), repr(robot.world))
+    """Of the compiled robot and the water around it; of nothing for a fitness without a robot."""
+    from mjx_revolve.episodes.fitness import Fitness
+    from mjx_revolve.evolution.body_fitness import BodyFitness
+
+    if isinstance(fitness, BodyFitness):
+        return hash_text(fitness.identity)
+    if isinstance(fitness, Fitness):
+        return hash_text(fitness.robot.mj_spec.to_xml(), repr(fitness.robot.world))
+    return hash_text()
 
 
 def program_versions() -> dict[str, str]:
-    """What must be the same in all processes of a run: our source and the engines' versions."""
+    """Our source and the engines' versions, the same in all processes of a run."""
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return {"mjx_revolve": runtime.source_hash(), **versions}
 
 
 def identify(fitness: Any) -> dict[str, Any]:
-    """What a worker must have in common with its leader: program, precision, robot and world."""
+    """What all processes of a run must have in common: program, precision, robot and world."""
     import jax
 
     return program_versions() | {
@@ -146,7 +144,7 @@ def identify(fitness: Any) -> dict[str, Any]:
 
 
 def find_difference(expected: dict[str, Any], found: dict[str, Any]) -> str:
-    """In what a worker differs from its leader, in words; nothing: in nothing that matters."""
+    """A difference between two results of `identify`, in words; "" where they are equal."""
     for name, value in expected.items():
         if found.get(name) != value:
             return f"{name}: expected {value} as the run has it; found {found.get(name)}"

@@ -1,16 +1,27 @@
-"""An individual: a body and a brain, where they come from, and what their life was worth."""
+"""An individual: a body, a brain, their origin and score; its record in logs and checkpoints."""
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from mjx_revolve.body.morphology import Morphology, make_morphology
+from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.genotypes.genotype import Genotype
 from mjx_revolve.inputs.errors import InputError, show
+
+if TYPE_CHECKING:
+    from mjx_revolve.evolution.body_fitness import BodyFitness
+
+NUM_ELITES = 4
+"""Elites that are kept for the final evaluation. Each was scored on its own generation's starts, so
+the highest score is partly luck."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,17 +30,17 @@ class Individual:
 
     Attributes:
         number: unique in a run; children have larger ones than their parents.
-        parents: theirs; of two, the first gave the body.
-        born: the generation.
+        parents: their numbers; of two, the first gave the body.
+        born: generation of birth.
         origin: how it came about: `random`, `seed NAME`, `mutation`, `crossover`, ...
         genome: of the genotype's kind.
-        body: what has grown of it, not trimmed.
-        brain: the one that it was born with; see `brains.Brains`.
-        learnt: the best one of its life; None before that, and where every trial failed.
+        body: what the genome develops into, not trimmed.
+        brain: at birth; see `brains.BrainEncoding`.
+        learnt: the best brain that was tried; None before that, and where every trial failed.
         genes: `learnt` as genes of the body's own controller; None where there is none.
         score: of `learnt`; NaN where there is none.
         measures: of `learnt`, see `measures`.
-        trials: brains that it has tried.
+        trials: brains that were tried.
     """
 
     number: int
@@ -47,31 +58,38 @@ class Individual:
 
     @cached_property
     def descriptors(self) -> Mapping[str, float]:
-        """Of the body."""
+        """Descriptors of the body by name."""
         return self.body.descriptors
 
-    def figure(self, name: str) -> float:
-        """A figure by name: the score, a measure of the life or a descriptor of the body.
-
-        Raises:
-            KeyError: there is no such figure.
-        """
+    def feature(self, name: str) -> float:
+        """A feature by name: the score, a measure or a descriptor of the body; NaN: not known."""
         if name == "score":
             return self.score
-        if name in self.measures:
-            return float(self.measures[name])
-        return float(self.descriptors[name])
+        return float(self.measures.get(name, self.descriptors.get(name, np.nan)))
+
+
+def features(individuals: Sequence[Individual], names: Sequence[str]) -> np.ndarray:
+    """`[N, D]` features of individuals by name; NaN where one is not known."""
+    rows = [[individual.feature(name) for name in names] for individual in individuals]
+    return np.array(rows, float).reshape(len(individuals), len(names))
+
+
+def best_individuals(individuals: Iterable[Individual]) -> tuple[Individual, ...]:
+    """The `NUM_ELITES` with the best scores, each once and at its best; of equals, the older."""
+    best: dict[int, Individual] = {}
+    for one in individuals:
+        if np.isfinite(one.score):
+            best[one.number] = max(best.get(one.number, one), one, key=lambda i: i.score)
+    return tuple(sorted(best.values(), key=lambda i: (-i.score, i.number))[:NUM_ELITES])
+
+
+# --- to and from files
 
 
 def to_record(individual: Individual, genotype: Genotype) -> dict[str, Any]:
-    """An individual as plain values, for JSON; floats keep their bits.
+    """An individual as plain values by name, for JSON; floats keep their bits.
 
-    Args:
-        individual: the individual.
-        genotype: of its kind.
-
-    Returns:
-        The values by name; `genome` is None where the body says all.
+    `genome` is None where the body says all.
     """
     body = individual.body.to_mapping()
     genome = genotype.to_plain(individual.genome)
@@ -98,8 +116,8 @@ def from_record(record: Any, genotype: Genotype, modules: Any, check: Any) -> In
     Args:
         record: plain values.
         genotype: of its kind.
-        modules: the types of modules by name.
-        check: `brains.Brains.check`.
+        modules: module types by name.
+        check: `brains.BrainEncoding.check`.
 
     Returns:
         The individual.
@@ -140,3 +158,58 @@ def from_record(record: Any, genotype: Genotype, modules: Any, check: Any) -> In
 def to_text(individual: Individual, genotype: Genotype) -> str:
     """A line of JSON."""
     return json.dumps(to_record(individual, genotype), separators=(",", ":"))
+
+
+def to_records(individuals: Iterable[Individual], genotype: Genotype) -> list[dict[str, Any]]:
+    """Records of individuals by number, each once; of several states of one, the last counts."""
+    known = {individual.number: individual for individual in individuals}
+    return [to_record(known[number], genotype) for number in sorted(known)]
+
+
+def from_records(records: Any, fitness: BodyFitness) -> dict[int, Individual]:
+    """The inverse of `to_records`: individuals by number.
+
+    Raises:
+        InputError: see `from_record`.
+    """
+    modules = read_modules(fitness.config)
+    found = (from_record(r, fitness.genotype, modules, fitness.brains.check) for r in records)
+    return {individual.number: individual for individual in found}
+
+
+def state_to_arrays(search: Any, counters: Sequence[str], seed: int) -> dict[str, np.ndarray]:
+    """A search's counters and its seed, which `reading_state` compares."""
+    return {name: np.asarray(getattr(search, name)) for name in counters} | {
+        "seed": np.asarray(seed)
+    }
+
+
+@contextlib.contextmanager
+def reading_state(
+    what: str, counters: Sequence[str], seed: int, arrays: Mapping[str, np.ndarray]
+) -> Iterator[dict[str, Any]]:
+    """Within this, arrays of a checkpoint are read; yields the counters by name.
+
+    Raises:
+        InputError: the arrays are damaged, or those of another run.
+    """
+    try:
+        found = int(arrays["seed"])
+        if found != seed:
+            raise InputError(f"seed: expected evolution.seed {seed}; found {found}")
+        yield {name: arrays[name].item() for name in counters}
+    except InputError:
+        raise
+    except (KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"expected {what}; found {reason}") from None
+
+
+def pack_json(value: Any) -> np.ndarray:
+    """Plain values as an array of bytes."""
+    return np.frombuffer(json.dumps(value).encode(), np.uint8)
+
+
+def unpack_json(array: np.ndarray) -> Any:
+    """The inverse of `pack_json`."""
+    return json.loads(array.tobytes())

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-# What asks a process to end; SIGHUP is a terminal that is lost.
+# Requests to end a process; SIGHUP is a lost terminal.
 _SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
@@ -50,11 +50,7 @@ class Interrupts:
         self._former = -1
 
     def be_patient(self, answer: str) -> None:
-        """From now on the first signal only asks.
-
-        Args:
-            answer: what it is answered by; how to quit at once is added.
-        """
+        """From now on the first signal is only noted, and answered by a line."""
         self._answer = answer
 
     def __enter__(self) -> Interrupts:
@@ -90,7 +86,7 @@ class Interrupts:
             self._ask(number)
 
     def _ask(self, number: int) -> None:
-        """Notes the first signal, and says so once."""
+        """Notes the first signal, and prints the answer once."""
         with self._answering:
             if self.signal is None:
                 self.signal = number

@@ -1,9 +1,10 @@
-"""Whether a population fits into the memory that is free, before it is made."""
+"""The check that a population fits into the memory that is free, before it is made."""
 
 from __future__ import annotations
 
-import math
+import bisect
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,73 +19,68 @@ from mjx_revolve.inputs.errors import InputError
 _COPIES, _MORE = 8, 100
 # Bytes for each pair of individuals; measured.
 _PAIRS = {"DifferentialEvolution": 24}
-# Random bodies that are weighed; they differ by a third. And more than any takes for a module
+# Random bodies that are measured; they differ by a third. And more than any takes for a module
 # [bytes]: some 1,500 were measured with the first two genotypes, 2,300 with the third. Choices.
 _BODIES, _MODULE = 16, 16_000
 
 
 def check_memory(config: Config, num_genes: int, genotype: Genotype | None = None) -> None:
-    """Refuses a population that is larger than the free memory, as far as that can be told.
+    """Refuses a population that is larger than the free memory, by a low estimate.
 
-    An estimate, and a low one: some strategies take more, and say so when they begin.
+    Some strategies take more, and raise when they begin.
 
     Args:
         config: of a run.
         num_genes: length of its genes.
-        genotype: what bodies are grown from, where they evolve.
+        genotype: of bodies, where they evolve.
 
     Raises:
         InputError: it is too large; the message has the largest that fits.
     """
     free = free_memory()
-    if free is None:
+    evolution, bodies = config.evolution, config.bodies
+    if free is None or (bodies is not None and genotype is None):
         return
-    if config.bodies is not None:
-        if genotype is not None:
-            _check_bodies(config, num_genes, genotype, free)
-        return
-    size = config.evolution.population_size
+    parents = evolution.population_size
     one = 4 * (_COPIES * num_genes + _MORE)
-    pair = _PAIRS.get(config.evolution.strategy, 0)
-    if size * one + size**2 * pair <= free:
+    if bodies is None or genotype is None:
+        pair = _PAIRS.get(evolution.strategy, 0)
+        _check(config, "evolution.population_size", parents, lambda n: n * one + n**2 * pair, free)
         return
-    most = int(2 * free / (one + math.sqrt(one**2 + 4 * pair * free)))
-    raise _refuse(config, "evolution.population_size", most, free, size)
-
-
-def _refuse(config: Config, place: str, most: int, free: int, found: int) -> InputError:
-    return InputError(
-        f"{config.source}: {place}: expected at most {most}, as {free / 1e9:.3g} GB of memory are "
-        f"free; found {found}"
-    )
-
-
-def _check_bodies(config: Config, num_genes: int, genotype: Genotype, free: int) -> None:
-    """The same of bodies: of parents and children at once, with the brains that these try."""
-    bodies = config.bodies
-    assert bodies is not None
-    parents = config.evolution.population_size
+    # Parents and children at once, with the brains that these try.
     children = bodies.selection.offspring or parents
-    tried = 4 * (_COPIES * num_genes + _MORE) * bodies.learning.population_size
+    tried = one * bodies.learning.population_size
     if (parents + children) * bodies.max_modules * _MODULE + children * tried <= free:
-        return  # by far, as nearly always: nothing has to be weighed
+        return  # by far, as nearly always: no body has to be made
     body = weigh_bodies(genotype)
-    if parents * body + children * (body + tried) <= free:
-        return
+
+    def need(parents: int, children: int) -> int:
+        return parents * body + children * (body + tried)
+
+    place = "evolution.population_size"
     if bodies.selection.offspring is None:
-        most = free // (2 * body + tried)
-        raise _refuse(config, "evolution.population_size", most, free, parents)
-    if children >= parents:
-        most = max(free - parents * body, 0) // (body + tried)
-        raise _refuse(config, "bodies.selection.offspring", most, free, children)
-    most = max(free - children * (body + tried), 0) // body
-    raise _refuse(config, "evolution.population_size", most, free, parents)
+        _check(config, place, parents, lambda n: need(n, n), free)
+    elif children < parents:
+        _check(config, place, parents, lambda n: need(n, children), free)
+    else:
+        place = "bodies.selection.offspring"
+        _check(config, place, children, lambda n: need(parents, n), free)
+
+
+def _check(config: Config, place: str, found: int, need: Callable[[int], int], free: int) -> None:
+    """Refuses a number of individuals that need more than the free memory [bytes]."""
+    if need(found) > free:
+        most = max(0, bisect.bisect_right(range(found), free, key=need) - 1)
+        raise InputError(
+            f"{config.source}: {place}: expected at most {most}, as {free / 1e9:.3g} GB of memory "
+            f"are free; found {found}"
+        )
 
 
 def weigh_bodies(genotype: Genotype) -> int:
-    """What a random body takes with its genome, the mean of a few [bytes]."""
+    """The memory of a random body with its genome, the mean of a few [bytes]."""
     rng = np.random.default_rng(0)
-    # What is made once is not to count.
+    # Whatever is made only once does not count.
     kept: list[Any] = [genotype.develop(genotype.random(rng)).descriptors]
     ours = not tracemalloc.is_tracing()
     if ours:

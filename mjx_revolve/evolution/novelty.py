@@ -16,11 +16,11 @@ def novelty(
     """Mean distances to the nearest neighbours.
 
     Args:
-        points: `[N, D]` descriptors of individuals. One with a value that is not finite has no
-            place: its novelty is 0, and it is nobody's neighbour.
+        points: `[N, D]` descriptors of individuals. One with a value that is not finite has
+            novelty 0, and is not a neighbour of others.
         others: `[K, D]` of further ones that may be neighbours, such as an archive's.
         neighbours: how many of the nearest; fewer where there are not so many.
-        scale: `[D]` a distance of 1 along each axis, see `spread`.
+        scale: `[D]` a distance of 1 along each axis, see `axis_scale`.
 
     Returns:
         `[N]` Euclidean distances; 0 where there is no neighbour.
@@ -29,7 +29,7 @@ def novelty(
     placed = np.isfinite(points).all(1)
     own = points[placed] / scale
     distances = cdist(own, np.concatenate([own, others[np.isfinite(others).all(1)] / scale]))
-    np.fill_diagonal(distances, np.inf)  # nobody is their own neighbour
+    np.fill_diagonal(distances, np.inf)  # no individual is its own neighbour
     count = min(neighbours, distances.shape[1] - 1)
     if count > 0:
         nearest = np.partition(distances, count - 1, axis=1)[:, :count]
@@ -37,12 +37,12 @@ def novelty(
     return found
 
 
-def spread(points: np.ndarray) -> np.ndarray:
-    """Standard deviations `[D]` of points `[N, D]` along each axis; 1 where there is none."""
+def axis_scale(points: np.ndarray) -> np.ndarray:
+    """Standard deviations `[D]` of points `[N, D]` along each axis; 1 where all are equal."""
     placed = points[np.isfinite(points).all(1)]
     if not len(placed):
         return np.ones(points.shape[1])
     deviation = placed.std(0)
-    # What is left of equal values by rounding is no spread.
+    # Rounding leaves a tiny deviation of equal values.
     tiny = 1e-12 * np.abs(placed).max(0)
     return np.where(deviation > tiny, deviation, 1.0)

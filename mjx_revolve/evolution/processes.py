@@ -1,10 +1,10 @@
-"""Workers of this machine: processes that score blocks, watched, and replaced when they are lost.
+"""Workers on this machine: processes that score blocks, watched, and replaced when they are lost.
 
 They are plain processes that run `serve`, not forks: JAX's threads do not survive a fork, and a
-script that uses a pool needs no `if __name__ == "__main__"`. What to do, blocks and scores pass
+script that uses an executor needs no `if __name__ == "__main__"`. The job, blocks and scores pass
 through a pipe, pickled. A second pipe, standard input, ends when the process that started them
-does, even by kill -9; they end with it. Interrupts are that one's affair: workers ignore them, so
-that the generation under way can be finished.
+does, even by kill -9; they end with it. Workers ignore interrupts, which the run handles, so that
+the generation under way can be finished.
 """
 
 from __future__ import annotations
@@ -19,28 +19,25 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
+from mjx_revolve.evolution.block_executor import WorkerExecutor
 from mjx_revolve.evolution.fingerprints import find_difference
 from mjx_revolve.evolution.jobs import (
-    TRIES,
-    Job,
-    News,
+    MakeFitness,
     WorkerError,
     compile_job,
     describe_error,
+    make_job,
     open_job,
-    share_out,
 )
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
-    import jax
-
+    from mjx_revolve.episodes.config import Config
     from mjx_revolve.evolution.blocks import Block, Scored
 
 # What a worker runs: it finds modules where this process finds them.
@@ -48,9 +45,9 @@ _PROGRAM = (
     "import sys; sys.path[:] = sys.argv[2:]; "
     "from mjx_revolve.evolution.processes import serve; serve(int(sys.argv[1]))"
 )
-# How often the leader looks for what sends no news: time that passed [s].
+# How often the executor looks at the time that workers take [s].
 _TICK = 0.25
-# How much of a worker's last words is looked at [bytes].
+# How much of the end of a worker's log is read [bytes].
 _TAIL = 4096
 _log = logging.getLogger(__name__)
 
@@ -81,17 +78,20 @@ def _end_with_parent() -> NoReturn:
 
 
 def _work(channel: Connection) -> None:
-    job, core, cache = channel.recv()
+    core, cache = channel.recv()
     try:
         runtime.prepare_worker(core, cache)
         from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
         from mjx_revolve.evolution.fingerprints import identify
 
+        job = channel.recv()
         fitness = open_job(job)
         compile_job(job, fitness)
         if core is not None:
             runtime.pin_process([core])
         channel.send(identify(fitness))
+    except EOFError:
+        raise
     except Exception as error:
         channel.send(describe_error(error))
         return
@@ -103,22 +103,23 @@ def _work(channel: Connection) -> None:
             channel.send(describe_error(error))
 
 
-# ------------------------------------------------------------------ in the leader
+# ------------------------------------------------------------------ in the run's process
 
 
-class _Worker:
+class LocalWorker:
     """A worker process.
 
     Attributes:
         process: the process.
         channel: the pipe to it.
-        core: where it is pinned to; None: nowhere.
+        core: the core it is pinned to; None: any.
         ready: whether it has opened the job.
         block: the number of the block that it scores; None: it is free.
-        age: how long it has been at that, as far as the leader watched [s].
+        age: how long it has been at that, as far as the executor watched [s].
     """
 
-    def __init__(self, job: Job, core: int | None, cache: Path | None) -> None:
+    def __init__(self, core: int | None, cache: Path | None) -> None:
+        """Starts the process, which waits for its job; OSError if the system refuses."""
         self.core = core
         self.ready = False
         self.block: int | None = None
@@ -127,7 +128,7 @@ class _Worker:
         self._log: IO[bytes] = tempfile.TemporaryFile("a+b")  # noqa: SIM115  (kept open)
         self.channel, theirs = Pipe()
         try:
-            # A group of its own: Ctrl-C and Ctrl-Z at the terminal reach only who leads.
+            # A group of its own: Ctrl-C and Ctrl-Z at the terminal reach only the run's process.
             self.process = subprocess.Popen(
                 [sys.executable, "-c", _PROGRAM, str(theirs.fileno()), *sys.path],
                 stdin=subprocess.PIPE, stdout=self._log, stderr=self._log,
@@ -139,11 +140,11 @@ class _Worker:
             raise
         finally:
             theirs.close()
-        self.tell(job, core, str(cache) if cache else None)
+        self.send((core, str(cache) if cache else None))
 
-    def tell(self, *message: Any) -> None:
-        """Sends a message."""
-        with contextlib.suppress(OSError):  # it has died: whoever listens to it will find out
+    def send(self, message: Any) -> None:
+        """Sends a message; that it has died is found out when its answer is read."""
+        with contextlib.suppress(OSError):
             self.channel.send(message)
 
     def describe_end(self) -> str:
@@ -171,81 +172,77 @@ class _Worker:
         self._log.close()
 
 
-class Processes:
-    """The workers of this machine; a `blocks.Workplace`. Whoever makes one closes it.
+class ProcessExecutor(WorkerExecutor[LocalWorker]):
+    """Scores with worker processes on this machine.
 
     Attributes:
-        identity: what workers must have in common with this process; see `fingerprints.identify`.
+        workers: the worker processes.
     """
 
-    place = ""
-
-    def __init__(self, count: int, job: Job, cache: Path | None) -> None:
-        """Starts them.
+    def __init__(
+        self, config: Config, make_fitness: MakeFitness | None, count: int, cache: Path | None
+    ) -> None:
+        """Starts the workers.
 
         Args:
-            count: how many. When they are at least as many as there are cores, each is pinned to a
-                core; fewer are left to the system, so that several such runs on one host do not
-                crowd on the same cores.
-            job: what to score.
+            config: of the run.
+            make_fitness: see `executor.make_executor`.
+            count: how many workers. When they are at least as many as there are cores, each is
+                pinned to a core; fewer are left to the system, so that several such runs on one
+                host do not crowd on the same cores.
             cache: the compilation cache's folder.
 
         Raises:
             WorkerError: the system refuses to start so many.
         """
-        self.identity: dict[str, Any] = {}
-        self._job, self._cache = job, cache
+        self.workers: list[LocalWorker] = []
+        self._cache = cache
         self._times: deque[float] = deque(maxlen=101)
         self._false_starts = 0
-        self._workers: list[_Worker] = []
         cores = runtime.list_cores()
         pinned = bool(cores) and count >= len(cores)
         try:
             for index in range(count):
                 core = cores[index % len(cores)] if pinned else None
-                self._workers.append(_Worker(job, core, cache))
+                self.workers.append(LocalWorker(core, cache))
+            job = make_job(config, make_fitness)
+            for worker in self.workers:
+                worker.send(job)
+            super().__init__(config, job)
         except BaseException as error:
-            begun = len(self._workers)
+            begun = len(self.workers)
             self.close()
-            if not isinstance(error, OSError):
+            if not isinstance(error, OSError) or begun == count:
                 raise
             raise WorkerError(
                 f"expected to start {count} workers; found after {begun}: {error.strerror or error}"
             ) from None
 
     @property
-    def workers(self) -> int:
-        """How many there are."""
-        return len(self._workers)
+    def num_workers(self) -> int:
+        """How many processes score."""
+        return len(self.workers)
 
-    def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored | str]:
-        """See `blocks.Workplace`.
+    def free(self) -> list[LocalWorker]:
+        """See `WorkerExecutor`."""
+        return [w for w in self.workers if w.ready and w.block is None]
 
-        Raises:
-            WorkerError: no worker is left, and none can be started.
-        """
-        return share_out(self, blocks, key)
-
-    def free(self) -> list[_Worker]:
-        """See `jobs.Crew`."""
-        return [w for w in self._workers if w.ready and w.block is None]
-
-    def send(self, worker: _Worker, number: int, block: Block, key: tuple[Any, str]) -> None:
-        """See `jobs.Crew`."""
+    def send(self, worker: LocalWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+        """See `WorkerExecutor`."""
         worker.block, worker.age = number, 0.0
-        worker.tell(block, key)
+        worker.send((block, key))
 
-    def attend(self) -> News:
-        """See `jobs.Crew`."""
+    def attend(self) -> list[tuple[int, Scored | str | None]]:
+        """See `WorkerExecutor`; WorkerError where no worker is left, and none can be started."""
         began = time.monotonic()
-        heard = wait([worker.channel for worker in self._workers], _TICK)
-        # Not more, even if this process was itself stopped meanwhile: nobody else is to blame.
+        heard = wait([worker.channel for worker in self.workers], _TICK)
+        # Not more, even if this process was itself stopped meanwhile: that is no fault of theirs.
         waited = min(time.monotonic() - began, 2 * _TICK)
-        news: News = []
-        for worker in list(self._workers):
+        news: list[tuple[int, Scored | str | None]] = []
+        for worker in list(self.workers):
             idle = worker.ready and worker.block is None
             worker.age += 0.0 if idle else waited
-            limits = self._job.limits
+            limits = self.job.limits
             limit = limits.patience(self._times) if worker.ready else limits.ready
             try:
                 if worker.channel in heard:
@@ -256,8 +253,8 @@ class Processes:
                 news += self._replace(worker, worker.describe_end())
         return news
 
-    def _take(self, worker: _Worker, message: Any) -> News:
-        """A worker's scores, or what it says once it is ready or cannot be."""
+    def _take(self, worker: LocalWorker, message: Any) -> list[tuple[int, Any]]:
+        """A worker's scores, or its answer once it is ready or cannot be."""
         if worker.ready:
             assert worker.block is not None
             number, worker.block = worker.block, None
@@ -270,33 +267,35 @@ class Processes:
         worker.ready, self._false_starts = True, 0
         return []
 
-    def _replace(self, worker: _Worker, how: str) -> News:
+    def _replace(self, worker: LocalWorker, how: str) -> list[tuple[int, str]]:
         """Starts another worker for one that died or hangs."""
         worker.end()
         self._false_starts += not worker.ready
-        if not worker.ready and self._false_starts >= TRIES:
+        if not worker.ready and self._false_starts >= self.job.limits.tries:
             self._dismiss(worker, how)
             return []
         _log.warning("a worker is replaced (%s)", how)
         try:
-            another = _Worker(self._job, worker.core, self._cache)
+            another = LocalWorker(worker.core, self._cache)
         except OSError as error:
             self._dismiss(worker, describe_error(error))
         else:
-            self._workers[self._workers.index(worker)] = another
+            another.send(self.job)
+            self.workers[self.workers.index(worker)] = another
         return [] if worker.block is None else [(worker.block, how)]
 
-    def _dismiss(self, worker: _Worker, why: str) -> None:
-        """Does without a worker, as long as there are others."""
+    def _dismiss(self, worker: LocalWorker, why: str) -> None:
+        """Goes on without a worker, as long as there are others."""
         worker.end()
-        self._workers.remove(worker)
-        if not self._workers:
+        self.workers.remove(worker)
+        if not self.workers:
             raise WorkerError(f"no worker can be started ({why})")
-        _log.warning("the run goes on with fewer workers, %d (%s)", len(self._workers), why)
+        _log.warning("the run goes on with fewer workers, %d (%s)", len(self.workers), why)
 
     def close(self) -> None:
-        """Ends them."""
-        for worker in self._workers:  # all at once, rather than one after the other
+        """Ends the workers."""
+        self.closed = True
+        for worker in self.workers:  # all at once, rather than one after the other
             worker.process.kill()
-        while self._workers:
-            self._workers.pop().end()
+        while self.workers:
+            self.workers.pop().end()

@@ -1,4 +1,4 @@
-"""What a run says while it goes on: tqdm's live line on a terminal, plain lines elsewhere."""
+"""Progress of a run: tqdm's live line on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class _Bar(tqdm):
 
 
 class _Nowhere(io.StringIO):
-    """Where the bar is drawn when nobody looks: it still tells the time left."""
+    """A file that drops the bar, which still estimates the time left."""
 
     def write(self, text: str) -> int:
         """Forgets it."""
@@ -45,7 +45,7 @@ def choose_stride(total: int) -> int:
 
 
 class Progress:
-    """Tells generation by generation how a run goes.
+    """Shows the progress of a run, generation by generation.
 
     On a terminal it is one line that is drawn anew. Elsewhere (a pipe, a log) it is one line each
     for the first generation, the last one, and those between at equal steps, at most about sixty in
@@ -73,19 +73,19 @@ class Progress:
         self._first = True
 
     def show(self, row: Mapping[str, float]) -> None:
-        """Tells a generation.
+        """Shows a generation.
 
         Args:
             row: its figures: generation, best, mean, evaluations_per_second, and failed where
                 there is such a column.
         """
         try:
-            self._tell(row)
+            self._show(row)
         except OSError:  # the terminal or the pipe is gone: no reason to end a run of days
             self._out, self._live = _Nowhere(), False
             self._bar.disable = True
 
-    def _tell(self, row: Mapping[str, float]) -> None:
+    def _show(self, row: Mapping[str, float]) -> None:
         generation = int(row["generation"])
         figures = {
             "best": f"{row['best']:.4g}",
@@ -98,7 +98,7 @@ class Progress:
         self._bar.set_description_str(words, refresh=False)
         self._bar.ncols = self._columns()
         first, self._first = self._first, False
-        if first:  # compiling took most of it: the time left is told from the next ones
+        if first:  # compiling took most of it: the time left follows from the next ones
             self._bar.unpause()
             self._bar.n = self._bar.initial = self._bar.last_print_n = generation
             self._bar.refresh()

@@ -1,7 +1,7 @@
-"""Who has children and who stays: tournaments, (μ+λ) and its kin, NSGA-II.
+"""Selection of parents and survivors: tournaments, (μ+λ) and its kin, NSGA-II.
 
-Everything follows from one order, `order`: by score, or by dominance and crowding where there are
-several objectives. Ties go to the older, and it does not matter in which order individuals are
+Everything follows from one order, `best_first`: by score, or by dominance and crowding where there
+are several objectives. Ties go to the older individual, whatever the order in which individuals are
 given. Nothing here knows what an individual is.
 """
 
@@ -23,7 +23,7 @@ class Candidates(NamedTuple):
         objectives: `[N, M]` higher is better; a row with a value that is not finite has failed and
             is worse than all others.
         born: `[N]` generation of birth.
-        ids: `[N]` unique, increasing with age: of two, the one with the lower id is the older.
+        ids: `[N]` unique; of two individuals, the one with the lower id is the older.
         is_child: `[N]` whether it is one of this generation's children.
     """
 
@@ -33,13 +33,13 @@ class Candidates(NamedTuple):
     is_child: np.ndarray
 
 
-class Scheme(NamedTuple):
+class SelectionScheme(NamedTuple):
     """A way to choose.
 
     Attributes:
-        parents: (rng, the living, settings, count) → `[count, 2]` indices of parents: two different
+        parents: (rng, population, settings, count) → `[count, 2]` indices of parents: two different
             individuals where there are two. There must be at least one.
-        survivors: (parents and children together, settings, μ, generation) → indices of those who
+        survivors: (parents and children together, settings, μ, generation) → indices of those that
             stay, best first.
     """
 
@@ -47,10 +47,10 @@ class Scheme(NamedTuple):
     survivors: Callable[[Candidates, SelectionConfig, int, int], np.ndarray]
 
 
-# --- who is better --------------------------------------------------------------------------------
+# --- order
 
 
-def order(objectives: np.ndarray, ids: np.ndarray) -> np.ndarray:
+def best_first(objectives: np.ndarray, ids: np.ndarray) -> np.ndarray:
     """Sorts individuals.
 
     Args:
@@ -67,8 +67,8 @@ def order(objectives: np.ndarray, ids: np.ndarray) -> np.ndarray:
     values = _valued(objectives)[by_age]
     if values.shape[1] == 1:
         return by_age[np.argsort(-values[:, 0], kind="stable")]
-    fronts = sort_fronts(values)
-    return by_age[np.lexsort((-crowding(values, fronts), fronts))]
+    fronts = nondominated_sort(values)
+    return by_age[np.lexsort((-crowding_distance(values, fronts), fronts))]
 
 
 def dominates(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def dominates(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.logical_and((a >= b).all(-1), (a > b).any(-1))
 
 
-def sort_fronts(objectives: np.ndarray) -> np.ndarray:
+def nondominated_sort(objectives: np.ndarray) -> np.ndarray:
     """Non-dominated sorting.
 
     After Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist multiobjective genetic algorithm:
@@ -95,7 +95,7 @@ def sort_fronts(objectives: np.ndarray) -> np.ndarray:
         objectives: `[N, M]` higher is better.
 
     Returns:
-        `[N]` number of the front: 0 for those that nobody dominates, 1 for those that only these
+        `[N]` number of the front: 0 for those that none dominates, 1 for those that only these
         dominate, and so on. Those that failed are the last front.
     """
     better = dominates(objectives[:, None], objectives[None])
@@ -110,8 +110,8 @@ def sort_fronts(objectives: np.ndarray) -> np.ndarray:
     return fronts
 
 
-def crowding(objectives: np.ndarray, fronts: np.ndarray) -> np.ndarray:
-    """How far the neighbours of each individual are within its front (Deb et al. 2002).
+def crowding_distance(objectives: np.ndarray, fronts: np.ndarray) -> np.ndarray:
+    """Distances between the neighbours of each individual within its front (Deb et al. 2002).
 
     Args:
         objectives: `[N, M]` higher is better.
@@ -135,28 +135,27 @@ def crowding(objectives: np.ndarray, fronts: np.ndarray) -> np.ndarray:
 
 
 def _valued(objectives: np.ndarray) -> np.ndarray:
-    """Those that failed as worse than everything."""
+    """Objectives; -inf in all columns for individuals that failed."""
     objectives = np.asarray(objectives, float)
     return np.where(np.isfinite(objectives).all(-1, keepdims=True), objectives, -np.inf)
 
 
-# --- parents --------------------------------------------------------------------------------------
+# --- parents
 
 
 def _by_tournament(
-    rng: np.random.Generator, living: Candidates, settings: SelectionConfig, count: int
+    rng: np.random.Generator, population: Candidates, settings: SelectionConfig, count: int
 ) -> np.ndarray:
     """Twice the best of `tournament` different ones."""
-    best_first = order(living.objectives, living.ids)
-    rank = np.argsort(best_first)
-    return best_first[_draw(rng, rank, settings.tournament, count)]
+    ranking = best_first(population.objectives, population.ids)
+    return ranking[_draw(rng, np.argsort(ranking), settings.tournament, count)]
 
 
-def _by_chance(
-    rng: np.random.Generator, living: Candidates, settings: SelectionConfig, count: int
+def _uniformly(
+    rng: np.random.Generator, population: Candidates, settings: SelectionConfig, count: int
 ) -> np.ndarray:
-    """All are alike."""
-    return _draw(rng, np.arange(len(living.ids)), 1, count)
+    """Any two, with equal probability."""
+    return _draw(rng, np.arange(len(population.ids)), 1, count)
 
 
 def _draw(rng: np.random.Generator, rank: np.ndarray, size: int, count: int) -> np.ndarray:
@@ -174,83 +173,72 @@ def _win(lots: np.ndarray, rank: np.ndarray, size: int) -> np.ndarray:
     return rank[np.argsort(lots, axis=1)[:, :size]].min(1)
 
 
-# --- survivors ------------------------------------------------------------------------------------
+# --- survivors
 
 
-def _plus(
-    candidates: Candidates, settings: SelectionConfig, mu: int, generation: int
-) -> np.ndarray:
+def _plus(found: Candidates, settings: SelectionConfig, mu: int, generation: int) -> np.ndarray:
     """The best of parents and children."""
-    return _best(candidates, _young(candidates, settings, generation), mu)
+    return _best(found, _young(found, settings, generation), mu)
 
 
-def _comma(
-    candidates: Candidates, settings: SelectionConfig, mu: int, generation: int
-) -> np.ndarray:
+def _comma(found: Candidates, settings: SelectionConfig, mu: int, generation: int) -> np.ndarray:
     """The best of the children."""
-    rows = _young(candidates, settings, generation)
-    return _best(candidates, rows[candidates.is_child[rows]], mu)
+    rows = _young(found, settings, generation)
+    return _best(found, rows[found.is_child[rows]], mu)
 
 
 def _generational(
-    candidates: Candidates, settings: SelectionConfig, mu: int, generation: int
+    found: Candidates, settings: SelectionConfig, mu: int, generation: int
 ) -> np.ndarray:
     """The best few of the parents, and of the children as many as there is room for."""
-    rows = _young(candidates, settings, generation)
-    child = candidates.is_child[rows]
-    elites = _best(candidates, rows[~child], min(settings.elites, mu))
-    children = _best(candidates, rows[child], mu - len(elites))
-    return _best(candidates, np.concatenate([elites, children]), mu)
+    rows = _young(found, settings, generation)
+    child = found.is_child[rows]
+    elites = _best(found, rows[~child], min(settings.elites, mu))
+    children = _best(found, rows[child], mu - len(elites))
+    return _best(found, np.concatenate([elites, children]), mu)
 
 
 def _best_ever(
-    candidates: Candidates, settings: SelectionConfig, mu: int, generation: int
+    found: Candidates, settings: SelectionConfig, mu: int, generation: int
 ) -> np.ndarray:
-    """The best, of whatever age: where nobody inherits anything there is nothing to keep young."""
-    return _best(candidates, np.arange(len(candidates.ids)), mu)
+    """The best, of whatever age: where nothing is inherited there is nothing to keep young."""
+    return _best(found, np.arange(len(found.ids)), mu)
 
 
-def _everybody(
-    candidates: Candidates, settings: SelectionConfig, mu: int, generation: int
-) -> np.ndarray:
-    """All: who lives is the archive's business."""
-    return _best(candidates, np.arange(len(candidates.ids)), len(candidates.ids))
+def _all(found: Candidates, settings: SelectionConfig, mu: int, generation: int) -> np.ndarray:
+    """All: the archive is the population."""
+    return _best(found, np.arange(len(found.ids)), len(found.ids))
 
 
-def _young(candidates: Candidates, settings: SelectionConfig, generation: int) -> np.ndarray:
-    """Indices of those who may stay; the youngest where all are too old."""
-    born = np.asarray(candidates.born)
+def _young(found: Candidates, settings: SelectionConfig, generation: int) -> np.ndarray:
+    """Indices of those that may stay; the youngest where all are too old."""
+    born = np.asarray(found.born)
     if settings.max_age is None or not born.size:
         return np.arange(len(born))
-    oldest = min(generation - settings.max_age + 1, int(born.max()))
-    return np.flatnonzero(born >= oldest)
+    return np.flatnonzero(born >= min(generation - settings.max_age + 1, int(born.max())))
 
 
-def _best(candidates: Candidates, rows: np.ndarray, count: int) -> np.ndarray:
+def _best(found: Candidates, rows: np.ndarray, count: int) -> np.ndarray:
     """The best `count` of some rows, best first."""
-    return rows[order(candidates.objectives[rows], candidates.ids[rows])][:count]
+    return rows[best_first(found.objectives[rows], found.ids[rows])][:count]
 
 
 # A child that takes the worst one's place if it is better, one child after the other, leaves the
 # best of all: `steady` differs from `plus` in how many children are born at a time. And NSGA-II is
 # `plus` in the order of several objectives.
-SCHEMES: dict[str, Scheme] = {
-    "plus": Scheme(_by_tournament, _plus),
-    "comma": Scheme(_by_tournament, _comma),
-    "generational": Scheme(_by_tournament, _generational),
-    "steady": Scheme(_by_tournament, _plus),
-    "nsga2": Scheme(_by_tournament, _plus),
-    "map_elites": Scheme(_by_chance, _everybody),
-    "random": Scheme(_by_chance, _best_ever),
+SCHEMES: dict[str, SelectionScheme] = {
+    "plus": SelectionScheme(_by_tournament, _plus),
+    "comma": SelectionScheme(_by_tournament, _comma),
+    "generational": SelectionScheme(_by_tournament, _generational),
+    "steady": SelectionScheme(_by_tournament, _plus),
+    "nsga2": SelectionScheme(_by_tournament, _plus),
+    "map_elites": SelectionScheme(_uniformly, _all),
+    "random": SelectionScheme(_uniformly, _best_ever),
 }
 
 
 def check_selection(settings: SelectionConfig, mu: int) -> None:
-    """Whether a population of `mu` can be kept up.
-
-    Args:
-        settings: who stays.
-        mu: size of the population, `evolution.population_size`.
+    """Checks that a population of `mu` individuals can be kept up.
 
     Raises:
         InputError: there are too few children, or no room for any.

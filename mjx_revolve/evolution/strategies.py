@@ -53,7 +53,7 @@ def losses_from_scores(scores: np.ndarray, penalty: float | None = None) -> np.n
     Non-finite scores (a rollout that blew up) become worse than the worst finite one by the
     spread of the finite ones, or `FAILED_SCORE` if none is finite. Tied scores, which would shrink
     CMA-ES's step size to nothing, are set one unit in the last place apart, later rows worse;
-    rows are exchangeable, so this favours nobody and needs no random numbers.
+    rows are exchangeable, so this needs no random numbers.
 
     Args:
         scores: `[P]` higher is better; may hold NaN and infinities.

@@ -1,9 +1,12 @@
-"""Many runs, one after the other in one process, so that they share what is compiled.
+"""Sweeps: many runs, one after the other in one process, so that they share compiled programs.
 
 A start takes as long as many generations even where all is compiled already: imports, tracing,
 reading the cache, in every worker. Runs that differ in their seed, or in how genes are searched
-for, have the same fitness; it is made once, and so are its workers. Scores do not depend on it: a
-pool knows nothing of the runs that it served before.
+for, have the same fitness; it is made once, and so are its workers. Scores do not depend on it: an
+executor keeps nothing of the runs before.
+
+The runs lie in one folder: `CASE/seed_K/` is a run folder, `CASE/seed_K.log` its log. Nothing else
+records what is done, so that a sweep can go on after any end.
 """
 
 from __future__ import annotations
@@ -12,35 +15,131 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal, NamedTuple
 
 import yaml
 from annotated_types import Ge, Le, MinLen
 
-from mjx_revolve.episodes.config import Config
-from mjx_revolve.evolution import session
+from mjx_revolve.episodes.config import Config, load_config
+from mjx_revolve.evolution.executor import Executor, make_executor
 from mjx_revolve.evolution.fingerprints import FREE_SETTINGS, fitness_hash
+from mjx_revolve.evolution.generations import Champion
 from mjx_revolve.evolution.interrupts import Interrupts
-from mjx_revolve.evolution.jobs import WorkerError
-from mjx_revolve.evolution.loop import Champion
-from mjx_revolve.evolution.plans import Plan, Step, make_plans, next_step
-from mjx_revolve.evolution.pool import Pool, make_pool
-from mjx_revolve.evolution.runs import Run
-from mjx_revolve.evolution.start import Start, begin_run, check_search, continue_run
+from mjx_revolve.evolution.jobs import MakeFitness, WorkerError
+from mjx_revolve.evolution.run import MakeExecutor, Run, check_search, check_unchanged
+from mjx_revolve.evolution.run_folder import RunFolder, is_new_folder, open_run_folder
 from mjx_revolve.evolution.tensorboard import check_tensorboard
 from mjx_revolve.inputs.commands import check_place, describe_refusal
-from mjx_revolve.inputs.errors import InputError, load_yaml, reading
-from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
-from mjx_revolve.inputs.schema import Row, Text, Whole, checked, read
-from mjx_revolve.inputs.trust import is_run_config, opening, remembering
+from mjx_revolve.inputs.schema import Integer, Text, TupleOf, checked, read
+from mjx_revolve.inputs.trust import opening, opening_config
+from mjx_revolve.inputs.yaml_reader import load_yaml
 
 FILE = "sweep.yaml"
-"""What a sweep's folder has beside the runs: what they are."""
+"""The file in a sweep's folder that describes its runs."""
 
-MakePool = Callable[[Config], Pool]
+
+class Plan(NamedTuple):
+    """One run of a study.
+
+    Attributes:
+        case: the name of its case.
+        seed: its seed.
+        folder: its run folder.
+        base: the configuration that all runs start from: a file, or a shipped one's name.
+        settings: replace values of `base`, `KEY.PATH=VALUE` each.
+    """
+
+    case: str
+    seed: int
+    folder: Path
+    base: str | Path
+    settings: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Its name in messages."""
+        return f"{self.case}/{self.folder.name}"
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """Everything that replaces values of `base`."""
+        return (*self.settings, f"evolution.seed={self.seed}")
+
+    @property
+    def config(self) -> Config:
+        """The configuration, everything replaced; raises `InputError`."""
+        return load_config(self.base, self.overrides)
+
+
+Step = Literal["finished", "begin", "continue"]
+
+
+def make_plans(
+    folder: Path, base: str | Path, cases: Mapping[str, Sequence[str]], seeds: Iterable[int]
+) -> list[Plan]:
+    """The runs of a study.
+
+    Args:
+        folder: of the study.
+        base: the configuration that all runs start from.
+        cases: settings that replace its values, by case.
+        seeds: of each case.
+
+    Returns:
+        The plans, all seeds of a case together, as these share compiled programs.
+    """
+    seeds = list(seeds)
+    return [
+        Plan(case, seed, folder / case / f"seed_{seed}", base, tuple(settings))
+        for case, settings in cases.items()
+        for seed in seeds
+    ]
+
+
+def next_step(plan: Plan) -> Step:
+    """The next step of a run: nothing, all, or the rest from its last checkpoint.
+
+    Raises:
+        InputError: the folder holds something else, or a run that another process writes, of
+            another configuration, or with more generations.
+    """
+    folder, wanted = plan.folder, plan.config
+    label = short_path(folder)
+    if not folder.is_dir() or not any(folder.iterdir()):
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{label}: expected a run folder; found a file")
+        return "begin"
+    if not (folder / "config.yaml").exists() and is_new_folder(folder):
+        return "begin"  # killed while its folder was made
+    run = open_run_folder(folder)
+    try:
+        check_unchanged(run.load_config(), wanted, label)
+        found, length = _generations(run), wanted.evolution.generations
+        finished = "finished" in run.info
+    finally:
+        run.close()
+    if found > length:
+        raise InputError(
+            f"{label}: expected a run of {length} generations at most; found {found} "
+            "(choose another --out)"
+        )
+    if finished and found == length:
+        return "finished"
+    return "continue"
+
+
+def _generations(run: RunFolder) -> int:
+    """How many generations a run has done."""
+    metrics = run.load_metrics() if run.metrics_path.exists() else {}
+    return int(metrics["generation"][-1]) if len(metrics.get("generation", ())) else 0
+
+
+# --- sweeps ---------------------------------------------------------------------------------------
 
 
 @checked
@@ -54,8 +153,8 @@ class Sweep:
     """
 
     config: Annotated[Text, MinLen(1)]
-    seeds: Annotated[Whole, Ge(1), Le(MOST_SEEDS)]
-    settings: Row[Text] = ()
+    seeds: Annotated[Integer, Ge(1), Le(MOST_SEEDS)]
+    settings: TupleOf[Text] = ()
 
     @property
     def cases(self) -> dict[str, tuple[str, ...]]:
@@ -76,16 +175,10 @@ class Sweep:
 
 
 def read_sweep(folder: str | Path) -> Sweep:
-    """Reads what the runs of a folder are.
-
-    Args:
-        folder: of a sweep.
-
-    Returns:
-        The sweep.
+    """Reads the `sweep.yaml` of a folder.
 
     Raises:
-        InputError: its file is missing, or holds something else.
+        InputError: it is missing, or holds something else.
     """
     path = Path(folder) / FILE
     data = load_yaml(path)
@@ -96,14 +189,7 @@ def read_sweep(folder: str | Path) -> Sweep:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuses a folder in which no sweep can be; whether its runs fit is for `next_step` to say.
-
-    Args:
-        folder: new, empty, or that of a sweep: of the one that is meant, or of one that it extends.
-
-    Raises:
-        InputError: it holds something else, or cannot be written.
-    """
+    """Raises `InputError` for a folder that is not new, empty or a sweep's; see `next_step`."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: expected a folder; found a file")
     if not (folder / FILE).is_file() and folder.is_dir() and any(folder.iterdir()):
@@ -114,68 +200,55 @@ def check_folder(folder: Path) -> None:
 
 
 def write_sweep(folder: Path, sweep: Sweep) -> None:
-    """Writes `sweep.yaml`.
-
-    Args:
-        folder: see `check_folder`.
-        sweep: the sweep.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Writes `sweep.yaml`."""
     data = {"config": sweep.config, "seeds": sweep.seeds, "settings": list(sweep.settings)}
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
     write_atomic(folder / FILE, f"# What the runs of this folder are.\n{text}".encode())
 
 
-class SharedPool:
-    """Makes the pool of a run, or hands out that of the run before, where it would be the same."""
+class SharedExecutor:
+    """Makes a run's executor, or returns that of the run before, where it would be the same."""
 
-    def __init__(self, make: MakePool) -> None:
-        """Has none yet.
-
-        Args:
-            make: makes one.
-        """
+    def __init__(self, make: MakeExecutor) -> None:
+        """Has no executor yet; `make` makes one."""
         self._make = make
-        self._pool: Pool | None = None
+        self._executor: Executor | None = None
         self._key = ""
 
-    def __call__(self, config: Config) -> Pool:
-        """The pool for a configuration; that of another one is closed."""
+    def __call__(self, config: Config) -> Executor:
+        """The executor of a configuration; that of another one is closed."""
         key = fitness_hash(config)
-        if self._pool is None or self._pool.closed or key != self._key:
+        if self._executor is None or self._executor.closed or key != self._key:
             self.close()
-            self._pool, self._key = self._make(config), key
-        return self._pool
+            self._executor, self._key = self._make(config), key
+        return self._executor
 
     def close(self) -> None:
         """Ends its workers."""
-        if self._pool is not None:
-            self._pool.close()
-        self._pool = None
+        if self._executor is not None:
+            self._executor.close()
+        self._executor = None
 
 
 def choose_steps(
-    plans: Sequence[Plan], make_fitness: Callable[[Config], Any] | None = None
+    plans: Sequence[Plan], make_fitness: MakeFitness | None = None
 ) -> dict[Plan, Step]:
-    """What is to be done with each run; all that can be wrong with any of them is said here.
+    """The next step of each run, after all checks of its configuration.
 
     Args:
         plans: the runs.
-        make_fitness: see `pool.make_pool`.
-
-    Returns:
-        The steps. Nothing has been changed.
+        make_fitness: see `executor.make_executor`.
 
     Raises:
         InputError: a configuration is wrong, alone or for its robot, world and strategy, or a run
-            folder holds something else; see `plans.next_step`.
+            folder holds something else; see `next_step`.
     """
     several = len({plan.case for plan in plans}) > 1
     steps: dict[Plan, Step] = {}
     seen = set()
-    with contextlib.closing(SharedPool(lambda c: make_pool(c, 1, make_fitness))) as pools:
+    with contextlib.closing(
+        SharedExecutor(lambda c: make_executor(c, 1, make_fitness))
+    ) as executors:
         for plan in plans:
             try:
                 steps[plan] = next_step(plan)
@@ -185,8 +258,8 @@ def choose_steps(
                 config = plan.config
                 if config.evolution.tensorboard:
                     check_tensorboard(config.source)
-                with _asking(plan):
-                    check_search(config, pools(config))
+                with opening_config(plan.base):
+                    check_search(config, executors(config))
             except InputError as error:
                 raise InputError(f"{plan.case}: {error}" if several else str(error)) from None
     return steps
@@ -194,8 +267,8 @@ def choose_steps(
 
 def run_plans(
     steps: dict[Plan, Step],
-    make_pool: MakePool,
-    draw: Callable[[Start, Champion], None],
+    make_executor: MakeExecutor,
+    draw: Callable[[Run, Champion], None],
     again: str,
 ) -> int:
     """Runs what is not finished, with a line on standard output for each.
@@ -204,7 +277,7 @@ def run_plans(
 
     Args:
         steps: the runs, from `choose_steps`.
-        make_pool: makes the pool of a run.
+        make_executor: makes the executor of a run.
         draw: writes the pictures of a run, when its champion is judged.
         again: the command that goes on.
 
@@ -220,7 +293,7 @@ def run_plans(
     width = len(str(len(steps)))
     with (
         Interrupts() as interrupts,
-        contextlib.closing(SharedPool(make_pool)) as pools,
+        contextlib.closing(SharedExecutor(make_executor)) as executors,
     ):
         interrupts.be_patient("stopping after the generation under way")
         for k, (plan, step) in enumerate(steps.items()):
@@ -233,7 +306,7 @@ def run_plans(
             print("running ... ", end="", flush=True)
             started = time.perf_counter()
             try:
-                champion = _run(plan, step, pools, draw, interrupts)
+                champion = _run(plan, step, executors, draw, interrupts)
             except (WorkerError, OSError) as error:
                 words = describe_refusal(error) if isinstance(error, OSError) else str(error)
                 print(f"failed\ngo on: {again}", flush=True)
@@ -259,8 +332,8 @@ def run_plans(
 def _run(
     plan: Plan,
     step: Step,
-    pools: SharedPool,
-    draw: Callable[[Start, Champion], None],
+    executors: SharedExecutor,
+    draw: Callable[[Run, Champion], None],
     interrupts: Interrupts,
 ) -> Champion | None:
     """Begins a run or goes on with it; None where it was interrupted before its end."""
@@ -270,31 +343,25 @@ def _run(
         out = opened.enter_context(log.open("a", encoding="utf-8"))
         if step == "continue":
             with opening(folder, trust=False):
-                start = continue_run(str(folder), None, _changes(plan), pools)
-            print(f"resuming {plan.name} {start.resumption}", file=out, flush=True)
+                run = Run.resume(str(folder), None, _changes(plan), executors)
+            print(f"resuming {plan.name} {run.resumption}", file=out, flush=True)
         else:
-            with _asking(plan):
+            with opening_config(plan.base):
                 place = str(folder)
-                start = begin_run(str(plan.base), plan.overrides, place, pools, interrupts.writing)
+                run = Run.begin(
+                    str(plan.base), plan.overrides, place, executors, interrupts.writing
+                )
             print(f"beginning {plan.name}", file=out, flush=True)
-        opened.callback(start.run.close)
-        _, champion = session.run_to_end(
-            start, interrupts, lambda champion: draw(start, champion), out
-        )
+        opened.callback(run.close)
+        champion = run.evolve(interrupts, draw, out)
         words = "stopped" if champion is None else f"champion: {champion.score:.3g}"
         print(words, file=out)
         return champion
 
 
-def _asking(plan: Plan) -> contextlib.AbstractContextManager[None]:
-    """Who names a configuration wants what it names; that of a run folder may be a stranger's."""
-    base = Path(plan.base)
-    return opening(base, trust=False) if is_run_config(base) else remembering()
-
-
 def _changes(plan: Plan) -> list[str]:
-    """Settings that may change when a run goes on, and have changed."""
-    old, new = Run(plan.folder).load_config().evolution, plan.config.evolution
+    """Settings that have changed, of those that may when a run goes on."""
+    old, new = RunFolder(plan.folder).load_config().evolution, plan.config.evolution
     return [
         f"evolution.{name}={json.dumps(getattr(new, name))}"
         for name in FREE_SETTINGS
@@ -303,6 +370,6 @@ def _changes(plan: Plan) -> list[str]:
 
 
 def _result(plan: Plan, words: str) -> str:
-    """What became of a run, and a remark."""
-    champion = Run(plan.folder).info.get("champion", {})
+    """The score of a finished run, and a remark."""
+    champion = RunFolder(plan.folder).info.get("champion", {})
     return f"{champion.get('score', float('nan')):.3g}, {words}"

@@ -1,8 +1,7 @@
-"""A copy of the metrics as TensorBoard's event files, for those who watch their runs there.
+"""A copy of the metrics as TensorBoard's event files.
 
 Written with tensorboardX, which needs neither TensorFlow nor TensorBoard. Its synchronous writer is
-used rather than its `SummaryWriter`: that one writes from a thread, where a full disk is noticed by
-nobody.
+used rather than its SummaryWriter, whose thread does not report a full disk.
 """
 
 from __future__ import annotations
@@ -11,13 +10,14 @@ import contextlib
 import importlib.util
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import with_path
 
-# Where a column of the metrics stands in TensorBoard's tree; measures of the task have their own.
+# The group of a column in TensorBoard; measures of the task have their own.
 _GROUPS = {
     "best": "fitness", "mean": "fitness", "std": "fitness", "median": "fitness",
     "lower_quartile": "fitness", "upper_quartile": "fitness", "champion": "fitness",
@@ -27,14 +27,7 @@ _GROUPS = {
 
 
 def check_tensorboard(source: str) -> None:
-    """Refuses to begin where the library is missing.
-
-    Args:
-        source: what asked for it, for the message.
-
-    Raises:
-        InputError: tensorboardX is not installed.
-    """
+    """Raises InputError, naming the configuration's `source`, if tensorboardX is missing."""
     if importlib.util.find_spec("tensorboardX") is None:
         raise InputError(
             f"{source}: evolution.tensorboard: expected the package tensorboardX (pip install "
@@ -52,7 +45,7 @@ class TensorBoardLog:
 
         Args:
             folder: where TensorBoard looks.
-            done: generations that are done already; whatever earlier files say of later ones is
+            done: generations that are done already; later ones in earlier files are
                 purged when TensorBoard reads them.
             history: the rows of those generations, written where there is no earlier file.
 
@@ -60,33 +53,38 @@ class TensorBoardLog:
             OSError: the disk is full or the folder cannot be written; it names the folder.
         """
         from tensorboardX.event_file_writer import EventsWriter
-        from tensorboardX.proto.event_pb2 import Event, SessionLog
+        from tensorboardX.proto.event_pb2 import SessionLog
 
         self._folder = folder
-        try:
+        with self._naming_folder():
             folder.mkdir(parents=True, exist_ok=True)
             resumed = any(folder.glob("events.out.tfevents.*"))
             # The library's name has the second only: two starts within one must not meet.
-            suffix = f".{os.getpid()}.{done:06d}"
-            self._writer = EventsWriter(str(folder / "events"), suffix)
-            start = SessionLog(status=SessionLog.START)
-            self._writer.write_event(Event(step=done + 1, wall_time=time.time(), session_log=start))
-            self._writer.flush()
-        except OSError as error:
-            raise OSError(error.errno, error.strerror or str(error), str(folder)) from None
+            self._writer = EventsWriter(str(folder / "events"), f".{os.getpid()}.{done:06d}")
+        self._write(step=done + 1, session_log=SessionLog(status=SessionLog.START))
         for row in () if resumed else history:
             self.add(row)
 
-    def add(self, row: Mapping[str, float]) -> None:
-        """Adds a generation.
+    @contextlib.contextmanager
+    def _naming_folder(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise with_path(error, self._folder) from None
 
-        Args:
-            row: the figures by column; `generation` is the step.
+    def _write(self, **event: Any) -> None:
+        from tensorboardX.proto.event_pb2 import Event
+
+        with self._naming_folder():
+            self._writer.write_event(Event(wall_time=time.time(), **event))
+            self._writer.flush()
+
+    def add(self, row: Mapping[str, float]) -> None:
+        """Adds a generation's figures by column, of which `generation` is the step.
 
         Raises:
             OSError: the disk is full; it names the folder.
         """
-        from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.proto.summary_pb2 import Summary
 
         values: list[Any] = [
@@ -94,16 +92,9 @@ class TensorBoardLog:
             for name, value in row.items()
             if name != "generation"
         ]
-        step = int(row["generation"])
-        try:
-            self._writer.write_event(
-                Event(step=step, wall_time=time.time(), summary=Summary(value=values))
-            )
-            self._writer.flush()
-        except OSError as error:
-            raise OSError(error.errno, error.strerror or str(error), str(self._folder)) from None
+        self._write(step=int(row["generation"]), summary=Summary(value=values))
 
     def close(self) -> None:
-        """Closes the file; what the disk refuses, `add` has told already."""
+        """Closes the file; `add` has raised already if the disk is full."""
         with contextlib.suppress(OSError):
             self._writer.close()

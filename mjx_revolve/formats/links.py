@@ -8,6 +8,7 @@ bodies are links one to one.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,11 @@ from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.body.solids import part_mesh
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.numerics.spatial import quat_to_rows
+from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.bed import Bed, bed_height
+from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
+from mjx_revolve.water.drag import DRAG_LAWS
+from mjx_revolve.water.laws import BuoyancyLaw, DragLaw, Export
 from mjx_revolve.water.world import World
 
 # The names of ROS (REP 105) for what does not move, for where a robot's odometry starts, and for
@@ -138,7 +142,7 @@ def make_links(robot: Robot) -> tuple[Link, ...]:
     parts = _place_parts(robot, taken={*names, *joints})
     links = []
     for body, (name, joint) in enumerate(zip(names, joints, strict=True), 1):
-        axes = matrix(model.body_iquat[body])
+        axes = quat_to_matrix(model.body_iquat[body])
         links.append(
             Link(
                 name=name,
@@ -146,7 +150,7 @@ def make_links(robot: Robot) -> tuple[Link, ...]:
                 parent=int(model.body_parentid[body]) - 1,
                 joint=_make_joint(robot, body, joint) if body > 1 else None,
                 position=model.body_pos[body].copy(),
-                rotation=matrix(model.body_quat[body]),
+                rotation=quat_to_matrix(model.body_quat[body]),
                 mass=float(model.body_mass[body]),
                 center_of_mass=model.body_ipos[body].copy(),
                 inertia=axes @ np.diag(model.body_inertia[body]) @ axes.T,
@@ -189,12 +193,6 @@ def rest_pose(links: tuple[Link, ...], index: int) -> tuple[np.ndarray, np.ndarr
 def plain(name: str) -> str:
     """A name of letters, digits and _ only, as ROS, Gazebo and XML all take it."""
     return re.sub(r"[^A-Za-z0-9_]", "_", name) or "_"
-
-
-def matrix(quat: np.ndarray) -> np.ndarray:
-    """`[3, 3]` rotation of a quaternion (w, x, y, z)."""
-    w, x, y, z = np.asarray(quat, np.float64)
-    return np.array(quat_to_rows((w, x, y, z)))
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
@@ -313,3 +311,21 @@ def _unique(names: list[str], taken: set[str]) -> list[str]:
         taken.add(other)
         found.append(other)
     return found
+
+
+def words_on_laws(
+    robot: Robot, export: Callable[[DragLaw | BuoyancyLaw], Export]
+) -> tuple[list[str], list[str], list[str]]:
+    """What a file's comment says of the laws on a robot's parts.
+
+    Args:
+        robot: from `build_robot`.
+        export: of a law, for the file's format.
+
+    Returns:
+        Notes on what stands for its buoyancy laws, for its drag laws, and what is lost of both.
+    """
+    lifting = [export(law) for name, law in BUOYANCY_LAWS.items() if name in robot.fluid.buoyancy]
+    dragging = [export(law) for name, law in DRAG_LAWS.items() if name in robot.fluid.drag]
+    notes = [list(dict.fromkeys(x.note for x in some if x.note)) for some in (lifting, dragging)]
+    return notes[0], notes[1], [x.missing for x in (*lifting, *dragging) if x.missing]

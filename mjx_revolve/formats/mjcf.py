@@ -10,8 +10,17 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.formats.links import Link, make_links, make_meshes, missing_flow, near_bed
+from mjx_revolve.formats.links import (
+    Link,
+    make_links,
+    make_meshes,
+    missing_flow,
+    near_bed,
+    words_on_laws,
+)
 from mjx_revolve.formats.xml_text import to_comment, to_list
+from mjx_revolve.numerics.spatial import matrix_to_quat
+from mjx_revolve.water.buoyancy import find_buoyancy_law
 
 # Groups that MuJoCo's viewer shows at first are 0 to 2.
 _SEEN, _HIDDEN = 2, 3
@@ -103,14 +112,12 @@ def _show_meshes(robot: Robot, spec: mujoco.MjSpec, links: tuple[Link, ...]) -> 
         for part in link.parts:
             for name in part.geoms:
                 spec.geom(name).group = _HIDDEN
-            quat = np.zeros(4)
-            mujoco.mju_mat2Quat(quat, np.ascontiguousarray(part.rotation).ravel())
             body.add_geom(
                 name=f"{part.name}/mesh",
                 type=mujoco.mjtGeom.mjGEOM_MESH,
                 meshname=part.mesh,
                 pos=part.position,
-                quat=quat,
+                quat=matrix_to_quat(part.rotation),
                 mass=0.0,
                 rgba=[*part.rgb, 1.0],
                 contype=0,
@@ -151,8 +158,8 @@ def _light(robot: Robot, spec: mujoco.MjSpec) -> None:
 
 def _floats(robot: Robot) -> np.ndarray:
     """`[npart]` whether water lifts a part."""
-    laws = np.array(robot.fluid.buoyancy)
-    return (laws != "off") & (robot.fluid.volume > 0) & (robot.world.gravity != 0)
+    lifts = np.array([find_buoyancy_law(name).lifts for name in robot.fluid.buoyancy])
+    return lifts & (robot.fluid.volume > 0) & (robot.world.gravity != 0)
 
 
 def _lift(robot: Robot, spec: mujoco.MjSpec) -> None:
@@ -182,27 +189,16 @@ def _limit_speed(joint: mujoco.MjsJoint, link: Link) -> None:
 
 def _water(robot: Robot) -> list[tuple[object, str]]:
     """What may stand for what in MuJoCo's water: whether it does, and in words."""
-    laws, off = {*robot.fluid.drag}, robot.world.drag == "off"
-    own = laws == {"inertia_box"}
+    lift, drag, _ = words_on_laws(robot, lambda law: law.mjcf)
     return [
-        (
-            _floats(robot).any(),
-            "the bodies whose names end in /lift weigh nothing (10 micrograms) and sit at the "
-            "centres of buoyancy; their gravcomp lifts with the weight of the displaced water",
-        ),
+        *((_floats(robot).any(), note) for note in lift),
         (
             robot.num_hinges,
             "the hinges' second damping coefficient holds them to the servos' top speed, at which "
             "it takes all of their effort",
         ),
-        (off, "there is no drag"),
-        ("ellipsoid" in laws, "drag and lift are MuJoCo's ellipsoid law, as it evolved with"),
-        (own, "drag is MuJoCo's inertia-box law, as it evolved with"),
-        (
-            not (off or own or "ellipsoid" in laws),
-            "drag is MuJoCo's inertia-box law: one box for all modules that are welded together, "
-            "in place of the modules' own faces",
-        ),
+        (robot.world.drag == "off", "there is no drag"),
+        *((True, note) for note in drag),
     ]
 
 
@@ -217,11 +213,7 @@ def _missing(robot: Robot) -> list[tuple[object, str]]:
             f"them), here {share:.2g} times their mass",
         ),
         (True, "a surface: half out of the water it is held up as if it were below"),
-        ("lift_drag" in table.drag, "fins: their lift and stall are left out"),
-        (
-            "off" in table.drag and world.drag != "off",
-            "modules without drag next to others with it",
-        ),
+        *((world.drag != "off", note) for note in words_on_laws(robot, lambda law: law.mjcf)[2]),
         (
             robot.num_thrusters,
             "the thrusters' curves: thrust is the gain times the command, the same at both ends of "

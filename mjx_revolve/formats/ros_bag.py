@@ -15,16 +15,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from mjx_revolve.engine.forces import motor_torques
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.torques import motor_torques
 from mjx_revolve.episodes.simulate import Trajectory
-from mjx_revolve.formats.links import BASE, ODOM, WORLD, Link, make_links, matrix
+from mjx_revolve.formats.links import BASE, ODOM, WORLD, Link, make_links
 from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.numerics.spatial import quat_mul, quat_to_matrix
 
 # Messages per second, unless the simulation steps more slowly [1/s].
 RATE = 100.0
@@ -192,10 +192,8 @@ def _messages(
 def _turned(rest: np.ndarray, link: Link, angle: float) -> np.ndarray:
     """Quaternion (w, x, y, z) of a link in its parent's frame, its hinge turned."""
     assert link.joint is not None
-    turn, pose = np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, link.joint.axis, angle)
-    mujoco.mju_mulQuat(pose, rest, turn)
-    return pose
+    turn = (np.cos(angle / 2), *(np.sin(angle / 2) * np.asarray(link.joint.axis)))
+    return np.array(quat_mul(tuple(rest), turn))
 
 
 class _Messages:
@@ -239,7 +237,7 @@ class _Messages:
                 [rad/s].
         """
         ros, none = self.ros, np.zeros(36)
-        linear = velocity[:3] @ matrix(quat)
+        linear = velocity[:3] @ quat_to_matrix(quat)
         pose = ros.Pose(ros.Point(*position.tolist()), self.quaternion(quat))
         twist = ros.Twist(ros.Vector3(*linear.tolist()), ros.Vector3(*velocity[3:].tolist()))
         return ros.Odometry(

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import jax
 import numpy as np
 
 from mjx_revolve.engine.robot import Robot
@@ -24,14 +25,19 @@ from mjx_revolve.formats.links import (
     PlacedPart,
     inertia_entries,
     make_links,
-    matrix,
     missing_flow,
     near_bed,
     plain,
     rest_pose,
     roll_pitch_yaw,
+    words_on_laws,
 )
 from mjx_revolve.formats.xml_text import Value, node, nodes, to_document, to_list
+from mjx_revolve.numerics.spatial import quat_to_matrix
+from mjx_revolve.water.buoyancy import find_buoyancy_law
+from mjx_revolve.water.drag import find_drag_law
+from mjx_revolve.water.face_drag import FACES, FaceNumbers
+from mjx_revolve.water.lift_drag import LIFT_DRAG, PlateNumbers
 from mjx_revolve.water.thrusters import thrust
 
 # Gazebo's usual step [s]: its water is explicit.
@@ -73,7 +79,7 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
     name = plain(robot.morphology.name)
     model = node(
         "model",
-        _pose(start[:3], matrix(start[3:7] / np.linalg.norm(start[3:7]))),
+        _pose(start[:3], quat_to_matrix(start[3:7] / np.linalg.norm(start[3:7]))),
         node("self_collide", False),
         *(one for link in links for one in _link(robot, links, link, meshes)),
         *(_hinge(link, links[link.parent]) for link in links[1:]),
@@ -170,7 +176,8 @@ def _surroundings(robot: Robot) -> Iterator[Element]:
 
 
 def _floats(robot: Robot) -> bool:
-    return any(law != "off" for law in robot.fluid.buoyancy) and robot.world.density > 0
+    lifts = any(find_buoyancy_law(name).lifts for name in robot.fluid.buoyancy)
+    return lifts and robot.world.density > 0
 
 
 # ------------------------------------------------------------------------- the robot
@@ -258,11 +265,9 @@ def _hinge(link: Link, parent: Link) -> Element:
 def _forces(robot: Robot, link: Link) -> Iterator[Element]:
     """Plugins of drag, fins, thrusters and servos."""
     for part in link.parts:
-        law = robot.fluid.drag[part.row]
-        if law == "lift_drag":
-            yield _fin(robot, part)
-        elif law != "off":
-            yield _drag(robot, part)
+        stand_in = find_drag_law(robot.fluid.drag[part.row]).sdf.stand_in
+        if stand_in:
+            yield PLUGINS[stand_in](robot, part)
         if part.part.thruster is not None:
             yield _thruster(robot, part)
     if link.joint is not None:
@@ -278,38 +283,42 @@ def _forces(robot: Robot, link: Link) -> Iterator[Element]:
         )
 
 
-def _drag(robot: Robot, part: PlacedPart) -> Element:
-    """Gazebo wants damping negative, after Fossen."""
-    density, table = robot.world.density, robot.fluid
-    values = [*table.drag_linear[part.row], *table.drag_angular[part.row]]
+def _face_drag(robot: Robot, part: PlacedPart) -> Element:
+    """Drag of the faces; Gazebo takes damping as negative, after Fossen."""
+    numbers: FaceNumbers = FACES.numbers(robot.fluid, robot.world)
+    values = [*numbers.linear[part.row], *numbers.angular[part.row]]
     tags = ("xUabsU", "yVabsV", "zWabsW", "kPabsP", "mQabsQ", "nRabsR")
     return _plugin(
         "hydrodynamics",
         "Hydrodynamics",
         link_name=part.name,
-        water_density=density,
+        water_density=robot.world.density,
         default_current=robot.world.current,
-        **{tag: -density * x for tag, x in zip(tags, values, strict=True)},
+        **{tag: -x for tag, x in zip(tags, values, strict=True)},
     )
 
 
-def _fin(robot: Robot, part: PlacedPart) -> Element:
-    table, row = robot.fluid, part.row
-    plate = table.plate[row]
+def _lift_drag(robot: Robot, part: PlacedPart) -> Element:
+    numbers: PlateNumbers = LIFT_DRAG.numbers(robot.fluid, robot.world)
+    plate = jax.tree.map(lambda x: x[part.row], numbers)
     names = ("a0", "cla", "cda", "cma", "alpha_stall", "cla_stall", "cda_stall", "cma_stall")
     return _plugin(
         "lift-drag",
         "LiftDrag",
         link_name=part.name,
-        air_density=robot.world.density if plate.density is None else plate.density,
-        area=table.plate_area[row],
-        forward=table.plate_forward[row],
-        upward=table.plate_upward[row],
-        cp=table.plate_center[row],
-        radial_symmetry=plate.radial_symmetry,
+        air_density=float(plate.density),
+        area=plate.area,
+        forward=plate.forward,
+        upward=plate.upward,
+        cp=plate.center,
+        radial_symmetry=bool(plate.radial_symmetry),
         reversible=True,
         **{name: getattr(plate, name) for name in names},
     )
+
+
+# Gazebo's plugins by the law that they have, as `DragLaw.sdf` names it.
+PLUGINS = {"faces": _face_drag, "lift_drag": _lift_drag}
 
 
 def _thruster(robot: Robot, part: PlacedPart) -> Element:
@@ -337,22 +346,14 @@ def _thruster(robot: Robot, part: PlacedPart) -> Element:
 def _water(robot: Robot) -> list[tuple[object, str]]:
     """What Gazebo's water is made of: whether it is there, and what it does."""
     world, table = robot.world, robot.fluid
+    lift, drag, _ = words_on_laws(robot, lambda law: law.sdf)
     return [
-        (
-            _floats(robot),
-            "Buoyancy lifts with the volume of the collision boxes, so these have the volume that "
-            "a part displaces, at its centre of volume, and the proportions of its box: not its "
-            "size",
-        ),
+        *((_floats(robot), note) for note in lift),
         (
             table.carried_mass.any(),
             "fluid_added_mass carries the added mass, and the water inside, of each part",
         ),
-        (
-            {*table.drag} - {"off", "lift_drag"},
-            "Hydrodynamics drags each part with the coefficients of its faces",
-        ),
-        ("lift_drag" in table.drag, "LiftDrag lifts and drags the fins"),
+        *((True, note) for note in drag),
         (any(world.current), "the drag knows the current"),
         (robot.num_thrusters, "Thruster pushes at propellers, which are links of their own"),
     ]
@@ -360,8 +361,7 @@ def _water(robot: Robot) -> list[tuple[object, str]]:
 
 def _missing(robot: Robot) -> list[tuple[object, str]]:
     """What Gazebo's plugins may lack: whether this robot or its world has it, and what it is."""
-    drag, bed = robot.fluid.drag, near_bed(robot)
-    other = "in whose place is the drag of the modules' faces"
+    bed = near_bed(robot)
     return [
         (True, "tilt at the surface: Gazebo cuts boxes as if they stood level"),
         (True, "the share of drag and added mass that is lost above the surface"),
@@ -373,10 +373,7 @@ def _missing(robot: Robot) -> list[tuple[object, str]]:
             robot.num_hinges,
             "the fall of a servo's torque towards its top speed: its limit is sharp here",
         ),
-        ("mask" in robot.fluid.buoyancy, "buoyancy: mask, all or nothing at the surface"),
-        ("ellipsoid" in drag, f"drag: ellipsoid, {other}"),
-        ("inertia_box" in drag, f"drag: inertia_box, {other}"),
-        ("lift_drag" in drag, "the current at the fins: Gazebo's LiftDrag knows the wind only"),
+        *((True, text) for text in words_on_laws(robot, lambda law: law.sdf)[2]),
         (
             robot.num_thrusters,
             "the thrusters' curves, lag and reaction torque, and that they lose thrust out of the "

@@ -1,1 +1,8 @@
-"""What bodies are grown from and how they vary. No worlds, brains or evolution; NumPy only."""
+"""Genomes of bodies: development, mutation, crossover. No worlds, brains, evolution; NumPy only.
+
+Public names are those in `__init__.pyi`; the modules are private and may move between releases.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,139 +1,389 @@
-"""CPPN: a network says for each place around the core which module is there, and how it is turned.
+"""Compositional pattern-producing networks: small graphs of functions that grow as they evolve.
 
-As in revolve2's `modular_robot_body_cppn`: bodies grow outward from the core, nearest places first,
-up to the most modules that there may be. The network is asked for every free slot: 1, where a
-module there would be (x, y, z, in steps of one module along the slots' directions, core frame) and
-how many modules lead to it. Its outputs are a score for no module and for each type, of which the
-highest counts, and the turn in quarters, rounded. What overlaps or exceeds a bound is left out.
+CPPNs are those of Stanley (Genetic Programming and Evolvable Machines 8, 2007); variation is that
+of NEAT (Stanley and Miikkulainen, Evolutionary Computation 10, 2002): weights and functions change,
+links come and go, and a node comes to stand in the middle of a link.
+
+NEAT numbers innovations, so that crossover can tell which genes of two parents are the same. Here
+the number of a link is the pair of its ends, and that of a node follows from the link that it was
+put into: the same innovation has the same number whoever makes it, without a register that all
+would have to share.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import hashlib
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from annotated_types import Ge, Unit
+from pydantic import BeforeValidator, Strict
 
-from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.genotype import (
-    Genotype,
-    Space,
-    check_within,
-    draw_within,
-    remember,
-    vary_within,
+from mjx_revolve.inputs.schema import (
+    Boolean,
+    ConstraintError,
+    Integer,
+    NonNegative,
+    Number,
+    Positive,
+    Share,
+    Text,
+    TupleOf,
+    as_tuple,
+    checked,
+    read,
+    words,
 )
-from mjx_revolve.genotypes.growth import Growth
-from mjx_revolve.genotypes.network import (
-    Network,
-    NetworkSettings,
-    cross_networks,
-    draw_network,
-    mutate_network,
-    read_network,
-)
-from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.schema import read
 
-# 1, x, y, z and the number of modules from the core: how the network numbers them.
-_INPUTS = 5
-_ONE, _DEPTH = -1, -5
-# In a random network the score of no module rises by so much more with each module from the core,
-# and comes to lead at a random distance. A choice: without it, nine in ten bodies fill all the room
-# that there is, as some way out of the core hardly ever ends.
-_SLOPE = 3.0
-_DISTANCES = 1.0, 4.0
+FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "identity": lambda x: x,
+    "sin": np.sin,
+    "gauss": lambda x: np.exp(-x * x),
+    "tanh": np.tanh,
+    "abs": np.abs,
+}
+"""What nodes may make of the sum of their inputs."""
+
+# Numbers of nodes fit into a float without loss, and so into JSON everywhere.
+_NUMBERS = 2**53
+# How often two random ends of a new link are drawn before there is none.
+_LINK_TRIES = 10
 
 
-def make_cppn(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
-    """The genotype of networks over the places of modules.
+class Node(NamedTuple):
+    """A node between inputs and outputs.
 
-    Args:
-        space: the bodies that there may be.
-        params: fields of `NetworkSettings`.
-        place: where they were given, for messages.
+    Attributes:
+        number: which it is; inputs have -1, -2, ..., outputs 0, 1, ...
+        function: a name in `FUNCTIONS`.
+    """
 
-    Returns:
-        The genotype; its genomes are networks. It can adopt no body.
+    number: int
+    function: str
+
+
+class Connection(NamedTuple):
+    """A weighted link.
+
+    Attributes:
+        source: number of the input or node that it comes from.
+        target: number of the node or output that it leads to.
+        weight: [-].
+    """
+
+    source: int
+    target: int
+    weight: float
+
+
+class CPPN(NamedTuple):
+    """A network without loops; outputs are the plain sums of what leads to them.
+
+    Attributes:
+        num_inputs: inputs, one of which is 1 where a bias is wanted.
+        num_outputs: outputs.
+        nodes: in an order in which all links lead on.
+        links: at most one between two ends.
+    """
+
+    num_inputs: int
+    num_outputs: int
+    nodes: tuple[Node, ...]
+    links: tuple[Connection, ...]
+
+    def evaluate(self, inputs: np.ndarray) -> np.ndarray:
+        """Outputs `[n, num_outputs]` of inputs `[n, num_inputs]`."""
+        columns = np.asarray(inputs, float).T
+        values = {-1 - i: columns[i] for i in range(self.num_inputs)}
+        leading: dict[int, list[Connection]] = {}
+        for link in self.links:
+            leading.setdefault(link.target, []).append(link)
+
+        def total(number: int) -> np.ndarray:
+            found = np.zeros(columns.shape[1])
+            for link in leading.get(number, ()):
+                found += link.weight * values[link.source]
+            return found
+
+        for node in self.nodes:
+            values[node.number] = FUNCTIONS[node.function](total(node.number))
+        return np.stack([total(k) for k in range(self.num_outputs)], axis=1)
+
+    def to_plain(self) -> dict[str, Any]:
+        """The network as JSON holds it, exactly; `read_cppn` reads it."""
+        return {
+            "num_inputs": self.num_inputs,
+            "num_outputs": self.num_outputs,
+            "nodes": [list(node) for node in self.nodes],
+            "links": [list(link) for link in self.links],
+        }
+
+
+@checked
+class CPPNSettings:
+    """How networks begin and how they vary.
+
+    Attributes:
+        max_nodes: most nodes between inputs and outputs.
+        first_nodes: how many of them a new network has.
+        std: standard deviation of weights that are drawn anew [-].
+        step: standard deviation of a weight's change [-].
+        weights: chance of each weight to change in a mutation.
+        add_node: chance of a node to come to stand in the middle of a link.
+        add_link: chance of a new link.
+        drop_link: chance of a link to go.
+        function: chance of a node's function to be drawn anew.
+        innovations: whether crossover aligns the parents by the numbers of their innovations. If
+            not, each output comes with all that leads to it from either parent.
 
     Raises:
-        InputError: a parameter is wrong.
+        InputError: a number is out of range.
     """
-    settings = read(NetworkSettings, dict(params), f"{place}.params")
-    outputs = 2 + len(space.modules)
 
-    develop = remember(lambda network: grow(network, space))
+    # Choices. With these, half of the mutants of bodies of 16 modules differ in two or fewer.
+    max_nodes: Annotated[Integer, Ge(0)] = 16
+    first_nodes: Annotated[Integer, Ge(0)] = 3
+    std: Annotated[Positive, Unit("-")] = 1.0
+    step: Annotated[NonNegative, Unit("-")] = 0.15
+    weights: Share = 0.2
+    add_node: Share = 0.1
+    add_link: Share = 0.15
+    drop_link: Share = 0.05
+    function: Share = 0.05
+    innovations: Boolean = True
 
-    def from_plain(plain: Any) -> Network:
-        network = read_network(plain, "genome")
-        found = (network.num_inputs, network.num_outputs)
-        if found != (_INPUTS, outputs):
-            raise InputError(
-                f"genome: expected {_INPUTS} inputs and {outputs} outputs, for {outputs - 2} types "
-                f"of modules; found {found[0]} and {found[1]}"
-            )
-        check_within(space, develop(network))
+    def __post_init__(self) -> None:
+        """Checks that first nodes fit in."""
+        if self.first_nodes > self.max_nodes:
+            most = f"at most max_nodes ({self.max_nodes})"
+            raise ConstraintError("first_nodes", most, str(self.first_nodes))
+
+
+# ------------------------------------------------------------------------- variation
+
+
+def draw_cppn(
+    rng: np.random.Generator, num_inputs: int, num_outputs: int, settings: CPPNSettings
+) -> CPPN:
+    """A random network: all inputs linked to all outputs, and then a few nodes.
+
+    Drawn with `rng`, as the settings say.
+    """
+    weights = rng.normal(0.0, settings.std, (num_inputs, num_outputs)).tolist()
+    links = [Connection(-1 - i, k, w) for i, row in enumerate(weights) for k, w in enumerate(row)]
+    network = CPPN(num_inputs, num_outputs, (), tuple(links))
+    for _ in range(settings.first_nodes):
+        network = _add_node(rng, network, settings)
+    return network
+
+
+def mutate_cppn(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
+    """A network that differs a little, at least in one weight."""
+    changes = [
+        (settings.add_node, _add_node),
+        (settings.add_link, _add_link),
+        (settings.drop_link, _drop_link),
+        (settings.function, _change_function),
+    ]
+    child = network
+    for chance, change in changes:
+        if rng.random() < chance:
+            child = change(rng, child, settings)
+    changed = rng.random(len(child.links)) < settings.weights
+    if child is network and child.links and not changed.any():
+        changed[rng.integers(len(changed))] = True
+    steps = rng.normal(0.0, settings.step, len(child.links)).tolist()
+    links = [
+        link._replace(weight=link.weight + step) if hit else link
+        for link, step, hit in zip(child.links, steps, changed, strict=True)
+    ]
+    return child._replace(links=tuple(links))
+
+
+def _add_node(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
+    """A node in the middle of a link, which gives way to one of weight 1 and one of its own."""
+    if len(network.nodes) >= settings.max_nodes or not network.links:
         return network
-
-    return Genotype(
-        name="cppn",
-        random=lambda rng: draw_within(
-            space, develop, lambda: _draw(rng, outputs, settings), place
+    which = int(rng.integers(len(network.links)))
+    source, target, weight = network.links[which]
+    taken = {node.number for node in network.nodes}
+    number, count = -1, 0
+    while number < network.num_outputs or number in taken:
+        if settings.innovations:
+            number, count = _number(source, target, count), count + 1
+        else:
+            number = int(rng.integers(_NUMBERS))
+    order = [node.number for node in network.nodes]
+    place = order.index(target) if target in order else len(order)
+    node = Node(number, _draw_function(rng))
+    return network._replace(
+        nodes=(*network.nodes[:place], node, *network.nodes[place:]),
+        links=(
+            *network.links[:which],
+            *network.links[which + 1 :],
+            Connection(source, number, 1.0),
+            Connection(number, target, weight),
         ),
-        mutate=lambda rng, network: vary_within(
-            space, develop, lambda: mutate_network(rng, network, settings), network
-        ),
-        cross=lambda rng, a, b: vary_within(
-            space, develop, lambda: cross_networks(rng, a, b, settings), a
-        ),
-        develop=develop,
-        adopt=None,
-        to_plain=Network.to_plain,
-        from_plain=from_plain,
     )
 
 
-def _draw(rng: np.random.Generator, outputs: int, settings: NetworkSettings) -> Network:
-    """A random network whose bodies end somewhere."""
-    network = draw_network(rng, _INPUTS, outputs, settings)
-    more = {_ONE: -_SLOPE * float(rng.uniform(*_DISTANCES)), _DEPTH: _SLOPE}
-    links = [
-        link._replace(weight=link.weight + more.get(link.source, 0.0)) if link.target == 0 else link
-        for link in network.links
-    ]
-    return network._replace(links=tuple(links))
+def _number(source: int, target: int, count: int) -> int:
+    """The number of the node that is put into a link, `count` of which are there."""
+    text = f"{source} {target} {count}".encode()
+    return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest()) % _NUMBERS
 
 
-def grow(network: Network, space: Space) -> Morphology:
-    """The body that a network describes.
+def _add_link(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
+    """A link between two ends that have none."""
+    hidden = [node.number for node in network.nodes]
+    sources = [*(-1 - i for i in range(network.num_inputs)), *hidden]
+    targets = [*hidden, *range(network.num_outputs)]
+    taken = {(link.source, link.target) for link in network.links}
+    for _ in range(_LINK_TRIES):
+        i, k = int(rng.integers(len(sources))), int(rng.integers(len(targets)))
+        # A node comes `num_inputs` later among the sources: links lead on.
+        if i - network.num_inputs < k and (sources[i], targets[k]) not in taken:
+            link = Connection(sources[i], targets[k], float(rng.normal(0.0, settings.std)))
+            return network._replace(links=(*network.links, link))
+    return network
+
+
+def _drop_link(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
+    """Without one of its links, and without nodes that then lead nowhere."""
+    if not network.links:
+        return network
+    which = int(rng.integers(len(network.links)))
+    links = (*network.links[:which], *network.links[which + 1 :])
+    return _part(network._replace(links=links), range(network.num_outputs))
+
+
+def _part(network: CPPN, outputs: Iterable[int]) -> CPPN:
+    """Some of the outputs, with what leads to them."""
+    needed = {*outputs}
+    for node in reversed(network.nodes):
+        if any(link.source == node.number and link.target in needed for link in network.links):
+            needed.add(node.number)
+    return network._replace(
+        nodes=tuple(node for node in network.nodes if node.number in needed),
+        links=tuple(link for link in network.links if link.target in needed),
+    )
+
+
+def _change_function(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
+    """With another function in one of its nodes."""
+    if not network.nodes:
+        return network
+    which = int(rng.integers(len(network.nodes)))
+    node = network.nodes[which]._replace(function=_draw_function(rng))
+    return network._replace(nodes=(*network.nodes[:which], node, *network.nodes[which + 1 :]))
+
+
+def _draw_function(rng: np.random.Generator) -> str:
+    return [*FUNCTIONS][int(rng.integers(len(FUNCTIONS)))]
+
+
+def cross_cppns(rng: np.random.Generator, a: CPPN, b: CPPN, settings: CPPNSettings) -> CPPN:
+    """A child of two networks.
+
+    With innovations: weights and functions of genes that both have come from either; all others are
+    the first parent's, as NEAT takes them from the fitter one. Without: each output comes from
+    either parent, with all that leads to it; where that is more than `max_nodes`, all from one.
 
     Args:
-        network: with 5 inputs and, for n types of modules, 2 + n outputs.
-        space: whose upper bounds are kept.
+        rng: what all is drawn from.
+        a: the first parent.
+        b: the second, with as many inputs and outputs.
+        settings: whether by innovations.
 
     Returns:
-        The body.
+        The child.
     """
-    growth = Growth(space)
-    places = [[0.0, 0.0, 0.0]]
-    wave = [(0, slot) for slot in growth.modules[0].kind.slots]
-    depth = 1.0
-    while wave and not growth.is_full:
-        asked = []
-        for parent, slot in wave:
-            step = growth.direction(parent, slot)
-            asked.append([a + b for a, b in zip(places[parent], step, strict=True)])
-        found = network.evaluate(np.array([[1.0, *place, depth] for place in asked]))
-        best = found[:, :-1].argmax(axis=1).tolist()
-        turns = np.rint(found[:, -1]).tolist()
-        after = []
-        for (parent, slot), place, which, turn in zip(wave, asked, best, turns, strict=True):
-            if which == 0:
-                continue
-            kind = space.kinds[which - 1]
-            index = growth.attach(parent, slot, kind, 90.0 * (turn % 4.0))
-            if index is not None:
-                places.append(place)
-                after += [(index, number) for number in kind.slots]
-        wave, depth = after, depth + 1.0
-    return growth.finish("robot")
+    if settings.innovations:
+        weights = {(link.source, link.target): link for link in b.links}
+        functions = {node.number: node for node in b.nodes}
+        from_b = (rng.random(len(a.links)) < 0.5, rng.random(len(a.nodes)) < 0.5)
+        return a._replace(
+            links=tuple(
+                weights.get((link.source, link.target), link) if other else link
+                for link, other in zip(a.links, from_b[0], strict=True)
+            ),
+            nodes=tuple(
+                functions.get(node.number, node) if other else node
+                for node, other in zip(a.nodes, from_b[1], strict=True)
+            ),
+        )
+    other = rng.random(a.num_outputs) < 0.5
+    one = _part(a, [k for k in range(a.num_outputs) if not other[k]])
+    two = _part(b, [k for k in range(a.num_outputs) if other[k]])
+    # Nodes of common descent may have other inputs by now: those of the second get new numbers.
+    new = {node.number: int(rng.integers(a.num_outputs, _NUMBERS)) for node in two.nodes}
+    nodes = tuple(node._replace(number=new[node.number]) for node in two.nodes)
+    if len(one.nodes) + len(nodes) > settings.max_nodes:
+        return b if rng.random() < 0.5 else a
+    links = tuple(
+        Connection(new.get(source, source), new.get(target, target), weight)
+        for source, target, weight in two.links
+    )
+    return a._replace(nodes=(*one.nodes, *nodes), links=(*one.links, *links))
+
+
+# ------------------------------------------------------------------------- reading
+
+
+_Node = Annotated[
+    tuple[Integer, Text], Strict(), BeforeValidator(as_tuple), words("a node's number and function")
+]
+_Link = Annotated[
+    tuple[Integer, Integer, Number],
+    Strict(),
+    BeforeValidator(as_tuple),
+    words("a link's source, target and weight"),
+]
+
+
+@checked
+class _Plain:
+    """A network as JSON holds it."""
+
+    num_inputs: Annotated[Integer, Ge(1)]
+    num_outputs: Annotated[Integer, Ge(1)]
+    nodes: TupleOf[_Node]
+    links: TupleOf[_Link]
+
+    def __post_init__(self) -> None:
+        """Checks that the pieces make a network."""
+        reached = {-1 - i for i in range(self.num_inputs)}
+        numbers = [number for number, _ in self.nodes]
+        for k, (number, function) in enumerate(self.nodes):
+            if function not in FUNCTIONS:
+                raise ConstraintError(
+                    f"nodes.{k}.1", f"one of {', '.join(FUNCTIONS)}", repr(function)
+                )
+            if number < self.num_outputs or number in numbers[:k]:
+                least = f"a number >= {self.num_outputs} that no other node has"
+                raise ConstraintError(f"nodes.{k}.0", least, str(number))
+        order = [*sorted(reached), *numbers, *range(self.num_outputs)]
+        for k, (source, target, _) in enumerate(self.links):
+            known = source in order and target in order and target not in reached
+            inner = known and (source < 0 or source >= self.num_outputs)
+            if not inner or order.index(source) >= order.index(target):
+                on = "a link from an input or node to a later node or an output"
+                raise ConstraintError(f"links.{k}", on, f"{source} to {target}")
+        if len({link[:2] for link in self.links}) < len(self.links):
+            raise ConstraintError("links", "one between two ends", "two with the same ends")
+
+
+def read_cppn(plain: Any, place: str = "network") -> CPPN:
+    """A network from what `CPPN.to_plain` made.
+
+    Raises:
+        InputError: it is no network.
+    """
+    found = read(_Plain, plain, place)
+    return CPPN(
+        num_inputs=found.num_inputs,
+        num_outputs=found.num_outputs,
+        nodes=tuple(Node(*node) for node in found.nodes),
+        links=tuple(Connection(*link) for link in found.links),
+    )

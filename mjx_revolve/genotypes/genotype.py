@@ -1,9 +1,9 @@
-"""What a genotype is, and the space of bodies that all of them stay in."""
+"""The interface of genotypes, the space of bodies, and what all genotypes are made of."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
@@ -13,26 +13,27 @@ from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.inputs.errors import InputError, show
 
-Found = TypeVar("Found")
+T = TypeVar("T")
 
 # Bounds on length and mass are kept up to rounding.
 SLACK = 1 + 1e-9
-# Variations of a parent that are tried before it is left as it is, and random genomes before it is
-# said that there are none. Choices: most bounds let every second or third pass.
+# Variations of a parent that are tried before it is left as it is, and random genomes before there
+# are said to be none. Choices: most bounds let every second or third pass.
 TRIES = 50
 _RANDOM_TRIES = 300
-# Values of which is remembered what was found: a choice, those of some generations.
-_REMEMBERED = 1000
+# How many results `cached` keeps: a choice, those of some generations.
+_CACHED = 1000
 
 
 class Genotype(NamedTuple):
-    """What bodies are grown from: plain functions of genomes, which are plain values.
+    """A representation of bodies: plain functions of genomes, which are plain values.
 
     All genomes that they return develop into bodies of the space, and all randomness comes from the
-    generator that they are given.
+    generator that they are given. `make_genotype` makes one from functions that need not keep to
+    the space.
 
     Attributes:
-        name: as a configuration gives it.
+        name: in a configuration.
         random: generator → genome. Raises `InputError` where none of many draws is in the space.
         mutate: (generator, genome) → genome that differs a little; the genome itself where none of
             `TRIES` mutants is in the space.
@@ -57,13 +58,13 @@ class Genotype(NamedTuple):
 
 
 def accept_all(body: Morphology) -> bool:
-    """True: no further limits."""
+    """No further limits."""
     return True
 
 
 @dataclass(frozen=True)
 class Space:
-    """Which bodies there may be.
+    """The space of bodies that a genotype keeps to.
 
     Attributes:
         catalogue: all types of modules by name and alias.
@@ -95,14 +96,7 @@ class Space:
         return tuple(self.catalogue[name] for name in self.modules)
 
     def refuses(self, body: Morphology) -> str | None:
-        """Why a body is not in the space.
-
-        Args:
-            body: any body.
-
-        Returns:
-            The reason, "expected X; found Y"; None where it is in the space.
-        """
+        """Why a body is not in the space, "expected X; found Y"; None where it is."""
         strange = next((m.type for m in body.modules if m.type not in self.catalogue), None)
         if strange is not None:
             return f"expected types of modules of the catalogue; found {show(strange)}"
@@ -127,7 +121,7 @@ def make_space(
     catalogue: Mapping[str, ModuleType],
     accepts: Callable[[Morphology], bool] = accept_all,
 ) -> Space:
-    """The space of bodies that a configuration asks for.
+    """The space of bodies of a configuration.
 
     Args:
         bodies: settings like `episodes.bodies_config.BodiesConfig`.
@@ -172,93 +166,102 @@ def make_space(
     )
 
 
-# ------------------------------------------------------------------------- what genotypes share
+# ------------------------------------------------------------------------- making one
 
 
-def remember(find: Callable[[Any], Found]) -> Callable[[Any], Found]:
-    """The same function, which knows what it has found for those that it was last asked for.
-
-    Who varies a genome develops it to see whether it is in the space; so will who asked for it.
-
-    Args:
-        find: a function of values that do not change, such as genome → body.
-
-    Returns:
-        The function.
-    """
-    known: dict[int, tuple[Any, Found]] = {}
-
-    def look_up(asked: Any) -> Found:
-        # Genomes need have no hash. They are kept, so that no other comes to have their id.
-        if id(asked) not in known:
-            if len(known) >= _REMEMBERED:
-                known.clear()
-            known[id(asked)] = asked, find(asked)
-        return known[id(asked)][1]
-
-    return look_up
-
-
-def draw_within(
-    space: Space, develop: Callable[[Any], Morphology], draw: Callable[[], Any], place: str
-) -> Any:
-    """A random genome whose body is in the space.
+def make_genotype(
+    space: Space,
+    name: str,
+    place: str,
+    *,
+    draw: Callable[[np.random.Generator], Any],
+    mutate: Callable[[np.random.Generator, Any], Any],
+    cross: Callable[[np.random.Generator, Any, Any], Any],
+    develop: Callable[[Any], Morphology],
+    to_plain: Callable[[Any], Any],
+    from_plain: Callable[[Any], Any],
+    adopt: Callable[[Morphology], Any] | None = None,
+) -> Genotype:
+    """A genotype that keeps to the space, from functions that need not.
 
     Args:
-        space: the space.
+        space: of the bodies.
+        name: in a configuration.
+        place: where the bounds were given, for messages.
+        draw: generator → any genome.
+        mutate: (generator, genome) → varied genome; None where what it drew cannot be done.
+        cross: (generator, genome, genome) → child; None where that cannot be done.
         develop: genome → body.
-        draw: draws any genome.
-        place: where the bounds were given, for the message.
-
-    Returns:
-        The first that is.
-
-    Raises:
-        InputError: none of many is.
+        to_plain: genome → what JSON can hold.
+        from_plain: its inverse; raises `InputError`.
+        adopt: body in the space → genome that develops into it; None where there is none.
     """
-    reason: str | None = None
-    for _ in range(_RANDOM_TRIES):
-        genome = draw()
-        reason = space.refuses(develop(genome))
-        if reason is None:
-            return genome
-    raise InputError(
-        f"{place}: expected bounds that random bodies can keep; found none of {_RANDOM_TRIES} that "
-        f"does (the last: {reason})"
+    develop = cached(develop)
+
+    def random(rng: np.random.Generator) -> Any:
+        reason: str | None = None
+        for _ in range(_RANDOM_TRIES):
+            genome = draw(rng)
+            reason = space.refuses(develop(genome))
+            if reason is None:
+                return genome
+        raise InputError(
+            f"{place}: expected bounds that random bodies can keep; found none of {_RANDOM_TRIES} "
+            f"that does (the last: {reason})"
+        )
+
+    def within(vary: Callable[..., Any]) -> Callable[..., Any]:
+        """The first variation that is in the space, or the first parent."""
+
+        def varied(rng: np.random.Generator, *parents: Any) -> Any:
+            for _ in range(TRIES):
+                child = vary(rng, *parents)
+                if child is not None and space.refuses(develop(child)) is None:
+                    return child
+            return parents[0]
+
+        return varied
+
+    def check(body: Morphology) -> None:
+        reason = space.refuses(body)
+        if reason is not None:
+            raise InputError(f"{body.path or body.name}: {reason}")
+
+    def read(plain: Any) -> Any:
+        genome = from_plain(plain)
+        check(develop(genome))
+        return genome
+
+    def adopted(body: Morphology) -> Any:
+        assert adopt is not None
+        check(body)
+        return adopt(replace(body, brain=None, path=None))
+
+    return Genotype(
+        name=name,
+        random=random,
+        mutate=within(mutate),
+        cross=within(cross),
+        develop=develop,
+        adopt=None if adopt is None else adopted,
+        to_plain=to_plain,
+        from_plain=read,
     )
 
 
-def vary_within(
-    space: Space, develop: Callable[[Any], Morphology], vary: Callable[[], Any], parent: Any
-) -> Any:
-    """A varied genome whose body is in the space.
+def cached(function: Callable[[Any], T]) -> Callable[[Any], T]:
+    """The same function with its last results kept, by the identity of its argument.
 
-    Args:
-        space: the space.
-        develop: genome → body.
-        vary: varies the parent; None where what it drew cannot be done.
-        parent: what is returned where none of `TRIES` is in the space.
-
-    Returns:
-        The first that is.
+    Variation develops a genome to see whether it is in the space; evaluation develops it again.
+    Genomes need no hash. They are kept beside the result, so that no other gets their id.
     """
-    for _ in range(TRIES):
-        child = vary()
-        if child is not None and space.refuses(develop(child)) is None:
-            return child
-    return parent
+    known: dict[int, tuple[Any, T]] = {}
 
+    def look_up(value: Any) -> T:
+        if id(value) not in known:
+            if len(known) >= _CACHED:
+                known.clear()
+            known[id(value)] = value, function(value)
+        return known[id(value)][1]
 
-def check_within(space: Space, body: Morphology) -> None:
-    """Refuses a body that is not in the space.
-
-    Args:
-        space: the space.
-        body: any body.
-
-    Raises:
-        InputError: it is not; the message says why.
-    """
-    reason = space.refuses(body)
-    if reason is not None:
-        raise InputError(f"{body.path or body.name}: {reason}")
+    return look_up

@@ -1,4 +1,4 @@
-"""A body while it grows, module after module: what would overlap or exceed a bound is left out."""
+"""Growth of a body, module after module: what would overlap or exceed a bound is left out."""
 
 from __future__ import annotations
 
@@ -20,15 +20,9 @@ _HAIR = 1e-9
 
 
 def name_place(kind: ModuleType, path: tuple[int, ...]) -> str:
-    """What a module is called that has no name of its own: its type, and the way to it.
+    """The name of a module from its type and its slots from the core on, as `ActiveHinge-1-1`.
 
-    Args:
-        kind: its type.
-        path: slots from the core on.
-
-    Returns:
-        Such as `ActiveHinge-1-1`. There is no `_` in it, so that the `_2` of a copy tells what it
-        is a copy of.
+    It has no `_`, which marks copies.
     """
     return "-".join((kind.name, *map(str, path)))
 
@@ -48,8 +42,8 @@ class Growth:
         """Begins with a core.
 
         Args:
-            space: whose upper bounds are kept; the lower ones are for who grows the body to see.
-            seed: a body whose core it begins with, and whose modules' names are kept for them; by
+            space: of the upper bounds; lower ones are left to the caller.
+            seed: gives the core, and reserves the names of its modules; by
                 default it begins with a core of the space's type.
         """
         kind = space.catalogue[space.core]
@@ -97,7 +91,7 @@ class Growth:
             slot: one of the parent's slots.
             kind: its type.
             orientation: turn about the direction in which it is attached [deg].
-            like: a module of the seed whose name, colour and params it gets; it then comes behind
+            like: a module of the seed with its name, colour and params; it then comes behind
                 its siblings, where others come before those of higher slots.
 
         Returns:
@@ -132,7 +126,7 @@ class Growth:
         return index
 
     def _free_name(self, kind: ModuleType, path: tuple[int, ...]) -> str:
-        """The name of a place, told apart from a seed's module that has it."""
+        """The name of a place, made different from those of the seed's modules."""
         stem = name = name_place(kind, path)
         count = 2
         while name in self._names:
@@ -183,14 +177,7 @@ class Growth:
         return False
 
     def finish(self, name: str) -> Morphology:
-        """The body as it is, modules depth first.
-
-        Args:
-            name: of the body.
-
-        Returns:
-            The body.
-        """
+        """The body with a name, modules depth first."""
         order: list[int] = []
         stack = [0]
         while stack:
@@ -231,7 +218,7 @@ class _Shape(NamedTuple):
 
 
 class _Same:
-    """A type of module, told apart from others by which it is, not by what is in it."""
+    """A type of module, compared by identity."""
 
     def __init__(self, kind: ModuleType) -> None:
         self.kind = kind

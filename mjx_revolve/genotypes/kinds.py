@@ -1,78 +1,72 @@
-"""The genotypes by name, and users' own."""
+"""The genotype that a configuration names: one of the package's, or a user's own."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.cppn import make_cppn
 from mjx_revolve.genotypes.genotype import Genotype, Space
-from mjx_revolve.genotypes.plasticoding import make_plasticoding
-from mjx_revolve.genotypes.tree import make_tree
+from mjx_revolve.genotypes.table import GENOTYPES
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.own_code import call_own, load_own, parse_own, short_name
+from mjx_revolve.inputs.user_code import (
+    call_user_function,
+    function_place,
+    load_user_function,
+    parse_user_function,
+    short_name,
+)
 
-# By the name that a configuration gives; each takes (space, params, place for messages).
-GENOTYPES: dict[str, Callable[[Space, Mapping[str, Any], str], Genotype]] = {
-    "tree": make_tree,
-    "plasticoding": make_plasticoding,
-    "cppn": make_cppn,
-}
 
-
-def make_genotype(
+def find_genotype(
     name: str, space: Space, params: Mapping[str, Any], source: str = "config"
 ) -> Genotype:
     """The genotype that a configuration names.
 
     Args:
-        name: one in `GENOTYPES`, or FILE.py:FUNCTION for a function of the user's own, which takes
-            the space and the params and returns a `Genotype`.
-        space: the bodies that there may be.
+        name: one in `GENOTYPES`, or FILE.py:FUNCTION for a user's function, which takes the space
+            and the params and returns a `Genotype`.
+        space: of the bodies.
         params: the genotype's settings.
-        source: what messages call the configuration.
-
-    Returns:
-        The genotype.
+        source: the configuration, in messages.
 
     Raises:
-        InputError: there is no such genotype, a setting is wrong, or a user's own makes bodies that
-            are not in the space; one line says where.
+        InputError: there is no such genotype, a setting is wrong, or a user's genotype makes bodies
+            that are not in the space.
     """
     if name in GENOTYPES:
-        return GENOTYPES[name](space, params, f"{source}: bodies")
-    if parse_own(name) is None:
+        module, function = GENOTYPES[name].split(".")
+        make = getattr(import_module(f"mjx_revolve.genotypes.{module}"), function)
+        genotype: Genotype = make(space, params, f"{source}: bodies")
+        return genotype
+    if parse_user_function(name) is None:
         known = ", ".join(GENOTYPES)
         raise InputError(
             f"{source}: bodies.genotype: expected one of {known}, or FILE.py:FUNCTION; "
             f"found {name!r}"
         )
-    function = load_own(name, f"{source}: bodies.genotype")
-    made = call_own(name, f"{short_name(name)} to make a genotype", function, space, dict(params))
-    genotype = _guard(name, made, space)
+    function = load_user_function(name, f"{source}: bodies.genotype")
+    expected = f"{short_name(name)} to make a genotype"
+    genotype = _guard(
+        name, call_user_function(name, expected, function, space, dict(params)), space
+    )
     _try(name, genotype)
     return genotype
 
 
-def _place(name: str) -> str:
-    """The user's function, for messages."""
-    own = parse_own(name)
-    return f"{own.path}: {own.function}" if own else name
-
-
 def _guard(name: str, genotype: Any, space: Space) -> Genotype:
-    """A user's genotype whose mistakes are one line, whenever they show."""
+    """A user's genotype whose errors become one line, whenever they occur."""
+    place = function_place(name)
     if not isinstance(genotype, Genotype):
-        found = type(genotype).__name__
-        raise InputError(f"{_place(name)}: expected a Genotype; found {found}")
+        raise InputError(f"{place}: expected a Genotype; found {type(genotype).__name__}")
 
     def guarded(what: str) -> Callable[..., Any]:
-        function = getattr(genotype, what)
-        return lambda *given: call_own(name, f"{short_name(name)} to {what}", function, *given)
+        function, expected = getattr(genotype, what), f"{short_name(name)} to {what}"
+        return lambda *given: call_user_function(name, expected, function, *given)
 
     grow = guarded("develop")
 
@@ -82,7 +76,7 @@ def _guard(name: str, genotype: Any, space: Space) -> Genotype:
         if isinstance(body, Morphology):
             reason = space.refuses(body)
         if reason is not None:
-            raise InputError(f"{_place(name)}: develop: {reason}")
+            raise InputError(f"{place}: develop: {reason}")
         return body
 
     return Genotype(
@@ -98,8 +92,8 @@ def _guard(name: str, genotype: Any, space: Space) -> Genotype:
 
 
 def _try(name: str, genotype: Genotype) -> None:
-    """Makes, grows and saves one child, so that mistakes show before a run begins."""
-    rng = np.random.default_rng(0)
+    """Makes, develops and saves one child, so that errors show before a run begins."""
+    rng, place = np.random.default_rng(0), function_place(name)
     one, other = genotype.random(rng), genotype.random(rng)
     child = genotype.mutate(rng, genotype.cross(rng, one, other))
     body, plain = genotype.develop(child), genotype.to_plain(child)
@@ -108,10 +102,10 @@ def _try(name: str, genotype: Genotype) -> None:
     except (TypeError, ValueError) as error:
         found = str(error).splitlines()[0]
         raise InputError(
-            f"{_place(name)}: to_plain: expected what JSON can hold; found: {found}"
+            f"{place}: to_plain: expected what JSON can hold; found: {found}"
         ) from None
     if genotype.develop(genotype.from_plain(json.loads(text))) != body:
         raise InputError(
-            f"{_place(name)}: to_plain, from_plain: expected a genome that JSON gives back; found "
-            "one that grows another body"
+            f"{place}: to_plain, from_plain: expected a genome that JSON gives back; found one "
+            "that grows another body"
         )

@@ -1,4 +1,4 @@
-"""Plasticoding: Revolve's L-system, whose sentences are drawn into bodies.
+"""Plasticoding: Revolve's L-system of bodies.
 
 A genome is a grammar with one rule for each letter that stands for a module. The sentence begins as
 the core's letter, C; in each iteration every such letter gives way to its rule. Then the sentence
@@ -21,7 +21,6 @@ stands for that module of the seed in its place, so that a rule can spell any bo
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -30,23 +29,16 @@ from annotated_types import Ge, Unit
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.genotype import (
-    Genotype,
-    Space,
-    check_within,
-    draw_within,
-    remember,
-    vary_within,
-)
+from mjx_revolve.genotypes.genotype import Genotype, Space, make_genotype
 from mjx_revolve.genotypes.growth import Growth
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import (
-    MisfitError,
+    Boolean,
+    ConstraintError,
+    Integer,
     NonNegative,
-    Row,
-    Switch,
     Text,
-    Whole,
+    TupleOf,
     checked,
     read,
 )
@@ -89,7 +81,7 @@ class Grammar(NamedTuple):
     Attributes:
         name: of the body.
         rules: what gives way to what: letters by letter; the core's begins with the core.
-        seed: the body whose modules its letters with a `#` name; None: there is none.
+        seed: the body of the modules that letters with a `#` name; None without.
     """
 
     name: str
@@ -118,10 +110,10 @@ class PlasticodingSettings:
     """
 
     # Revolve's, but for `max_rule`, a choice.
-    iterations: Annotated[Whole, Ge(1)] = 3
-    groups: Annotated[Whole, Ge(1)] = 3
-    max_rule: Annotated[Whole, Ge(1)] = 40
-    upright: Switch = True
+    iterations: Annotated[Integer, Ge(1)] = 3
+    groups: Annotated[Integer, Ge(1)] = 3
+    max_rule: Annotated[Integer, Ge(1)] = 40
+    upright: Boolean = True
     add: _Rate = 1.0
     delete: _Rate = 1.0
     swap: _Rate = 1.0
@@ -129,19 +121,16 @@ class PlasticodingSettings:
     def __post_init__(self) -> None:
         """Checks that something can happen."""
         if not any((self.add, self.delete, self.swap)):
-            raise MisfitError("", "a number > 0 among add, delete and swap", "all of them 0")
+            raise ConstraintError("", "a number > 0 among add, delete and swap", "all of them 0")
 
 
 def make_plasticoding(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
-    """Revolve's L-system.
+    """Revolve's L-system: genomes are grammars.
 
     Args:
-        space: the bodies that there may be.
+        space: of the bodies.
         params: fields of `PlasticodingSettings`.
         place: where they were given, for messages.
-
-    Returns:
-        The genotype; its genomes are grammars.
 
     Raises:
         InputError: a parameter is wrong.
@@ -150,36 +139,25 @@ def make_plasticoding(space: Space, params: Mapping[str, Any], place: str) -> Ge
     letters = make_alphabet(space, settings.upright)
     names = [*letters]
 
-    @remember
     def develop(grammar: Grammar) -> Morphology:
         sentence = expand(grammar.rules, settings.iterations)
         return draw_sentence(sentence, letters, space, grammar.name, grammar.seed)
 
     def adopt(body: Morphology) -> Grammar:
-        check_within(space, body)
-        body = replace(body, brain=None, path=None)
         spelled = (CORE, *(f"#{module.name}" for module in body.modules[1:]))
         return Grammar(body.name, {CORE: spelled} | dict.fromkeys(names, ()), body)
 
-    def from_plain(plain: Any) -> Grammar:
-        grammar = _read(plain, names, space)
-        check_within(space, develop(grammar))
-        return grammar
-
-    def random(rng: np.random.Generator) -> Grammar:
-        return Grammar("robot", _draw_rules(rng, names, settings.groups))
-
-    return Genotype(
-        name="plasticoding",
-        random=lambda rng: draw_within(space, develop, lambda: random(rng), place),
-        mutate=lambda rng, grammar: vary_within(
-            space, develop, lambda: _mutate(rng, grammar, names, settings), grammar
-        ),
-        cross=lambda rng, a, b: vary_within(space, develop, lambda: _cross(rng, a, b), a),
+    return make_genotype(
+        space,
+        "plasticoding",
+        place,
+        draw=lambda rng: Grammar("robot", _draw_rules(rng, names, settings.groups)),
+        mutate=lambda rng, grammar: _mutate(rng, grammar, names, settings),
+        cross=_cross,
         develop=develop,
         adopt=adopt,
         to_plain=_to_plain,
-        from_plain=from_plain,
+        from_plain=lambda plain: _read(plain, names, space),
     )
 
 
@@ -187,11 +165,11 @@ def make_alphabet(space: Space, upright: bool = True) -> dict[str, Letter]:
     """The letters that stand for modules, beside the core's.
 
     Args:
-        space: whose types of modules they are.
+        space: of the types of modules.
         upright: whether others than joints have a letter for standing upright, too.
 
     Returns:
-        What they stand for: Revolve's letters where it has any, F for a fin, T and LT for the
+        Letters by name: Revolve's where it has any, F for a fin, T and LT for the
         thrusters; types of users' own have their names, with 1 and 2 behind it for joints.
     """
     found = {}
@@ -242,12 +220,9 @@ def draw_sentence(
     Args:
         sentence: its letters.
         letters: what they stand for.
-        space: whose upper bounds are kept.
+        space: of the upper bounds.
         name: of the body.
-        seed: whose core it begins with, and whose modules letters with a `#` name.
-
-    Returns:
-        The body.
+        seed: gives the core, and the modules that letters with a `#` name.
     """
     turtle = _Turtle(Growth(space, seed), seed)
     for letter in sentence:
@@ -265,11 +240,11 @@ def draw_sentence(
 
 
 class _Turtle:
-    """Where a sentence is drawn.
+    """The state of drawing a sentence.
 
     Attributes:
         growth: the body so far.
-        side: the slot at which the next module is mounted; None: it is not.
+        side: the slot at which the next module is mounted; None if it is not.
     """
 
     def __init__(self, growth: Growth, seed: Morphology | None) -> None:
@@ -278,7 +253,7 @@ class _Turtle:
         self._here = 0
         self._back: list[int] = []
         self._upright = [False]
-        # The seed's modules and whose they are, by name, and where those are that were drawn.
+        # The seed's modules with their parents by name, and the indices of those that were drawn.
         modules = seed.modules if seed else ()
         self._seed = {m.name: (m, modules[m.parent].name) for m in modules[1:]}
         self._drawn = {m.name: 0 for m in modules[:1]}
@@ -308,7 +283,7 @@ class _Turtle:
             self._here = index
 
     def mount(self, letter: Letter) -> None:
-        """A module at the side that was said, or behind those at all sides."""
+        """A module at the chosen side, or at the back where all sides are taken."""
         if self.side is None:
             return
         slot = self._slot(self.side)
@@ -396,7 +371,7 @@ def _mutate(
 
 
 def _used(rules: Mapping[str, tuple[str, ...]]) -> list[str]:
-    """The letters whose rules a sentence can come to."""
+    """The letters with rules that a sentence can reach."""
     found = [CORE]
     for letter in found:
         found += [new for new in dict.fromkeys(rules[letter]) if new in rules and new not in found]
@@ -418,7 +393,7 @@ class _Plain:
     """A grammar as JSON holds it."""
 
     name: Text
-    rules: dict[Text, Row[Text]]
+    rules: dict[Text, TupleOf[Text]]
     seed: dict[Text, Any] | None = None
 
 

@@ -1,7 +1,7 @@
 """The direct genotype: the genome is the body itself, and varies by edits.
 
-Modules keep their names while others come and go around them, so that what is known of a joint
-stays with it.
+Modules keep their names while others are added and removed around them, so that the genes of a
+joint stay with it.
 """
 
 from __future__ import annotations
@@ -25,16 +25,10 @@ from mjx_revolve.body.edits import (
 from mjx_revolve.body.module_types import ModuleType, Slot
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.genotype import (
-    Genotype,
-    Space,
-    check_within,
-    draw_within,
-    vary_within,
-)
+from mjx_revolve.genotypes.genotype import Genotype, Space, make_genotype
 from mjx_revolve.genotypes.growth import Growth, name_place
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.schema import MisfitError, NonNegative, checked, read
+from mjx_revolve.inputs.schema import ConstraintError, NonNegative, checked, read
 
 _Rate = Annotated[NonNegative, Unit("-")]
 
@@ -70,19 +64,16 @@ class TreeSettings:
     def __post_init__(self) -> None:
         """Checks that something can happen."""
         if not any(getattr(self, field.name) for field in fields(self)):
-            raise MisfitError("", "a number > 0 among the mutations", "all of them 0")
+            raise ConstraintError("", "a number > 0 among the mutations", "all of them 0")
 
 
 def make_tree(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
-    """The direct genotype.
+    """The direct genotype: genomes are bodies.
 
     Args:
-        space: the bodies that there may be.
+        space: of the bodies.
         params: fields of `TreeSettings`.
         place: where they were given, for messages.
-
-    Returns:
-        The genotype; its genomes are bodies.
 
     Raises:
         InputError: a parameter is wrong.
@@ -92,36 +83,22 @@ def make_tree(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
     mutations = [_MUTATIONS[name] for name, rate in rates.items() if rate > 0.0]
     bounds = np.cumsum([rate for rate in rates.values() if rate > 0.0])
 
-    def vary(rng: np.random.Generator, body: Morphology) -> Morphology | None:
-        """One mutation that is drawn; None where it cannot be done."""
+    def mutate(rng: np.random.Generator, body: Morphology) -> Morphology | None:
         drawn = np.searchsorted(bounds, rng.random() * bounds[-1], side="right")
         return _try(mutations[drawn], space, rng, body)
 
-    def adopt(body: Morphology) -> Morphology:
-        check_within(space, body)
-        return replace(body, brain=None, path=None)
-
-    def from_plain(plain: Any) -> Morphology:
-        body = make_morphology(plain, space.catalogue, source="genome")
-        check_within(space, body)
-        return body
-
-    return Genotype(
-        name="tree",
-        random=lambda rng: draw_within(space, _same, lambda: _grow(space, rng), place),
-        mutate=lambda rng, body: vary_within(space, _same, lambda: vary(rng, body), body),
-        cross=lambda rng, a, b: vary_within(
-            space, _same, lambda: _try(_exchange, space, rng, a, b), a
-        ),
-        develop=_same,
-        adopt=adopt,
+    return make_genotype(
+        space,
+        "tree",
+        place,
+        draw=lambda rng: _grow(space, rng),
+        mutate=mutate,
+        cross=lambda rng, a, b: _try(_exchange, space, rng, a, b),
+        develop=lambda body: body,
+        adopt=lambda body: body,
         to_plain=Morphology.to_mapping,
-        from_plain=from_plain,
+        from_plain=lambda plain: make_morphology(plain, space.catalogue, source="genome"),
     )
-
-
-def _same(body: Morphology) -> Morphology:
-    return body
 
 
 def _try(edit: Callable[..., Morphology | None], *arguments: Any) -> Morphology | None:
@@ -306,7 +283,7 @@ def mirror_limb(body: Morphology, index: int) -> Morphology | None:
         index: of the subtree's first module, not the core.
 
     Returns:
-        The body, whose poses are as they were; None where a slot has no mirror image.
+        The body, with poses unchanged; None where a slot has no mirror image.
     """
     modules = list(body.modules)
     for i in range(index, index + _size(body, index)):

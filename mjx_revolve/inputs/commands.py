@@ -1,8 +1,7 @@
-"""What the command lines share: how arguments are read, how notes are shown, how mistakes end.
+"""What the command lines share: reading of arguments, notes on stderr, errors as exit codes.
 
-What the package says by `logging` is a line on stderr, `note: ...`; a mistake is one line there and
-an exit code. Nothing heavy is imported here: `--help` is there
-at once.
+What the package logs is a line on stderr, `note: ...`; an error is one line there and an exit code.
+Nothing heavy is imported here, so that `--help` is quick.
 """
 
 from __future__ import annotations
@@ -12,18 +11,15 @@ import contextlib
 import logging
 import math
 import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
 from typing import NoReturn
 
-from mjx_revolve.inputs.early import end_at_once, is_importing
+from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.shipped import list_shipped
-from mjx_revolve.inputs.terminal import spell_what_is_lacking
+from mjx_revolve.inputs.terminal import spell_unencodable
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 
 _SEEDS = 2**32  # what JAX's keys take, and a run's configuration
@@ -32,7 +28,7 @@ _LONGEST = 86_400.0
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser whose complaints are one line, like those about files."""
+    """Argument parser with errors of one line, like those about files."""
 
     def error(self, message: str) -> NoReturn:
         """Raises `InputError` instead of printing the usage and ending the process."""
@@ -60,15 +56,7 @@ def read_seconds(text: str) -> float:
 
 
 def whole(low: int, high: int | None = None) -> Callable[[str], int]:
-    """Makes a reader of whole numbers, for `add_argument(type=whole(1))`.
-
-    Args:
-        low: the smallest.
-        high: the largest; None: there is none.
-
-    Returns:
-        Takes what was typed and returns the number.
-    """
+    """A reader of whole numbers from low to high, for `add_argument(type=whole(1))`."""
 
     def read(text: str) -> int:
         """Reads a whole number within the bounds."""
@@ -86,12 +74,26 @@ def whole(low: int, high: int | None = None) -> Callable[[str], int]:
 read_seed = whole(0, _SEEDS - 1)
 
 
-def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds what `champion.load_episode` is to be told: path, duration, seed, individual, world ...
+def add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of commands that evolve: `--workers` and `--cluster`."""
+    parser.add_argument(
+        "--workers", type=whole(1), metavar="N",
+        help="processes on this machine (default: its cores)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--cluster", metavar="SCHEDULER",
+        help="a Dask scheduler's address, or its scheduler file: its workers score",
+    )  # fmt: skip
 
-    Args:
-        parser: of a command that shows an episode.
-    """
+
+def check_run_arguments(arguments: argparse.Namespace) -> None:
+    """Raises `InputError` for both options of `add_run_arguments` at once."""
+    if arguments.cluster is not None and arguments.workers is not None:
+        raise InputError("--cluster: expected no --workers beside it; found both")
+
+
+def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds what `champion.load_episode` takes: path, duration, seed, individual, world, modules."""
     parser.add_argument(
         "path", type=read_path, help="run folder, genes.yaml, or morphology (YAML or name)"
     )
@@ -101,7 +103,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=read_seed, metavar="N", help="draws another start")
     parser.add_argument(
         "--individual", type=whole(0), metavar="N",
-        help="one of those who lived in the run, where bodies evolve (default: the champion)",
+        help="number of an individual of the run, where bodies evolve (default: the champion)",
     )  # fmt: skip
     parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
     parser.add_argument(
@@ -112,11 +114,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_colony_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds what names a whole colony instead of an episode: `--colony` and `--time`.
-
-    Args:
-        parser: of a command that shows an episode.
-    """
+    """Adds what names a whole colony instead of an episode: `--colony` and `--time`."""
     parser.add_argument(
         "--colony",
         action="store_true",
@@ -132,14 +130,7 @@ def add_colony_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check_colony_arguments(arguments: argparse.Namespace) -> None:
-    """Refuses what does not go with a colony, or without one.
-
-    Args:
-        arguments: with what `add_episode_arguments` and `add_colony_arguments` add.
-
-    Raises:
-        InputError: one was given, or `--colony` without a run folder.
-    """
+    """Raises `InputError` for options that do not go with `--colony`, or without it."""
     if not arguments.colony:
         if arguments.time is not None:
             raise InputError("--time: expected --colony with it; found none")
@@ -152,28 +143,20 @@ def check_colony_arguments(arguments: argparse.Namespace) -> None:
 
 
 def opening_episode(arguments: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
-    """Asks for what the path names, as `trust.opening` does, while it is entered.
-
-    Args:
-        arguments: with what `add_episode_arguments` adds.
-    """
+    """`trust.opening` of the files that `add_episode_arguments` takes."""
     named = (arguments.path, arguments.world, arguments.modules)
     return opening(*(name for name in named if name is not None), trust=arguments.trust)
 
 
 def individual_name(number: int | None) -> str:
-    """What files of an individual are called, from its run folder on, but for their ending."""
+    """The path of an individual's files in its run folder, without suffix; "" for None."""
     return "" if number is None else f"individuals/{number}"
 
 
 def check_episode_path(path: str | Path) -> None:
-    """Refuses a path at which there is nothing, before anything heavy is imported.
+    """Raises `InputError` if there is no run folder, `genes.yaml` or morphology at a path.
 
-    Args:
-        path: of a run folder, a `genes.yaml` or a morphology; or a shipped morphology's name.
-
-    Raises:
-        InputError: there is nothing.
+    This precedes the imports of JAX and MuJoCo.
     """
     shipped = list_shipped("morphologies")
     if not Path(path).exists() and str(path) not in shipped:
@@ -184,14 +167,11 @@ def check_episode_path(path: str | Path) -> None:
 
 
 def check_place(path: str | Path, label: str) -> None:
-    """Refuses a place where no file can be, before any work is done for it.
+    """Raises `InputError` if a file cannot be written at a path, before any work is done for it.
 
     Args:
-        path: of a file or a folder to write; the folders that it names are made later.
-        label: what messages call it.
-
-    Raises:
-        InputError: a file is in its way, or the folder may not be written.
+        path: of a file or a folder; its parents are made later.
+        label: of messages.
     """
     for folder in Path(path).parents:
         if folder.is_dir():
@@ -205,7 +185,7 @@ def check_place(path: str | Path, label: str) -> None:
 
 
 class _Note(logging.Formatter):
-    """Notes repeat names from files, which must not move a terminal's cursor."""
+    """Notes without control characters: they repeat names from files."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The note, each line of it plain."""
@@ -214,7 +194,7 @@ class _Note(logging.Formatter):
 
 @contextlib.contextmanager
 def show_notes() -> Iterator[None]:
-    """Shows on stderr what the package says by `logging`, while it is entered."""
+    """Shows on stderr what the package logs."""
     handler = logging.StreamHandler()
     handler.setFormatter(_Note("note: %(message)s"))
     logger = logging.getLogger("mjx_revolve")
@@ -226,20 +206,20 @@ def show_notes() -> Iterator[None]:
 
 
 def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
-    """Runs a command line's `main`; what goes wrong by no fault of ours becomes one line.
+    """Runs a command's `main`; errors that are no bug of the package become one line.
 
     Args:
         main: takes the arguments (None: `sys.argv[1:]`) and returns the exit code.
         argv: the arguments.
 
     Returns:
-        The exit code: `main`'s; 2 where the input is wrong (`InputError`), 1 where the system
-        refused something (a full disk, too little memory), and 130 when interrupted.
+        The exit code: `main`'s; 2 if the input is wrong (`InputError`), 1 if the system refused
+        something (a full disk, too little memory), 130 when interrupted.
     """
-    spell_what_is_lacking()
-    interrupts: list[int] = []
+    spell_unencodable()
+    early_sigint.running = True
     try:
-        with _noting_interrupts(interrupts), show_notes():
+        with show_notes():
             return main(argv)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -250,11 +230,8 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
     except OSError as error:
         print(f"error: {plain(describe_refusal(error))}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
-    except Exception as error:
-        if interrupts:  # what the import of compiled code makes of a KeyboardInterrupt
+    except (KeyboardInterrupt, Exception) as error:
+        if early_sigint.interrupted or isinstance(error, KeyboardInterrupt):
             print("interrupted", file=sys.stderr)
             return 130
         # XLA's kind of error; its class cannot be named without importing JAX.
@@ -263,28 +240,6 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         reason = str(error).partition("\n")[0].removeprefix("RESOURCE_EXHAUSTED:").strip()
         print(f"error: too little memory: {reason or 'none is left'}", file=sys.stderr)
         return 1
-
-
-@contextlib.contextmanager
-def _noting_interrupts(noted: list[int]) -> Iterator[None]:
-    """Has Ctrl-C raise `KeyboardInterrupt`, as ever, and notes it; while importing, see `early`."""
-
-    def note(number: int, frame: FrameType | None) -> None:
-        noted.append(number)
-        if before is end_at_once and is_importing(frame):
-            end_at_once(number, frame)
-        raise KeyboardInterrupt
-
-    before = signal.getsignal(signal.SIGINT)
-    ours = before in (signal.default_int_handler, end_at_once)
-    if not ours or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def describe_refusal(error: OSError) -> str:

@@ -1,8 +1,7 @@
-"""What reads a user's input: one kind of error, and YAML without its traps.
+"""Errors in a user's input: one exception, one line, and how values are shown in it.
 
-Every function that reads user input raises `InputError` with one line that names the file, the
-place in it, what was expected and what was found. Command lines turn it into exit code 2 (see
-`commands.run_command`).
+Whatever reads user input raises `InputError` with one line: "PLACE: expected X; found Y". Commands
+turn it into exit code 2 (`run_command`).
 """
 
 from __future__ import annotations
@@ -10,39 +9,24 @@ from __future__ import annotations
 import contextlib
 import re
 import reprlib
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from mjx_revolve.inputs.witness import tell
-
-# Revolve's deepest evolved robots stay below 60 levels of YAML; Python's own recursion limit is
-# 1000. A file nested deeper than this is a mistake or an attack.
-_MAX_DEPTH = 200
-# An alias bomb is small in the file and huge when walked; our files need no aliases at all.
-_MAX_NODES = 200_000
-# PyYAML reads some 20,000 values in a second; a robot of a thousand modules has as many.
-_MAX_WRITTEN = 100_000
-# It reads some 500 kB in a second; a robot of a thousand modules is a fifth of that.
-_MAX_BYTES = 2_000_000
-# Python refuses to print integers of more than 4300 digits.
-_MAX_BITS = 14_000
 # The longest value, without blanks or in quotes, that a message repeats [characters].
 _MAX_VALUE = 200
-
-
-def plain(text: str) -> str:
-    """A text on one line of a terminal or a page: what is not printable is spelled out."""
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-
-
 _LONG = re.compile(
     rf"(?<![^\s(\[])(['\"])(?:(?!\1).){{{_MAX_VALUE},}}\1(?!\w)|\S{{{2 * _MAX_VALUE},}}"
 )
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 60
+
+
+def plain(text: str) -> str:
+    """A text on one line of a terminal or a page: what is not printable is escaped."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def _cut(match: re.Match[str]) -> str:
@@ -54,7 +38,7 @@ def _cut(match: re.Match[str]) -> str:
 class InputError(ValueError):
     """A user's input is wrong; the message says where, what was expected and what was found.
 
-    Names in it may be a stranger's: the message is one printable line, and long values are cut.
+    Names in it may come from a stranger's files: it is one printable line, long values are cut.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -62,12 +46,23 @@ class InputError(ValueError):
         super().__init__(_LONG.sub(_cut, plain(str(message))))
 
 
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 60
+class ConstraintError(ValueError):
+    """Values that do not fit together, raised by a validator or a `__post_init__`."""
+
+    def __init__(self, place: str, expected: str, found: str) -> None:
+        """Takes the parts of a message.
+
+        Args:
+            place: relative to the validator, such as a field's name; "" for itself.
+            expected: in words.
+            found: as the message shows it.
+        """
+        super().__init__(f"{place}: expected {expected}; found {found}")
+        self.place, self.expected, self.found = place, expected, found
 
 
 def show(value: Any) -> str:
-    """A value as a message shows it: short, whatever it is."""
+    """A value as a message shows it: short."""
     try:
         return _SHORT.repr(value)
     except ValueError:  # Python refuses to print integers of more than 4300 digits
@@ -76,10 +71,7 @@ def show(value: Any) -> str:
 
 @contextlib.contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Puts a file's path before what is wrong with it, whoever says so.
-
-    Args:
-        path: the file that is read in the body of the `with`.
+    """Puts a file's path before errors about it, those of the operating system included.
 
     Raises:
         InputError: the body raised one, or could not read the file.
@@ -96,139 +88,3 @@ def reading(path: str | Path) -> Iterator[None]:
         raise InputError(f"{path}: expected UTF-8 text; found {error.reason}") from None
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
-
-
-def _too_deep() -> InputError:
-    return InputError(f"expected at most {_MAX_DEPTH} levels of nesting; found more")
-
-
-class SafeLoader(yaml.SafeLoader):
-    """`yaml.SafeLoader` that reads `1e-3` as a number and refuses duplicate keys.
-
-    What is neither mapping, list, text, number, truth value nor date is refused, too; so is what is
-    nested too deeply or too much, as soon as that can be told.
-    """
-
-    _depth = _count = 0
-
-    def fetch_flow_collection_start(self, token: Any) -> None:
-        """Scans a `[` or a `{`; PyYAML's time grows with the square of how many are open."""
-        if self.flow_level > _MAX_DEPTH:
-            raise _too_deep()
-        super().fetch_flow_collection_start(token)
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """The next node and all within it."""
-        self._depth += 1
-        self._count += 1
-        if self._depth > _MAX_DEPTH:
-            raise _too_deep()
-        if self._count > _MAX_WRITTEN:
-            raise InputError(f"expected at most {_MAX_WRITTEN} values; found more")
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        return node
-
-    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """The value of a node; a text that its tag cannot have (`!!int x`) is an `InputError`."""
-        try:
-            return super().construct_object(node, deep)
-        except (InputError, yaml.YAMLError, RecursionError):
-            raise
-        except Exception as error:  # PyYAML's constructors take their tag's word for it
-            kind = node.tag.rpartition(":")[2]
-            reason = f": {error}" if isinstance(error, ValueError) else ""
-            raise InputError(
-                f"line {node.start_mark.line + 1}: expected valid YAML; found {show(node.value)} "
-                f"as {kind}{reason}"
-            ) from None
-
-
-# YAML 1.1 wants a dot in floats and no sign before it; people write 1e-3 and -.5 and mean it.
-SafeLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^[-+]?(?:(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+|\.[0-9][0-9_]*)$"
-    ),
-    list("-+.0123456789"),
-)
-
-
-def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hashable, Any]:
-    mapping: dict[Hashable, Any] = {}
-    for key_node, value_node in node.value:
-        key = loader.construct_object(key_node, deep=True)
-        place = f"line {key_node.start_mark.line + 1}"
-        if not isinstance(key, Hashable):
-            raise InputError(f"{place}: expected a plain key; found {show(key)}")
-        if key in mapping:
-            raise InputError(f"{place}: expected each key once; found {show(key)} twice")
-        mapping[key] = loader.construct_object(value_node, deep=True)
-    return mapping
-
-
-def _construct_int(loader: SafeLoader, node: yaml.ScalarNode) -> int:
-    value = yaml.SafeLoader.construct_yaml_int(loader, node)
-    if value.bit_length() > _MAX_BITS:  # hexadecimal digits may be as many as there are
-        place = f"line {node.start_mark.line + 1}"
-        raise InputError(f"{place}: expected a whole number of a few digits; found a huge integer")
-    return value
-
-
-def _refuse_tag(loader: SafeLoader, node: yaml.Node) -> None:
-    loader.construct_undefined(node)
-
-
-SafeLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
-SafeLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
-for _name in ("binary", "omap", "pairs", "set"):  # bytes, tuples and sets: no file of ours has any
-    SafeLoader.add_constructor(f"tag:yaml.org,2002:{_name}", _refuse_tag)
-
-
-def _check_size(data: Any) -> None:
-    stack, count = [(data, 0)], 0
-    while stack:
-        item, depth = stack.pop()
-        count += 1
-        if depth > _MAX_DEPTH:
-            raise _too_deep()
-        if count > _MAX_NODES:
-            raise InputError(f"expected at most {_MAX_NODES} values; found more (aliases?)")
-        if isinstance(item, dict):
-            stack.extend((value, depth + 1) for value in item.values())
-        elif isinstance(item, list):
-            stack.extend((value, depth + 1) for value in item)
-
-
-def load_yaml(path: str | Path) -> Any:
-    """Reads one YAML document.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The document as plain Python values (dict, list, str, int, float, bool, None).
-
-    Raises:
-        InputError: the file is missing, unreadable, no valid YAML, nested too deeply, or repeats a
-            key.
-    """
-    with reading(path):
-        with open(path, "rb") as file:
-            content = file.read(_MAX_BYTES + 1)
-        if len(content) > _MAX_BYTES:
-            raise InputError(f"expected at most {_MAX_BYTES // 10**6} MB of YAML; found more")
-    tell(path, "data", content)
-    with reading(path):
-        text = content.decode("utf-8")
-        try:
-            data = yaml.load(text, Loader=SafeLoader)
-            _check_size(data)
-        except RecursionError:
-            raise _too_deep() from None
-        except yaml.YAMLError as error:
-            mark = getattr(error, "problem_mark", None)
-            place = f"line {mark.line + 1}: " if mark else ""
-            problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-            raise InputError(f"{place}expected valid YAML; found: {problem}") from None
-    return data

@@ -1,4 +1,4 @@
-"""Where files may be read and written, and writing so that nothing is lost."""
+"""Paths that may be read and written, and atomic writing."""
 
 from __future__ import annotations
 
@@ -10,22 +10,19 @@ from pathlib import Path
 from mjx_revolve.inputs.errors import InputError
 
 PAGES = (".html", ".htm")
-"""What the name of a page for browsers may end in."""
+"""Suffixes of pages for browsers."""
 
 
 def check_name(path: str | Path, endings: Sequence[str], label: str | None = None) -> Path:
-    """Refuses a name that a file to write may not have.
+    """The path of a file to write.
 
     Args:
         path: as a user gave it.
-        endings: what it may end in.
-        label: what messages call it; by default the path.
-
-    Returns:
-        The path.
+        endings: suffixes that it may have.
+        label: of messages; by default the path.
 
     Raises:
-        InputError: it ends in none of them, or is a folder.
+        InputError: it has none of the suffixes, or is a folder.
     """
     path = Path(path)
     if path.suffix.lower() not in endings:
@@ -39,14 +36,11 @@ def check_name(path: str | Path, endings: Sequence[str], label: str | None = Non
 
 
 def resolve_inside(path: str | Path, folder: str | Path) -> Path:
-    """A file's real path, which must lie inside a folder.
+    """A file's path without links, which must lie inside a folder.
 
     Args:
-        path: as it was written, from the folder on.
-        folder: that it must not lead out of, by no link either.
-
-    Returns:
-        The path without links.
+        path: relative to the folder.
+        folder: that contains it.
 
     Raises:
         InputError: it leads out, or nowhere.
@@ -75,7 +69,7 @@ def write_atomic(path: Path, content: bytes | Callable[[Path], None]) -> None:
 
     Args:
         path: the file; its folder is made if need be.
-        content: the bytes, or a function that writes to the path it is given.
+        content: the bytes, or a function that writes to a path.
 
     Raises:
         OSError: the disk is full or the folder cannot be written; it names `path`.
@@ -109,5 +103,5 @@ def sync_folder(folder: Path) -> None:
 
 
 def with_path(error: OSError, path: Path) -> OSError:
-    """The same error, naming the file that the user knows."""
+    """The same error with the path that the user knows."""
     return OSError(error.errno, error.strerror or str(error), str(path))

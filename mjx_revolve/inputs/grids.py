@@ -1,34 +1,37 @@
 """Grids of settings: `KEY.PATH=VALUE,VALUE,...` for each axis, and all their combinations.
 
-A comma separates values where it stands outside of brackets and quotes; a value is YAML, as in
-`overrides.py`, so that `world.current=[0,0,0],[0.1,0,0]` has two values.
+Values are YAML, those between brackets or quotes may hold commas: `world.current=[0,0,0],[0.1,0,0]`
+has two.
 """
 
 from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import yaml
+
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.overrides import read_overrides
+from mjx_revolve.inputs.yaml_reader import SafeLoader
 
-_CLOSING = {"[": "]", "{": "}"}
 _LONGEST = 80  # of a case's name, which is that of a folder [characters]
 MOST_SEEDS = 10_000
 """Runs of one case at most (a choice)."""
-_MOST = 1000  # cases in a grid: more than anybody has run; a typing error has a million (a choice)
+_MOST = 1000  # cases in a grid; a typing error easily has a million (a choice)
 
 
-class Axis(NamedTuple):
-    """A setting and the values that it takes.
+class GridAxis(NamedTuple):
+    """A setting and its values.
 
     Attributes:
         key: dotted.
-        texts: its values as they were typed, YAML.
+        texts: the values as they were typed, YAML.
     """
 
     key: str
@@ -36,73 +39,44 @@ class Axis(NamedTuple):
 
 
 def split_values(text: str, label: str) -> list[str]:
-    """Cuts a text at the commas outside of brackets and quotes.
+    """The values of a YAML list without its brackets, as they were typed.
 
     Args:
-        text: YAML values with commas between them.
-        label: what messages call it.
-
-    Returns:
-        The values, without the blanks around them.
+        text: values with commas between them.
+        label: of messages.
 
     Raises:
-        InputError: a bracket or a quote does not close, or there is nothing between two commas.
+        InputError: it is no such list, or there is nothing between two commas.
     """
-    values, open_brackets = [""], ""
-    quote, escaped, before = "", False, ","  # `before`: the last character that is no blank
-    for mark in text:
-        if quote:
-            if escaped:
-                escaped = False
-            elif mark == quote:
-                quote = ""
-            else:
-                escaped = quote == '"' and mark == "\\"
-            values[-1] += mark
-            before = mark
-            continue
-        # An apostrophe within a word opens nothing; after `'` it is YAML's way to write one.
-        if mark in "'\"" and (before in ",[{:" or before == mark == "'"):
-            quote = mark
-        elif mark in _CLOSING:
-            open_brackets += _CLOSING[mark]
-        elif mark in "]}":
-            if not open_brackets.endswith(mark):
-                raise InputError(f"{label}: expected brackets in pairs; found {show(text)}")
-            open_brackets = open_brackets[:-1]
-        elif mark == "," and not open_brackets:
-            values.append("")
-            before = mark
-            continue
-        values[-1] += mark
-        before = before if mark.isspace() else mark
-    if quote or open_brackets:
-        what = "a quote" if quote else "a bracket"
-        raise InputError(f"{label}: expected {what} to be closed; found {show(text)}")
-    values = [value.strip() for value in values]
-    if len(values) > 1 and not all(values):
-        raise InputError(f"{label}: expected a value between commas; found none in {show(text)}")
-    return values
+    if "," not in text:
+        return [text.strip()]
+    listed = f"[{text}\n]"
+    try:
+        node = yaml.compose(listed, Loader=SafeLoader)
+    except (yaml.YAMLError, InputError, RecursionError):
+        node = None
+    values = []
+    if node is not None and node.value:
+        values = [listed[one.start_mark.index : one.end_mark.index] for one in node.value]
+        # Neither a comma nor a comment nor another list may follow.
+        values = values if not listed[node.value[-1].end_mark.index : -1].strip() else []
+    if not values:
+        raise InputError(f"{label}: expected YAML values between commas; found {show(text)}")
+    return [value.strip() for value in values]
 
 
-def read_axes(settings: Sequence[str]) -> list[Axis]:
-    """Reads what was typed as `--set`.
-
-    Args:
-        settings: `KEY.PATH=VALUE,VALUE,...` each.
-
-    Returns:
-        An axis for each setting, also for those of one value.
+def read_axes(settings: Sequence[str]) -> list[GridAxis]:
+    """Reads what was typed as `--set`, `KEY.PATH=VALUE,VALUE,...` each; an axis may have one value.
 
     Raises:
         InputError: a text is no such setting, or a setting or a value is there twice.
     """
-    axes: dict[str, Axis] = {}
+    axes: dict[str, GridAxis] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
         key = key.strip()
         if not equals:
-            read_overrides([setting])  # which says what is wrong
+            read_overrides([setting])  # which raises the error
         if key in axes:
             raise InputError(
                 f"--set {key}: expected each setting once, with commas between its values; found "
@@ -112,35 +86,29 @@ def read_axes(settings: Sequence[str]) -> list[Axis]:
         values: list[Any] = []
         for one in texts:
             (value,) = read_overrides([f"{key}={one}"])[0].values()
-            if any(_same(value, other) for other in values):
+            # Python takes 1 for True.
+            if any(value == x and isinstance(value, bool) == isinstance(x, bool) for x in values):
                 raise InputError(f"--set {key}: expected each value once; found {show(one)} twice")
             values.append(value)
-        axes[key] = Axis(key, tuple(texts))
+        axes[key] = GridAxis(key, tuple(texts))
     return list(axes.values())
 
 
-def _same(value: Any, other: Any) -> bool:
-    """Whether two values are; Python takes 1 for True."""
-    return value == other and isinstance(value, bool) == isinstance(other, bool)
-
-
-def combine(axes: Sequence[Axis], otherwise: str) -> dict[str, tuple[str, ...]]:
-    """All combinations of an axis's value with those of the others.
+def combine(axes: Sequence[GridAxis], otherwise: str) -> dict[str, tuple[str, ...]]:
+    """All combinations of the axes' values, by name.
 
     Args:
-        axes: of the grid.
-        otherwise: the name where there is one combination only.
+        axes: of the grid; the last one changes fastest.
+        otherwise: the name if there is one combination only.
 
     Returns:
         Settings, `KEY.PATH=VALUE` each, by a name that a folder may have: the values in which
-        they differ, `morphology=spider+duration=5`. The last axis changes fastest.
+        they differ, `morphology=spider+duration=5`.
 
     Raises:
         InputError: there are too many.
     """
-    count = 1
-    for axis in axes:
-        count *= len(axis.texts)
+    count = math.prod(len(axis.texts) for axis in axes)
     if count > _MOST:
         raise InputError(f"--set: expected at most {_MOST} combinations; found {count}")
     several = [axis for axis in axes if len(axis.texts) > 1]

@@ -7,7 +7,8 @@ from typing import Any
 
 import yaml
 
-from mjx_revolve.inputs.errors import InputError, SafeLoader, show
+from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.yaml_reader import SafeLoader
 
 
 def copy_plain(value: Any) -> Any:
@@ -20,13 +21,10 @@ def copy_plain(value: Any) -> Any:
 
 
 def read_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> tuple[dict[str, Any], str]:
-    """Reads overrides.
+    """Values by dotted key, and the label of messages about them.
 
     Args:
         overrides: a mapping of dotted keys, or texts like `task.duration=5`, whose values are YAML.
-
-    Returns:
-        values by dotted key, and what messages call them.
 
     Raises:
         InputError: a text is no `KEY.PATH=VALUE`.
@@ -54,11 +52,11 @@ def merge_override(
     """Sets one dotted key in place; a mapping is merged into a mapping.
 
     Args:
-        data: what is overridden.
+        data: nested mappings.
         key: dotted.
         value: its new value.
-        label: what messages call overrides.
-        named: sections that may stand as a name alone, which is then their key `name`.
+        label: of overrides in messages.
+        named: sections that may be given as a name alone, which is then their key `name`.
 
     Raises:
         InputError: the key leads into something that is no mapping.
@@ -86,15 +84,7 @@ def merge_override(
 
 
 def sets(overrides: Mapping[str, Any], place: str) -> bool:
-    """Whether overrides set what is at a place, or something in it.
-
-    Args:
-        overrides: by dotted key, mappings nested.
-        place: dotted.
-
-    Returns:
-        Whether they do.
-    """
+    """Whether overrides, by dotted key, set what is at a dotted place, or something in it."""
     for key, value in overrides.items():
         if f"{key}.".startswith(f"{place}."):
             return True

@@ -1,7 +1,7 @@
-"""What a user's value may be: types that pydantic checks, and its complaints in our words.
+"""Types of users' values, checked by pydantic with error messages of ours.
 
 A `@checked` class is a frozen dataclass whose values are checked whenever one is made, in code, by
-`dataclasses.replace` or from a mapping in a file. Annotations say it all::
+`dataclasses.replace` or from a mapping in a file::
 
     @checked
     class Jet:
@@ -10,9 +10,9 @@ A `@checked` class is a frozen dataclass whose values are checked whenever one i
 
         def __post_init__(self) -> None:
             if self.thrust == 0.0 and self.axis[2] != 0.0:
-                raise MisfitError("axis", "a level one, since there is no thrust", show(self.axis))
+                raise ConstraintError("axis", "a level one without thrust", show(self.axis))
 
-and every complaint follows from them: `jet: thrust: expected a number >= 0 [N]; found -1`.
+Messages follow from the annotations: `jet: thrust: expected a number >= 0 [N]; found -1`.
 """
 
 from __future__ import annotations
@@ -37,8 +37,13 @@ from pydantic import (
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic_core import ArgsKwargs
 
-from mjx_revolve.inputs.complaints import MisfitError, fields_of, find_problems, join, refuse
-from mjx_revolve.inputs.errors import show
+from mjx_revolve.inputs.errors import ConstraintError, show
+from mjx_revolve.inputs.validation_messages import (
+    fields_of,
+    find_problems,
+    join,
+    refuse,
+)
 
 T = TypeVar("T")
 
@@ -46,7 +51,7 @@ LARGEST = (2.0 - 2.0**-23) * 2.0**127
 """The largest number of float32."""
 
 words = doc
-"""What messages say of a type instead of its name, as metadata of `Annotated`."""
+"""A type's description in messages, as metadata of `Annotated`."""
 
 
 # --- types ----------------------------------------------------------------------------------------
@@ -58,7 +63,7 @@ def _plain(value: Any) -> Any:
 
 
 def as_tuple(value: Any) -> Any:
-    """Lists and arrays as tuples; whatever else as it is."""
+    """Lists and arrays as tuples; other values as they are."""
     if isinstance(value, tuple | str | bytes):
         return value
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -68,15 +73,17 @@ def as_tuple(value: Any) -> Any:
 def _unit_vector(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     length = math.sqrt(sum(x * x for x in vector))
     if not 1e-9 < length < math.inf:
-        raise MisfitError("", "a direction, not zero", show(list(vector)))
+        raise ConstraintError("", "a direction, not zero", show(list(vector)))
     x, y, z = (v / length for v in vector)
     return (x, y, z)
 
 
 def _within(number: float) -> float:
-    """The number, if single precision holds it, in which all is computed."""
+    """The number, if it is within the range of single precision."""
     if abs(number) > LARGEST:
-        raise MisfitError("", f"a number between -{LARGEST:.3g} and {LARGEST:.3g}", show(number))
+        raise ConstraintError(
+            "", f"a number between -{LARGEST:.3g} and {LARGEST:.3g}", show(number)
+        )
     return number
 
 
@@ -88,11 +95,11 @@ NonNegative = Annotated[Number, Ge(0)]
 Positive = Annotated[Number, Gt(0)]
 Share = Annotated[Number, Ge(0), Le(1), Unit("-")]
 
-Whole = Annotated[int, Strict()]
-Switch = Annotated[bool, Strict()]
+Integer = Annotated[int, Strict()]
+Boolean = Annotated[bool, Strict()]
 Text = Annotated[str, Strict()]
 
-Row = Annotated[tuple[T, ...], Strict(), BeforeValidator(as_tuple)]
+TupleOf = Annotated[tuple[T, ...], Strict(), BeforeValidator(as_tuple)]
 """Any number of one kind, from a list, tuple or array."""
 Pair = Annotated[tuple[T, T], Strict(), BeforeValidator(as_tuple)]
 Triple = Annotated[tuple[T, T, T], Strict(), BeforeValidator(as_tuple)]
@@ -103,13 +110,13 @@ Direction = Annotated[Vector, AfterValidator(_unit_vector), Unit("-")]
 
 
 def is_off(value: Any) -> bool:
-    """Whether a value says that there is none: YAML 1.1 reads a bare `off` as False."""
+    """Whether a value means none: YAML 1.1 reads a bare `off` as False."""
     return value is None or value is False or (isinstance(value, str) and value == "off")
 
 
-Law = Annotated[T, BeforeValidator(lambda value: "off" if value is False else value)]
+LawName = Annotated[T, BeforeValidator(lambda value: "off" if value is False else value)]
 """The name of a law, one of them `off`, which YAML reads as False."""
-Maybe = Annotated[T | None, BeforeValidator(lambda value: None if is_off(value) else value)]
+OrOff = Annotated[T | None, BeforeValidator(lambda value: None if is_off(value) else value)]
 """A value, or `off`."""
 
 
@@ -118,16 +125,11 @@ Maybe = Annotated[T | None, BeforeValidator(lambda value: None if is_off(value) 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def checked(kind: type[T]) -> type[T]:
-    """Makes a class a frozen dataclass that checks its values.
+    """Makes a class a frozen dataclass that checks its values and raises `InputError`.
 
     Numbers become floats, lists tuples, mappings what the annotation says. An annotation's
-    `Unit(...)` and `words(...)` go into messages.
-
-    Args:
-        kind: the class. Its `__post_init__`, if any, raises `MisfitError` where values do not fit.
-
-    Returns:
-        The class; making one raises `InputError`.
+    `Unit(...)` and `words(...)` go into messages. A `__post_init__` raises `ConstraintError` where
+    values do not fit together.
     """
     config = ConfigDict(extra="forbid")
     made: Any = pydantic_dataclass(frozen=True, config=config)(kind)
@@ -145,7 +147,7 @@ def checked(kind: type[T]) -> type[T]:
             raise refuse(problems, lambda _: f"{label}{name}: ") from None
 
     def __getstate__(self: Any) -> dict[str, Any]:  # noqa: N807
-        """Its fields: what follows from them is found again by whoever unpickles it."""
+        """The fields alone, without cached properties."""
         return {name: self.__dict__[name] for name in names}
 
     names = [field.name for field in dataclasses.fields(made)]
@@ -160,19 +162,16 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def read(kind: Any, value: Any, place: str = "", context: Any = None) -> Any:
-    """Reads a user's value.
+    """Reads a user's value as a type.
 
     Args:
-        kind: what it should be: a `checked` class, or any other type with annotations.
-        value: what was given; mappings and lists as in YAML.
+        kind: a `checked` class, or any other type with annotations.
+        value: mappings and lists as in YAML.
         place: where it was given, for messages.
-        context: what validators find as `info.context`.
-
-    Returns:
-        The value as its type says.
+        context: `info.context` of validators.
 
     Raises:
-        InputError: it is something else; the message says where, what was expected, what was found.
+        InputError: it is something else.
     """
     try:
         return _adapter(kind).validate_python(value, context=context)

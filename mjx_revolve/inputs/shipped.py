@@ -15,21 +15,14 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def list_shipped(kind: Kind) -> dict[str, Path]:
-    """The files of a kind that come with the package.
-
-    Args:
-        kind: which.
-
-    Returns:
-        Their paths by name, in alphabetical order.
-    """
+    """Paths of the files that come with the package, by name, in alphabetical order."""
     folders = (_PACKAGE / kind, _PACKAGE.parent / kind)
     folder = next((folder for folder in folders if folder.is_dir()), folders[0])
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def is_shipped(path: Path) -> bool:
-    """Whether a file comes with the package; without links."""
+    """Whether a path without links is that of a file of the package."""
     kinds = ("configs", "morphologies")
     folders = (_PACKAGE, *(_PACKAGE.parent / kind for kind in kinds))
     return any(path.is_relative_to(folder) for folder in folders)
@@ -38,17 +31,16 @@ def is_shipped(path: Path) -> bool:
 def find_shipped(
     path: str | Path, kind: Kind, folder: str | Path = "", label: str | None = None
 ) -> Path:
-    """The file that a user means, who may write a shipped one's name.
+    """The path of a user's file, or of a shipped one by its name.
 
     Args:
         path: a path, or a name. A file of that path wins over a shipped one of that name.
-        kind: what is wanted.
-        folder: where a relative path starts; "": the current folder.
-        label: the place that named it, for the message; None: it is called by itself.
+        kind: of file.
+        folder: base of relative paths; "" for the current one.
+        label: the place that named it, for the message; None for the path.
 
     Returns:
-        The path; as it is where it looks like one (it has a folder or a suffix), so that whoever
-        reads the file says what is wrong with it.
+        The path; unchanged if it has a folder or a suffix, so that the reader reports its errors.
 
     Raises:
         InputError: there is neither such a file nor such a name.

@@ -1,9 +1,9 @@
-"""Whose run folder it is: what may be run and read because of one, and what is asked first.
+"""Audit of files: which of those that a run folder names may be read or run.
 
 A run folder names Python files of its owner's, and may name any file at all. Before a command runs
 or reads such a file, it must be one that this user has used: named in a configuration that they
-gave to `evolve`, or allowed by `--trust`. Both are remembered by what is in the file, outside of
-all run folders, so that a folder may be moved and another's is never taken for one's own.
+gave to `evolve`, or allowed by `--trust`. Both are recorded by content, outside of all run folders,
+so that a folder may be moved and another's is never taken for one's own.
 """
 
 from __future__ import annotations
@@ -13,18 +13,45 @@ import contextlib
 import hashlib
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import is_shipped
-from mjx_revolve.inputs.witness import Kind, heard_by
 
 _log = logging.getLogger(__name__)
 
+Kind = Literal["data", "Python"]
+Hook = Callable[[Path, Kind, bytes], None]
+"""Takes a file's path, what it is used as, and its content; raises to refuse it."""
+
+# Of the whole process, so that they hold in all its threads.
+_hooks: list[Hook] = []
+
 
 class UntrustedError(InputError):
-    """A file is not used because nobody has allowed it."""
+    """A file is not used because it is not trusted."""
+
+
+@contextlib.contextmanager
+def audited_by(hook: Hook) -> Iterator[None]:
+    """Calls a hook for each file before it is used."""
+    _hooks.append(hook)
+    try:
+        yield
+    finally:
+        _hooks.remove(hook)
+
+
+def audit(path: str | Path, kind: Kind, content: bytes) -> None:
+    """Calls the hooks for a file that is about to be used; without any, all files are allowed.
+
+    Raises:
+        InputError: it is refused.
+    """
+    for hook in _hooks:
+        hook(Path(path), kind, content)
 
 
 def add_trust_argument(parser: argparse.ArgumentParser) -> None:
@@ -37,23 +64,23 @@ def add_trust_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def record_path() -> Path:
-    """Where it is remembered: below `$XDG_STATE_HOME`, or `~/.local/state`."""
+    """The record of files used: below `$XDG_STATE_HOME`, or `~/.local/state`."""
     home = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
     return Path(home).absolute() / "mjx_revolve" / "trusted"
 
 
-@contextlib.contextmanager
-def opening(*places: str | Path, trust: bool) -> Iterator[None]:
-    """Asks for what run folders name.
+def opening(*places: str | Path, trust: bool) -> contextlib.AbstractContextManager[None]:
+    """Restricts what run folders may name.
 
     Args:
-        places: the folders, or files in them: what lies there is read without asking, but never
-            run.
-        trust: whether everything is allowed, and remembered.
+        places: the folders, or files in them: what lies there may be read, but not run.
+        trust: whether everything is allowed, and recorded.
     """
+    if trust:
+        return remembering()
     roots = [_root_of(Path(place)) for place in places]
 
-    def ask(path: Path, kind: Kind, content: bytes) -> None:
+    def check(path: Path, kind: Kind, content: bytes) -> None:
         real = path.resolve()
         if kind == "data" and is_run_config(real):
             # Genes of one's own may name any run's configuration: that run is opened, too.
@@ -71,13 +98,20 @@ def opening(*places: str | Path, trust: bool) -> Iterator[None]:
             "--trust; found another"
         )
 
-    with heard_by(_remember if trust else ask):
-        yield
+    return audited_by(check)
 
 
 def remembering() -> contextlib.AbstractContextManager[None]:
-    """Remembers all files that are used meanwhile as this user's own choice."""
-    return heard_by(_remember)
+    """Records all files that are used meanwhile as this user's own choice."""
+    return audited_by(_remember)
+
+
+def opening_config(
+    path: str | Path, trust: bool = False
+) -> contextlib.AbstractContextManager[None]:
+    """Trusts the files of a configuration that a user names, unless it is a run folder's."""
+    asks = is_run_config(Path(path)) and not trust
+    return opening(path, trust=False) if asks else remembering()
 
 
 def is_run_config(path: Path) -> bool:
@@ -114,7 +148,7 @@ def _remember(path: Path, kind: Kind, content: bytes) -> None:
         record.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         with open(record, "a", encoding="ascii", opener=_private) as file:
             file.write(f"{_digest(kind, content)}\n")
-    except OSError as error:  # a read-only home: --trust is asked for again
+    except OSError as error:  # a read-only home: --trust is needed again
         _log.warning("not remembered that you use %s: %s", path, error.strerror)
 
 

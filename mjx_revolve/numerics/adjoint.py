@@ -1,8 +1,8 @@
 """The way back over a loop of steps, compiled as the way ahead is.
 
 JAX's own way back over a scan of population steps is hundreds of small kernels for each step: it
-takes 20 times as long as the way ahead, and XLA minutes to compile. Here the loop ahead keeps what
-it carries into each step, one array; a step back computes that step again and derives it (which is
+takes 20 times as long as the way ahead, and XLA minutes to compile. Here the loop ahead keeps the
+carry of each step, one array; a step back computes that step again and differentiates it (
 checkpointing at every step: memory grows with the carry alone), and is cut into small calls like
 the step itself. It takes 3 times as long as the way ahead.
 """
@@ -15,54 +15,70 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_revolve.numerics.xla import in_one_array, in_small_calls
+from mjx_revolve.numerics.xla import in_fused_calls, in_one_array
+
+
+def differentiate_as(
+    fun: Callable[..., Any], differentiated: Callable[..., Any]
+) -> Callable[..., Any]:
+    """`fun`, but differentiated as another form of the same function.
+
+    XLA takes minutes over the derivative of one long function, and seconds over many short ones.
+    """
+    called = jax.custom_jvp(fun)
+
+    @called.defjvp
+    def _differentiate(primals: Any, tangents: Any) -> Any:
+        return jax.jvp(differentiated, primals, tangents)
+
+    return called
 
 
 def fused_back(
-    step: Callable[[Any, Any, Any], Any], carry: Any, row: Any, push: jax.Array
+    step: Callable[[Any, Any, Any], Any], carry: Any, row: Any, offset: jax.Array
 ) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any, Any], tuple[Any, jax.Array]]]:
-    """The steps ahead and back of a loop whose slopes are wanted.
+    """The steps ahead and back of a loop that is differentiated.
 
     Args:
-        step: (carry, row, push) → carry; element-wise but for sums over what is broadcast. Of the
-            carry's leaves, those `[..., lanes]` have slopes; scalars have none.
-        carry: one like those that it will get.
-        row: likewise; nothing is derived by it.
-        push: likewise, what is added to something within the step so that slopes by it are found.
+        step: (carry, row, offset) → carry; element-wise but for sums over what is broadcast. Of the
+            carry's leaves, those `[..., lanes]` have gradients; scalars have none.
+        carry: an example.
+        row: an example; it has no gradient.
+        offset: an example; added to something within the step, for the gradient by it.
 
     Returns:
-        (ahead, back). Ahead: (carry, row) → carry, without a push. Back: (slope by the carry after
-        the step, carry before it, row) → (slope by that one, slope by the push). Carries are packed
-        by `xla.in_one_array`, slopes like its first result.
+        (ahead, back). Ahead: (carry, row) → carry, without an offset. Back: (gradient by the carry
+        after the step, carry before it, row) → (gradient by that one, gradient by the offset).
+        Carries are packed by `xla.in_one_array`, gradients like its first result.
     """
     pack, unpack = in_one_array(carry)
     wide = [x.ndim > 0 for x in jax.tree.leaves(carry)]
-    none = jnp.zeros_like(push)
+    none = jnp.zeros_like(offset)
 
     def spread(carry: Any) -> list[jax.Array]:
         return [x for x, w in zip(jax.tree.leaves(carry), wide, strict=True) if w]
 
-    def back(slope: Any, carry: Any, row: Any) -> Any:
+    def back(gradient: Any, carry: Any, row: Any) -> Any:
         leaves, tree = jax.tree.flatten(carry)
 
-        def run(values: list[jax.Array], push: jax.Array) -> list[jax.Array]:
+        def run(values: list[jax.Array], offset: jax.Array) -> list[jax.Array]:
             given = iter(values)
             filled = [next(given) if w else x for x, w in zip(leaves, wide, strict=True)]
-            return spread(step(jax.tree.unflatten(tree, filled), row, push))
+            return spread(step(jax.tree.unflatten(tree, filled), row, offset))
 
         _, pull = jax.vjp(run, spread(carry), none)
-        return pull(spread(slope))
+        return pull(spread(gradient))
 
-    ahead = in_small_calls(
+    ahead = in_fused_calls(
         lambda carry, row: step(carry, row, none),
         (carry, row),
         pack,
         lambda packed, row: (unpack(packed), row),
     )
-    stacked = in_small_calls(
+    stacked = in_fused_calls(
         back,
         (carry, carry, row),
         lambda found: (pack(found[0])[0], found[1]),
-        lambda slope, packed, row: (unpack((slope, packed[1])), unpack(packed), row),
+        lambda gradient, packed, row: (unpack((gradient, packed[1])), unpack(packed), row),
     )
     return ahead, stacked

@@ -76,7 +76,7 @@ def _minus(a: Mat, b: Mat) -> Mat:
     return tuple(vsub(x, y) for x, y in zip(a, b, strict=True))
 
 
-class Released(NamedTuple):
+class JointElimination(NamedTuple):
     """What setting a hinge free leaves for the way back."""
 
     row_a: Vec
@@ -85,19 +85,19 @@ class Released(NamedTuple):
     rest: Scalar
 
 
-def lift_off(
+def eliminate_joint(
     block: Block,
     bias: tuple[Vec, Vec],
     inertia: Scalar,
     torque: Scalar,
     coriolis: tuple[Vec, Vec],
     symmetric: bool,
-) -> tuple[Block, tuple[Vec, Vec], Released]:
+) -> tuple[Block, tuple[Vec, Vec], JointElimination]:
     """Articulated inertia and bias of a hinge's body, the hinge (its z axis) set free.
 
     Args:
         block: of the body and all that it carries.
-        bias: likewise.
+        bias: of the same bodies.
         inertia: that the hinge adds about its axis: armature and implicit terms [kg·m²].
         torque: at the hinge [N·m].
         coriolis: velocity times joint velocity.
@@ -128,7 +128,7 @@ def lift_off(
         vadd(vadd(bias[0], carried[0]), vscale(pushed, column_a)),
         vadd(vadd(bias[1], carried[1]), vscale(pushed, column_l)),
     )
-    return left, bias, Released(row_a, row_l, inverse, rest)
+    return left, bias, JointElimination(row_a, row_l, inverse, rest)
 
 
 def solve_root(block: Block, bias: tuple[Vec, Vec], symmetric: bool) -> tuple[Vec, Vec]:

@@ -30,26 +30,39 @@ from mjx_revolve.numerics.spatial import (
 )
 
 
-class Motion(NamedTuple):
-    """Where the bodies of a level are and how they move, `[nbody, lanes]` each.
+class BodyMotion(NamedTuple):
+    """Pose and velocity of the bodies of a level, `[nbody, lanes]` each.
 
     Attributes:
-        spin: angular velocity, body frame [rad/s].
+        angular_velocity: body frame [rad/s].
         velocity: of the body's origin, body frame [m/s].
-        up: world z in the body frame.
+        z_axis: the world's z axis, body frame.
         height: world z of the origin [m].
-        x_axis: world x in the body frame, where something needs it, else None.
-        y_axis: world y likewise.
-        place: world x and y of the origin [m], likewise.
+        x_axis: the world's x axis, body frame; None where no law needs the horizontal position.
+        y_axis: the world's y axis, body frame, or None.
+        xy: world x and y of the origin [m], or None.
+        midpoint: angular and linear velocity half a step ahead, for momenta that turn with the
+            body; None where no water is carried along.
     """
 
-    spin: Vec
+    angular_velocity: Vec
     velocity: Vec
-    up: Vec
+    z_axis: Vec
     height: Scalar
     x_axis: Any
     y_axis: Any
-    place: Any
+    xy: Any
+    midpoint: Any = None
+
+    @property
+    def midpoint_velocity(self) -> tuple[Vec, Vec]:
+        """Angular and linear velocity with which momenta turn."""
+        return self.midpoint or (self.angular_velocity, self.velocity)
+
+    @property
+    def axes(self) -> tuple[Vec, Vec, Vec]:
+        """The world's three axes, body frame: the rows of the rotation world from body."""
+        return self.x_axis, self.y_axis, self.z_axis
 
 
 class SpatialInertia(NamedTuple):
@@ -99,18 +112,20 @@ def add_block(a: Block, s: Scalar, b: Block) -> Block:
     )
 
 
-def apply_block(a: Block, spin: Vec, velocity: Vec) -> tuple[Vec, Vec]:
+def apply_block(a: Block, angular_velocity: Vec, velocity: Vec) -> tuple[Vec, Vec]:
     """Matrix times a motion, (angular, linear)."""
     return (
-        vadd(matvec(a.angular, spin), matvec(a.across, velocity)),
-        vadd(matvec(a.back, spin), matvec(a.linear, velocity)),
+        vadd(matvec(a.angular, angular_velocity), matvec(a.across, velocity)),
+        vadd(matvec(a.back, angular_velocity), matvec(a.linear, velocity)),
     )
 
 
-def apply_inertia(inertia: SpatialInertia, spin: Vec, velocity: Vec) -> tuple[Vec, Vec]:
+def apply_inertia(inertia: SpatialInertia, angular_velocity: Vec, velocity: Vec) -> tuple[Vec, Vec]:
     """Inertia times a motion: its momentum, (angular, linear)."""
-    angular = vadd(symvec(inertia.angular, spin), matvec(inertia.cross, velocity))
-    linear = vadd(matvec(transpose(inertia.cross), spin), symvec(inertia.linear, velocity))
+    angular = vadd(symvec(inertia.angular, angular_velocity), matvec(inertia.cross, velocity))
+    linear = vadd(
+        matvec(transpose(inertia.cross), angular_velocity), symvec(inertia.linear, velocity)
+    )
     return angular, linear
 
 
@@ -151,9 +166,11 @@ def shift_inertia(linear: Sym, angular: Sym, position: Vec) -> SpatialInertia:
     )
 
 
-def cross_force(spin: Vec, velocity: Vec, angular: Vec, linear: Vec) -> tuple[Vec, Vec]:
+def cross_force(angular_velocity: Vec, velocity: Vec, angular: Vec, linear: Vec) -> tuple[Vec, Vec]:
     """The force cross product (Featherstone's v ×*): rate of change of a momentum seen turning."""
-    return vadd(cross(spin, angular), cross(velocity, linear)), cross(spin, linear)
+    return vadd(cross(angular_velocity, angular), cross(velocity, linear)), cross(
+        angular_velocity, linear
+    )
 
 
 def sum_parts(x: Scalar, n: int) -> Scalar:

@@ -42,7 +42,7 @@ def prepare_process() -> Path | None:
     """Fixes the thread settings and turns on JAX's persistent compilation cache.
 
     Settings that are already in the environment (`OPENBLAS_NUM_THREADS`,
-    `JAX_COMPILATION_CACHE_DIR`) are respected, and so is a cache folder that JAX was already told;
+    `JAX_COMPILATION_CACHE_DIR`) are respected, and so is a cache folder that JAX already has;
     an empty `JAX_COMPILATION_CACHE_DIR` turns the cache off. Imports JAX.
 
     Returns:
@@ -97,11 +97,11 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
 
 
 @contextlib.contextmanager
-def one_compiles(program: str) -> Iterator[None]:
+def compile_lock(program: str) -> Iterator[None]:
     """Lets one process of a host in first, and those that come meanwhile when that one is done.
 
     The others then read from the compilation cache what it compiled; doing it at the same time
-    would take all of them longer. Without a cache nobody waits.
+    would take all of them longer. Without a cache there is no lock.
 
     Args:
         program: a fingerprint of what is compiled.
@@ -260,7 +260,7 @@ def source_hash() -> str:
 
 
 def describe_process() -> dict[str, Any]:
-    """What the bits of a run depend on, and who ran it: for `run.json`. Imports JAX.
+    """What the bits of a run depend on, and its command: for `run.json`. Imports JAX.
 
     Returns:
         Versions, git revision, arguments, platform, CPU, device and thread settings.

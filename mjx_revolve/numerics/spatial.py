@@ -179,7 +179,7 @@ def rotate_sym(r: Mat, s: Sym) -> Sym:
 def safe_norm(a: Vec) -> Scalar:
     """|a|, with gradient 0 instead of NaN where a = 0."""
     square = dot(a, a)
-    # The inner `where` keeps the square root's infinite slope out of the backward pass.
+    # The inner `where` keeps the square root's infinite gradient out of the backward pass.
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
@@ -238,7 +238,7 @@ def quat_mul(p: tuple[Scalar, ...], q: tuple[Scalar, ...]) -> tuple[Scalar, ...]
     )
 
 
-def quat_to_rows(q: tuple[Scalar, Scalar, Scalar, Scalar]) -> Mat:
+def quat_to_mat(q: tuple[Scalar, ...]) -> Mat:
     """Rotation matrix (world from body) of a unit quaternion (w, x, y, z)."""
     a, b, c, d = q
     return (
@@ -246,3 +246,31 @@ def quat_to_rows(q: tuple[Scalar, Scalar, Scalar, Scalar]) -> Mat:
         (2 * (b * c + a * d), a * a - b * b + c * c - d * d, 2 * (c * d - a * b)),
         (2 * (b * d - a * c), 2 * (c * d + a * b), a * a - b * b - c * c + d * d),
     )
+
+
+def quat_to_matrix(quat: np.ndarray) -> np.ndarray:
+    """`[..., 4]` unit quaternions (w, x, y, z) to `[..., 3, 3]` rotation matrices."""
+    rows = quat_to_mat(tuple(np.moveaxis(np.asarray(quat, np.float64), -1, 0)))
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
+    """`[..., 3, 3]` rotation matrices to `[..., 4]` unit quaternions (w, x, y, z).
+
+    As MuJoCo's `mju_mat2Quat`: w is positive where the trace is, else the largest of the others.
+    """
+    m = np.asarray(matrix, np.float64)
+    x, y, z = (m[..., i, i] for i in range(3))
+    # 4 q qᵀ, of which every row is the quaternion but for its length.
+    products = np.empty((*m.shape[:-2], 4, 4))
+    diagonal = (1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z)
+    for k, value in enumerate(diagonal):
+        products[..., k, k] = value
+    for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0)), 1):
+        products[..., 0, k] = products[..., k, 0] = m[..., i, j] - m[..., j, i]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        products[..., i + 1, j + 1] = products[..., j + 1, i + 1] = m[..., i, j] + m[..., j, i]
+    largest = np.argmax(np.stack((x, y, z), -1), -1) + 1
+    row = np.where(x + y + z > 0, 0, largest)
+    quat = np.take_along_axis(products, row[..., None, None], -2)[..., 0, :]
+    return quat / np.linalg.norm(quat, axis=-1, keepdims=True)

@@ -1,28 +1,29 @@
-"""What it takes to make XLA:CPU compile a population step into one fast loop. Nothing else knows.
+"""Compiles element-wise steps of a population into few fast loops on XLA:CPU.
 
-Two things stand in the way, and two internal annotations of XLA remove them (jaxlib is pinned for
-their sake; tests/test_xla.py notices if they lose their effect; results do not depend on them):
+Two internal annotations of XLA do it (jaxlib is pinned for their sake; `tests/numerics/test_xla.py`
+notices if they lose their effect). Results do not depend on them, but for the last bits.
 
 1. XLA:CPU recomputes a shared value inside every fusion that uses it, and a tree recursion is
-   nothing but shared values: the work multiplies with depth. `optimization_barrier` does not help,
-   as the CPU compiler drops it before fusion. A call that is never inlined does: `share_once`.
-2. Each kernel that the loop runs costs about 300 ns to dispatch, more than the arithmetic on a
-   chunk of 64 individuals. A call marked `xla_cpu_small_call` is compiled into one function:
-   `small_call`. Inside it there is no scatter and no reduction: the population step writes sums
-   out. Compiling such a function takes time that grows with the square of its length: so long
-   steps are cut into several functions. The loop over time stays outside (`fused_scan`): inside, it
-   would be a tenth faster, but LLVM takes twice as long, as it forgets all that it knows of it with
-   every inner loop that it turns. XLA:CPU aborts ("All or none of the slices should have an
-   explicit index") over such a function that has a parameter which nothing in it uses, as a loop
-   of unknown length leaves them: so what no result needs is left out.
+   nothing but shared values: the work multiplies with depth. An optimization barrier does not help,
+   as the CPU compiler drops it before fusion. A call that is never inlined does: `materialize`.
+2. Each kernel that a loop runs costs about 300 ns to dispatch, more than the arithmetic on a chunk
+   of 64 individuals. A call marked `xla_cpu_small_call` is compiled into one function. Inside it
+   there is no scatter and no reduction: the population step writes sums out. Compiling such a
+   function takes time that grows with the square of its length: so long steps are cut into several
+   functions. The loop over time stays outside: inside, it would be a tenth faster, but LLVM takes
+   twice as long. XLA:CPU aborts ("All or none of the slices should have an explicit index") over
+   such a function that has a parameter which nothing in it uses, as a loop of unknown length leaves
+   them: so what no result needs is left out.
 
-Both are plain identities to JAX: jit, vmap and grad go through them. On other back ends they are
-left out.
+Other layers use `fuse_step`, `fuse` and `materialize`, all identities to JAX: jit, vmap and grad go
+through them. They do nothing on other back ends, nor where the environment variable
+`MJX_REVOLVE_FUSE` is 0: the same results, slower, which tells an error of XLA's from one of ours.
 """
 
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -31,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
+from jax.interpreters import ad, batching, mlir
 
 # Individuals stepped together on a CPU: enough to fill vector registers, few enough that the loop's
 # live values stay in the first-level cache (measured: 64 to 256 alike, 16 to 32 slower).
@@ -62,18 +64,39 @@ _LOOPS = {"cond", "scan", "while"}
 
 
 def on_cpu() -> bool:
-    """Whether JAX's default back end is the CPU, where the annotations mean something."""
+    """Whether JAX's default back end is the CPU."""
     return jax.default_backend() == "cpu"
 
 
-def compiler_options() -> dict[str, Any] | None:
-    """Options for the outermost `jax.jit` of a rollout; 30 % on processors with AVX-512."""
-    return {"xla_cpu_prefer_vector_width": 512} if on_cpu() else None
+def fuses() -> bool:
+    """Whether programs are traced with the annotations; `MJX_REVOLVE_FUSE=0` turns them off."""
+    return on_cpu() and os.environ.get("MJX_REVOLVE_FUSE") != "0"
 
 
-def hasty_options() -> dict[str, Any] | None:
-    """Those of a program that runs once: compiled in two thirds of the time, six times as slow."""
-    return {"xla_backend_optimization_level": 0} if on_cpu() else None
+def compiler_options(fast: bool = False) -> dict[str, Any] | None:
+    """Options for the outermost `jax.jit` of a rollout.
+
+    Args:
+        fast: for a program that runs once: compiled in two thirds of the time, six times as slow.
+            Else vectors of 512 bits: 30 % faster on processors with AVX-512.
+    """
+    if not on_cpu():
+        return None
+    return {"xla_backend_optimization_level": 0} if fast else {"xla_cpu_prefer_vector_width": 512}
+
+
+def jit(fun: Callable[..., Any], fast: bool = False, **settings: Any) -> Any:
+    """`jax.jit` with `compiler_options`, which only the outermost jit may have."""
+    return jax.jit(fun, compiler_options=compiler_options(fast), **settings)
+
+
+def is_traced(*args: Any) -> bool:
+    """Whether arguments are part of a larger program, which has compiler options of its own."""
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(args))
+
+
+materialize_p = core.Primitive("materialize")
+"""The identity, computed by a function of its own on a CPU; `Graph` finds its operands by it."""
 
 
 @jax.jit
@@ -86,36 +109,41 @@ def _never_inlined(x: jax.Array) -> jax.Array:
     return set_xla_metadata(_same(x), inlineable="false")
 
 
-def share_once(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Makes XLA compute each value that `fun` uses more than once exactly once.
+materialize_p.def_impl(lambda x: x)
+materialize_p.def_abstract_eval(lambda x: x)
+batching.defvectorized(materialize_p)
+ad.deflinear2(materialize_p, lambda cotangent, _: (cotangent,))
+mlir.register_lowering(materialize_p, lambda _, x: [x])
+mlir.register_lowering(
+    materialize_p, mlir.lower_fun(_never_inlined, False), platform="cpu", cacheable=False
+)
+
+
+def materialize(x: jax.Array) -> jax.Array:
+    """`x`, computed by itself and once, however many operations use it.
+
+    For what is broadcast, too: within a loop over the wider array, XLA:CPU would compute it for
+    each element again.
+    """
+    return materialize_p.bind(x) if fuses() else x
+
+
+def fuse(fun: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:
+    """A function whose shared values XLA computes once.
 
     Args:
-        fun: a function of pytrees of arrays.
+        fun: a function of pytrees of arrays; element-wise but for loops, unless `inline`.
+        inline: whether it becomes part of what calls it, instead of one function of its own.
 
     Returns:
-        The same function, its multiply-used floating-point values behind calls that are not
-        inlined.
+        The same function.
     """
-    return lambda *args: Graph(fun, args)(*args) if on_cpu() else fun(*args)
+    shared = lambda *args: Graph(fun, args)(*args) if fuses() else fun(*args)  # noqa: E731
+    return shared if inline else fuse_call(shared)
 
 
-def store(x: jax.Array) -> jax.Array:
-    """Makes XLA:CPU compute a value by itself, once, whoever uses it."""
-    return _never_inlined(x) if on_cpu() else x
-
-
-@jax.jit
-def keep(x: jax.Array) -> jax.Array:
-    """The same; inside a `Graph` it says that `x`, though used once, is to be stored.
-
-    For what is broadcast: within a loop over the wider array, XLA:CPU would compute it for each
-    element again.
-    """
-    return x
-
-
-def small_call(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Makes XLA:CPU compile `fun`, element-wise but for loops, as one function."""
+def fuse_call(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """A function, element-wise but for loops, that XLA:CPU compiles as one."""
 
     def called(*args: Any) -> Any:
         return jax.tree.map(
@@ -123,28 +151,7 @@ def small_call(fun: Callable[..., Any]) -> Callable[..., Any]:
             jax.jit(fun)(*args),
         )
 
-    return called if on_cpu() else fun
-
-
-def derived_by(fun: Callable[..., Any], derived: Callable[..., Any]) -> Callable[..., Any]:
-    """`fun`, but differentiated as `derived`.
-
-    XLA takes minutes over the derivative of one long function, and seconds over many short ones.
-
-    Args:
-        fun: a function of pytrees of arrays.
-        derived: the same function as it is to be differentiated.
-
-    Returns:
-        The same function.
-    """
-    called = jax.custom_jvp(fun)
-
-    @called.defjvp
-    def _derive(primals: Any, tangents: Any) -> Any:
-        return jax.jvp(derived, primals, tangents)
-
-    return called
+    return called if fuses() else fun
 
 
 class _Operation(NamedTuple):
@@ -166,16 +173,8 @@ class Graph:
 
     def __init__(self, fun: Callable[..., Any], examples: Any) -> None:
         """Traces `fun` (of pytrees of arrays) on arguments like `examples`."""
-        leaves, tree = jax.tree.flatten(examples)
-        structure: list[Any] = []
-
-        def flat(*xs: Any) -> list[Any]:
-            out, out_tree = jax.tree.flatten(fun(*jax.tree.unflatten(tree, xs)))
-            structure.append(out_tree)
-            return out
-
-        closed = jax.make_jaxpr(flat)(*leaves)
-        self._structure = structure[0]
+        closed, shapes = jax.make_jaxpr(fun, return_shape=True)(*examples)
+        self._structure = jax.tree.structure(shapes)
         self._operations: list[_Operation] = []
         self._constants: dict[int, Any] = {}
         self._kept: set[int] = set()
@@ -194,14 +193,14 @@ class Graph:
         return self._finish(values)
 
     def in_pieces(self, size: int, pack: Callable[[Any], Any], unpack: Callable[..., Any]) -> Any:
-        """The function cut into several, each compiled as one: `small_call`.
+        """The function cut into several, each compiled as one by `fuse_call`.
 
         XLA's time for a function grows faster than its length, and several compile at once.
 
         Args:
             size: of a piece, in stored values.
-            pack: what becomes of the results within the last piece.
-            unpack: the function's arguments from what is given instead, within each piece.
+            pack: applied to the results, within the last piece.
+            unpack: makes the function's arguments, within each piece.
 
         Returns:
             A function of what `unpack` takes that returns what `pack` gives.
@@ -234,7 +233,7 @@ class Graph:
                         return pack(self._finish(local))
                     return [local[v] for v in outputs]
 
-                found = small_call(compute)(args, *(values[v] for v in inputs))
+                found = fuse_call(compute)(args, *(values[v] for v in inputs))
                 if last:
                     return found
                 values.update(zip(outputs, found, strict=True))
@@ -275,8 +274,9 @@ class Graph:
                 # jnp.clip, jnp.where and their like.
                 inside = dict(zip(inner.jaxpr.invars, inputs, strict=True))
                 outputs = self._inline(inner.jaxpr, inner.consts, inside)
-                if eqn.params["name"] == "keep":
-                    self._kept.update(v for v in outputs if isinstance(v, int))
+            elif eqn.primitive is materialize_p:
+                outputs = inputs
+                self._kept.update(v for v in outputs if isinstance(v, int))
             else:
                 outputs = [self._number() for _ in eqn.outvars]
                 self._operations.append(_Operation(eqn, inputs, outputs))
@@ -294,7 +294,7 @@ class Graph:
         return kept[::-1]
 
     def _choose(self) -> dict[int, bool]:
-        """Values to be stored, in order; False: a loop's, stored without our doing."""
+        """Values to be stored, in order; False: a loop's, which XLA stores anyway."""
         uses: dict[int, int] = {}
         for inputs in [*(op.inputs for op in self._operations), self._results]:
             for v in {v for v in inputs if isinstance(v, int)}:
@@ -327,7 +327,7 @@ class Graph:
             out = op.equation.primitive.bind(*inputs, **op.equation.params)
             out = out if op.equation.primitive.multiple_results else [out]
             for v, x in zip(op.outputs, out, strict=True):
-                values[v] = _never_inlined(x) if self._stored.get(v) else x
+                values[v] = materialize_p.bind(x) if self._stored.get(v) else x
 
     def _finish(self, values: dict[int, Any]) -> Any:
         return jax.tree.unflatten(self._structure, [_value(values, v) for v in self._results])
@@ -340,8 +340,8 @@ def _value(values: dict[int, Any], v: Any) -> Any:
     return np.asarray(v.val, v.aval.dtype)
 
 
-def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any) -> Any:
-    """How to repeat a step of a chunk of a population fastest.
+def fuse_step(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any) -> Any:
+    """The fastest form of a loop's step over a chunk of a population.
 
     A step becomes one function, or several if it is long, which a loop of XLA's own calls. The
     carry travels as one array, because every array that a loop carries costs as much as a call.
@@ -349,19 +349,18 @@ def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any
     Args:
         step: (carry, row) → (carry, output); element-wise. The carry's leaves are `[..., lanes]`
             of one floating-point type, but for scalars.
-        carry: one like those that it will get.
-        row: likewise.
+        carry: an example.
+        row: an example.
 
     Returns:
         (step, pack, unpack): the step on packed carries, and functions between carries and packed
         ones.
     """
-    if not on_cpu():
+    if not fuses():
         return step, lambda x: x, lambda x: x
     pack, unpack = in_one_array(carry)
-    fused = in_small_calls(
-        step,
-        (carry, row),
+    fused = Graph(step, (carry, row)).in_pieces(
+        _PIECE,
         lambda result: (pack(result[0]), result[1]),
         lambda packed, row: (unpack(packed), row),
     )
@@ -369,7 +368,7 @@ def fused_scan(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any
 
 
 def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """How to pack what a loop carries.
+    """Functions that pack what a loop carries.
 
     Args:
         carry: an example; its leaves are `[..., lanes]` of one floating-point type, but for
@@ -400,21 +399,21 @@ def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]
     return pack, unpack
 
 
-def in_small_calls(
+def in_fused_calls(
     fun: Callable[..., Any], examples: Any, pack: Callable[[Any], Any], unpack: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """A function of packed arguments that packs its results, as few calls of compiled pieces.
+    """A function of packed arguments and results, as few calls of compiled pieces.
 
     Args:
         fun: element-wise.
-        examples: arguments like those that it will get.
-        pack: what becomes of its results.
-        unpack: its arguments from what is given instead.
+        examples: of its arguments.
+        pack: applied to its results.
+        unpack: makes its arguments.
 
     Returns:
         A function of what `unpack` takes that returns what `pack` gives.
     """
-    if not on_cpu():
+    if not fuses():
         return lambda *args: pack(fun(*unpack(*args)))
     found: Callable[..., Any] = Graph(fun, examples).in_pieces(_PIECE, pack, unpack)
     return found

@@ -1,4 +1,4 @@
-"""What became of everybody in a colony: from when to when they lived, and of whom they come."""
+"""Lives of the robots of a colony: birth, death and descent."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
-from mjx_revolve.episodes.lives import Event, read_events, read_lives
+from mjx_revolve.episodes.individual_log import Event, read_events, read_individuals
 
 
 @dataclass(frozen=True, eq=False)
-class Span:
-    """From birth to death.
+class Lifespan:
+    """A robot's life, from birth to death.
 
     Attributes:
-        number: whose.
-        parents: theirs; the first gave the body.
+        number: of the robot.
+        parents: their numbers; the first gave the body.
         founder: the first of the line that gave the body.
         born: when [s].
-        end: of its death, or of what is known where it lives on [s].
-        cause: of its death; "" where it lives on.
-        score: its last fitness; NaN where that is not known.
+        end: time of death; of a living robot, end of the record [s].
+        cause: of death; "" of a living robot.
+        score: last fitness; NaN where it is not known.
     """
 
     number: int
@@ -37,21 +37,21 @@ class Span:
 
     @property
     def age(self) -> float:
-        """How old it got, or is [s]."""
+        """Age at death, or so far [s]."""
         return self.end - self.born
 
 
 @dataclass(frozen=True, eq=False)
-class History:
-    """A colony's life.
+class ColonyHistory:
+    """The history of a colony.
 
     Attributes:
-        spans: of all who were ever born, by number, in the order of birth.
+        spans: lives by number, in the order of birth.
         events: in the order of time.
-        end: until when it is known [s].
+        end: of the record [s].
     """
 
-    spans: dict[int, Span]
+    spans: dict[int, Lifespan]
     events: list[Event]
     end: float
 
@@ -61,7 +61,7 @@ class History:
 
     @cached_property
     def children(self) -> dict[int, list[int]]:
-        """Numbers of those to whom somebody gave the body, in the order of birth."""
+        """Numbers of the children that have each robot's body, in the order of birth."""
         found: dict[int, list[int]] = {number: [] for number in self.spans}
         for span in self.spans.values():
             if span.parents and span.parents[0] in found:
@@ -70,21 +70,18 @@ class History:
 
     @cached_property
     def families(self) -> list[int]:
-        """Founders, whose line lived longest (in robots times seconds) first."""
+        """Founders, the longest-lived line (robots times seconds) first."""
         lived: dict[int, float] = defaultdict(float)
         for span in self.spans.values():
             lived[span.founder] += span.age
         return sorted(lived, key=lambda founder: (-lived[founder], founder))
 
     def count_living(self, times: np.ndarray, founder: int | None = None) -> np.ndarray:
-        """How many lived at some times.
+        """Numbers of living robots `[T]`; births count at their time, deaths do not.
 
         Args:
             times: `[T]` [s].
             founder: of one family only; None: of all.
-
-        Returns:
-            `[T]`; who dies at a moment does not count in it, who is born does.
         """
         these = [s for s in self.spans.values() if founder is None or s.founder == founder]
         born = np.sort([span.born for span in these])
@@ -92,7 +89,7 @@ class History:
         return np.searchsorted(born, times, "right") - np.searchsorted(gone, times, "right")
 
     def line(self, number: int) -> list[int]:
-        """Somebody and those whose body it has, in the end: the oldest first."""
+        """A robot and the ancestors that gave its body, the oldest first."""
         found: list[int] = []
         while number in self.spans:
             found.append(number)
@@ -103,42 +100,42 @@ class History:
         return found[::-1]
 
 
-def read_history(folder: Path, until: float = 0.0) -> tuple[History, list[str]]:
-    """Reads what became of everybody in a colony.
+def read_history(folder: Path, until: float = 0.0) -> tuple[ColonyHistory, list[str]]:
+    """Reads the history of a colony.
 
     Args:
         folder: the run folder.
-        until: until when it has lived, where more is known than its events tell [s].
+        until: time that it has lived at least, where its events end earlier [s].
 
     Returns:
-        The history, and a line about each thing that is wrong. Who died without having been born,
-        as a log says that lacks lines, is left out.
+        The history, and a line about each thing that is wrong. Deaths without a birth, of a log
+        that lacks lines, are left out.
     """
     events, problems = read_events(folder)
-    lives, more = read_lives(folder)
+    lives, more = read_individuals(folder)
     end = max([until, *(event.time for event in events)])
     if lives and not events:
-        problems.append("events.jsonl: nobody knows when and where who lived")
-    return put_together(events, {n: life.score for n, life in lives.items()}, end), problems + more
+        problems.append("events.jsonl is missing: times and places of lives are not known")
+    return make_history(events, {n: life.score for n, life in lives.items()}, end), problems + more
 
 
-def put_together(events: list[Event], scores: dict[int, float], end: float) -> History:
-    """A history from what happened.
+def make_history(events: list[Event], scores: dict[int, float], end: float) -> ColonyHistory:
+    """Makes a history of events.
 
     Args:
         events: in the order of time.
         scores: of individuals, as far as they are known.
-        end: until when it is known [s].
+        end: of the record [s].
 
     Returns:
         The history.
     """
     deaths = {event.number: event for event in events if event.kind == "death"}
-    spans: dict[int, Span] = {}
+    spans: dict[int, Lifespan] = {}
     for event in sorted((e for e in events if e.kind == "birth"), key=lambda e: e.number):
         number, death = event.number, deaths.get(event.number)
         mother = spans.get(event.parents[0]) if event.parents else None
-        spans[number] = Span(
+        spans[number] = Lifespan(
             number=number,
             parents=event.parents,
             founder=number if mother is None else mother.founder,
@@ -147,4 +144,4 @@ def put_together(events: list[Event], scores: dict[int, float], end: float) -> H
             cause="" if death is None else death.cause,
             score=scores.get(number, math.nan),
         )
-    return History(spans, events, end)
+    return ColonyHistory(spans, events, end)

@@ -1,7 +1,8 @@
-"""Everybody who lived in a colony: their lives as lines, their families, and where they met."""
+"""Pictures of a colony: its population over time, its robots' lives, families and places."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -11,26 +12,142 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mjx_revolve.episodes.colony_config import ColonyConfig
-from mjx_revolve.view.colony_curves import LABEL, death_looks, scale_time
-from mjx_revolve.view.colony_history import History, Span
-from mjx_revolve.view.plots import COLORS, WIDE, dress, head, legend_above, new_figure
+from mjx_revolve.view.colony_history import ColonyHistory, Lifespan
+from mjx_revolve.view.convergence import COLONY_LABEL, scale_time
+from mjx_revolve.view.plots import (
+    BLUE,
+    COLORS,
+    GREY,
+    INK,
+    WIDE,
+    color_bar,
+    in_style,
+    legend_above,
+    new_figure,
+)
 
-# The largest families have colours of their own; of one palette, so that neighbours differ.
-_FAMILIES = (
-    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7b5ea7", "#8c6d31",
-)  # fmt: skip
-_REST, _INK, _GREY = "#c3ccd3", "#222222", "#6b7680"
-_CHARGER, _WATER = "#e69f00", "#f2f7fa"
-# Lines of lives: width where there is room, and the least [points].
-_THICK, _THIN = 3.0, 0.55
-_SHADES = "viridis"
+_CAUSES = {
+    "age": ("#8894a0", "died of age"),
+    "energy": ("#e69f00", "died of an empty battery"),
+    "lost": ("#cc79a7", "lost"),
+    "failed": ("#d55e00", "failed"),
+}
+_OTHER_CAUSE = ("#3b3b3b", "died of something else")  # that this version does not know
+_CHILD, _FOUNDER = "#4a97c9", "#b9d6e8"  # births with and without parents
+_BINS = 60  # of births and deaths along the time axis, at most
+# The largest families have colours of their own.
+_FAMILIES = (*COLORS[:6], "#7b5ea7", "#8c6d31")
+_REST, _CHARGER, _WATER = "#c3ccd3", "#e69f00", "#f2f7fa"
+_THIN, _THICK = 0.55, 3.0  # of the lines of lives [points]
 
 
-def plot_lives(history: History, title: str = "") -> Figure:
-    """Draws the lives of all who were born in a colony, one line each.
+def cause_styles(causes: Sequence[str] | Mapping[str, int]) -> dict[str, tuple[str, str]]:
+    """Colours and words of causes of death, the known ones first; "" is no cause."""
+    names = [*(name for name in _CAUSES if name in causes), *sorted(set(causes) - {*_CAUSES, ""})]
+    return {name: _CAUSES.get(name, _OTHER_CAUSE) for name in names}
+
+
+def plot_history(
+    history: ColonyHistory,
+    colony: ColonyConfig | None,
+    room: int | None = None,
+    champion: int | None = None,
+    title: str = "",
+) -> dict[str, Figure]:
+    """All pictures of a colony by name; see the functions of this module."""
+    figures = {
+        "population": plot_population(history, room, title),
+        "lives": plot_lives(history, title),
+        "families": plot_families(history, champion, title),
+    }
+    return figures if colony is None else figures | {"arena": plot_arena(history, colony, title)}
+
+
+# --- population -----------------------------------------------------------------------------------
+
+
+@in_style
+def plot_population(history: ColonyHistory, room: int | None = None, title: str = "") -> Figure:
+    """Draws how many robots lived in a colony, and births and deaths over time.
+
+    Args:
+        history: of the colony.
+        room: the most robots that may live at a time; None: not known.
+        title: a line above the picture.
+
+    Returns:
+        The figure: the living over time; below, births upwards and deaths by cause downwards.
+    """
+    scale, words = scale_time(history.end)
+    figure = new_figure(WIDE, 5.6, title)
+    top, low = figure.subplots(2, 1, sharex=True, height_ratios=(1.15, 1.0))
+    moments = [event.time for event in history.events if event.kind != "mating"]
+    times = np.unique([0.0, *moments, history.end])
+    living = history.count_living(times)
+    top.fill_between(times / scale, living, step="post", color=BLUE, alpha=0.2, linewidth=0)
+    top.step(times / scale, living, where="post", color=BLUE, label="alive")
+    if room is not None:
+        top.axhline(room, color=GREY, linewidth=1.0, linestyle=(0, (5, 3)),
+                    label=f"room for {room}")  # fmt: skip
+    top.set(ylabel="robots", ylim=(0, 1.08 * max([*living, room or 1])))
+    top.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
+    edges = _bins(history.end)
+    _draw_turnover(low, history, edges, scale)
+    low.set(xlabel=words, ylabel=f"robots in each {edges[1] - edges[0]:g} s")
+    for axes in (top, low):
+        legend_above(axes)
+    _limit_time(top, history, scale)
+    return figure
+
+
+def _bins(end: float) -> np.ndarray:
+    """Edges of round, equal bins from 0 to `end` [s]."""
+    least = max(end, 1.0) / _BINS
+    power = 10.0 ** math.floor(math.log10(least))
+    width = next(k * power for k in (1, 2, 3, 6, 10) if k * power >= least * (1 - 1e-9))
+    return width * np.arange(max(1, math.ceil(end / width + 1e-9)) + 1)
+
+
+def _draw_turnover(axes: Axes, history: ColonyHistory, edges: np.ndarray, scale: float) -> None:
+    """Births upwards, deaths downwards, stacked by kind."""
+    births, deaths = history.of_kind("birth"), history.of_kind("death")
+    up = [
+        ([e.time for e in births if e.parents], _CHILD, "children born"),
+        ([e.time for e in births if not e.parents], _FOUNDER, "strangers born"),
+    ]
+    down = [
+        ([e.time for e in deaths if e.cause == cause], color, words)
+        for cause, (color, words) in cause_styles([e.cause for e in deaths]).items()
+    ]
+    middle, width = (edges[:-1] + edges[1:]) / 2 / scale, (edges[1] - edges[0]) / scale
+    for sign, stack in ((1, up), (-1, down)):
+        base = np.zeros(len(middle))
+        for moments, color, words in stack:
+            if moments:
+                count = sign * np.histogram(moments, edges)[0]
+                axes.bar(middle, count, 0.86 * width, base, color=color, label=words)
+                base = base + count
+    axes.axhline(0, color="#333333", linewidth=0.8)
+    low, high = axes.dataLim.intervaly
+    axes.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low) or 1.0)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=7))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{abs(value):.0f}"))
+
+
+def _limit_time(axes: Axes, history: ColonyHistory, scale: float) -> None:
+    end = max(history.end, 1e-9) / scale
+    axes.set_xlim(-0.012 * end, 1.012 * end)
+
+
+# --- lives ----------------------------------------------------------------------------------------
+
+
+@in_style
+def plot_lives(history: ColonyHistory, title: str = "") -> Figure:
+    """Draws the lives of all robots of a colony, one line each.
 
     Args:
         history: of the colony.
@@ -39,210 +156,178 @@ def plot_lives(history: History, title: str = "") -> Figure:
     Returns:
         The figure: on the left a line from birth to death for each robot, the first one lowest,
         coloured by its last fitness, a dot where it died of something else than age; on the right
-        how old they got.
+        their ages at death.
     """
     scale, words = scale_time(history.end)
     spans = list(history.spans.values())
-    figure = new_figure(WIDE, 6.4)
+    figure = new_figure(WIDE, 6.4, title)
     left, right = figure.subplots(1, 2, width_ratios=(3.4, 1.0))
-    scores = np.array([span.score for span in spans])
-    known = scores[np.isfinite(scores)]
-    # A few who are far above all others would leave no colours for the rest.
-    shades = Normalize(0.0, float(np.quantile(known, 0.98)) if known.size else 1.0, clip=True)
-    width = float(np.clip(260.0 / max(len(spans), 1), _THIN, _THICK))
-    rows = np.arange(len(spans))
-    lines = _lines(spans, rows, scale, width)
-    # Grey: not known, as of the living where a run was stopped.
-    lines.set(cmap=colormaps[_SHADES].with_extremes(bad=_REST), norm=shades)
-    lines.set_array(np.ma.masked_invalid(scores))
+    scores = np.ma.masked_invalid([span.score for span in spans])
+    known = scores.compressed()
+    lines = _lifelines(spans, scale, 260.0)
+    # Grey: not known, as of the living where a run was stopped. A few scores far above all others
+    # would leave no colours for the rest.
+    most = float(np.quantile(known, 0.98)) if known.size else 1.0
+    lines.set(cmap=colormaps["viridis"].with_extremes(bad=_REST), norm=Normalize(0.0, most, True))
+    lines.set_array(scores)
     left.add_collection(lines)
-    _mark_deaths(left, spans, rows, scale)
-    left.set_ylim(-0.02 * len(spans) - 1, 1.02 * len(spans))
-    left.set_xlim(-0.01 * history.end / scale, 1.01 * max(history.end, 1e-9) / scale)
+    styles = cause_styles([span.cause for span in spans if span.cause != "age"])
+    for cause, (color, label) in styles.items():
+        places = [(s.end / scale, k) for k, s in enumerate(spans) if s.cause == cause]
+        left.plot(*np.transpose(places), "o", color=color, markersize=3.2, markeredgewidth=0,
+                  label=label, zorder=3)  # fmt: skip
+    if styles:
+        left.legend(loc="upper left", bbox_to_anchor=(0.02, 0.82), borderaxespad=0.2,
+                    handletextpad=0.2)  # fmt: skip
     left.set(xlabel=words, ylabel="robots, in the order of birth")
+    left.set_ylim(-0.02 * len(spans) - 1, 1.02 * len(spans))
+    _limit_time(left, history, scale)
     left.yaxis.set_major_locator(MaxNLocator(integer=True))
-    dress(left)
     left.grid(False, axis="y")
-    # Nobody is drawn in the corner of those who are born late and live early.
+    # The upper left corner is empty: late births are at the right.
     inset = left.inset_axes((0.03, 0.93, 0.42, 0.022))
-    bar = figure.colorbar(lines, cax=inset, orientation="horizontal", extend="max")
-    bar.set_label(f"last {LABEL}", fontsize=9)
-    bar.outline.set_visible(False)
-    inset.tick_params(labelsize=8.5, colors="#333333")
+    color_bar(figure, lines, f"last {COLONY_LABEL}", cax=inset, orientation="horizontal",
+              extend="max")  # fmt: skip
     _draw_ages(right, spans)
-    if title:
-        figure.suptitle(title, x=0.012, ha="left", fontsize=11, color=_INK, parse_math=False)
     return figure
 
 
-def _lines(spans: Sequence[Span], rows: np.ndarray, scale: float, width: float) -> LineCollection:
-    """A line for each life, in its row."""
-    ends = np.array([[span.born, span.end] for span in spans]).reshape(-1, 2) / scale
-    points = np.stack([ends, np.repeat(rows[:, None], 2, 1)], -1)
-    return LineCollection(list(points), linewidths=width, capstyle="butt")
+def _lifelines(spans: Sequence[Lifespan], scale: float, room: float) -> LineCollection:
+    """A line for each life, the k-th at height k; as thick as `room` [points] allows."""
+    lines = [[(span.born / scale, k), (span.end / scale, k)] for k, span in enumerate(spans)]
+    width = float(np.clip(room / max(len(spans), 1), _THIN, _THICK))
+    return LineCollection(lines, linewidths=width, capstyle="butt")
 
 
-def _mark_deaths(axes: Axes, spans: Sequence[Span], rows: np.ndarray, scale: float) -> None:
-    """Dots where somebody died of something else than age."""
-    causes = {span.cause: 1 for span in spans if span.cause not in ("", "age")}
-    for cause, (color, words) in death_looks(causes).items():
-        these = [k for k, span in enumerate(spans) if span.cause == cause]
-        axes.plot([spans[k].end / scale for k in these], rows[these], "o", color=color,
-                  markersize=3.2, markeredgewidth=0, label=words, zorder=3)  # fmt: skip
-    if causes:
-        axes.legend(loc="upper left", bbox_to_anchor=(0.02, 0.82), fontsize=8.5, frameon=False,
-                    borderaxespad=0.2, handletextpad=0.2)  # fmt: skip
-
-
-def _draw_ages(axes: Axes, spans: Sequence[Span]) -> None:
-    """How old who has died got, by cause; and who lives, so far."""
-    scale, words = scale_time(max((span.age for span in spans), default=0.0))
-    edges = np.linspace(0, max((span.age for span in spans), default=1.0) / scale or 1.0, 19)
-    causes = {span.cause: 1 for span in spans if span.cause}
-    looks = {**death_looks(causes), "": (COLORS[0], "alive in the end")}
-    ages = {name: [s.age / scale for s in spans if s.cause == name] for name in looks}
-    shown = [name for name in looks if ages[name]]
+def _draw_ages(axes: Axes, spans: Sequence[Lifespan]) -> None:
+    """Ages at death by cause, and of the living so far."""
+    oldest = max((span.age for span in spans), default=0.0)
+    scale, words = scale_time(oldest)
+    edges = np.linspace(0, oldest / scale or 1.0, 19)
+    styles = {**cause_styles([span.cause for span in spans]), "": (BLUE, "alive in the end")}
+    ages = {name: [s.age / scale for s in spans if s.cause == name] for name in styles}
+    shown = [name for name in styles if ages[name]]
     if shown:
         axes.hist([ages[name] for name in shown], bins=edges.tolist(), stacked=True, rwidth=0.88,
-                  orientation="horizontal", color=[looks[name][0] for name in shown],
-                  label=[looks[name][1] for name in shown])  # fmt: skip
-        axes.legend(loc="lower left", bbox_to_anchor=(-0.05, 1.0), fontsize=8.5, frameon=False,
-                    borderaxespad=0.1, handlelength=1.1)  # fmt: skip
-    axes.set(xlabel="robots", ylabel=words.replace("time", "age"))
-    axes.set_ylim(0, edges[-1])
+                  orientation="horizontal", color=[styles[name][0] for name in shown],
+                  label=[styles[name][1] for name in shown])  # fmt: skip
+        axes.legend(loc="lower left", bbox_to_anchor=(-0.05, 1.0), borderaxespad=0.1,
+                    handlelength=1.1)  # fmt: skip
+    axes.set(xlabel="robots", ylabel=words.replace("time", "age"), ylim=(0, edges[-1]))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=4))
-    dress(axes)
 
 
 # --- families -------------------------------------------------------------------------------------
 
 
-def plot_families(history: History, champion: int | None = None, title: str = "") -> Figure:
-    """Draws who descends from whom in a colony.
+@in_style
+def plot_families(history: ColonyHistory, champion: int | None = None, title: str = "") -> Figure:
+    """Draws the lines of descent of a colony.
 
     Args:
         history: of the colony.
-        champion: whose line is drawn over the others; None: nobody's.
+        champion: robot whose line is drawn over the others; None: none.
         title: a line above the picture.
 
     Returns:
         The figure: on top each family's share of the living; below, a line for each life, which
         hangs on that of the parent that gave the body, families beside each other. A family is all
-        who have their bodies from one founder; the largest have colours.
+        robots that have their bodies from one founder; the largest have colours.
     """
     scale, words = scale_time(history.end)
-    shown = [f for f in history.families if len(_members(history, f)) > 1][: len(_FAMILIES)]
+    spans = [history.spans[number] for number in _order(history)]
+    members = [span.founder for span in spans]
+    shown = [family for family in history.families if members.count(family) > 1][: len(_FAMILIES)]
     colors = dict(zip(shown, _FAMILIES, strict=False))
-    figure = new_figure(WIDE, 8.0)
+    hues = [colors.get(span.founder, _REST) for span in spans]
+    figure = new_figure(WIDE, 8.0, title)
     top, low = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 2.4))
     times = np.linspace(0.0, history.end, 500)
     counts = [history.count_living(times, family) for family in shown]
-    rest = (
-        history.count_living(times) - np.sum(counts, axis=0)
-        if shown
-        else (history.count_living(times))
-    )
-    labels = [f"of #{family}" for family in shown]
-    top.stackplot(times / scale, [*counts, rest], labels=[*labels, "others"],
-                  colors=[*(colors[f] for f in shown), _REST], linewidth=0, alpha=0.9)  # fmt: skip
+    rest = history.count_living(times) - sum(counts, np.zeros(len(times)))
+    top.stackplot(times / scale, [*counts, rest], labels=[*(f"of #{f}" for f in shown), "others"],
+                  colors=[*colors.values(), _REST], linewidth=0, alpha=0.9)  # fmt: skip
     top.set_ylabel("robots alive")
     top.set_ylim(bottom=0)
     legend_above(top, 0.0)
-    order = _order(history)
-    row = {number: k for k, number in enumerate(order)}
-    spans = [history.spans[number] for number in order]
-    width = float(np.clip(330.0 / max(len(order), 1), _THIN, _THICK))
-    shades = [colors.get(span.founder, _REST) for span in spans]
-    lines = _lines(spans, np.arange(len(spans)), scale, width)
-    lines.set_color(shades)
-    _draw_descent(low, history, row, colors, scale, max(0.45, 0.3 * width))
+    row = {span.number: k for k, span in enumerate(spans)}
+    lines = _lifelines(spans, scale, 330.0)
+    lines.set_color(hues)
+    _draw_descent(low, history, row, hues, scale, max(0.45, 0.3 * lines.get_linewidths()[0]))
     low.add_collection(lines)
-    if champion in history.spans:
-        assert champion is not None
+    if champion in row:
         _draw_line(low, history, champion, row, scale)
-    low.set_ylim(len(order) + 1.0, -2.0)
+    low.set(xlabel=words, ylabel=f"{len(spans)} robots by family", ylim=(len(spans) + 1.0, -2.0))
     low.set_yticks([])
-    low.set(xlabel=words, ylabel=f"{len(order)} robots by family")
-    for axes in (top, low):
-        dress(axes)
     low.grid(False, axis="y")
     low.spines["left"].set_visible(False)
-    low.set_xlim(-0.01 * history.end / scale, 1.01 * max(history.end, 1e-9) / scale)
+    _limit_time(low, history, scale)
     legend_above(low)
-    if title:
-        figure.suptitle(title, x=0.012, ha="left", fontsize=11, color=_INK, parse_math=False)
     return figure
+
+
+def _order(history: ColonyHistory) -> list[int]:
+    """All numbers, families by their founders' births, each child's own line beside its parent."""
+    order: list[int] = []
+    stack = [span.number for span in history.spans.values() if span.founder == span.number][::-1]
+    while stack:
+        order.append(stack.pop())
+        # The youngest first, so that lines down to children do not cross older ones' families.
+        stack += history.children[order[-1]]
+    return order
 
 
 def _draw_descent(
     axes: Axes,
-    history: History,
+    history: ColonyHistory,
     row: Mapping[int, int],
-    colors: Mapping[int, str],
+    hues: Sequence[str],
     scale: float,
     width: float,
 ) -> None:
     """From each parent's line down to its children's; paler beyond its death, where they came late.
 
-    A child is born a while after its parents have met, which they need not live to see.
+    A child is born a while after its parents have met: they may be dead by then.
     """
-    drops, late, hues, late_hues = [], [], [], []
+    drops, late, drop_hues, late_hues = [], [], [], []
     for number, children in history.children.items():
         span, at = history.spans[number], row[number]
-        hue = colors.get(span.founder, _REST)
-        for child in children:
-            born = history.spans[child].born / scale
-            drops.append([(born, at), (born, row[child])])
-            hues.append(hue)
-        last = max((history.spans[child].born for child in children), default=span.end)
-        if last > span.end:
-            late.append([(span.end / scale, at), (last / scale, at)])
-            late_hues.append(hue)
-    axes.add_collection(LineCollection(drops, colors=hues, linewidths=width, alpha=0.55))
+        births = [history.spans[child].born / scale for child in children]
+        drops += [[(x, at), (x, row[child])] for x, child in zip(births, children, strict=True)]
+        drop_hues += [hues[at]] * len(children)
+        if births and max(births) > span.end / scale:
+            late.append([(span.end / scale, at), (max(births), at)])
+            late_hues.append(hues[at])
+    axes.add_collection(LineCollection(drops, colors=drop_hues, linewidths=width, alpha=0.55))
     axes.add_collection(LineCollection(late, colors=late_hues, linewidths=width, alpha=0.35))
 
 
-def _members(history: History, founder: int) -> list[int]:
-    return [span.number for span in history.spans.values() if span.founder == founder]
-
-
-def _order(history: History) -> list[int]:
-    """All numbers, families by their founders' births, each child's own line beside its parent."""
-    found: list[int] = []
-    founders = [span.number for span in history.spans.values() if span.founder == span.number]
-    stack = founders[::-1]
-    while stack:
-        number = stack.pop()
-        found.append(number)
-        # The youngest first, so that lines down to children do not cross elder ones' families.
-        stack += history.children[number]
-    return found
-
-
 def _draw_line(
-    axes: Axes, history: History, number: int, row: Mapping[int, int], scale: float
+    axes: Axes, history: ColonyHistory, number: int, row: Mapping[int, int], scale: float
 ) -> None:
     """The line of descent of one robot, over all others."""
-    line = history.line(number)
-    points = []
-    for one, child in zip(line, [*line[1:], None], strict=True):
-        span = history.spans[one]
-        end = span.end if child is None else history.spans[child].born
-        points += [(span.born / scale, row[one]), (end / scale, row[one])]
-    axes.plot(*np.transpose(points), color=_INK, linewidth=1.3, zorder=4,
+    line = [history.spans[one] for one in history.line(number)]
+    ends = [*(child.born for child in line[1:]), line[-1].end]
+    points = [
+        (time / scale, row[span.number])
+        for span, end in zip(line, ends, strict=True)
+        for time in (span.born, end)
+    ]
+    axes.plot(*np.transpose(points), color=INK, zorder=4,
               label=f"the champion's line, #{number}")  # fmt: skip
-    axes.plot(*points[-1], "*", color=_INK, markersize=9, zorder=5)
+    axes.plot(*points[-1], "*", color=INK, markersize=9, zorder=5)
 
 
 # --- the arena ------------------------------------------------------------------------------------
 
 
-def plot_arena(history: History, colony: ColonyConfig, title: str = "") -> Figure:
-    """Draws where a colony's robots were born, met and died, from above.
+@in_style
+def plot_arena(history: ColonyHistory, colony: ColonyConfig, title: str = "") -> Figure:
+    """Draws the places of births, matings and deaths in a colony, from above.
 
     Args:
         history: of the colony.
-        colony: whose arena, clinic and chargers.
+        colony: its arena, clinic and chargers.
         title: a line above the picture.
 
     Returns:
@@ -250,55 +335,37 @@ def plot_arena(history: History, colony: ColonyConfig, title: str = "") -> Figur
         cause.
     """
     scale, words = scale_time(history.end)
-    figure = new_figure(WIDE, 4.3)
+    figure = new_figure(WIDE, 4.3, title)
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
-    points = None
-    for axes, kind, name in zip(panels[:2], ("birth", "mating"), ("born", "met"), strict=True):
+    born, met, died = panels
+    for axes, kind, name in ((born, "birth", "were born"), (met, "mating", "pairs met")):
         events = history.of_kind(kind)
         place = np.array([event.place for event in events]).reshape(-1, 3)
-        if kind == "birth":
-            _draw_clinic(axes, colony)
         points = axes.scatter(
             place[:, 0], place[:, 1], c=[event.time / scale for event in events],
-            s=_dot(len(events)), cmap=_SHADES, vmin=0, vmax=max(history.end, 1e-9) / scale,
+            s=_dot(len(events)), cmap="viridis", vmin=0, vmax=max(history.end, 1e-9) / scale,
             alpha=0.8, linewidths=0, zorder=3,
         )  # fmt: skip
-        head(axes, f"where {len(events)} {'were ' if kind == 'birth' else 'pairs '}{name}")
+        axes.set_title(f"where {len(events)} {name}")
     deaths = history.of_kind("death")
-    for cause, (color, told) in death_looks({event.cause: 1 for event in deaths}).items():
+    for cause, (color, label) in cause_styles([event.cause for event in deaths]).items():
         place = np.array([event.place for event in deaths if event.cause == cause])
-        panels[2].scatter(place[:, 0], place[:, 1], s=_dot(len(deaths)), color=color, alpha=0.8,
-                          linewidths=0, label=told, zorder=3)  # fmt: skip
-    head(panels[2], f"where {len(deaths)} died")
-    half = colony.arena.size / 2
+        died.scatter(place[:, 0], place[:, 1], s=_dot(len(deaths)), color=color, alpha=0.8,
+                     linewidths=0, label=label, zorder=3)  # fmt: skip
+    died.set_title(f"where {len(deaths)} died")
     for axes in panels:
-        axes.set_aspect("equal")
-        axes.set(xlabel="x (m)", xlim=(-1.06 * half, 1.06 * half), ylim=(-1.06 * half, 1.06 * half))
-        dash = "-" if colony.arena.edge == "lost" else (0, (4, 3))
-        frame = Rectangle((-half, -half), 2 * half, 2 * half, facecolor=_WATER, edgecolor=_GREY)
-        frame.set(linewidth=1.0, linestyle=dash, zorder=0)
-        axes.add_patch(frame)
-        _draw_chargers(axes, colony)
-        dress(axes)
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=5))
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=5))
-        axes.tick_params(labelleft=axes is panels[0])
-    panels[0].set_ylabel("y (m)")
+        _draw_arena(axes, colony)
+        axes.tick_params(labelleft=axes is born)
+    born.set_ylabel("y (m)")
+    _draw_clinic(born, colony)
     if deaths:
-        # Beside the colours' bar, which leaves room for it.
-        panels[2].legend(loc="upper center", bbox_to_anchor=(0.5, -0.19), fontsize=8.5, ncols=1,
-                         frameon=False, borderaxespad=0.2, handletextpad=0.2,
-                         markerscale=1.6).set_in_layout(False)  # fmt: skip
-    if points is not None:
-        bar = figure.colorbar(points, ax=list(panels), location="bottom", shrink=0.42, aspect=32,
-                              pad=0.04, anchor=(0.2, 1.0))  # fmt: skip
-        bar.set_label(words, fontsize=9)
-        bar.outline.set_visible(False)
-        if bar.solids is not None:
-            bar.solids.set_alpha(1)
-        bar.ax.tick_params(labelsize=8.5, colors="#333333")
-    if title:
-        figure.suptitle(title, x=0.012, ha="left", fontsize=11, color=_INK, parse_math=False)
+        # Beside the colour bar, which leaves room for it.
+        died.legend(loc="upper center", bbox_to_anchor=(0.5, -0.19), borderaxespad=0.2,
+                    handletextpad=0.2, markerscale=1.6).set_in_layout(False)  # fmt: skip
+    bar = color_bar(figure, points, words, ax=list(panels), location="bottom", shrink=0.42,
+                    aspect=32, pad=0.04, anchor=(0.2, 1.0))  # fmt: skip
+    if bar.solids is not None:
+        bar.solids.set_alpha(1)
     return figure
 
 
@@ -307,19 +374,25 @@ def _dot(count: int) -> float:
     return float(np.clip(5000.0 / max(count, 1), 7.0, 26.0))
 
 
-def _draw_clinic(axes: Axes, colony: ColonyConfig) -> None:
-    radius = colony.birth.radius
-    axes.add_patch(Circle((0, 0), radius, facecolor="#fbe3ec", edgecolor="#cc79a7", linewidth=1.0,
-                          zorder=1))  # fmt: skip
-    box = {"facecolor": _WATER, "alpha": 0.8, "linewidth": 0, "pad": 1.0}
-    axes.text(0, -1.06 * radius, "clinic", color="#a8517f", fontsize=8.5, ha="center", va="top",
-              zorder=4, bbox=box)  # fmt: skip
-
-
-def _draw_chargers(axes: Axes, colony: ColonyConfig) -> None:
-    energy = colony.energy
-    for x, y, _ in energy.chargers if energy is not None else ():
-        assert energy is not None
+def _draw_arena(axes: Axes, colony: ColonyConfig) -> None:
+    half, energy = colony.arena.size / 2, colony.energy
+    axes.set(xlabel="x (m)", xlim=(-1.06 * half, 1.06 * half), ylim=(-1.06 * half, 1.06 * half))
+    axes.set_aspect("equal")
+    axes.locator_params(nbins=5)
+    dash = "-" if colony.arena.edge == "lost" else (0, (4, 3))
+    axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor=_WATER, edgecolor=GREY,
+                             linewidth=1.0, linestyle=dash, zorder=0))  # fmt: skip
+    for x, y, _ in () if energy is None else energy.chargers:
         axes.add_patch(Circle((x, y), energy.reach, facecolor="none", edgecolor=_CHARGER,
                               linewidth=1.2, linestyle=(0, (2, 2)), zorder=2))  # fmt: skip
         axes.plot(x, y, "P", color=_CHARGER, markersize=8, markeredgecolor="white", zorder=4)
+
+
+def _draw_clinic(axes: Axes, colony: ColonyConfig) -> None:
+    """The circle in which founders are born."""
+    radius = colony.birth.radius
+    axes.add_patch(Circle((0, 0), radius, facecolor="#fbe3ec", edgecolor="#cc79a7", linewidth=1.0,
+                          zorder=1))  # fmt: skip
+    box = {"facecolor": _WATER, "alpha": 0.8, "pad": 1.0, "linewidth": 0}
+    axes.text(0, -1.06 * radius, "clinic", color="#a8517f", fontsize=8.5, ha="center", va="top",
+              zorder=4, bbox=box)  # fmt: skip

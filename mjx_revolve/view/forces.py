@@ -12,15 +12,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_revolve.engine.levels import make_levels
-from mjx_revolve.engine.pushes import part_forces
+from mjx_revolve.engine.forces import part_forces
+from mjx_revolve.engine.population import init
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.step import init
+from mjx_revolve.engine.single_tree import make_single_tree
 from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.course import pose_robot
-from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.view.poses import pose_robot
+from mjx_revolve.view.surroundings import water_at
+from mjx_revolve.water.flow import Water
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +75,13 @@ def module_forces(
             raise InputError(f"trajectory.{name}: expected {[count, width]}; found {list(shape)}")
     rows = np.arange(0, count, every)
     qpos, qvel = np.asarray(trajectory.qpos)[rows], np.asarray(trajectory.qvel)[rows]
-    if trajectory.command is None:  # no lag is known of: what was asked for
+    if trajectory.command is None:  # no lag is known: the commands themselves
         command = np.asarray(trajectory.ctrl)[rows][:, list(robot.thrusters)]
     else:
         command = np.asarray(trajectory.command)[rows]
     time = np.asarray(trajectory.time, float)[rows]
-    now = water_at(robot, rows, time, count, water)
-    levels = make_levels(robot)
+    now = water_at(robot.world, rows, time, count, water)
+    levels = make_single_tree(robot)
 
     def run(qpos: jax.Array, qvel: jax.Array, command: jax.Array, water: Water) -> Any:
         # The rows of the trajectory stand side by side, as if they were a population.
@@ -98,7 +99,7 @@ def sum_modules(robot: Robot, force: np.ndarray) -> np.ndarray:
     """Forces on modules from those on their parts.
 
     Args:
-        robot: whose.
+        robot: of the forces.
         force: `[S, npart, 3]` [N].
 
     Returns:
@@ -106,26 +107,3 @@ def sum_modules(robot: Robot, force: np.ndarray) -> np.ndarray:
     """
     own = robot.fluid.module == np.arange(robot.morphology.num_modules)[:, None]
     return np.einsum("spi,mp->smi", force, own.astype(force.dtype))
-
-
-def water_at(
-    robot: Robot, rows: np.ndarray, time: np.ndarray, steps: int, water: Water | None = None
-) -> Water:
-    """The water at rows of a trajectory.
-
-    Args:
-        robot: in whose world.
-        rows: `[S]` of them.
-        time: `[S]` their times [s].
-        steps: how many rows the trajectory has.
-        water: as given to `simulate`; by default the world's, without its gusts.
-
-    Returns:
-        Water of `[S]` each.
-    """
-    base = water_of(robot.world) if water is None else water
-    # A row of the trajectory is the state after its step, which the next step's water meets.
-    after = np.minimum(rows + 1, steps - 1)
-    pick = lambda x: np.broadcast_to(np.asarray(x, np.float32), (steps,))[after]  # noqa: E731
-    now: Water = jax.tree.map(pick, base)
-    return now._replace(time=(now.time + time).astype(np.float32))

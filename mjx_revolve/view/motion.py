@@ -1,7 +1,6 @@
-"""What a robot did, analysed once as plain values: pictures, films, pages and reports only draw.
+"""The motion of a robot, analysed once as plain values: pictures, films and pages only draw it.
 
-`Motion` is an episode with all that is told of it; the functions below take arrays and know no
-robot.
+`Motion` is an analysed episode; the functions below take arrays alone.
 """
 
 from __future__ import annotations
@@ -10,10 +9,11 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
-from mjx_revolve.inputs.brief import brief
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.view.surroundings import water_velocity
 from mjx_revolve.water.flow import Water
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mjx_revolve.episodes.config import TaskConfig
     from mjx_revolve.episodes.simulate import Trajectory
 
-# Who gets less far than this only drifted to and fro, and has no heading [body lengths].
+# A robot that gets less far than this only drifted to and fro, and has no heading [body lengths].
 _STAYED = 0.05
 _MOST_POSES = 6
 # Neighbouring poses are at least this far apart [body lengths]; two alone may be closer.
@@ -40,7 +40,7 @@ class Motion:
     """What a robot did in an episode, up to the first row that is not finite; T rows.
 
     Attributes:
-        robot: who.
+        robot: that moved.
         length: of its body [m].
         weight: in air [N].
         time: `[T]` [s].
@@ -51,7 +51,7 @@ class Motion:
         surface: `[T]` z of the still surface, world frame [m].
         depth: `[T]` of the core below it [m].
         period: of the strokes [s]; None where the hinges do not repeat themselves.
-        poses: rows along the way that can be told apart, see `choose_poses`.
+        poses: rows along the way at which poses do not overlap, see `choose_poses`.
         angles: `[T, nhinge]` of the joints in the order of the servos [rad].
         targets: `[T, nhinge]` that the controller sets them [rad].
         phases: `[T, nhinge]` of a CPG's oscillators in the same order [rad]: 0 when the joint's
@@ -103,7 +103,7 @@ class Motion:
     cost: float
     costs: np.ndarray
 
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 def analyse_motion(
@@ -117,7 +117,7 @@ def analyse_motion(
     """Makes a motion of a trajectory.
 
     Args:
-        robot: who swam.
+        robot: that swam.
         trajectory: what it did. Rows after the first that is not finite are left out.
         counted_from: see `Motion`.
         phases: `[T, nhinge]`, see `Motion`.
@@ -153,8 +153,8 @@ def analyse_motion(
     away = np.linalg.norm(path - path[first], axis=1)
     seconds, distance = float(time[-1] - time[first]), float(away[-1])
     if water is not None:
-        water = Water(*_rows(water, count))
-    current = water_velocity(robot, water, path)
+        water = jax.tree.map(lambda x: np.asarray(x)[:count] if np.ndim(x) else x, water)
+    current = water_velocity(robot.world, water, path)
     drift = current[first:-1].sum(axis=0) * (seconds / max(count - 1 - first, 1))
     # A millimetre bounds the cost where the robot stays, as in `measures.measure`.
     costs = (energy - energy[first]) / (weight * np.maximum(away, 1e-3))
@@ -194,17 +194,6 @@ def analyse_motion(
     )
 
 
-def _rows(water: Water, count: int) -> list[Any]:
-    """The first rows of water, whose values are numbers or have a row each."""
-
-    def cut(value: Any) -> Any:
-        if isinstance(value, tuple):
-            return tuple(map(cut, value))
-        return np.asarray(value)[:count] if np.ndim(value) else value
-
-    return [cut(value) for value in water]
-
-
 def counted_time(task: TaskConfig, timestep: float) -> float:
     """When a task begins to count.
 
@@ -215,9 +204,9 @@ def counted_time(task: TaskConfig, timestep: float) -> float:
     Returns:
         The time of the first record of the track that it judges [s].
     """
-    from mjx_revolve.episodes.scoring import first_counted, sample_rows
+    from mjx_revolve.episodes.scoring import first_scored_row, sample_rows
 
-    return sample_rows(task, timestep)[0] * timestep * (1 + first_counted(task, timestep))
+    return sample_rows(task, timestep)[0] * timestep * (1 + first_scored_row(task, timestep))
 
 
 def count_finite(values: Any) -> int:
@@ -237,7 +226,7 @@ def nearest_rows(time: np.ndarray, moments: np.ndarray) -> list[int]:
 
 
 def choose_poses(time: np.ndarray, path: np.ndarray, length: float) -> list[int]:
-    """Rows of a trajectory at equal times that can be told apart.
+    """Rows of a trajectory at equal times at which poses do not overlap.
 
     Args:
         time: `[T]` [s].

@@ -13,9 +13,9 @@ import numpy as np
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.episodes.tasks import TASKS
-from mjx_revolve.evolution.plans import Plan
-from mjx_revolve.evolution.runs import Run
+from mjx_revolve.evolution.sweeps import Plan
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.view.population import read_population
 
@@ -30,7 +30,7 @@ class Outcome(NamedTuple):
         plan: of the evolution.
         champion: figures of its champion by name: `score` and measures on fresh starts, descriptors
             of its body.
-        population: means over those who lived at the end, as their lives went; empty where only
+        population: means over the individuals alive at the end; empty where only
             brains evolve.
         metrics: the columns of `metrics.csv`.
         body: the champion's; None where nothing is known of it.
@@ -49,19 +49,10 @@ class Outcome(NamedTuple):
     evolved: bool = True
 
 
-def is_finished(plan: Plan) -> bool:
-    """Whether a run has all its generations and its champion.
-
-    Raises:
-        InputError: its `run.json` is damaged.
-    """
-    return (plan.folder / "run.json").is_file() and "finished" in Run(plan.folder).info
-
-
 def find_outcomes(
     plans: Sequence[Plan], add: Callable[[str, Figures], Figures] = lambda case, figures: {}
 ) -> tuple[list[Outcome], list[str]]:
-    """What the finished runs have found. Nobody's code is run for it.
+    """What the finished runs have found, without running any user's code.
 
     Args:
         plans: the runs; those that are not finished are left out.
@@ -73,7 +64,7 @@ def find_outcomes(
     found, lost = [], []
     for plan in plans:
         try:
-            if is_finished(plan):
+            if RunReader(plan.folder).is_finished:
                 found.append(_read_outcome(plan, add))
         except (OSError, KeyError, ValueError, TypeError, IndexError) as error:
             place = short_path(plan.folder)
@@ -83,7 +74,7 @@ def find_outcomes(
 
 
 def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome:
-    run = Run(plan.folder)
+    run = RunReader(plan.folder)
     facts, config = run.info["champion"], run.load_config()
     path = plan.folder / "champion" / "morphology.yaml"
     body = None
@@ -99,7 +90,7 @@ def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome
         if problems:
             raise ValueError(problems[0])
         living = people.alive(people.last)
-        alive = [dict(life.figures) for life in living if life.score == life.score]
+        alive = [dict(life.features) for life in living if life.score == life.score]
         lives = [life | add(plan.case, life) for life in alive]
         names = lives[0] if lives else {}
         population = {name: float(np.mean([life[name] for life in lives])) for name in names}

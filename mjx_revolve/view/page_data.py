@@ -1,151 +1,265 @@
-"""What the page of `viewer` is given of an episode: plain values for its scripts."""
+"""Meshes, poses and water as pages receive them: plain values for JSON, with numbers packed."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
 import math
-from typing import Any
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.episodes.champion import Episode
-from mjx_revolve.view.course import finite_part, pose_robot, water_drift
-from mjx_revolve.view.forces import module_forces, sum_modules, water_at
-from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
-from mjx_revolve.view.packed import pack_bed, pack_floats, pack_pieces, pack_waves, pack_whole
-from mjx_revolve.view.surroundings import moves, target_of, water_velocity
-from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.numerics.spatial import matrix_to_quat
+from mjx_revolve.view.pieces import make_pieces, mount_piece, smooth_mesh
+from mjx_revolve.view.poses import continuous_quaternions
+from mjx_revolve.view.surroundings import bed_rings
+from mjx_revolve.water.world import World
 
-# Poses per second, and how many at most: a long episode gets fewer per second.
-_RATE, _MOST = 50.0, 3000
-# Red, green, blue of the arrows of each kind of force.
-_COLORS = {
-    "buoyancy": (0.56, 0.93, 1.0),
-    "drag": (1.0, 0.30, 0.42),
-    "thrust": (1.0, 0.83, 0.25),
-}
-# Three quarters of a kind's arrows are shorter than the first of these shares of the body's length,
-# and all are shorter than the second; of a small body, than these lengths [m].
-_ARROW, _LONGEST = (0.3, 0.1), (0.65, 0.22)
-_LEFT_OUT = "left out here; python -m mjx_revolve.viewer RUN --individual N has them"
-# Forces below this are rounding [N].
-_NOTHING = 1e-5
+if TYPE_CHECKING:
+    from mjx_revolve.view.recording import Mark, ReplayRobot
+
+Packed = dict[str, Any]
+
+# A bed that is further below than this is lost in the water's haze [m].
+_SIGHT = 25.0
+# The bed is drawn on rings from the way's middle to the horizon, of these radii [m].
+_RADIUS = np.concatenate([[0.0], np.geomspace(0.1, 1500.0, 109)])
 
 
-def page_data(episode: Episode, forces: bool = True) -> dict[str, Any]:
-    """What the page's scripts read, as plain values for JSON.
+def pack_floats(values: Any) -> Packed:
+    """Packs numbers whole: base64 of little-endian float32."""
+    return {"f32": base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()}
+
+
+def pack_quantized(values: np.ndarray) -> Packed:
+    """Packs numbers to 1/32767 of the largest: base64 of int16, and their scale."""
+    scale = float(np.abs(values).max(initial=0.0)) / 32767 or 1.0
+    whole = np.round(values / scale).astype("<i2")
+    return {"i16": base64.b64encode(whole.tobytes()).decode(), "scale": scale}
+
+
+# --- meshes ---------------------------------------------------------------------------------------
+
+
+@dataclass
+class RobotMeshes:
+    """Meshes of a page's robots; robots that look alike share a body, pieces that do a shape.
+
+    Attributes:
+        shapes: distinct meshes: vertices [m], normals, and faces of three vertices each, packed.
+        bodies: distinct robots: `length` [m]; `tree`, for each moving body its parent (-1 for the
+            core), position and quaternion (w first) in the parent's frame, and its hinge's axis;
+            `pieces`, each a body, a shape, a colour (0 to 255), position and quaternion in the
+            body's frame.
+    """
+
+    shapes: list[Packed] = field(default_factory=list)
+    bodies: list[Packed] = field(default_factory=list)
+    _robots: dict[int, tuple[Robot, int]] = field(default_factory=dict)
+    _bodies: dict[str, int] = field(default_factory=dict)
+    _shapes: dict[bytes, int] = field(default_factory=dict)
+
+    def add(self, robot: Robot) -> int:
+        """Index of a robot's body, which is added where it is new."""
+        if id(robot) not in self._robots:
+            data = self._body(robot)
+            number = self._bodies.setdefault(json.dumps(data), len(self.bodies))
+            if number == len(self.bodies):
+                self.bodies.append(data)
+            self._robots[id(robot)] = robot, number  # the robot is kept, so that its id is
+        return self._robots[id(robot)][1]
+
+    def _body(self, robot: Robot) -> Packed:
+        assembly = robot.assembly
+        position, rotation = assembly.from_parents()
+        tree = [
+            [int(assembly.parent[k]) - 1,
+             *_numbers(position[k], matrix_to_quat(rotation[k]), assembly.axis[k])]
+            for k in range(1, len(assembly.parent))
+        ]  # fmt: skip
+        pieces = []
+        for piece in make_pieces(robot.morphology):
+            if piece.mark:  # rods and arrows are for pictures at rest
+                continue
+            body, where, turn = mount_piece(robot, piece)
+            color = [round(255 * float(x)) for x in piece.color]
+            place = _numbers(where, matrix_to_quat(turn))
+            pieces.append([body - 1, self._shape(piece.corners), color, *place])
+        return {"length": round(robot.morphology.length, 4), "tree": tree, "pieces": pieces}
+
+    def _shape(self, corners: np.ndarray) -> int:
+        key = hashlib.blake2b(np.ascontiguousarray(corners).tobytes(), digest_size=16).digest()
+        number = self._shapes.setdefault(key, len(self.shapes))
+        if number == len(self.shapes):
+            mesh = smooth_mesh(corners)
+            parts = {"vertices": mesh.vertices, "normals": mesh.vertex_normals}
+            shape = {name: pack_quantized(np.asarray(x)) for name, x in parts.items()}
+            self.shapes.append(shape | {"faces": pack_floats(mesh.faces)})
+        return number
+
+
+def _numbers(*vectors: Any) -> list[float]:
+    """Numbers as short as a picture needs them."""
+    return [round(float(x), 6) for vector in vectors for x in vector]
+
+
+# --- poses ----------------------------------------------------------------------------------------
+
+
+def pack_poses(
+    times: Sequence[np.ndarray], qpos: Sequence[np.ndarray], steps: Sequence[float]
+) -> Packed:
+    """Poses of all robots as one text.
+
+    Every number is rounded to a whole number of steps. Only its difference from the pose before is
+    kept, in two bytes: first the low ones, then the high ones, packed by zlib. Rounding does not
+    add up. Times are kept as they are, in single precision.
 
     Args:
-        episode: what to show.
-        forces: whether the page has arrows of forces, which take seconds to compile.
+        times: of each robot `[T]` [s].
+        qpos: of each robot `[T, nq]`.
+        steps: what positions [m], quaternions [-] and hinges [rad] are rounded to.
 
     Returns:
-        Arrays are packed: base64 of little-endian float32 as `f32`, or of int16 as `i16` with a
-        `scale`. Along time there is a row each `step` seconds.
-
-    Raises:
-        InputError: the episode has no finite row.
+        `poses`: the text; `steps`; `origins`: of each robot's positions [m]; `rows`: T of each.
     """
-    episode, _ = finite_part(episode)
-    robot, trajectory = episode.robot, episode.trajectory
-    world, length = robot.world, robot.morphology.length
-    water: Water = water_of(world) if episode.water is None else episode.water
-    every = _stride(np.asarray(trajectory.time, float))
-    rows = np.arange(0, len(trajectory.time), every)
-    time, qpos = (np.asarray(x, float)[rows] for x in (trajectory.time, trajectory.qpos))
-    poses = pose_robot(robot, qpos)
-    step = float(time[-1] - time[0]) / max(len(time) - 1, 1) or world.timestep
-    period = stroke_period(time, qpos[:, 7:])
-    weight = robot.fluid.volume / robot.fluid.volume.sum()
-    center = smooth_path(time, np.einsum("spi,p->si", poses.parts, weight), period)
-    now = water_at(robot, rows, time, len(trajectory.time), water)
-    low = float((poses.parts[..., 2] - np.linalg.norm(robot.fluid.half_size, axis=1)).min())
-    surface = _first(water.surface_height)
-    net = qpos[-1, :2] - qpos[0, :2]
-    target = target_of(episode.fitness.config.task if episode.fitness else None, trajectory)
-    moved = float(np.linalg.norm(net)) > 0.05 * length
+    origins = [rows[0, :3].round(3) for rows in qpos]
+    # Differences must fit two bytes, at any speed.
+    farthest = max(np.abs(np.diff(rows[:, :3], axis=0)).max(initial=0.0) for rows in qpos)
+    steps = (max(steps[0], float(farthest) / 32000), *steps[1:])
+    numbers = []
+    for rows, origin in zip(qpos, origins, strict=True):
+        position = (rows[:, :3] - origin) / steps[0]
+        turn = continuous_quaternions(rows[:, 3:7]) / steps[1]
+        # Angles are those of hinges, at most a turn or two.
+        hinges = np.clip(rows[:, 7:], -30, 30) / steps[2]
+        whole = np.round(np.c_[position, turn, hinges]).astype(np.int64)
+        numbers.append(np.diff(whole, axis=0, prepend=0).T.ravel())  # number after number
+    low_high = np.concatenate(numbers).astype("<i2").view(np.uint8).reshape(-1, 2)
+    raw = np.concatenate(times).astype("<f4").tobytes() + low_high.T.tobytes()
     return {
-        "length": length,
-        "start": float(time[0]),
-        "step": step,
-        "count": len(time),
-        # Of the way, from x towards y [deg]; who stays is shown along y.
-        "heading": math.degrees(math.atan2(net[1], net[0])) if moved else 90.0,
-        "core": pack_floats(qpos[:, :3]),
-        "center": pack_floats(center),
-        "speed": pack_floats(speed_over(time, qpos[:, :3], period)),
-        "drift": pack_floats(water_drift(robot, now, center, step)),
-        "current": _current(water_velocity(robot, now, center)),
-        "target": None if target is None else pack_floats(target[rows]),
-        "robot": {
-            "bodies": poses.position.shape[1] - 1,
-            **pack_pieces(robot),
-            "position": pack_floats(poses.position[:, 1:]),
-            "quaternion": pack_whole(poses.quaternion[:, 1:]),
-        },
-        "anchors": _anchors(robot),
-        "forces": _forces(episode, every, water)
-        if forces
-        else {
-            name: {"color": color, "scale": 0, "force": pack_whole(np.zeros(0)), "why": _LEFT_OUT}
-            for name, color in _COLORS.items()
-        },
-        "world": {
-            "surface": surface,
-            "waves": pack_waves(world, _first(water.time)),
-            "bed": pack_bed(world, center, low),
-        },
-        "floor": low - 0.1 * length,  # below the robot: where the grid is drawn
-        "deepest": max(1.3 * (surface - float(qpos[:, 2].min())), surface - low, 1.5 * length),
+        "poses": base64.b64encode(zlib.compress(raw, 6)).decode(),
+        "steps": steps,
+        "origins": [origin.tolist() for origin in origins],
+        "rows": [len(rows) for rows in qpos],
     }
 
 
-def _forces(episode: Episode, every: int, water: Water) -> dict[str, Any]:
-    """The arrows of all kinds of forces."""
-    robot, length = episode.robot, episode.robot.morphology.length
-    found = module_forces(robot, episode.trajectory, every, water)
-    return {
-        name: _arrows(color, sum_modules(robot, getattr(found, name)), length)
-        for name, color in _COLORS.items()
+# --- water ----------------------------------------------------------------------------------------
+
+
+def pack_water(world: World, path: np.ndarray, low: float, begun: float = 0.0) -> Packed:
+    """The water of a page.
+
+    Args:
+        world: surface, waves, bed.
+        path: `[S, 3]` where robots get, world frame [m].
+        low: z of their lowest point [m].
+        begun: the sea's time when the page's is 0 [s].
+
+    Returns:
+        `world`: surface, waves and bed; `current` [m/s].
+    """
+    sea = {
+        "surface": float(world.surface_height),
+        "waves": pack_waves(world, begun),
+        "bed": _pack_bed(world, path, low),
     }
+    return {"world": sea, "current": [*world.current]}
 
 
-def _current(velocity: np.ndarray) -> dict[str, Any] | None:
-    """The water's velocity around the robot, waves apart `[S, 3]` [m/s]; None where it is still."""
-    if not moves(velocity):
+def pack_waves(world: World, begun: float = 0.0) -> list[dict[str, float]]:
+    """The world's waves that move, each as a cos(k·p - ωt + φ).
+
+    Args:
+        world: the waves, and the current that carries them.
+        begun: the sea's time at which t is 0 [s].
+
+    Returns:
+        A mapping for each wave: k, its direction x and y, amplitude, omega, phase.
+    """
+    waves = []
+    for wave in world.waves:
+        if wave.amplitude == 0:
+            continue
+        k = wave.wavenumber(world.gravity, world.water_depth)
+        x, y = math.cos(wave.direction), math.sin(wave.direction)
+        along = k * (x * world.current[0] + y * world.current[1])
+        omega = wave.frequency(world.gravity, world.water_depth) + along
+        phase = math.remainder(wave.phase - omega * begun, 2 * math.pi)
+        waves.append({
+            "k": k, "x": x, "y": y, "amplitude": wave.amplitude, "omega": omega, "phase": phase,
+        })  # fmt: skip
+    return waves
+
+
+def _pack_bed(world: World, path: np.ndarray, low: float) -> Packed | None:
+    """Heights of the bed on rings around a path; None where there is no bed in sight."""
+    if world.bed is None:
         return None
+    middle = (path[:, :2].min(0) + path[:, :2].max(0)) / 2
+    height = bed_rings(world.bed, middle, _RADIUS)[..., 2]
+    reach = float(np.ptp(path[:, :2], axis=0).max()) + _SIGHT
+    if low - float(height[reach >= _RADIUS].max()) > _SIGHT:
+        return None
+    rings, sectors = height.shape
     return {
-        "fastest": float(np.linalg.norm(velocity, axis=1).max()),
-        "velocity": pack_floats(velocity),
+        "center": middle.tolist(),
+        "rings": rings,
+        "sectors": sectors,
+        "radius": pack_floats(_RADIUS),
+        "height": pack_floats(height),
     }
 
 
-def _stride(time: np.ndarray) -> int:
-    """Rows from one pose that is kept to the next."""
-    dt = float(time[-1] - time[0]) / (len(time) - 1) if len(time) > 1 else 1.0
-    return max(1, round(1 / (_RATE * dt)), math.ceil(len(time) / _MOST))
+def replay_data(
+    robots: Sequence[ReplayRobot],
+    floor: float,
+    marks: Sequence[Mark] = (),
+    leap: float | None = None,
+    begun: float = 0.0,
+) -> dict[str, Any]:
+    """What a replay's page receives but for the poses, as plain values for JSON.
 
-
-def _anchors(robot: Robot) -> list[dict[str, Any]]:
-    """Where each module's arrows begin: at the centre of its part that displaces most."""
-    fluid, anchors = robot.fluid, []
-    for module in range(robot.morphology.num_modules):
-        k = int(np.where(fluid.module == module, fluid.volume, -1.0).argmax())
-        place = fluid.position[k] + fluid.rotation[k] @ fluid.center_of_volume[k]
-        anchors.append({"body": int(fluid.body[k]) - 1, "place": place.round(6).tolist()})
-    return anchors
-
-
-def _arrows(color: tuple[float, ...], force: np.ndarray, length: float) -> dict[str, Any]:
-    """A kind of force `[S, nmodule, 3]` [N], and how long its arrows are [m/N]; 0 where none is."""
-    size = np.linalg.norm(force, axis=-1)
-    size, scale = size[size > _NOTHING], 0.0
-    if size.size:
-        usual, longest = (max(share * length, least) for share, least in (_ARROW, _LONGEST))
-        scale = min(usual / float(np.percentile(size, 75)), longest / float(size.max()))
-    return {"color": color, "scale": scale, "force": pack_whole(force)}
-
-
-def _first(value: Any) -> float:
-    """A number, or the first of its rows."""
-    return float(np.ravel(np.asarray(value, float))[0])
+    Args:
+        robots: in one world.
+        floor: z below all of them, where the grid is drawn [m].
+        marks: places to show.
+        leap: see `viewer.write_colony_page`.
+        begun: the sea's time when the page's is 0 [s].
+    """
+    meshes = RobotMeshes()
+    listed = [
+        {
+            "name": one.name,
+            "body": meshes.add(one.robot),
+            "start": round(one.appears, 4),
+            "end": None if one.end is None else round(float(one.end), 4),
+            "info": {
+                key: value if isinstance(value, str) else f"{float(value):.4g}"
+                for key, value in one.info.items()
+            },
+        }
+        for one in robots
+    ]
+    places = np.concatenate([np.asarray(one.qpos, float)[:, :3] for one in robots])
+    ends = [float(one.end) for one in robots if one.end is not None]
+    return {
+        "size": float(np.median([one.robot.morphology.length for one in robots])),
+        "begin": min(one["start"] for one in listed),
+        "last": max([*ends, *(float(one.time[-1]) for one in robots)]),
+        "low": places.min(0).tolist(),
+        "high": places.max(0).tolist(),
+        "floor": floor,
+        "robots": listed,
+        "shapes": meshes.shapes,
+        "bodies": meshes.bodies,
+        "marks": [{"name": m.name, "place": [*m.place], "radius": m.radius} for m in marks],
+        "leap": leap,
+        **pack_water(robots[0].robot.world, places, floor, begun),
+    }

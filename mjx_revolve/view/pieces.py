@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,22 +14,19 @@ from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.body.solids import part_mesh
+from mjx_revolve.view.palette import HINGE_AXIS, MODULES, THRUST_AXIS
 
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
 
 # Parts that move with a hinge are drawn darker than the frame, or the hinge could not be made out.
 _MOVING = 0.72
-_AXIS = (1.0, 0.47, 0.1)  # hinge axes are drawn as thin rods of this colour
-_ROD = (0.0011, 0.025)  # their radius and half length [m]
-_THRUST = (0.13, 0.66, 0.30)  # thrusts are drawn as arrows of this colour, along a command ahead
-_ARROW = (0.0011, 0.034, 0.0036, 0.010)  # shaft's radius and length, head's radius and length [m]
-# Modules without a colour of their own, as evolution grows them, have one of these: those of the
-# shipped robots, and their neighbours.
-_COLORS = {
-    "core": (0.95, 0.42, 0.32), "hinge": (0.94, 0.92, 0.84), "sensor": (0.55, 0.42, 0.72),
-    "thruster": (0.38, 0.40, 0.45), "fin": (0.20, 0.65, 0.60), "brick": (0.93, 0.72, 0.26),
-}  # fmt: skip
+# Hinge axes are drawn as thin rods: their radius and half length [m].
+_ROD = (0.0011, 0.025)
+# Arrows of thrusts: radius and length of the shaft and of the head [m].
+_ARROW = (0.0011, 0.034, 0.0036, 0.010)
+# Edges of a part are sharp where its faces turn by more than this.
+_CREASE = math.radians(35.0)
 _MOST_DRAWN = 500  # types of modules whose meshes are remembered; some 100 kB each
 
 
@@ -79,7 +77,7 @@ def make_pieces(morphology: Morphology) -> list[Piece]:
     pieces = []
     for number, module in enumerate(morphology.modules):
         kind = module.kind
-        rgb = np.clip(np.asarray(module.rgb or _COLORS[_role(module)], float), 0.0, 1.0)
+        rgb = np.clip(np.asarray(module.rgb or MODULES[_role(module)], float), 0.0, 1.0)
         for k, triangles in enumerate(_triangles(kind)):
             shade = rgb * (_MOVING if kind.hinge is not None and k > 0 else 1.0)
             pieces.append(Piece(number, k, triangles, shade))
@@ -87,14 +85,14 @@ def make_pieces(morphology: Morphology) -> list[Piece]:
             radius, half = _ROD
             profile = [(-half, 0.0), (-half, radius), (half, radius), (half, 0.0)]
             rod = _spindle(kind.hinge.axis, profile) + np.asarray(kind.hinge.anchor)
-            pieces.append(Piece(number, 0, rod, np.array(_AXIS), mark=True))
+            pieces.append(Piece(number, 0, rod, np.array(HINGE_AXIS), mark=True))
         for k, part in enumerate(kind.parts):
             if part.thruster is not None:
                 radius, shaft, wide, head = _ARROW
                 profile = [(0.0, 0.0), (0.0, radius), (shaft, radius), (shaft, wide)]
                 arrow = _spindle(part.thruster.axis, [*profile, (shaft + head, 0.0)])
                 arrow = arrow + np.asarray(part.position) + np.asarray(part.thruster.position)
-                pieces.append(Piece(number, k, arrow, np.array(_THRUST), mark=True))
+                pieces.append(Piece(number, k, arrow, np.array(THRUST_AXIS), mark=True))
     return pieces
 
 
@@ -120,6 +118,19 @@ def _triangles(kind: ModuleType) -> list[np.ndarray]:
             _DRAWN.clear()
         _DRAWN[key] = [part_mesh(kind, p).triangles + np.asarray(p.position) for p in kind.parts]
     return _DRAWN[key]
+
+
+def smooth_mesh(corners: np.ndarray) -> trimesh.Trimesh:
+    """A mesh for shading: smooth but for its edges, along which it is cut open.
+
+    Args:
+        corners: `[m, 3, 3]` triangles [m].
+
+    Returns:
+        The mesh; `vertex_normals` are those to shade with.
+    """
+    mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners))
+    return trimesh.graph.smooth_shade(mesh, angle=_CREASE, facet_minarea=None)
 
 
 def mount_piece(robot: Robot, piece: Piece) -> tuple[int, np.ndarray, np.ndarray]:

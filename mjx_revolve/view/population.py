@@ -1,4 +1,4 @@
-"""Who lived in a run in which bodies evolved: who was best, and who came of whom."""
+"""Individuals of a run in which bodies evolved: the living, the best, lines of descent."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from mjx_revolve.episodes.lives import Life, read_generations, read_lives
+from mjx_revolve.episodes.individual_log import LoggedIndividual, read_generations, read_individuals
 
 Picked = TypeVar("Picked")
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """All who were ever born.
+    """All individuals of a run.
 
     Attributes:
         lives: by number.
-        living: numbers of those who were alive after each generation.
+        living: numbers of the individuals that were alive after each generation.
     """
 
-    lives: dict[int, Life]
+    lives: dict[int, LoggedIndividual]
     living: dict[int, tuple[int, ...]]
 
     @property
@@ -32,23 +32,23 @@ class Population:
         """The last generation; 0: there is none."""
         return max(self.living, default=0)
 
-    def alive(self, generation: int) -> list[Life]:
-        """Who was alive after a generation, the best first, failures last."""
+    def alive(self, generation: int) -> list[LoggedIndividual]:
+        """Individuals alive after a generation, the best first, failures last."""
         found = [self.lives[n] for n in self.living.get(generation, ()) if n in self.lives]
         return sorted(found, key=_rank)
 
     def figures(self, generation: int, name: str) -> np.ndarray:
-        """`[N]` a figure of those who were alive after a generation, the best first."""
-        return np.array([life.figures.get(name, math.nan) for life in self.alive(generation)])
+        """`[N]` a feature of the individuals alive after a generation, the best first."""
+        return np.array([life.features.get(name, math.nan) for life in self.alive(generation)])
 
-    def best(self) -> Life | None:
-        """The best of all times, of equals the oldest; None: nobody has a score."""
+    def best(self) -> LoggedIndividual | None:
+        """The best of all, of equals the oldest; None: none has a score."""
         known = [life for life in self.lives.values() if not math.isnan(life.score)]
         return min(known, key=_rank, default=None)
 
-    def line(self, number: int) -> list[Life]:
-        """An individual and those whose body it has, in the end: the oldest first."""
-        found: list[Life] = []
+    def line(self, number: int) -> list[LoggedIndividual]:
+        """An individual and the ancestors that gave its body, the oldest first."""
+        found: list[LoggedIndividual] = []
         life = self.lives.get(number)
         while life is not None:
             found.append(life)
@@ -56,53 +56,53 @@ class Population:
         return found[::-1]
 
 
-def _rank(life: Life) -> tuple[float, int]:
+def _rank(life: LoggedIndividual) -> tuple[float, int]:
     return math.inf if math.isnan(life.score) else -life.score, life.number
 
 
 def read_population(folder: Path) -> tuple[Population, list[str]]:
-    """Reads who lived in a run.
+    """Reads the individuals of a run.
 
     Args:
         folder: the run folder.
 
     Returns:
-        The population, and a line about each thing that is wrong. Where it is not known who was
-        alive, those count who were born in a generation.
+        The population, and a line about each thing that is wrong. Where the living are not known,
+        those born in a generation count.
     """
-    lives, problems = read_lives(folder)
+    lives, problems = read_individuals(folder)
     living, more = read_generations(folder)
     problems += more
     if lives and not living:
-        problems.append("generations.jsonl: nobody knows who was alive: the new-born stand in")
+        problems.append("generations.jsonl names none: the newborn stand in for the living")
         for life in lives.values():
             living[life.born] = (*living.get(life.born, ()), life.number)
     lost = {number for numbers in living.values() for number in numbers} - set(lives)
     if lost:
-        problems.append(f"individuals.jsonl lacks {len(lost)} of those who were alive")
+        problems.append(f"individuals.jsonl lacks {len(lost)} of the living")
     return Population(lives, living), problems
 
 
-class Kin(NamedTuple):
+class LineageStep(NamedTuple):
     """A step of a line of descent.
 
     Attributes:
-        life: who.
+        life: the individual.
         mate: the second parent, if there is one.
         skipped: ancestors between this one and the one before.
     """
 
-    life: Life
-    mate: Life | None
+    life: LoggedIndividual
+    mate: LoggedIndividual | None
     skipped: int
 
 
-def trace_family(population: Population, number: int, most: int = 8) -> list[Kin]:
+def trace_lineage(population: Population, number: int, most: int = 8) -> list[LineageStep]:
     """The line of descent of an individual, by the parents that gave it its body.
 
     Args:
-        population: in which it lived.
-        number: whose line.
+        population: of the run.
+        number: of the individual.
         most: steps; of a longer line those stay that gained most over their parent.
 
     Returns:
@@ -117,16 +117,16 @@ def trace_family(population: Population, number: int, most: int = 8) -> list[Kin
     for place, before in zip(kept, [-1, *kept], strict=False):
         life = line[place]
         mate = population.lives.get(life.parents[1]) if len(life.parents) > 1 else None
-        found.append(Kin(life, mate, int(place - before - 1)))
+        found.append(LineageStep(life, mate, int(place - before - 1)))
     return found
 
 
-def pick_ancestors(population: Population, number: int, count: int) -> list[Life]:
+def pick_ancestors(population: Population, number: int, count: int) -> list[LoggedIndividual]:
     """An individual and some of its ancestors, at equal distances in its line.
 
     Args:
-        population: in which it lived.
-        number: whose ancestors.
+        population: of the run.
+        number: of the individual.
         count: how many of them; all, where there are fewer.
 
     Returns:

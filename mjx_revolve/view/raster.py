@@ -1,4 +1,4 @@
-"""Triangles to pixels: a depth buffer of our own, in parallel projection.
+"""Triangles to pixels: a depth buffer in parallel projection.
 
 matplotlib sorts whole polygons by their mean depth, which puts parts that touch in the wrong order.
 Nothing here needs a display or a graphics driver.
@@ -7,17 +7,17 @@ Nothing here needs a display or a graphics driver.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
+from matplotlib.axes import Axes
 from scipy.ndimage import gaussian_filter
 
 from mjx_revolve.view.pieces import Scene
 
 # Each pixel is the mean of this many in both directions: smooth edges.
 _FINE = 2
-# Neighbouring pixels whose depths differ by more than this [m], or whose faces are turned by more
-# than 30 degrees, get a line between them.
+# Neighbouring pixels get a line between them where depths differ by more than this [m], or faces
+# are turned by more than 30 degrees.
 _STEP = 1.5e-3
 _TURN = math.cos(math.radians(30.0))
 
@@ -36,6 +36,10 @@ def make_view(azimuth: float, elevation: float) -> np.ndarray:
     right = np.array([-math.sin(a), math.cos(a), 0.0])
     towards = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
     return np.stack([right, np.cross(towards, right), towards])
+
+
+REST_VIEW = make_view(-58.0, 30.0)
+"""The three-quarter view of bodies at rest."""
 
 
 def depth_buffer(
@@ -106,12 +110,7 @@ def _lines(depth: np.ndarray, part: np.ndarray, normal: np.ndarray) -> np.ndarra
 
 
 def draw_scene(
-    scene: Scene,
-    view: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    pixel: float,
-    tint: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    scene: Scene, view: np.ndarray, low: np.ndarray, high: np.ndarray, pixel: float
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """Picture of a scene in a view.
 
@@ -121,8 +120,6 @@ def draw_scene(
         low: `[2]` lower left corner of the picture, right and up in the view [m].
         high: `[2]` its upper right corner at least [m].
         pixel: size of a pixel [m].
-        tint: changes the finished colours: `[..., 3]` colours and `[..., 3]` places in the view
-            (right, up, towards the viewer [m]; towards is -inf where nothing is) to `[..., 3]`.
 
     Returns:
         red, green, blue, alpha `[rows, columns, 4]`, row 0 the lowest, and what it covers: left,
@@ -142,19 +139,32 @@ def draw_scene(
     light = 0.46 + 0.60 * np.clip(normal @ main, 0, 1) + 0.16 * np.clip(normal @ fill, 0, 1)
     light *= _occlusion(depth, fine)
     # Dark colours keep a little light of their own, or their edges would vanish.
-    color = 0.06 + 0.94 * scene.color[index]
-    color = np.clip(color * light[..., None], 0.0, 1.0)
+    color = np.clip((0.06 + 0.94 * scene.color[index]) * light[..., None], 0.0, 1.0)
     color[_lines(depth, part, normal)] *= 0.4
-    if tint is not None:
-        right = low[0] + fine * (np.arange(columns * _FINE) + 0.5)
-        up = low[1] + fine * (np.arange(rows * _FINE) + 0.5)
-        color = tint(color, np.stack([*np.meshgrid(right, up), depth], axis=-1))
     image = np.concatenate([color * covered[..., None], covered[..., None]], axis=-1)
     image = image.reshape(rows, _FINE, columns, _FINE, 4).mean(axis=(1, 3))
     image[..., :3] /= np.maximum(image[..., 3:], 1e-6)
-    return np.clip(image, 0.0, 1.0), (
-        low[0],
-        low[0] + columns * pixel,
-        low[1],
-        low[1] + rows * pixel,
-    )
+    right, top = low + pixel * np.array([columns, rows])
+    return np.clip(image, 0.0, 1.0), (low[0], right, low[1], top)
+
+
+def show_scene(
+    axes: Axes, scene: Scene, view: np.ndarray, pixel: float, alpha: float = 1.0, zorder: float = 3
+) -> None:
+    """Puts a picture of a scene into axes whose units are metres of the view, limits unchanged.
+
+    Args:
+        axes: to draw into.
+        scene: what to draw.
+        view: from `make_view`.
+        pixel: size of a pixel [m].
+        alpha: opacity, 0 to 1.
+        zorder: of the picture among the artists of the axes.
+    """
+    points = scene.corners.reshape(-1, 3) @ view[:2].T
+    low, high = points.min(axis=0) - 4 * pixel, points.max(axis=0) + 4 * pixel
+    image, extent = draw_scene(scene, view, low, high, pixel)
+    limits = axes.axis()
+    axes.imshow(image, extent=extent, origin="lower", interpolation="bilinear", aspect="auto",
+                alpha=alpha, zorder=zorder)  # fmt: skip
+    axes.axis(limits)

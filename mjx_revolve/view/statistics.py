@@ -1,11 +1,28 @@
-"""What a few seeds can say: bootstrap intervals and rank tests, and how often they err.
+"""Statistics over a few seeds: intervals of means and of differences, and rank tests.
 
-A value is a seed's; individuals of one run are relatives and no further evidence.
+Every report and every study uses these functions. One value is one seed's: the individuals of one
+run are relatives, not further evidence.
+
+Intervals are Student's t and, for a difference, Welch's t. For 3 to 10 seeds a percentile bootstrap
+is too narrow (T. Hesterberg, The American Statistician 69:371, 2015), and among tests that compare
+learning algorithms by few seeds Welch's errs least (C. Colas et al., arXiv:1904.06979). Measured
+with 4,000 draws, an interval of nominally 95 % holds the true mean in so many of 100 cases:
+
+| values              | seeds | Student's t | percentile bootstrap | Welch's t of a difference |
+|---------------------|-------|-------------|----------------------|---------------------------|
+| normal              | 3     | 95          | 75                   | 97                        |
+| normal              | 5     | 95          | 85                   | 96                        |
+| normal              | 10    | 95          | 90                   | 96                        |
+| exponential         | 5     | 88          | 78                   | 97                        |
+| two modes, 30 : 70  | 3     | 72          | 64                   | 98                        |
+| two modes, 30 : 70  | 5     | 81          | 79                   | 98                        |
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import warnings
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from math import comb
 from typing import NamedTuple
@@ -15,49 +32,61 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 LEVEL = 0.95  # of intervals
-ALPHA = 1 - LEVEL  # below which p is called a difference
-_RESAMPLES = 9999  # of bootstraps and of permutations, where there are more of these
+ALPHA = 1 - LEVEL  # a smaller p is called a difference
+FEWEST = 3  # values for which an interval is drawn: t(0.975, 1) = 12.7 is wider than any page
+_RESAMPLES = 9999  # of permutation tests, where there are more permutations
 COVERAGE = (
-    "Intervals are percentile bootstraps of the mean over seeds (9999 resamples). With few seeds "
-    "they are too narrow: of normally distributed values, they hold the truth in 84 of 100 cases "
-    "with 5 seeds and in 90 with 10, those of differences in 88 and 92, rather than in 95."
+    "Intervals are mean ± t(0.975, n − 1) s / √n over the n seeds (Student), those of differences "
+    "Welch's. They take the seeds' values for normally distributed. Of skewed values they are too "
+    "narrow: with 5 seeds they hold the mean of an exponential distribution in 88 of 100 cases "
+    "rather than in 95."
 )
-"""What reports say of `interval` and `difference`; measured over 1,500 draws each."""
+"""What reports say about `interval` and `difference`."""
 
 
 class Interval(NamedTuple):
-    """A mean, or a difference of means, and where it may lie.
+    """A mean, or a difference of means, and its confidence interval mean ± half.
 
     Attributes:
-        mean: of the values; NaN without any.
-        low: of the interval; NaN below two values.
-        high: of the interval.
+        mean: of the finite values; NaN without any.
+        half: half width of the interval; NaN with fewer than two values.
+        size: number of values, in a difference of the smaller group.
     """
 
     mean: float
-    low: float
-    high: float
+    half: float
+    size: int
+
+    @property
+    def low(self) -> float:
+        """Lower end."""
+        return self.mean - self.half
+
+    @property
+    def high(self) -> float:
+        """Upper end."""
+        return self.mean + self.half
 
     def __str__(self) -> str:
-        """As `0.31 [0.27, 0.36]`."""
+        """As `0.1537 ± 0.0042`: the mean to the digits that the interval supports."""
         if not np.isfinite(self.mean):
             return "–"
-        ends = f" [{_shown(self.low)}, {_shown(self.high)}]" if np.isfinite(self.low) else ""
-        return f"{_shown(self.mean)}{ends}"
-
-
-def _shown(number: float) -> str:
-    """Three digits, or the whole part."""
-    text = f"{number:.0f}" if abs(number) >= 1000 else f"{number:.3g}"
-    return ("0" if text == "-0" else text).replace("-", "−")
+        if not self.half > 1e-9 * abs(self.mean):  # one value, or equal ones
+            text = f"{self.mean:.0f}" if abs(self.mean) >= 1000 else f"{self.mean:.3g}"
+        elif (places := 1 - math.floor(math.log10(self.half))) > 8:
+            text = f"{self.mean:.3g} ± {self.half:.1g}"
+        else:
+            places = max(places, 0)
+            text = f"{self.mean:.{places}f} ± {self.half:.{places}f}"
+        return text.replace("-", "−")
 
 
 class Comparison(NamedTuple):
-    """Whether groups differ.
+    """Tests of whether groups differ.
 
     Attributes:
-        p: of Kruskal's and Wallis's test over all groups; 1 where there is nothing to test.
-        pairs: of Mann's and Whitney's test for each two of them, by Holm's correction.
+        p: of the Kruskal-Wallis test over all groups; 1 where there is nothing to test.
+        pairs: p of the Mann-Whitney test of each pair, with Holm's correction.
     """
 
     p: float
@@ -69,63 +98,63 @@ def _finite(values: ArrayLike) -> np.ndarray:
     return x[np.isfinite(x)]
 
 
-def interval(values: ArrayLike) -> Interval:
-    """Mean and its interval, a percentile bootstrap (Efron 1979).
+def mean_and_half(rows: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means over the first axis, half widths of Student's intervals, and numbers of values.
 
     Args:
-        values: `[n]`, one for each seed; what is not finite does not count.
+        rows: `[n, ...]`, a row for each seed; values that are not finite do not count.
 
     Returns:
-        The interval, always the same for the same values.
+        `[...]` each; NaN where there are too few values.
     """
+    x = np.asarray(rows, float)
+    x = np.ma.masked_invalid(x)
+    count = np.asarray(x.count(axis=0))
+    error = np.sqrt(x.var(axis=0, ddof=1) / np.maximum(count, 1))
+    half = stats.t.ppf(0.5 + LEVEL / 2, np.maximum(count - 1, 1)) * np.ma.filled(error, np.nan)
+    return np.ma.filled(x.mean(axis=0), np.nan), np.where(count > 1, half, np.nan), count
+
+
+def interval(values: ArrayLike) -> Interval:
+    """Mean of one value per seed `[n]` and Student's confidence interval."""
     x = _finite(values)
-    if len(x) < 2:
-        return Interval(float(x.mean()) if len(x) else np.nan, np.nan, np.nan)
-    return Interval(float(x.mean()), *_bootstrap((x,), lambda x, axis: x.mean(axis)))
+    if not len(x):
+        return Interval(math.nan, math.nan, 0)
+    mean, half, count = mean_and_half(x)
+    return Interval(float(mean), float(half), int(count))
+
+
+def quantiles(rows: ArrayLike, shares: Sequence[float]) -> np.ndarray:
+    """Quantiles `[q, T]` of rows `[n, T]` over the first axis; NaN without a finite value."""
+    x = np.asarray(rows, float)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of columns without values
+        return np.nanquantile(np.where(np.isfinite(x), x, np.nan), shares, axis=0)
 
 
 def difference(values: ArrayLike, others: ArrayLike) -> Interval:
-    """Difference of two means and its interval, both groups resampled.
+    """Mean of `values` minus that of `others`, one value per seed each, with Welch's interval.
 
-    Args:
-        values: `[n]`, one for each seed.
-        others: `[m]`, to be subtracted.
-
-    Returns:
-        The interval.
+    B. L. Welch, Biometrika 34:28, 1947; unequal variances, degrees of freedom by Satterthwaite.
     """
     x, y = _finite(values), _finite(others)
-    if min(len(x), len(y)) < 2:
-        both = len(x) and len(y)
-        return Interval(float(x.mean() - y.mean()) if both else np.nan, np.nan, np.nan)
-    ends = _bootstrap((x, y), lambda x, y, axis: x.mean(axis) - y.mean(axis))
-    return Interval(float(x.mean() - y.mean()), *ends)
-
-
-def _bootstrap(samples: tuple, statistic: object) -> tuple[float, float]:
-    rng = np.random.default_rng(0)
-    found = stats.bootstrap(
-        samples,
-        statistic,
-        confidence_level=LEVEL,
-        method="percentile",
-        n_resamples=_RESAMPLES,
-        rng=rng,
-    ).confidence_interval
-    return float(found.low), float(found.high)
+    count = min(len(x), len(y))
+    if not count:
+        return Interval(math.nan, math.nan, 0)
+    mean = float(x.mean() - y.mean())
+    if count == 1:
+        return Interval(mean, math.nan, count)
+    if not np.ptp(x) and not np.ptp(y):
+        return Interval(mean, 0.0, count)
+    ends = stats.ttest_ind(x, y, equal_var=False).confidence_interval(LEVEL)
+    return Interval(mean, float(ends.high - ends.low) / 2, count)
 
 
 def rank_test(values: ArrayLike, others: ArrayLike) -> float:
-    """Two-sided p of Mann's and Whitney's test.
+    """Two-sided p of the Mann-Whitney test of values `[n]` and others `[m]`.
 
-    By permutations, so that it is exact for few values and bears equal ones.
-
-    Args:
-        values: `[n]`.
-        others: `[m]`.
-
-    Returns:
-        p; 1 where a side has fewer than two values or all are the same.
+    By permutations: exact for few values, also for equal ones. 1 where a side has fewer than two
+    values or all values are the same.
     """
     x, y = _finite(values), _finite(others)
     if min(len(x), len(y)) < 2 or not np.ptp(np.concatenate([x, y])):
@@ -135,7 +164,7 @@ def rank_test(values: ArrayLike, others: ArrayLike) -> float:
 
 
 def smallest_p(count: int, other: int, pairs: int = 1) -> float:
-    """The smallest p that `rank_test` can give, after Holm's correction for so many pairs."""
+    """Smallest p that `rank_test` can give, after Holm's correction for so many pairs."""
     if min(count, other) < 2:
         return 1.0
     ways = min(comb(count + other, count), _RESAMPLES + 1)  # beyond, permutations are drawn
@@ -143,32 +172,20 @@ def smallest_p(count: int, other: int, pairs: int = 1) -> float:
 
 
 def holm(p: ArrayLike) -> list[float]:
-    """Holm's correction for several tests (Scandinavian Journal of Statistics 6, 1979).
+    """The p values of several tests, corrected so that α bounds the chance of any false one.
 
-    Args:
-        p: of each test.
-
-    Returns:
-        p of each, so that less than α of them is wrong with probability α at most over all tests.
+    S. Holm, Scandinavian Journal of Statistics 6:65, 1979.
     """
     p = np.asarray(p, float)
     order = np.argsort(p, kind="stable")
     corrected = np.maximum.accumulate(np.arange(len(p), 0, -1) * p[order])
-    found = np.empty_like(p)
-    found[order] = np.minimum(corrected, 1.0)
-    return found.tolist()
+    result = np.empty_like(p)
+    result[order] = np.minimum(corrected, 1.0)
+    return result.tolist()
 
 
 def compare(groups: Mapping[str, ArrayLike], pairs: bool = True) -> Comparison:
-    """Tests whether groups differ, and which.
-
-    Args:
-        groups: values by name.
-        pairs: whether each two of them are tested, too.
-
-    Returns:
-        The comparison.
-    """
+    """Tests whether groups of values, by name, differ; and each pair of them, if `pairs`."""
     known = {name: _finite(values) for name, values in groups.items()}
     two = list(combinations(known, 2)) if pairs else []
     corrected = holm([rank_test(known[a], known[b]) for a, b in two])

@@ -1,8 +1,7 @@
-"""Picture of a swimming robot: poses along its way, and one stroke seen by a camera that follows.
+"""Picture of a swimming robot: poses along its way from above and from the side, and one stroke.
 
-Drawn with the depth buffer of `raster`, so it needs no display and no graphics driver. The view
-is a parallel projection from a little above, turned so that the robot swims to the right. In it a
-pixel further down may be deeper or nearer, so depths are written beside the robot, not on an axis.
+Drawn with the depth buffer of `raster`, so it needs no display and no graphics driver. All views
+are parallel projections, turned so that the robot swims to the right.
 """
 
 from __future__ import annotations
@@ -10,282 +9,56 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+from scipy.spatial.transform import Rotation
 
-from mjx_revolve.view.labels import (
-    INK,
-    SOFT,
-    Places,
-    draw_current,
-    draw_scale_bars,
-    draw_target,
-    write,
-)
 from mjx_revolve.view.motion import Motion, analyse_motion, stroke_rows
+from mjx_revolve.view.motion_plots import WATER, draw_surface
+from mjx_revolve.view.palette import ACCENT, CURRENT, RGB, SAND, TARGET
 from mjx_revolve.view.pieces import Piece, Scene, make_pieces, mount_piece, place_pieces
-from mjx_revolve.view.raster import make_view
-from mjx_revolve.view.surroundings import moves
-from mjx_revolve.view.water_panel import (
-    Panel,
-    Surface,
-    draw_ground,
-    draw_pose,
-    draw_surface,
-    fit_panel,
-    open_water,
-    region_around,
-)
-from mjx_revolve.water.bed import bed_height, bed_slope
+from mjx_revolve.view.plots import INK, in_style, new_figure
+from mjx_revolve.view.poses import pose_robot
+from mjx_revolve.view.raster import make_view, show_scene
+from mjx_revolve.view.surroundings import bed_at, is_moving
 from mjx_revolve.water.flow import Water
 
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
     from mjx_revolve.episodes.simulate import Trajectory
 
-_PAGE = (1600, 900)  # pixels
-_DPI = 100
-_LEFT, _TOP, _GAP = 36, 74, 14  # of the panels on the page [pixels]
-_STRIP = 212  # height of the snapshots
-_SNAPSHOTS = 6
-_PATH = "#e2711d"
-_ELEVATION = 20.0  # of the viewer [deg]
-_TOWARDS = 14.0  # the robot swims this much towards the viewer, not straight to the right [deg]
+_INCHES, _DPI = (16.0, 9.0), 100
+_LEFT, _RIGHT, _TOP, _GAP = 0.95, 0.3, 0.74, 0.14  # free margins of the page [inches]
+_STRIP, _SNAPSHOTS = 2.0, 6  # height [inches] and number of the snapshots of a stroke
+_SOFT = "#4d6675"
+_FLOW: RGB = (0.5 * CURRENT[0], 0.5 * CURRENT[1], 0.5 * CURRENT[2])  # darker, on pale water
+_RIM = [withStroke(linewidth=2.5, foreground=(1, 1, 1, 0.7))]  # around words on any ground
 # The surface and the bed are shown where they are at most this far away [body lengths].
 _SURFACE_NEAR, _BED_NEAR = 0.3, 0.6
+_SHORTER = 0.28  # share of the height that the lower of both views has at least
 
 
-def pose_scene(robot: Robot, qpos: np.ndarray, pieces: Sequence[Piece] | None = None) -> Scene:
-    """The robot's parts in a pose.
+def pose_scenes(robot: Robot, qpos: np.ndarray) -> list[Scene]:
+    """The robot's parts in poses `qpos` `[S, nq]`: a scene for each, world frame [m]."""
+    poses, pieces = pose_robot(robot, qpos), make_pieces(robot.morphology)
+    rotation = Rotation.from_quat(poses.quaternion, scalar_first=True).as_matrix()
+    mounts = {id(piece): mount_piece(robot, piece) for piece in pieces}
 
-    Args:
-        robot: the robot.
-        qpos: `[nq]` as in a trajectory.
-        pieces: from `make_pieces(robot.morphology)`, where they are there already.
+    def scene(k: int) -> Scene:
+        def place(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+            body, position, turned = mounts[id(piece)]
+            frame = rotation[k, body]
+            return poses.position[k, body] + frame @ position, frame @ turned
 
-    Returns:
-        The scene, world frame [m].
-    """
-    data = mujoco.MjData(robot.mj_model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(robot.mj_model, data)
+        return place_pieces(pieces, place)
 
-    def place(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-        body, position, rotation = mount_piece(robot, piece)
-        frame = data.xmat[body].reshape(3, 3)
-        return data.xpos[body] + frame @ position, frame @ rotation
-
-    return place_pieces(make_pieces(robot.morphology) if pieces is None else pieces, place)
-
-
-def _panel_axes(figure: Figure, left: int, bottom: int, size: tuple[int, int]) -> Axes:
-    """Axes whose units are the pixels of the page, `size` of them from its corner."""
-    width, height = _PAGE
-    box = (left / width, bottom / height, size[0] / width, size[1] / height)
-    axes = figure.add_axes(box)
-    axes.set_axis_off()
-    axes.set_xlim(0, size[0])
-    axes.set_ylim(0, size[1])
-    return axes
-
-
-def _show_image(axes: Axes, image: np.ndarray, zorder: float) -> None:
-    """Puts an image, pixel for pixel, into axes of `_panel_axes`."""
-    rows, columns = image.shape[:2]
-    image = np.clip(image, 0.0, 1.0)
-    if image.shape[2] == 4:
-        image[..., :3] = np.clip(image[..., :3] / np.maximum(image[..., 3:], 1e-6), 0.0, 1.0)
-    limits = axes.axis()
-    axes.imshow(image, extent=(0, columns, 0, rows), origin="lower", interpolation="nearest",
-                aspect="auto", zorder=zorder)  # fmt: skip
-    axes.axis(limits)
-
-
-def _ground(robot: Robot, points: np.ndarray) -> tuple[float, np.ndarray, bool]:
-    """The plane below the robot: height at the origin [m], slope [2], and whether it is the bed."""
-    length, bed = robot.morphology.length, robot.world.bed
-    if bed is not None:
-        place = points[:, :2].mean(axis=0)
-        slope = np.array([float(k) for k in bed_slope(bed, *place)])
-        height = float(bed_height(bed, *place)) - float(slope @ place)
-        if (points[:, 2] - height - points[:, :2] @ slope).min() < _BED_NEAR * length:
-            return height, slope, True
-    return float(points[:, 2].min()) - 0.08 * length, np.zeros(2), False
-
-
-def _surface(motion: Motion, points: np.ndarray, top: float, fade: float) -> Surface | None:
-    """The water's surface around points `[n, 2]`, if it is near the robot's top [m]."""
-    height = float(motion.surface[0])
-    if height >= top + _SURFACE_NEAR * motion.length:
-        return None
-    return Surface(height, region_around(motion.along, points, fade))
-
-
-def _draw_way(
-    figure: Figure, motion: Motion, scenes: list[Scene], view: np.ndarray, bottom: int
-) -> None:
-    """The large picture: the robot in several poses along its way."""
-    length, path = motion.length, motion.path
-    size = (_PAGE[0] - 2 * _LEFT, _PAGE[1] - _TOP - bottom)
-    points = np.concatenate([*(scene.corners.reshape(-1, 3) for scene in scenes), path])
-    region = region_around(motion.along, points[:, :2], 0.9 * length)
-    surface = _surface(motion, points[:, :2], float(points[:, 2].max()), 0.9 * length)
-    shown = points
-    if surface is not None:
-        shown = np.concatenate([points, [[*path[0, :2], surface.height]]])
-    target = motion.target
-    if target is not None and _is_near(motion, target):
-        shown = np.concatenate([shown, target[None]])
-    panel = fit_panel(view, shown, size, (46, 46, 34, 40))
-
-    image = open_water(size)
-    opacity = np.linspace(0.45, 1.0, len(scenes)) if len(scenes) > 1 else np.ones(1)
-    draw_ground(image, panel, region, _ground(motion.robot, points), scenes, opacity)
-    if surface is not None:
-        draw_surface(image, panel, surface)
-    depth = points @ view[2]
-    layer = np.zeros((*image.shape[:2], 4))
-    for scene, share in zip(scenes, opacity, strict=True):
-        draw_pose(layer, panel, scene, float(share), (depth.min(), depth.max()), surface)
-    axes = _panel_axes(figure, _LEFT, bottom, size)
-    _show_image(axes, image, zorder=1)
-    _show_image(axes, layer, zorder=3)
-
-    # The same line once behind the robots and once, faintly, in front of them.
-    way, steady = panel.pixels(path), panel.pixels(motion.steady)
-    axes.plot(*way.T, color=_PATH, lw=0.9, alpha=0.6, zorder=2)
-    axes.plot(*steady.T, color=_PATH, lw=2.6, solid_capstyle="round", zorder=2)
-    axes.plot(*steady.T, color=_PATH, lw=1.4, alpha=0.7, solid_capstyle="round", zorder=4)
-    axes.plot(*way[motion.poses].T, "o", color="white", markeredgecolor=_PATH, markeredgewidth=2,
-              markersize=7, zorder=5)  # fmt: skip
-    places = Places(axes, layer[..., 3] > 0.02)
-    places.take_line(way)
-    if target is not None:
-        draw_target(panel, target, path[-1], places)
-    _label_poses(motion, panel, scenes, places, surface is None)
-    if moves(motion.current):
-        mean = motion.current.mean(axis=0)
-        if np.linalg.norm(mean) > 0.1 * np.linalg.norm(motion.current, axis=1).mean():
-            draw_current(panel, mean, places)
-    draw_scale_bars(panel, motion.along, length, places)
-    if surface is not None:
-        spots = [(x, y) for y in range(size[1] - 20, 20, -10) for x in range(90, size[0] - 90, 20)]
-        places.put(write(axes, (0, 0), "water surface", color=SOFT), spots)
-
-
-def _is_near(motion: Motion, target: np.ndarray) -> bool:
-    """Whether a target has room in the picture: within half the way of it, or two bodies."""
-    away = float(np.linalg.norm(motion.path - target, axis=1).min())
-    way = float(np.linalg.norm(motion.path[-1] - motion.path[0]))
-    return away <= max(0.5 * way, 2 * motion.length)
-
-
-def _label_poses(
-    motion: Motion, panel: Panel, scenes: Sequence[Scene], places: Places, deep: bool
-) -> None:
-    """When each pose was, and how deep the core is in the first and the last, if `deep`."""
-    ends = (motion.poses[0], motion.poses[-1])
-    # Further away, it could be a neighbour's.
-    sides = (0, 25, -25, 50, -50) + (100, -100, 150, -150) * (len(scenes) == 1)
-    for row, scene in zip(motion.poses, scenes, strict=True):
-        x, y = at = panel.pixels(motion.path[row])
-        when = f"{motion.time[row]:.1f}".removesuffix(".0") + " s"
-        reach = int(np.abs(panel.pixels(scene.corners.reshape(-1, 3)) - at).max()) + 60
-        spots = [(x + side, y + sign * up) for up in range(20, reach, 4) for sign in (1, -1)
-                 for side in sides]  # fmt: skip
-        depth = f"\ndepth {motion.depth[row]:.2f} m" if deep and row in ends else ""
-        for words in dict.fromkeys((when + depth, when)):
-            label = write(places.axes, (x, y), words, fontsize=14, fontweight="bold")
-            if places.put(label, spots):
-                break
-
-
-def _draw_stroke(figure: Figure, motion: Motion, pieces: Sequence[Piece], view: np.ndarray) -> None:
-    """The strip: snapshots of one stroke, or of the last second."""
-    rows = stroke_rows(motion.time, motion.period, _SNAPSHOTS)
-    places = motion.path[rows]
-    scenes = [pose_scene(motion.robot, motion.qpos[row], pieces) for row in rows]
-    size = ((_PAGE[0] - 2 * _LEFT - (_SNAPSHOTS - 1) * _GAP) // _SNAPSHOTS, _STRIP)
-    around = np.concatenate(
-        [scene.corners.reshape(-1, 3) - at for scene, at in zip(scenes, places, strict=True)]
-    )
-    home = fit_panel(view, around, size, (8, 8, 10, 26))
-    depth = around @ view[2]
-    for k, (scene, at) in enumerate(zip(scenes, places, strict=True)):
-        panel = replace(home, low=home.low + view[:2] @ at)
-        near = float(view[2] @ at)
-        image = open_water(size)
-        top = float(scene.corners[..., 2].max())
-        surface = _surface(motion, at[None, :2], top, motion.length)
-        if surface is not None:
-            draw_surface(image, panel, surface)
-        layer = np.zeros((size[1], size[0], 4))
-        draw_pose(layer, panel, scene, 1.0, (near + depth.min(), near + depth.max()), surface)
-        axes = _panel_axes(figure, _LEFT + k * (size[0] + _GAP), _LEFT, size)
-        _show_image(axes, image * (1.0 - layer[..., 3:]) + layer[..., :3], zorder=1)
-        since = motion.time[rows[k]] - motion.time[rows[0]]
-        late = f"+{since:.2f} s" if k else f"{motion.time[rows[0]]:.2f} s"
-        write(axes, (12, size[1] - 17), late, ha="left")
-    period = motion.period
-    words = "the last second" if period is None else f"one stroke of {period:.2f} s"
-    figure.text(_LEFT / _PAGE[0], (_LEFT + _STRIP + 19) / _PAGE[1],
-                f"{words.capitalize()}, seen by a camera that follows the core",
-                fontsize=12, color=INK, va="center")  # fmt: skip
-
-
-def _headline(motion: Motion) -> str:
-    """Who, and how fast while it counts."""
-    name = str(motion.robot.morphology.name)
-    if motion.seconds <= 0.0:
-        return name
-    words = f"{name}: {motion.speed / motion.length:.2g} body lengths/s ({motion.speed:.2g} m/s)"
-    if not moves(motion.current):
-        return words
-    # What drifts covers ground without swimming.
-    return f"{words} over ground, {motion.water_speed / motion.length:.2g} through the water"
-
-
-def _facts(motion: Motion) -> str:
-    """How far and how long."""
-    begun = motion.time[motion.first]
-    when = f"after the first {begun:.3g} s" if motion.first else "getting under way included"
-    return (
-        f"{motion.distance:.2g} m ({motion.distance / motion.length:.2g} body lengths) in "
-        f"{motion.seconds:.3g} s, {when}"
-    )
-
-
-def draw_motion(motion: Motion) -> Figure:
-    """Draws the way a robot swam.
-
-    Args:
-        motion: what it did.
-
-    Returns:
-        The figure: poses along the way with the core's path, and below them six snapshots of one
-        stroke where the robot has hinges. Speed and distance are those that count.
-    """
-    width, height = _PAGE
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    heading = math.degrees(math.atan2(motion.along[1], motion.along[0]))
-    view = make_view(heading - 90.0 + _TOWARDS, _ELEVATION)
-    pieces = make_pieces(motion.robot.morphology)
-    strip = motion.robot.num_hinges > 0 and len(motion.time) > 1
-    if strip:
-        _draw_stroke(figure, motion, pieces, view)
-    scenes = [pose_scene(motion.robot, motion.qpos[row], pieces) for row in motion.poses]
-    _draw_way(figure, motion, scenes, view, _LEFT + (_STRIP + 38 if strip else 0))
-
-    left, line = _LEFT / width, 1.0 - 0.5 * _TOP / height
-    figure.text(left, line, _headline(motion), fontsize=17, color=INK, va="center")
-    figure.text(1.0 - left, line, _facts(motion), fontsize=12, color=SOFT, ha="right", va="center")
-    return figure
+    return [scene(k) for k in range(len(qpos))]
 
 
 def plot_swim(
@@ -299,10 +72,10 @@ def plot_swim(
 
     Args:
         robot: the robot.
-        trajectory: what it did. Rows after the first that is not finite are left out.
+        trajectory: of the robot. Rows after the first that is not finite are left out.
         counted_from: when its task begins to count, see `motion.counted_time` [s].
         water: surface and current, each a number or a row for each step; None: the world's.
-        target: `[3]` where it was to go, world frame [m].
+        target: `[3]` that it was to reach, world frame [m].
 
     Returns:
         The figure.
@@ -311,3 +84,268 @@ def plot_swim(
         InputError: the trajectory is another robot's, or has no finite row.
     """
     return draw_motion(analyse_motion(robot, trajectory, counted_from, None, water, target))
+
+
+@in_style
+def draw_motion(motion: Motion) -> Figure:
+    """Draws the way a robot swam.
+
+    Args:
+        motion: of the robot.
+
+    Returns:
+        The figure: poses along the way with the core's path, from above and from the side in one
+        scale, and below them six snapshots of one stroke where the robot has hinges. Speed and
+        distance are those that count.
+    """
+    width, height = _INCHES
+    figure = new_figure(width, height)
+    figure.set(dpi=_DPI, layout_engine="none")
+    line = 1.0 - 0.5 * _TOP / height
+    figure.text(0.36 / width, line, _headline(motion), fontsize=17, color=INK, va="center")
+    figure.text(1 - _RIGHT / width, line, _facts(motion), fontsize=12, color=_SOFT, ha="right",
+                va="center")  # fmt: skip
+    strip = motion.robot.num_hinges > 0 and len(motion.time) > 1
+    _draw_way(figure, motion, 0.7 + (_STRIP + 0.65 if strip else 0.0))
+    if strip:
+        _draw_stroke(figure, motion)
+    return figure
+
+
+def _headline(motion: Motion) -> str:
+    """Name, and mean speed while it counts."""
+    name = str(motion.robot.morphology.name)
+    if motion.seconds <= 0.0:
+        return name
+    words = f"{name}: {motion.speed / motion.length:.2g} body lengths/s ({motion.speed:.2g} m/s)"
+    if not is_moving(motion.current):
+        return words
+    # A robot that drifts covers ground without swimming.
+    return f"{words} over ground, {motion.water_speed / motion.length:.2g} through the water"
+
+
+def _facts(motion: Motion) -> str:
+    """Distance and time while it counts."""
+    begun = motion.time[motion.first]
+    when = f"after the first {begun:.3g} s" if motion.first else "getting under way included"
+    return (
+        f"{motion.distance:.2g} m ({motion.distance / motion.length:.2g} body lengths) in "
+        f"{motion.seconds:.3g} s, {when}"
+    )
+
+
+def _axes_at(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+    """Axes of so many inches, that far from the page's lower left corner."""
+    wide, high = _INCHES
+    return figure.add_axes((left / wide, bottom / high, width / wide, height / high))
+
+
+def _write(axes: Axes, words: str, at: Any, **style: Any) -> None:
+    axes.annotate(words, at, path_effects=_RIM, zorder=8,
+                  **{"color": INK, "ha": "center", "va": "center"} | style)  # fmt: skip
+
+
+# --- the way --------------------------------------------------------------------------------------
+
+
+def _draw_way(figure: Figure, motion: Motion, bottom: float) -> None:
+    """Plan and side view of poses along the way, in metres from the start and the surface."""
+    length = motion.length
+    origin = np.array([*motion.path[0, :2], motion.surface[0]])
+    heading = math.degrees(math.atan2(motion.along[1], motion.along[0]))
+    plan, side = make_view(heading - 90.0, 90.0), make_view(heading - 90.0, 0.0)
+    scenes = [replace(scene, corners=scene.corners - origin)
+              for scene in pose_scenes(motion.robot, motion.qpos[motion.poses])]  # fmt: skip
+    path, steady = motion.path - origin, motion.steady - origin
+    target = None if motion.target is None else motion.target - origin
+    near = target is not None and _is_near(motion, target, path)
+    points = np.concatenate([*(scene.corners.reshape(-1, 3) for scene in scenes), path,
+                             *([target[None]] if near and target is not None else [])])  # fmt: skip
+    ahead, across = points @ plan[0], points @ plan[1]
+    bed = _bed_profile(motion, points, side, origin)
+    heights = [points[:, 2].min(), points[:, 2].max()]
+    if bed is not None:
+        heights[0] = min(heights[0], *np.interp([ahead.min(), ahead.max()], *bed))
+    if heights[1] > -_SURFACE_NEAR * length:
+        heights[1] = max(heights[1], 0.0)
+    low = np.array([ahead.min(), across.min(), heights[0]]) - 0.12 * length
+    high = np.array([ahead.max(), across.max(), heights[1]]) + 0.2 * length
+    middle, unit, boxes = (low + high) / 2, *_arrange(high - low, bottom)
+    both = []
+    for view, centre, (left, at, wide, tall) in zip(
+        (plan, side), (middle[[0, 1]], middle[[0, 2]]), boxes, strict=True
+    ):
+        axes = _axes_at(figure, left, at, wide, tall)
+        (x0, y0), (x1, y1) = (centre + sign * unit * np.array([wide, tall]) / 2 for sign in (-1, 1))
+        axes.axis((x0, x1, y0, y1))
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=int(0.8 * wide), steps=[1, 2, 5, 10]))
+        axes.yaxis.set_major_locator(MaxNLocator(nbins=max(3, int(tall)), steps=[1, 2, 5, 10]))
+        axes.set_facecolor(WATER)
+        axes.grid(color="white", linewidth=1.0)
+        axes.tick_params(labelsize=12)
+        fades = np.linspace(0.45, 1.0, len(scenes)) if len(scenes) > 1 else [1.0]
+        for scene, fade in zip(scenes, fades, strict=True):
+            show_scene(axes, scene, view, unit / _DPI, float(fade))
+        # The same line once behind the robots and once, faintly, in front of them.
+        way, smooth = path @ view[:2].T, steady @ view[:2].T
+        axes.plot(*way.T, color=ACCENT, linewidth=0.9, alpha=0.6, zorder=2)
+        axes.plot(*smooth.T, color=ACCENT, linewidth=2.6, zorder=2)
+        axes.plot(*smooth.T, color=ACCENT, linewidth=1.4, alpha=0.7, zorder=4)
+        axes.plot(*way[motion.poses].T, "o", color="white", markeredgecolor=ACCENT,
+                  markeredgewidth=1.6, markersize=5, zorder=5)  # fmt: skip
+        if target is not None:
+            away = float(np.linalg.norm(target - path[-1]))
+            if near or view is plan:
+                _draw_target(axes, view[:2] @ target, way[-1], away, near, unit)
+        both.append(axes)
+    above, beside = both
+    if boxes[0][0] == boxes[1][0]:  # above each other
+        above.tick_params(labelbottom=False)
+    else:
+        above.set_xlabel("along the way (m)", fontsize=13)
+    above.set_ylabel("across (m)", fontsize=13)
+    beside.set_xlabel("along the way (m)", fontsize=13)
+    beside.set_ylabel("depth (m)", fontsize=13)
+    beside.yaxis.set_major_formatter(FuncFormatter(lambda z, _: f"{0.0 - z:.4g}".replace("-", "−")))
+    for axes, words in ((above, "from above"), (beside, "from the side")):
+        axes.text(0.99, 0.03, words, transform=axes.transAxes, color=_SOFT, ha="right")
+    if heights[1] >= 0.0:
+        beside.set_facecolor("white")
+        draw_surface(beside, 0.0)
+    if bed is not None:
+        beside.fill_between(*bed, beside.get_ylim()[0], color=SAND, zorder=1)
+    _label_poses(beside, motion, scenes, side, 0.5 * unit)
+    above.add_artist(AnchoredSizeBar(
+        above.transData, length, f"1 body length ({length:.2g} m)", "lower left", frameon=False,
+        color=INK, sep=4, borderpad=0.6, size_vertical=0.03 * unit,
+    ))  # fmt: skip
+    _draw_current(above, motion.current, plan, unit)
+
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, width and height of axes [inches]."""
+
+
+def _arrange(size: np.ndarray, bottom: float) -> tuple[float, tuple[Box, Box]]:
+    """Metres per inch and the boxes of plan and side view, whichever way they become larger.
+
+    Above each other or side by side; both views have one scale and fill the page.
+
+    Args:
+        size: `[3]` along the way, across it and upwards of what is shown [m].
+        bottom: of the lower view [inches].
+    """
+    wide, tall = _INCHES[0] - _LEFT - _RIGHT, _INCHES[1] - _TOP - bottom
+    share = float(np.clip(size[2] / size[1:].sum(), _SHORTER, 1 - _SHORTER))
+    low, high, half = (tall - _GAP) * share, (tall - _GAP) * (1 - share), (wide - _LEFT) / 2
+    stacked = (_LEFT, bottom + low + _GAP, wide, high), (_LEFT, bottom, wide, low)
+    paired = (_LEFT, bottom, half, tall), (2 * _LEFT + half, bottom, half, tall)
+
+    def unit(boxes: tuple[Box, Box]) -> float:
+        (_, _, w, h), (_, _, _, below) = boxes
+        return float((size / [w, h, below]).max())
+
+    return min(((unit(boxes), boxes) for boxes in (stacked, paired)), key=lambda found: found[0])
+
+
+def _is_near(motion: Motion, target: np.ndarray, path: np.ndarray) -> bool:
+    """Whether a target has room in the picture: within half the way of it, or two bodies."""
+    away = float(np.linalg.norm(path - target, axis=1).min())
+    return away <= max(0.5 * float(np.linalg.norm(path[-1] - path[0])), 2 * motion.length)
+
+
+def _bed_profile(
+    motion: Motion, points: np.ndarray, side: np.ndarray, origin: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Places along the way and heights of the bed there, if it is near the points `[n, 3]`."""
+    if motion.robot.world.bed is None:
+        return None
+    ahead, across = points @ side[0], points @ side[2]
+    span = float(np.ptp(ahead)) + 4 * motion.length
+    x = (ahead.min() + ahead.max()) / 2 + np.linspace(-2 * span, 2 * span, 400)
+    place = np.outer(x, side[0, :2]) + across.mean() * side[2, :2] + origin[:2]
+    z = bed_at(motion.robot.world.bed, *place.T) - origin[2]
+    below = float((points[:, 2] - np.interp(ahead, x, z)).min())
+    return (x, z) if below < _BED_NEAR * motion.length else None
+
+
+def _label_poses(
+    axes: Axes, motion: Motion, scenes: Sequence[Scene], view: np.ndarray, least: float
+) -> None:
+    """The time of each pose above it, where the last label is at least `least` [m] away."""
+    last = None
+    for row, scene in zip(motion.poses, scenes, strict=True):
+        points = scene.corners.reshape(-1, 3) @ view[:2].T
+        at = np.array([(points[:, 0].min() + points[:, 0].max()) / 2, points[:, 1].max()])
+        if last is None or np.abs(at - last).max() > least:
+            when = f"{motion.time[row]:.1f}".removesuffix(".0") + " s"
+            _write(axes, when, at, xytext=(0, 9), textcoords="offset points", fontsize=12,
+                   fontweight="bold")  # fmt: skip
+            last = at
+
+
+def _draw_current(axes: Axes, current: np.ndarray, plan: np.ndarray, unit: float) -> None:
+    """An arrow along the mean of velocities `[T, 3]` in the upper left corner, and its speed."""
+    mean = current.mean(axis=0)
+    speed = float(np.linalg.norm(mean))
+    if is_moving(current) and speed > 0.1 * np.linalg.norm(current, axis=1).mean():
+        corner = np.array([axes.get_xlim()[0], axes.get_ylim()[1]])
+        words = f"current {speed:.2g} m/s"
+        _write(axes, words, corner + unit * np.array([1.0, -0.2]), color=_FLOW, fontsize=11)
+        middle, ahead = corner + unit * np.array([1.0, -0.5]), 0.35 * unit * (plan[:2] @ mean)
+        _arrow(axes, middle - ahead / speed, middle + ahead / speed, _FLOW)
+
+
+def _draw_target(
+    axes: Axes, target: np.ndarray, here: np.ndarray, away: float, near: bool, unit: float
+) -> None:
+    """A mark on the target; where it is out of the picture, an arrow from `here` towards it."""
+    if near:
+        axes.plot(*target, "o", color="none", markersize=15, markeredgecolor=TARGET,
+                  markeredgewidth=2, zorder=6)  # fmt: skip
+        axes.plot(*target, "o", color=TARGET, markersize=5, zorder=6)
+        _write(axes, "target", target + unit * np.array([0, 0.22]), color=TARGET, fontsize=11)
+        return
+    ahead = unit * (target - here) / max(float(np.linalg.norm(target - here)), 1e-9)
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    end = np.clip(here + 1.2 * ahead, low + 0.1 * unit, high - 0.1 * unit)
+    _arrow(axes, end - 0.6 * ahead, end, TARGET)
+    words = f"target, {away:.2g} m on"
+    _write(axes, words, end + unit * np.array([0, 0.2]), color=TARGET, fontsize=11, ha="right")
+
+
+def _arrow(axes: Axes, start: np.ndarray, end: np.ndarray, color: RGB) -> None:
+    look = {"arrowstyle": "-|>", "color": color, "lw": 2.6, "mutation_scale": 18, "shrinkB": 0}
+    axes.annotate("", (end[0], end[1]), (start[0], start[1]), zorder=7, arrowprops=look)
+
+
+# --- one stroke -----------------------------------------------------------------------------------
+
+
+def _draw_stroke(figure: Figure, motion: Motion) -> None:
+    """The strip: snapshots of one stroke, or of the last second, from a little above."""
+    rows = stroke_rows(motion.time, motion.period, _SNAPSHOTS)
+    heading = math.degrees(math.atan2(motion.along[1], motion.along[0]))
+    view = make_view(heading - 76.0, 20.0)
+    scenes = [replace(scene, corners=scene.corners - motion.path[row]) for row, scene in
+              zip(rows, pose_scenes(motion.robot, motion.qpos[rows]), strict=True)]  # fmt: skip
+    flat = np.concatenate([scene.corners.reshape(-1, 3) for scene in scenes]) @ view[:2].T
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    box = np.array([(_INCHES[0] - 2 * _RIGHT + _GAP) / _SNAPSHOTS - _GAP, _STRIP])
+    unit = float(((high - low) / (box - 0.3)).max())
+    middle, half = (low + high) / 2, unit * box / 2
+    for k, (row, scene) in enumerate(zip(rows, scenes, strict=True)):
+        axes = _axes_at(figure, _RIGHT + k * (box[0] + _GAP), 0.25, *box)
+        axes.set(xticks=[], yticks=[], facecolor=WATER)
+        axes.spines[:].set_visible(False)
+        axes.axis((middle[0] - half[0], middle[0] + half[0],
+                   middle[1] - half[1], middle[1] + half[1]))  # fmt: skip
+        show_scene(axes, scene, view, unit / _DPI)
+        since = motion.time[row] - motion.time[rows[0]]
+        late = f"+{since:.2f} s" if k else f"{motion.time[row]:.2f} s"
+        axes.text(0.04, 0.96, late, transform=axes.transAxes, color=INK, fontsize=11, va="top")
+    period = motion.period
+    words = "The last second" if period is None else f"One stroke of {period:.2f} s"
+    figure.text(_RIGHT / _INCHES[0], (_STRIP + 0.42) / _INCHES[1],
+                f"{words}, seen by a camera that follows the core", fontsize=12, color=INK,
+                va="center")  # fmt: skip

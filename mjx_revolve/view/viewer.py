@@ -1,33 +1,63 @@
-"""One HTML file that replays an episode in any browser.
+"""One HTML file that replays robots in any browser: an episode, or a colony.
 
-The file holds everything: the robot's meshes, its poses and the forces on its modules along the
-episode (`page_data`), three.js, and the page's own scripts in `viewer_page/`. It needs no server
-and asks for nothing over the network.
+A file holds everything: meshes, poses, what is known of the water and the forces, three.js, and the
+scripts of `viewer_page/`. It needs no server and nothing from the network. Of a pose it keeps qpos,
+rounded, as the difference from the pose before, which zlib then packs: a pose of the shipped robots
+takes some 18 bytes. Long runs of many robots keep fewer poses, so that a page stays small enough to
+be sent: 64 robots for three hours, two poses a second, take 24 MB.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
+from mjx_revolve.view.palette import page_palette
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.champion import Episode
+    from mjx_revolve.view.recording import Mark, ReplayRobot
 
-_PAGE = Path(__file__).parent / "viewer_page"
+_FILES = Path(__file__).parent / "viewer_page"
+# What positions [m], quaternions [-] and hinges [rad] of many robots are rounded to: less than can
+# be seen. Choices.
+_STEPS = (1e-3, 5e-4, 2e-3)
+# A page that a browser opens without a wait, and most mail takes. A choice [bytes].
+_MOST = 24_000_000
+# Poses that are closer than this do not make motion smoother [s].
+_CLOSEST = 0.02
+_TRIES = 12  # at guessing how many poses fit
+
+
+@dataclass(frozen=True)
+class PageSummary:
+    """What a page holds.
+
+    Attributes:
+        bytes: its size.
+        poses: how many poses it keeps.
+        gap: least time between two poses of a robot, outside of the window; 0: all are kept [s].
+    """
+
+    bytes: int
+    poses: int
+    gap: float
 
 
 def write_viewer(episode: Episode, path: str | Path, forces: bool = True) -> None:
-    """Writes the replay of an episode as one HTML file.
-
-    The file appears whole or not at all.
+    """Writes the replay of an episode as one HTML file, whole or not at all.
 
     Args:
         episode: what to show; rows after the first that is not finite are left out.
         path: of the file, which ends in `.html`; its folder is made if need be.
-        forces: see `make_page`.
+        forces: whether the page has arrows of forces, which take seconds to compile.
 
     Raises:
         InputError: `path` has another ending, or the episode has no finite row.
@@ -37,34 +67,77 @@ def write_viewer(episode: Episode, path: str | Path, forces: bool = True) -> Non
 
 
 def make_page(episode: Episode, forces: bool = True) -> str:
-    """The replay of an episode as the text of an HTML file.
-
-    Args:
-        episode: what to show.
-        forces: whether it has arrows of forces, which take seconds to compile.
-
-    Returns:
-        The page.
-
-    Raises:
-        InputError: the episode has no finite row.
-    """
-    from mjx_revolve.view.page_data import page_data
+    """The replay of an episode as the text of an HTML file; see `write_viewer`."""
+    from mjx_revolve.view.episode_data import episode_data
 
     return fill_page(
-        "page.html",
+        "replay",
+        maker="viewer",
         title=episode.title,
-        subtitle=_subtitle(episode),
-        data=page_data(episode, forces),
+        subtitle=_episode_subtitle(episode),
+        data=episode_data(episode, forces),
     )
 
 
-def fill_page(template: str, **values: Any) -> str:
-    """A page of `viewer_page/`, which holds all files that it needs.
+def write_colony_page(
+    robots: Sequence[ReplayRobot],
+    path: str | Path,
+    title: str,
+    *,
+    marks: Sequence[Mark] = (),
+    leap: float | None = None,
+    window: tuple[float, float] | None = None,
+    most: int = _MOST,
+) -> PageSummary:
+    """Writes the replay of many robots as one HTML file, whole or not at all.
 
     Args:
-        template: its name there.
-        values: what it is filled with: `title`, `subtitle`, and `data` for its scripts.
+        robots: all that ever appear, in one world.
+        path: of the file, which ends in `.html`; its folder is made if need be.
+        title: its heading.
+        marks: places to show.
+        leap: a robot that is farther than this from its pose before was put there, and is not
+            shown on the way [m]; None: never.
+        window: from when to when no pose is left out, however large that makes the page [s].
+        most: about how large the page may be [bytes]; where there are too many poses for that,
+            each robot keeps those that are some time apart.
+
+    Returns:
+        What the page holds.
+
+    Raises:
+        InputError: `path` has another ending, there is no robot, or one of them has poses that do
+            not fit its body.
+        OSError: the file cannot be written.
+    """
+    path = check_name(path, PAGES)
+    if not robots:
+        raise InputError("robots: expected at least one robot to show; found none")
+    for one in robots:
+        one.check()
+    world = robots[0].robot.world
+    low = min(float(np.asarray(one.qpos)[:, 2].min()) for one in robots)
+    size = max(one.robot.morphology.length for one in robots)
+    from mjx_revolve.view.page_data import replay_data
+
+    data = replay_data(robots, low - 0.5 * size, marks, leap) | {"many": True, "episode": None}
+    page = {"maker": "colony", "title": title}
+    bare = len(fill_page("replay", subtitle="", data=data, **page).encode())
+    poses, gap, packed = _fit(robots, window, max(most - bare, most // 50))
+    count = f"{len(robots)} robot{'s' if len(robots) > 1 else ''}"
+    often = f"a pose of each every {gap:.2g} s" if gap > 0.1 else ""
+    subtitle = " \u00b7 ".join(filter(None, (count, world.name.replace("_", " "), often)))
+    content = fill_page("replay", subtitle=subtitle, data=data | packed, **page).encode()
+    write_atomic(path, content)
+    return PageSummary(len(content), poses, gap)
+
+
+def fill_page(template: str, **values: Any) -> str:
+    """A page of `viewer_page/`, with all files that it needs inside.
+
+    Args:
+        template: its name there: "replay" or "live".
+        values: `maker`, `title`, `subtitle`, and `data` for its scripts.
 
     Returns:
         The text of an HTML file.
@@ -72,14 +145,15 @@ def fill_page(template: str, **values: Any) -> str:
     import jinja2
 
     pages = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_PAGE), autoescape=True, undefined=jinja2.StrictUndefined
+        loader=jinja2.FileSystemLoader(_FILES), autoescape=True, undefined=jinja2.StrictUndefined
     )
     pages.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    file = lambda name: (_PAGE / name).read_text(encoding="utf-8")  # noqa: E731
-    return pages.get_template(template).render(file=file, **values)
+    file = lambda name: (_FILES / name).read_text(encoding="utf-8")  # noqa: E731
+    page = pages.get_template(f"{template}.html")
+    return page.render(file=file, palette=page_palette(), script=f"{template}.js", **values)
 
 
-def _subtitle(episode: Episode) -> str:
+def _episode_subtitle(episode: Episode) -> str:
     """Score, body and water in a line."""
     body, world = episode.robot.morphology, episode.robot.world
     words = []
@@ -98,3 +172,35 @@ def _subtitle(episode: Episode) -> str:
         height = 2 * math.hypot(*(wave.amplitude for wave in world.waves))
         words.append(f"waves of {height:.2g} m")
     return " \u00b7 ".join(words)
+
+
+def _fit(
+    robots: Sequence[ReplayRobot], window: tuple[float, float] | None, room: int
+) -> tuple[int, float, dict[str, Any]]:
+    """As many poses as fit into so many bytes: how many, how far apart [s], and packed."""
+    from mjx_revolve.view.page_data import pack_poses
+
+    times = [np.asarray(one.time, float) for one in robots]
+    qpos = [np.asarray(one.qpos, float) for one in robots]
+    gap, total = _CLOSEST, sum(map(len, times))
+    usual = max((float(np.median(np.diff(t))) for t in times if len(t) > 1), default=0.0)
+    for _ in range(_TRIES):
+        rows = [_thin(time, gap, window) for time in times]
+        kept_times = [x[own] for x, own in zip(times, rows, strict=True)]
+        kept_qpos = [x[own] for x, own in zip(qpos, rows, strict=True)]
+        packed = pack_poses(kept_times, kept_qpos, _STEPS)
+        count, size = sum(map(len, rows)), len(packed["poses"])
+        if size <= room:
+            break
+        gap = max(gap, usual) * max(1.1, size / room)
+    return count, gap if count < total else 0.0, packed
+
+
+def _thin(time: np.ndarray, gap: float, window: tuple[float, float] | None) -> np.ndarray:
+    """Rows of times `[T]` that are some time apart [s], and the first and the last."""
+    slot = np.floor((time - time[0]) / gap + 1e-6)
+    kept = np.r_[True, np.diff(slot) > 0]
+    kept[-1] = True
+    if window is not None:
+        kept |= (time >= window[0]) & (time <= window[1])
+    return np.flatnonzero(kept)

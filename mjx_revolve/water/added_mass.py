@@ -12,7 +12,38 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import elliprd
 
+from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.spatial import Scalar, Vec, mul, neg
+from mjx_revolve.water.laws import Coefficient, law_numbers, part_field
+
+COEFFICIENTS = (
+    Coefficient(
+        "added_mass_coefficient", "-", "multiplies the envelope's added mass", 1.0, own_field=True
+    ),
+    Coefficient(
+        "entrained_water",
+        "-",
+        "share of the room in the box that the material leaves free, whose water is carried along",
+        0.0,
+        high=1.0,
+        own_field=True,
+    ),
+)
+
+
+@law_numbers
+class CarriedWater:
+    """Water that parts carry along, wholly wet: added mass and entrained water.
+
+    Attributes:
+        inertia: about the body's origin, body frame.
+        mass: along the part's axes [kg].
+        angular: about them, about the box's centre [kg·m²].
+    """
+
+    inertia: SpatialInertia = part_field("kg m2", varied=("added_mass", "density"))
+    mass: Vec = part_field("kg", axes="size", varied=("added_mass", "density"))
+    angular: Vec = part_field("kg m2", axes="size", varied=("added_mass", "density"))
 
 
 def lamb_coefficients(semi_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +118,7 @@ def entrained_water(
     return np.repeat(volume[..., None], 3, -1), inertia
 
 
-def come_aboard(share: Scalar, before: Scalar, dt: float) -> Scalar:
+def wetting_rate(share: Scalar, before: Scalar, dt: float) -> Scalar:
     """How fast a part's wet share grows; 0 where it shrinks.
 
     Args:
@@ -98,7 +129,7 @@ def come_aboard(share: Scalar, before: Scalar, dt: float) -> Scalar:
     Returns:
         Its rate [1/s].
     """
-    # A choice and no max: where both are 1, under water, that would share out a slope.
+    # A choice and no max: where both are 1, under water, that would split a gradient.
     return jnp.where(share > before, (share - before) * (1 / dt), 0)
 
 
@@ -118,7 +149,7 @@ def slam(rate: Scalar, carried: Any, speed: Vec) -> Vec:
     aboard in one step is carried in the next, so that momentum is kept however long the step.
 
     Args:
-        rate: from `come_aboard` [1/s].
+        rate: from `wetting_rate` [1/s].
         carried: what the part carries wholly wet, along or about its axes [kg, or kg·m²].
         speed: relative to the water [m/s, or rad/s].
 

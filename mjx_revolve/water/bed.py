@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from annotated_types import Unit
 
-from mjx_revolve.inputs.schema import MisfitError, NonNegative, Number, Positive, checked
+from mjx_revolve.inputs.errors import ConstraintError
+from mjx_revolve.inputs.schema import NonNegative, Number, Positive, checked
 from mjx_revolve.numerics.spatial import namespace, sincos
 
 # The thesis's lake: bed about 998 m x 998 m, z from -112.8 m to +36.7 m.
@@ -37,8 +38,8 @@ class Bed:
             body is too light for it to be stable (see `contact`).
         friction: Coulomb coefficient [-].
         contact: what keeps robots out of it: "penalty" (see `contact.bed_contact`), or "mjx", the
-            modules' boxes by MuJoCo's constraint solver (see `mjx_step`), which needs `engine: mjx`
-            and ignores `stiffness`.
+            modules' boxes by MuJoCo's constraint solver (see `engine.mjx_engine`), which needs
+            `engine: mjx` and ignores `stiffness`.
     """
 
     kind: Literal["flat", "lake"] = "flat"
@@ -53,7 +54,7 @@ class Bed:
         """Checks that a lake is deepest at its deepest place."""
         if self.kind == "lake" and self.highest <= self.height:
             above = f"more than height ({self.height:g})"
-            raise MisfitError("highest", above, f"{self.highest:g}")
+            raise ConstraintError("highest", above, f"{self.highest:g}")
 
 
 def bed_height(bed: Bed, x: Any, y: Any) -> Any:
@@ -116,7 +117,7 @@ def bed_slope(bed: Bed, x: Any, y: Any) -> tuple[Any, Any]:
     )
 
 
-@lru_cache(maxsize=8)  # every robot that is compiled above a bed asks for it
+@lru_cache(maxsize=8)  # every robot above a bed needs it
 def sample_bed(bed: Bed, n: int = 201) -> np.ndarray:
     """The bed on a grid, for MuJoCo's height field and for pictures.
 
@@ -130,6 +131,6 @@ def sample_bed(bed: Bed, n: int = 201) -> np.ndarray:
     # float32, as the population step computes it.
     line = np.linspace(-bed.extent / 2, bed.extent / 2, n).astype(np.float32)
     x, y = np.meshgrid(line, line)
-    heights = bed_height(bed, x, y).astype(np.float64)
+    heights: np.ndarray = bed_height(bed, x, y).astype(np.float64)
     heights.flags.writeable = False
     return heights

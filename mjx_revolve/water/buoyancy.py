@@ -1,15 +1,15 @@
-"""What the surface leaves of a box: its submerged share, Archimedes' force, surface tension.
+"""Buoyancy: the submerged fraction of a box, Archimedes' force, surface tension.
 
 A box of half edges h, whose centre is at depth d and which sees the vertical n, is cut by a plane.
 With a_i = h_i |n_i| the mean over the box of max(0, depth) is W(d, a), and everything else is its
-slope: the submerged share ∂W/∂d, the share's first moment -∂W/∂n. W is a box spline, usually
+gradient: the submerged fraction ∂W/∂d, its first moment -∂W/∂n. W is a box spline, usually
 written as a sum over the corners of (±) (d ± a₁ ± a₂ ± a₃)⁴ / (192 a₁a₂a₃), which is 0/0 when an
 edge is level and a difference of large numbers long before. Here the longest of the a_i is
 integrated last, over a rectangle whose own integrals are written without differences; so the form
 is exact at every attitude, in float32 too.
 
 All are pure functions on tuples of arrays (see `spatial`), run under `jit`, `vmap` and `grad` and
-have finite slopes everywhere.
+have finite gradients everywhere.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.spatial import Scalar, Vec, cross, mul, total, vadd, vscale
+from mjx_revolve.water.laws import BuoyancyLaw, Export, find_law
 
 
 class _Rectangle(NamedTuple):
@@ -52,7 +53,7 @@ class _Cut(NamedTuple):
 def _exchange(a: Any, b: Any) -> tuple[Any, Any, Any]:
     """The smaller, the larger, and whether they changed places.
 
-    Selects and no min and max: where two are equal, those would share the slope between both.
+    Selects and no min and max: where two are equal, those would split the gradient between both.
     """
     swap = a > b
     return jnp.where(swap, b, a), jnp.where(swap, a, b), swap
@@ -97,7 +98,7 @@ def _cut(x: Any, r: _Rectangle) -> _Cut:
     Returns:
         The integrals.
     """
-    # Which side slopes at 0 are taken from has to be the same here and in every `x >= 0` below.
+    # The one-sided gradient at 0 must be the same here and in every `x >= 0` below.
     b = 1 - jnp.where(x >= 0, x, -x) * r.per_long
     whole = b >= r.ratio
     s = jnp.where(whole, 1.0, jnp.maximum(0.5 + b * r.steepness, 0))
@@ -107,10 +108,10 @@ def _cut(x: Any, r: _Rectangle) -> _Cut:
     return _Cut(s * (3 * zz + ww), s * z * (zz + ww), s * s * (z + w * (1 - s)))
 
 
-def submersion(up: Vec, depth: Scalar, half_size: Vec, mode: str) -> tuple[Scalar, Vec]:
-    """How much of a tilted box is below the surface, and where that share's centre is.
+def cut_box(up: Vec, depth: Scalar, half_size: Vec) -> tuple[Scalar, Vec]:
+    """Submerged fraction of a tilted box, and the centre of the submerged piece.
 
-    "partial" is the exact volume and centroid of the box cut by a plane. Let a₁ ≤ a₂ ≤ a₃ be the
+    The exact volume and centroid of the box cut by a plane. Let a₁ ≤ a₂ ≤ a₃ be the
     h_i |n_i| in order and M, N, F_i the integrals of `_cut` over the rectangle of a₁, a₂. Then
 
         share = [M(d + a₃) - M(d - a₃)] / 2a₃,    W = [N(d + a₃) - N(d - a₃)] / 2a₃,
@@ -118,30 +119,22 @@ def submersion(up: Vec, depth: Scalar, half_size: Vec, mode: str) -> tuple[Scala
         ∂W/∂a₃ = [M(d + a₃) + M(d - a₃)] / 2a₃ - W/a₃,
 
     and the moment is -∂W/∂n_i = -h_i² n_i (∂W/∂a_i / a_i), the quotient without division by a
-    vanishing a_i: righting moments have their true slope at a level attitude. Force and moment come
-    from one potential, so they conserve energy; they are continuous at all depths and attitudes.
-    Their slopes are too, but for the one true exception: the force on a box that is level gets its
-    full slope at once, when a whole face meets the surface.
+    vanishing a_i: righting moments have their true gradient at a level attitude. Force and moment
+    come from one potential, so they conserve energy; they are continuous at all depths and
+    attitudes. Their gradients are too, with one true exception: the force on a level box gets
+    its full gradient at once, when a whole face meets the surface.
 
-    Errors in units of the box: 1e-14 in float64, 1e-6 in float32 (tests/physics/test_buoyancy.py).
-
-    "mask" is the thesis's rule: all of the part once its centre is below the surface. "off": none.
+    Errors in units of the box: 1e-14 in float64, 1e-6 in float32 (`tests/water/test_buoyancy.py`).
 
     Args:
         up: the world's vertical, part frame.
         depth: depth of the box's centre below the surface [m], positive under water.
         half_size: half edges [m].
-        mode: "partial", "mask" or "off".
 
     Returns:
-        The submerged share [-], and share times centre of the submerged piece relative to the box's
-        centre, part frame [m].
+        The submerged fraction [-], and fraction times centre of the submerged piece relative to the
+        box's centre, part frame [m].
     """
-    zero = jnp.zeros_like(depth)
-    if mode == "off":
-        return zero, (zero, zero, zero)
-    if mode == "mask":
-        return jnp.asarray(depth > 0, zero.dtype), (zero, zero, zero)
     a, b, c = (mul(h, jnp.abs(n)) for h, n in zip(half_size, up, strict=True))
     a, b, swap_first = _exchange(a, b)
     b, c, swap_last = _exchange(b, c)
@@ -157,25 +150,31 @@ def submersion(up: Vec, depth: Scalar, half_size: Vec, mode: str) -> tuple[Scala
     reached, covered = high >= 0, low >= 0
     between = reached & ~covered
     plain = jnp.where(covered, 2.0, jnp.where(reached, jnp.minimum(high * per_c, 2), 0.0))
-    slope_a = jnp.where(between, 2 - by_short, by_short) * (1 / 12)
-    slope_b = jnp.where(between, 4 - by_long, by_long) * (1 / 24)
+    gradient_a = jnp.where(between, 2 - by_short, by_short) * (1 / 12)
+    gradient_b = jnp.where(between, 4 - by_long, by_long) * (1 / 24)
     second = jnp.where(between, 2 + 2 * r.ratio * r.ratio - second, second)
     tilt = r.long * per_c
     share = 0.5 * plain + tilt * (1 / 24) * (upper.first - lower.first)
-    slope_c = 0.25 * plain * (2 - plain) + tilt * (1 / 24) * (
+    gradient_c = 0.25 * plain * (2 - plain) + tilt * (1 / 24) * (
         upper.first + lower.first - tilt * second
     )
-    slope_a, slope_b = _back(swap_again, slope_a, slope_b)
-    slope_b, slope_c = _back(swap_last, slope_b, slope_c)
-    slope_a, slope_b = _back(swap_first, slope_a, slope_b)
+    gradient_a, gradient_b = _back(swap_again, gradient_a, gradient_b)
+    gradient_b, gradient_c = _back(swap_last, gradient_b, gradient_c)
+    gradient_a, gradient_b = _back(swap_first, gradient_a, gradient_b)
     moment = [
-        mul(-(h * h), n * (slope * per_c))
-        for h, n, slope in zip(half_size, up, (slope_a, slope_b, slope_c), strict=True)
+        mul(-(h * h), n * (gradient * per_c))
+        for h, n, gradient in zip(half_size, up, (gradient_a, gradient_b, gradient_c), strict=True)
     ]
     return share, tuple(moment)
 
 
-def displaced(
+def mask_box(up: Vec, depth: Scalar, half_size: Vec) -> tuple[Scalar, Vec]:
+    """As `cut_box`, but all of the box once its centre is below the surface, and no moment."""
+    zero = jnp.zeros_like(depth)
+    return jnp.asarray(depth > 0, zero.dtype), (zero, zero, zero)
+
+
+def displaced_water(
     share: Scalar, moment: Vec, volume: Scalar, center: Vec, density: Scalar
 ) -> tuple[Scalar, Vec]:
     """The water that a part displaces: its mass and the first moment of it.
@@ -208,16 +207,14 @@ def buoyancy(
     Args:
         up: the world's vertical, part frame; times gravity plus the water's own acceleration when
             the last argument is the density [kg/m³] alone.
-        share: as in `displaced`.
-        moment: likewise.
-        volume: likewise.
+        share, moment, volume: as in `displaced_water`.
         center: centre of volume, from the box's centre, part frame [m].
         weight_density: ρ g of the water [N/m³].
 
     Returns:
         Force [N] and torque [N·m], part frame, at the box's centre.
     """
-    weight, first = displaced(share, moment, volume, center, weight_density)
+    weight, first = displaced_water(share, moment, volume, center, weight_density)
     return vscale(weight, up), cross(first, up)
 
 
@@ -241,14 +238,14 @@ def surface_tension(
 
     A face that lies level would be wetted in an instant. So a point at depth t counts as wetted by
     a share that rises from 0 to 1 for t in ±λ, λ = √(γ/ρg) the capillary length (2.7 mm in water),
-    with the triangle (λ - |t|)/λ² as its slope: force and torque are then continuous. For the mean
-    over a face with centre at depth d and half heights a₁, a₂ that is a second difference,
+    with the triangle (λ - |t|)/λ² as its derivative: force and torque are then continuous. For the
+    mean over a face with centre at depth d and half heights a₁, a₂ that is a second difference,
 
         wetted share = [N(d + λ) - 2 N(d) + N(d - λ)] / λ²,
 
-    with N, and its slopes M by d and F_i by a_i, from `_cut`. Force ∂E/∂d along `up` and torque
-    (-∂E/∂n) × n are sums of the same differences of M and F. They vanish when the whole box is
-    further than λ from the surface.
+    with N, and its derivatives M by d and F_i by a_i, from `_cut`. Force ∂E/∂d along `up` and
+    torque (-∂E/∂n) × n are sums of the same differences of M and F. They vanish when the whole box
+    is further than λ from the surface.
 
     Args:
         up: the world's vertical, part frame.
@@ -275,7 +272,7 @@ def surface_tension(
         area = 4 * half_size[j] * half_size[k] * exposed[i]
         short, long, swap = _exchange(heights[j], heights[k])
         r = _rectangle(short, long, blur)
-        slope_short, slope_long = 0.0, 0.0
+        gradient_short, gradient_long = 0.0, 0.0
         for side in (1, -1):
             x = depth - side * mul(half_size[i], up[i])
             first, by_short, by_long = 0.0, 0.0, 0.0
@@ -296,12 +293,54 @@ def surface_tension(
             of_face = mul(area, plain + r.long * (1 / 12) * first)
             line = total(line, of_face)
             lever[i] = total(lever[i], mul(side * half_size[i], of_face))
-            slope_short = total(slope_short, by_short)
-            slope_long = total(slope_long, by_long)
-        slope_j, slope_k = _back(swap, slope_short * (1 / 6), slope_long * (1 / 12))
-        for axis, slope in ((j, slope_j), (k, slope_k)):
+            gradient_short = total(gradient_short, by_short)
+            gradient_long = total(gradient_long, by_long)
+        gradient_j, gradient_k = _back(swap, gradient_short * (1 / 6), gradient_long * (1 / 12))
+        for axis, gradient in ((j, gradient_j), (k, gradient_k)):
             square = half_size[axis] * half_size[axis]
-            lever[axis] = total(lever[axis], mul(-area * square, up[axis] * slope))
+            lever[axis] = total(lever[axis], mul(-area * square, up[axis] * gradient))
     strength = -tension * math.cos(contact_angle) / blur**2
     force = vscale(mul(strength, line), up)
     return force, cross(vscale(strength, lever), up)
+
+
+# ------------------------------------------------------------------------- the table
+
+_LIFT = (
+    "the bodies whose names end in /lift weigh nothing (10 micrograms) and sit at the centres of "
+    "buoyancy; their gravcomp lifts with the weight of the displaced water"
+)
+_BOXES = (
+    "Buoyancy lifts with the volume of the collision boxes, so these have the volume that a part "
+    "displaces, at its centre of volume, and the proportions of its box: not its size"
+)
+
+PARTIAL = BuoyancyLaw(
+    name="partial",
+    summary="the submerged share of each module's box, cut by the surface",
+    submersion=cut_box,
+    mjcf=Export("partial", note=_LIFT),
+    sdf=Export("partial", note=_BOXES),
+)
+MASK = BuoyancyLaw(
+    name="mask",
+    summary="all or nothing, by the box's centre: the thesis's rule",
+    submersion=mask_box,
+    mjcf=Export("partial", note=_LIFT),
+    sdf=Export("partial", _BOXES, missing="buoyancy: mask, all or nothing at the surface"),
+)
+OFF = BuoyancyLaw(
+    name="off",
+    summary="no lift; what is dragged is dragged as with mask",
+    submersion=mask_box,
+    lifts=False,
+    mjcf=Export(""),
+    sdf=Export(""),
+)
+
+BUOYANCY_LAWS = {law.name: law for law in (PARTIAL, MASK, OFF)}
+
+
+def find_buoyancy_law(name: str) -> BuoyancyLaw:
+    """The buoyancy law of a name; an unknown one is an `InputError`."""
+    return find_law(BUOYANCY_LAWS, name)

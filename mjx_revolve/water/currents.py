@@ -18,18 +18,10 @@ import numpy as np
 from annotated_types import Ge, Le, Unit
 from pydantic import BeforeValidator
 
-from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.errors import ConstraintError, InputError, reading
 from mjx_revolve.inputs.files import resolve_inside
-from mjx_revolve.inputs.schema import (
-    MisfitError,
-    NonNegative,
-    Number,
-    Triple,
-    Vector,
-    checked,
-    words,
-)
-from mjx_revolve.inputs.witness import tell
+from mjx_revolve.inputs.schema import NonNegative, Number, Triple, Vector, checked, words
+from mjx_revolve.inputs.trust import audit
 
 # Shortest wave [m]. Far below 0.1 m surface tension drives waves, which these laws do not know.
 _SHORTEST = 0.01
@@ -103,7 +95,7 @@ class Wave:
         """Checks that its length is given once."""
         if (self.wavelength is None) == (self.period is None):
             found = "none" if self.period is None else "both"
-            raise MisfitError("", "either wavelength or period", found)
+            raise ConstraintError("", "either wavelength or period", found)
 
     def wavenumber(self, gravity: float, water_depth: float | None) -> float:
         """k, from its length, or from its period by the dispersion relation ω² = g k tanh(k h).
@@ -157,14 +149,14 @@ def check_wave(wave: Wave, gravity: float, water_depth: float | None, place: str
         place: what messages call it.
 
     Raises:
-        MisfitError: it is one.
+        ConstraintError: it is one.
     """
     if gravity <= 0:
-        raise MisfitError(place, "gravity above 0", f"{gravity:g}")
+        raise ConstraintError(place, "gravity above 0", f"{gravity:g}")
     k = wave.wavenumber(gravity, water_depth)
     length = 2 * math.pi / k
     if length < 0.999 * _SHORTEST:
-        raise MisfitError(
+        raise ConstraintError(
             f"{place}.period",
             f"that of a wave of at least {_SHORTEST:g} m",
             f"{wave.period:g} s, a wave of {length:.3g} m",
@@ -172,7 +164,7 @@ def check_wave(wave: Wave, gravity: float, water_depth: float | None, place: str
     # Miche 1944 (Dean & Dalrymple 1991, § 4.8): height over length where crests break.
     highest = 0.142 * length * (1.0 if water_depth is None else math.tanh(k * water_depth))
     if 2 * wave.amplitude > highest:
-        raise MisfitError(
+        raise ConstraintError(
             f"{place}.amplitude",
             f"at most {highest / 2:.3g}, or a wave {length:.4g} m long breaks",
             f"{wave.amplitude:g}",
@@ -187,8 +179,8 @@ class CurrentField:
 
     Attributes:
         x: `[nx]` rising world x of the grid's planes [m].
-        y: `[ny]` likewise.
-        z: `[nz]` likewise; a single one where the current is the same at all depths.
+        y: `[ny]` rising world y [m].
+        z: `[nz]` rising world z [m]; a single one where the current is the same at all depths.
         velocity: `[nx, ny, nz, 3]` world frame [m/s].
         path: where it was read.
     """
@@ -200,7 +192,7 @@ class CurrentField:
     path: str = ""
 
     def __post_init__(self) -> None:
-        """Checks the numbers, and keeps copies that nobody can change."""
+        """Checks the numbers, and keeps read-only copies."""
         digest = hashlib.sha256()
         shape = []
         for name in ("x", "y", "z", "velocity"):
@@ -233,13 +225,14 @@ class CurrentField:
         return hash(self._key)
 
     def __repr__(self) -> str:
-        """Says which numbers, as runs are told apart by their worlds' text."""
+        """Size and digest: the text of a world tells runs apart."""
         nx, ny, nz = self.velocity.shape[:3]
         return f"CurrentField({nx} x {ny} x {nz} points, {self._key})"
 
     @property
     def _key(self) -> str:
-        return self.__dict__["_digest"]
+        digest: str = self.__dict__["_digest"]
+        return digest
 
 
 def _check_axis(name: str, axis: np.ndarray) -> None:
@@ -297,7 +290,7 @@ def load_current_field(path: str | Path) -> CurrentField:
     if path.is_file():
         with reading(path):
             content = path.read_bytes()
-        tell(path, "data", content)
+        audit(path, "data", content)
     with reading(path):
         if path.suffix.lower() == ".npz":
             return _read_arrays(path)

@@ -46,7 +46,7 @@ def is_uniform(world: World) -> bool:
     return world.shear is None and world.current_field is None and not world.waves
 
 
-def needs_place(world: World) -> bool:
+def needs_horizontal_position(world: World) -> bool:
     """Whether a step must know where its bodies are, horizontally."""
     return not is_uniform(world)
 
@@ -129,7 +129,7 @@ def shear_flow(shear: Shear, depth: Scalar) -> Vec:
     """A current that fades with depth, u(d) = u₀ f(d / D), on top of the uniform one.
 
     - "linear": f = 1 - d/D down to D, 0 below.
-    - "power": f = (1 - d/D)ⁿ likewise; n = 1/7 is the common law of tidal streams above a bed at D
+    - "power": f = (1 - d/D)ⁿ down to D; n = 1/7 is the common law of tidal streams above a bed at D
       (Soulsby 1997, Dynamics of Marine Sands, § 3.3).
     - "exponential": f = e^(-d/D), as drift under wind fades.
 
@@ -152,7 +152,8 @@ def shear_flow(shear: Shear, depth: Scalar) -> Vec:
         inside = share < 1
         left = jnp.where(inside, 1 - share, 1)
         profile = jnp.where(inside, left**shear.exponent, 0)
-    return vscale(profile, shear.velocity)
+    velocity: Vec = vscale(profile, shear.velocity)
+    return velocity
 
 
 def _cell(axis: np.ndarray, at: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -213,7 +214,8 @@ def field_flow(field: CurrentField, x: Scalar, y: Scalar, z: Scalar) -> Vec:
             return _pick(table, index)
         (stride, share), *rest = spans
         here, there = between(table, index, rest), between(table, index + stride, rest)
-        return here + share * (there - here)
+        found: jax.Array = here + share * (there - here)
+        return found
 
     tables = [field.velocity[..., i].reshape(-1).astype(dtype) for i in range(3)]
     return tuple(between(table, index, spans) if table.any() else 0.0 for table in tables)
@@ -236,7 +238,7 @@ def wave_flow(
     level, whatever the world's is.
 
     The world's uniform current U carries the waves, so θ runs at ω + k·U at a fixed place; the
-    acceleration is what the water feels, (∂/∂t + U·∇) u. Shear, field and gusts carry no waves.
+    acceleration is that of the water itself, (∂/∂t + U·∇) u. Shear, field and gusts carry no waves.
 
     Args:
         world: gravity, water depth and current.
@@ -266,7 +268,7 @@ def _fading(world: World, wave: Wave, water: Water, z: Scalar) -> tuple[Scalar, 
     if h is None:
         fade = jnp.exp(k * below)
         return fade, fade
-    # cosh(k(z + h)) / sinh(kh) and sinh likewise, without large numbers.
+    # cosh(k(z + h)) / sinh(kh) and the same with sinh, without large numbers.
     below = jnp.maximum(below, -h)
     whole = -1 / math.expm1(-2 * k * h)
     fade, mirrored = jnp.exp(k * below), jnp.exp(-k * (below + 2 * h))
@@ -290,7 +292,7 @@ def wave_convection(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar)
         Acceleration [m/s²], world frame.
     """
     velocity: Vec = (0.0, 0.0, 0.0)
-    slopes: list[Scalar] = [0.0] * 6  # ∇u is symmetric, as u has a potential: xx xy xz yy yz zz
+    gradient: list[Scalar] = [0.0] * 6  # ∇u is symmetric, as u has a potential: xx xy xz yy yz zz
     for wave in _running(world):
         velocity = vadd(velocity, wave_flow(world, wave, water, x, y, z)[0])
         (c, s), omega = _towards(wave), wave.frequency(world.gravity, world.water_depth)
@@ -299,8 +301,8 @@ def wave_convection(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar)
         rate = wave.wavenumber(world.gravity, world.water_depth) * wave.amplitude * omega
         level, tilt = rate * along * sine, rate * upright * cosine
         terms = (-c * c * level, -c * s * level, c * tilt, -s * s * level, s * tilt, level)
-        slopes = [add(a, b) for a, b in zip(slopes, terms, strict=True)]
-    return symvec(tuple(slopes), velocity)
+        gradient = [add(a, b) for a, b in zip(gradient, terms, strict=True)]
+    return symvec(tuple(gradient), velocity)
 
 
 def gust_path(gust: Gust, key: jax.Array, steps: int, dt: float, trials: int) -> jax.Array:

@@ -24,56 +24,122 @@ sign in a jump where α wraps at ±90°, unless `cla_stall` brings it to zero th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.numerics.spatial import Scalar, Vec, cross, dot, mul, neg, safe_norm, sub, vscale
+from mjx_revolve.numerics.spatial import (
+    Scalar,
+    Vec,
+    cross,
+    dot,
+    mul,
+    neg,
+    safe_norm,
+    sub,
+    vadd,
+    vscale,
+)
+from mjx_revolve.water.face_drag import FACES
+from mjx_revolve.water.laws import (
+    Drag,
+    Export,
+    PartDragLaw,
+    PartFlow,
+    PartShapes,
+    law_numbers,
+    part_field,
+)
+from mjx_revolve.water.plates import LiftDrag
 
-__all__ = ["LiftDrag", "lift_drag", "lift_drag_damping", "lift_drag_wrench"]
+if TYPE_CHECKING:
+    from mjx_revolve.water.world import World
 
-
-# The coefficients of a plate.
+# What `_numbers` casts: the coefficients of a plate.
 _NAMES = ("a0", "cla", "cda", "alpha_stall", "cla_stall", "cda_stall", "cma", "cma_stall")
+_BY_AREA = "lift, drag and moment are varied together, by `area`"
+_SHAPE = "a direction or a place"
 
 
-class PlateTable(NamedTuple):
-    """Plates side by side: the fields of `LiftDrag` that the law reads, an array or number each."""
-
-    a0: Any
-    cla: Any
-    cda: Any
-    alpha_stall: Any
-    cla_stall: Any
-    cda_stall: Any
-    cma: Any
-    cma_stall: Any
-    radial_symmetry: Any
-    density: Any
-
-    @classmethod
-    def of(cls, plates: Sequence[LiftDrag], density: float) -> PlateTable:
-        """`[n]` each.
-
-        Args:
-            plates: n of them.
-            density: of the water, for those that give none [kg/m³].
-        """
-        return cls(
-            **{name: np.array([float(getattr(p, name)) for p in plates]) for name in _NAMES},
-            radial_symmetry=np.array([p.radial_symmetry for p in plates], bool),
-            density=np.array([density if p.density is None else p.density for p in plates]),
-        )
+def _of_world(name: str) -> Callable[[World], float]:
+    """The world's own plate stands in padding, so that what is the same in all parts folds."""
+    return lambda world: float(getattr(world.lift_drag, name))
 
 
-def _numbers(p: LiftDrag | PlateTable, dtype: Any) -> Any:
+@law_numbers
+class PlateNumbers:
+    """Plates side by side: the fields of `LiftDrag`, and their drag against turning.
+
+    Attributes:
+        area: of the plate [m²].
+        forward: unit vector of zero angle of attack.
+        upward: unit vector of the upper surface.
+        center: centre of pressure, from the box's centre [m].
+        angular: of the faces' drag against turning about each axis [kg·m²]: no plate has one, and
+            without it a free plate would spin up for ever.
+    """
+
+    a0: Any = part_field("rad", blank=_of_world("a0"), fixed=_BY_AREA)
+    cla: Any = part_field("1/rad", blank=_of_world("cla"), fixed=_BY_AREA)
+    cda: Any = part_field("1/rad", blank=_of_world("cda"), fixed=_BY_AREA)
+    alpha_stall: Any = part_field("rad", blank=_of_world("alpha_stall"), fixed=_BY_AREA)
+    cla_stall: Any = part_field("1/rad", blank=_of_world("cla_stall"), fixed=_BY_AREA)
+    cda_stall: Any = part_field("1/rad", blank=_of_world("cda_stall"), fixed=_BY_AREA)
+    cma: Any = part_field("m/rad", blank=_of_world("cma"), fixed=_BY_AREA)
+    cma_stall: Any = part_field("m/rad", blank=_of_world("cma_stall"), fixed=_BY_AREA)
+    radial_symmetry: Any = part_field("-", blank=_of_world("radial_symmetry"), fixed=_BY_AREA)
+    density: Any = part_field("kg/m3", blank=lambda world: world.density, fixed=_BY_AREA)
+    area: Any = part_field("m2", varied=("drag", "density"))
+    forward: Any = part_field("-", axes="vector", blank=np.eye(3)[0], fixed=_SHAPE)
+    upward: Any = part_field("-", axes="vector", blank=np.eye(3)[2], fixed=_SHAPE)
+    center: Any = part_field("m", axes="vector", fixed=_SHAPE)
+    angular: Any = part_field("kg m2", axes="size", varied=("drag", "density"))
+
+
+def plate_numbers(
+    plates: Sequence[LiftDrag],
+    half_size: Float[np.ndarray, "n 3"],
+    silhouette: Float[np.ndarray, "n 3"],
+    angular: Float[np.ndarray, "n 3"],
+    density: float,
+) -> PlateNumbers:
+    """Numbers of parts as plates, `[n]` or `[n, 3]` each.
+
+    Args:
+        plates: what each part's parameters say.
+        half_size: half edges of the boxes [m].
+        silhouette: area seen along each axis [m²]: where a plate gives none, it lies along the
+            largest, with its chord along the longer of that face's edges.
+        angular: see `PlateNumbers` [kg·m²].
+        density: of the water, for plates that give none [kg/m³].
+    """
+    upward = silhouette.argmax(-1)
+    forward = np.where(np.arange(3) == upward[:, None], -np.inf, half_size).argmax(-1)
+
+    def given(name: str, usual: np.ndarray) -> np.ndarray:
+        pairs = zip((getattr(plate, name) for plate in plates), usual, strict=True)
+        return np.array([np.asarray(y if x is None else x, float) for x, y in pairs])
+
+    return PlateNumbers(
+        **{name: np.array([float(getattr(p, name)) for p in plates]) for name in _NAMES},
+        radial_symmetry=np.array([p.radial_symmetry for p in plates], bool),
+        density=given("density", np.full(len(plates), density)),
+        area=given("area", silhouette.max(-1)),
+        forward=given("forward", np.eye(3)[forward]),
+        upward=given("upward", np.eye(3)[upward]),
+        center=given("cp", np.zeros((len(plates), 3))),
+        angular=angular,
+    )
+
+
+def _numbers(p: LiftDrag | PlateNumbers, dtype: Any) -> Any:
     """The coefficients in the dtype of what they meet."""
-    cast = lambda x: x if isinstance(x, jax.Array) else np.asarray(x, dtype)  # noqa: E731
-    return {name: cast(getattr(p, name)) for name in _NAMES}
+    found = ((name, getattr(p, name)) for name in _NAMES)
+    return {name: x if isinstance(x, jax.Array) else np.asarray(x, dtype) for name, x in found}
 
 
 def _may_be(x: Any) -> bool:
@@ -82,7 +148,7 @@ def _may_be(x: Any) -> bool:
 
 
 def lift_drag_wrench(
-    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateTable
+    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateNumbers
 ) -> tuple[Vec, Vec]:
     """Force and pitching moment of plates.
 
@@ -154,25 +220,24 @@ def lift_drag_wrench(
 
 
 def lift_drag(
-    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateTable
+    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateNumbers
 ) -> Vec:
     """The force of `lift_drag_wrench` alone [N]."""
     return lift_drag_wrench(v, forward, upward, area, density, p)[0]
 
 
 def lift_drag_damping(
-    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateTable
+    v: Vec, forward: Vec, upward: Vec, area: Scalar, density: Scalar, p: LiftDrag | PlateNumbers
 ) -> Scalar:
     """How fast the force may fall with velocity, at most: what makes a step implicit.
 
-    An upper estimate of the slope, ρ A |v| (largest lift slope + largest drag slope). A step that
-    adds dt times half of it to the inertia stays first order whatever the estimate (a W-method:
-    Hairer & Wanner 1996, § IV.7), and is stable because the estimate is not too small.
+    An upper estimate of the force's gradient, ρ A |v| (largest lift slope + largest drag slope). A
+    step that adds dt times half of it to the inertia stays first order whatever the estimate (a
+    W-method: Hairer & Wanner 1996, § IV.7), and is stable because the estimate is not too small.
 
     Args:
         v: velocity of the centre of pressure relative to the water [m/s].
-        forward: unused, as in `lift_drag_wrench`.
-        upward: likewise.
+        forward, upward: unused, so that both functions take the same.
         area: of the plate [m²].
         density: of the water [kg/m³], where p gives none.
         p: coefficients.
@@ -186,5 +251,40 @@ def lift_drag_damping(
     k = {name: xp.abs(x) for name, x in _numbers(p, speed.dtype).items()}
     steepest = xp.maximum(k["cla"], k["cla_stall"])
     most = k["cda"] * k["alpha_stall"] + k["cda_stall"] * (np.pi / 2 - k["alpha_stall"])
-    slope = steepest + xp.maximum(xp.maximum(k["cda"], k["cda_stall"]), 2 * most)
-    return mul(mul(density, area), slope.astype(speed.dtype) * speed)
+    gradient = steepest + xp.maximum(xp.maximum(k["cda"], k["cda_stall"]), 2 * most)
+    return mul(mul(density, area), gradient.astype(speed.dtype) * speed)
+
+
+def _plates_of(parts: PartShapes, world: World) -> PlateNumbers:
+    angular = FACES.numbers(parts, world).angular
+    plates = parts.parameters["lift_drag"]
+    return plate_numbers(plates, parts.half_size, parts.silhouette, angular, world.density)
+
+
+def _plate_drag(flow: PartFlow, plate: PlateNumbers, world: World) -> Drag:
+    v, w, submerged = flow
+    at = vadd(v, cross(w, plate.center))
+    given = (plate.forward, plate.upward, plate.area, world.density, plate)
+    force, torque = lift_drag_wrench(at, *given)
+    torque = vadd(torque, cross(plate.center, force))
+    # Half of the gradient: the step then takes the force in the middle of its velocities.
+    half = mul(0.5, mul(lift_drag_damping(at, *given), submerged))
+    return Drag(vscale(submerged, force), vscale(submerged, torque), (half, half, half))
+
+
+LIFT_DRAG = PartDragLaw(
+    name="lift_drag",
+    summary="Gazebo's lift and drag of a plate",
+    explicit=False,
+    varied=True,
+    parameters=LiftDrag,
+    numbers=_plates_of,
+    force=_plate_drag,
+    angular=lambda plate: plate.angular,
+    mjcf=Export("inertia_box", FACES.mjcf.note, missing="fins: their lift and stall are left out"),
+    sdf=Export(
+        "lift_drag",
+        note="LiftDrag lifts and drags the fins",
+        missing="the current at the fins: Gazebo's LiftDrag knows the wind only",
+    ),
+)

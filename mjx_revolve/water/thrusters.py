@@ -25,8 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.numerics.spatial import Scalar
+from mjx_revolve.water.propellers import Thruster
 
 
 def _numpy_of(x: Any) -> Any:
@@ -35,7 +35,7 @@ def _numpy_of(x: Any) -> Any:
 
 
 def _like(constant: Any, x: Any) -> Any:
-    """A constant, or an array of them, that does not widen x."""
+    """A constant in the dtype of x, which it must not widen."""
     traced = isinstance(constant, jax.Array)
     return np.asarray(constant, x.dtype) if hasattr(x, "dtype") and not traced else constant
 
@@ -43,33 +43,24 @@ def _like(constant: Any, x: Any) -> Any:
 # ------------------------------------------------------------------------- the laws
 
 
-def first_order_lag(before: Any, command: Any, time_constant: Any, dt: float) -> Any:
-    """A command behind its lag after a step: s ← s e^(-dt/τ) + (1 - e^(-dt/τ)) x.
+def lag_decay(time_constant: Any, dt: float) -> np.ndarray:
+    """e^(-dt/τ), what a step leaves of a command behind its lag [-]; 0 where τ [s] is 0."""
+    tau = np.asarray(time_constant, float)
+    return np.where(tau > 0, np.exp(-dt / np.where(tau > 0, tau, 1.0)), 0.0)
+
+
+def lagged_command(before: Any, command: Any, decay: Any) -> Any:
+    """A command behind its lag after a step: s ← s e^(-dt/τ) + (1 - e^(-dt/τ)) x [-].
 
     Exact for a command that is held during the step, whatever the step. Source: `Dynamics.cc`.
 
     Args:
         before: s [-].
         command: x [-].
-        time_constant: τ, a number or an array of constants [s]; 0 is no lag.
-        dt: [s].
-
-    Returns:
-        s after the step [-].
+        decay: from `lag_decay` [-].
     """
-    return mix_command(before, command, kept_share(time_constant, dt))
-
-
-def kept_share(time_constant: Any, dt: float) -> np.ndarray:
-    """e^(-dt/τ): what is left after a step of a command behind its lag; 0 without a lag [-]."""
-    tau = np.asarray(time_constant, float)
-    return np.where(tau > 0, np.exp(-dt / np.where(tau > 0, tau, 1.0)), 0.0)
-
-
-def mix_command(before: Any, command: Any, kept: Any) -> Any:
-    """The lagged command, from what is kept of it and the one that is asked for [-]."""
-    # Not x + kept (s - x): at rest at x, rounding must leave s alone.
-    return before * _like(kept, before) + command * _like(1 - kept, command)
+    # Not x + decay (s - x): at rest at x, rounding must leave s alone.
+    return before * _like(decay, before) + command * _like(1 - decay, command)
 
 
 def basic_thrust(command: Any, gain: Any) -> Any:
@@ -93,9 +84,9 @@ def dead_band_thrust(command: Any, backward: Any, forward: Any, low: Any, high: 
     Args:
         command: x [-].
         backward: k_l ≥ 0, a number or an array of constants [N].
-        forward: k_r ≥ 0, likewise.
-        low: δ_l ≤ 0, likewise [-].
-        high: δ_r ≥ 0, likewise.
+        forward: k_r ≥ 0 [N].
+        low: δ_l ≤ 0 [-].
+        high: δ_r ≥ 0 [-].
 
     Returns:
         T [N].
@@ -116,7 +107,7 @@ def interpolated_thrust(command: Any, commands: Sequence[Any], thrusts: Sequence
     Args:
         command: x [-].
         commands: of the points, rising; each a number or an array of constants [-].
-        thrusts: at the points, likewise [N].
+        thrusts: at the points [N].
 
     Returns:
         T [N].

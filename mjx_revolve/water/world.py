@@ -6,34 +6,32 @@ A world is one small frozen value, read from a small YAML file. The two worlds o
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge, Le, MinLen, Unit
 from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 
-from mjx_revolve.body.plates import LiftDrag
-from mjx_revolve.inputs.errors import InputError, load_yaml, reading
+from mjx_revolve.inputs.errors import ConstraintError, InputError, reading, show
 from mjx_revolve.inputs.schema import (
-    Law,
-    Maybe,
-    MisfitError,
+    Boolean,
     NonNegative,
     Number,
-    Row,
-    Switch,
+    OrOff,
     Text,
+    TupleOf,
     Vector,
     as_tuple,
     checked,
     is_off,
     read,
-    show,
     words,
 )
+from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.currents import (
     CurrentField,
@@ -44,6 +42,14 @@ from mjx_revolve.water.currents import (
     find_field,
     load_current_field,
 )
+from mjx_revolve.water.law_names import (
+    BuoyancyName,
+    Coefficients,
+    DragName,
+    buoyancy_names,
+    drag_names,
+)
+from mjx_revolve.water.plates import LiftDrag
 
 _FOLDER = Path(__file__).parent / "worlds"
 
@@ -69,7 +75,7 @@ def _read_gravity(value: Any) -> Any:
     plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in value)
     if not plain or len(value) != 3 or value[:2] != (0, 0) or value[2] > 0:
         down = "a number, or (0, 0, -g), since the surface is level [m/s2]"
-        raise MisfitError("", down, show(value))
+        raise ConstraintError("", down, show(value))
     return -value[2]
 
 
@@ -95,7 +101,7 @@ def _read_field(value: Any, info: ValidationInfo) -> Any:
     if isinstance(value, CurrentField):
         return value
     if not isinstance(value, str | Path) or not str(value):
-        raise MisfitError("", "the path of a file", show(value))
+        raise ConstraintError("", "the path of a file", show(value))
     return load_current_field(find_field(value, info.context or Path()))
 
 
@@ -111,10 +117,9 @@ class World:
         surface_height: z of the water surface, world frame [m].
         current: velocity of the water, world frame [m/s], length 3.
         bed: the ground, or None.
-        buoyancy: "partial" (submerged share of each module's box), "mask" (the thesis: all or
-            nothing by the box's centre) or "off".
-        drag: "faces" (quadratic, on the modules' true faces, and angular), "lift_drag" (Gazebo's
-            plugin on each module as a plate), "inertia_box" or "ellipsoid" (MuJoCo's laws), "off".
+        buoyancy: name of a buoyancy law.
+        drag: name of a drag law.
+        coefficients: of laws, by name, for modules that give none of their own.
         added_mass: whether the water that a module carries along is part of its inertia.
         lift_drag: parameters of `drag: lift_drag`; fins have their own.
         shear: a current that fades with depth, or None. All moving water adds up: current, shear,
@@ -139,19 +144,26 @@ class World:
         BeforeValidator(_read_bed),
         words("'off', a height in metres or a mapping with kind"),
     ] = None
-    buoyancy: Law[Literal["partial", "mask", "off"]] = "partial"
-    drag: Law[Literal["faces", "lift_drag", "inertia_box", "ellipsoid", "off"]] = "faces"
-    added_mass: Switch = True
+    buoyancy: Annotated[BuoyancyName, words(buoyancy_names())] = "partial"
+    drag: Annotated[DragName, words(drag_names())] = "faces"
+    coefficients: Coefficients = ()
+    added_mass: Boolean = True
     lift_drag: LiftDrag = LiftDrag()
-    shear: Maybe[Shear] = None
+    shear: OrOff[Shear] = None
     current_field: Annotated[InstanceOf[CurrentField] | None, BeforeValidator(_read_field)] = None
-    gust: Maybe[Gust] = None
-    waves: Annotated[Row[Wave], BeforeValidator(_read_waves)] = ()
+    gust: OrOff[Gust] = None
+    waves: Annotated[TupleOf[Wave], BeforeValidator(_read_waves)] = ()
     water_depth: Annotated[Number, Ge(1e-2), Unit("m")] | None = None
     surface_tension: Annotated[
-        Maybe[SurfaceTension], BeforeValidator(lambda value: {} if value is True else value)
+        OrOff[SurfaceTension], BeforeValidator(lambda value: {} if value is True else value)
     ] = None
     timestep: Annotated[Number, Ge(1e-5), Le(0.1), Unit("s")] = 0.005
+
+    def __repr__(self) -> str:
+        """Its fields, which tell runs apart; no coefficients read as before there were any."""
+        values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        shown = (f"{k}={v!r}" for k, v in values if (k, v) != ("coefficients", ()))
+        return f"World({', '.join(shown)})"
 
     def __post_init__(self) -> None:
         """Checks that the waves fit the water."""
@@ -174,7 +186,8 @@ def make_world(**fields: Any) -> World:
     Raises:
         InputError: an unknown field or a value out of range.
     """
-    return read(World, fields)
+    world: World = read(World, fields)
+    return world
 
 
 def load_world(name: str | Path, **overrides: Any) -> World:
@@ -207,7 +220,7 @@ def load_world(name: str | Path, **overrides: Any) -> World:
             raise InputError(f"expected a mapping of world fields; found {show(data)}")
         fields: dict[Any, Any] = {"name": path.stem} | data
         # A world file names its field's file from where it stands itself.
-        world = read(World, fields, context=path.parent)
+        world: World = read(World, fields, context=path.parent)
     if not overrides:
         return world
     for key, value in overrides.items():
@@ -217,4 +230,5 @@ def load_world(name: str | Path, **overrides: Any) -> World:
             alike = value.get("kind", below.get("kind")) == below.get("kind")
             overrides[key] = {**below, **value} if alike else value
     with reading(f"world {world.name}"):
-        return read(World, fields | {"current_field": world.current_field} | overrides)
+        world = read(World, fields | {"current_field": world.current_field} | overrides)
+    return world

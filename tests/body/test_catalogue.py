@@ -234,91 +234,35 @@ MOUNT = Mount((-0.5, 0, 0), (1, 0, 0))
     "make, message",
     [
         (lambda: Box((1, 0, 1)), "box: size.1: expected a number > 0 [m]; found 0"),
-        (lambda: Box((1, 1)), "box: size: expected three numbers > 0 [m]; found (1, 1)"),
-        (lambda: Box("abc"), "box: size: expected three numbers > 0 [m]; found 'abc'"),
-        (lambda: Box((1, 1, math.nan)), "box: size.2: expected a number > 0 [m]; found nan"),
         (lambda: Box((1, 1, True)), "box: size.2: expected a number > 0 [m]; found True"),
-        (lambda: Box((1, 1, 10**400)), "box: size.2: expected a number > 0 [m]; found 1000"),
-        (lambda: replace(PART, mass=-1), "part 'p': mass: expected a number >= 0 [kg]; found -1"),
-        (lambda: replace(PART, volume=math.inf), "part 'p': volume: expected a number >= 0 [m3]"),
-        (lambda: replace(PART, drag_coefficient="1"), "drag_coefficient: expected a number >= 0"),
-        (lambda: replace(PART, added_mass_coefficient=-1), "added_mass_coefficient: expected"),
-        (lambda: replace(PART, contact=1), "part 'p': contact: expected true or false; found 1"),
         (lambda: replace(PART, name="a/b"), "_ or -, beginning with a letter; found 'a/b'"),
-        (lambda: replace(PART, boxes=()), "part 'p': boxes: expected at least one box; found 0"),
         (
             lambda: replace(PART, boxes=(Box((1, 1, 1), (1, 0, 0)),)),
             "part 'p': boxes.0.position: expected [0, 0, 0]",
         ),
         (
             lambda: replace(PART, buoyancy="some"),
-            "part 'p': buoyancy: expected one of partial, mask, off, or nothing; found 'some'",
+            "part 'p': buoyancy: expected one of partial, mask, off; found 'some'",
         ),
         (
             lambda: replace(PART, drag="inertia_box"),
             "part 'p': drag: expected one of faces, lift_drag, ellipsoid, off (inertia_box is "
             "a law of whole bodies); found 'inertia_box'",
         ),
-        (lambda: replace(PART, drag=["off"]), "part 'p': drag: expected one of faces, lift_drag"),
-        (
-            lambda: replace(PART, added_mass=1),
-            "part 'p': added_mass: expected true or false, or nothing; found 1",
-        ),
-        (
-            lambda: replace(PART, entrained_water=1.5),
-            "part 'p': entrained_water: expected a number >= 0 and <= 1 [-]; found 1.5",
-        ),
-        (lambda: replace(PART, entrained_water=-0.1), "entrained_water: expected a number >= 0"),
-        (lambda: replace(PART, ballast_mass=-1), "ballast_mass: expected a number >= 0 [kg]"),
-        (lambda: replace(PART, ballast_volume=-1), "ballast_volume: expected a number >= 0 [m3]"),
-        (lambda: replace(PART, ballast_position=1), "ballast_position: expected three numbers [m]"),
-        (
-            lambda: replace(PART, lift_drag=[]),
-            "part 'p': lift_drag: expected a mapping, or nothing; f",
-        ),
         (lambda: replace(PART, lift_drag={"clap": 1}), "part 'p': lift_drag.clap: expected one of"),
-        (
-            lambda: replace(PART, thruster=True),
-            "part 'p': thruster: expected a mapping, or nothing",
-        ),
-        (
-            lambda: Thruster(curve="linear"),
-            "thruster: curve: expected one of basic, dead_band, interpolated; found 'linear'",
-        ),
         (lambda: Thruster(axis=(0, 0, 0)), "thruster: axis: expected a direction, not zero"),
-        (lambda: Thruster(position=(0, 0)), "thruster: position: expected three numbers [m]"),
-        (lambda: Thruster(gain=-1), "thruster: gain: expected a number >= 0 [N]; found -1"),
-        (lambda: Thruster(gain=math.nan), "thruster: gain: expected a number >= 0 [N]; found nan"),
-        (lambda: Thruster(time_constant=-1), "thruster: time_constant: expected a number >= 0 [s]"),
-        (lambda: Thruster(torque_ratio="a"), "thruster: torque_ratio: expected a number [m]"),
-        (lambda: Thruster(range=(-1, 0, 1)), "thruster: range: expected two numbers [-]"),
         (
             lambda: Thruster(range=(0.1, 1)),
             "thruster: range: expected [lowest, highest] around the command 0 [-]; found [0.1, 1.0",
         ),
-        (lambda: Thruster(range=(0, 0)), "thruster: range: expected [lowest, highest] around the"),
         (
             lambda: Thruster(gain_backward=1),
             "thruster: gain_backward: expected none with curve basic; found 1.0",
         ),
-        (
-            lambda: Thruster(dead_band=(-1, 1)),
-            "thruster: dead_band: expected none with curve basic",
-        ),
-        (lambda: Thruster(commands=(0, 1)), "thruster: commands: expected none with curve basic"),
         (lambda: Thruster(thrusts=(0, 1)), "thruster: thrusts: expected none with curve basic; f"),
-        (lambda: replace(LINE, gain=2), "gain: expected none with curve interpolated; found 2.0"),
         (
             lambda: Thruster(curve="dead_band", dead_band=(0.1, 0.2)),
             "thruster: dead_band: expected [at most 0, at least 0] [-]; found [0.1, 0.2]",
-        ),
-        (
-            lambda: Thruster(curve="dead_band", gain_backward=-1),
-            "thruster: gain_backward: expected a number >= 0 [N], or nothing; found -1",
-        ),
-        (
-            lambda: Thruster(curve="interpolated"),
-            "thruster: commands: expected as many as thrusts, two or more; found 0 and 0",
         ),
         (
             lambda: replace(LINE, thrusts=(0, 1)),
@@ -328,34 +272,15 @@ MOUNT = Mount((-0.5, 0, 0), (1, 0, 0))
             lambda: replace(LINE, commands=(-1, 1, 1)),
             "thruster: commands: expected numbers that rise from each to the next [-]; found",
         ),
-        (lambda: replace(LINE, commands="abc"), "commands: expected a list of numbers [-]; found"),
-        (
-            lambda: replace(LINE, commands=(0, 1, "a")),
-            "commands.2: expected a number [-]; found 'a",
-        ),
-        (lambda: replace(HINGE, axis=(0, 0, 0)), "hinge: axis: expected a direction, not zero"),
         (lambda: replace(HINGE, range=(0.5, 1)), "hinge: range: expected [lowest, highest] around"),
-        (lambda: replace(HINGE, range=(1, -1)), "hinge: range: expected [lowest, highest] around"),
-        (lambda: replace(HINGE, range=1), "hinge: range: expected two numbers [rad]; found 1"),
-        (lambda: replace(HINGE, effort=0), "hinge: effort: expected a number > 0 [N m]; found 0"),
-        (lambda: replace(HINGE, speed=-1), "hinge: speed: expected a number > 0 [rad/s]; found -1"),
         (lambda: Slot((0, 0, 1), (0, 0, 1)), "slot: up: expected a vector perpendicular"),
-        (lambda: Mount((0, 0, 0), (0, 0, 1)), "mount: outward: expected a vector perpendicular"),
-        (lambda: ModuleType("M", ()), "module 'M': parts: expected parts, each name once"),
         (lambda: ModuleType("M", (PART, PART)), "parts: expected parts, each name once"),
-        (lambda: ModuleType("M M", (PART,)), "module 'M M': name: expected letters"),
         (
             lambda: ModuleType("M", (PART,), MOUNT, {0: Slot((0, 0, 0), (1, 0, 0))}),
             "module 'M': slots: expected numbers >= 1 (0 is where it is attached); found 0",
         ),
-        (
-            lambda: ModuleType("M", (PART,), None, {"a": Slot((0, 0, 0), (1, 0, 0))}),
-            "module 'M': slots: expected a whole number >= 0; found 'a'",
-        ),
-        (lambda: ModuleType("M", (PART,), sensor="no"), "sensor: expected true or false"),
         (lambda: ModuleType("M", (replace(PART, mass=0),)), "expected a core heavier than 0 kg"),
         (lambda: ModuleType("M", (PART, replace(PART, name="q")), None, {}, HINGE), "mount: exp"),
-        (lambda: ModuleType("M", (PART,), MOUNT, {}, HINGE), "expected a moving part"),
         (
             lambda: ModuleType("M", (PART, replace(PART, name="q", mass=0)), MOUNT, {}, HINGE),
             "parts: expected a moving part (the second or later) heavier than 0 kg",
@@ -528,99 +453,31 @@ def _drop(*keys):
     "text, message",
     [
         ("", "mine.yaml: expected a mapping with modules; found None"),
-        ("[]", "mine.yaml: expected a mapping with modules; found []"),
-        ("module: {}", "mine.yaml: module: expected one of modules; found an unknown key; did you"),
-        ("{}", "mine.yaml: modules: expected a mapping from names to module types; found none"),
-        ("modules: []", "modules: expected a mapping from names to module types; found []"),
         ("modules: {A: 3}", "modules.A: expected a mapping with parts, mount"),
         (
             _changed(_set("Fin", "wings", 2)),
             "modules.Fin.wings: expected one of parts, mount, slots",
         ),
         (_changed(_drop("Fin", "mount")), "modules.Fin.mount: expected a face such as -x, a mapp"),
-        (_changed(_set("Fin", "parts", {})), "modules.Fin.parts: expected a list of parts"),
-        (
-            _changed(_drop("Fin", "parts", 0, "mass")),
-            "parts.0.mass: expected a number >= 0 [kg]; found none",
-        ),
         (
             _changed(_set("Fin", "parts", 0, "mass", "2 g")),
             "modules.Fin.parts.0.mass: expected a number >= 0 [kg]; found '2 g'",
-        ),
-        (_changed(_set("Fin", "parts", 0, "masse", 1)), "parts.0.masse: expected one of name, "),
-        (
-            _changed(_drop("Fin", "parts", 0, "size")),
-            "modules.Fin.parts.0: expected one of size and boxes; found both or neither",
         ),
         (
             _changed(_set("Fin", "parts", 1, "size", [1, 1, 1])),
             "modules.Fin.parts.1: expected one of size and boxes; found both or neither",
         ),
-        (_changed(_set("Fin", "parts", 1, "boxes", [])), "parts.1.boxes: expected a list of box"),
-        (
-            _changed(_set("Fin", "parts", 1, "boxes", 0, "size", [1, -1, 1])),
-            "modules.Fin.parts.1.boxes.0.size.1: expected a number > 0 [m]; found -1",
-        ),
         (
             _changed(_set("Fin", "parts", 1, "lift_drag", {"clap": 1})),
             "modules.Fin.parts.1.lift_drag.clap: expected one of a0, cla, cda",
         ),
-        (
-            _changed(_set("Fin", "parts", 1, "lift_drag", {"cla": "steep"})),
-            "modules.Fin.parts.1.lift_drag.cla: expected a number [1/rad]; found 'steep'",
-        ),
-        (
-            _changed(_set("Fin", "parts", 1, "lift_drag", {"cla": 10**400})),
-            "modules.Fin.parts.1.lift_drag.cla: expected a number [1/rad]; found 1000",
-        ),
-        (
-            _changed(_set("Fin", "parts", 1, "lift_drag", True)),
-            "lift_drag: expected a mapping, or nothing; found True",
-        ),
-        (
-            _changed(_set("Fin", "parts", 1, "thruster", {"power": 1})),
-            "modules.Fin.parts.1.thruster.power: expected one of axis, position, curve, gain",
-        ),
-        (
-            _changed(_set("Fin", "parts", 1, "thruster", {"range": [1, 2]})),
-            "modules.Fin.parts.1.thruster.range: expected [lowest, highest] around",
-        ),
-        (
-            _changed(_set("Fin", "parts", 1, "thruster", [1])),
-            "thruster: expected a mapping, or noth",
-        ),
-        (
-            _changed(_set("Fin", "parts", 1, "drag", "inertia_box")),
-            "modules.Fin.parts.1.drag: expected one of faces, lift_drag, ellipsoid",
-        ),
-        (
-            _changed(_set("Fin", "parts", 1, "ballast_position", [0, 0])),
-            "modules.Fin.parts.1.ballast_position: expected three numbers [m]",
-        ),
         (_changed(_set("Fin", "mount", "-z")), "Fin.mount: expected -x, +x, -y, +y or a mapping"),
-        (_changed(_set("Fin", "mount", 3)), "Fin.mount: expected a mapping with position, outward"),
         (_changed(_set("Fin", "mount", None)), "modules.Fin.mount: expected one, since it has"),
-        (
-            _changed(_set("Fin", "slots", [1])),
-            "Fin.slots: expected a mapping from numbers to faces",
-        ),
-        (_changed(_set("Fin", "slots", 1, "up")), "Fin.slots.1: expected -x, +x, -y, +y"),
         (_changed(_set("Fin", "slots", 1, {})), "Fin.slots.1.position: expected three"),
         (_changed(_set("Fin", "slots", 0, "+x")), "slots: expected numbers >= 1 (0 is where"),
-        (_changed(_drop("Fin", "hinge", "axis")), "Fin.hinge.axis: expected three numbers [-]; f"),
-        (
-            _changed(_set("Fin", "hinge", "torque", 1)),
-            "Fin.hinge.torque: expected one of axis, anc",
-        ),
-        (_changed(_set("Fin", "hinge", "range", [1, 2])), "modules.Fin.hinge.range: expected [low"),
-        (_changed(_set("Fin", "aliases", "Hoop")), "Fin.aliases: expected a list of names"),
         (
             _changed(_set("Fin", "aliases", ["Hoop"])),
             "modules.Ring: expected each name and alias once; found Hoop twice",
-        ),
-        (
-            _changed(_set("3d", {"parts": [], "mount": None})),
-            "modules: expected letters, digits, _",
         ),
         (
             "modules: {3: {mount: null, parts: [{size: [1, 1, 1], mass: 1}]}}",

@@ -817,17 +817,9 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
     "text, message",
     [
         ("", "expected a mapping with id, body and brain; found an empty file"),
-        ("- body", "expected a mapping with id, body and brain; found ['body']"),
-        ("just text", "expected a mapping with id, body and brain; found 'just text'"),
-        ("id: x\nbrain: {}", "expected the key body; found ['id', 'brain']"),
-        ("{}", "expected the key body; found []"),
         ("body: {type: Core}\nbrian: {}", "expected only id, body, sensors, brain; found 'brian'"),
         ("body:", "body: expected a module (a mapping with a type); found nothing"),
-        ("body: [1]", "body: expected a module (a mapping with a type); found [1]"),
-        ("body: {}", "body.type: expected one of Core, CoreComponent; found none"),
         ("body: {type: Bric}", "body.type: expected one of Core, CoreComponent; found 'Bric'"),
-        ("body: {type: [Core]}", "body.type: expected one of Core, CoreComponent; found ['Core']"),
-        ("body: {type: NO}", "body.type: expected one of Core, CoreComponent; found False"),
         (
             "body: {type: FixedBrick}",
             "body.type: expected one of Core, CoreComponent (the root is a core); found 'FixedBri",
@@ -837,30 +829,14 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
             "body.children.1.type: expected one of ActiveHinge, Fin, FixedBrick, FixedBrickSensor, "
             "LiftThruster, Thruster, TouchSensor (a core is always the root); found 'Core'",
         ),
-        (
-            "body: {type: Core, children: {0: {type: Bric}}}",
-            "body.children.0.type: expected one of ActiveHinge, Fin, FixedBrick, FixedBrickSensor, "
-            "LiftThruster, Thruster, TouchSensor; found 'Bric'",
-        ),
-        ("body: {type: Core, orientaton: 0}", "body: expected only id, type, slot, orientation, p"),
         ("body: {type: Core, orientation: 90}", "body.orientation: expected 0 (the core is attac"),
-        ("body: {type: Core, children: []}", "body.children: expected a mapping from slots to mod"),
-        ("body: {type: Core, children: {1: }}", "body.children.1: expected a module (a mapping"),
         (
             "body: {type: Core, children: {4: {type: FixedBrick}}}",
             "body.children: expected one of the slots 0, 1, 2, 3 of type Core; found 4",
         ),
-        ("body: {type: Core, children: {x: {}}}", "0, 1, 2, 3 of type Core; found 'x'"),
-        ("body: {type: Core, children: {-1: {}}}", "0, 1, 2, 3 of type Core; found -1"),
-        ("body: {type: Core, children: {1.0: {}}}", "0, 1, 2, 3 of type Core; found 1.0"),
-        ("body: {type: Core, children: {yes: {}}}", "0, 1, 2, 3 of type Core; found True"),
         (
             "body: {type: Core, children: {1: {type: FixedBrick}, '1': {type: FixedBrick}}}",
             "body.children: expected each slot once; found slot 1 twice",
-        ),
-        (
-            HINGE_ON % "children: {2: {type: FixedBrick}}",
-            "body.children.1.children: expected one of the slots 1 of type ActiveHinge; found 2",
         ),
         (
             "body: {type: Core, children: {1: {type: FixedBrick, children: {0: {}}}}}",
@@ -871,113 +847,41 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
             "body.children.1.children: expected none, since type TouchSensor has no slots; f",
         ),
         (HINGE_ON % "orientation: 45", "expected 0, 90, 180, 270 or -90 [deg]; found 45"),
-        (HINGE_ON % "orientation: north", "children.1.orientation: expected 0, 90, 180, 270 or"),
-        (HINGE_ON % "orientation: .nan", "expected 0, 90, 180, 270 or -90 [deg]; found nan"),
-        (HINGE_ON % "orientation: yes", "expected 0, 90, 180, 270 or -90 [deg]; found True"),
-        (HINGE_ON % "orientation: [90]", "expected 0, 90, 180, 270 or -90 [deg]; found [90]"),
-        (HINGE_ON % "orientation: 360", "expected 0, 90, 180, 270 or -90 [deg]; found 360"),
         (HINGE_ON % "id: no", "children.1.id: expected a name or a number (YAML reads yes, no,"),
-        (
-            HINGE_ON % f"id: 0x{'f' * 4000}",
-            "line 1: expected a whole number of a few digits; found a h",
-        ),
-        (HINGE_ON % "id: [a]", "children.1.id: expected a name or a number"),
-        ("id: {}\nbody: {type: Core}", "id: expected a name or a number"),
-        (HINGE_ON % "params: 3", "children.1.params: expected a mapping; found 3"),
         (HINGE_ON % "params: {red: 1}", "params: expected red, green and blue, or none; found red"),
         (
             HINGE_ON % "params: {red: 1, green: 2, blue: 0}",
             "body.children.1.params.green: expected a number from 0 to 1; found 2",
         ),
-        (
-            HINGE_ON % "params: {red: 1, green: x;, blue: 0}",
-            "params.green: expected a number from 0 to 1; found 'x;'",
-        ),
-        (
-            HINGE_ON % "params: {red: 1, green: -0.1, blue: 0}",
-            "params.green: expected a number from 0 to 1; found -0.1",
-        ),
-        (HINGE_ON % "params: {mass: -1}", "params.mass: expected a number >= 0 [kg]; found -1"),
         (HINGE_ON % "params: {mass: 2 g}", "params.mass: expected a number >= 0 [kg]; found '2 g'"),
-        (HINGE_ON % "params: {mass: }", "params.mass: expected a number >= 0 [kg]; found None"),
-        (HINGE_ON % "params: {volume: .inf}", "params.volume: expected a number >= 0 [m3]; found"),
-        (HINGE_ON % "params: {volume: 1e999}", "params.volume: expected a number >= 0 [m3]"),
-        (HINGE_ON % "params: {ballast: yes}", "ballast: expected a number >= 0 [kg]; found True"),
-        (HINGE_ON % "params: {electronics_volume: -1}", "electronics_volume: expected a number >="),
         (
             HINGE_ON % "params: {ballast_position: [0, 1]}",
             "body.children.1.params.ballast_position: expected three numbers [m]; found [0, 1]",
         ),
         (
-            HINGE_ON % "params: {ballast_position: 1}",
-            "ballast_position: expected three numbers [m]",
-        ),
-        (
-            HINGE_ON % "params: {ballast_position: [0, 0, x]}",
-            "position.2: expected a number [m]; f",
-        ),
-        (HINGE_ON % "params: {center_of_volume: [0]}", "center_of_volume: expected three numbers"),
-        (HINGE_ON % "params: {ballast_volume: -1}", "ballast_volume: expected a number >= 0 [m3]"),
-        (
-            HINGE_ON % "params: {entrained_water: 2}",
-            "body.children.1.params.entrained_water: expected a number >= 0 and <= 1 [-]; found 2",
-        ),
-        (HINGE_ON % "params: {entrained_water: x}", "params.entrained_water: expected a number >="),
-        (HINGE_ON % "params: {drag_coefficient: -1}", "params.drag_coefficient: expected a number"),
-        (HINGE_ON % "params: {added_mass_coefficient: }", "added_mass_coefficient: expected a num"),
-        (
             HINGE_ON % "params: {buoyancy: on}",
             "children.1.params.buoyancy: expected one of partial, mask, off; found True",
         ),
-        (HINGE_ON % "params: {drag: 3}", "drag: expected one of faces, lift_drag, ellipsoid, off"),
         (
             HINGE_ON % "params: {drag: inertia_box}",
             "ellipsoid, off (inertia_box is a law of whole bodies); found 'inertia_box'",
         ),
-        (HINGE_ON % "params: {added_mass: 2}", "added_mass: expected true or false; found 2"),
         (
             HINGE_ON % "params: {thrust: 1}",
             "body.children.1.params: thrust: expected a module with a thruster; found type Ac",
-        ),
-        (
-            HINGE_ON % "params: {thruster: {gain: 1}}",
-            "params: thruster: expected a module with a thruster; found type Ac",
-        ),
-        (
-            JET_ON % "thruster: {power: 1}",
-            "body.children.1.params: thruster: power: expected one of axis, position, curve, gain",
-        ),
-        (
-            HINGE_ON % "params: {thruster: 1}",
-            "params.thruster: expected a mapping with any",
-        ),
-        (
-            HINGE_ON % "params: {lift_drag: {}}",
-            "params.lift_drag: expected a mapping with any",
         ),
         (
             HINGE_ON % "params: {lift_drag: {Cla: 1}}",
             "params: lift_drag: Cla: expected one of a0, cla, cda",
         ),
         (
-            HINGE_ON % "params: {lift_drag: {cla: x}}",
-            "body.children.1.params: lift_drag: cla: expected a number [1/rad]; found 'x'",
-        ),
-        (JET_ON % "thrust: -1", "params.thrust: expected a number >= 0 [N]; found -1"),
-        (
-            JET_ON % "thruster: {gain: x}",
-            "body.children.1.params: thruster: gain: expected a number >= 0 [N]; found 'x'",
-        ),
-        (
             JET_ON % "thrust: 1, thruster: {range: [-1, 0]}",
             "thrust: expected a thruster that pushes at its highest command 0; found 0 N there",
         ),
-        (HINGE_ON % "params: {mass: 0}", "children.1.params: module 'ActiveHinge': parts: expec"),
         (
             "body: {type: Core, params: {mass: 0}}",
             "body.params: module 'Core': mass: expected a co",
         ),
-        ("body: {type: Core\n", "expected valid YAML; found"),
         ("body: {type: Core, type: Core}", "expected each key once; found 'type' twice"),
     ],
 )
@@ -1026,14 +930,7 @@ def test_a_body_shares_nothing_with_its_mapping():
     "mapping, message",
     [
         (None, "morphology: expected a mapping with id, body and brain; found None"),
-        ([], "morphology: expected a mapping with id, body and brain; found []"),
-        ({"id": "x"}, "morphology: expected the key body; found ['id']"),
         ({"type": "Bric"}, "morphology: body.type: expected one of Core, CoreComponent; found"),
-        ({"type": "Core", "childen": {}}, "morphology: body: expected only id, type, slot, orie"),
-        (
-            {"body": {"type": "Core", "children": {1: {"type": "Fin", "orientation": 45}}}},
-            "morphology: body.children.1.orientation: expected 0, 90, 180, 270 or -90 [deg]; f",
-        ),
         (yaml.safe_load(RING), "morphology: body: expected modules that do not overlap at rest"),
     ],
 )

@@ -14,27 +14,24 @@ from laboratory import (
     WATER,
     at_rest,
     body,
-    check_slope_at_rest,
     elbow_robot,
     march,
     random_states,
     read,
     world,
 )
-from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.gait import UNITS, describe_gait
-from mjx_revolve.control.kinds import CONTROLLERS
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.kinds import find_controller
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes.config import CONTROLLERS as CHOICES
 from mjx_revolve.episodes.config import ControllerConfig
 
 EFFORT, SPEED = 0.17658, 5.235988
 # What those that do not listen are told of their robot.
-STILL = Sense(0.0, 0.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+STILL = SensorReadings(0.0, 0.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
 
 
 @lru_cache
@@ -79,36 +76,11 @@ def test_the_number_of_genes_follows_from_the_body(name):
     assert make_sine(robot, harmonics=3).num_genes == 7 * n + 1
 
 
-def test_spider_has_18_cpg_genes_and_25_sine_genes():
-    """Eight hinges; four hips round the core make six pairs, and each leg one more."""
-    assert make_cpg(robot_of("spider")).num_genes == 8 + 10
-    assert make_sine(robot_of("spider")).num_genes == 25
-
-
-@pytest.mark.parametrize("kind", MAKERS)
-def test_every_gene_has_a_name_of_its_own(kind):
-    controller = MAKERS[kind](robot_of("spider"))
-    assert len(controller.gene_names) == controller.num_genes
-    assert len(set(controller.gene_names)) == controller.num_genes
-    assert all(
-        "hip" in name or "knee" in name or name == "frequency" for name in controller.gene_names
-    )
-
-
 def test_the_names_that_a_configuration_gives():
     plant = plant_of(robot_of("spider"))
-    assert {*CONTROLLERS, "brain"} == {*CHOICES}
     for kind, genes in (("cpg", 18), ("sine", 25), ("feedback", 8 * (1 + 7))):
-        assert CONTROLLERS[kind](plant, ControllerConfig(type=kind)).num_genes == genes
-    assert CONTROLLERS["sine"](plant, ControllerConfig(type="sine", harmonics=2)).num_genes == 41
-
-
-def test_bound_controllers_keep_what_they_were_given():
-    controller = make_sine(robot_of("spider"))
-    genes = np.zeros(25)
-    bound = bind_genes(controller, genes)
-    assert bound.controller is controller
-    assert bound.genes is genes
+        assert find_controller(plant, ControllerConfig(type=kind)).num_genes == genes
+    assert find_controller(plant, ControllerConfig(type="sine", harmonics=2)).num_genes == 41
 
 
 # ------------------------------------------------------------------------- descriptions
@@ -182,15 +154,6 @@ def test_what_does_not_swing_has_no_gait():
 # ------------------------------------------------------------------------- targets
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", MAKERS)
-def test_zero_genes_keep_still(kind):
-    robot = robot_of("spider")
-    controller = MAKERS[kind](robot)
-    targets, _ = play(robot, controller, np.zeros((controller.num_genes, 2)), 400)
-    assert not targets.any()
-
-
 @pytest.mark.parametrize("kind", MAKERS)
 @pytest.mark.parametrize("amplitude", [1.0, 0.4])
 def test_targets_stay_within_the_range(kind, amplitude):
@@ -258,24 +221,6 @@ def test_sine_is_a_sine():
     expected = np.pi / 4 * (0.5 * np.sin(0.3) + wave)
     assert targets[120:, 0, 0] == pytest.approx(expected[120:], abs=1e-9)
     assert not targets[:, 1:].any()
-
-
-@pytest.mark.parametrize("kind", MAKERS)
-def test_order_only_permutes_the_rows(kind):
-    """What reaches each hinge does not depend on the order in which an engine lists them."""
-    robot = robot_of("spider")
-    controller = MAKERS[kind](robot)
-    genes = drawn(controller)
-    plain, _ = play(robot, controller, genes, 200)
-    order = np.random.default_rng(1).permutation(8)
-    turned, _ = play(robot, controller, genes, 200, order=order)
-    assert turned == pytest.approx(plain[:, order], abs=1e-9)
-
-
-@pytest.mark.parametrize("kind", MAKERS)
-def test_gradients_are_finite_at_zero_genes(kind):
-    plant = plant_of(elbow_robot(world()))
-    check_slope_at_rest(MAKERS[kind](plant), plant, STILL)
 
 
 # ------------------------------------------------------------------------- servos

@@ -9,7 +9,7 @@ import pytest
 
 from mjx_revolve.control.courses import Course, course_path
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.starts import cues_of, draw_starts
+from mjx_revolve.episodes.starts import draw_starts, episode_context
 from mjx_revolve.water.world import load_world
 
 
@@ -43,8 +43,8 @@ def test_courses_are_drawn_around_the_direction():
         assert 2.0 <= np.min(moment) < 2.3 and 9.7 < np.max(moment) <= 10.0
         assert np.abs(turn).max() <= 0.7 and np.max(turn) > 0.6
     assert len({float(x[0]) for x in (*course.moments, *course.turns)}) == 6
-    cues = cues_of(task, starts, jnp.zeros((3, 200)))
-    assert cues.course is course and cues.target is None and cues.chase is None
+    cues = episode_context(task, starts, jnp.zeros((3, 200)))
+    assert cues.course is course and cues.target is None and cues.pursuit is None
 
 
 def test_what_else_is_drawn_does_not_depend_on_courses():

@@ -25,14 +25,14 @@ from laboratory import (
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.body.sensors import Sensor, SensorRow
-from mjx_revolve.control.sense import Cues, feel, start_memory
-from mjx_revolve.control.sensors import USUAL, make_observer, with_types
+from mjx_revolve.control.readings import EpisodeContext, init_memory, read_sensors
+from mjx_revolve.control.sensors import DEFAULT_SENSORS, make_observer, resolve_sensors
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
+from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.rows import make_rows
-from mjx_revolve.engine.step import make_step_engine
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.fitness import fit_body, make_mixed_fitness
 from mjx_revolve.evolution.fingerprints import settings_hash
@@ -50,7 +50,7 @@ TARGET = np.array([1.0, 2.0, -4.0])
 FEET = ("back_foot", "right_thigh", "left_knee", "core")
 PLACES = tuple(f"at {name}" for name in FEET)
 ASKED = ("forces", "load", *PLACES, "each FixedBrick")
-RIGID = ("up", "north", "spin", "flow", "target", "force")  # vectors of a place
+RIGID = ("up", "north", "angular_velocity", "flow", "target", "force")  # vectors of a place
 ALONE = ("height", "climb", "altitude")
 
 
@@ -77,17 +77,17 @@ def moving(robot, seed):
     return (qpos, qvel), (after, speed), qacc
 
 
-def felt(engine_of, before, after, ctrl, feels=ASKED):
+def felt(engine_of, before, after, ctrl, signals=ASKED):
     """The senses after a step, in float64, as NumPy; and the plant's rows."""
     with jax.enable_x64(True):
 
         def run(before, after, ctrl):
             engine = engine_of()
-            memory = start_memory(feels, engine, engine.init(*before))
+            memory = init_memory(signals, engine, engine.init(*before))
             memory = memory._replace(ctrl=engine.plant.arrange(ctrl))
             state, water = engine.init(*after), water_of(SEA)
-            cues = Cues(target=tuple(TARGET))
-            found = feel(SEA, engine, state, water, jnp.zeros(()), cues, memory, feels)
+            cues = EpisodeContext(target=tuple(TARGET))
+            found = read_sensors(SEA, engine, state, water, jnp.zeros(()), cues, memory, signals)
             return found._replace(noise=None), engine.plant.source
 
         arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (before, after, ctrl))
@@ -160,7 +160,7 @@ def expected(sensors, name):
     return {
         "up": axes[:, 2],
         "north": axes[:, 0],
-        "spin": of("gyro"),
+        "angular_velocity": of("gyro"),
         "flow": seen(water) - of("velocimeter"),
         "target": seen(TARGET - place),
         "force": of("accelerometer"),
@@ -199,13 +199,13 @@ def test_modules_of_a_moving_spider_feel_what_mujocos_sensors_do(kind, robot, sp
     before, after, ctrl, sensors = spiders
     found, source = felt(lambda: make_engine(robot, kind), before, after, ctrl)
     for name in FEET:
-        compare(found.places[f"at {name}"], expected(sensors, name), lambda x: x)
-    knee = found.places["at left_knee"]
+        compare(found.modules[f"at {name}"], expected(sensors, name), lambda x: x)
+    knee = found.modules["at left_knee"]
     for name, kind in (("angle", "pos"), ("speed", "vel"), ("load", "actuatorfrc")):
         wanted = sensors["left_knee", f"joint{kind}"][:, 0]
         assert getattr(knee, name) == pytest.approx(wanted, abs=1e-9)
         assert np.abs(wanted).max() > 0.01
-    compare_bricks(found.places["each FixedBrick"], source, sensors, range(LANES))
+    compare_bricks(found.modules["each FixedBrick"], source, sensors, range(LANES))
 
 
 def compare_bricks(place, source, sensors, lanes):
@@ -217,9 +217,9 @@ def compare_bricks(place, source, sensors, lanes):
             name = f"{limbs[k // 2]}_{('thigh', 'foot')[k % 2]}"
             row = 1 + int(np.flatnonzero(column == k)[0])
             wanted = {key: x[lane] for key, x in expected(sensors, name).items()}
-            assert place.there[row, lane] == 1
+            assert place.present[row, lane] == 1
             compare(place, wanted, lambda x, row=row, lane=lane: x[row, lane])
-        assert place.there[:, lane].sum() == 8 and place.there[0, lane] == 0
+        assert place.present[:, lane].sum() == 8 and place.present[0, lane] == 0
 
 
 @pytest.mark.slow
@@ -230,17 +230,18 @@ def test_in_a_batch_of_different_bodies_they_feel_the_same(robot, spiders):
     bodies = pack_bodies(robots, capacity, np.float64)
 
     def engine():
-        return make_step_engine(
-            make_rows(SEA, capacity, bodies, LANES), jax.tree.map(jnp.asarray, bodies.plant)
+        return PopulationEngine(
+            make_batched_trees(SEA, capacity, bodies, LANES),
+            jax.tree.map(jnp.asarray, bodies.plant),
         )
 
-    feels = ("forces", "load", "each FixedBrick", "each Fin")
-    found, source = felt(engine, before, after, ctrl, feels)
-    bricks = found.places["each FixedBrick"]
+    signals = ("forces", "load", "each FixedBrick", "each Fin")
+    found, source = felt(engine, before, after, ctrl, signals)
+    bricks = found.modules["each FixedBrick"]
     compare_bricks(bricks, source, sensors, [0])
     # The elbow's are its two, whatever else stands in its rows.
-    assert bricks.there[:, 1].sum() == 2
-    assert not found.places["each Fin"].there.any()
+    assert bricks.present[:, 1].sum() == 2
+    assert not found.modules["each Fin"].present.any()
     # Bodies of a batch have no names of their own.
     with pytest.raises(InputError, match="expected `each` a type of modules in place of `at`"):
         capacity.plant.site("at back_foot")
@@ -257,7 +258,7 @@ def test_sensors_on_modules_reach_the_observation(robot, spiders):
     ]
     plant = make_engine(robot).plant
     observer = make_observer(declared, DT, plant)
-    assert observer.feels == ("at back_foot", "at left_knee", "forces", "each FixedBrick")
+    assert observer.signals == ("at back_foot", "at left_knee", "forces", "each FixedBrick")
     assert observer.robot_names == (
         "back_foot flow x", "back_foot flow y", "back_foot flow z", "left_knee accelerometer x",
         "left_knee accelerometer y", "left_knee accelerometer z", "left_knee angle",
@@ -319,7 +320,7 @@ def test_a_pads_cells_are_its_left_and_its_right_half(kind):
     qpos = np.zeros((robot.mj_model.nq, 3))
     qpos[3], qpos[5] = np.cos(angles / 2), np.sin(angles / 2)  # about y: +x goes down
     qpos[2] = -1.0 + half[2] - 5e-4
-    cells, _ = touched(lambda: make_engine(robot, kind), qpos, "cells")
+    cells, _ = touched(lambda: make_engine(robot, kind), qpos, "contact_by_half")
     left, right = cells[2]
     for lane, angle in enumerate(angles):
         for found, x in ((left, half[1]), (right, -half[1])):
@@ -362,7 +363,7 @@ def test_a_box_at_rest_presses_its_halves_as_in_mujoco():
     assert theirs == pytest.approx(lever, rel=2e-3)  # its solver stops short of rest
     _, qpos, qvel, _ = march(robot, 1.0, *at_rest(robot, height=-1 + 0.025), every=200)
     assert np.abs(qvel[-1]).max() < 1e-6
-    [cells], _ = touched(lambda: make_engine(robot), qpos[-1], "cells")
+    [cells], _ = touched(lambda: make_engine(robot), qpos[-1], "contact_by_half")
     # Half a millimetre deeper on one side, it stands a little aslant.
     assert np.concatenate(cells) == pytest.approx(lever, rel=1e-3)
 
@@ -378,11 +379,11 @@ def test_the_beds_force_on_a_body_counts_what_rides_on_it():
 
     def many():
         plant = jax.tree.map(jnp.asarray, bodies.plant)
-        return make_step_engine(make_rows(MUD, capacity, bodies, 3), plant)
+        return PopulationEngine(make_batched_trees(MUD, capacity, bodies, 3), plant)
 
     assert bodies.count.max() > robot.num_hinges  # some row rides
-    found, source = touched(many, qpos, "touch")
-    alone, _ = touched(lambda: make_engine(robot), qpos[:8, [0, 2]], "touch")
+    found, source = touched(many, qpos, "contact_force")
+    alone, _ = touched(lambda: make_engine(robot), qpos[:8, [0, 2]], "contact_force")
     for lane, own in ((0, 0), (2, 1)):
         rows = np.flatnonzero(source[:, lane] == 0)
         assert found[0, lane] == pytest.approx(alone[0, own], rel=1e-9)
@@ -397,14 +398,12 @@ def test_the_beds_force_on_a_body_counts_what_rides_on_it():
     ("sensor", "message"),
     [
         ({"type": "gyro", "at": "a", "each": "Core"}, "0.each: expected none, as there is `at`"),
-        ({"type": "touch"}, "0.at: expected the id of a module, as touch is felt by one; found"),
-        ({"type": "battery", "at": "hand"}, "0.at: expected none, as battery is of the robot"),
+        ({"type": "touch"}, "0.at: expected the id of a module, as touch sits on one; found"),
         (
             {"type": "angle", "each": "Core"},
             "0.each: expected none, as angle is at each hinge; found",
         ),
         ({"type": "contact", "each": "Core"}, "0.each: expected none, as contact is of each rigid"),
-        ({"type": "gyro", "at": []}, "0.at: expected a name; found []"),
     ],
 )
 def test_sensors_that_cannot_sit_there(sensor, message):
@@ -438,19 +437,19 @@ modules:
 def test_types_of_modules_bring_their_sensors(tmp_path):
     (tmp_path / "modules.yaml").write_text(FISHY)
     modules = MODULES | load_modules(tmp_path / "modules.yaml")
-    found = with_types([Sensor(type="tilt")], modules)
+    found = resolve_sensors([Sensor(type="tilt")], modules)
     assert [s.label for s in found] == ["tilt", "FixedBrick flow", "turn"]
     assert [s.where for s in found] == ["robot", "body", "body"]
-    assert with_types(None, modules)[: len(USUAL)] == USUAL
-    assert with_types(None, MODULES) is None
+    assert resolve_sensors(None, modules)[: len(DEFAULT_SENSORS)] == DEFAULT_SENSORS
+    assert resolve_sensors(None, MODULES) is None
     # An alias is as good as a name; what is no type is refused, and so is one name twice.
-    assert with_types([Sensor(type="gyro", each="CoreComponent")], MODULES)[0].each == "Core"
+    assert resolve_sensors([Sensor(type="gyro", each="CoreComponent")], MODULES)[0].each == "Core"
     with pytest.raises(
         InputError, match=r"config: sensors.0.each: expected a type of modules, one"
     ):
-        with_types([Sensor(type="gyro", each="Brick")], MODULES)
+        resolve_sensors([Sensor(type="gyro", each="Brick")], MODULES)
     with pytest.raises(InputError, match=r"config: sensors.2.name: expected names that differ"):
-        with_types([Sensor(type="tilt", name="turn")], modules)
+        resolve_sensors([Sensor(type="tilt", name="turn")], modules)
     (tmp_path / "modules.yaml").write_text(FISHY.replace("type: gyro", "type: angle"))
     with pytest.raises(InputError, match=r"sensors.1: expected a kind that may sit on modules"):
         load_modules(tmp_path / "modules.yaml")

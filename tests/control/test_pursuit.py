@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 
 from laboratory import box_robot, world
-from mjx_revolve.control.pursuit import Chase, Pursuer, pursue, start_chase
-from mjx_revolve.control.sense import Cues, Memory, feel, remember, start_memory
+from mjx_revolve.control.pursuit import Pursuer, PursuitLimits, init_pursuer, step_pursuer
+from mjx_revolve.control.readings import (
+    EpisodeContext,
+    SensorMemory,
+    init_memory,
+    read_sensors,
+    update_memory,
+)
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.state import Root
+from mjx_revolve.engine.state import RootState
 from mjx_revolve.water.flow import water_of
 
 DT = 0.005
@@ -24,15 +30,15 @@ def vec(*numbers):
 
 def chase(prey, start, speed, turn, seconds, heading=None):
     """`[T + 1, 3]` the pursuer's way; prey: time → place."""
-    can = Chase(jnp.array([speed], jnp.float32), jnp.array([turn], jnp.float32))
-    begin = start_chase(vec(*start), tuple(jnp.reshape(x, 1) for x in prey(jnp.float32(0))))
+    can = PursuitLimits(jnp.array([speed], jnp.float32), jnp.array([turn], jnp.float32))
+    begin = init_pursuer(vec(*start), tuple(jnp.reshape(x, 1) for x in prey(jnp.float32(0))))
     if heading is not None:
         begin = begin._replace(heading=vec(*heading))
 
     def step(pursuer, count):
         place = tuple(jnp.reshape(jnp.float32(x), 1) for x in prey(DT * count))
-        after = pursue(pursuer, can, place, DT)
-        return after, jnp.concatenate(after.place)
+        after = step_pursuer(pursuer, can, place, DT)
+        return after, jnp.concatenate(after.position)
 
     _, way = jax.lax.scan(step, begin, jnp.arange(round(seconds / DT)).astype(jnp.float32))
     return np.concatenate([[start], np.asarray(way)])
@@ -89,16 +95,16 @@ def test_a_pursuer_travels_with_what_is_remembered():
     half = np.sqrt(0.5)
     qpos = jnp.array([1.0, 0, -2, half, 0, 0, half], jnp.float32)[:, None]
     state = engine.init(qpos, jnp.zeros((6, 1)))
-    can = Chase(jnp.array([2.0]), jnp.array([1.0]))
-    cues = Cues(target=vec(4.0, 0.0, -2.0), chase=can)
-    memory = start_memory((), engine, state, cues)
+    can = PursuitLimits(jnp.array([2.0]), jnp.array([1.0]))
+    cues = EpisodeContext(target=vec(4.0, 0.0, -2.0), pursuit=can)
+    memory = init_memory((), engine, state, cues)
     assert isinstance(memory.pursuer, Pursuer)
     zero = vec(0.0, 0.0, 0.0)
-    root = Root(vec(1.0, 0.0, -2.0), engine.root(state).quat, zero, zero)
-    memory = remember(memory, root, root, jnp.zeros((0, 1)), jnp.zeros(1), 0.5, cues=cues)
-    felt = feel(tank, engine, state, water_of(tank), jnp.zeros(()), cues, memory)
+    root = RootState(vec(1.0, 0.0, -2.0), engine.root(state).quat, zero, zero)
+    memory = update_memory(memory, root, root, jnp.zeros((0, 1)), jnp.zeros(1), 0.5, context=cues)
+    felt = read_sensors(tank, engine, state, water_of(tank), jnp.zeros(()), cues, memory)
     assert np.concatenate(felt.target) == pytest.approx([0, -2, 0], abs=1e-6)  # 3 m less 1 m
-    assert start_memory((), engine, state, Cues(target=cues.target)) == Memory()
+    assert init_memory((), engine, state, EpisodeContext(target=cues.target)) == SensorMemory()
 
 
 @pytest.mark.parametrize(("sight", "seen"), [(2.9, False), (3.1, True)])
@@ -108,8 +114,8 @@ def test_what_is_out_of_sight_is_not_felt(sight, seen):
     tank = world()
     engine = make_engine(box_robot((0.1, 0.1, 0.1), 1.0, tank))
     state = engine.init(jnp.zeros((7, 1)).at[3].set(1.0), jnp.zeros((6, 1)))
-    cues = Cues(target=vec(0.0, 3.0, 0.0), sight=jnp.array([sight]))
-    felt = feel(tank, engine, state, water_of(tank), jnp.zeros(()), cues, Memory())
+    cues = EpisodeContext(target=vec(0.0, 3.0, 0.0), sight=jnp.array([sight]))
+    felt = read_sensors(tank, engine, state, water_of(tank), jnp.zeros(()), cues, SensorMemory())
     found = {name: np.array(SENSORS[name].signal(felt)) for name in ("target", "bearing")}
     assert felt.seen.tolist() == [seen]
     assert found["target"].ravel() == pytest.approx([0, 3.0 * seen, 0])
@@ -121,11 +127,11 @@ def test_what_is_out_of_sight_is_not_felt(sight, seen):
 @pytest.mark.parametrize("place", [(3.0, 0, 0), (-3.0, 0, 0), (0.0, 0, 0), (1.0, 2, 0)])
 def test_its_way_has_a_slope_everywhere(place):
     """Ahead, right behind, where it is itself: derivatives are numbers."""
-    can = Chase(jnp.array([0.5]), jnp.array([1.0]))
+    can = PursuitLimits(jnp.array([0.5]), jnp.array([1.0]))
 
     def after(prey):
         pursuer = Pursuer(vec(0, 0, 0), vec(1, 0, 0))
-        found = pursue(pursuer, can, tuple(prey[:, None]), 0.1)
-        return jnp.sum(jnp.stack([*found.place, *found.heading]))
+        found = step_pursuer(pursuer, can, tuple(prey[:, None]), 0.1)
+        return jnp.sum(jnp.stack([*found.position, *found.heading]))
 
     assert np.isfinite(jax.grad(after)(jnp.array(place, jnp.float32))).all()

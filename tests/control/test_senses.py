@@ -12,17 +12,25 @@ import pytest
 
 from laboratory import QUICK, WATER, arm_robot, box_robot, elbow_robot, random_states, world
 from mjx_revolve.control.courses import Course
-from mjx_revolve.control.sense import FEELS, Cues, feel, remember, start_memory
+from mjx_revolve.control.readings import (
+    OPTIONAL_SIGNALS,
+    EpisodeContext,
+    init_memory,
+    read_sensors,
+    update_memory,
+)
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
+from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.rows import make_rows
-from mjx_revolve.engine.state import Root
-from mjx_revolve.engine.step import make_step_engine
+from mjx_revolve.engine.population import PopulationEngine
+from mjx_revolve.engine.state import RootState
 from mjx_revolve.water.flow import Water, water_of
 
 LANES = 3
 TANK = world(**WATER | {"current": (0.3, 0.0, 0.0), "bed": {"height": -9.0}})
-CUES = Cues(target=(1.0, 2.0, -4.0), drift=(0.5, 0.0, 0.0), sight=100.0, course=Course(0.3, 0.1))
+CUES = EpisodeContext(
+    target=(1.0, 2.0, -4.0), drift=(0.5, 0.0, 0.0), sight=100.0, course=Course(0.3, 0.1)
+)
 
 
 def senses(tank, make, qpos, qvel, ctrl, time=2.0, cues=CUES, water=None):
@@ -32,11 +40,13 @@ def senses(tank, make, qpos, qvel, ctrl, time=2.0, cues=CUES, water=None):
         def run(qpos, qvel, ctrl):
             engine = make()
             state = engine.init(qpos, qvel)
-            memory = start_memory(FEELS, engine, state)
+            memory = init_memory(OPTIONAL_SIGNALS, engine, state)
             asked = engine.plant.arrange(ctrl)
             memory = memory._replace(ctrl=asked)
             now = water_of(tank) if water is None else water
-            felt = feel(tank, engine, state, now, jnp.asarray(time), cues, memory, FEELS)
+            felt = read_sensors(
+                tank, engine, state, now, jnp.asarray(time), cues, memory, OPTIONAL_SIGNALS
+            )
             return felt._replace(noise=None), engine.plant.source
 
         arrays = [jnp.asarray(x, jnp.float64) for x in (qpos, qvel, ctrl)]
@@ -109,7 +119,7 @@ def test_the_core_feels_what_mujocos_sensors_do(felt, mujocos, states):
     axes = mujocos["axes"].reshape(3, 3, LANES)
     assert np.stack(sense.up) == pytest.approx(axes[2], abs=1e-12)
     assert np.stack(sense.north) == pytest.approx(axes[0], abs=1e-12)
-    assert np.stack(sense.spin) == pytest.approx(mujocos["gyro"], abs=1e-12)
+    assert np.stack(sense.angular_velocity) == pytest.approx(mujocos["gyro"], abs=1e-12)
     # Water that flows with .3 m/s along x, less the core's own velocity.
     water = np.einsum("ijl,i->jl", axes, (0.3, 0.0, 0.0))
     assert np.stack(sense.flow) == pytest.approx(water - mujocos["velocity"], abs=1e-12)
@@ -138,8 +148,8 @@ def test_joints_feel_what_mujocos_sensors_do(robot, felt, mujocos):
 
 def of_many(robots, capacity):
     bodies = pack_bodies(robots, capacity, np.float64)
-    rows = make_rows(TANK, capacity, bodies, LANES)
-    return make_step_engine(rows, jax.tree.map(jnp.asarray, bodies.plant))
+    rows = make_batched_trees(TANK, capacity, bodies, LANES)
+    return PopulationEngine(rows, jax.tree.map(jnp.asarray, bodies.plant))
 
 
 @pytest.mark.slow
@@ -154,7 +164,8 @@ def test_one_body_many_bodies_and_mjx_feel_the_same(kind, robot, felt, states):
     lanes = slice(0, 2 if kind == "different" else LANES)
     one, own = felt
     for name in one._fields:
-        if name not in ("angle", "speed", "load", "touch", "noise", "nearest", "places"):
+        rows = name in ("angle", "speed", "load", "touch", "nearest")
+        if not rows and getattr(one, name) is not None:
             a, b = np.stack(getattr(found, name)), np.stack(getattr(one, name))
             assert a[..., lanes] == pytest.approx(b[..., lanes], abs=1e-12), name
     for name in ("angle", "speed", "load"):
@@ -182,11 +193,13 @@ def test_an_accelerometer_in_a_spinning_vacuum_is_mujocos():
 
         def run(qpos, qvel):
             state = engine.init(qpos, qvel)
-            memory = start_memory(("force",), engine, state)
+            memory = init_memory(("force",), engine, state)
             ctrl = jnp.zeros((0, 1))
             new, _ = engine.step(state, ctrl, water)
-            memory = remember(memory, engine.root(state), engine.root(new), ctrl, 0.0, 1e-5)
-            return feel(tank, engine, new, water, jnp.zeros(()), Cues(), memory).force
+            memory = update_memory(memory, engine.root(state), engine.root(new), ctrl, 0.0, 1e-5)
+            return read_sensors(
+                tank, engine, new, water, jnp.zeros(()), EpisodeContext(), memory
+            ).force
 
         found = jax.jit(run, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
     assert np.concatenate(found) == pytest.approx(data.sensordata, abs=1e-3)
@@ -211,7 +224,9 @@ def test_touch_is_the_beds_force_on_each_body(robot):
 
         def push(qpos, qvel):
             state = engine.init(qpos, qvel)
-            return engine.push(state, engine.plant.arrange(jnp.zeros(ctrl.shape)), water_of(TANK))
+            return engine.external_force(
+                state, engine.plant.arrange(jnp.zeros(ctrl.shape)), water_of(TANK)
+            )
 
         bed, _ = jax.jit(push, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
     # Nothing moves, so that no force has friction: all of them point up.
@@ -226,10 +241,10 @@ def test_the_waters_surface_is_what_heights_are_measured_from(robot, states):
 
 
 def test_work_adds_up():
-    root = Root(*(4 * (jnp.zeros(1),),) * 4)
-    memory = start_memory(("work",), *_toy())
+    root = RootState(*(4 * (jnp.zeros(1),),) * 4)
+    memory = init_memory(("work",), *_toy())
     for _ in range(3):
-        memory = remember(memory, root, root, jnp.zeros((0, 1)), jnp.array([2.0]), 0.1)
+        memory = update_memory(memory, root, root, jnp.zeros((0, 1)), jnp.array([2.0]), 0.1)
     assert memory.work == pytest.approx(6.0)
     assert memory.acceleration is None and memory.ctrl is None
 

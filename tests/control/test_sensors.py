@@ -14,8 +14,8 @@ from laboratory import OAR, ROOT, read, world
 from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.body.sensors import SENSORS, Sensor, SensorRow
 from mjx_revolve.control.kinds import find_controller
-from mjx_revolve.control.sense import Sense
-from mjx_revolve.control.sensors import draw_normal, make_observer
+from mjx_revolve.control.readings import SensorReadings
+from mjx_revolve.control.sensors import hash_normal, make_observer
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import ControllerConfig
@@ -33,7 +33,7 @@ def watch(sensor, signal, noise=None, joint=None, dt=DT):
     def step(state, now):
         k, height = now
         angle = jnp.broadcast_to(height, (joint.shape[0], *height.shape))
-        sense = Sense(height, height, (), (), angle=angle, noise=noise)
+        sense = SensorReadings(height, height, (), (), angle=angle, noise=noise)
         state, found = observer.observe(state, k * dt, sense, joint)
         return state, jnp.stack([*found.robot, *found.joint])
 
@@ -111,7 +111,7 @@ def test_noise_belongs_to_the_hinge_not_to_its_row():
         number = np.array(order, np.int32)[:, None]
         observer = make_observer([Sensor(type="angle", noise=0.1)], DT)
         angle = jnp.zeros((3, 4))
-        sense = Sense(0.0, 0.0, (), (), angle=angle, noise=jnp.arange(4, dtype=jnp.uint32))
+        sense = SensorReadings(0.0, 0.0, (), (), angle=angle, noise=jnp.arange(4, dtype=jnp.uint32))
         return np.asarray(observer.observe((), jnp.array(0.5), sense, number)[1].joint[0])
 
     assert np.array_equal(noise([2, 0, 1])[[1, 2, 0]], noise([0, 1, 2]))
@@ -123,7 +123,7 @@ def test_the_noise_is_normal():
     from scipy.stats import kstest
 
     seeds = jnp.arange(200_000, dtype=jnp.uint32)
-    found = np.asarray(draw_normal(seeds, 3, 0, 17, jnp.float32))
+    found = np.asarray(hash_normal(seeds, 3, 0, 17, jnp.float32))
     assert kstest(found, "norm").statistic < 0.004
     assert np.mean(np.abs(found) > 3) == pytest.approx(0.0027, rel=0.15)
     assert np.isfinite(found).all()
@@ -133,12 +133,12 @@ def test_a_sensor_of_bodies_speaks_of_core_and_hinges():
     observer = make_observer([Sensor(type="contact", range=(0, 10)), Sensor(type="gyro")], DT)
     touch = jnp.array([[1.0], [2.0], [30.0]])
     spin = tuple(jnp.full(1, x) for x in (1.0, 2.0, -3.0))
-    sense = Sense(0.0, 0.0, (), spin, touch=touch)
+    sense = SensorReadings(0.0, 0.0, (), spin, touch=touch)
     _, found = observer.observe((), jnp.array(0.0), sense, np.zeros((2, 1), np.int32))
     assert np.concatenate(found.robot) == pytest.approx([0.1, 0.1, 0.2, -0.3])
     assert found.joint[0] == pytest.approx(np.array([[0.2], [1.0]]))
     assert observer.robot_names == ("contact", "gyro x", "gyro y", "gyro z")
-    assert observer.joint_names == ("contact",) and observer.feels == ("touch",)
+    assert observer.joint_names == ("contact",) and observer.signals == ("touch",)
 
 
 # ------------------------------------------------------------------------- files

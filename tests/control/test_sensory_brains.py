@@ -14,8 +14,8 @@ from laboratory import body, check_slope_at_rest, elbow_robot, world
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.gait import describe_gait
 from mjx_revolve.control.joint_network import make_joint_network
-from mjx_revolve.control.kinds import CONTROLLERS, find_controller
-from mjx_revolve.control.sense import Sense
+from mjx_revolve.control.kinds import find_controller
+from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensory_cpg import make_sensory_cpg
 from mjx_revolve.control.splines import make_splines, refine_splines
 from mjx_revolve.engine.plant import plant_of
@@ -24,7 +24,7 @@ from mjx_revolve.episodes.config import ControllerConfig
 
 DT, REACH = 0.005, np.pi / 4
 SENSORS = tuple(Sensor(type=name) for name in ("gyro", "depth", "angle", "speed", "contact"))
-NEW = ("mlp", "rnn", "sensory_cpg", "splines")
+KINDS = ("cpg", "sine", "mlp", "rnn", "sensory_cpg", "splines")
 
 
 @lru_cache
@@ -33,7 +33,7 @@ def robot_of(name):
 
 
 def make(kind, plant, **settings):
-    if kind != "splines":
+    if kind in ("mlp", "rnn", "sensory_cpg"):
         settings.setdefault("sensors", SENSORS)
     return find_controller(plant, ControllerConfig(type=kind, **settings))
 
@@ -46,7 +46,7 @@ def sense_of(rows, lanes=1, seed=0, order=None):
     if order is not None:
         angle, speed = angle[order], speed[order]
         touch = np.concatenate([touch[:1], touch[1:][order]])
-    return Sense(one, one, three, three, angle=angle, speed=speed, touch=touch)
+    return SensorReadings(one, one, three, three, angle=angle, speed=speed, touch=touch)
 
 
 def play(controller, plant, genes, steps, sense, start=0):
@@ -70,7 +70,7 @@ def drawn(controller, lanes=1, seed=0, scale=1.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", NEW)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["spider", "auv"])
 def test_zero_genes_keep_still_whatever_is_felt(kind, name):
     robot = robot_of(name)
@@ -81,20 +81,20 @@ def test_zero_genes_keep_still_whatever_is_felt(kind, name):
     assert not (found - np.asarray(plant.low + plant.high)[None] / 2).any()
     busy = play(controller, plant, drawn(controller), 150, sense)
     assert np.abs(np.diff(busy, axis=0)).max() > 1e-4
-    if kind != "splines":  # which swing beyond their points, and are clipped by the servo
+    if kind not in ("splines", "sine"):  # which the servo clips
         assert np.all(busy <= np.asarray(plant.high) + 1e-9)
     # No joint jumps: a full stroke takes 50 ms or more.
     moved = np.diff(busy[:, : robot.num_hinges], axis=0, prepend=0)
     assert not moved.size or np.abs(moved).max() < 2 * REACH / 10
 
 
-@pytest.mark.parametrize("kind", NEW)
+@pytest.mark.parametrize("kind", KINDS)
 def test_genes_have_names_of_their_own_and_places(kind):
     controller = make(kind, plant_of(robot_of("spider")))
     assert len(set(controller.gene_names)) == controller.num_genes == len(set(controller.genes))
 
 
-@pytest.mark.parametrize("kind", NEW)
+@pytest.mark.parametrize("kind", KINDS)
 def test_order_only_permutes_the_rows(kind):
     robot = robot_of("spider")
     plain, order = plant_of(robot), np.random.default_rng(1).permutation(8)
@@ -106,7 +106,7 @@ def test_order_only_permutes_the_rows(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", NEW)
+@pytest.mark.parametrize("kind", KINDS)
 def test_gradients_are_finite_at_zero_genes(kind):
     plant = plant_of(elbow_robot(world()))
     sense = jax.tree.map(jnp.asarray, sense_of(2))
@@ -122,9 +122,8 @@ def test_a_shared_network_fits_any_body(kind):
 
 def test_what_a_controller_asks_to_feel():
     plant = plant_of(robot_of("spider"))
-    assert make("mlp", plant).feels == ("touch",)
-    assert make("rnn", plant, sensors=None).feels == ()
-    assert set(NEW) < set(CONTROLLERS)
+    assert make("mlp", plant).signals == ("touch",)
+    assert make("rnn", plant, sensors=None).signals == ()
 
 
 # ------------------------------------------------------------------------- by hand
@@ -155,7 +154,9 @@ def test_the_shared_network_by_hand(recurrent):
     slope = [np.pi * np.sin(named[f"phase {x}"]) for x in ("x", "y", "z", "away")]
     late = np.column_stack([place, away]) @ slope
     rate = 2 * np.pi * 2.0 * (1 + np.sin(named["frequency"])) / 2
-    sense = Sense(np.array([0.3]), np.array([0.4]), (), (), angle=np.array([[0.5], [-0.2]]))
+    sense = SensorReadings(
+        np.array([0.3]), np.array([0.4]), (), (), angle=np.array([[0.5], [-0.2]])
+    )
     found = play(controller, plant, genes, 120, sense)[..., 0]
     said, memory = np.zeros(2), np.zeros((2, 3))
     units = range(1, 4)
@@ -189,7 +190,7 @@ def test_messages_travel_from_neighbour_to_neighbour():
     assert (0, 1) in pairs and (1, 2) in pairs and (0, 2) not in pairs
     controller = make_joint_network(plant, [Sensor(type="angle")], hidden=4, messages=2)
     genes = drawn(controller)
-    calm = Sense(0.0, 0.0, (), (), angle=np.zeros((n, 1)))
+    calm = SensorReadings(0.0, 0.0, (), (), angle=np.zeros((n, 1)))
     moved = calm._replace(angle=np.eye(n)[:, :1])
     a, b = (play(controller, plant, genes, 6, x, start=200) for x in (calm, moved))
     heard = np.abs(a - b)[..., 0] > 1e-12
@@ -208,7 +209,7 @@ def test_oscillators_settle_at_their_lags_and_answer_to_sensors():
     genes[names.index(f"amplitude {first}")] = 0.6
     genes[names.index(f"amplitude {second}")] = 0.3
     genes[names.index(f"lag {first}~{second}")] = 0.25
-    quiet = Sense(np.zeros(1), np.zeros(1), (), ())
+    quiet = SensorReadings(np.zeros(1), np.zeros(1), (), ())
     found = play(controller, plant, genes, 1600, quiet)[..., 0]
     time, rate = DT * np.arange(1600), 2 * np.pi * 1.0
     late = found[1200:]

@@ -19,10 +19,9 @@ from mjx_revolve import build_robot, load_morphology, load_world, make_mixed_fit
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.assembly import assemble
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.columns import read_columns
-from mjx_revolve.engine.model_changes import changed_assembly, changed_columns
 from mjx_revolve.engine.mujoco_model import compile_model
-from mjx_revolve.engine.plant import figure_of
+from mjx_revolve.engine.plant import body_geometry
+from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.inputs.errors import InputError
 
 # Fins, thrusters before and behind hinges, a point ballast, a plate that is its own body.
@@ -120,7 +119,7 @@ def _descends(m, body, above):
 
 def test_the_inertia_box_is_that_of_mujocos_principal_axes():
     for robot in robots("inertia_box"):
-        m, columns = robot.mj_model, read_columns(robot.assembly)
+        m, columns = robot.mj_model, read_constants(robot.assembly)
         box = columns.bodies[3]
         i = m.body_inertia[1:]
         size = np.sqrt(6 * (i[:, [1, 0, 0]] + i[:, [2, 2, 1]] - i) / m.body_mass[1:, None])
@@ -138,12 +137,13 @@ def test_the_ellipsoid_law_has_mujocos_numbers():
         m, table = robot.mj_model, robot.fluid
         names = [f"{a.name}/{p.name}" for a in robot.morphology.modules for p in a.kind.parts]
         fluid = m.geom_fluid[[m.geom(name).id for name in names]]
-        density = robot.world.density * (np.array(table.drag) == "ellipsoid")
-        ours = read_columns(robot.assembly).parts.ellipsoid
+        density = robot.world.density
+        own = np.array(table.drag) == "ellipsoid"
+        ours = read_constants(robot.assembly).parts.drag["ellipsoid"]
         # The largest and the sum do not depend on which axes describe the part.
         for name, first in (("mass", 6), ("inertia", 9)):
-            found = np.sort(np.stack(ours[name], 1)[:-1], 1)
-            close(found, density[:, None] * np.sort(fluid[:, first : first + 3], 1))
+            found = np.sort(np.stack(getattr(ours, name), 1)[:-1], 1)
+            close(found[own], density * np.sort(fluid[own, first : first + 3], 1))
 
 
 def test_robots_side_by_side_have_the_bits_that_each_has_alone():
@@ -160,7 +160,7 @@ def test_robots_side_by_side_have_the_bits_that_each_has_alone():
                 getattr(together, name)[bodies], getattr(robot.assembly, name)[1:]
             )
         parts = together.layout.body == k
-        for name in ("position", "exposed", "drag_linear", "drag_angular", "carried_mass"):
+        for name in ("position", "exposed", "silhouette", "carried_mass"):
             assert np.array_equal(getattr(together.fluid, name)[parts], getattr(robot.fluid, name))
         alone = jax.tree.leaves(pack_bodies([robot], capacity, np.float64))
         for one, many in zip(alone, jax.tree.leaves(packed), strict=True):
@@ -169,7 +169,10 @@ def test_robots_side_by_side_have_the_bits_that_each_has_alone():
 
 def test_figures_are_those_of_the_body_at_rest():
     for robot in robots():
-        figure, corners = figure_of(robot), robot.morphology.layout.core_corners().reshape(-1, 3)
+        figure, corners = (
+            body_geometry(robot),
+            robot.morphology.layout.core_corners().reshape(-1, 3),
+        )
         assert figure.length == pytest.approx(robot.morphology.length)
         assert figure.weight == pytest.approx(9.81 * robot.morphology.mass, rel=1e-3)
         assert figure.lowest == pytest.approx(-corners[:, 2].min())
@@ -205,23 +208,3 @@ def test_robots_of_two_worlds_do_not_stand_side_by_side():
     one, other = build_robot(body("core"), world()), build_robot(body("core"), world(gravity=3.7))
     with pytest.raises(InputError, match="robot 'core': expected the world of 'core'"):
         pack_bodies([one, other], fit_capacity([one]))
-
-
-def test_what_was_changed_in_the_model_by_hand_counts():
-    """Hinges, servos and masses; and nothing else differs, not even in its last bit."""
-    robot = build_robot(body("spider"), load_world("lake"))
-    untouched = read_columns(robot.assembly)
-    model = robot.mj_model
-    assert changed_assembly(robot) is robot.assembly
-    assert changed_columns(robot, untouched) is untouched
-    model.dof_damping[8], model.jnt_limited[:] = 0.5, 0
-    model.actuator_gainprm[:, 0], model.actuator_biasprm[:] = 0.0, 0.0
-    model.body_mass[3] *= 2
-    found = changed_columns(robot, untouched).hinges
-    np.testing.assert_array_equal(found.gain[2:], 0)
-    np.testing.assert_array_equal(found.stiffness[2:], 0)
-    np.testing.assert_array_equal(found.range[1][2:], np.inf)
-    assert found.damping[4] == 0.5 and np.sum(found.damping != untouched.hinges.damping) == 1
-    assert found.armature is untouched.hinges.armature
-    ratio = changed_assembly(robot).mass[1:] / robot.assembly.mass[1:]
-    np.testing.assert_allclose(ratio, np.where(np.arange(1, 10) == 3, 2, 1))

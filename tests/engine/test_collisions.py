@@ -9,20 +9,20 @@ import pytest
 
 from laboratory import QUICK, body, box_robot, world
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.collisions import (
-    ALONE,
-    Touch,
-    contact_force,
+from mjx_revolve.engine.batched_trees import make_batched_trees
+from mjx_revolve.engine.interaction import (
+    NO_NEIGHBOUR,
+    ContactParameters,
     frames_of,
-    make_meeting,
-    nearest_of,
+    make_interaction,
+    nearest_robot,
+    penalty_force,
 )
+from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.rows import make_rows
 from mjx_revolve.engine.spheres import pack_spheres, sphere_box
 from mjx_revolve.engine.state import State
-from mjx_revolve.engine.step import make_step_engine
-from mjx_revolve.episodes.rollout import begin, flow_at, go_on
+from mjx_revolve.episodes.rollout import Rollout, held
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
 
@@ -71,23 +71,23 @@ def meeting_of(worlds: int = 1, tag: bool = False):
     @partial(jax.jit, compiler_options=QUICK)
     def find(packed, qpos, qvel, present):
         tables, spheres = packed
-        rows = make_rows(space, capacity, tables, len(robots))
+        rows = make_batched_trees(space, capacity, tables, len(robots))
         labels = jnp.arange(len(robots), dtype=qpos.dtype) if tag else None
-        meet = make_meeting(rows, spheres, present, worlds, Touch(), labels)
-        state = make_step_engine(rows, tables.plant).init(qpos, qvel)
-        return frames_of(rows, state), meet.look(state, meet.start(state))[0]
+        meet = make_interaction(rows, spheres, present, worlds, ContactParameters(), labels)
+        state = PopulationEngine(rows, tables.plant).init(qpos, qvel)
+        return frames_of(rows, state), meet.detect(state, meet.init(state))[0]
 
     return partial(find, packed)
 
 
 def wrenches(meeting, frames) -> tuple[np.ndarray, np.ndarray]:
     """`[rows + 1, 3, lanes]` forces and torques about the world's origin, world frame."""
-    (torque, force), (below_torque, below_force) = meeting.push
+    (torque, force), (below_torque, below_force) = meeting.wrench
     join = lambda a, b: np.concatenate([np.asarray(a), np.asarray(b)[:, 0]])  # noqa: E731
     force = np.stack([join(a, b) for a, b in zip(force, below_force, strict=True)], 1)
     torque = np.stack([join(a, b) for a, b in zip(torque, below_torque, strict=True)], 1)
     axes = np.array(frames.axes).transpose(2, 0, 1, 3)  # world axis, then body component
-    place = np.array(frames.place).transpose(1, 0, 2)
+    place = np.array(frames.position).transpose(1, 0, 2)
     force = np.einsum("rwbl,rbl->rwl", axes, force)
     torque = np.einsum("rwbl,rbl->rwl", axes, torque) + np.cross(place, force, axis=1)
     return force, torque
@@ -96,10 +96,10 @@ def wrenches(meeting, frames) -> tuple[np.ndarray, np.ndarray]:
 def by_hand(qpos, qvel, frames, present) -> np.ndarray:
     """`[lanes, 3]` force on each robot, sphere by sphere, from the law in words."""
     space, robots, _, _, spheres = crowd_tables()
-    touch, dt, lanes = Touch(), space.timestep, len(robots)
+    touch, dt, lanes = ContactParameters(), space.timestep, len(robots)
     axes = np.array(frames.axes).transpose(2, 3, 0, 1)
     at = lambda x: np.array(x).transpose(1, 2, 0)  # noqa: E731
-    place, velocity, spin = at(frames.place), at(frames.velocity), at(frames.spin)
+    place, velocity, spin = at(frames.position), at(frames.velocity), at(frames.angular_velocity)
     total = np.zeros((lanes, 3))
 
     def ball(i, s):
@@ -166,15 +166,19 @@ def test_force_at_rest_is_the_springs():
     """dt to 0, no speed: k d along the normal, and nothing apart."""
     still = (0.0, 0.0, 0.0)
     up = (0.0, 0.0, 1.0)
-    force = contact_force(Touch(), jnp.float64(0.003), up, still, 1.0, 1.0, 1e-9)
+    force = penalty_force(ContactParameters(), jnp.float64(0.003), up, still, 1.0, 1.0, 1e-9)
     assert np.allclose(force, (0, 0, 2000 * 0.003), rtol=1e-6)
-    assert np.allclose(contact_force(Touch(), jnp.float64(-0.1), up, still, 1.0, 1.0, 1e-3), 0)
+    assert np.allclose(
+        penalty_force(ContactParameters(), jnp.float64(-0.1), up, still, 1.0, 1.0, 1e-3), 0
+    )
 
 
 def test_friction_is_coulombs_against_the_slip():
     """At 1 m/s the creep speed matters by 5e-7; dt to 0."""
     slip = (1.0, 0.0, 0.0)
-    force = contact_force(Touch(), jnp.float64(0.003), (0.0, 0.0, 1.0), slip, 1.0, 1.0, 1e-9)
+    force = penalty_force(
+        ContactParameters(), jnp.float64(0.003), (0.0, 0.0, 1.0), slip, 1.0, 1.0, 1e-9
+    )
     assert np.allclose(force, (-0.4 * 6, 0, 6), rtol=1e-5)
 
 
@@ -182,8 +186,8 @@ def test_a_contact_stops_no_more_than_its_mass():
     """However stiff and long a step: what comes at 1 m/s with 10 g is at most brought to rest,
     and pushed out of the depth within one step."""
     for dt in (1e-3, 1e-2, 0.1):
-        hard = Touch(stiffness=1e9)
-        force = contact_force(
+        hard = ContactParameters(stiffness=1e9)
+        force = penalty_force(
             hard, jnp.float64(0.01), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0), 0.01, 0.01, dt
         )
         after = -1 + dt * float(force[2]) / 0.01
@@ -229,7 +233,7 @@ def test_who_is_nearest():
     present[6:] = False
     present[7] = True  # the only one of its world
     tags = np.arange(12.0) + 1
-    toward, tag = nearest_of(tuple(map(jnp.asarray, place)), 2, present, jnp.asarray(tags))
+    toward, tag = nearest_robot(tuple(map(jnp.asarray, place)), 2, present, jnp.asarray(tags))
     toward = np.array(toward)
     for k in range(6):
         others = [j for j in range(6) if present[j] and j != k]
@@ -237,7 +241,7 @@ def test_who_is_nearest():
         if present[k]:
             assert np.allclose(toward[:, k], place[:, best] - place[:, k])
             assert tag[k] == tags[best]
-    assert np.allclose(toward[:, 7], (0, 0, ALONE)) and tag[7] == 0
+    assert np.allclose(toward[:, 7], (0, 0, NO_NEIGHBOUR)) and tag[7] == 0
 
 
 @lru_cache(maxsize=8)
@@ -253,23 +257,14 @@ def duel(dt: float):
     @partial(jax.jit, compiler_options=QUICK)
     def run(packed, qpos, qvel):
         tables, spheres = packed
-        rows = make_rows(space, capacity, tables, 2)
-        meet = make_meeting(rows, spheres, jnp.ones(2, bool), 1, Touch())
-        engine = make_step_engine(rows, tables.plant, meet=meet)
+        rows = make_batched_trees(space, capacity, tables, 2)
+        meet = make_interaction(rows, spheres, jnp.ones(2, bool), 1, ContactParameters())
+        engine = PopulationEngine(rows, tables.plant, interaction=meet)
         still = jnp.zeros((tables.plant.num_rows, 2))
         state = engine.init(qpos, qvel)
-        _, kept = go_on(
-            engine,
-            lambda state, time, row, sense: (state, still),
-            flow_at(space, water_of(space)),
-            lambda state, ctrl, energy, water: engine.observe(state),
-            begin(engine, state, ()),
-            None,
-            records=round(0.5 / dt),
-            every=2,
-            timestep=dt,
-        )
-        return kept
+        rollout = Rollout(engine, held(still), space, water_of(space))
+        record = lambda now, ctrl, water: engine.observe(now.state)  # noqa: E731
+        return rollout.advance(rollout.init(state), record, round(0.5 / dt), 2)[1]
 
     return partial(run, (tables, spheres)), np.array([0.3, 0.6])
 
@@ -310,12 +305,20 @@ def test_without_others_nothing_changes():
     @partial(jax.jit, static_argnums=1, compiler_options=QUICK)
     def run(packed, meet: bool):
         tables, spheres = packed
-        rows = make_rows(space, capacity, tables, 8)
-        meeting = make_meeting(rows, spheres, jnp.ones(8, bool), 1, Touch()) if meet else None
-        engine = make_step_engine(rows, tables.plant, meet=meeting)
+        rows = make_batched_trees(space, capacity, tables, 8)
+        meeting = (
+            make_interaction(rows, spheres, jnp.ones(8, bool), 1, ContactParameters())
+            if meet
+            else None
+        )
+        engine = PopulationEngine(rows, tables.plant, interaction=meeting)
         state = engine.init(qpos, qvel)
         assert isinstance(state, State)
-        pushes = (engine.meet.look(state, engine.meet.start(state))[0].push,) if meet else ()
+        pushes = (
+            (engine.interaction.detect(state, engine.interaction.init(state))[0].wrench,)
+            if meet
+            else ()
+        )
         ctrl = jnp.zeros((tables.plant.num_rows, 8))
         return engine.observe(engine.step(state, ctrl, water_of(space), *pushes)[0])
 

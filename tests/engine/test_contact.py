@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import at_rest, body, march, random_states, world
+from laboratory import body, march, random_states, world
 from mjx_revolve.engine.contact import bed_contact, bed_plane
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.water.bed import Bed, bed_height, bed_slope
@@ -172,16 +172,6 @@ def test_creep_stays_below_the_stated_speed(lake_core):
     """Where tan(slope) is half of μ, the docstring's 1 mm/s law creeps at .6 mm/s."""
     _, q, _ = lake_core
     assert np.linalg.norm(q[-1, :2, 1] - q[-51, :2, 1]) / 5.0 < 0.0012
-
-
-def test_sliding_friction_is_coulombs():
-    """A core on dry ground at 1 m/s loses μ g until it is slow."""
-    robot = sink(FLAT, surface_height=-50.0, drag="off", added_mass=False)
-    sunk = 0.09 * G / 4 / FLAT.stiffness  # four corners carry its weight
-    qpos, qvel = at_rest(robot, 1, FLAT.height + 0.0225 - sunk)
-    qvel[0] = 1.0
-    time, _, v, _ = march(robot, 0.11, qpos, qvel)
-    assert v[-1, 0, 0] == pytest.approx(1.0 - 0.6 * G * time[-1], abs=0.05)
 
 
 @pytest.mark.slow

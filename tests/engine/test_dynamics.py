@@ -22,6 +22,7 @@ from laboratory import (
     oar_robot,
     random_states,
     read,
+    with_motors,
     world,
 )
 from mjx_revolve.body.morphology import load_morphology
@@ -29,6 +30,7 @@ from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed
+from mjx_revolve.water.face_drag import FACES
 from mjx_revolve.water.flow import Water
 from references import clip_box
 
@@ -45,9 +47,8 @@ def drawn(robot, lanes, seed=0, speed=1.0):
 
 
 def stock(robot):
-    """The robot with MuJoCo's own servos, which know no top speed; before anything compiles it."""
-    robot.mj_model.jnt_user[:] = np.inf
-    return robot
+    """The robot with MuJoCo's own servos, which have no top speed."""
+    return with_motors(robot, np.inf)
 
 
 def mujoco_model(robot, drag):
@@ -151,6 +152,7 @@ def test_slanted_modules_have_our_water():
     rigid = LIMB.replace("ActiveHinge", "FixedBrick")
     robot = build_robot(slanted(rigid), world(**WATER | {"added_mass": False}))
     model, table, density = robot.mj_model, robot.fluid, robot.world.density
+    faces = FACES.numbers(table, robot.world)
     qpos, qvel = random_states(robot, 6)
     qpos[2] = np.linspace(-0.06, 0.06, 6)
     found, data = accelerate(robot, qpos, qvel), mujoco.MjData(model)
@@ -169,8 +171,8 @@ def test_slanted_modules_have_our_water():
             center = table.center_of_volume[p]
             share, moment = clip_box(axes[2], -place[2], half)
             lift = density * 9.81 * table.volume[p] * axes[2]
-            push = share * (lift - density * table.drag_linear[p] * np.abs(v) * v)
-            twist = -share * density * table.drag_angular[p] * np.abs(w) * w
+            push = share * (lift - faces.linear[p] * np.abs(v) * v)
+            twist = -share * faces.angular[p] * np.abs(w) * w
             twist += np.cross(moment + share * center, lift)
             force = force + jacobians[0].T @ axes @ push + jacobians[1].T @ axes @ twist
         expected = np.linalg.solve(mass, force)

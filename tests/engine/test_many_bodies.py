@@ -18,17 +18,22 @@ from experiments.random_bodies import random_body
 from laboratory import QUICK, ROOT, WATER, accelerate, body, march, random_states, read, world
 from mjx_revolve import MODULES, load_config, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
-from mjx_revolve.control.controller import gene_places
-from mjx_revolve.engine.batch import Group, fit_capacity, order_rows, pack_bodies, resize
-from mjx_revolve.engine.columns import read_columns
+from mjx_revolve.control.controller import gene_indices
+from mjx_revolve.engine.batch import (
+    PartGroup,
+    fit_capacity,
+    order_rows,
+    pack_bodies,
+)
+from mjx_revolve.engine.batched_trees import make_batched_trees
+from mjx_revolve.engine.population import PopulationEngine, acceleration
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.rows import make_rows
-from mjx_revolve.engine.step import acceleration, make_step_engine
+from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.fitness import fit_body
-from mjx_revolve.episodes.rollout import roll_out
+from mjx_revolve.episodes.rollout import Rollout, held
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import share_once
+from mjx_revolve.numerics.xla import fuse
 from mjx_revolve.water.flow import water_of
 
 BED = {"kind": "flat", "height": -5.0}
@@ -56,7 +61,7 @@ def zoo(name):
 def quick_compiles():
     """Leaves out the compiler's optimisations; test_end_to_end.py runs with them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.episodes.evaluation.compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         yield
 
 
@@ -82,15 +87,30 @@ def pack(robots, capacity, each):
     return jax.tree.map(jnp.asarray, bodies)
 
 
+def resize_capacity(capacity, **changes):
+    """A capacity with other room; what is constant stays so."""
+    found = replace(capacity, **changes)
+
+    def sized(level, count, points):
+        pairs = zip(level.parts, found.groups, strict=True)
+        parts = tuple(replace(p, count=count(g)) for p, g in pairs)
+        touching = level.points and replace(level.points, count=points)
+        return replace(level, parts=parts, points=touching)
+
+    row = sized(found.row, lambda group: group.parts, found.points)
+    root = sized(found.root, lambda group: group.root_parts, found.root_points)
+    return replace(found, row=row, root=root)
+
+
 @lru_cache(maxsize=8)
 def accelerator(tank, capacity):
     """`step.acceleration` of packed bodies."""
 
     def run(bodies, q, v, c):
-        rows = make_rows(tank, capacity, bodies, q.shape[-1])
+        rows = make_batched_trees(tank, capacity, bodies, q.shape[-1])
         return acceleration(rows, q, v, bodies.plant.arrange(c), water_of(tank))
 
-    return jax.jit(share_once(run), compiler_options=QUICK)
+    return jax.jit(fuse(run, inline=True), compiler_options=QUICK)
 
 
 def mixed_acceleration(robots, capacity, each, arrays):
@@ -127,7 +147,7 @@ def test_accelerations_are_those_of_each_body_alone(name):
 
 
 @pytest.mark.slow
-def test_more_padding_and_more_riders_change_nothing():
+def test_more_padding_and_more_overflow_rows_change_nothing():
     """More rows, a deeper stack, a larger root, and bodies cut into more or fewer rows."""
     robots = zoo("waves and bed")
     capacity = fit_capacity(robots)
@@ -136,7 +156,7 @@ def test_more_padding_and_more_riders_change_nothing():
     found = mixed_acceleration(robots, capacity, 4, arrays)
     scale = np.abs(found).max(0)
     groups = tuple(g._replace(root_parts=g.root_parts + 2) for g in capacity.groups)
-    padded = resize(
+    padded = resize_capacity(
         capacity,
         rows=capacity.rows + 5,
         slots=capacity.slots + 1,
@@ -145,13 +165,13 @@ def test_more_padding_and_more_riders_change_nothing():
     )
     again = mixed_acceleration(robots, padded, 4, arrays)
     assert np.all(np.abs(again - found).max(0) < 1e-11 * scale)
-    # One part in each row, and one on the root, which then has riders of its own.
+    # One part in each row, and one on the root, which then has overflow rows of its own.
     groups = tuple(g._replace(parts=1, root_parts=1) for g in capacity.groups)
     points = dict.fromkeys(("points", "root_points"), 8 if capacity.points else 0)
-    single = resize(capacity, rows=40, slots=5, groups=groups, **points)
-    order = order_rows(robots[0].assembly, read_columns(robots[0].assembly), groups)
+    single = resize_capacity(capacity, rows=40, slots=5, groups=groups, **points)
+    order = order_rows(robots[0].assembly, read_constants(robots[0].assembly), groups)
     assert order.length[0] == len(robots[0].fluid.volume) - 1
-    assert np.sum(order.rider & (order.body == 1)) > 0
+    assert np.sum(order.overflow & (order.body == 1)) > 0
     again = mixed_acceleration(robots, single, 4, arrays)
     assert np.all(np.abs(again - found).max(0) < 1e-9 * scale)
 
@@ -162,16 +182,16 @@ def test_a_short_stack_holds_any_tree():
     for seed in range(12):
         robot = build_robot(random_body(seed, 2 + seed, 3), tank)
         assembly = robot.assembly
-        columns = read_columns(assembly)
+        columns = read_constants(assembly)
         for parts, root in ((1, 99), (2, 99), (5, 99), (2, 1), (3, 4)):
-            groups = [Group(laws, parts, root) for laws in columns.laws]
+            groups = [PartGroup(laws, parts, root) for laws in columns.laws]
             rows = order_rows(assembly, columns, groups)
             assert 2 ** (rows.slot.max() + 1) - 1 <= rows.length[0] + 1 == len(rows.slot) + 1
             stack = {0: 1}  # the root
-            each = zip(rows.body, rows.rider, rows.source, rows.slot, strict=True)
-            for own, rider, source, slot in each:
-                assert stack[source] == (own if rider else assembly.parent[own])
-                stack[slot] = None if rider else own
+            each = zip(rows.body, rows.overflow, rows.source, rows.slot, strict=True)
+            for own, overflow, source, slot in each:
+                assert stack[source] == (own if overflow else assembly.parent[own])
+                stack[slot] = None if overflow else own
 
 
 def test_room_for_all_bodies_of_so_many_modules():
@@ -198,21 +218,12 @@ def test_a_trajectory_is_that_of_the_body_alone():
     with jax.enable_x64(True):
 
         def run(bodies, qpos, qvel, ctrl):
-            rows = make_rows(tank, capacity, bodies, qpos.shape[-1])
-            engine = make_step_engine(rows, bodies.plant)
+            rows = make_batched_trees(tank, capacity, bodies, qpos.shape[-1])
+            engine = PopulationEngine(rows, bodies.plant)
             asked = engine.plant.arrange(ctrl)
-            return roll_out(
-                engine,
-                lambda state, time, row, sense: (state, asked),
-                lambda time, row: water_of(tank),
-                lambda state, ctrl, energy, water: (*engine.observe(state), energy),
-                engine.init(qpos, qvel),
-                (),
-                None,
-                records=10,
-                every=10,
-                timestep=tank.timestep,
-            )[1]
+            rollout = Rollout(engine, held(asked), tank, water_of(tank))
+            record = lambda now, ctrl, water: (*engine.observe(now.state), now.energy)  # noqa: E731
+            return rollout.advance(rollout.init(engine.init(qpos, qvel)), record, 10, 10)[1]
 
         jitted = jax.jit(run, compiler_options=QUICK)
         start = [jnp.asarray(x) for x in (qpos, qvel, ctrl)]
@@ -273,11 +284,11 @@ def test_scores_are_those_of_each_body_alone(config, fitness, tmp_path):
         speed = np.asarray(measures["speed_m_s"])[here]
         assert speed == pytest.approx(np.asarray(more["speed_m_s"]), abs=1e-5)
     # The same program for other bodies, and bits that do not depend on who swims beside.
-    compiled = fitness.setup._jitted._cache_size()
+    compiled = fitness.program(genes, key)._cache_size()
     others = [robots[1], robots[0], *(robots[k] for k in pick[2:])]
     swapped = jnp.stack([genes[1], genes[0], *genes[2:]])
     once_more = fitness(others, swapped, key)
-    assert fitness.setup._jitted._cache_size() == compiled
+    assert fitness.program(genes, key)._cache_size() == compiled
     assert np.array_equal(np.asarray(once_more)[[1, 0, 2, 3, 4]], np.asarray(scores))
     # Nor on whether they all happen to have its body.
     snakes = fitness([robots[1]] * 5, swapped.at[1:].set(0.0), key)
@@ -300,10 +311,10 @@ def test_a_body_with_a_population_of_its_own(config, fitness):
         assert np.ravel(measures[name]) == pytest.approx(np.asarray(values), abs=1e-4), name
     # One program for any body, and bits that do not depend on who is beside.
     alone, _ = fitness.evaluate(robots[1], genes[1], key)
-    compiled = fitness.setup._jitted._cache_size()
+    compiled = fitness.program(genes, key)._cache_size()
     assert np.array_equal(alone, scores[1])
     again = fitness(robots[0], genes[0].at[1:].set(0.0), key)
-    assert fitness.setup._jitted._cache_size() == compiled
+    assert fitness.program(genes, key)._cache_size() == compiled
     assert again[0] == scores[0, 0] and again[1] != scores[0, 1]
     # Tables as well as robots.
     assert np.array_equal(fitness(fitness.pack(robots), genes, key), scores)
@@ -444,7 +455,7 @@ def test_bodies_without_anything_to_control_are_refused_by_name(config):
 
 def test_genes_find_their_joints_again(fitness):
     robot = fitness.build(body("snake"))
-    places = gene_places(fitness.controller_of(robot), fitness.setup.controller)
+    places = gene_indices(fitness.controller_of(robot), fitness.controller)
     assert len(set(places.tolist())) == len(places) == fitness.controller_of(robot).num_genes
     with pytest.raises(InputError, match=rf"genes: expected \[..., {len(places)}\]; found \[2, 3"):
         fitness.pad_genes(np.zeros((2, 3)), robot)
@@ -500,7 +511,7 @@ def test_constants_follow_from_the_types_of_modules_not_from_examples():
     tank = world(**WATER)
     capacity = fit_capacity([build_robot(body("snake"), tank)], hinges=12, rows=30)
     groups = tuple(g._replace(parts=12, root_parts=30) for g in capacity.groups)
-    roomy = resize(capacity, groups=groups)
+    roomy = resize_capacity(capacity, groups=groups)
     pack_bodies([build_robot(random_body(seed, 5, 6), tank) for seed in range(12)], roomy)
 
 

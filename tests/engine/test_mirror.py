@@ -11,8 +11,8 @@ import pytest
 from laboratory import QUICK, ROOT
 from mjx_revolve import build_robot, load_morphology, load_world
 from mjx_revolve.engine.plant import actuators_of
-from mjx_revolve.engine.step import make_population_engine
-from mjx_revolve.numerics.xla import share_once
+from mjx_revolve.engine.population import make_population_engine
+from mjx_revolve.numerics.xla import fuse
 from mjx_revolve.water.flow import water_of
 
 # Sines and sums in another order: some hundred steps of float64.
@@ -73,7 +73,7 @@ def swimmer(robot):
         return state, engine.observe(state)[0]
 
     def run(qpos, qvel, ctrl):
-        return jax.lax.scan(share_once(step), engine.init(qpos, qvel), ctrl)[1]
+        return jax.lax.scan(fuse(step, inline=True), engine.init(qpos, qvel), ctrl)[1]
 
     return engine, jax.jit(run, compiler_options=QUICK)
 

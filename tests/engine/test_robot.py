@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import mujoco
 import numpy as np
 import pytest
 
-from laboratory import OURS, ROOT, WILD, body, box_robot, read, world
+from laboratory import OURS, ROOT, WILD, body, box_robot, face_drag, read, world
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.engine.batch import fit_capacity
+from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot, check_timestep, export_mjcf
+from mjx_revolve.engine.single_tree import make_single_tree
+from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height
+from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.world import load_world
 
 EFFORT, SPEED = 0.17658, 5.235988
@@ -174,9 +182,10 @@ def test_fluid_table_of_the_catalogue():
     fluid = robot.fluid
     faces = np.array([0.089 * 0.045, 0.089 * 0.045, 0.089 * 0.089])
     assert fluid.exposed[0] == pytest.approx(1.0)
-    assert fluid.drag_linear[0] == pytest.approx(0.5 * 1.05 * faces)
+    assert face_drag(robot).linear[0] == pytest.approx(0.5 * 999.1026 * 1.05 * faces)
     assert fluid.center_of_volume[0] == pytest.approx(0.0)
-    assert fluid.plate_area[0] == pytest.approx(0.089 * 0.089)
+    plates = LIFT_DRAG.numbers(fluid, robot.world)
+    assert plates.area[0] == pytest.approx(0.089 * 0.089)
     # Two bricks on a core, face to face: each hides a face of the other.
     chain = build_robot(
         read("""
@@ -291,3 +300,60 @@ def test_the_longest_step_of_mujocos_laws_does_not_depend_on_ours(coefficient):
     ):
         check_timestep(plate)
     check_timestep(box_robot((0.1, 0.1, 0.002), 0.02, tank, drag_coefficient=coefficient))
+
+
+# ------------------------------------------------------------------------- edited models
+
+
+@pytest.mark.parametrize("kind", ["spec", "model"])
+def test_an_edited_model_is_a_new_robot(kind):
+    """Both engines have its masses, hinges and servos; the first robot stays as it is."""
+    robot = build_robot(body("snake"), world())
+    if kind == "spec":
+        edit = robot.mj_spec
+        name = robot.mj_model.joint(4).name
+        edit.joint(name).damping = [0.5, 0, 0]
+        edit.joint(name).range = [-0.1, 0.2]
+    else:
+        edit = copy.copy(robot.mj_model)
+        edit.dof_damping[9], edit.jnt_range[4] = 0.5, [-0.1, 0.2]
+        edit.body_mass[5] *= 2
+    other = robot.with_model(edit)
+    before, after = (make_single_tree(x).below[3].hinges for x in (robot, other))
+    assert np.max(after.damping) == 0.5 and np.max(before.damping) < 0.1
+    assert -0.1 in np.ravel(after.range[0]) and 0.2 in np.ravel(after.range[1])
+    assert np.allclose(after.gain, before.gain)
+    doubled = 2 if kind == "model" else 1
+    assert other.assembly.mass[5] == pytest.approx(doubled * robot.assembly.mass[5])
+    assert make_engine(other, "mjx").robot.mj_model.dof_damping[9] == 0.5
+    again = pickle.loads(pickle.dumps(other))
+    assert again.mj_model.dof_damping[9] == 0.5
+
+
+def test_what_an_edited_model_may_not_change():
+    robot = build_robot(body("snake"), world())
+    edit = copy.copy(robot.mj_model)
+    edit.body_pos[3] += 0.1
+    edit.opt.timestep = 0.1
+    with pytest.raises(InputError, match=r"servos only; found another body_pos, opt\.timestep"):
+        robot.with_model(edit)
+    spec = robot.mj_spec
+    spec.geoms[0].size = [-1.0, 0.0, 0.0]
+    with pytest.raises(InputError, match="expected one that MuJoCo can compile"):
+        robot.with_model(spec)
+    heavy = robot.with_model(copy.copy(robot.mj_model))
+    with pytest.raises(InputError, match="expected it as built"):
+        fit_capacity([heavy])
+
+
+def test_a_model_edited_in_place_is_refused():
+    """Before and after the first use of the robot."""
+    robot = build_robot(body("snake"), world())
+    robot.mj_model.body_mass[2] *= 2
+    with pytest.raises(InputError, match="edited in place"):
+        make_engine(robot)
+    robot = build_robot(body("snake"), world())
+    make_engine(robot)
+    robot.mj_model.body_mass[2] *= 2
+    with pytest.raises(InputError, match="edited in place"):
+        simulate(robot, None, 0.1)

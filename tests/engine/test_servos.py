@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from laboratory import elbow_robot, world
-from mjx_revolve.engine.levels import make_levels
 from mjx_revolve.engine.servos import servo
+from mjx_revolve.engine.single_tree import make_single_tree
 
 
 @pytest.fixture(scope="module")
 def hinges():
-    return make_levels(elbow_robot(world())).below[0].hinges
+    return make_single_tree(elbow_robot(world())).below[0].hinges
 
 
 def curve(hinges, speed, target):

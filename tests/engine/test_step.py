@@ -20,6 +20,7 @@ from laboratory import (
     at_rest,
     body,
     box_robot,
+    face_drag,
     limp,
     march,
     random_states,
@@ -32,6 +33,7 @@ from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.water.added_mass import box_added_mass
 from mjx_revolve.water.bed import Bed
+from mjx_revolve.water.face_drag import FACES
 from mjx_revolve.water.flow import Water, gust_path
 from references import Lagrangian
 
@@ -43,7 +45,7 @@ CUBE = (0.1, 0.1, 0.1)  # carries the same water along every axis, so no Munk mo
 def quick_compiles():
     """Leaves out the compiler's optimisations: they cost more than these short runs save."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         yield
 
 
@@ -202,7 +204,7 @@ def test_a_body_drifts_to_the_current(added_mass):
     robot = box_robot(CUBE, 1.0, world(drag="faces", added_mass=added_mass, current=current))
     time, _, v, _ = march(robot, 10.0, *at_rest(robot, 1, -5.0), every=20)
     inertia = 1.0 + (RHO * robot.fluid.added_mass[0, 0] if added_mass else 0.0)
-    drag = RHO * robot.fluid.drag_linear[0, 0]
+    drag = face_drag(robot).linear[0, 0]
     expected = current - closing(current, drag, inertia, time[:, None])
     assert v[:, :3, 0] == pytest.approx(expected, abs=0.005 * 0.3)
     assert np.linalg.norm(v[-1, :3, 0] - current) < 0.05
@@ -216,7 +218,7 @@ def test_boxes_at_several_depths_see_several_currents():
     qpos[2] = -1.0, -5.0, -12.0
     time, q, v, _ = march(robot, 5.0, qpos, qvel, every=20)
     inertia = 1.0 + RHO * robot.fluid.added_mass[0, 0]
-    drag = RHO * robot.fluid.drag_linear[0, 0]
+    drag = face_drag(robot).linear[0, 0]
     for lane, share in enumerate((0.9, 0.5, 0.0)):
         u = share * np.array([0.4, -0.2, 0.0])
         expected = u - closing(u, drag, inertia, time[:, None])
@@ -299,8 +301,9 @@ def check_switch(switch, height, speed, engines):
     # Without buoyancy of its own, a part is wet or dry by its centre.
     share = np.where(wings & (switch == "buoyancy"), float(height < 0), share)
     on = lambda name: np.where(wings & (switch == name), 0.0, share)  # noqa: E731
+    drag = FACES.numbers(plain, robot.world).linear
     force = RHO * G * on("buoyancy") @ plain.volume - mass * G
-    force -= RHO * on("drag") @ plain.drag_linear[:, 2] * speed * abs(speed)
+    force -= on("drag") @ drag[:, 2] * speed * abs(speed)
     carried = RHO * on("added_mass") @ plain.added_mass[:, 2]
     found = accelerate(robot, qpos, qvel)[:, 0]
     assert found[2] == pytest.approx(force / (mass + carried), rel=1e-9)

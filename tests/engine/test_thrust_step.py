@@ -17,6 +17,7 @@ from laboratory import (
     at_rest,
     body,
     box_robot,
+    face_drag,
     march,
     random_states,
     read,
@@ -35,7 +36,7 @@ NEUTRAL = RHO * 1e-3
 def quick_compiles():
     """Leaves out the compiler's optimisations: they cost more than these short runs save."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.episodes.simulate.compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         yield
 
 
@@ -54,7 +55,7 @@ def test_speed_under_thrust():
     commands = np.array([[1.0, 0.5, -0.7]])
     time, _, v, work = march(robot, 20.0, qpos, qvel, commands, every=10)
     force = 0.5 * commands[0] * np.abs(commands[0])
-    steady = np.sqrt(np.abs(force) / (RHO * robot.fluid.drag_linear[0, 0])) * np.sign(force)
+    steady = np.sqrt(np.abs(force) / (face_drag(robot).linear[0, 0])) * np.sign(force)
     inertia = NEUTRAL + RHO * robot.fluid.added_mass[0, 0]
     expected = steady * np.tanh(time[:, None] * force / (inertia * steady))
     assert v[:, 0] == pytest.approx(expected, abs=0.002 * steady[0])

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK, WATER, body, box_robot, random_states, world
+from laboratory import QUICK, WATER, body, box_robot, random_states, with_motors, world
 from mjx_revolve.body.morphology import load_morphology
-from mjx_revolve.engine.levels import make_levels
+from mjx_revolve.engine.population import acceleration, tree_plant
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.step import acceleration, level_plant
+from mjx_revolve.engine.single_tree import make_single_tree
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.water.flow import water_of
 
@@ -27,12 +27,12 @@ CUBE = {"mass": 1.0, "center_of_volume": (0.01, 0.0, 0.0)}
 
 def push(robot, states, variation=None, ctrl=None) -> np.ndarray:
     """Accelerations of lanes of states, `[nv, lanes]`."""
-    levels = make_levels(robot)
+    levels = make_single_tree(robot)
     ctrl = np.zeros((robot.mj_model.nu, states[0].shape[1])) if ctrl is None else ctrl
 
     def run(qpos, qvel, ctrl, variation):
-        own = levels if variation is None else levels.varied(variation)
-        asked = level_plant(levels).arrange(ctrl)
+        own = levels if variation is None else levels.with_variation(variation)
+        asked = tree_plant(levels).arrange(ctrl)
         return acceleration(own, qpos, qvel, asked, water_of(robot.world))
 
     with jax.enable_x64(True):
@@ -76,17 +76,15 @@ def test_a_faster_motor_and_one_lane_each(tmp_path):
     factors = np.array([0.8, 1.25])
     found = push(arm, (qpos, qvel), Variation(motor=factors), ctrl)
     for lane, factor in enumerate(factors):
-        other = build_robot(core, world(**WATER))
-        other.mj_model.jnt_user[:] *= factor
+        other = with_motors(arm, factor)
         one = slice(lane, lane + 1)
         expected = push(other, (qpos[:, one], qvel[:, one]), None, ctrl[:, one])
         np.testing.assert_allclose(found[:, one], expected, rtol=1e-9)
 
 
 def test_motors_without_a_limit_have_none_after_it():
-    arm = build_robot(body("spider"), world(**WATER))
-    arm.mj_model.jnt_user[:] = np.inf
-    levels = make_levels(arm)
-    varied = levels.varied(Variation(motor=0.5))
+    arm = with_motors(build_robot(body("spider"), world(**WATER)), np.inf)
+    levels = make_single_tree(arm)
+    varied = levels.with_variation(Variation(motor=0.5))
     for before, after in zip(levels.below, varied.below, strict=True):
         assert after.hinges.motor == before.hinges.motor

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK, ROOT, SLOPE, compiled_quickly, swimmer
-from mjx_revolve import InputError, make_fitness
-from mjx_revolve.episodes.fitness import WORST
+from laboratory import QUICK, ROOT, SLOPE, read, swimmer
+from mjx_revolve import InputError, make_fitness, make_mixed_fitness
+from mjx_revolve.episodes.scoring import WORST
 from mjx_revolve.episodes.tasks import TASKS, Track
 
 KEY = jax.random.key(7)
@@ -33,11 +33,7 @@ body:
 TASK = {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 2}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    """Leaves out the compiler's optimisations; test_end_to_end.py runs with them."""
-    with compiled_quickly("evaluation.compiler_options"):
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +61,16 @@ def test_one_score_each_and_the_same_again(fitness, population, scores):
     assert scores.shape == (70,) and np.all(np.isfinite(scores))
     np.testing.assert_array_equal(scores, fitness(population, KEY))
     assert not np.array_equal(scores, fitness(population, jax.random.key(8)))
+
+
+@pytest.mark.slow
+def test_without_fused_steps_the_scores_are_the_same(settings, population, scores, monkeypatch):
+    """`MJX_REVOLVE_FUSE=0`: to rounding, as the compiler contracts other products."""
+    monkeypatch.setenv("MJX_REVOLVE_FUSE", "0")
+    plain = make_fitness(settings)
+    compiled = jax.jit(plain.evaluate).lower(population, KEY).as_text()
+    assert "small_call" not in compiled and "inlineable" not in compiled
+    np.testing.assert_allclose(plain(population, KEY), scores, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -199,3 +205,20 @@ SETTINGS = SimpleNamespace(
 )
 def test_tasks_with_known_scores(task, given, score):
     assert float(TASKS[task].score(given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_single_chains_have_populations_of_their_own(settings):
+    """XLA:CPU aborts over the program for one body if all are chains of a few hinges."""
+    chain = """
+body:
+  type: Core
+  children:
+    1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {1: {type: ActiveHinge}}}}}
+"""
+    fitness = make_mixed_fitness(settings, [read(ROBOT), read(chain)], **{"task.duration": 0.4})
+    robots = [fitness.build(read(text)) for text in (ROBOT, chain)]
+    genes = jax.random.normal(jax.random.key(1), (2, 2, fitness.num_genes))
+    pick = [robots[0], robots[0], robots[1], robots[1]]
+    beside = fitness(pick, genes.reshape(4, -1), KEY)
+    np.testing.assert_allclose(fitness(robots, genes, KEY).ravel(), beside, rtol=1e-5, atol=1e-7)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK, ROOT, body
+from laboratory import ROOT, body
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.measure_table import MEASURES, records_of
@@ -263,14 +263,6 @@ def test_names_are_read_written_and_checked(tmp_path):
     ) and str(caught.value).startswith("--set task.measures.0: expected one of speed_bl_s, ")
     with pytest.raises(InputError, match=r"task\.measures: expected a list .*; found 'tilt_rad'"):
         load_config(base, ["task.measures=tilt_rad"])
-
-
-@pytest.fixture
-def quick_compiles():
-    """Leaves out the compiler's optimisations."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.episodes.evaluation.compiler_options", lambda: QUICK)
-        yield
 
 
 ARM = """

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from laboratory import compiled_quickly, swimmer
+from laboratory import swimmer
 from mjx_revolve import InputError, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import RobustConfig, dump_config, load_config, make_config
@@ -22,10 +22,7 @@ body: {id: core, type: Core, children: {
 WIDE = {"drag": 2.0, "added_mass": 1.5, "density": 1.01, "motor": 1.3}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    with compiled_quickly("evaluation.compiler_options", "simulate.hasty_options"):
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 @pytest.fixture(scope="module")
@@ -59,17 +56,17 @@ def test_what_cannot_be_varied_is_refused(settings, change, words):
 @pytest.mark.slow
 def test_draws_are_the_keys_and_within_their_ranges(settings):
     fitness = make_fitness(settings, **{"task.trials": 200})
-    drawn = fitness.setup.starts(KEY).variation
+    drawn = fitness.draw_starts(KEY).variation
     for name, factor in drawn._asdict().items():
         low, high = np.log(np.asarray(factor)).min(), np.log(np.asarray(factor)).max()
         most = np.log(WIDE[name])
         assert -most <= low < -0.9 * most and 0.9 * most < high <= most
-    again, other = (fitness.setup.starts(key).variation for key in (KEY, jax.random.key(8)))
+    again, other = (fitness.draw_starts(key).variation for key in (KEY, jax.random.key(8)))
     np.testing.assert_array_equal(np.stack(drawn), np.stack(again))
     assert not np.any(np.stack(drawn) == np.stack(other))
     # Starts are drawn as they are without.
-    plain = make_fitness(settings, **{"task.trials": 200, "task.robust": False}).setup.starts(KEY)
-    np.testing.assert_array_equal(plain.quat, fitness.setup.starts(KEY).quat)
+    plain = make_fitness(settings, **{"task.trials": 200, "task.robust": False}).draw_starts(KEY)
+    np.testing.assert_array_equal(plain.quat, fitness.draw_starts(KEY).quat)
     assert plain.variation is None and Variation._fields == tuple(RobustConfig.model_fields)
 
 
@@ -88,7 +85,7 @@ def test_one_body_and_many_and_its_replay(settings):
     np.testing.assert_allclose(mixed(robots[0], genes, KEY), scores, rtol=1e-3, atol=1e-5)
     # Other draws, the same program.
     assert not np.allclose(fitness(genes, jax.random.key(8)), scores, rtol=1e-3)
-    assert fitness.setup._jitted._cache_size() == 1
+    assert fitness.program(genes, KEY)._cache_size() == 1
     one = make_fitness(settings, **{"task.trials": 1})
     score, _ = one.judge(one.replay(genes[0], KEY), KEY)
     assert score == pytest.approx(float(one(genes[:1], KEY)[0]), rel=1e-3)

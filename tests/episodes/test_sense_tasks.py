@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK
 from mjx_revolve import make_fitness, make_mixed_fitness
 from mjx_revolve.episodes.config import TaskConfig, load_config
 from mjx_revolve.episodes.tasks import TASKS, Track
@@ -97,7 +96,7 @@ def test_a_course_is_followed_from_row_to_row():
 
 
 @pytest.mark.parametrize("name", ["search", "escape"])
-def test_scores_have_a_slope_where_nothing_is_left(name):
+def test_scores_have_a_gradient_where_nothing_is_left(name):
     """Touched from the first row on, or never nearer: derivatives are numbers."""
     for x in ((4.5, 4.5, 0.0), (0.0, 0.0, 0.0)):
         given = track(along_x(*x), target=along_x(*[4.5] * 3))
@@ -117,13 +116,7 @@ CHASED = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    """Leaves out the compiler's optimisations: they cost more than these short runs save."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.episodes.evaluation.compiler_options", lambda: QUICK)
-        patch.setattr("mjx_revolve.episodes.simulate.hasty_options", lambda: QUICK)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +129,7 @@ def chased():
 
 @pytest.mark.slow
 def test_a_pursuer_is_the_robots_own(chased):
-    """Whoever swims beside it; the scores of its episodes are those of their trajectories."""
+    """Whatever its neighbours; the scores of its episodes are those of their trajectories."""
     fitness, genes, scores = chased
     key = jax.random.key(2)
     assert len(set(scores.tolist())) == 3 and (scores < 0.95).all()

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from laboratory import OAR, QUICK, read
+from laboratory import OAR, read
 from mjx_revolve.episodes.fitness import make_mixed_fitness
 from mjx_revolve.episodes.tank import make_tank
 from mjx_revolve.inputs.errors import InputError
@@ -25,13 +25,7 @@ body:
 """
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    """Leaves out the compiler's optimisations."""
-    with pytest.MonkeyPatch.context() as patch:
-        for place in ("tank", "evaluation"):
-            patch.setattr(f"mjx_revolve.episodes.{place}.compiler_options", lambda: QUICK)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +82,7 @@ def test_alone_it_swims_as_in_an_episode(tank, mixed, robots):
     water = tank()
     start = np.asarray(trajectory.qpos[0])
     assert np.allclose(start[:2], 0, atol=1e-3)
-    water.add(robot, own, (0, 0, -2), noise=int(mixed.setup.starts(jax.random.key(0)).noise[0]))
+    water.add(robot, own, (0, 0, -2), noise=int(mixed.draw_starts(jax.random.key(0)).noise[0]))
     trail = water.advance(2.0, 0.02)
     count = 7 + robot.num_hinges
     assert np.allclose(trail.time, trajectory.time)
@@ -149,11 +143,11 @@ def test_robots_do_not_pass_through_each_other(tank, robots):
         for x in (-0.11, 0.11):
             water.add(robots[0], None, (x, 0, -1), (0.7071, 0, 0, 0.7071))
         water.advance(2.0, 0.02)
-        passage = water._passage
-        speed = passage.state.velocity[0].copy()
+        state = water.state
+        speed = state.state.velocity[0].copy()
         speed[:2] = 0.3, -0.3
-        velocity = (speed, *passage.state.velocity[1:])
-        water._passage = passage._replace(state=passage.state._replace(velocity=velocity))
+        velocity = (speed, *state.state.velocity[1:])
+        water.state = state._replace(state=state.state._replace(velocity=velocity))
         if not present:
             water.remove(1)
         trail = water.advance(2.0, 0.02)

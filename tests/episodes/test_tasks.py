@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import QUICK, body
+from laboratory import body
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
-from mjx_revolve.engine.plant import figure_of
+from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.starts import cues_of, draw_starts, start_pose, target_path
+from mjx_revolve.episodes.starts import draw_starts, episode_context, start_pose, target_path
 from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task, Track, score_unit
 from mjx_revolve.water.world import load_world
 
@@ -44,12 +44,7 @@ bending = Task(bend, "rad", records=("core", "joints"))
 """
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    """Leaves out the compiler's optimisations: they cost more than these short runs save."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.episodes.evaluation.compiler_options", lambda: QUICK)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +155,7 @@ def test_a_righted_body_starts_with_its_centre_of_mass_below_that_of_its_volume(
         expected = lever / np.linalg.norm(lever) if lever.any() else np.array([0.0, 0.0, 1.0])
         assert mass.sum() == pytest.approx(volume.sum() * RHO, rel=1e-4)
         pose = start_pose(TASKS["speed"], many.config.task, many.world, figure,
-                          many.setup.starts(KEY))  # fmt: skip
+                          many.draw_starts(KEY))  # fmt: skip
         for quat in np.asarray(pose[3:].T, float):
             turned = np.zeros(3)
             mujoco.mju_rotVecQuat(turned, expected, quat)
@@ -171,7 +166,7 @@ def figures_alone_and_in_a_batch(many, robots):
     """Each robot's figure, once it was seen that a batch has the same numbers."""
     together = many.pack(robots).figure
     for k, robot in enumerate(robots):
-        alone = figure_of(robot)
+        alone = body_geometry(robot)
         for name in alone._fields:
             batch = np.asarray(getattr(together, name), float)[..., k]
             assert batch == pytest.approx(np.asarray(getattr(alone, name), float), rel=1e-6), name
@@ -181,9 +176,9 @@ def figures_alone_and_in_a_batch(many, robots):
 def test_what_points_down_is_turned_half_way_round(settings):
     config = righted(settings, start_attitude="righted", start_tilt=0.0)
     fitness = make_fitness(config)
-    figure = figure_of(fitness.robot)._replace(up=[0.0, 0.0, -1.0])
-    pose = start_pose(fitness.task, fitness.setup.settings, fitness.robot.world, figure,
-                      fitness.setup.starts(KEY))  # fmt: skip
+    figure = body_geometry(fitness.robot)._replace(up=[0.0, 0.0, -1.0])
+    pose = start_pose(fitness.task, fitness.settings, fitness.robot.world, figure,
+                      fitness.draw_starts(KEY))  # fmt: skip
     down = np.zeros(3)
     mujoco.mju_rotVecQuat(down, np.array([0.0, 0.0, -1.0]), np.asarray(pose[3:, 0], float))
     assert down == pytest.approx([0, 0, 1], abs=1e-6)
@@ -218,7 +213,7 @@ def test_targets_are_drawn_anew_for_each_episode_and_move():
     settings = TaskConfig(type="reach_target", target_distance=1.5, target_speed=0.2, trials=64)
     starts = draw_starts(settings, load_world("lake"), jax.random.key(0), 10)
     place = jnp.ones((3, 64))
-    cues = cues_of(settings, starts, place)
+    cues = episode_context(settings, starts, place)
     away = np.stack(cues.target) - 1
     assert np.hypot(*away[:2]) == pytest.approx(1.5) and not away[2].any()
     bearing = np.arctan2(away[1], away[0])
@@ -259,7 +254,7 @@ def test_a_target_is_recorded_as_it_is_felt(settings):
     key, genes = jax.random.key(4), np.zeros(fitness.num_genes)
     score = fitness(genes[None], key)
     assert fitness.judge(fitness.replay(genes, key), key)[0] == pytest.approx(float(score[0]))
-    cues = fitness.cues(key)
+    cues = fitness.context(key)
     away = [np.linalg.norm(np.stack(cues.target_at(t)) - [0, 0, -1]) for t in (0.1, 1.0)]
     length = fitness.robot.morphology.length
     assert score[0] == pytest.approx((away[0] - away[1]) / length, abs=0.05)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import OAR, compiled_quickly, swimmer
+from laboratory import OAR, swimmer
 from mjx_revolve import InputError, make_fitness, make_vector_env, simulate
 from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.episodes import vector_env
@@ -29,11 +29,7 @@ TASK = {
 SENSORS = ["tilt", {"type": "depth", "noise": 0.1}, "accelerometer", "angle", "speed"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    names = "vector_env", "evaluation", "simulate"
-    with compiled_quickly(*(f"{name}.compiler_options" for name in names)):
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +82,7 @@ def replay(fitness, actions, every, seed, episode=0):
         ctrl,
         qpos=fitness.starts(key)[0][:, 0],
         water=fitness.water(key),
-        cues=fitness.cues(key),
+        context=fitness.context(key),
     ), key
 
 
@@ -151,7 +147,7 @@ def test_rewards_are_progress(env, fitness, episode):
     _, rewards, *_ = episode
     trajectory, _ = replay(fitness, strokes()[:, 1], env.environment.every, 4)
     x = np.asarray(trajectory.qpos)[env.environment.every - 1 :: env.environment.every, 0]
-    length = fitness.setup.figure_of(None).length
+    length = fitness.geometry.length
     # Counting begins at row 2 of the track, 0.3 s after the start; nothing leaves the depth that
     # counts.
     assert rewards[7 : STEPS + 1, 1] == pytest.approx(np.diff(x)[5:] / (0.7 * length), abs=1e-4)
@@ -189,12 +185,12 @@ def test_who_acts_as_the_sine_controller_scores_as_it_does(config, fitness):
 
 
 TASKS = {
-    "hold_depth": {"world": {"name": "lake", "current": [0.1, 0.0, 0.0]}},
     "speed": {
         "task.current_std": 0.1,
         "task.energy_weight": 0.01,
         "world": {
             "name": "lake",
+            "current": [0.1, 0.0, 0.0],
             "gust": {"std": 0.1, "time": 1.0},
             "waves": [{"amplitude": 0.05, "period": 2.0}],
         },

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import OAR, SLOPE, compiled_quickly, swimmer
+from laboratory import OAR, QUICK, SLOPE, swimmer
 from mjx_revolve import InputError, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.episodes.scoring import WORST
 from mjx_revolve.episodes.windows import make_windows
@@ -32,10 +32,7 @@ BRAINS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    with compiled_quickly("windows.compiler_options", "evaluation.compiler_options"):
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 @pytest.fixture(scope="module")
@@ -51,39 +48,39 @@ def drawn(count, num_genes, scale=0.4):
     return jnp.asarray(scale * np.random.default_rng(0).normal(size=(count, num_genes)))
 
 
-def check_slope(value, genes, slope, count=6):
-    """A slope against central differences, along single genes and along a direction of all."""
+def check_gradient(value, genes, gradient, count=6):
+    """A gradient against central differences, along single genes and along a direction of all."""
     draw = np.random.default_rng(1)
     picked = draw.choice(len(genes), min(count, len(genes)), replace=False)
     ways = [np.eye(len(genes))[k] for k in picked] + [draw.normal(size=len(genes))]
-    size = np.abs(slope).max()
-    assert np.count_nonzero(slope) > len(slope) // 2 and size > 1e-4
+    size = np.abs(gradient).max()
+    assert np.count_nonzero(gradient) > len(gradient) // 2 and size > 1e-4
     for way in ways:
         ahead, behind = (float(value(genes + s * 1e-6 * way)) for s in (1, -1))
         # Differences over 2 µ leave 1e-10 of the value, and what bends within them.
-        assert slope @ way == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-4 * size)
+        assert gradient @ way == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-4 * size)
 
 
 def mean_gain(windows, episodes):
     """Genes → the mean gain of a window, for differences."""
-    return lambda genes: np.mean(windows.climb(genes[None], episodes)[0].gain)
+    return lambda genes: np.mean(windows.step(genes[None], episodes)[0].gain)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BRAINS)
-def test_closed_loop_slopes_are_those_of_differences(settings, kind):
+def test_closed_loop_gradients_are_those_of_differences(settings, kind):
     """Through sensors with noise, brain, servos and water, in float64, over 0.4 s."""
     with jax.enable_x64(True):
         fitness = make_fitness(listening(settings, kind), **{"task.duration": 0.4})
         windows, genes = make_windows(fitness), drawn(1, fitness.num_genes)
-        episodes = windows.begin(genes, KEY)
-        slopes, _ = windows.climb(genes, episodes)
-        slope = np.asarray(slopes.slope).mean((0, 1))
-        check_slope(mean_gain(windows, episodes), np.asarray(genes[0]), slope)
+        episodes = windows.init(genes, KEY)
+        gradients, _ = windows.step(genes, episodes)
+        gradient = np.asarray(gradients.gradient).mean((0, 1))
+        check_gradient(mean_gain(windows, episodes), np.asarray(genes[0]), gradient)
 
 
 @pytest.mark.slow
-def test_slopes_for_many_bodies_are_those_of_differences(settings, tmp_path):
+def test_gradients_for_many_bodies_are_those_of_differences(settings, tmp_path):
     """A closed loop of two different bodies side by side, by JAX's own gradient."""
     (tmp_path / "turned.yaml").write_text(
         OAR.replace("ActiveHinge,", "ActiveHinge, orientation: 90,")
@@ -96,8 +93,8 @@ def test_slopes_for_many_bodies_are_those_of_differences(settings, tmp_path):
         packed, genes = many.pack([many.build(x) for x in bodies]), drawn(2, many.num_genes)
         total = lambda x: jnp.sum(many(packed, x.reshape(2, -1), KEY))  # noqa: E731
         both = jax.jit(jax.value_and_grad(total), compiler_options=SLOPE)
-        slope = np.asarray(both(genes.reshape(-1))[1])
-        check_slope(lambda x: both(x)[0], np.asarray(genes.reshape(-1)), slope, 4)
+        gradient = np.asarray(both(genes.reshape(-1))[1])
+        check_gradient(lambda x: both(x)[0], np.asarray(genes.reshape(-1)), gradient, 4)
 
 
 @pytest.fixture(scope="module")
@@ -122,30 +119,31 @@ def windows(brain):
 def test_windows_carried_on_are_one_long_rollout(brain, windows):
     """The program of the fitness knows of no windows: the same scores, to rounding in float64.
 
-    And the slope of the last window takes what came before it as given, though that came of other
-    genes: differences of that window alone.
+    And the gradient of the last window takes what came before it as given, though that came of
+    other genes: differences of that window alone.
     """
-    assert repr(windows) == "Windows(directed_swim in lake, 3 of 0.2 s)" and windows.count == 3
+    assert repr(windows) == "TruncatedBPTT(directed_swim in lake, 3 of 0.2 s)"
+    assert windows.count == 3
     with jax.enable_x64(True):
         genes = drawn(2, brain.num_genes)
-        episodes, gains = windows.begin(genes, KEY), []
+        episodes, gains = windows.init(genes, KEY), []
         for _ in range(windows.count):
             before = episodes
-            slopes, episodes = windows.climb(genes, before)
-            gains.append(np.asarray(slopes.gain))
+            gradients, episodes = windows.step(genes, before)
+            gains.append(np.asarray(gradients.gain))
         expected = np.asarray(brain(genes, KEY))
         assert np.mean(np.sum(gains, 0), 1) == pytest.approx(expected, abs=1e-12)
-        # Until the settling time is over nothing counts, and so nothing has a slope.
+        # Until the settling time is over nothing counts, and so nothing has a gradient.
         assert not gains[0].any() and gains[1].any()
         with pytest.raises(InputError, match=r"^episodes: expected some under way; found their"):
-            windows.climb(genes, episodes)
+            windows.step(genes, episodes)
         new = genes[::-1]
-        slope = np.asarray(windows.climb(new, before)[0].slope).mean(1)[0]
+        gradient = np.asarray(windows.step(new, before)[0].gradient).mean(1)[0]
 
         def value(own):
-            return np.mean(windows.climb(jnp.stack([own, new[1]]), before)[0].gain[0])
+            return np.mean(windows.step(jnp.stack([own, new[1]]), before)[0].gain[0])
 
-        check_slope(value, np.asarray(new[0]), slope, 3)
+        check_gradient(value, np.asarray(new[0]), gradient, 3)
 
 
 @pytest.mark.slow
@@ -153,24 +151,25 @@ def test_memory_grows_with_the_state_and_not_with_the_steps_working(windows):
     """XLA's own sum of what lives beside arguments and results."""
     with jax.enable_x64(True):  # as above, so that nothing is compiled again
         population = jnp.zeros((2, windows.fitness.num_genes))
-        episodes = jax.eval_shape(windows._begin, population, KEY)
-        compiled = windows._climb.lower(population, episodes).compile()
+        episodes = jax.eval_shape(windows.init, population, KEY)
+        step = jax.jit(windows.step, compiler_options=QUICK)
+        compiled = step.lower(population, episodes).compile()
     steps = windows.horizon / windows.fitness.robot.world.timestep
-    carried = sum(x.size for x in jax.tree.leaves(episodes.under_way)) / 4  # for each lane
+    carried = sum(x.size for x in jax.tree.leaves(episodes.rollout)) / 4  # for each lane
     # A step of a lane keeps 8 bytes for each number that it carries, its water, and some more while
-    # slopes by the parameters of a record are found; its working is some thousand numbers.
+    # gradients by the parameters of a record are found; its working is some thousand numbers.
     assert compiled.memory_analysis().temp_size_in_bytes / (64 * steps) < 4 * 8 * carried
 
 
 @pytest.mark.slow
-def test_what_blows_up_has_no_slope_and_spreads_none(windows):
+def test_what_blows_up_has_no_gradient_and_spreads_none(windows):
     with jax.enable_x64(True):
         genes = drawn(2, windows.fitness.num_genes)
         broken = genes.at[1].set(jnp.nan)
-        (one, _), (other, _) = (windows.climb(x, windows.begin(x, KEY)) for x in (genes, broken))
-        assert np.all(other.gain[1] == WORST) and not np.any(other.slope[1])
+        (one, _), (other, _) = (windows.step(x, windows.init(x, KEY)) for x in (genes, broken))
+        assert np.all(other.gain[1] == WORST) and not np.any(other.gradient[1])
         np.testing.assert_array_equal(one.gain[0], other.gain[0])
-        np.testing.assert_array_equal(one.slope[0], other.slope[0])
+        np.testing.assert_array_equal(one.gradient[0], other.gradient[0])
 
 
 def test_what_is_refused(settings):
@@ -181,8 +180,8 @@ def test_what_is_refused(settings):
     assert make_windows(fitness, 0.3).count == 2
     windows = make_windows(fitness)
     with pytest.raises(InputError, match=r"^population: expected \[P, 4\]; found \[1, 3\]$"):
-        windows.begin(np.zeros((1, 3)), KEY)
+        windows.init(np.zeros((1, 3)), KEY)
     with pytest.raises(InputError, match=r"^key: expected jax\.random\.key"):
-        windows.begin(np.zeros((1, 4)), 3)
+        windows.init(np.zeros((1, 4)), 3)
     with pytest.raises(InputError, match="engine: expected population, to go back"):
         make_windows(make_fitness(settings, engine="mjx"))

@@ -13,10 +13,10 @@ from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution.body_fitness import make_body_fitness
-from mjx_revolve.evolution.coevolution import check_bodies
+from mjx_revolve.evolution.coevolution import BodyEvolution
+from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.individuals import from_record
-from mjx_revolve.evolution.life import evaluate
-from mjx_revolve.evolution.pool import Pool
+from mjx_revolve.evolution.learning import score_brains
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.shipped import find_shipped
 
@@ -32,7 +32,7 @@ CONFIG = {
 
 @pytest.fixture
 def quick_compiles(monkeypatch):
-    monkeypatch.setattr("mjx_revolve.episodes.evaluation.compiler_options", lambda: QUICK)
+    monkeypatch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
 
 
 def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
@@ -42,16 +42,16 @@ def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
     argv = ["small.yaml", "--out", "run", "--workers", "1"]
     assert run_command(command.main, argv) == 0
     assert "champion: " in capsys.readouterr().out
-    people = [json.loads(line) for line in (tmp_path / "run" / "individuals.jsonl").open()]
-    assert len(people) == 8 and sum(bool(person["parents"]) for person in people) == 4
+    individuals = [json.loads(line) for line in (tmp_path / "run" / "individuals.jsonl").open()]
+    assert len(individuals) == 8 and sum(bool(person["parents"]) for person in individuals) == 4
 
     fitness = make_body_fitness(load_config("small.yaml"))
-    pool = Pool(fitness, fitness.block_size)
+    executor = Executor(fitness, fitness.block_size)
     modules = read_modules(fitness.config)
-    lived = [from_record(p, fitness.genotype, modules, fitness.brains.check) for p in people]
+    lived = [from_record(p, fitness.genotype, modules, fitness.brains.check) for p in individuals]
     for one in lived[::3]:
         key = jax.random.fold_in(jax.random.key(0), one.born)
-        [(scores, measures)] = score(pool, one, jax.random.split(key)[0])
+        [(scores, measures)] = score(executor, one, jax.random.split(key)[0])
         assert scores[0] == one.score
         assert {name: float(x[0]) for name, x in measures.items()} == one.measures
         assert 0 <= one.measures["energy_j"] < 1
@@ -60,15 +60,15 @@ def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
     episode = load_episode("run")
     key = replay_key(0)
     champion = next(one for one in lived if one.genes == tuple(map(float, episode.genes)))
-    [(scores, _)] = score(pool, champion, key)
+    [(scores, _)] = score(executor, champion, key)
     assert episode.fitness.judge(episode.trajectory, key)[0] == pytest.approx(scores[0], abs=1e-4)
 
 
-def score(pool, one, key):
+def score(executor, one, key):
     """What somebody has learnt, scored by itself."""
-    genes = np.zeros((1, pool.num_genes), np.float32)
-    genes[0, pool.layout(one.body).columns] = one.genes
-    return evaluate(pool, [one], [genes], key)
+    genes = np.zeros((1, executor.num_genes), np.float32)
+    genes[0, executor.fitness.layout(one.body).columns] = one.genes
+    return score_brains(executor, [one], [genes], key)
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_shipped_configurations(name):
     """They are whole, and there is room for all bodies that they grow."""
     config = load_config(find_shipped(name, "configs"))
     fitness = make_body_fitness(config)
-    check_bodies(config, Pool(fitness, fitness.block_size))
+    BodyEvolution(config, Executor(fitness, fitness.block_size))
     rng = np.random.default_rng(1)
     bodies = [fitness.genotype.develop(fitness.genotype.random(rng)) for _ in range(40)]
     packed = fitness.mixed.pack([fitness.build(body) for body in bodies])

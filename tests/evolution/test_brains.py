@@ -12,7 +12,7 @@ from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.bodies_config import BrainsConfig
-from mjx_revolve.evolution.brains import lay_out_genes, make_brains
+from mjx_revolve.evolution.brains import gene_layout, make_brain_encoding
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.world import load_world
 
@@ -23,7 +23,7 @@ LAKE = load_world("lake")
 def layout_of(morphology, make=make_sine, common=None):
     plant = plant_of(build_robot(morphology, LAKE))
     own = make(plant)
-    return lay_out_genes(own, common or own, plant)
+    return gene_layout(own, common or own, plant)
 
 
 def common(make=make_sine):
@@ -32,7 +32,7 @@ def common(make=make_sine):
 
 
 def joints(**settings):
-    return make_brains(BrainsConfig(**settings), common())
+    return make_brain_encoding(BrainsConfig(**settings), common())
 
 
 def shorter():
@@ -59,7 +59,7 @@ def test_places_of_genes():
 
 @pytest.mark.parametrize("kind", ["joints", "cppn"])
 def test_vectors_and_files_keep_all_bits(kind):
-    brains = make_brains(BrainsConfig(type=kind), common())
+    brains = make_brain_encoding(BrainsConfig(type=kind), common())
     layout = layout_of(shorter(), common=common())
     brain = brains.draw(np.random.default_rng(3), layout)
     vector = brains.to_vector(brain, layout)
@@ -70,7 +70,7 @@ def test_vectors_and_files_keep_all_bits(kind):
 
 @pytest.mark.parametrize("kind", ["joints", "cppn"])
 def test_genes_of_joints_that_a_body_lacks_are_zero(kind):
-    brains = make_brains(BrainsConfig(type=kind), common())
+    brains = make_brain_encoding(BrainsConfig(type=kind), common())
     layout = layout_of(shorter(), common=common())
     genes = brains.express(np.ones((2, brains.size), np.float32), layout)
     assert genes.shape == (2, common().num_genes)
@@ -92,7 +92,7 @@ def test_a_child_with_its_parents_body_has_its_genes():
 
 def test_a_joint_that_has_grown_does_as_the_nearest():
     """A hinge more at the snake's end takes over what the last one had; the others keep theirs."""
-    brains = make_brains(BrainsConfig(mutation=0.0), common())
+    brains = make_brain_encoding(BrainsConfig(mutation=0.0), common())
     small = layout_of(shorter(), common=common())
     parent = brains.draw(np.random.default_rng(0), small)
     layout = layout_of(SNAKE)
@@ -107,7 +107,7 @@ def test_a_joint_that_has_grown_does_as_the_nearest():
 
 
 def test_of_two_parents_the_first_ones_joints_come_first():
-    brains = make_brains(BrainsConfig(mutation=0.0), common())
+    brains = make_brain_encoding(BrainsConfig(mutation=0.0), common())
     small, large = layout_of(shorter(), common=common()), layout_of(SNAKE)
     first = dict.fromkeys(small.names, 1.0)
     second = dict.fromkeys(large.names, 2.0)
@@ -117,7 +117,7 @@ def test_of_two_parents_the_first_ones_joints_come_first():
 
 def test_a_copy_does_as_its_original():
     """Of a limb that was doubled; one that a second parent gave does as it did there."""
-    brains = make_brains(BrainsConfig(mutation=0.0), common())
+    brains = make_brain_encoding(BrainsConfig(mutation=0.0), common())
     bare = add_module(body("core"), 0, 0, "ActiveHinge", name="fin")
     bare = add_module(bare, 0, 1, "ActiveHinge", name="leg")
     double = add_module(bare, 0, 2, "ActiveHinge", name="fin_2")
@@ -145,7 +145,7 @@ def test_a_limb_where_there_was_none():
 
 def test_the_network_by_hand():
     """With one weight from x to the first kind of gene, those genes are x in units of .1 m."""
-    brains, layout = make_brains(BrainsConfig(type="cppn"), common()), layout_of(SNAKE)
+    brains, layout = make_brain_encoding(BrainsConfig(type="cppn"), common()), layout_of(SNAKE)
     weights = np.zeros(brains.size, np.float32)
     hidden, inputs = 12, 7
     weights[hidden * inputs + hidden + 1] = 2.0  # output 0 ("u"), behind the hidden nodes, input x
@@ -170,7 +170,7 @@ def test_the_network_by_hand():
 
 def test_network_children():
     """Each weight comes of one of the parents."""
-    brains = make_brains(BrainsConfig(type="cppn", mutation=0.0), common())
+    brains = make_brain_encoding(BrainsConfig(type="cppn", mutation=0.0), common())
     ones, twos = [1.0] * brains.size, [2.0] * brains.size
     child = brains.inherit(np.random.default_rng(0), [ones, twos], layout_of(SNAKE))
     share = child.count(1.0) / brains.size
@@ -182,4 +182,4 @@ def test_network_children():
                                             ("cppn", {}), ("cppn", [1.0, 2.0])])  # fmt: skip
 def test_damaged_brains(kind, brain):
     with pytest.raises(InputError, match="brain: expected"):
-        make_brains(BrainsConfig(type=kind), common()).check(brain)
+        make_brain_encoding(BrainsConfig(type=kind), common()).check(brain)

@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import jax
@@ -22,24 +21,18 @@ from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve import sweep
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.evolution import jobs, runs
+from mjx_revolve.evolution import jobs
+from mjx_revolve.evolution import run_folder as runs
+from mjx_revolve.evolution.executor import Executor, make_executor
 from mjx_revolve.evolution.jobs import Limits, WorkerError
-from mjx_revolve.evolution.pool import Pool, make_pool
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-from toys import CLOCK
+from toys import CLOCK, wait_for
 
 distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
 dask = pytest.importorskip("dask")
 pytestmark = pytest.mark.slow
 KEY = jax.random.key(1)
-
-
-def wait_for(condition, seconds=300.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
 
 
 class Dask:
@@ -94,23 +87,22 @@ def config(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def pool(cluster, config):
+def executor(cluster, config):
     """One worker to begin with."""
     cluster.add_worker()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TOY_TROUBLE", str(cluster.folder / "order"))
-        patch.setattr(jobs, "LIMITS", Limits(block=4.0))
-        patch.setattr(jobs, "TRIES", 2)
-        with make_pool(config, None, toys.make_troubled, str(cluster.file)) as pool:
-            pool.folder = cluster.folder / "lost"
-            yield pool
+        patch.setattr(jobs, "LIMITS", Limits(block=4.0, tries=2))
+        with make_executor(config, None, toys.make_troubled, str(cluster.file)) as executor:
+            executor.folder = cluster.folder / "lost"
+            yield executor
 
 
-def check_scores(pool, seed, size=22):
+def check_scores(executor, seed, size=22):
     """The same bits as in this process."""
     population = np.random.default_rng(seed).normal(size=(size, 5)).astype(np.float32)
-    scores, measures = pool.evaluate(population, KEY)
-    alone, alone_measures = Pool(toys.Toy(), 4).evaluate(population, KEY)
+    scores, measures = executor.evaluate(population, KEY)
+    alone, alone_measures = Executor(toys.Toy(), 4).evaluate(population, KEY)
     assert scores.tobytes() == alone.tobytes()
     assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
 
@@ -119,17 +111,17 @@ def said(caplog):
     return [r.getMessage() for r in caplog.records if r.name.startswith("mjx_revolve")]
 
 
-def test_workers_may_join_at_any_time(cluster, pool, caplog):
-    check_scores(pool, 1)
-    assert pool.workers == 1 and len(pool._workplace._workers) == 1
+def test_workers_may_join_at_any_time(cluster, executor, caplog):
+    check_scores(executor, 1)
+    assert executor.num_workers == 1 and len(executor.workers) == 1
     cluster.add_worker()
-    wait_for(lambda: pool._workplace.attend() or pool.workers == 2)
-    check_scores(pool, 2)
-    assert pool.describe() == {"cluster": str(cluster.file), "block": 4}
+    wait_for(lambda: executor.attend() or executor.num_workers == 2)
+    check_scores(executor, 2)
+    assert executor.describe() == {"cluster": str(cluster.file), "block": 4}
     assert [line for line in said(caplog) if "waiting" not in line] == []
 
 
-def test_a_sweep_has_the_workers_of_a_cluster(cluster, pool, tmp_path, monkeypatch, capsys):
+def test_a_sweep_has_the_workers_of_a_cluster(cluster, executor, tmp_path, monkeypatch, capsys):
     """The same bits as in this process, over several runs that share its workers."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
@@ -138,7 +130,7 @@ def test_a_sweep_has_the_workers_of_a_cluster(cluster, pool, tmp_path, monkeypat
         argv = ["toy.yaml", "--seeds", "2", *options]
         assert run_command(lambda argv: sweep.main(argv, toys.make_toy), argv) == 0
     for name in ("toy/seed_0", "toy/seed_1"):
-        here, there = (runs.Run(tmp_path / out / name) for out in ("here", "there"))
+        here, there = (runs.RunFolder(tmp_path / out / name) for out in ("here", "there"))
         assert "cluster" in there.info["workers"]
         assert here.info["champion"] == there.info["champion"]
         tables = [
@@ -149,59 +141,59 @@ def test_a_sweep_has_the_workers_of_a_cluster(cluster, pool, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("kind", ["kill", "hang", "raise"])
-def test_a_lost_worker_costs_nothing(cluster, pool, kind, caplog):
-    before = {*pool._workplace._workers}
+def test_a_lost_worker_costs_nothing(cluster, executor, kind, caplog):
+    before = {*executor.workers}
     (cluster.folder / "order").write_text(kind)
-    check_scores(pool, 3)
+    check_scores(executor, 3)
     assert not (cluster.folder / "order").exists()
-    gone = before - {*pool._workplace._workers}
+    gone = before - {*executor.workers}
     assert len(gone) == (kind != "raise")
     assert [line for line in said(caplog) if "waiting" not in line] == [
         f"the worker at {address} is gone" for address in gone
     ]
 
 
-def test_a_block_that_kills_scores_worst_and_is_named(pool, caplog):
+def test_a_block_that_kills_scores_worst_and_is_named(executor, caplog):
     population = np.random.default_rng(4).normal(size=(10, 5)).astype(np.float32)
     population[5] = 200.0
-    scores, _ = pool.evaluate(population, KEY)
-    alone, _ = Pool(toys.Toy(), 4).evaluate(population, KEY)
+    scores, _ = executor.evaluate(population, KEY)
+    alone, _ = Executor(toys.Toy(), 4).evaluate(population, KEY)
     assert np.isnan(scores[4:8]).all()
     rest = [0, 1, 2, 3, 8, 9]
     assert scores[rest].tobytes() == alone[rest].tobytes()
     assert sum("is gone" in line for line in said(caplog)[:-1]) >= 2
     path = Path(said(caplog)[-1].rpartition(" ")[2])
     assert said(caplog)[-1].startswith("4 individuals count as failed, because their workers do")
-    assert path.parent == pool.folder and path.is_file()
+    assert path.parent == executor.folder and path.is_file()
 
 
-def test_workers_of_another_source_are_refused(cluster, pool, config, caplog, tmp_path):
+def test_workers_of_another_source_are_refused(cluster, executor, config, caplog, tmp_path):
     shutil.copytree(ROOT / "mjx_revolve", tmp_path / "mjx_revolve")
     with open(tmp_path / "mjx_revolve" / "water" / "drag.py", "a") as file:
         file.write("\n# Another law.\n")
-    known = {*pool._workplace._workers}
+    known = {*executor.workers}
     cluster.add_worker(package=tmp_path)
 
     def refused():
-        pool._workplace.attend()
-        return [w for w in pool._workplace._workers.values() if w.refused]
+        executor.attend()
+        return [w for w in executor.workers.values() if w.refused]
 
     wait_for(refused)
     (worker,) = refused()
     assert worker.address not in known
-    ours = pool._workplace.identity["mjx_revolve"]
+    ours = executor.identity["mjx_revolve"]
     (line,) = [line for line in said(caplog) if "refused" in line]
     assert line.startswith(
         f"the worker at {worker.address} is refused: mjx_revolve: expected {ours} as the run has "
         "it; found "
     )
-    check_scores(pool, 5)
+    check_scores(executor, 5)
     assert worker.blocks == []
 
 
 @pytest.mark.slow
 def test_a_lost_scheduler_ends_the_run_which_goes_on_elsewhere(
-    cluster, pool, config, capsys, monkeypatch, tmp_path
+    cluster, executor, config, capsys, monkeypatch, tmp_path
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TOY_TROUBLE", str(tmp_path / "none"))
@@ -234,16 +226,16 @@ def test_a_lost_scheduler_ends_the_run_which_goes_on_elsewhere(
         assert run("--resume", "run", "--workers", 1, *more) == 0
         assert run("toy.yaml", "--out", "whole", "--workers", 1, *more) == 0
         one, other = (
-            runs.Run(tmp_path / name).load_checkpoint().arrays for name in ("run", "whole")
+            runs.RunFolder(tmp_path / name).load_checkpoint().arrays for name in ("run", "whole")
         )
         assert one.keys() == other.keys()
         for name in one.keys() - set(CLOCK):
             assert one[name].tobytes() == other[name].tobytes(), name
         # There is nobody at that address any more.
         with pytest.raises(InputError, match=f"--cluster {cluster.file}: expected a Dask schedule"):
-            make_pool(config, None, toys.make_toy, str(cluster.file))
+            make_executor(config, None, toys.make_toy, str(cluster.file))
     with pytest.raises(WorkerError, match="is lost"):
-        check_scores(pool, 7)
+        check_scores(executor, 7)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +247,7 @@ def test_a_lost_scheduler_ends_the_run_which_goes_on_elsewhere(
 )
 def test_places_without_a_scheduler_are_one_line(config, place, message):
     with pytest.raises(InputError, match=message) as caught:
-        make_pool(config, None, toys.make_toy, place)
+        make_executor(config, None, toys.make_toy, place)
     assert "\n" not in str(caught.value)
 
 
@@ -264,4 +256,4 @@ def test_without_dask_it_says_what_to_install(config, monkeypatch):
     with pytest.raises(
         InputError, match=r"--cluster: expected Dask \(pip install 'mjx_revolve\[cl"
     ):
-        make_pool(config, None, toys.make_toy, "tcp://127.0.0.1:1")
+        make_executor(config, None, toys.make_toy, "tcp://127.0.0.1:1")

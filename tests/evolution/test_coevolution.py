@@ -1,4 +1,4 @@
-"""Bodies that evolve, on a fitness that costs nothing: lives, generations, run folders."""
+"""Bodies that evolve, on a fitness that costs nothing: learning, generations, run folders."""
 
 import csv
 import json
@@ -12,10 +12,13 @@ from mjx_revolve import evolve as command
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.episodes.champion import champion_number
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.evolution import coevolution, runs
+from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.evolution import run_folder as runs
+from mjx_revolve.evolution.coevolution import BodyEvolution
+from mjx_revolve.evolution.executor import Executor
+from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.individuals import from_record, to_record
-from mjx_revolve.evolution.life import evaluate, live, make_learner
-from mjx_revolve.evolution.pool import Pool
+from mjx_revolve.evolution.learning import learn, score_brains
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from toys import CLOCK, make_toy_bodies
@@ -33,20 +36,23 @@ def start(folder, bodies=(), **evolution):
     """A pool over the toy, with other settings."""
     config = load_config(toys.write_bodies_config(folder / "other.yaml", bodies, **evolution))
     fitness = make_toy_bodies(config)
-    return config, Pool(fitness, fitness.block_size)
+    return config, Executor(fitness, fitness.block_size)
 
 
-def run(config, pool, search=None):
+def run(config, executor, search=None):
     """All generations: the last search, and all rows."""
-    rows = []
-    for found, row in coevolution.coevolve(config, pool, search):
-        search = found
-        rows.append(row)
-    return search, rows
+    history = generations(config, executor, search)
+    return history[-1][0], [row for _, row in history]
+
+
+def generations(config, executor, search=None):
+    """All searches and rows."""
+    evolution = BodyEvolution(config, executor)
+    return list(run_generations(evolution, config.evolution.generations, search))
 
 
 def same(one, other, fitness):
-    """Whether two individuals are the same in every bit, what they were through included."""
+    """Whether two individuals are the same in every bit, scores included."""
     return to_record(one, fitness.genotype) == to_record(other, fitness.genotype)
 
 
@@ -54,44 +60,43 @@ def main(*argv):
     return run_command(lambda argv: command.main(argv, make_toy_bodies), [str(a) for a in argv])
 
 
-# --- lives ---
+# --- learning ---
 
 
-def strangers(config, pool):
-    return coevolution._Step(config, pool)._strangers(coevolution.start_search(config), 1)
+def founders(config, executor):
+    evolution = BodyEvolution(config, executor)
+    return evolution.ask(evolution.start()).offspring
 
 
 @pytest.mark.slow
-def test_a_life_alone_is_the_life_among_others(folder):
+def test_learning_does_not_depend_on_the_other_bodies(folder):
     for learning in ({}, {"population_size": 4, "generations": 3}):
-        config, pool = start(folder, {"learning": learning})
-        learner = make_learner(config.bodies.learning, pool.fitness.brains.size)
-        born, key = strangers(config, pool), jax.random.key(3)
-        together = live(pool, learner, born, key)
-        alone = live(pool, learner, born[4:5], key)
-        assert same(alone[0], together[4], pool.fitness)
+        config, executor = start(folder, {"learning": learning})
+        born, key = founders(config, executor), jax.random.key(3)
+        together = learn(executor, born, key)
+        alone = learn(executor, born[4:5], key)
+        assert same(alone[0], together[4], executor.fitness)
         assert not np.isnan(alone[0].score)
 
 
 def test_learning_improves_and_is_what_counts(folder):
     """One trial is the brain of birth; more find better ones, and the score is the best one's."""
-    config, pool = start(folder)
-    born, key = strangers(config, pool), jax.random.key(0)
-    naive = live(pool, None, born, key)
+    config, executor = start(folder)
+    born, key = founders(config, executor), jax.random.key(0)
+    naive = learn(executor, born, key)
     for individual in naive:
         assert individual.learnt == individual.brain and individual.trials == 1
-    config, pool = start(folder, {"learning": {"population_size": 8, "generations": 6}})
-    learner = make_learner(config.bodies.learning, pool.fitness.brains.size)
-    learned = live(pool, learner, born, key)
+    config, executor = start(folder, {"learning": {"population_size": 8, "generations": 6}})
+    learned = learn(executor, born, key)
     gains = [after.score - before.score for before, after in zip(naive, learned, strict=True)]
     assert min(gains) >= 0 and np.mean(gains) > 0.05
     for individual in learned:
         assert individual.trials == 48 and individual.brain in [n.brain for n in naive]
     # Scored by itself, what was learnt gives the score again, on the same starts.
-    wide = np.zeros((len(learned), 1, pool.num_genes), np.float32)
+    wide = np.zeros((len(learned), 1, executor.num_genes), np.float32)
     for row, individual in zip(wide, learned, strict=True):
-        row[:, pool.fitness.layout(individual.body).columns] = individual.genes
-    again = evaluate(pool, learned, wide, jax.random.split(key)[0])
+        row[:, executor.fitness.layout(individual.body).columns] = individual.genes
+    again = score_brains(executor, learned, wide, jax.random.split(key)[0])
     for (score, _), individual in zip(again, learned, strict=True):
         assert score[0] == pytest.approx(individual.score, abs=1e-6)
 
@@ -109,44 +114,32 @@ def watch(fitness, seen):
 
 def test_blocks_hold_one_body_where_many_brains_are_tried(folder):
     for size, alone in ((1, False), (5, False), (6, True), (9, False), (20, True)):
-        config, pool = start(folder, {"learning": {"population_size": size}})
+        config, executor = start(folder, {"learning": {"population_size": size}})
         seen: list = []
-        watch(pool.fitness, seen)
-        live(pool, None, strangers(config, pool), jax.random.key(0))
-        assert pool.fitness.alone == alone
+        watch(executor.fitness, seen)
+        learn(executor, founders(config, executor), jax.random.key(0))
+        assert executor.fitness.one_body_per_block == alone
         assert {len(genes) for genes, *_ in seen} == {8}
         assert all(len(bodies) == 1 for _, _, bodies, _ in seen) == alone
         assert len(seen) == (6 * -(-size // 8) if alone else -(-6 * size // 8))
 
 
 def test_those_that_fail_have_no_score(folder):
-    config, pool = start(folder, {"learning": {"population_size": 4, "generations": 2}})
-    inner = pool.fitness.evaluate
+    config, executor = start(folder, {"learning": {"population_size": 4, "generations": 2}})
+    inner = executor.fitness.evaluate
 
     def fail(genes, which, bodies, key):
         scores, measures = inner(genes, which, bodies, key)
         lost = np.array([body.num_hinges < 3 for body in bodies])[which]
-        return np.where(lost, pool.fitness.worst_score, scores), measures
+        return np.where(lost, executor.fitness.worst_score, scores), measures
 
-    object.__setattr__(pool.fitness, "evaluate", fail)
-    learner = make_learner(config.bodies.learning, pool.fitness.brains.size)
-    for individual in live(pool, learner, strangers(config, pool), jax.random.key(0)):
+    object.__setattr__(executor.fitness, "evaluate", fail)
+    for individual in learn(executor, founders(config, executor), jax.random.key(0)):
         lost = individual.body.num_hinges < 3
         assert np.isnan(individual.score) == lost == (individual.learnt is None)
-    search, rows = run(config, pool)
+    search, rows = run(config, executor)
     assert any(row["failed"] for row in rows)
     assert all(individual.body.num_hinges >= 3 for individual in search.elites)
-
-
-@pytest.mark.parametrize(("learning", "message"), [
-    ({"generations": 2}, "bodies.learning.population_size: expected at least 2"),
-    ({"generations": 2, "population_size": 4, "strategy": "nope"}, "bodies.learning.strategy"),
-    ({"generations": 2, "population_size": 4, "strategy_params": {"x": 1}}, "strategy_params.x"),
-])  # fmt: skip
-def test_wrong_learners(folder, learning, message):
-    config, pool = start(folder, {"learning": learning})
-    with pytest.raises(InputError, match=message):
-        coevolution.check_bodies(config, pool)
 
 
 # --- generations ---
@@ -167,8 +160,8 @@ SCHEMES = [
 @pytest.mark.parametrize("selection", SCHEMES, ids=lambda s: s["type"])
 def test_generations(folder, selection):
     """The bookkeeping of all schemes, and that the same seed gives the same bits."""
-    config, pool = start(folder, {"selection": selection})
-    search, rows = run(config, pool)
+    config, executor = start(folder, {"selection": selection})
+    search, rows = run(config, executor)
     per = selection.get("offspring", 6)
     assert [row["generation"] for row in rows] == [1, 2, 3, 4, 5]
     assert search.next_number == search.trials == rows[-1]["evaluations"] == 6 + 4 * per
@@ -182,8 +175,8 @@ def test_generations(folder, selection):
     for individual in search.living:
         assert all(parent < individual.number for parent in individual.parents)
         assert individual.born == 1 or individual.parents or selection["type"] == "random"
-    again, repeated = run(config, pool)
-    assert all(map(lambda a, b: same(a, b, pool.fitness), search.living, again.living))
+    again, repeated = run(config, executor)
+    assert all(map(lambda a, b: same(a, b, executor.fitness), search.living, again.living))
     for row, other in zip(rows, repeated, strict=True):
         assert {k: v for k, v in row.items() if k not in CLOCK} == pytest.approx(
             {k: v for k, v in other.items() if k not in CLOCK}, nan_ok=True, abs=0, rel=0
@@ -191,13 +184,13 @@ def test_generations(folder, selection):
 
 
 @pytest.mark.slow
-def test_evolution_finds_what_is_asked_for(folder):
+def test_evolution_finds_the_optimum(folder):
     """Three hinges, and genes near a half: far above what random search finds."""
     found = {}
     for kind in ("plus", "random"):
         bodies = {"selection": {"type": kind}, "brains": {"mutation": 0.1}}
-        config, pool = start(folder, bodies, population_size=10, generations=20)
-        search, _ = run(config, pool)
+        config, executor = start(folder, bodies, population_size=10, generations=20)
+        search, _ = run(config, executor)
         found[kind] = search.elites[0].score
         assert search.elites[0].body.num_hinges == 3
     # Both find the hinges; of what is left, inheritance leaves less than half.
@@ -211,12 +204,12 @@ def test_inheritance(folder):
     learning = {"population_size": 8, "generations": 4, "std_init": 0.5}
     for how in ("lamarckian", "darwinian", "none"):
         brains = {"inheritance": how, "mutation": 0.0}
-        config, pool = start(folder, {"brains": brains, "learning": learning, "crossover": 0.0})
-        people, pairs = {}, 0
-        for search, _ in coevolution.coevolve(config, pool):
-            for child in search.newborn:
-                people[child.number] = child
-                for parent in (people[number] for number in child.parents):
+        config, executor = start(folder, {"brains": brains, "learning": learning, "crossover": 0.0})
+        individuals, pairs = {}, 0
+        for search, _ in generations(config, executor):
+            for child in search.offspring:
+                individuals[child.number] = child
+                for parent in (individuals[number] for number in child.parents):
                     same_joints = child.brain.keys() & parent.brain.keys()
                     source = parent.learnt if how == "lamarckian" else parent.brain
                     alike = [child.brain[name] == source[name] for name in same_joints]
@@ -227,49 +220,46 @@ def test_inheritance(folder):
 
 @pytest.mark.parametrize("genotype", ["plasticoding", "cppn"])
 def test_other_genotypes(folder, genotype):
-    config, pool = start(folder, {"genotype": genotype, "brains": {"type": "cppn"}})
-    search, _ = run(config, pool)
+    config, executor = start(folder, {"genotype": genotype, "brains": {"type": "cppn"}})
+    search, _ = run(config, executor)
     for individual in search.living:
         again = from_record(
-            json.loads(json.dumps(to_record(individual, pool.fitness.genotype))),
-            pool.fitness.genotype, coevolution.read_modules(config), pool.fitness.brains.check,
+            json.loads(json.dumps(to_record(individual, executor.fitness.genotype))),
+            executor.fitness.genotype, read_modules(config),
+            executor.fitness.brains.check,
         )  # fmt: skip
-        assert same(individual, again, pool.fitness)
+        assert same(individual, again, executor.fitness)
 
 
 def test_seeds_begin_the_population(folder):
     bodies = {"seeds": ["snake", "spider"], "random": 0.5, "max_modules": 30, "max_hinges": 10}
-    config, pool = start(folder, bodies)
-    first = strangers(config, pool)
+    config, executor = start(folder, bodies)
+    first = founders(config, executor)
     assert [i.origin for i in first] == ["seed snake", "seed spider", "mutant of snake",
                                         "random", "random", "random"]  # fmt: skip
-    for individual, seed in zip(first, pool.fitness.seeds, strict=False):
+    for individual, seed in zip(first, executor.fitness.seeds, strict=False):
         assert individual.body.modules == seed.modules
     assert first[2].body.modules != first[0].body.modules
+
+
+LEARNING = {"generations": 2, "population_size": 4}
 
 
 @pytest.mark.parametrize(("bodies", "message"), [
     ({"seeds": ["snake"]}, r"snake.yaml: expected 2 to 8 modules; found"),
     ({"seeds": ["snake"], "genotype": "cppn", "max_modules": 30, "max_hinges": 10},
      "bodies.seeds: expected none"),
-    ({"modules": ["Wing"]}, "bodies.modules"),
     ({"params": {"nope": 1}}, "bodies.params.nope"),
-])  # fmt: skip
-def test_wrong_bodies(folder, bodies, message):
-    with pytest.raises(InputError, match=message):
-        start(folder, bodies)
-
-
-@pytest.mark.parametrize(("bodies", "message"), [
+    ({"learning": {"generations": 2}}, "bodies.learning.population_size: expected at least 2"),
+    ({"learning": LEARNING | {"strategy": "nope"}}, "bodies.learning.strategy"),
     ({"selection": {"type": "nsga2", "objectives": ["score", "sped"]}}, "objectives: expected"),
     ({"archive": {"axes": {"num_hinges": {"low": 0, "high": 4}, "x": {"low": 0, "high": 1}}}},
      "archive.axes: expected"),
     ({"selection": {"type": "comma", "offspring": 2}}, "offspring"),
 ])  # fmt: skip
-def test_wrong_selections(folder, bodies, message):
-    config, pool = start(folder, bodies)
+def test_wrong_settings(folder, bodies, message):
     with pytest.raises(InputError, match=message):
-        coevolution.check_bodies(config, pool)
+        BodyEvolution(*start(folder, bodies))
 
 
 # --- the archive ---
@@ -282,10 +272,10 @@ ARCHIVE = {
 
 
 def test_map_elites_keeps_the_best_of_each_kind(folder):
-    config, pool = start(folder, ARCHIVE, generations=12)
+    config, executor = start(folder, ARCHIVE, generations=12)
     best: dict = {}
-    for search, row in coevolution.coevolve(config, pool):
-        for one in search.newborn:
+    for search, row in generations(config, executor):
+        for one in search.offspring:
             cell = (one.body.num_hinges, one.body.num_modules)
             if cell not in best or one.score > best[cell].score:
                 best[cell] = one
@@ -299,7 +289,7 @@ def test_map_elites_keeps_the_best_of_each_kind(folder):
 
 def contents(folder):
     """What must be the same for two runs of the same seed."""
-    found = runs.Run(folder)
+    found = runs.RunFolder(folder)
     arrays = {n: a.tobytes() for n, a in found.load_checkpoint().arrays.items() if n not in CLOCK}
     table = {n: c.tobytes() for n, c in found.load_metrics().items() if n not in CLOCK}
     names = ("champion/genes.yaml", "champion/morphology.yaml", "individuals.jsonl",
@@ -333,13 +323,13 @@ def test_what_is_in_a_run_folder(folder, capsys):
     out = capsys.readouterr().out
     assert "bodies (tree, at most 8 modules)" in out and "champion: " in out
     run_folder = folder / "run"
-    people = [json.loads(line) for line in (run_folder / "individuals.jsonl").open()]
-    assert [person["id"] for person in people] == list(range(len(people)))
+    individuals = [json.loads(line) for line in (run_folder / "individuals.jsonl").open()]
+    assert [person["id"] for person in individuals] == list(range(len(individuals)))
     last = [json.loads(line) for line in (run_folder / "generations.jsonl").open()][-1]
     rows = list(csv.DictReader((run_folder / "archive.csv").open()))
     assert {int(row["id"]) for row in rows} == set(last["living"])
     for row in rows:
-        person = people[int(row["id"])]
+        person = individuals[int(row["id"])]
         assert float(row["score"]) == pytest.approx(person["score"])
         assert float(row["num_hinges"]) == person["descriptors"]["num_hinges"]
     archive, lives = runs.load_archive(run_folder)
@@ -347,10 +337,10 @@ def test_what_is_in_a_run_folder(folder, capsys):
     assert [life.score for life in lives] == [archive.scores[int(row["cell"])] for row in rows]
     body = load_morphology(run_folder / "champion" / "morphology.yaml")
     assert body.num_hinges == 3
-    champion = people[champion_number(run_folder)]
+    champion = individuals[champion_number(run_folder)]
     assert champion["body"] == json.loads(json.dumps(body.to_mapping()))
     assert (run_folder / "bodies.png").read_bytes().startswith(b"\x89PNG")
-    table = runs.Run(run_folder).load_metrics()
+    table = runs.RunFolder(run_folder).load_metrics()
     assert table["coverage"][-1] == pytest.approx(len(rows) / 28)
 
 

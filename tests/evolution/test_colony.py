@@ -1,9 +1,8 @@
-"""A colony: fitness and life by hand, who mates, births and deaths that add up, resume."""
+"""A colony: its rules by hand, births and deaths that add up, resume."""
 
 import json
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 import yaml
@@ -11,22 +10,28 @@ import yaml
 from laboratory import QUICK, ROOT
 from mjx_revolve.episodes.colony_config import ColonyConfig, EnergyConfig, LifeConfig
 from mjx_revolve.episodes.config import load_config, make_config
-from mjx_revolve.episodes.lives import read_generations, read_lives
-from mjx_revolve.episodes.tank import Trail
+from mjx_revolve.episodes.individual_log import read_generations, read_individuals
+from mjx_revolve.episodes.tank import TankTrajectory
 from mjx_revolve.evolution.body_fitness import make_body_fitness
 from mjx_revolve.evolution.colony import (
-    Citizen,
+    CAUSES,
     Colony,
-    Pregnancy,
-    _Commune,
-    colony_from_arrays,
-    colony_of,
-    colony_to_arrays,
+    Member,
+    PendingBirth,
+    age_members,
     fitness_of,
+    give_birth,
     life_span,
+    make_rules,
+    mate,
+    remove_dead,
     share_power,
+    wrap_edges,
 )
-from mjx_revolve.evolution.pool import make_pool
+from mjx_revolve.evolution.colony_search import ColonyEvolution
+from mjx_revolve.evolution.executor import make_executor
+from mjx_revolve.evolution.generations import run_generations
+from mjx_revolve.evolution.reproduction import make_founder
 from mjx_revolve.evolve import main
 from mjx_revolve.inputs.errors import InputError
 
@@ -68,7 +73,7 @@ def test_life_span_by_hand():
 
 
 def test_chargers_share_their_power():
-    """Within reach everybody gets the most; beyond it falls as 1/d²; a crowd shares."""
+    """Within reach robots get the most; beyond, power falls as 1/d²; many robots share it."""
     energy = EnergyConfig(power=1.0, most=0.5, reach=1.0)
     assert share_power(np.array([[0.5, 2.0]]), energy) == pytest.approx([0.5, 0.125])
     crowd = share_power(np.full((1, 8), 0.2), energy)
@@ -90,95 +95,131 @@ def fitness(config):
 def quick_compiles():
     """Leaves out the compiler's optimisations."""
     with pytest.MonkeyPatch.context() as patch:
-        for place in ("tank", "evaluation"):
-            patch.setattr(f"mjx_revolve.episodes.{place}.compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         yield
 
 
-def crowd(commune, places, scores, born=0.0):
-    """Citizens who stood still at some places; those before each one are numbered from 0."""
-    rng, citizens = np.random.default_rng(0), {}
-    commune.events, commune.born, commune.next_number = [], [], 0
-    genotype = commune.fitness.genotype
-    trail = np.zeros((4, 7 + commune.tank.mixed.capacity.hinges, commune.tank.places))
+@pytest.fixture(scope="module")
+def rules(fitness):
+    return make_rules(fitness)
+
+
+def stand(fitness, places, scores, end=10.0):
+    """A colony of members that stood still at some places, and their trajectory up to a time."""
+    rng, members = np.random.default_rng(0), {}
+    qpos = np.zeros((4, 7 + fitness.mixed.capacity.hinges, 8))
     for k, (place, score) in enumerate(zip(places, scores, strict=True)):
-        individual = commune._grow(rng, (), 1, "random", genotype.random(rng))
-        individual = replace(individual, score=score)
-        track = np.array([place], float)
-        citizens[k] = Citizen(individual, k, born, track, np.zeros(3), 5.0)
-        trail[:, :3, k] = place
-    return citizens, Trail(np.arange(4.0), trail, np.zeros((4, 8)), np.ones(8, bool))
+        individual = replace(make_founder(fitness, rng, k, 1), score=score)
+        members[k] = Member(individual, k, 0.0, np.array([place], float), np.zeros(3), 5.0)
+        qpos[:, :3, k] = place
+    time = end - np.arange(4.0)[::-1]
+    return Colony(members=members), TankTrajectory(time, qpos, np.zeros((4, 8)), np.ones(8, bool))
 
 
-def test_who_mates(config, fitness):
-    """The nearest first, each once; alike in fitness, adult, not with child, pairs not too often,
+def parents(colony):
+    """Numbers of the parents of children to come."""
+    return [tuple(parent.number for parent in p.parents) for p in colony.pending_births]
+
+
+def test_mating(fitness, rules):
+    """The nearest first, each once; alike in fitness, adult, not gestating, pairs not too often,
     and only as long as there is room."""
-    commune = _Commune(config, fitness)
     # Along a line: 0 and 1 are near, 2 a bit farther from 1, 3 far, 4 near 3 but much less fit.
     places = [(0, 0, -1), (0.3, 0, -1), (0.7, 0, -1), (-1.0, 1.0, -1), (-0.9, 1.0, -1)]
-    citizens, trail = crowd(commune, places, [0.1, 0.2, 0.15, 0.2, 0.01])
-    mated, found = commune._mate(citizens, (), trail, 10.0)
-    assert [tuple(i.number for i in p.parents) for p in found] == [(1, 0)]  # the fitter first
-    assert found[0].due == 16.0 and mated[0].busy == mated[1].busy == 16.0
-    assert mated[0].children == {1: 1} and mated[1].children == {0: 1} and not mated[2].children
-    [event] = commune.events
+    colony, trajectory = stand(fitness, places, [0.1, 0.2, 0.15, 0.2, 0.01])
+    mated, [event] = mate(colony, trajectory, rules)
+    members = mated.members
+    assert parents(mated) == [(1, 0)] and mated.pending_births[0].due == 16.0  # the fitter first
+    assert members[0].busy_until == members[1].busy_until == 16.0
+    assert members[0].children == {1: 1} and members[1].children == {0: 1}
+    assert not members[2].children
     assert event["id"] == 0 and event["other"] == 1 and event["place"] == [0.15, 0, -1]
-    # With child, 1 mates with nobody; then with 2, as 0 and 1 have had their two.
-    again, more = commune._mate(mated, found, trail, 12.0)
-    assert len(more) == 1 and again is not None
-    later = {n: replace(c, busy=-1.0) for n, c in mated.items()}
+    # While it gestates, 1 does not mate; then with 2, as 0 and 1 have had their two.
+    assert parents(mate(mated, trajectory._replace(time=trajectory.time + 2), rules)[0]) == [(1, 0)]
+    later = {n: replace(m, busy_until=-1.0) for n, m in members.items()}
     later[0], later[1] = (replace(later[a], children={b: 2}) for a, b in ((0, 1), (1, 0)))
-    _, third = commune._mate(later, (), trail, 20.0)
-    assert [tuple(i.number for i in p.parents) for p in third] == [(1, 2)]
-    # Children of 3 s mate with nobody, nor does anybody where all places are promised.
-    assert (
-        commune._mate({n: replace(c, born=8.0) for n, c in citizens.items()}, (), trail, 10.0)[1]
-        == ()
+    assert parents(mate(Colony(members=later), trajectory, rules)[0]) == [(1, 2)]
+    # Robots of 2 s do not mate, nor does any where all slots are promised.
+    young = {n: replace(m, born=8.0) for n, m in colony.members.items()}
+    assert parents(mate(Colony(members=young), trajectory, rules)[0]) == []
+    full = replace(
+        colony, pending_births=(PendingBirth(99.0, mated.pending_births[0].parents),) * 3
     )
-    full = tuple(Pregnancy(99.0, found[0].parents) for _ in range(3))
-    assert commune._mate(citizens, full, trail, 10.0)[1] == full
+    assert mate(full, trajectory, rules)[0].pending_births == full.pending_births
 
 
-def test_who_dies(config, fitness):
-    commune = _Commune(config, fitness)
+def test_deaths(fitness, rules):
     places = [(0, 0, -1), (1, 0, -3.5), (0, 1, -1), (1, 1, -1), (-1, 0, -1)]
-    citizens, trail = crowd(commune, places, [0.2, 0.2, 0.02, 0.2, 0.2])
-    for k in range(5):
-        commune.tank.robots[k] = fitness.build(citizens[k].individual.body)
-    citizens[3] = replace(citizens[3], charge=-9.0)
-    trail.qpos[2, 4, 4] = np.nan
+    colony, trajectory = stand(fitness, places, [0.2, 0.2, 0.02, 0.2, 0.2], end=13.0)
+    empty = replace(colony.members[3], charge=-9.0)
+    trajectory.qpos[2, 4, 4] = np.nan
     # 2 has a tenth of full fitness: its childhood of 12 s is longer than 4 s.
-    alive, died = commune._bury(citizens, trail, 13.0)
-    assert list(alive) == [0]
-    assert {e["id"]: e["cause"] for e in commune.events} == {
-        1: "lost", 2: "age", 3: "energy", 4: "failed"
-    }  # fmt: skip
-    assert np.isnan(died[-1].score) and died[0].measures == {"age": 13.0, "children": 0.0}
-    # The charger at the origin has given 0 all it takes: .2 W for four looks of .5 s.
-    assert alive[0].charge == pytest.approx(5.0 + 0.2 * 4 * 0.5)
+    left, events = remove_dead(
+        replace(colony, members={**colony.members, 3: empty}), trajectory, rules
+    )
+    assert list(left.members) == [0]
+    assert {e["id"]: e["cause"] for e in events} == {1: "lost", 2: "age", 3: "energy", 4: "failed"}
+    assert {e["cause"] for e in events} == set(CAUSES)
+    assert np.isnan(left.died[-1].score)
+    assert left.died[0].measures == {"age": 13.0, "children": 0.0}
 
 
-def test_edges_wrap_without_a_jump_in_the_track(config, fitness):
-    commune = _Commune(config, fitness)
-    citizens, trail = crowd(commune, [(1.3, 0, -1)], [0.1])
-    found = commune._wrap(citizens)[0]
-    assert found.offset.tolist() == [2.5, 0, 0]
-    assert commune._place_of(found) == pytest.approx([-1.2, 0, -1])
-    trail.qpos[:, 0, 0] = [-1.2, -1.15, -1.1, -1.05]
-    track = commune._age(found, trail).track
+def test_an_interval_costs_energy_and_chargers_give_it(fitness, rules):
+    """The charger at the origin gives 0 all it takes, .2 W for four looks of .5 s; idling costs
+    .2 W over the interval of 4 s, motors what the trajectory has."""
+    colony, trajectory = stand(fitness, [(0, 0, -1)], [0.0])
+    trajectory.energy[:, 0] = 0.25
+    member = age_members(colony, trajectory, rules).members[0]
+    assert member.charge == pytest.approx(5.0 + 0.2 * 4 * 0.5 - 0.2 * 4.0 - 4 * 0.25)
+
+
+def test_edges_wrap_without_a_jump_in_the_track(fitness, rules):
+    colony, trajectory = stand(fitness, [(1.3, 0, -1)], [0.1])
+    wrapped, shift = wrap_edges(colony, rules)
+    assert shift[:, 0].tolist() == [-2.5, 0, 0] and not shift[:, 1:].any()
+    member = wrapped.members[0]
+    assert member.offset.tolist() == [2.5, 0, 0]
+    assert member.position == pytest.approx([-1.2, 0, -1])
+    trajectory.qpos[:, 0, 0] = [-1.2, -1.15, -1.1, -1.05]
+    track = age_members(wrapped, trajectory, rules).members[0].track
     assert track[:, 0] == pytest.approx([1.3, 1.3, 1.35, 1.4, 1.45])
 
 
+def test_births(fitness, rules):
+    """Children that are due, in free slots and away from others, then founders up to the least."""
+    colony, _ = stand(fitness, [(0, 0, -1), (0, 0.8, -1)], [0.2, 0.1])
+    one, other = (member.individual for member in colony.members.values())
+    pending = tuple(PendingBirth(due, (one, other)) for due in (10.0, 11.0))
+    colony = replace(colony, pending_births=pending, next_number=2, generation=7)
+    found, events = give_birth(colony, 10.0, rules, np.random.default_rng(1))
+    assert found.pending_births == pending[1:]  # 11 s is not yet
+    assert list(found.members) == [0, 1, 2] and found.next_number == 3
+    child = found.members[2]
+    assert child.individual.parents == (0, 1) and child.individual.born == 7
+    assert child.slot == 2 and child.born == 10.0 and child.charge == 5.0
+    assert np.hypot(*child.position[:2]) <= 1.0 and child.position[2] == -1.0
+    assert found.born == (child.individual,) and events[0]["parents"] == [0, 1]
+    # Of two in a full clinic, none is born: the child waits, and no founder takes its number.
+    packed = rules._replace(
+        colony=rules.colony.model_copy(
+            update={"birth": rules.colony.birth.model_copy(update={"radius": 0.0})}
+        )
+    )
+    found, events = give_birth(colony, 10.0, packed, np.random.default_rng(1))
+    assert found.pending_births == pending and found.next_number == 2 and not events
+
+
 @pytest.fixture(scope="module")
-def lives(config):
+def history(config):
     """All intervals of a small colony: searches and rows."""
-    with make_pool(config, workers=1) as pool:
-        return list(colony_of(config, pool)), pool
+    with make_executor(config, workers=1) as executor:
+        evolution = ColonyEvolution(config, executor)
+        return list(run_generations(evolution, config.evolution.generations)), evolution
 
 
 @pytest.mark.slow
-def test_births_and_deaths_add_up(lives, config):
-    found, _ = lives
+def test_births_and_deaths_add_up(history, config):
+    found, _ = history
     alive, seen = set(), set()
     total = 0
     for search, row in found:
@@ -191,10 +232,10 @@ def test_births_and_deaths_add_up(lives, config):
                 total += 1
             if event["event"] == "death":
                 alive.remove(event["id"])
-        assert set(search.citizens) == alive and row["living"] == len(alive)
+        assert set(search.members) == alive and row["living"] == len(alive)
         assert 3 <= len(alive) <= 8
-        places = [c.place for c in search.citizens.values()]
-        assert len(set(places)) == len(places)
+        slots = [member.slot for member in search.members.values()]
+        assert len(set(slots)) == len(slots)
         assert row["time"] == pytest.approx(4.0 * search.generation)
     events = [e["event"] for search, _ in found for e in search.events]
     assert {"birth", "mating", "death"} == set(events)  # this seed has all of them
@@ -203,22 +244,20 @@ def test_births_and_deaths_add_up(lives, config):
 
 
 @pytest.mark.slow
-def test_it_goes_on_from_any_checkpoint_bit_for_bit(lives, config):
-    found, pool = lives
-    fitness = pool.fitness
-    arrays = colony_to_arrays(config, fitness, found[4][0])
-    again = colony_from_arrays(config, fitness, arrays)
-    rest = list(colony_of(config, pool, again))
+def test_it_goes_on_from_any_checkpoint_bit_for_bit(history, config):
+    found, evolution = history
+    again = evolution.from_arrays(evolution.to_arrays(found[4][0]))
+    rest = list(run_generations(evolution, config.evolution.generations, again))
     assert len(rest) == len(found) - 5
     for (one, row), (other, same) in zip(found[5:], rest, strict=True):
         assert json.dumps(one.events) == json.dumps(other.events)
         for name in row:
             if name not in ("seconds", "times_real_time", "evaluations_per_second"):
                 assert np.array_equal(row[name], same[name], equal_nan=True), name
-    last, same = (colony_to_arrays(config, fitness, s[-1][0]) for s in (found, rest))
+    last, same = (evolution.to_arrays(rows[-1][0]) for rows in (found, rest))
     assert last.keys() == same.keys()
     for name in last.keys() - {"seconds"}:
-        # Places that nobody has are stepped along, whoever was there last.
+        # Slots that are free are stepped along, with the robot that was there last.
         if not name.startswith("tank."):
             assert np.array_equal(last[name], same[name]), name
     here = last["tank.alive"]
@@ -228,22 +267,22 @@ def test_it_goes_on_from_any_checkpoint_bit_for_bit(lives, config):
 
 
 @pytest.mark.slow
-def test_the_command_writes_and_resumes_a_run(tmp_path, lives, capsys):
-    """Stopped after five intervals and resumed, it tells what `lives` did in one go."""
+def test_the_command_writes_and_resumes_a_run(tmp_path, history, capsys):
+    """Stopped after five intervals and resumed, its events are those of `history`."""
     path, run = tmp_path / "colony.yaml", tmp_path / "run"
     path.write_text(yaml.safe_dump(SETTINGS))
     assert main([str(path), "--out", str(run), "--set", "evolution.generations=5"]) == 0
     assert main(["--resume", str(run), "--set", "evolution.generations=10"]) == 0
-    searches = [search for search, _ in lives[0][:10]]
+    searches = [search for search, _ in history[0][:10]]
     events = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
     assert events == json.loads(json.dumps([e for search in searches for e in search.events]))
     living, _ = read_generations(run)
     assert living == {s.generation: tuple(i.number for i in s.living) for s in searches}
-    people, wrong = read_lives(run)
-    assert not wrong and sorted(people) == list(range(searches[-1].next_number))
+    individuals, wrong = read_individuals(run)
+    assert not wrong and sorted(individuals) == list(range(searches[-1].next_number))
     ended = {i.number: i.score for search in searches for i in search.died}
     for number, score in ended.items():
-        assert people[number].score == pytest.approx(score, nan_ok=True)
+        assert individuals[number].score == pytest.approx(score, nan_ok=True)
     assert (run / "champion" / "genes.yaml").is_file()
     out = capsys.readouterr().out
     assert "champion:" in out and "generation 10/10" in out
@@ -277,12 +316,16 @@ def test_a_gusty_world_is_refused(config):
     data = {**SETTINGS, "world": {"name": "lake", "bed": False, "gust": gust}}
     with (
         pytest.raises(InputError, match="without gusts"),
-        make_pool(make_config(data, ROOT), workers=1) as pool,
+        make_executor(make_config(data, ROOT), workers=1) as executor,
     ):
-        _Commune(pool.config, pool.fitness)
+        ColonyEvolution(executor.fitness.config, executor)
 
 
-def test_the_shipped_configuration_loads():
-    found = load_config(ROOT / "configs" / "lake_colony.yaml")
-    assert isinstance(found.colony, ColonyConfig)
-    assert Colony().living == () and jax.device_count() > 0
+def test_the_shipped_configuration():
+    """What docs/colony.md says of it."""
+    config = load_config(ROOT / "configs" / "lake_colony.yaml")
+    colony = config.colony
+    assert isinstance(colony, ColonyConfig) and colony.energy is None and colony.touch
+    assert (colony.birth.initial, config.evolution.population_size) == (48, 64)
+    assert colony.interval * config.evolution.generations == 7200
+    assert config.bodies.brains.inheritance == "darwinian"

@@ -14,7 +14,7 @@ import pytest
 import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve
-from mjx_revolve.evolution.runs import Run
+from mjx_revolve.evolution.run_folder import RunFolder
 
 SCRIPT = """
 import os, sys
@@ -36,6 +36,7 @@ def make_fitness(config):
 
     return Slow(noise=0.1)
 
+assert "numpy" not in sys.modules and "jax" not in sys.modules, "loaded before the settings"
 sys.exit(run_command(lambda argv: evolve.main(argv, make_fitness), sys.argv[1:]))
 """
 PATH = f"{ROOT}{os.pathsep}{ROOT / 'tests'}"
@@ -75,7 +76,7 @@ def start(folder, stuck=0):
 
 def saved(folder):
     """The generation of the newest checkpoint, and how many lines the metrics have there."""
-    run = Run(folder / "run")
+    run = RunFolder(folder / "run")
     checkpoint = run.load_checkpoint()
     assert not checkpoint.damaged
     lines = run.metrics_path.read_bytes()[: checkpoint.meta["metrics_position"]].splitlines()
@@ -102,13 +103,14 @@ def test_two_signals_at_once_save_even_inside_a_compiled_program(folder, monkeyp
     time.sleep(0.002)
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=60)
-    assert process.returncode == 128 + signal.SIGTERM, out
+    # Signals that are pending together may arrive in any order.
+    assert process.returncode in (128 + signal.SIGINT, 128 + signal.SIGTERM), out
     assert "ended at once; what was finished is saved" in out
     assert saved(folder) == 7
     monkeypatch.chdir(folder)
     more = ["--resume", "run", "--set", "evolution.generations=9"]
     assert evolve.main(more, lambda config: toys.Quadratic(noise=0.1)) == 0
-    assert Run(folder / "run").load_metrics()["generation"].tolist() == list(range(1, 10))
+    assert RunFolder(folder / "run").load_metrics()["generation"].tolist() == list(range(1, 10))
 
 
 @pytest.mark.slow

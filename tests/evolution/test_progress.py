@@ -43,9 +43,7 @@ def clock(monkeypatch):
     return now
 
 
-@pytest.mark.parametrize(
-    ("total", "stride"), [(1, 1), (60, 1), (61, 2), (120, 2), (200, 5), (500, 10), (2000, 50)]
-)
+@pytest.mark.parametrize(("total", "stride"), [(1, 1), (61, 2), (200, 5), (2000, 50)])
 def test_a_log_has_sixty_lines_at_most(total, stride, clock):
     assert progress.choose_stride(total) == stride
     out = io.StringIO()
@@ -80,19 +78,7 @@ def test_plain_lines_tell_the_time_left(clock):
     ]
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.4, "00:00"), (60.0, "01:00"), (11159.0, "3:05:59")]
-)
-def test_times_left(seconds, text, clock):
-    out = io.StringIO()
-    shown = progress.Progress(0, 3, out)
-    shown.show(row(1))
-    clock[0] += seconds
-    shown.show(row(2))
-    assert out.getvalue().splitlines()[-1].endswith(f"  left {text}")
-
-
-@pytest.mark.parametrize("columns", [20, 50, 80, 200])
+@pytest.mark.parametrize("columns", [20, 200])
 def test_the_live_line_fits_its_terminal(columns, clock, monkeypatch):
     monkeypatch.setattr(progress.Progress, "_columns", lambda self: columns - 1)
     out = Terminal()

@@ -9,15 +9,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from experiments.meshes import mesh_volume
 from exports import NAMES, angles_of, forward, lake_robot, odd_episode
 from laboratory import body
-from mjx_revolve.body.meshes import mesh_volume
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.formats.export import export_robot
-from mjx_revolve.formats.links import make_links, make_meshes, matrix, rest_pose, roll_pitch_yaw
+from mjx_revolve.formats.links import make_links, make_meshes, rest_pose, roll_pitch_yaw
 from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.world import load_world
 
 
@@ -63,7 +64,7 @@ def test_meshes_have_the_parts_volume(robot):
 @pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-7])
 def test_angles_turn_as_the_matrix_does(pitch):
     def turn(axis, angle):
-        return matrix([np.cos(angle / 2), *(np.sin(angle / 2) * np.eye(3)[axis])])
+        return quat_to_matrix([np.cos(angle / 2), *(np.sin(angle / 2) * np.eye(3)[axis])])
 
     rotation = turn(2, -0.7) @ turn(1, pitch) @ turn(0, 2.1)
     roll, back, yaw = roll_pitch_yaw(rotation)

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from exports import odd_episode
-from mjx_revolve.engine.torques import motor_torques
-from mjx_revolve.formats.links import make_links, matrix
+from mjx_revolve.engine.forces import motor_torques
+from mjx_revolve.formats.links import make_links
 from mjx_revolve.formats.ros_bag import pick_rows, write_bag
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import quat_to_matrix
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,7 @@ def test_bag_transforms_lead_to_every_link(bag, episode):
             position, turn = poses[one.header.frame_id]
             poses[one.child_frame_id] = (
                 position + turn @ [p.x, p.y, p.z],
-                turn @ matrix([q.w, q.x, q.y, q.z]),
+                turn @ quat_to_matrix([q.w, q.x, q.y, q.z]),
             )
         data.qpos[:] = np.asarray(episode.trajectory.qpos)[rows[k]]
         mujoco.mj_kinematics(robot.mj_model, data)
@@ -117,7 +118,7 @@ def test_bag_odometry_is_in_its_frames(bag, episode):
             message.twist.twist.angular,
         )
         np.testing.assert_allclose([p.x, p.y, p.z], qpos[:3])
-        turn = matrix(qpos[3:7] / np.linalg.norm(qpos[3:7]))
+        turn = quat_to_matrix(qpos[3:7] / np.linalg.norm(qpos[3:7]))
         np.testing.assert_allclose([v.x, v.y, v.z], turn.T @ qvel[:3], atol=1e-9)
         np.testing.assert_allclose([w.x, w.y, w.z], qvel[3:6], atol=1e-9)
 

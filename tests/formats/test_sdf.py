@@ -11,8 +11,11 @@ from exports import NAMES, angles_of, forward, lake_robot
 from laboratory import body
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.formats.export import export_robot
-from mjx_revolve.formats.links import make_links, matrix, rest_pose
+from mjx_revolve.formats.links import make_links, rest_pose
 from mjx_revolve.formats.sdf import make_sdf
+from mjx_revolve.numerics.spatial import quat_to_matrix
+from mjx_revolve.water.face_drag import FACES
+from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.world import load_world
 
 
@@ -30,7 +33,7 @@ def pose_of(element):
     turn = np.eye(3)
     for axis in (2, 1, 0):
         half = x[3 + axis] / 2
-        turn = turn @ matrix([np.cos(half), *(np.sin(half) * np.eye(3)[axis])])
+        turn = turn @ quat_to_matrix([np.cos(half), *(np.sin(half) * np.eye(3)[axis])])
     return x[:3], turn, pose.get("relative_to")
 
 
@@ -111,6 +114,8 @@ def test_sdf_has_the_water_of_each_part(robot):
     plugins = model.findall("plugin")
     drags = {p.findtext("link_name"): p for p in plugins if "Hydrodynamics" in p.get("name")}
     fins = {p.findtext("link_name"): p for p in plugins if "LiftDrag" in p.get("name")}
+    faces = FACES.numbers(table, robot.world)
+    plates = LIFT_DRAG.numbers(table, robot.world)
     for link in make_links(robot):
         for part in link.parts:
             k, element = part.row, model.find(f"link[@name='{part.name}']")
@@ -124,7 +129,7 @@ def test_sdf_has_the_water_of_each_part(robot):
             carried = [*table.carried_mass[k], *table.carried_inertia[k]]
             np.testing.assert_allclose(values, density * np.array(carried), rtol=1e-9)
             if table.drag[k] == "lift_drag":
-                assert float(fins[part.name].findtext("area")) == pytest.approx(table.plate_area[k])
+                assert float(fins[part.name].findtext("area")) == pytest.approx(plates.area[k])
                 assert float(fins[part.name].findtext("air_density")) == density
                 continue
             # After Fossen: what brakes is negative.
@@ -132,8 +137,8 @@ def test_sdf_has_the_water_of_each_part(robot):
                 float(drags[part.name].findtext(tag))
                 for tag in ("xUabsU", "yVabsV", "zWabsW", "kPabsP", "mQabsQ", "nRabsR")
             ]
-            expected = [*table.drag_linear[k], *table.drag_angular[k]]
-            np.testing.assert_allclose(found, -density * np.array(expected), rtol=1e-9)
+            expected = [*faces.linear[k], *faces.angular[k]]
+            np.testing.assert_allclose(found, -np.array(expected), rtol=1e-9)
     graded = root.find("world/plugin/graded_buoyancy")
     assert float(graded.findtext("default_density")) == density
     assert float(graded.findtext("density_change/above_depth")) == 0.0

@@ -7,10 +7,10 @@ import pytest
 
 from laboratory import tree
 from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.genotypes.cppn import grow
+from mjx_revolve.genotypes.cppn import CPPN, Connection, Node
+from mjx_revolve.genotypes.cppn_genotype import grow
 from mjx_revolve.genotypes.genotype import Space
-from mjx_revolve.genotypes.kinds import make_genotype
-from mjx_revolve.genotypes.network import Link, Network, Node
+from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.inputs.errors import InputError
 
 SPACE = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 30, 0, 20)
@@ -20,7 +20,7 @@ NONE, BRICK, HINGE, TURN = range(4)
 
 
 def network(*links, nodes=()):
-    return Network(5, 4, tuple(nodes), tuple(Link(*link) for link in links))
+    return CPPN(5, 4, tuple(nodes), tuple(Connection(*link) for link in links))
 
 
 def test_a_cross_with_a_tail():
@@ -57,7 +57,7 @@ def test_slots_are_asked_for_where_they_are():
     assert found == [((1, 2, 1, 1)[:k], "FixedBrick", 0.0) for k in (1, 2, 3, 4)]
     # With a quarter turn of all, the first one's right looks down and its left up: there and
     # straight on it is -1, 5 and 4, and 3 nowhere.
-    turned = bricks._replace(links=(*bricks.links, Link(ONE, TURN, 1.0)))
+    turned = bricks._replace(links=(*bricks.links, Connection(ONE, TURN, 1.0)))
     assert tree(grow(turned, SPACE)) == [((1,), "FixedBrick", 90.0)]
 
 
@@ -78,19 +78,19 @@ def test_what_overlaps_is_left_out_and_bounds_are_kept():
 
 
 def test_networks_of_other_spaces_are_refused():
-    genotype = make_genotype("cppn", SPACE, {}, "test.yaml")
+    genotype = find_genotype("cppn", SPACE, {}, "test.yaml")
     with pytest.raises(
         InputError, match=r"genome: expected 5 inputs and 4 outputs, for 2 types of"
     ):
-        genotype.from_plain(Network(5, 5, (), ()).to_plain())
+        genotype.from_plain(CPPN(5, 5, (), ()).to_plain())
     space = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 3, 30, 0, 20)
     with pytest.raises(InputError, match="expected 3 to 30 modules; found 1"):
-        make_genotype("cppn", space, {}, "x").from_plain(Network(5, 4, (), ()).to_plain())
+        find_genotype("cppn", space, {}, "x").from_plain(CPPN(5, 4, (), ()).to_plain())
 
 
 @pytest.mark.parametrize("innovations", [True, False])
 def test_both_crossovers_stay_in_the_space(innovations):
-    genotype = make_genotype("cppn", SPACE, {"innovations": innovations}, "test.yaml")
+    genotype = find_genotype("cppn", SPACE, {"innovations": innovations}, "test.yaml")
     rng = np.random.default_rng(3)
     genomes = [genotype.random(rng) for _ in range(10)]
     for _ in range(60):

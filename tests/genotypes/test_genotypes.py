@@ -18,10 +18,11 @@ from mjx_revolve.body.edits import remove_module
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.body.placement import find_overlaps
 from mjx_revolve.episodes import bodies_config
+from mjx_revolve.genotypes.cppn import CPPNSettings
 from mjx_revolve.genotypes.genotype import TRIES, Space, accept_all, make_space
-from mjx_revolve.genotypes.kinds import GENOTYPES, make_genotype
-from mjx_revolve.genotypes.network import NetworkSettings
+from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.genotypes.plasticoding import PlasticodingSettings
+from mjx_revolve.genotypes.table import GENOTYPES
 from mjx_revolve.genotypes.tree import TreeSettings
 from mjx_revolve.inputs.errors import InputError
 
@@ -49,7 +50,7 @@ kinds = pytest.mark.parametrize("name", GENOTYPES)
 
 
 def make(name, space, **params):
-    return make_genotype(name, space, params, "test.yaml")
+    return find_genotype(name, space, params, "test.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -362,10 +363,6 @@ def test_what_is_not_adopted(name):
 # ------------------------------------------------------------------------- names and settings
 
 
-def test_configurations_know_all_genotypes():
-    assert tuple(GENOTYPES) == bodies_config.GENOTYPES
-
-
 @kinds
 def test_settings_are_checked(name):
     with pytest.raises(InputError, match=r"test.yaml: bodies.params.colour: expected one of"):
@@ -421,7 +418,7 @@ def worms(tmp_path):
 
 def test_the_pages_own_genotype_works(worms):
     space = SPACES["bricks and hinges"]
-    genotype = make_genotype(worms, space, {"name": "wurm"}, "test.yaml")
+    genotype = find_genotype(worms, space, {"name": "wurm"}, "test.yaml")
     rng = np.random.default_rng(0)
     genomes = [genotype.random(rng) for _ in range(50)]
     for a, b in pairwise(genomes):
@@ -439,7 +436,7 @@ def test_the_pages_configuration_is_one():
         assert space.refuses(body) is None
 
 
-@pytest.mark.parametrize("kind", [TreeSettings, PlasticodingSettings, NetworkSettings])
+@pytest.mark.parametrize("kind", [TreeSettings, PlasticodingSettings, CPPNSettings])
 def test_the_page_has_all_settings_with_their_defaults(kind):
     said = {}
     for line in PAGE.splitlines():

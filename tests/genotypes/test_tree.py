@@ -10,7 +10,7 @@ import pytest
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.genotypes.genotype import Space
-from mjx_revolve.genotypes.kinds import make_genotype
+from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.genotypes.tree import TreeSettings, mirror_limb, opposite_slot
 from mjx_revolve.inputs.errors import InputError
 
@@ -29,7 +29,7 @@ ONE = make_morphology(
 
 def only(name):
     """The genotype with one kind of mutation, and 40 mutants of a body."""
-    genotype = make_genotype("tree", SPACE, dict.fromkeys(RATES, 0) | {name: 1}, "test.yaml")
+    genotype = find_genotype("tree", SPACE, dict.fromkeys(RATES, 0) | {name: 1}, "test.yaml")
     rng = np.random.default_rng(0)
     return [genotype.mutate(rng, ONE) for _ in range(40)]
 
@@ -128,7 +128,7 @@ def test_a_limb_is_mirrored():
 def test_a_mirror_image_takes_the_place_of_what_is_there():
     spider = load_morphology("spider")
     space = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 20, 0, 10)
-    genotype = make_genotype("tree", space, dict.fromkeys(RATES, 0) | {"mirror": 1}, "test.yaml")
+    genotype = find_genotype("tree", space, dict.fromkeys(RATES, 0) | {"mirror": 1}, "test.yaml")
     rng = np.random.default_rng(1)
     for _ in range(10):
         body = genotype.mutate(rng, spider)
@@ -154,7 +154,7 @@ def test_opposite_slots():
 
 def test_crossover_exchanges_subtrees():
     """The child is the first parent, but for one subtree that comes from the second."""
-    genotype = make_genotype("tree", SPACE, {}, "test.yaml")
+    genotype = find_genotype("tree", SPACE, {}, "test.yaml")
     other = make_morphology(
         {"id": "two", "body": {"id": "core", "type": "Core", "children": {
             0: {"id": "tail", "type": "ActiveHinge", "children": {
@@ -178,6 +178,6 @@ def test_rates():
     with pytest.raises(
         InputError, match=r"a.yaml: bodies.params.add: expected a number >= 0 \[-\]"
     ):
-        make_genotype("tree", SPACE, {"add": -1}, "a.yaml")
+        find_genotype("tree", SPACE, {"add": -1}, "a.yaml")
     with pytest.raises(InputError, match=r"bodies.params.ad: .*did you mean add\?"):
-        make_genotype("tree", SPACE, {"ad": 1}, "a.yaml")
+        find_genotype("tree", SPACE, {"ad": 1}, "a.yaml")

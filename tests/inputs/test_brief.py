@@ -16,7 +16,7 @@ from mjx_revolve import (
 )
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.simulate import Trajectory
-from mjx_revolve.inputs.brief import brief
+from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.view.motion import analyse_motion
 
 
@@ -26,7 +26,7 @@ class Some:
     rows: np.ndarray
     more: object = None
     hidden: int = field(default=3, repr=False)
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 def test_arrays_by_shape_and_nothing_by_nothing():

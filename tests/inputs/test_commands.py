@@ -56,15 +56,12 @@ def test_help_loads_nothing_heavy(name, words):
         ([""], "path: expected a path; found '' (see --help)"),
         (["a", "--duration"], "--duration: expected one argument (see --help)"),
         (["a", "--duration", "-1"], "--duration: expected seconds > 0; found '-1' (see --help)"),
-        (["a", "--duration", "inf"], "--duration: expected seconds > 0; found 'inf' (see --help)"),
         (["a", "--duration", "1e300"], "--duration: expected at most 86400 s; found '1e300' (see"),
         (
             ["a", "--rate", "0"],
             "--rate: expected a whole number from 1 to 9; found '0' (see --help)",
         ),
-        (["a", "--rate", "3.0"], "--rate: expected a whole number from 1 to 9; found '3.0' (see"),
         (["a", "--rate", "²"], "--rate: expected a whole number from 1 to 9; found '²' (see"),
-        (["a", "--count", "0"], "--count: expected a whole number >= 1; found '0' (see --help)"),
         (["a", "--count", "9" * 5000], "--count: expected a whole number >= 1; found '999"),
     ],
 )

@@ -38,8 +38,8 @@ from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes import champion
 from mjx_revolve.episodes.config import dump_config, load_config
-from mjx_revolve.evolution import start
-from mjx_revolve.evolution.runs import load_archive
+from mjx_revolve.evolution import run as runs
+from mjx_revolve.evolution.run_folder import load_archive
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view import results
 from mjx_revolve.view.report.data import read_run
@@ -271,7 +271,7 @@ def test_configurations(folder, mutant):
     places = ("config.yaml", "world")
     config = read_file(read, folder, *places)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(start, "create_run", malformed.stop)
+        patch.setattr(runs, "create_run_folder", malformed.stop)
         argv = ["config.yaml", "--out", "out", "--workers", "1"]
         code = run_main(lambda argv: evolve.main(argv, make_toy), argv, folder, *places)
     if refused(config):

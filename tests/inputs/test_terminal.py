@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from laboratory import ROOT
-from mjx_revolve.inputs.terminal import spell, spell_what_is_lacking
+from mjx_revolve.inputs.terminal import spell, spell_unencodable
 
 CODE = (  # in ASCII itself
     "import sys; from mjx_revolve.inputs.commands import run_command\n"
@@ -51,7 +51,7 @@ def test_commands_print_on_ascii_terminals(place):
 def test_utf8_terminals_get_every_sign(monkeypatch):
     raw = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, "utf-8"))
-    spell_what_is_lacking()
+    spell_unencodable()
     print("0.158 ± 0.003, 魚")
     sys.stdout.flush()
     assert raw.getvalue().decode() == "0.158 ± 0.003, 魚\n"

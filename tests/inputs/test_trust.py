@@ -14,11 +14,13 @@ import toys
 from laboratory import _ELBOW as ELBOW
 from mjx_revolve import evolve, export, replay, report, viewer
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.episodes.lives import INDIVIDUALS, read_lives
-from mjx_revolve.evolution import runs
-from mjx_revolve.inputs import own_code, trust
+from mjx_revolve.episodes.individual_log import INDIVIDUALS, read_individuals
+from mjx_revolve.evolution import run_folder as runs
+from mjx_revolve.inputs import trust
+from mjx_revolve.inputs import user_code as own_code
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError, load_yaml
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.yaml_reader import load_yaml
 
 MINE = "import pathlib\npathlib.Path({mark!r}).touch()\ndef rise(track, settings): return 0.0\n"
 SECRET = "hunter2: s3cr3t-token\n"
@@ -43,7 +45,7 @@ def folder(tmp_path, monkeypatch):
         "evolution": {"strategy": "SNES", "population_size": 4, "generations": 1},
     }  # fmt: skip
     (tmp_path / "swim.yaml").write_text(json.dumps(settings))
-    run, _ = runs.create_run("run", load_config("swim.yaml"), settings=[])
+    run, _ = runs.create_run_folder("run", load_config("swim.yaml"), settings=[])
     run.save_champion(np.zeros(3, np.float32), final=False, origin="<b>x</b>\x1b[2J")
     run.close()
     (tmp_path / "private.yaml").write_text(SECRET)
@@ -85,15 +87,15 @@ def test_what_one_has_evolved_oneself_is_known(folder):
     shutil.move("mine", "moved")
     name = f"{folder / 'moved' / 'inputs' / 'own.py'}:rise"
     with trust.opening("moved", trust=False):
-        own_code.load_own(name, "task.type")
+        own_code.load_user_function(name, "task.type")
     (folder / "moved" / "inputs" / "own.py").write_text("rise = print\n")
     with trust.opening("moved", trust=False), pytest.raises(trust.UntrustedError):
-        own_code.load_own(name, "task.type")
+        own_code.load_user_function(name, "task.type")
     with trust.opening("moved", trust=True):  # allowed, and known from now on
-        own_code.load_own(name, "task.type")
+        own_code.load_user_function(name, "task.type")
     (folder / "copy.py").write_text("rise = print\n")
     with trust.opening("moved", trust=False):
-        own_code.load_own(f"{folder / 'copy.py'}:rise", "task.type")
+        own_code.load_user_function(f"{folder / 'copy.py'}:rise", "task.type")
 
 
 @pytest.mark.slow
@@ -102,7 +104,7 @@ def test_a_command_runs_what_is_trusted_and_remembers(folder, argv, capsys):
     shutil.rmtree("run")
 
     def make(config):
-        own_code.load_own(config.task.type, "task.type")
+        own_code.load_user_function(config.task.type, "task.type")
         return toys.Toy()
 
     def run(*argv):
@@ -111,7 +113,7 @@ def test_a_command_runs_what_is_trusted_and_remembers(folder, argv, capsys):
     assert run("swim.yaml", "--out", "run") == 0
     shutil.rmtree(folder / "state")  # it has become somebody else's
     code = folder / "run" / "inputs" / "own.py"
-    sys.modules.pop(own_code.load_own(f"{code}:rise", "task.type").__module__)
+    sys.modules.pop(own_code.load_user_function(f"{code}:rise", "task.type").__module__)
     (folder / "was run").unlink()
     assert run(*argv) == 2
     assert "own.py: expected a Python file that you have used" in capsys.readouterr().err
@@ -131,7 +133,7 @@ def test_what_was_read_is_not_thereby_allowed_to_run(folder):
     with trust.opening("run", trust=False):
         load_yaml("both.py")
         with pytest.raises(trust.UntrustedError):
-            own_code.load_own(f"{folder / 'both.py'}:body", "task.type")
+            own_code.load_user_function(f"{folder / 'both.py'}:body", "task.type")
 
 
 def test_genes_elsewhere_may_name_a_runs_configuration(folder, capsys):
@@ -226,7 +228,7 @@ def test_huge_numbers_in_a_log_are_damage(tmp_path):
             "descriptors": {}, "measures": {}}  # fmt: skip
     lines = [json.dumps(line), json.dumps(line | {"id": 2, "score": 10**400})]
     (tmp_path / INDIVIDUALS).write_text("\n".join(lines) + "\n")
-    lives, problems = read_lives(tmp_path)
+    lives, problems = read_individuals(tmp_path)
     assert list(lives) == [1] and problems == [f"{INDIVIDUALS}: 1 line is damaged and left out"]
-    with pytest.raises(InputError, match="individual 1: genes: expected numbers; found"):
+    with pytest.raises(InputError, match=r"individual 1: genes.0: expected a number; found"):
         assert lives[1].genes is None

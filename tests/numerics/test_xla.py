@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from mjx_revolve.numerics import xla
-from mjx_revolve.numerics.xla import derived_by, fused_scan, on_cpu, over_chunks, share_once
+from mjx_revolve.numerics.adjoint import differentiate_as
+from mjx_revolve.numerics.xla import fuse, fuse_step, materialize, on_cpu, over_chunks
 
 LANES = jnp.linspace(-1, 1, 64, dtype=jnp.float32)
 
@@ -39,7 +40,7 @@ def fused(x):
 
     rows = jnp.linspace(0, 1, 7)
     carry = (x, (jnp.stack([x, -x]), jnp.zeros((), jnp.int32)))
-    turn, pack, unpack = fused_scan(turn, carry, rows[0])
+    turn, pack, unpack = fuse_step(turn, carry, rows[0])
     packed, kept = jax.lax.scan(turn, pack(carry), rows)
     return unpack(packed), kept
 
@@ -60,7 +61,7 @@ def plain(x):
 def test_they_change_nothing(monkeypatch, pieces):
     """Whole, and cut into pieces: to rounding, as the compiler may contract other products."""
     monkeypatch.setattr(xla, "_PIECE", xla.Graph(step, (LANES,)).size / pieces)
-    tricked = jax.jit(derived_by(fused, plain))
+    tricked = jax.jit(differentiate_as(fused, plain))
     agree = partial(jax.tree.map, partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5))
     agree(tricked(LANES), plain(LANES))
     both = jax.vmap(tricked)(jnp.stack([LANES, 2 * LANES]))
@@ -76,8 +77,8 @@ def test_what_no_result_needs_is_left_out():
     def fun(x, unused):
         return jnp.tanh(x), jnp.sqrt(unused) + jnp.exp(x)
 
-    left = str(jax.make_jaxpr(share_once(lambda *xs: fun(*xs)[0]))(LANES, LANES))
-    both = str(jax.make_jaxpr(share_once(fun))(LANES, LANES))
+    left = str(jax.make_jaxpr(fuse(lambda *xs: fun(*xs)[0], inline=True))(LANES, LANES))
+    both = str(jax.make_jaxpr(fuse(fun, inline=True))(LANES, LANES))
     assert "sqrt" in both and "exp" in both and "tanh" in left
     assert "sqrt" not in left and "exp" not in left
 
@@ -90,11 +91,11 @@ def test_xla_still_takes_them(monkeypatch):
         return jax.jit(lambda x: fun(x)).lower(LANES).compile().as_text()
 
     bare = text(lambda x: rolled(x, step))
-    shared = text(lambda x: rolled(x, share_once(step)))
+    shared = text(lambda x: rolled(x, fuse(step, inline=True)))
     # Shared values stay behind calls of their own that were not inlined.
     assert shared.count(" call(") > bare.count(" call(")
     marked = lambda x: len(re.findall(r" call\(.*xla_cpu_small_call", text(x)))  # noqa: E731
-    assert marked(lambda x: rolled(x, share_once(step))) == 0
+    assert marked(lambda x: rolled(x, fuse(step, inline=True))) == 0
     assert marked(fused) == 1
     monkeypatch.setattr(xla, "_PIECE", 2)
     assert marked(fused) == round(xla.Graph(step, (LANES,)).size / 2) > 2
@@ -114,9 +115,27 @@ def test_chunks_are_all_of_one_shape():
     assert set(seen) == {(4,)}
 
 
-def test_what_is_kept_is_stored_though_it_is_used_once():
+def test_a_materialized_value_is_stored_though_it_is_used_once():
     x, y = jnp.ones(4), jnp.ones((8, 4))
     plain = lambda x, y: jnp.tanh(x)[None] * y  # noqa: E731
-    kept = lambda x, y: xla.keep(jnp.tanh(x))[None] * y  # noqa: E731
-    assert (xla.Graph(plain, (x, y)).size, xla.Graph(kept, (x, y)).size) == (0, 1)
-    assert np.array_equal(xla.Graph(kept, (x, y))(x, y), plain(x, y))
+    marked = lambda x, y: materialize(jnp.tanh(x))[None] * y  # noqa: E731
+    assert (xla.Graph(plain, (x, y)).size, xla.Graph(marked, (x, y)).size) == (0, 1)
+    assert np.array_equal(xla.Graph(marked, (x, y))(x, y), plain(x, y))
+
+
+def test_a_materialized_value_has_batches_and_gradients():
+    fun = lambda x: jnp.sum(materialize(jnp.tanh(x)) * x)  # noqa: E731
+    expected = jax.jit(jax.grad(lambda x: jnp.sum(jnp.tanh(x) * x)))(LANES)
+    np.testing.assert_allclose(jax.jit(jax.grad(fun))(LANES), expected, rtol=1e-6)
+    both = jax.jit(jax.vmap(fun))(jnp.stack([LANES, 2 * LANES]))
+    np.testing.assert_allclose(both, [fun(LANES), fun(2 * LANES)], rtol=1e-6)
+
+
+def test_without_the_annotations_the_results_are_the_same(monkeypatch):
+    """`MJX_REVOLVE_FUSE=0` tells an error of XLA's from one of ours."""
+    tricked = jax.jit(lambda x: (fused(x), fuse(step)(x)))(LANES)
+    monkeypatch.setenv("MJX_REVOLVE_FUSE", "0")
+    bare = jax.jit(lambda x: (fused(x), fuse(step)(x)))
+    assert "materialize" not in str(jax.make_jaxpr(bare)(LANES))
+    assert "small_call" not in bare.lower(LANES).as_text()
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5), bare(LANES), tricked)

@@ -8,7 +8,7 @@ from matplotlib.path import Path
 
 from mjx_revolve.episodes.bodies_config import ArchiveConfig
 from mjx_revolve.evolution.archive import cell_of, filled, insert, make_archive
-from mjx_revolve.view.archive_map import _polygons, plot_archive
+from mjx_revolve.view.archive_map import plot_archive, voronoi_cells
 from mjx_revolve.view.plots import figure_png, figure_svg
 
 VIRIDIS = colormaps["viridis"]
@@ -27,7 +27,7 @@ def archive(axes, kind="grid", count=30):
     empty = make_archive(settings, 0)
     share = np.random.default_rng(1).random((count, axes))
     points = empty.lows + share * (empty.highs - empty.lows)
-    return insert(empty, np.arange(count), np.linspace(-1, 2, count), points)[0]
+    return insert(empty, np.arange(count), np.linspace(-1, 2, count), points)
 
 
 def star(figure):
@@ -73,9 +73,9 @@ def test_the_cells_of_a_tessellation_are_those_of_the_nearest_centre():
     assert star(figure) == found.centers[np.nanargmax(found.scores)].tolist()
 
 
-def test_polygons_fill_the_square():
+def testvoronoi_cells_fill_the_square():
     centers = np.random.default_rng(3).random((50, 2))
-    polygons = _polygons(centers)
+    polygons = voronoi_cells(centers)
     areas = []
     for x, y in (polygon.T for polygon in polygons):
         areas.append(abs(np.sum(x * np.roll(y, 1) - y * np.roll(x, 1))) / 2)

@@ -10,14 +10,14 @@ from matplotlib.collections import LineCollection
 from laboratory import QUICK
 from mjx_revolve import report, viewer
 from mjx_revolve.episodes.colony_config import ColonyConfig, EnergyConfig
-from mjx_revolve.episodes.lives import Event, read_events
-from mjx_revolve.evolution.colony_watch import open_colony, watch_colony
+from mjx_revolve.episodes.individual_log import Event, read_events
+from mjx_revolve.evolution.colony_observer import observe_colony, open_colony
 from mjx_revolve.evolve import main
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.colony_curves import plot_colony, plot_population, scale_time
-from mjx_revolve.view.colony_history import put_together
-from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives
+from mjx_revolve.view.colony_history import make_history
+from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives, plot_population
+from mjx_revolve.view.convergence import plot_colony, scale_time
 from mjx_revolve.view.plots import figure_png
 from mjx_revolve.view.report.data import read_run
 
@@ -37,7 +37,7 @@ EVENTS = [
 
 @pytest.fixture
 def history():
-    return put_together(EVENTS, {0: 0.1, 2: 0.3}, 60.0)
+    return make_history(EVENTS, {0: 0.1, 2: 0.3}, 60.0)
 
 
 # --- logs ---
@@ -45,24 +45,15 @@ def history():
 
 def test_events_are_read_back(tmp_path):
     """Damaged lines are left out and counted; one that is being written is no damage."""
+    base = {"id": 0, "place": [1, 2, -1]}
+    born = {"time": 0.0, "event": "birth", "place": [1, 2, None], "parents": [], "origin": ""}
     good = [
-        {
-            "time": 0.0,
-            "event": "birth",
-            "id": 0,
-            "place": [1, 2, None],
-            "parents": [],
-            "origin": "",
-        },
-        {"time": 2.0, "event": "mating", "id": 0, "place": [1, 2, -1], "other": 1},
-        {"time": 1.0, "event": "death", "id": 0, "place": [1, 2, -1], "cause": "age", "age": 1.0},
-    ]
+        base | born, base | {"time": 2.0, "event": "mating", "other": 1},
+        base | {"time": 1.0, "event": "death", "cause": "age", "age": 1.0},
+    ]  # fmt: skip
     bad = [
-        "{", "[]", "\\x00", json.dumps(good[0] | {"id": -1}),
-        json.dumps(good[0] | {"parents": [3]}),
-        json.dumps(good[0] | {"place": [1, 2]}), json.dumps(good[0] | {"place": [1, 2, 1e999]}),
-        json.dumps(good[0] | {"time": None}), json.dumps(good[0] | {"event": "feast"}),
-        json.dumps(good[1] | {"other": "one"}), json.dumps(good[2] | {"cause": 3}),
+        "{", json.dumps(good[0] | {"parents": [3]}), json.dumps(good[0] | {"place": [1, 2]}),
+        json.dumps(good[0] | {"event": "feast"}), json.dumps(good[1] | {"other": "one"}),
     ]  # fmt: skip
     lines = [*map(json.dumps, good), *bad]
     (tmp_path / "events.jsonl").write_text("".join(f"{x}\n" for x in lines) + lines[0])
@@ -127,7 +118,7 @@ def test_families_stand_together(history):
 def test_empty_and_odd_histories_are_drawn():
     """Nobody was born, or in one moment only: no picture complains."""
     colony = ColonyConfig(energy=EnergyConfig(chargers=((1, 0, -2),)))
-    for history in (put_together([], {}, 0.0), put_together(EVENTS[:1], {}, 0.0)):
+    for history in (make_history([], {}, 0.0), make_history(EVENTS[:1], {}, 0.0)):
         for figure in (plot_population(history), plot_lives(history), plot_families(history),
                        plot_arena(history, colony)):  # fmt: skip
             assert figure_png(figure).startswith(b"\x89PNG")
@@ -167,8 +158,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("colony")
     (folder / "colony.yaml").write_text(yaml.safe_dump(SETTINGS))
     with pytest.MonkeyPatch.context() as patch:
-        for place in ("tank", "evaluation"):
-            patch.setattr(f"mjx_revolve.episodes.{place}.compiler_options", lambda: QUICK)
+        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         assert main([str(folder / "colony.yaml"), "--out", str(folder / "run")]) == 0
         yield folder / "run"
 
@@ -196,7 +186,7 @@ def test_what_is_watched_is_what_happened(run):
     """From the checkpoint in the middle to the end, as the run's own log has it."""
     config, fitness, search, begin = open_colony(run, 8.0)
     assert begin == 8.0 and search.generation == 4
-    sights, events = watch_colony(config, fitness, search, begin, 8.0, 0.05)
+    sights, events = observe_colony(config, fitness, search, begin, 8.0, 0.05)
     logged = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
     same = [(e["event"], e["id"]) for e in logged if e["time"] > 8.0]
     assert [(e["event"], e["id"]) for e in events] == same and same

@@ -8,14 +8,23 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import WATER, accelerate, arm_robot, body, box_robot, random_states, world
+from laboratory import (
+    WATER,
+    accelerate,
+    arm_robot,
+    body,
+    box_robot,
+    face_drag,
+    random_states,
+    world,
+)
 from mjx_revolve.body.module_types import Thruster
-from mjx_revolve.body.plates import LiftDrag
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.forces import Forces, module_forces, sum_modules
 from mjx_revolve.water.flow import Water, flow, water_of
+from mjx_revolve.water.plates import LiftDrag
 
 RHO, G = 999.1026, 9.81
 BRICK = (0.06, 0.04, 0.02)
@@ -189,13 +198,13 @@ def test_water_of_its_time():
     still = water_of(sea)
     for k in range(3):
         u = [float(x) for x in flow(sea, still._replace(time=time[k]), 0.3, 0.0, -0.5)[0]]
-        c = RHO * robot.fluid.drag_linear[0]
+        c = face_drag(robot).linear[0]
         assert forces.drag[k, 0] == pytest.approx(c * np.abs(u) * u, rel=2e-3, abs=1e-6)
     # A row of the current is the water of the step that follows; the last one stays.
     robot = box_robot(BRICK, 0.03, world(drag="faces"))
     gusty = Water(0.0, (np.array([0.1, 0.2, 0.3]), 0.0, 0.0))
     forces = module_forces(robot, states(robot, rows, time=time), water=gusty)
-    c = RHO * robot.fluid.drag_linear[0, 0]
+    c = face_drag(robot).linear[0, 0]
     assert forces.drag[:, 0, 0] == pytest.approx(c * np.array([0.04, 0.09, 0.09]), rel=1e-4)
 
 

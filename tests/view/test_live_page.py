@@ -1,4 +1,4 @@
-"""A running world in a browser: its keeper, its server, its page, and who may be dropped."""
+"""A running world in a browser: the simulation, its server, its page, and its catalogue."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from test_bodies import make_run
 
-from browser import Browser, find_browser
+from browser import Browser, needs_browser
 from laboratory import body
 from mjx_revolve import live
 from mjx_revolve.engine.robot import build_robot
@@ -22,13 +22,13 @@ from mjx_revolve.episodes.fitness import make_mixed_fitness
 from mjx_revolve.episodes.tank import make_tank
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.course import pose_robot
-from mjx_revolve.view.live.keeper import Entry, Keeper
+from mjx_revolve.view.live.commands import Current, Drop, Pause, Rate, Remove, Reset, read_command
 from mjx_revolve.view.live.page import live_page
+from mjx_revolve.view.live.robot_catalogue import load_catalogue
 from mjx_revolve.view.live.server import LiveServer
-from mjx_revolve.view.live.stock import load_stock
-from mjx_revolve.view.live.window import Hands, make_scene, poses_at
-from mjx_revolve.view.live.wishes import Current, Drop, Pause, Rate, Remove, Reset, read_wish
+from mjx_revolve.view.live.simulation import CatalogueEntry, LiveSimulation
+from mjx_revolve.view.live.window import KeyBindings, LiveScene
+from mjx_revolve.view.poses import pose_robot
 from mjx_revolve.water.world import load_world
 from standin import SPEED, StandIn
 
@@ -39,31 +39,33 @@ PATIENCE = 60.0  # s, for a machine that does other things; nothing waits that l
 def entries():
     world = load_world("lake")
     robots = {name: build_robot(body(name), world) for name in ("spider", "snake")}
-    swims = [Entry(f"{n}, swims", n, "group", r, lambda: np.zeros(3)) for n, r in robots.items()]
-    return [*swims, Entry("spider, still", "spider", "group", robots["spider"])]
+    swims = [
+        CatalogueEntry(f"{n}, swims", n, "group", r, lambda: np.zeros(3)) for n, r in robots.items()
+    ]
+    return [*swims, CatalogueEntry("spider, still", "spider", "group", robots["spider"])]
 
 
 class Running:
-    """A keeper in a thread, and a listener."""
+    """A simulation in a thread, and a listener."""
 
     def __init__(self, entries, lanes=4, **more):
         world = entries[0].robot.world
         self.tank = StandIn(world, lanes)
-        self.keeper = Keeper(self.tank, world, entries, **more)
-        self.thread = threading.Thread(target=self.keeper.run, daemon=True)
+        self.simulation = LiveSimulation(self.tank, world, entries, **more)
+        self.thread = threading.Thread(target=self.simulation.run, daemon=True)
 
     def __enter__(self):
-        self.listener = self.keeper.listen()
+        self.listener = self.simulation.listen()
         self.thread.start()
         return self
 
     def __exit__(self, *_):
-        self.keeper.stop()
+        self.simulation.stop()
         self.thread.join(PATIENCE)
         assert not self.thread.is_alive()
 
-    def ask(self, wish):
-        return self.keeper.ask(wish).result(PATIENCE)
+    def ask(self, command):
+        return self.simulation.ask(command).result(PATIENCE)
 
     def hear(self, wanted, check=lambda data: True):
         """The next event of a name that passes a check."""
@@ -88,7 +90,7 @@ def poses_of(data):
     }
 
 
-# --------------------------------------------------------------------- the keeper
+# --------------------------------------------------------------------- the simulation
 
 
 def test_poses_are_those_of_the_tank(entries):
@@ -128,14 +130,14 @@ def test_nothing_moves_while_nobody_looks(entries):
     running = Running(entries)
     with running:
         running.hear("poses")
-        running.keeper.leave(running.listener)
+        running.simulation.leave(running.listener)
         running.ask(Rate(1.0))  # the slice that was under way is over
         before = running.tank.time
         running.ask(Rate(1.0))
         assert running.tank.time <= before + 0.11
-        other = running.keeper.listen()
-        names = [read_event(other.get(timeout=PATIENCE))[0] for _ in range(3)]
-        assert names == ["state", "cast", "poses"]  # what there is comes first
+        other = running.simulation.listen()
+        names = [read_event(other.get(timeout=PATIENCE))[0] for _ in range(4)]
+        assert names == ["state", "bodies", "cast", "poses"]  # what there is comes first
 
 
 def test_robots_find_room_beside_others(entries):
@@ -143,7 +145,7 @@ def test_robots_find_room_beside_others(entries):
         running.ask(Pause(True))
         keys = [running.ask(Drop(who)) for who in (0, 1, 2)]
         assert keys == [0, 1, 2]
-        places = np.array([running.keeper.qpos[key][:2] for key in keys])
+        places = np.array([running.simulation.qpos[key][:2] for key in keys])
         apart = np.linalg.norm(places[:, None] - places, axis=-1)[np.triu_indices(3, 1)]
         lengths = [entries[who].robot.morphology.length for who in (0, 1, 2)]
         least = 0.6 * (min(lengths) * 2)
@@ -152,24 +154,24 @@ def test_robots_find_room_beside_others(entries):
         with pytest.raises(InputError, match=r"tank: expected a free place; found all 4 taken"):
             running.ask(Drop(0))
         running.ask(Remove(1))
-        assert [one.key for one in running.keeper.inmates] == [0, 2, 3]
+        assert [one.key for one in running.simulation.robots] == [0, 2, 3]
         with pytest.raises(InputError, match=r"remove\.key: expected a robot's; found 1"):
             running.ask(Remove(1))
-        with pytest.raises(InputError, match=r"drop\.who: expected a number below 3; found 3"):
+        with pytest.raises(InputError, match=r"drop\.entry: expected a number below 3; found 3"):
             running.ask(Drop(3))
         running.ask(Current((0.1, 0, 0)))
         running.ask(Reset())
-        assert (running.keeper.inmates, running.keeper.current) == ((), (0, 0, 0))
-        assert not running.keeper.paused
+        assert (running.simulation.robots, running.simulation.current) == ((), (0, 0, 0))
+        assert not running.simulation.paused
 
 
 def test_nobody_is_dropped_into_the_bed():
     world = load_world("lake", bed={"kind": "flat", "height": -2.0})
     robot = build_robot(body("snake"), world)
-    with Running([Entry("snake", "snake", "", robot)], first=()) as running:
+    with Running([CatalogueEntry("snake", "snake", "", robot)], first=()) as running:
         running.ask(Pause(True))
         key = running.ask(Drop(0, depth=50.0))
-        assert running.keeper.qpos[key][2] == pytest.approx(-2 + robot.morphology.length / 2)
+        assert running.simulation.qpos[key][2] == pytest.approx(-2 + robot.morphology.length / 2)
 
 
 def test_who_blows_up_is_taken_out(entries):
@@ -183,13 +185,13 @@ def test_who_blows_up_is_taken_out(entries):
 
 def test_a_sleeping_listener_is_given_up(entries):
     """It is told that this is the end; its page comes again. Others are told on."""
-    keeper = Keeper(StandIn(entries[0].robot.world), entries[0].robot.world, entries)
-    sleeping = keeper.listen()
+    simulation = LiveSimulation(StandIn(entries[0].robot.world), entries[0].robot.world, entries)
+    sleeping = simulation.listen()
     for _ in range(150):
-        keeper._publish("event: note\ndata: 1\n\n")
+        simulation.publish("event: note\ndata: 1\n\n")
     assert [*sleeping.queue][-1] is None and sleeping.qsize() == 100
-    other = keeper.listen()
-    keeper._publish("event: note\ndata: 2\n\n")
+    other = simulation.listen()
+    simulation.publish("event: note\ndata: 2\n\n")
     assert [read_event(text) for text in other.queue][-1] == ("note", 2)
 
 
@@ -199,10 +201,13 @@ def test_a_sleeping_listener_is_given_up(entries):
         ([1], r"expected a mapping with `do`; found \[1\]"),
         ({}, "do: expected one of drop, remove, current, pause, rate, reset; found nothing"),
         ({"do": ["drop"]}, "do: expected one of drop"),
-        ({"do": "drop"}, r"drop\.who: expected"),
-        ({"do": "drop", "who": True}, r"drop\.who: expected a whole number >= 0; found True"),
-        ({"do": "drop", "who": 0, "place": [0]}, r"drop\.place: expected"),
-        ({"do": "drop", "who": 0, "place": [0, 1e6]}, r"drop\.place\.1: expected a number >= -500"),
+        ({"do": "drop"}, r"drop\.entry: expected"),
+        ({"do": "drop", "entry": True}, r"drop\.entry: expected a whole number >= 0; found True"),
+        ({"do": "drop", "entry": 0, "place": [0]}, r"drop\.place: expected"),
+        (
+            {"do": "drop", "entry": 0, "place": [0, 1e6]},
+            r"drop\.place\.1: expected a number >= -500",
+        ),
         ({"do": "current", "velocity": [0, 9, 0]}, r"current\.velocity\.1: expected"),
         ({"do": "rate", "factor": 0}, r"rate\.factor: expected a number >= 0\.02"),
         ({"do": "pause", "on": 1}, r"pause\.on: expected true or false; found 1"),
@@ -210,9 +215,9 @@ def test_a_sleeping_listener_is_given_up(entries):
         ({"do": "remove", "key": 0, "who": 1}, r"remove\.who: expected"),
     ],
 )
-def test_wishes_are_checked(data, match):
+def test_commands_are_checked(data, match):
     with pytest.raises(InputError, match=match) as error:
-        read_wish(data)
+        read_command(data)
     assert "\n" not in str(error.value)
 
 
@@ -221,14 +226,14 @@ def test_wishes_are_checked(data, match):
 
 @pytest.fixture(scope="module")
 def served(entries):
-    """A server, with its keeper at work."""
+    """A server of a simulation that runs."""
     world = entries[0].robot.world
     setup = SimpleNamespace(controller=SimpleNamespace(type="cpg"))
-    stock = SimpleNamespace(
+    catalogue = SimpleNamespace(
         world=world, entries=entries, title="a </script> title", mixed=SimpleNamespace(config=setup)
     )
     with Running(entries) as running:
-        server = LiveServer(running.keeper, live_page(stock, 4))
+        server = LiveServer(running.simulation, live_page(catalogue, 4))
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         yield server
@@ -250,11 +255,11 @@ def request(server, method, place, content=None, token=None, **headers):
     return found
 
 
-def wish(server, data, **more):
-    """Status and answer of a wish."""
+def command(server, data, **more):
+    """Status and answer of a command."""
     content = data if isinstance(data, str) else json.dumps(data)
     given = {"Content_Type": "application/json", "Origin": server.origins[0]} | more
-    status, _, text = request(server, "POST", "wish", content, **given)
+    status, _, text = request(server, "POST", "command", content, **given)
     return status, json.loads(text)
 
 
@@ -275,56 +280,50 @@ def test_strangers_are_refused(served):
     """Neither another token, nor another name for this machine, nor another page's posts."""
     assert request(served, "GET", "", token="wrong")[0] == 404
     assert request(served, "GET", "events", token="")[0] == 404
+    for place in ("body/0", "bodies", "../etc"):
+        assert request(served, "GET", place)[0] == 404
     assert request(served, "GET", "", Host="evil.example")[0] == 404
-    assert request(served, "POST", "wish", "{}", token="wrong")[0] == 404
+    assert request(served, "POST", "command", "{}", token="wrong")[0] == 404
     stop = {"do": "pause", "on": True}
-    status, answer = wish(served, stop, Origin="http://evil.example")
+    status, answer = command(served, stop, Origin="http://evil.example")
     assert (status, answer["error"].partition(";")[0]) == (403, "Origin: expected our own page")
-    assert wish(served, stop, Origin="null")[0] == 403
-    assert wish(served, stop, Content_Type="text/plain")[0] == 415
-    assert wish(served, stop, Host="evil.example")[0] == 404
-    assert not served.keeper.paused
+    assert command(served, stop, Origin="null")[0] == 403
+    assert command(served, stop, Content_Type="text/plain")[0] == 415
+    assert command(served, stop, Host="evil.example")[0] == 404
+    assert not served.simulation.paused
     assert request(served, "PUT", "wish", "{}")[0] == 501
 
 
-def test_malformed_wishes(served):
+def test_malformed_commands(served):
     """One line, status 400."""
     for data in ("", "{", "[" * 3000, "nan", '{"do": "rate", "factor": NaN}', "[]", '{"do": 1}'):
-        status, answer = wish(served, data)
+        status, answer = command(served, data)
         assert status == 400 and "\n" not in answer["error"], data
         assert "expected" in answer["error"]
-    assert wish(served, "x" * 5000)[0] == 400
-    assert wish(served, {"do": "drop", "who": 99})[1]["error"].startswith("drop.who: expected")
+    assert command(served, "x" * 5000)[0] == 400
+    assert command(served, {"do": "drop", "entry": 99})[1]["error"].startswith(
+        "drop.entry: expected"
+    )
 
 
-def test_wishes_come_true(served):
-    before = len(served.keeper.inmates)
-    status, answer = wish(served, {"do": "drop", "who": 1, "place": [4, 5], "depth": 2})
+def test_commands_are_done(served):
+    before = len(served.simulation.robots)
+    status, answer = command(served, {"do": "drop", "entry": 1, "place": [4, 5], "depth": 2})
     assert status == 200 and answer["ok"]
-    assert len(served.keeper.inmates) == before + 1
-    place = served.keeper.qpos[answer["key"]][:3]
+    assert len(served.simulation.robots) == before + 1
+    place = served.simulation.qpos[answer["key"]][:3]
     assert np.linalg.norm(place - [4, 5, -2]) < 1
-    assert wish(served, {"do": "remove", "key": answer["key"]})[0] == 200
-    assert len(served.keeper.inmates) == before
+    assert command(served, {"do": "remove", "key": answer["key"]})[0] == 200
+    assert len(served.simulation.robots) == before
     other = served.origins[1]
-    assert wish(served, {"do": "current", "velocity": [0.1, 0, 0]}, Origin=other)[0] == 200
-    assert served.keeper.current == (0.1, 0, 0)
-    assert wish(served, {"do": "reset"})[0] == 200
-
-
-def test_bodies(served):
-    """With the shapes of their pieces; of nobody else."""
-    status, _, text = request(served, "GET", "body/0")
-    data = json.loads(text)
-    assert status == 200 and len(data["tree"]) == 9
-    assert {str(piece[1]) for piece in data["pieces"]} == {*data["shapes"]}
-    for place in ("body/", "body/-1", "body/99", "body/x", "body/9999999999", "bodies", "../etc"):
-        assert request(served, "GET", place)[0] == 404
+    assert command(served, {"do": "current", "velocity": [0.1, 0, 0]}, Origin=other)[0] == 200
+    assert served.simulation.current == (0.1, 0, 0)
+    assert command(served, {"do": "reset"})[0] == 200
 
 
 def test_the_stream(served):
     """What there is, then poses as time goes on."""
-    wish(served, {"do": "reset"})
+    command(served, {"do": "reset"})
     connection = http.client.HTTPConnection("127.0.0.1", served.server_address[1], timeout=PATIENCE)
     connection.request("GET", f"/{served.token}/events")
     answer = connection.getresponse()
@@ -336,7 +335,10 @@ def test_the_stream(served):
         found.append(read_event("".join(lines)))
     connection.close()
     names = [name for name, _ in found]
-    assert names[:2] == ["state", "cast"]
+    assert names[:3] == ["state", "bodies", "cast"]
+    [body] = found[1][1]
+    assert body["number"] == 0 and len(body["tree"]) == 9
+    assert {str(piece[1]) for piece in body["pieces"]} == {*body["shapes"]}
     moments = np.concatenate([data["t"] for name, data in found if name == "poses"][1:])
     assert np.diff(moments) == pytest.approx(0.05, abs=1e-3)
     for data in (data for name, data in found if name == "poses"):
@@ -344,35 +346,35 @@ def test_the_stream(served):
         assert all(rows[:, 2] == pytest.approx(-1, abs=1e-5) for rows in poses_of(data).values())
 
 
-# --------------------------------------------------------------------- who may be dropped
+# --------------------------------------------------------------------- the catalogue
 
 
 def test_the_stock_of_a_run(tmp_path):
     """Champion and individuals, the best first, with their genes; then shipped robots."""
-    stock = load_stock([str(make_run(tmp_path / "run"))])
-    names = [entry.name for entry in stock.entries]
+    catalogue = load_catalogue([str(make_run(tmp_path / "run"))])
+    names = [entry.name for entry in catalogue.entries]
     assert names[0] == "champion: 0.4 body lengths/s"
     assert names[1].startswith("individual 5: 0.5") and names[2].startswith("individual 3: 0.3")
     assert "individual 2" not in " ".join(names)  # every trial of its life failed
     assert "spider, a brain by chance" in names and "core, still" in names
     assert "core, a brain by chance" not in names  # it has nothing to move
-    champion = stock.entries[0]
+    champion = catalogue.entries[0]
     assert champion.group == "run" and champion.robot.num_hinges == 3
     assert champion.genes() == pytest.approx(0.1 * np.arange(10))
-    drawn = stock.entries[names.index("spider, a brain by chance")]
+    drawn = catalogue.entries[names.index("spider, a brain by chance")]
     assert drawn.genes().shape == (3 * 8 + 1,) and drawn.genes().std() > 0.1
-    assert stock.entries[names.index("spider, still")].genes() is None
-    assert stock.world.name == "empty_underwater" and stock.title == "run"
-    assert stock.mixed.capacity.hinges >= 8
+    assert catalogue.entries[names.index("spider, still")].genes() is None
+    assert catalogue.world.name == "empty_underwater" and catalogue.title == "run"
+    assert catalogue.mixed.capacity.hinges >= 8
 
 
 def test_the_stock_of_configurations_and_bodies(tmp_path):
-    stock = load_stock(["snake", "lake_swim"], "empty_underwater")
-    names = [entry.name for entry in stock.entries]
+    catalogue = load_catalogue(["snake", "lake_swim"], "empty_underwater")
+    names = [entry.name for entry in catalogue.entries]
     assert names[:3] == ["snake, a brain by chance", "snake, still", "spider, a brain by chance"]
     assert len(set(names)) == len(names)
-    assert stock.world.name == "empty_underwater"
-    assert stock.title == "snake and lake_swim"
+    assert catalogue.world.name == "empty_underwater"
+    assert catalogue.title == "snake and lake_swim"
 
 
 @pytest.mark.parametrize(
@@ -391,7 +393,7 @@ def test_what_cannot_be_dropped(tmp_path, monkeypatch, paths, match):
     settings = make_run(tmp_path / "run") / "config.yaml"
     settings.write_text(settings.read_text().replace('"sine"', '"cpg"'))
     with pytest.raises(InputError, match=match):
-        load_stock(paths)
+        load_catalogue(paths)
 
 
 # --------------------------------------------------------------------- the command
@@ -453,51 +455,52 @@ def test_the_scene_has_everybody_where_they_are(entries):
     with Running(entries, first=(Drop(0), Drop(1, (3.0, 0.0)))) as running:
         running.hear("poses")
         running.ask(Pause(True))
-        keeper = running.keeper
-        scene = make_scene(keeper, {})
-        poses = poses_at(keeper, keeper.time)
+        simulation = running.simulation
+        scene = LiveScene(simulation)
+        poses = simulation.poses_at(simulation.time)
         scene.pose(poses)
         import mujoco
 
         mujoco.mj_kinematics(scene.model, scene.data)
         assert scene.keys == (0, 1)
-        for one in keeper.inmates:
+        for one in simulation.robots:
             expected = pose_robot(one.robot, poses[one.key][None].astype(float))
             for k in range(1, one.robot.mj_model.nbody):
                 name = f"{one.key}/{one.robot.mj_model.body(k).name}"
                 assert scene.data.body(name).xpos == pytest.approx(
                     expected.position[0, k], abs=1e-9
                 )
-        middle = poses_at(keeper, keeper.time - 0.025)[0]
-        rows = [poses[0] for _, poses in list(keeper.recent)[-2:]]
-        assert middle[:3] == pytest.approx((rows[0][:3] + rows[1][:3]) / 2, abs=1e-6)
+        early, middle, late = (
+            simulation.poses_at(simulation.time - ago)[0] for ago in (0.05, 0.025, 0.0)
+        )
+        assert middle[:3] == pytest.approx((early[:3] + late[:3]) / 2, abs=1e-6)
 
 
 def test_keys_of_the_window(entries):
     with Running(entries) as running:
         running.hear("poses")
-        keeper, hands = running.keeper, Hands(running.keeper)
+        simulation, hands = running.simulation, KeyBindings(running.simulation)
 
         def press(key):
             hands.press(key)
-            running.ask(Rate(1.0))  # wishes are done in turn
+            running.ask(Rate(1.0))  # commands are done in turn
 
         press(ord("."))
         assert "snake, swims" in hands.words()[1]
         press(257)
-        assert [one.name for one in keeper.inmates] == ["spider", "snake"]
+        assert [one.name for one in simulation.robots] == ["spider", "snake"]
         press(262)
         press(265)
-        assert keeper.current == pytest.approx((0.05, 0.05, 0.0))
+        assert simulation.current == pytest.approx((0.05, 0.05, 0.0))
         press(261)
-        assert [one.name for one in keeper.inmates] == ["spider"]
+        assert [one.name for one in simulation.robots] == ["spider"]
         press(ord(" "))
-        assert keeper.paused and "(paused)" in hands.words()[1]
+        assert simulation.paused and "(paused)" in hands.words()[1]
         for _ in range(4):
             press(257)
         assert "tank: expected a free place" in hands.words()[1]
         press(268)
-        assert len(keeper.inmates) == 1 and not keeper.paused
+        assert len(simulation.robots) == 1 and not simulation.paused
 
 
 # --------------------------------------------------------------------- the true tank
@@ -509,14 +512,15 @@ def test_a_true_tank(monkeypatch):
     config = {"morphology": "snake", "world": "empty_underwater", "trim": "neutral",
               "controller": {"type": "sine"}, "task": {"type": "speed"}}  # fmt: skip
     mixed = make_mixed_fitness(config, [body("snake")])
-    entry = Entry("snake", "snake", "", mixed.build(body("snake")))
-    keeper = Keeper(make_tank(mixed, 2), mixed.world, [entry], first=(Drop(0, None, 1.0, 0.0),))
-    listener = keeper.listen()
-    thread = threading.Thread(target=keeper.run, daemon=True)
+    entry = CatalogueEntry("snake", "snake", "", mixed.build(body("snake")))
+    first = (Drop(0, None, 1.0, 0.0),)
+    simulation = LiveSimulation(make_tank(mixed, 2), mixed.world, [entry], first=first)
+    listener = simulation.listen()
+    thread = threading.Thread(target=simulation.run, daemon=True)
     thread.start()
     try:
-        keeper.ask(Rate(8.0))
-        start = keeper.ask(Current((0.0, 0.2, 0.0)))
+        simulation.ask(Rate(8.0))
+        start = simulation.ask(Current((0.0, 0.2, 0.0)))
         name, data = "", {}
         while name != "poses" or data["t"][-1] < 8:
             name, data = read_event(listener.get(timeout=300))
@@ -526,15 +530,12 @@ def test_a_true_tank(monkeypatch):
         # Nothing holds it level or at its depth exactly, but nothing pushes it elsewhere.
         assert rows[-1, 1] > 0.8 and abs(rows[-1, 0]) < 0.3 and abs(rows[-1, 2] + 1) < 0.3
     finally:
-        keeper.stop()
+        simulation.stop()
         thread.join(300)
 
 
 # --------------------------------------------------------------------- in a browser
 
-needs_browser = pytest.mark.skipif(
-    find_browser() is None, reason="no chromium or chrome on the path to open the page with"
-)
 FACTS = "(document.documentElement?.dataset ?? {})"
 
 
@@ -542,7 +543,7 @@ FACTS = "(document.documentElement?.dataset ?? {})"
 @needs_browser
 def test_a_user_plays(served):
     """Drops a robot in the middle and another where they click; makes a current; takes one out."""
-    wish(served, {"do": "reset"})
+    command(served, {"do": "reset"})
     with Browser(900, 600) as browser:
         browser.send("Page.navigate", url=f"{served.address}#plain")
         browser.wait(f"{FACTS}.poses && {FACTS}.busy === 'false' && {FACTS}.frames > 2")
@@ -558,7 +559,7 @@ def test_a_user_plays(served):
         browser.mouse("mousePressed", 450, 400, button="left", clickCount=1)
         browser.mouse("mouseReleased", 450, 400, button="left", clickCount=1)
         browser.wait(f"{FACTS}.robots === '3'")
-        assert np.linalg.norm(served.keeper.qpos[_last(served)][:2]) < 10
+        assert np.linalg.norm(served.simulation.qpos[_last(served)][:2]) < 10
         box = browser.evaluate(
             "(b => [b.x + b.width / 2, b.y + b.height / 2])"
             "(document.getElementById('compass').getBoundingClientRect())"
@@ -567,26 +568,16 @@ def test_a_user_plays(served):
         browser.mouse("mousePressed", *at, button="left", buttons=1, clickCount=1)
         browser.mouse("mouseReleased", *at, button="left", clickCount=1)
         browser.wait(f"{FACTS}.current && {FACTS}.current.split(',')[0] > 0.1")
-        x, y, z = served.keeper.current
+        x, y, z = served.simulation.current
         assert x > 0.1 and abs(y) < 0.03 and z == 0
         browser.click("#list li button")
         browser.wait(f"{FACTS}.robots === '2'")
         browser.press(" ")
         browser.wait(f"{FACTS}.paused === 'true'")
-        assert served.keeper.paused
+        assert served.simulation.paused
         browser.click("#reset")
         browser.wait(f"{FACTS}.robots === '1' && {FACTS}.paused === 'false'")
-        boxes = (
-            "[...document.querySelectorAll('.glass:not([hidden])')]"
-            ".map((e) => e.getBoundingClientRect())"
-            ".filter((b) => b.width > 0).map((b) => [b.left, b.top, b.right, b.bottom])"
-        )
-        for size in ((900, 600), (1280, 760), (390, 760)):
-            browser.resize(*size)
-            panels = np.array(browser.evaluate(boxes))
-            low = np.maximum(panels[:, None, :2], panels[:, :2])
-            high = np.minimum(panels[:, None, 2:], panels[:, 2:])
-            assert ((low < high).all(-1) == np.eye(len(panels), dtype=bool)).all(), size
+        browser.check_panels((900, 600), (1280, 760), (390, 760))
         assert browser.errors == []
         ours = served.origins[0]
         assert all(
@@ -595,4 +586,4 @@ def test_a_user_plays(served):
 
 
 def _last(server):
-    return server.keeper.inmates[-1].key
+    return server.simulation.robots[-1].key

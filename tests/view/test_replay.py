@@ -1,3 +1,5 @@
+"""Films: what they show and when, how they are drawn and written, and the command."""
+
 from __future__ import annotations
 
 import io
@@ -12,9 +14,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw
+import yaml
+from PIL import Image
 
-from laboratory import WATER, body, world
+from laboratory import ROOT, WATER, body, world
 from mjx_revolve import replay
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
@@ -23,19 +26,21 @@ from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
 from mjx_revolve.view.film import opengl, overlay
-from mjx_revolve.view.film.camera import FOVY, plan_shots
-from mjx_revolve.view.film.draw import draw_frames
-from mjx_revolve.view.film.film import make_film
-from mjx_revolve.view.film.stage import BACKGROUND, build_stage, make_sand, smooth_mesh
+from mjx_revolve.view.film.camera import FOVY, plan_circle, plan_shots
+from mjx_revolve.view.film.draw import draw_frames, draw_shaded
+from mjx_revolve.view.film.film import make_colony_film, make_film
+from mjx_revolve.view.film.stage import BACKGROUND, build_stage, make_sand
 from mjx_revolve.view.film.video import gif_stride, make_gif, write_mp4
 from mjx_revolve.view.film.waterlight import (
-    _bright_lines,
-    _daylight,
-    _open_water,
-    _transmission,
+    bright_lines,
+    daylight,
     make_shader,
+    open_water,
+    transmission,
 )
-from mjx_revolve.view.swim_picture import pose_scene
+from mjx_revolve.view.pieces import smooth_mesh
+from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
+from mjx_revolve.view.swim_picture import pose_scenes
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import load_world
 
@@ -177,7 +182,7 @@ def test_projection_of_a_known_point():
 def test_stage_stands_as_the_robot_does(name):
     robot = build_robot(body(name), load_world("lake"))
     shapes = (robot.mj_model.ngeom, robot.mj_model.nmesh)
-    model = build_stage(robot)
+    model = build_stage({0: robot}, robot.world)
     assert (robot.mj_model.ngeom, robot.mj_model.nmesh) == shapes
     assert model.nq == robot.mj_model.nq
     random = np.random.default_rng(1)
@@ -191,19 +196,20 @@ def test_stage_stands_as_the_robot_does(name):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(its, data)
     for body_id in range(robot.mj_model.nbody):
-        other = model.body(robot.mj_model.body(body_id).name).id
+        name = robot.mj_model.body(body_id).name
+        other = model.body(name if body_id == 0 else f"0/{name}").id
         assert drawn.xpos[other] == pytest.approx(weighed.xpos[body_id], abs=1e-12)
         assert drawn.xmat[other] == pytest.approx(weighed.xmat[body_id], abs=1e-12)
     # The meshes' corners are those of the pictures, axes and arrows apart.
     corners = []
     for geom in range(model.ngeom):
-        if model.geom(geom).name.startswith("drawn"):
+        if model.geom(geom).name.startswith("0/drawn"):
             mesh = model.geom_dataid[geom]
             first = model.mesh_vertadr[mesh]
             points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
             frame = drawn.geom_xmat[geom].reshape(3, 3)
             corners.append(points @ frame.T + drawn.geom_xpos[geom])
-    scene = pose_scene(robot, qpos)
+    (scene,) = pose_scenes(robot, qpos[None])
     assert len(corners) == sum(len(m.kind.parts) for m in robot.morphology.modules)
     for points in corners:
         near = np.abs(scene.corners.reshape(-1, 3)[None] - points[:3, None]).max(-1).min(1)
@@ -212,17 +218,16 @@ def test_stage_stands_as_the_robot_does(name):
 
 @pytest.mark.slow
 def test_stage_counts_from_its_origin(spider):
-    model = build_stage(spider, origin=(380.0, 20.0, -10.0), sight=5.0)
+    model = build_stage({0: spider}, spider.world, origin=(380.0, 20.0, -10.0), sight=5.0)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     assert data.geom_xpos[model.geom("surface").id] == pytest.approx([0, 0, 10])
 
 
 def test_a_world_without_a_bed_has_none(spider):
-    open_water_world = load_world("lake", bed="off")
-    model = build_stage(build_robot(spider.morphology, open_water_world))
+    model = build_stage({0: spider}, load_world("lake", bed="off"))
     names = [model.geom(k).name for k in range(model.ngeom)]
-    assert "sand" not in names and "bed" not in names
+    assert "sand" not in names and "0/bed" not in names
 
 
 def test_normals_are_sharp_on_a_cube_and_smooth_on_a_pipe():
@@ -250,24 +255,24 @@ def test_sand_can_be_laid_side_by_side():
 
 
 def test_water_takes_red_first():
-    clear = np.asarray(_transmission(0.0, 1.0))
+    clear = np.asarray(transmission(0.0, 1.0))
     assert clear == pytest.approx([1, 1, 1])
-    near, far = (np.asarray(_transmission(x, 1.0)) for x in (1.0, 8.0))
+    near, far = (np.asarray(transmission(x, 1.0)) for x in (1.0, 8.0))
     assert (near > 0.75).all() and (far < 0.4).all()
     assert far[0] < far[1] < far[2]
     # Small robots are seen as clearly as large ones.
-    assert np.asarray(_transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
+    assert np.asarray(transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
 
 
 def test_light_comes_from_above():
-    assert np.asarray(_daylight(0.0)) == pytest.approx([1, 1, 1])
-    assert (np.diff(np.asarray(_daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
-    assert (np.diff(np.asarray(_open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
+    assert np.asarray(daylight(0.0)) == pytest.approx([1, 1, 1])
+    assert (np.diff(np.asarray(daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
+    assert (np.diff(np.asarray(open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
 
 
 def test_bright_lines_only_move_light_about():
     x, y = np.meshgrid(np.linspace(0, 20, 200), np.linspace(0, 20, 200))
-    lines = np.asarray(_bright_lines(1.0, 9.81, 0.7, x, y))
+    lines = np.asarray(bright_lines(1.0, 9.81, 0.7, x, y))
     assert lines.mean() == pytest.approx(1.0, abs=0.2)
     assert lines.min() > 0 and lines.std() > 0.1
 
@@ -330,8 +335,8 @@ def test_frames_are_evenly_spaced_and_between_the_rows(episode):
     film = make_film(episode, SIZE, 30)
     assert len(film.time) == 30
     assert np.diff(film.time) == pytest.approx(1 / 30)
-    assert film.qpos[15, 0] == pytest.approx(0.2 * film.time[15], abs=1e-9)
-    assert film.speed == pytest.approx(math.hypot(0.2, 0.1), rel=0.05)
+    assert film.robots[0].qpos[15, 0] == pytest.approx(0.2 * film.time[15], abs=1e-9)
+    assert film.notes.speed == pytest.approx(math.hypot(0.2, 0.1), rel=0.05)
     assert film.lost is None
 
 
@@ -340,7 +345,7 @@ def test_a_turn_over_the_sign_of_the_quaternion_is_a_small_one(spider):
     qpos = np.array(episode.trajectory.qpos)
     qpos[1::2, 3:7] *= -1
     film = make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)), SIZE, 77)
-    assert np.abs(film.qpos[:, 3]) == pytest.approx(1.0)
+    assert np.abs(film.robots[0].qpos[:, 3]) == pytest.approx(1.0)
 
 
 def test_motes_drift_with_the_current_and_its_gusts(spider):
@@ -356,8 +361,9 @@ def test_motes_drift_with_the_current_and_its_gusts(spider):
 def test_balls_hold_every_part(spider):
     film = make_film(swim(spider), SIZE, 10)
     for k in (0, 7):
-        away = np.linalg.norm(pose_scene(spider, film.qpos[k]).corners - film.center[k], axis=-1)
-        assert away.max() < film.radius[k] < 1.3 * away.max()
+        scene = pose_scenes(spider, film.robots[0].qpos[k, None])[0]
+        away = np.linalg.norm(scene.corners - film.center[k], axis=-1)
+        assert away.max() < film.notes.radius[k] < 1.3 * away.max()
 
 
 def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
@@ -367,7 +373,7 @@ def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
     film = make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)), SIZE, 30)
     assert film.lost == pytest.approx(121 * STEP)
     assert len(film.time) == 18
-    assert np.isfinite(film.qpos).all()
+    assert np.isfinite(film.robots[0].qpos).all()
     qpos[:] = np.nan
     with pytest.raises(
         InputError, match="qpos: expected finite numbers in its first row; found none"
@@ -402,7 +408,7 @@ def test_the_bed_shows_where_it_is_near(spider, way):
     world = load_world("lake", bed={"kind": "flat", "height": -1.3})
     robot = build_robot(spider.morphology, world)
     film = make_film(swim(robot, 0.1, depth=1.1), SIZE, 10)
-    assert "bed" not in film.robot.mj_model.names.decode() or film.shots.position[0, 2] > -1.3
+    assert film.shots.position[0, 2] > -1.3
     frame = next(iter(draw_frames(film, way)))
     low = frame[95:110, 60:].reshape(-1, 3).mean(0)
     assert low[0] > 80  # sand is no water
@@ -472,29 +478,174 @@ def test_current_and_target_are_shown():
     still = np.zeros((50, 0))
     rows = Trajectory(time, qpos, np.zeros((50, 6)), np.zeros((50, 2, 3)), still, 0 * time)
 
-    def signs(target):
-        config = SimpleNamespace(task=SimpleNamespace(target=target))
-        fitness = None if target is None else SimpleNamespace(config=config)
+    def signs(frame, target=None, rows=rows):
+        """Words in a frame, their places, and how many pixels are pink."""
+        fitness = SimpleNamespace(config=SimpleNamespace(task=SimpleNamespace(target=target)))
         film = make_film(Episode("core", robot, rows, fitness=fitness), (320, 240), 10)
-        picture = Image.new("RGB", (320, 240))
-        words = overlay._make_signs(film, 1.0)(ImageDraw.Draw(picture, "RGBA"), 3)
-        pink = (np.asarray(picture, int) - overlay._AIM[:3] == 0).all(-1)
-        return [text for *_, text, _ in words], pink.sum(), words
+        blank, words = np.zeros((240, 320, 3), np.uint8), []
+        with pytest.MonkeyPatch.context() as patch:
+            write = overlay.Pen.write
+            patch.setattr(
+                overlay.Pen, "write", lambda *a, **k: words.append(a[1:4]) or write(*a, **k)
+            )
+            drawn = overlay.make_overlay(film)(blank, np.full((240, 320), np.inf), frame)
+        said = {text: (x, y) for x, y, text in words if "current" in text or "target" in text}
+        return said, int((np.abs(drawn.astype(int) - overlay.AIM[:3]).max(-1) < 40).sum())
 
-    assert signs(None)[:2] == (["current 0.10 m/s"], 0)
+    assert [*signs(3)[0]] == ["current 0.10 m/s"]
     x, y, z = qpos[0, :3]
-    said, pixels, words = signs((x, y, z + 0.05))
-    assert said == ["current 0.10 m/s", "target, 0.05 m"] and pixels > 30
-    assert 100 < words[1][0] < 220 and 40 < words[1][1] < 180  # not far from the robot
-    said, pixels, words = signs((x + 5.0, y, z))
-    assert said[1] == "target, 5 m" and pixels > 30
+    said, pixels = signs(3, (x, y, z + 0.05))
+    assert [*said] == ["current 0.10 m/s", "target, 0.05 m"] and pixels > 30
+    at = said["target, 0.05 m"]
+    assert 100 < at[0] < 220 and 40 < at[1] < 180  # not far from the robot
+    said, pixels = signs(3, (x + 5.0, y, z))
+    assert "target, 5 m" in said and pixels > 30
     # One that moves is where the trajectory has it: 2 m away at the start, and 1 m nearer a second
     # on.
     way = qpos[:, :3] + np.array([1.0, 0, 0]) * (2 - time[:, None])
-    film = make_film(Episode("core", robot, replace(rows, target=way)), (320, 240), 10)
-    draw = ImageDraw.Draw(Image.new("RGB", (320, 240)), "RGBA")
-    sign = overlay._make_signs(film, 1.0)
-    assert [sign(draw, frame)[1][2] for frame in (2, 9)] == ["target, 1.8 m", "target, 1.1 m"]
+    moving = replace(rows, target=way)
+    assert (
+        "target, 1.8 m" in signs(2, rows=moving)[0] and "target, 1.1 m" in signs(9, rows=moving)[0]
+    )
+
+
+# --- colonies -----------------------------------------------------------------------------------
+
+SETTINGS = {
+    "trim": "neutral",
+    "world": {"name": "empty_underwater", "bed": False, "drag": "ellipsoid", "timestep": 0.0125},
+    "controller": {"type": "sine"},
+    "task": {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 1, "depth": 1.0},
+    "bodies": {"max_modules": 4, "max_hinges": 1, "brains": {"inheritance": "darwinian"}},
+    "colony": {
+        "interval": 1.0,
+        "look": 0.5,
+        "arena": {"size": 2.5, "depth": 3.0},
+        "birth": {"radius": 1.0, "initial": 3, "least": 3},
+        "life": {"window": 1.0},
+    },
+    "evolution": {"population_size": 4, "generations": 1, "checkpoint_every": 1, "seed": 3},
+}
+
+
+@pytest.fixture(scope="module")
+def colony(spider):
+    """One stays; one is put to the other side at 1 s; one is born at 1 s and dies at 2 s."""
+
+    def robot(name, begin, until, x, y, **more):
+        time = np.arange(begin, until, 0.05)
+        qpos = np.zeros((len(time), 7 + spider.num_hinges))
+        qpos[:, 0], qpos[:, 1], qpos[:, 2], qpos[:, 3] = x, y, -0.5, 1.0
+        return ReplayRobot(name, spider, time, qpos, **more)
+
+    leaper = robot("leaps", 0.0, 3.0, 2.0, 0.0)
+    leaper.qpos[leaper.time >= 1.0 - 1e-9, 0] = -2.0
+    robots = [
+        robot("stays", 0.0, 3.0, 0.0, 1.5, start=0.0),
+        leaper,
+        robot("lives", 1.05, 2.0, 0.0, -1.5, start=1.0, end=2.0),
+    ]
+    marks = [Mark("clinic", (0.0, 0.0, -1.0), 1.0)]
+    return Recording("three", robots, 0.0, 3.0, marks, leap=2.5)
+
+
+def test_robots_are_shown_while_they_are_alive(colony):
+    film = make_colony_film(colony, SIZE, 30)
+    assert len(film.time) == 90
+    alive = [one.alive for one in film.robots]
+    assert np.all(alive[:2]) and alive[2].tolist() == [30 <= k < 60 for k in range(90)]
+    assert [x.tolist() for x in film.notes.births] == [[1.0], [2]]
+    assert [x.tolist() for x in film.notes.deaths] == [[2.0], [2]]
+    # Never between the two sides, though frames lie between poses.
+    assert set(film.robots[1].qpos[:, 0].tolist()) == {2.0, -2.0}
+    assert [overlay.count_words(film, film.notes, frame) for frame in (0, 30, 89)] == [
+        "2 robots   0 births   0 deaths",
+        "3 robots   1 birth   0 deaths",
+        "2 robots   1 birth   1 death",
+    ]
+
+
+@pytest.mark.parametrize(("depth", "above"), [(0.2, True), (60.0, False)])
+def test_the_camera_circles_and_sees_most(depth, above):
+    random, time = np.random.default_rng(0), np.arange(60) / 2
+    places = np.tile(random.uniform(-5, 5, (40, 1, 3)), (1, 60, 1)) * (1, 1, 0) - (0, 0, depth)
+    alive = np.ones((40, 60), bool)
+    shots = plan_circle(time, places, alive, reach=0.2, aspect=4 / 3, surface=0.0)
+    assert shots.above is above
+    middle = np.median(places[:, 0], axis=0)
+    off = shots.position - middle
+    assert np.arctan2(off[:, 2], np.hypot(off[:, 0], off[:, 1])) == pytest.approx(math.pi / 4)
+    turned = np.unwrap(np.arctan2(off[:, 1], off[:, 0]))
+    assert np.degrees(turned[-1] - turned[0]) == pytest.approx(3.0 * time[-1])
+    for frame in range(0, 60, 10):
+        flat, away = shots.project(frame, places[:, frame])
+        inside = (np.abs(flat) < (4 / 3, 1)).all(1) & (away > 0)
+        assert inside.mean() >= 0.75
+
+
+def test_the_camera_stays_where_no_robot_is_left():
+    alive = np.zeros((1, 20), bool)
+    alive[0, :5] = True
+    places = np.ones((1, 20, 3)) * (1.0, 2.0, -1.0)
+    shots = plan_circle(np.arange(20) / 10, places, alive, reach=0.2, aspect=1.0, surface=10.0)
+    assert np.isfinite(shots.position).all()
+    assert np.linalg.norm(shots.position - (1.0, 2.0, -1.0), axis=1) == pytest.approx(
+        np.full(20, shots.distance)
+    )
+
+
+@pytest.mark.slow
+def test_the_dead_are_not_drawn(colony, way):
+    """Something is as far away as a robot, where it is in the frame, while it is alive."""
+    film, seen = make_colony_film(colony, SIZE, 1), 0
+    for picture, depth, frame in draw_shaded(film, way):
+        assert picture.shape == (120, 160, 3)
+        for one in film.robots:
+            (flat,), (away,) = film.shots.project(frame, one.qpos[frame, None, :3])
+            row, column = 60 - 60 * flat[1], 80 + 60 * flat[0]
+            if not (2 < row < 118 and 2 < column < 158):
+                continue
+            near = depth[int(row) - 2 : int(row) + 3, int(column) - 2 : int(column) + 3]
+            # Behind them is nothing but the bed, far below.
+            drawn = abs(near.min() - away) < one.robot.morphology.length
+            assert drawn == one.alive[frame]
+            seen += 1
+    assert seen >= 6
+    assert film.robots[2].alive.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([str(ROOT / "morphologies" / "fish.yaml"), "--colony"], "run folder of a colony"),
+        (["run", "--colony", "--view"], "--colony: expected none of --view, --html, --ancestors"),
+        (["run", "--colony", "--out", "a.html"], "ends in .mp4 or .gif, with a film of several"),
+        ([str(ROOT / "morphologies" / "fish.yaml"), "--time", "3"], "--time: expected --colony"),
+        ([str(ROOT), "--colony", "--seed", "1"], "--seed: expected none with --colony"),
+    ],
+)
+def test_what_is_no_film_of_a_colony(arguments, words, capsys):
+    assert run_command(replay.main, arguments) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_films_a_colony(way, tmp_path, capsys):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.yaml").write_text(
+        yaml.safe_dump(SETTINGS)
+    )  # all that a colony's beginning needs
+    arguments = [str(run), "--colony", "--time", "1", "--duration", "2"]
+    arguments += ["--size", "160x120", "--fps", "5"]
+    assert replay.main(arguments) == 0
+    assert "robots, 160 x 120" in capsys.readouterr().out
+    with av.open(str(run / "colony.mp4")) as file:
+        stream = file.streams.video[0]
+        assert sum(1 for _ in file.decode(stream)) == 10
+        assert (stream.width, stream.height) == SIZE
+    assert run_command(replay.main, arguments) == 2  # never over a film that is there
+    assert "expected no such file yet" in capsys.readouterr().err
 
 
 # --- the command --------------------------------------------------------------------------------
@@ -595,17 +746,9 @@ def test_the_user_s_opengl_is_the_only_one_tried(monkeypatch):
     ("words", "message"),
     [
         (("--size", "640"), "--size: expected WIDTHxHEIGHT"),
-        (("--size", "641x480"), "even numbers of pixels"),
         (("--size", "0x0"), "from 64x64 to 3840x2160; found '0x0'"),
-        (("--size", "64000x480"), "--size"),
         (("--fps", "0"), "--fps: expected a whole number from 1 to 120; found '0'"),
-        (("--fps", "29.97"), "--fps"),
-        (("--seed", "-1"), "from 0 to 4294967295; found '-1'"),
-        (("--seed", "99999999999"), "--seed: expected a whole number"),
         (("--duration", "0"), "--duration: expected seconds > 0; found '0'"),
-        (("--duration", "nan"), "--duration"),
-        (("--duration", "long"), "--duration"),
-        (("--fast",), "unrecognized arguments"),
         (("--html", "--out", "x.mp4"), "with --html"),
         (("--view", "--out", "x.mp4"), "--view: expected neither"),
     ],
@@ -615,38 +758,6 @@ def test_wrong_options(words, message, tmp_path, capsys):
     assert run_command(replay.main, [str(tmp_path / "spider.yaml"), *words]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1 and error.startswith("error: ")
-
-
-def genes(folder, text):
-    folder.mkdir()
-    (folder / "config.yaml").write_text("")
-    (folder / "champion").mkdir()
-    (folder / "champion" / "genes.yaml").write_text(text)
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda at: at / "none", "expected a run folder, a genes.yaml or a morphology; found none"),
-        (lambda at: at, "expected a run folder; found no config.yaml in it"),
-        (lambda at: genes(at / "run", "[1, 2"), "expected valid YAML"),
-        (lambda at: genes(at / "run", "genes: many"), "genes: expected a list of numbers"),
-    ],
-)
-def test_wrong_paths(make, message, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(opengl, "_works", lambda way: True)
-    path = make(tmp_path)
-    assert run_command(replay.main, [str(path), "--out", str(tmp_path / "x.mp4")]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-
-
-def test_a_run_without_a_champion(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(opengl, "_works", lambda way: True)
-    (tmp_path / "config.yaml").write_text("")
-    assert run_command(replay.main, [str(tmp_path)]) == 2
-    assert "expected a champion; found none" in capsys.readouterr().err
 
 
 def test_a_place_that_cannot_be_written(command, way, tmp_path, capsys):

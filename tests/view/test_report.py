@@ -5,10 +5,8 @@ import json
 import shutil
 from html.parser import HTMLParser
 
-import jax
 import numpy as np
 import pytest
-import scipy.stats
 
 import mjx_revolve
 from laboratory import _ELBOW as ELBOW
@@ -16,25 +14,21 @@ from laboratory import read
 from mjx_revolve import evolve, report
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.fitness import make_fitness
+from mjx_revolve.episodes.run_reader import read_metrics
 from mjx_revolve.episodes.scoring import replay_key
-from mjx_revolve.evolution import runs
+from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.fingerprints import model_hash, settings_hash
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
-from mjx_revolve.view import plots
-from mjx_revolve.view.report import champion_pictures, run_pictures, tables
+from mjx_revolve.view import convergence, motion_plots, plots
 from mjx_revolve.view.report import page as report_page
 from mjx_revolve.view.report import repeat as report_repeat
+from mjx_revolve.view.report import tables
 from mjx_revolve.view.report.champion import cpg_phases, replay_champion
-from mjx_revolve.view.report.data import read_metrics, read_run
-from mjx_revolve.view.report.groups import (
-    differences,
-    format_interval,
-    group_runs,
-    mean_difference,
-    mean_interval,
-)
+from mjx_revolve.view.report.data import read_run
+from mjx_revolve.view.report.groups import differences, group_runs
+from mjx_revolve.view.statistics import interval
 
 SETTINGS = {
     "morphology": "elbow.yaml",
@@ -63,7 +57,7 @@ def make_run(folder, config, fitness, seed=0, generations=6, finished=True, scor
     evolution = config.evolution.model_copy(update={"seed": seed})
     config = config.model_copy(update={"evolution": evolution})
     settings = ["controller.max_frequency=1.0", f"evolution.seed={seed}"]
-    run, config = runs.create_run(
+    run, config = runs.create_run_folder(
         folder, config, started="2026-01-02T03:04:05+00:00", seed=seed,
         config_file=config.source, settings=settings, model_hash=model_hash(fitness),
         **runtime.describe_process(),
@@ -115,58 +109,12 @@ def copy(lab, tmp_path, monkeypatch):
 def quick(lab, monkeypatch):
     """Reports that compile nothing: all runs have the same robot."""
     monkeypatch.setattr("mjx_revolve.view.report.page.make_fitness", lambda config: lab["fitness"])
-    monkeypatch.setattr("mjx_revolve.view.report.page._swim_jpeg", lambda replay: b"\xff\xd8")
+    monkeypatch.setattr("mjx_revolve.view.swim_picture.show_scene", lambda *_: None)
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
 
 
 def run_main(*argv):
     return run_command(report.main, [str(word) for word in argv])
-
-
-# --- statistics ---
-
-
-def test_intervals_of_known_numbers():
-    interval = mean_interval([1.0, 2.0, 3.0])
-    assert (interval.mean, interval.count) == (2.0, 3)
-    assert interval.half == pytest.approx(4.302653 / np.sqrt(3), rel=1e-6)  # t(0.975, 2) / √3
-    values = np.array([[1.0, 5.0, np.nan], [2.0, np.nan, np.nan], [3.0, 5.0, np.nan]])
-    wide = mean_interval(values)
-    assert wide.mean[:2].tolist() == [2.0, 5.0]
-    assert wide.count.tolist() == [3, 2, 0]
-    assert wide.half[1] == 0.0
-    assert np.isnan([wide.mean[2], wide.half[2], mean_interval([4.0]).half]).all()
-
-
-def test_intervals_agree_with_scipy():
-    draw = np.random.default_rng(0)
-    a, b = draw.normal(1, 2, 7), draw.normal(0, 1, 5)
-    low, high = scipy.stats.t.interval(0.95, 6, a.mean(), scipy.stats.sem(a))
-    assert mean_interval(a).half == pytest.approx((high - low) / 2)
-    welch = scipy.stats.ttest_ind(a, b, equal_var=False).confidence_interval(0.95)
-    difference = mean_difference(a, b)
-    assert difference.mean == pytest.approx(a.mean() - b.mean())
-    assert difference.half == pytest.approx((welch.high - welch.low) / 2)
-    assert mean_difference([1.0, 1.0], [2.0, 2.0]).half == 0.0
-    assert np.isnan(mean_difference([1.0], b).half)
-    assert mean_difference([], b).count == 0
-
-
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ([], "–"),
-        ([float("nan")], "–"),
-        ([0.12345], "0.123"),
-        ([0.1, 0.1, 0.1], "0.1"),
-        ([0.15, 0.16, 0.17], "0.160 ± 0.025"),
-        ([-12.0, -15.0, -13.0], "−13.3 ± 3.8"),
-        ([1000.0, 3000.0], "2000 ± 12706"),
-        ([1e-12, 3e-12], "2e−12 ± 1e−11"),
-    ],
-)
-def test_means_are_written_to_the_digits_that_count(values, text):
-    assert format_interval(mean_interval(values)) == text
 
 
 # --- groups ---
@@ -209,7 +157,6 @@ def test_curves_go_as_far_as_all_runs_do(lab, tmp_path):
     x, values = group.curve("champion")
     assert x.tolist() == [1, 3, 4]
     assert np.allclose(values, [[row(g, seed)["champion"] for g in x] for seed in range(3)])
-    assert group.curve("champion", "evaluations")[0].tolist() == [8, 24, 32]
     assert np.isnan(group.curve("no_such_column")[1]).all()
     assert group.scores() == []
     assert group.best().seed == 0  # the furthest, where nothing was judged
@@ -249,42 +196,19 @@ def break_cell(run):
 DAMAGES = [
     (lambda run: cut(run / "metrics.csv"), "damaged", "metrics.csv ends at generation 2, but the "
      "run reached 6"),
-    (break_cell, "damaged", "metrics.csv: 1 line is damaged and left out"),
     (break_cell, "damaged", "metrics.csv: 1 of 6 generations are not in it"),
-    (lambda run: (run / "metrics.csv").write_bytes(bytes(300)), "incomplete", "metrics.csv is "
-     "empty"),
-    (lambda run: (run / "metrics.csv").write_bytes(b"\xff\xfe\x00a,b\n1,2\n"), "damaged",
-     "metrics.csv: expected a header with a column generation; found"),
-    (lambda run: cut(run / "metrics.csv", 0.1), "damaged", "metrics.csv: expected a header"),
-    (lambda run: (run / "metrics.csv").unlink(), "incomplete", "metrics.csv is missing"),
-    (lambda run: (run / "run.json").unlink(), "incomplete", "run.json is missing"),
     (lambda run: cut(run / "run.json"), "damaged", "run.json: expected JSON; found"),
     (lambda run: (run / "config.yaml").unlink(), "incomplete", "config.yaml is missing"),
-    (lambda run: (run / "config.yaml").write_text("a: {"), "damaged", "config.yaml: line "),
-    (lambda run: (run / "config.yaml").write_text("[]"), "damaged", "config.yaml: expected a map"),
-    (lambda run: edit(run / "config.yaml", "duration: 1.0", "duration: -1"), "damaged",
-     "config.yaml: task.duration: expected a number > 0 [s]; found -1"),
-    (lambda run: edit(run / "config.yaml", "engine: population", "engine: population\nflux: 3"),
-     "of another version", "config.yaml: this version does not know flux; read without"),
     (lambda run: edit(run / "config.yaml", "trials: 1", "trials: 1\n  trails: 2"),
      "of another version", "this version does not know task.trails; read without"),
-    (lambda run: edit(run / "run.json", f'"jax": "{jax.__version__}"', '"jax": "0.0.7"'),
-     "of another version", f"made with older jax 0.0.7 (here {jax.__version__}): a replay may"),
     (lambda run: made_by(run, "mjx_revolve", "99.1"),
      "of another version", "made with newer mjx_revolve 99.1 (here "),
-    (lambda run: edit(run / "run.json", '"versions"', '"visions"'), "of another version",
-     "run.json names no versions"),
     (lambda run: (run / "inputs" / "elbow.yaml").unlink(), "incomplete",
      "inputs/elbow.yaml is missing: champion/morphology.yaml stands in for it"),
     (lambda run: (run / "champion" / "genes.yaml").unlink(), "incomplete",
      "the champion shown is the best individual in checkpoints/generation_000006.npz"),
-    (lambda run: (run / "champion" / "genes.yaml").write_text("genes: [1, .nan]"), "damaged",
-     "champion/genes.yaml: genes: expected a list of finite numbers; found nan at 1"),
-    (lambda run: (run / "champion" / "genes.yaml").write_text("genes: [1,"), "damaged",
-     "champion/genes.yaml: line 1: expected valid YAML"),
     (lambda run: cut(run / "checkpoints" / "generation_000006.npz"), "damaged",
      "checkpoints/generation_000006.npz: File is not a zip file"),
-    (lambda run: shutil.rmtree(run / "checkpoints"), "incomplete", "checkpoints/ has none"),
     (lambda run: edit(run / "run.json", '"finished"', '"began"'), "not finished",
      "stopped or still running after 6 of 6 generations"),
 ]  # fmt: skip
@@ -302,8 +226,8 @@ def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
     assert record.genes is not None
     if "metrics" in text and record.metrics:  # whatever is left makes pictures
         (group,) = group_runs([record])
-        assert plots.figure_svg(run_pictures.plot_seeds(group)).startswith(b"<?xml")
-        assert plots.figure_svg(plots.plot_fitness(record.metrics)).startswith(b"<?xml")
+        assert plots.figure_svg(convergence.plot_seeds(group)).startswith(b"<?xml")
+        assert plots.figure_svg(convergence.plot_fitness(record.metrics)).startswith(b"<?xml")
 
 
 @pytest.mark.slow
@@ -320,19 +244,20 @@ def test_values_of_the_wrong_kind_do_not_stop_a_report(copy, quick, capsys):
 def test_metrics_of_another_version_may_lack_columns(tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_text("generation,best\r\n2,0.5\r\n1,inf\r\n2,0.6\r\n")
-    table, problems = read_metrics(path)
-    assert problems == []
+    table, bad, damage = read_metrics(path)
+    assert not bad and not damage
     assert table["generation"].tolist() == [1, 2]
-    assert np.isnan(table["best"][0]) and table["best"][1] == 0.6  # the resumed run's line counts
-    assert plots.figure_svg(plots.plot_fitness(table)).startswith(b"<?xml")
+    assert table["best"].tolist() == [np.inf, 0.6]  # the resumed run's line counts
+    table["best"][0] = np.nan
+    assert plots.figure_svg(convergence.plot_fitness(table)).startswith(b"<?xml")
     bare = {"generation": table["generation"]}
-    assert plots.figure_svg(plots.plot_fitness(bare)).startswith(b"<?xml")
+    assert plots.figure_svg(convergence.plot_fitness(bare)).startswith(b"<?xml")
 
 
 def test_quartiles_are_drawn_where_there_are_some():
     table = {"generation": np.arange(1.0, 4), "best": np.arange(3.0), "median": np.arange(3.0) / 2,
              "lower_quartile": np.zeros(3), "upper_quartile": np.arange(3.0)}  # fmt: skip
-    top = plots.plot_fitness(table).axes[0]
+    top = convergence.plot_fitness(table).axes[0]
     labels = [text.get_text() for text in top.get_legend().get_texts()]
     assert labels == ["quartiles", "median", "best"]
 
@@ -405,7 +330,7 @@ def axes_of(figure):
 
 
 def test_joint_angles_are_those_of_the_joints(lab):
-    first, second = axes_of(champion_pictures.plot_joints(lab["replay"].motion))
+    first, second = axes_of(motion_plots.plot_joints(lab["replay"].motion))
     trajectory = lab["trajectory"]
     assert first.get_title(loc="left") == "shoulder"
     assert np.allclose(first.lines[1].get_ydata(), np.degrees(trajectory.qpos[:, 7]))
@@ -415,7 +340,7 @@ def test_joint_angles_are_those_of_the_joints(lab):
 
 def test_power_adds_up(lab):
     replay = lab["replay"]
-    power, energy, cost = axes_of(champion_pictures.plot_energy(replay.motion))
+    power, energy, cost = axes_of(motion_plots.plot_energy(replay.motion))
     assert [axes.get_ylabel() for axes in (power, energy, cost)] == [
         "power (W)", "energy so far (J)", "cost of transport (–)",
     ]  # fmt: skip
@@ -427,7 +352,7 @@ def test_power_adds_up(lab):
 
 
 def test_phases_and_thrusters(lab):
-    phases = axes_of(champion_pictures.plot_phases(lab["replay"].motion))
+    phases = axes_of(motion_plots.plot_phases(lab["replay"].motion))
     assert phases[0].images[0].get_array().shape == (2, 200)
     assert phases[0].images[0].get_cmap().name == "twilight"  # a circle: 0 and 2π look the same
     from types import SimpleNamespace
@@ -437,7 +362,7 @@ def test_phases_and_thrusters(lab):
     model = SimpleNamespace(actuator=lambda i: SimpleNamespace(name="bow"))
     robot = SimpleNamespace(thrusters=(0,), mj_model=model)
     motion = SimpleNamespace(robot=robot, time=time, commands=command, lagged=0.5 * command)
-    (axes,) = axes_of(champion_pictures.plot_thrusters(motion))
+    (axes,) = axes_of(motion_plots.plot_thrusters(motion))
     assert np.ptp(axes.lines[0].get_xdata()) < 2.0  # the last of many swings
     assert np.ptp(axes.lines[1].get_ydata()) == pytest.approx(1.0, abs=0.05)
 
@@ -453,12 +378,13 @@ def test_comparison_of_very_different_lengths(lab, tmp_path):
             made.append(read_run(folder))
     groups = group_runs(made)
     styles = {group.name: k for k, group in enumerate(groups)}
-    left, right = axes_of(run_pictures.plot_comparison(groups, styles))
+    left, right = axes_of(convergence.plot_comparison(groups, styles))
     assert left.get_xscale() == "log"
-    assert np.allclose(left.lines[0].get_ydata(), np.mean(groups[0].curve("champion")[1], axis=0))
+    # Each seed, then their mean.
+    assert np.allclose(left.lines[3].get_ydata(), np.mean(groups[0].curve("champion")[1], axis=0))
     assert [tick.get_text() for tick in right.get_xticklabels()] == ["A", "B"]
     (same,) = group_runs(made[:3])
-    left, _ = axes_of(run_pictures.plot_comparison([same], {same.name: 0}))
+    left, _ = axes_of(convergence.plot_comparison([same], {same.name: 0}))
     assert left.get_xscale() == "linear"
 
 
@@ -473,23 +399,21 @@ def test_searches_in_which_everything_fails_make_pictures(lab, tmp_path):
     assert other.problems == []
     for records in ([one], [other], [one, other]):
         groups = group_runs(records)
-        axes_of(run_pictures.plot_comparison(groups, {group.name: 0 for group in groups}))
-        axes_of(run_pictures.plot_seeds(groups[0]))
-        axes_of(plots.plot_fitness(records[-1].metrics))
+        axes_of(convergence.plot_comparison(groups, {group.name: 0 for group in groups}))
+        axes_of(convergence.plot_seeds(groups[0]))
+        axes_of(convergence.plot_fitness(records[-1].metrics))
 
 
 def test_long_episodes_make_small_pictures():
-    from types import SimpleNamespace
-
     time = np.arange(100_000) * 0.005
     path = np.random.default_rng(0).normal(size=(len(time), 3)).cumsum(0) * 1e-3
-    figure = plots.plot_trajectory(SimpleNamespace(time=time, xpos=np.stack([path, path], axis=1)))
+    figure = motion_plots.plot_path(time, path)
     assert len(plots.figure_svg(figure)) < 1e6
 
 
 def test_champions_start_at_one_place(lab):
     motion = lab["replay"].motion
-    figure = run_pictures.plot_champions([("one", 0, [motion] * 3), ("b", 1, [motion])])
+    figure = motion_plots.plot_champions([("one", 0, [motion] * 3), ("b", 1, [motion])])
     above, side, away = axes_of(figure)
     assert np.allclose(above.lines[0].get_xydata()[0], 0)
     way = np.asarray(lab["trajectory"].xpos)[:, 1]
@@ -500,22 +424,20 @@ def test_champions_start_at_one_place(lab):
 
 @pytest.mark.parametrize(("index", "text"), [(0, "A"), (25, "Z"), (26, "AA"), (52, "BA")])
 def test_letters_never_run_out(index, text):
-    assert run_pictures.letter(index) == text
-    assert set(run_pictures.style_of(index)) == {"color", "linestyle"}
+    assert plots.letter(index) == text
+    assert set(plots.style_of(index)) == {"color", "linestyle"}
 
 
 def test_side_views_look_across_the_way():
-    from types import SimpleNamespace
-
     time = np.arange(100) * 0.05
     path = np.stack([0 * time, 0.2 * time, 0 * time - 1], axis=-1)
-    figure = plots.plot_trajectory(SimpleNamespace(time=time, xpos=np.stack([path, path], axis=1)))
+    figure = motion_plots.plot_path(time, path)
     assert figure.axes[1].get_xlabel() == "y (m)"
 
 
 def test_pictures_are_the_same_bytes_twice():
     table = {"generation": np.arange(1.0, 4), "best": np.arange(3.0)}
-    first, second = (plots.figure_svg(plots.plot_fitness(table)) for _ in range(2))
+    first, second = (plots.figure_svg(convergence.plot_fitness(table)) for _ in range(2))
     assert first == second
     assert b"<text" not in first  # no fonts needed
 
@@ -558,14 +480,14 @@ def test_a_command_that_no_longer_fits_is_not_shown(lab, copy):
     source = copy.parent / "swim.yaml"
     shutil.copy(lab["folder"] / "elbow.yaml", copy.parent)
     shutil.copy(lab["folder"] / "swim.yaml", source)
-    runs.Run(copy).update_info(config_file=str(source))
+    runs.RunFolder(copy).update_info(config_file=str(source))
     commands = report_repeat.repeat_commands(read_run(copy))
     assert commands[1][1].startswith("python -m mjx_revolve.evolve swim.yaml --seed 0 ")
     edit(source, '"duration": 1.0', '"duration": 2.0')
     assert len(report_repeat.repeat_commands(read_run(copy))) == 1
     source.unlink()
     assert len(report_repeat.repeat_commands(read_run(copy))) == 1
-    runs.Run(copy).update_info(xla_flags="--a --b", threads={"OPENBLAS_NUM_THREADS": "2"})
+    runs.RunFolder(copy).update_info(xla_flags="--a --b", threads={"OPENBLAS_NUM_THREADS": "2"})
     ((_, command),) = report_repeat.repeat_commands(read_run(copy))
     assert command.startswith("OPENBLAS_NUM_THREADS=2 XLA_FLAGS='--a --b' python -m ")
 
@@ -623,19 +545,8 @@ def test_text_is_escaped():
     box = sections.problems([run], ["<lost>"], True)
     content = [("x", "<h>", inside), ("y", "none", " ")]
     page = Page(report_page.make_page("<t>", "<w>", box, content))
-    for text in (
-        "<script>",
-        '"<pre>&',
-        "<run>",
-        "<img>",
-        "<t>",
-        "<h>",
-        "<w>",
-        "<a>",
-        "<b>",
-        "<lost>",
-    ):
-        assert text in page.words
+    written = ("<script>", '"<pre>&', "<run>", "<img>", "<t>", "<h>", "<w>", "<a>", "<b>", "<lost>")
+    assert all(text in page.words for text in written)
     assert "none" not in page.text
 
 
@@ -667,7 +578,7 @@ def test_a_page_about_several_runs(lab, copy, quick, capsys):
     assert "the same configuration and seed as" in capsys.readouterr().err
     page = Page((copy.parent / "page.html").read_text())
     assert "4 runs of swim" in page.words
-    assert format_interval(mean_interval([lab["score"]] * 3)) in page.words
+    assert str(interval([lab["score"]] * 3)) in page.words
     assert "Champions side by side" in page.words
     assert any("95 % confidence" in words for words in page.words)
     assert len(page.images) == 3 + 5
@@ -711,21 +622,16 @@ def test_a_page_about_what_is_left(copy, quick, capsys):
     ("argv", "message"),
     [
         ([], "the following arguments are required: RUN (see --help)"),
-        (["run", "--outt", "x"], "unrecognized arguments: --outt x (see --help)"),
         (["nowhere"], "nowhere: expected a run folder; found none"),
-        (["run", "nowhere"], "nowhere: expected a run folder; found none"),
-        (["run/config.yaml"], "run/config.yaml: expected a run folder; found a file"),
         (["empty"], "empty: expected a run folder; found nothing of a run"),
         (["run", "run/../run"], "run/../run: expected each run once; found it as run, too"),
         (["run", "--out", "page.pdf"], "--out page.pdf: expected a name that ends in .html"),
-        (["run", "--out", "folder.html"], "--out folder.html: expected a file; found a folder"),
         (["run", "--out", "no/page.html"], "--out no/page.html: expected the folder no; found"),
         (["run"], "run/report.html: expected no file or an earlier report; found another file"),
     ],
 )
 def test_wrong_commands(copy, argv, message, capsys):
     (copy.parent / "empty").mkdir()
-    (copy.parent / "folder.html").mkdir()
     (copy / "report.html").write_text("mine")
     before = sorted(copy.parent.rglob("*"))
     assert run_main(*argv) == 2

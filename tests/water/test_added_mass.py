@@ -18,7 +18,6 @@ from laboratory import (
 )
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.water.added_mass import box_added_mass, lamb_coefficients
-from mjx_revolve.water.flow import Water
 from references import Lagrangian
 
 RHO = 999.1026
@@ -103,23 +102,6 @@ def test_net_force_accelerates_body_and_water():
     assert -accelerate(robot, qpos, qvel)[2] == pytest.approx(net / (0.4 + carried), rel=1e-12)
 
 
-def test_munk_moment():
-    """A body that moves askew is turned broadside on: M = ½ (m_b - m_a) U² sin 2α."""
-    robot = deep_box()
-    alpha = np.linspace(-np.pi / 2, np.pi / 2, 9)
-    qpos, qvel = at_rest(robot, 9, -3.0)
-    qvel[0], qvel[2] = 0.4 * np.cos(alpha), 0.4 * np.sin(alpha)
-    added, inertia = RHO * robot.fluid.added_mass[0], RHO * robot.fluid.added_inertia[0]
-    own = 0.2 / 12 * (SIZE[0] ** 2 + SIZE[2] ** 2)
-    # -ν × (A ν) about y, with x forward and z up; positive turns the nose (x) down.
-    moment = 0.5 * (added[2] - added[0]) * 0.4**2 * np.sin(2 * alpha)
-    spin = accelerate(robot, qpos, qvel)[4]
-    assert spin == pytest.approx(moment / (own + inertia[1]), abs=1e-12)
-    # It moves up (α > 0) and its nose goes down: further away from where it moves to.
-    assert added[2] > added[0]
-    assert spin[5] > 0
-
-
 def impulses(robot, qpos, qvel):
     """Linear and angular (about the world's origin) impulse of a single box and its water."""
     added, spin_added = RHO * robot.fluid.added_mass[0], RHO * robot.fluid.added_inertia[0]
@@ -170,19 +152,6 @@ def test_conservation_over_a_rollout():
     assert drift[1] / drift[2] == pytest.approx(2.0, abs=0.4)
 
 
-@pytest.mark.parametrize("mass", [0.5, 0.16, 0.05])
-def test_a_light_plate_keeps_its_energy(mass):
-    """Three, ten and thirty times its mass carried across it, at the default step, for 2 s."""
-    robot = box_robot((0.2, 0.1, 0.01), mass, world(added_mass=True))
-    qpos, qvel = random_states(robot, 16, speed=1.0)
-    _, q, v, _ = march(robot, 2.0, qpos, qvel, every=100)
-    lagrangian = Lagrangian(robot, RHO)
-    start = [lagrangian.energy(*s) for s in zip(qpos.T, qvel.T, strict=True)]
-    for row, rate in zip(q, v, strict=True):
-        energy = [lagrangian.energy(*s) for s in zip(row.T, rate.T, strict=True)]
-        assert np.divide(energy, start) == pytest.approx(1.0, abs=1e-9)
-
-
 # ------------------------------------------------------------------------- jointed bodies
 
 
@@ -211,17 +180,3 @@ def test_a_jointed_body_obeys_lagrange():
 @pytest.mark.parametrize("name", ["spider", "gecko"])
 def test_shipped_bodies_obey_lagrange(name):
     check_lagrange(build_robot(body(name), world(added_mass=True)), 4)
-
-
-@pytest.mark.slow
-def test_galilean_invariance_in_a_uniform_current():
-    """A current is a moving frame: accelerations as in still water at velocities less by it."""
-    robot = arm_robot(world(added_mass=True, drag="faces", gravity=9.81, buoyancy="partial"))
-    current = np.array([0.3, -0.2, 0.1])
-    # Some are half out of the water; in one instant, a surface that moves looks like one at rest.
-    qpos, qvel = random_states(robot, 24, depth=2.0)
-    moving = qvel.copy()
-    moving[:3] += current[:, None]
-    still = accelerate(robot, qpos, qvel, water=Water(0.0, (np.float64(0),) * 3))
-    flowing = accelerate(robot, qpos, moving, water=Water(0.0, tuple(current)))
-    assert flowing == pytest.approx(still, abs=1e-10 * np.abs(still).max())

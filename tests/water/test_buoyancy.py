@@ -14,12 +14,12 @@ import pytest
 from laboratory import QUICK, accelerate, at_rest, body, box_robot, march, world
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import trim_neutral
-from mjx_revolve.engine.levels import make_levels
-from mjx_revolve.engine.pushes import part_forces
+from mjx_revolve.engine.forces import part_forces
+from mjx_revolve.engine.population import init
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.step import init
-from mjx_revolve.water.buoyancy import buoyancy, submersion
-from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.engine.single_tree import make_single_tree
+from mjx_revolve.water.buoyancy import BUOYANCY_LAWS, buoyancy, cut_box
+from mjx_revolve.water.flow import water_of
 from references import clip_box
 
 WATER = 999.1026  # kg/m³, the thesis's
@@ -43,11 +43,11 @@ ERROR = {True: 1e-14, False: 1e-6}  # float64, float32
 
 @lru_cache
 def _cut(half, mode):
-    return jax.jit(lambda up, depth: submersion(up, depth, half, mode))
+    return jax.jit(lambda up, depth: BUOYANCY_LAWS[mode].submersion(up, depth, half))
 
 
 def cut(up, depth, half, mode="partial", x64=True):
-    """`submersion` of many states of one box: `[n, 3]`, `[n]`, `[3]` to `[n]`, `[n, 3]`."""
+    """`cut_box` of many states of one box: `[n, 3]`, `[n]`, `[3]` to `[n]`, `[n, 3]`."""
     with jax.enable_x64(x64):
         up = tuple(jnp.asarray(x) for x in np.asarray(up, float).T)
         share, moment = _cut(tuple(half), mode)(up, jnp.asarray(depth))
@@ -129,14 +129,11 @@ def test_far_above_and_below_the_surface_nothing_is_cut(mode):
         assert not moment.any()
 
 
-def test_mask_is_all_or_nothing_and_off_is_nothing():
+def test_mask_is_all_or_nothing():
     up = attitudes(4)
     depth = np.array([-1e-6, 1e-6, -0.2, 0.2])
     share, moment = cut(up, depth, BOXES["cube"], "mask")
     assert share.tolist() == [0, 1, 0, 1]
-    assert not moment.any()
-    share, moment = cut(up, depth, BOXES["cube"], "off")
-    assert not share.any()
     assert not moment.any()
 
 
@@ -151,7 +148,7 @@ def test_force_moment_and_gradients_are_continuous_through_the_surface(name):
     half = BOXES[name]
 
     def everything(depth, angle):
-        share, moment = submersion(tilted(angle), depth, tuple(half), "partial")
+        share, moment = cut_box(tilted(angle), depth, tuple(half))
         return jnp.stack([share, *(m / half.max() for m in moment)])
 
     @jax.jit
@@ -178,9 +175,7 @@ def test_only_a_level_face_changes_the_slope_at_once_and_by_its_area():
     """
     half = np.array([0.3, 0.2, 0.1])
     slope = jax.jit(
-        jax.vmap(
-            jax.grad(lambda d, t: submersion(tilted(t), d, tuple(half), "partial")[0]), (0, None)
-        )
+        jax.vmap(jax.grad(lambda d, t: cut_box(tilted(t), d, tuple(half))[0]), (0, None))
     )
     just = 1e-9
     with jax.enable_x64(True):
@@ -257,7 +252,7 @@ def test_gradients_against_differences(name, half):
     state = np.array([level * (np.abs(up) @ np.array(half)), *up])
 
     def everything(state):
-        share, moment = submersion(tuple(state[1:]), state[0], half, "partial")
+        share, moment = cut_box(tuple(state[1:]), state[0], half)
         return jnp.stack([share, *moment])
 
     with jax.enable_x64(True):
@@ -280,7 +275,7 @@ def test_gradients_are_finite_everywhere(x64):
     with jax.enable_x64(x64):
 
         def everything(depth, up):
-            share, moment = submersion(tuple(up), depth, half, "partial")
+            share, moment = cut_box(tuple(up), depth, half)
             return jnp.stack([share, *moment])
 
         slopes = jax.jit(jax.vmap(jax.jacrev(everything, (0, 1))))
@@ -301,11 +296,9 @@ def test_lanes_parts_and_vmap_agree():
     depth = draw.uniform(-0.1, 0.1, (2, 3, 4))
     half = draw.uniform(0.02, 0.08, (3, 2, 3, 1))
     with jax.enable_x64(True):
-        share, moment = jax.jit(lambda u, d: submersion(tuple(u), d, tuple(half), "partial"))(
-            up, depth
-        )
+        share, moment = jax.jit(lambda u, d: cut_box(tuple(u), d, tuple(half)))(up, depth)
         flat = np.broadcast_to(half, up.shape).reshape(3, -1).T
-        one = jax.vmap(lambda u, d, h: submersion(tuple(u), d, tuple(h), "partial"))
+        one = jax.vmap(lambda u, d, h: cut_box(tuple(u), d, tuple(h)))
         each, moments = one(up.reshape(3, -1).T, depth.ravel(), flat)
     assert np.asarray(share).ravel() == pytest.approx(np.asarray(each), abs=1e-15)
     assert np.stack(moment).reshape(3, -1) == pytest.approx(np.stack(moments), abs=1e-15)
@@ -319,7 +312,7 @@ def test_force_and_moment_come_from_one_potential(name):
     depth = np.random.default_rng(2).uniform(-0.9, 0.9, n) * (np.abs(up) @ half)
 
     def first(state):
-        share, moment = submersion((state[1], state[2], state[3]), state[0], tuple(half), "partial")
+        share, moment = cut_box((state[1], state[2], state[3]), state[0], tuple(half))
         return jnp.stack([share, *(-m for m in moment)])
 
     with jax.enable_x64(True):
@@ -372,53 +365,6 @@ def test_archimedes_and_the_lever_of_the_centre_of_volume():
 # ------------------------------------------------------------------------- falling
 
 
-def center_of_mass(robot, qpos):
-    data = mujoco.MjData(robot.mj_model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(robot.mj_model, data)
-    mujoco.mj_comPos(robot.mj_model, data)
-    return data.subtree_com[0].copy()
-
-
-@pytest.fixture(scope="module")
-def falls():
-    """One compiled spider for water and for air: the surface tells which it is in."""
-    robot = build_robot(body("spider"), world(gravity=G, buoyancy="partial"))
-    qpos, qvel = at_rest(robot, 2, -1.0)
-    air_and_water = Water(np.array([-1e4, 0.0]), (0.0, 0.0, 0.0))
-    return robot, march(robot, 2.0, qpos, qvel, water=air_and_water, every=10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("lane", "expected"), [(0, 9.81), (1, 0.60648)])
-def test_the_thesis_spider_falls(falls, lane, expected):
-    """Drag and added mass off: 9.8100 m/s² in air, .60648 m/s² in water, to 1e-4."""
-    robot, (time, qpos, _, _) = falls
-    model = robot.mj_model
-    mass, volume = model.body_subtreemass[0], robot.fluid.volume.sum()
-    assert expected == pytest.approx(G if lane == 0 else G * (1 - WATER * volume / mass), abs=1e-5)
-    height = [center_of_mass(robot, row[:, lane])[2] for row in qpos]
-    start = center_of_mass(robot, at_rest(robot, 1, -1.0)[0][:, 0])[2]
-    # Semi-implicit Euler from rest: z_n = z_0 - a dt² n (n + 1) / 2, exactly.
-    n = np.round(time / 0.005)
-    fall = 2 * (start - np.array(height)) / (0.005**2 * n * (n + 1))
-    assert fall == pytest.approx(expected, abs=1e-5)
-    # The core itself: the legs are lighter than it and hang back by their servos' give.
-    core = 2 * (-1.0 - qpos[-1, 2, lane]) / (0.005**2 * n[-1] * (n[-1] + 1))
-    assert core == pytest.approx(expected, abs=1e-3)
-
-
-def test_a_single_module_falls_in_air_and_water():
-    robot = build_robot(body("core"), world(gravity=G, buoyancy="partial"))
-    qpos, qvel = at_rest(robot, 2, -1.0)
-    _, _, qvel, _ = march(
-        robot, 1.0, qpos, qvel, water=Water(np.array([-1e4, 0.0]), (0.0, 0.0, 0.0)), x64=False
-    )
-    net = G * (1 - WATER * 5.054e-5 / 0.09)
-    # float32: a sum of 200 equal steps.
-    assert -qvel[-1, 2] == pytest.approx([G, net], rel=2e-6)
-
-
 # ------------------------------------------------------------------------- hovering and floating
 
 
@@ -431,66 +377,6 @@ def test_a_neutral_spider_stays_put_for_ten_seconds():
     # The legs float and the core sinks by what the servos give, a tenth of a millimetre.
     assert np.abs(qpos[:, :3] - start[:3]).max() < 5e-4
     assert np.abs(qpos[:, 4:7]).max() < 1e-4
-
-
-@pytest.mark.parametrize(
-    ("size", "relative_density"),
-    [((0.2, 0.2, 0.1), 0.5), ((0.3, 0.2, 0.08), 0.8)],
-)
-def test_a_box_floats_at_its_draft(size, relative_density):
-    tank = world(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
-    robot = box_robot(size, relative_density * WATER * np.prod(size), tank)
-    qpos, qvel = at_rest(robot, 3)
-    level = size[2] * (0.5 - relative_density)
-    # At its draft; dropped from above the water; let go below it, tilted.
-    qpos[2] = level, level + size[2], level - size[2]
-    qpos[4, 2] = 0.1
-    _, qpos, qvel, _ = march(robot, 60.0, qpos, qvel, every=20)
-    assert np.abs(qpos[:, 2, 0] - level).max() < 1e-9
-    # Quadratic drag lets small bobs die like 1/t; their middle is the draft, and they stay upright.
-    late = qpos[300:]
-    assert late[:, 2].mean(0) == pytest.approx(level, abs=0.005 * size[2])
-    assert np.abs(late[:, 2] - level).max() < 0.08 * size[2]
-    assert np.abs(late[:, 4:6]).max() < 0.02
-
-
-@pytest.mark.parametrize(
-    ("size", "relative_density", "added_mass"),
-    [((0.2, 0.2, 0.1), 0.5, False), ((0.2, 0.2, 0.1), 0.5, True), ((0.4, 0.1, 0.2), 0.7, True)],
-)
-def test_bobbing_frequency(size, relative_density, added_mass):
-    """ω² = ρ g A / (m + share × m_a): a half-wet box carries its wet share of the water."""
-    tank = world(gravity=G, buoyancy="partial", added_mass=added_mass, timestep=0.002)
-    mass = relative_density * WATER * np.prod(size)
-    robot = box_robot(size, mass, tank)
-    qpos, qvel = at_rest(robot)
-    level = size[2] * (0.5 - relative_density)
-    amplitude = 1e-3 * size[2]
-    qpos[2] = level + amplitude
-    time, qpos, _, _ = march(robot, 4.0, qpos, qvel)
-    carried = relative_density * WATER * robot.fluid.added_mass[0, 2] if added_mass else 0.0
-    omega = np.sqrt(WATER * G * size[0] * size[1] / (mass + carried))
-    # First order in the time step, second in the amplitude (the carried share varies with draft).
-    assert qpos[:, 2, 0] - level == pytest.approx(
-        amplitude * np.cos(omega * time), abs=0.02 * amplitude
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("added_mass", [False, True])
-def test_righting_frequency_of_a_submerged_box(added_mass):
-    """A neutral box, its volume above its mass, swings like a pendulum: ω² = ρVgh / (I + I_a)."""
-    size, lever = (0.06, 0.1, 0.04), 0.004
-    tank = world(gravity=G, buoyancy="partial", added_mass=added_mass, timestep=0.001)
-    mass = WATER * np.prod(size)
-    robot = box_robot(size, mass, tank, center_of_volume=(0.0, 0.0, lever))
-    qpos, qvel = at_rest(robot, 1, -2.0)
-    qpos[3:5, 0] = np.cos(5e-4), np.sin(5e-4)
-    time, qpos, _, _ = march(robot, 4.0, qpos, qvel)
-    inertia = mass * (size[1] ** 2 + size[2] ** 2) / 12
-    inertia += WATER * robot.fluid.added_inertia[0, 0] if added_mass else 0.0
-    omega = np.sqrt(mass * G * lever / inertia)
-    assert 2 * qpos[:, 4, 0] == pytest.approx(1e-3 * np.cos(omega * time), abs=2e-5)
 
 
 def test_a_box_is_cut_where_it_is_wherever_its_volume_has_its_centre():
@@ -517,7 +403,7 @@ def test_a_box_is_cut_where_it_is_wherever_its_volume_has_its_centre():
 def part_buoyancy(robot, qpos, qvel):
     """`[lanes, npart, 3]` buoyancy of each part, world frame."""
     with jax.enable_x64(True):
-        levels = make_levels(robot)
+        levels = make_single_tree(robot)
         state = init(levels, jnp.asarray(qpos), jnp.asarray(qvel))
         thrusts = jnp.zeros((robot.num_thrusters, qpos.shape[1]))
         run = jax.jit(partial(part_forces, levels), compiler_options=QUICK)

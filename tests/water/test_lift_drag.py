@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import accelerate, at_rest, box_robot, march, world
+from laboratory import accelerate, at_rest, box_robot, face_drag, march, world
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.lift_drag import LiftDrag, lift_drag, lift_drag_damping, lift_drag_wrench
 
@@ -145,30 +145,6 @@ def test_named_departures():
 
 
 # ------------------------------------------------------------------------- values by hand
-
-
-@pytest.mark.parametrize(
-    ("degrees", "lift", "drag"),
-    [
-        (0, 0, 0),
-        (10, 20, 1),  # on the slopes, 2 and .1
-        (20, 40, 2),  # at the stall
-        (30, 30, 12),  # 10° past it, with -1 and 1
-        (60, 0, 42),  # all lift gone
-        (80, 0, 62),  # and it stays so
-    ],
-)
-def test_lift_and_drag_coefficients_by_hand(degrees, lift, drag):
-    """On both sides, and from behind; q A = ½ ρ U² A. Lift stands across the flow."""
-    p = LiftDrag(cla=2.0, cda=0.1, alpha_stall=math.pi / 9, cla_stall=-1.0, cda_stall=1.0)
-    lift, drag = math.radians(lift), math.radians(drag)
-    angle, speed = math.radians(degrees), 1.7
-    for side in (1, -1):
-        v = flow(side * angle, speed)[:, 0]
-        up = np.array([math.sin(side * angle), 0, math.cos(angle)])
-        expected = 0.5 * RHO * speed**2 * AREA * (side * lift * up - drag * v / speed)
-        assert wrench(v, p)[0] == pytest.approx(expected, abs=1e-12)
-        assert wrench(-v, p)[0] == pytest.approx(-expected, abs=1e-12)
 
 
 def test_zero_lift_at_minus_a0_and_slope_there():
@@ -442,7 +418,7 @@ def test_centre_of_pressure():
     force, moment = wrench(v + np.cross(w, cp, 0, 0, 0), p, area=SIZE[0] * SIZE[1])
     spin = INERTIA[:, None] * w
     torque = moment + np.cross(cp, force, 0, 0, 0) - np.cross(w, spin, 0, 0, 0)
-    torque -= RHO * robot.fluid.drag_angular[0][:, None] * np.abs(w) * w
+    torque -= face_drag(robot).angular[0][:, None] * np.abs(w) * w
     assert found[:3] == pytest.approx(force / MASS, rel=1e-9, abs=1e-9)
     assert found[3:] == pytest.approx(torque / INERTIA[:, None], rel=1e-9, abs=1e-8)
 

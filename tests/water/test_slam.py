@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from laboratory import QUICK, arm_robot, at_rest, box_robot, limp, march, random_states, world
-from mjx_revolve.water.buoyancy import submersion
+from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
 from mjx_revolve.water.flow import Water
 from references import Lagrangian
 
@@ -32,7 +32,9 @@ def axes(qpos):
 
 @lru_cache
 def _cut(half, mode):
-    return jax.jit(lambda up, depth: submersion(up, depth, half, mode), compiler_options=QUICK)
+    return jax.jit(
+        lambda up, depth: BUOYANCY_LAWS[mode].submersion(up, depth, half), compiler_options=QUICK
+    )
 
 
 def wetness(qpos, mode="partial"):

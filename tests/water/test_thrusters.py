@@ -13,9 +13,10 @@ from mjx_revolve.body.catalogue import MODULES, Thruster
 from mjx_revolve.water.thrusters import (
     basic_thrust,
     dead_band_thrust,
-    first_order_lag,
     ideal_power,
     interpolated_thrust,
+    lag_decay,
+    lagged_command,
     thrust,
 )
 
@@ -26,6 +27,10 @@ LINE = Thruster(
 BAND = Thruster(curve="dead_band", gain=2.0, gain_backward=0.5, dead_band=(-0.1, 0.3))
 BASIC = Thruster(gain=3.0)
 ALL = {"basic": BASIC, "dead_band": BAND, "interpolated": LINE, "catalogue's": None}
+
+
+def first_order_lag(before, command, time_constant, dt):
+    return lagged_command(before, command, lag_decay(time_constant, dt))
 
 
 def curve(name: str) -> Thruster:

@@ -14,7 +14,7 @@ from mjx_revolve.water.flow import (
     flow,
     gust_path,
     is_uniform,
-    needs_place,
+    needs_horizontal_position,
     surface,
     water_of,
 )
@@ -77,8 +77,8 @@ def test_still_water_costs_nothing():
 
 def test_what_a_step_asks_of_a_world():
     still, drifting = make_world(), make_world(current=(0, 0.1, 0))
-    assert (is_uniform(still), needs_place(still)) == (True, False)
-    assert not needs_place(drifting)
+    assert (is_uniform(still), needs_horizontal_position(still)) == (True, False)
+    assert not needs_horizontal_position(drifting)
     field = CurrentField([0.0], [0.0], [0.0], np.zeros((1, 1, 1, 3)))
     for fields in (
         {"waves": SEA},
@@ -86,7 +86,7 @@ def test_what_a_step_asks_of_a_world():
         {"current_field": field},
     ):
         world = make_world(**fields)
-        assert (is_uniform(world), needs_place(world)) == (False, True)
+        assert (is_uniform(world), needs_horizontal_position(world)) == (False, True)
 
 
 def test_all_motion_adds_up():

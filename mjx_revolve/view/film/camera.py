@@ -188,7 +188,7 @@ def plan_circle(
     some = alive.any(axis=0)
     middle = np.zeros((len(time), 3))
     middle[some] = np.nanmedian(there[:, some], axis=0)
-    # Where nobody is left, the camera stays.
+    # Where no robot is left, the camera stays.
     rows = np.maximum.accumulate(np.where(some, np.arange(len(time)), 0))
     target = _smooth(middle[rows], _DRIFT / step)
     away = np.linalg.norm((there - target)[..., :2], axis=-1)[alive]

@@ -1,7 +1,7 @@
-"""A film's pictures: into arrays, one frame after the other, or into MuJoCo's own window.
+"""A film's pictures: as arrays, one frame after the other, or in MuJoCo's own window.
 
-MuJoCo's renderer gives colours, and how far away they are; `mujoco.Renderer` would draw twice for
-both. Frames come one by one, so that a long film needs no more memory than a short one.
+MuJoCo's renderer gives colours and their distances; `mujoco.Renderer` would draw twice for both.
+Frames come one by one, so that a long film needs no more memory than a short one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from typing import Any
 
 import jax
@@ -21,19 +20,21 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.film.film import Film, Shown
-from mjx_revolve.view.film.overlay import Overlay, make_overlay
-from mjx_revolve.view.film.stage import SUN, SURFACE, build_stage
+from mjx_revolve.view.film.film import Film
+from mjx_revolve.view.film.overlay import make_overlay
+from mjx_revolve.view.film.stage import SURFACE, build_stage, robot_qpos
 from mjx_revolve.view.film.waterlight import make_shader
+from mjx_revolve.view.palette import SUN
 
-# How far one sees, in distances of the camera from the robot.
-SIGHT = 9.0
-# The bed, the robot's parts, and what a user adds in the viewer.
+# Range of sight, in distances of the camera from the robot.
+_SIGHT = 9.0
+# The bed, and what a user adds in the viewer.
 _MOST_GEOMS = 4000
+# A group of geoms that is not drawn.
+_HIDDEN = 5
 # The sky is a cube about so large, in shares of the far plane's distance; nothing else is that far.
 _SKY = 0.3
 
-_Pose = Callable[[mujoco.MjData, int], None]
 _Paint = Callable[[mujoco.MjvScene], tuple[np.ndarray, np.ndarray]]
 
 
@@ -41,72 +42,62 @@ def draw_frames(film: Film, way: str) -> Iterator[np.ndarray]:
     """Draws a film.
 
     Args:
-        film: from `make_film`.
+        film: from `make_film` or `make_colony_film`.
         way: of making an OpenGL context, from `opengl.find_opengl`.
 
     Yields:
         `[height, width, 3]` uint8, one frame after the other.
     """
-    model = _stage_of(film, plain=True)
-    pose = partial(_pose, film)
-    yield from draw_staged(film, model, pose, make_overlay(film), way)
+    for picture, depth, frame in draw_shaded(film, way):
+        if frame == 0:
+            overlay = make_overlay(film)
+        yield overlay(picture, depth, frame)
 
 
-def draw_staged(
-    film: Shown,
-    model: mujoco.MjModel,
-    pose: _Pose,
-    overlay: Overlay,
-    way: str,
-    fine: float = 1.0,
-) -> Iterator[np.ndarray]:
-    """Draws a film of whoever is in a model.
-
-    Args:
-        film: where the camera stands in what water, frame by frame.
-        model: what is drawn, counted from the film's origin.
-        pose: sets a model's data to a frame.
-        overlay: what is laid over frames, as from `overlay.make_overlay`.
-        way: see `draw_frames`.
-        fine: how fine the surface is and how thick the haze, next to films of one robot.
+def draw_shaded(film: Film, way: str) -> Iterator[tuple[Any, np.ndarray, int]]:
+    """Draws a film without marks and words; see `draw_frames`.
 
     Yields:
-        See `draw_frames`.
+        `[height, width, 3]` uint8, depths along the view `[height, width]` [m], the frame's number.
     """
-    shots, world = film.shots, film.robot.world
-    shade = make_shader(world, film.size, shots.distance / fine, shots.above, film.origin.tolist())
+    model, shots, origin = _stage_of(film, plain=True), film.shots, film.origin
+    shade = make_shader(
+        film.world, film.size, shots.distance / film.fine, shots.above, origin.tolist()
+    )
     waiting: tuple[Any, np.ndarray, int] | None = None
     with _open_painter(model, film.size, way) as paint:
         data, scene = mujoco.MjData(model), mujoco.MjvScene(model, _MOST_GEOMS + model.ngeom)
         for flag in (mujoco.mjtRndFlag.mjRND_FOG, mujoco.mjtRndFlag.mjRND_HAZE):
             scene.flags[flag] = 0
+        groups = model.geom_group.copy()
         for frame in range(len(film.time)):
-            _arrange(model, data, scene, film, pose, frame)
+            _arrange(model, data, scene, film, groups, frame)
             color, depth = paint(scene)
             water = jax.tree.map(lambda x, frame=frame: np.float32(x[frame]), film.water)
             # JAX works on this frame while MuJoCo draws the next.
             shaded = shade(
                 color,
                 depth,
-                (shots.position[frame] - film.origin).astype(np.float32),
+                (shots.position[frame] - origin).astype(np.float32),
                 shots.axes(frame).astype(np.float32),
-                water._replace(surface_height=water.surface_height - np.float32(film.origin[2])),
+                water._replace(surface_height=water.surface_height - np.float32(origin[2])),
             )
             if waiting is not None:
-                yield overlay(*waiting)
+                yield waiting
             waiting = (shaded, depth, frame)
         if waiting is not None:
-            yield overlay(*waiting)
+            yield waiting
 
 
 def _stage_of(film: Film, plain: bool) -> mujoco.MjModel:
-    """What is drawn of a film's robot and the world around its way."""
-    distance = film.shots.distance
-    reach = float(np.linalg.norm(np.ptp(film.center[:, :2], axis=0))) / 2 + distance
-    return build_stage(film.robot, film.size, film.origin, reach, SIGHT * distance, plain)
+    """What is drawn of a film's robots and the world around them."""
+    distance, off = film.shots.distance, film.center - film.origin
+    reach = float(np.linalg.norm(off[:, :2], axis=1).max()) + distance
+    robots = {k: one.robot for k, one in enumerate(film.robots)}
+    return build_stage(robots, film.world, film.size, film.origin, reach, _SIGHT * distance, plain)
 
 
-def _aim(camera: mujoco.MjvCamera, film: Shown, frame: int) -> None:
+def _aim(camera: mujoco.MjvCamera, film: Film, frame: int) -> None:
     """Puts MuJoCo's camera where the film's stands."""
     shots = film.shots
     x, y, z = shots.axes(frame)[2]
@@ -116,22 +107,28 @@ def _aim(camera: mujoco.MjvCamera, film: Shown, frame: int) -> None:
     camera.elevation = math.degrees(math.asin(np.clip(z, -1.0, 1.0)))
 
 
-def _pose(film: Film, data: mujoco.MjData, frame: int) -> None:
-    """Puts the robot where it is in a frame."""
-    data.qpos[:] = film.qpos[frame]
-    data.qpos[:3] -= film.origin
+def _pose(model: mujoco.MjModel, data: mujoco.MjData, film: Film, frame: int) -> None:
+    """Puts the robots where they are in a frame."""
+    for k, one in enumerate(film.robots):
+        own = robot_qpos(model, data, k)
+        own[:] = one.qpos[frame]
+        own[:3] -= film.origin
 
 
 def _arrange(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     scene: mujoco.MjvScene,
-    film: Shown,
-    pose: _Pose,
+    film: Film,
+    groups: np.ndarray,
     frame: int,
 ) -> None:
-    """Poses who is shown, and puts camera and light in their places."""
-    pose(data, frame)
+    """Puts robots, camera and light in their places; hides robots that are not alive."""
+    owner = model.body_rootid[model.geom_bodyid]
+    for k, one in enumerate(film.robots):
+        own = owner == model.jnt_bodyid[model.joint(f"{k}/root").id]
+        model.geom_group[own] = groups[own] if one.alive[frame] else _HIDDEN
+    _pose(model, data, film, frame)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
@@ -139,9 +136,10 @@ def _arrange(
     option.geomgroup[SURFACE] = 0
     mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
     # The shadow map is spread around the sun's own place: close to the robot it is fine.
+    sun = film.center[frame] - film.origin + 4.0 * film.shots.distance * np.array(SUN)
     for light in scene.lights[: scene.nlight]:
         if light.castshadow:
-            light.pos[:] = film.center[frame] - film.origin + 4.0 * film.shots.distance * SUN
+            light.pos[:] = sun
     # What is there for show casts no shadow. The bed's own would only stain it with dots.
     for geom in scene.geoms[: scene.ngeom]:
         if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and model.geom_bodyid[geom.objid] == 0:
@@ -214,7 +212,7 @@ def show_film(film: Film) -> None:
         while window.is_running():
             frame = int((time.monotonic() - begun) * film.fps) % len(film.time)
             with window.lock():
-                _pose(film, data, frame)
+                _pose(model, data, film, frame)
                 # The user may turn the camera; it goes along with the robot.
                 window.cam.lookat[:] += target[frame] - target[last]
                 mujoco.mj_forward(model, data)

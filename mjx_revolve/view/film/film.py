@@ -1,59 +1,79 @@
-"""A film as a value: poses at equal times, the water and the robot's way, and where the camera is.
+"""A film as a value: robots and their poses at equal times, the water, and where the camera is.
 
-Whoever draws frames (`draw`), or lays something over them (`overlay`), reads it from here.
+`draw` draws its frames, `overlay` lays marks and words over them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
-from mjx_revolve.view.course import bed_at, finite_part, nearer_signs, pose_robot
-from mjx_revolve.view.film.camera import Shots, plan_shots
-from mjx_revolve.view.forces import water_at
+from mjx_revolve.view.film.camera import Shots, plan_circle, plan_shots
 from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
-from mjx_revolve.water.flow import Water
+from mjx_revolve.view.poses import finite_rows, pose_robot
+from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
+from mjx_revolve.view.surroundings import bed_at, target_of, water_at, water_velocity
+from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.water.world import World
+
+# From the air, the ripples around many robots are so much smaller than the camera's distance would
+# have them. In the water the haze would be thicker by as much. A choice.
+_FINE = 2.5
 
 
-class Shown(Protocol):
-    """What films of one robot and of many have in common; see `Film`."""
+@dataclass(frozen=True, eq=False)
+class FilmRobot:
+    """A robot of a film of F frames.
 
-    @property
-    def robot(self) -> Robot:
-        """One whose world it is."""
+    Attributes:
+        robot: its body.
+        qpos: `[F, nq]` its poses, world frame.
+        alive: `[F]` whether it is shown.
+    """
 
-    @property
-    def fps(self) -> int:
-        """Frames per second."""
+    robot: Robot
+    qpos: np.ndarray
+    alive: np.ndarray
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height [pixels]."""
 
-    @property
-    def time(self) -> np.ndarray:
-        """`[F]` of the frames [s]."""
+@dataclass(frozen=True, eq=False)
+class EpisodeNotes:
+    """What is written and marked over the frames of an episode.
 
-    @property
-    def center(self) -> np.ndarray:
-        """`[F, 3]` the middle of who is shown [m]."""
+    Attributes:
+        score: a line below the title.
+        way: `[F, 3]` of the robot without the to and fro of its strokes, world frame [m].
+        radius: `[F]` of balls around the robot [m].
+        speed: `[F]` of the core, over a stroke or a second around each frame [m/s].
+        current: `[F, 3]` velocity of the water around the robot, waves apart, world frame [m/s].
+        target: `[F, 3]` world frame [m]; None without one.
+    """
 
-    @property
-    def water(self) -> Water:
-        """Of `[F]` each."""
+    score: str
+    way: np.ndarray
+    radius: np.ndarray
+    speed: np.ndarray
+    current: np.ndarray
+    target: np.ndarray | None
 
-    @property
-    def shots(self) -> Shots:
-        """The camera."""
 
-    @property
-    def origin(self) -> np.ndarray:
-        """`[3]` from where OpenGL counts [m]."""
+@dataclass(frozen=True, eq=False)
+class ColonyNotes:
+    """What is written and marked over the frames of a colony.
+
+    Attributes:
+        marks: places to show.
+        births: time `[B]` [s] and index `[B]` of the robots that are born in the film.
+        deaths: the same of those that die.
+    """
+
+    marks: tuple[Mark, ...]
+    births: tuple[np.ndarray, np.ndarray]
+    deaths: tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,56 +81,41 @@ class Film:
     """What is shown, and when; F frames, world frame.
 
     Attributes:
-        episode: whose life it is.
+        title: what is shown.
+        robots: all that ever appear, in one world.
         fps: frames per second.
         size: width and height [pixels].
         time: `[F]` of the frames [s].
-        qpos: `[F, nq]` the robot's poses.
-        center: `[F, 3]` of balls that hold the robot [m].
-        radius: `[F]` of these balls [m].
-        way: `[F, 3]` of their centres without the to and fro of the strokes [m].
-        speed: `[F]` of the core, over a stroke or a second around each frame [m/s].
+        center: `[F, 3]` middle of what is shown [m].
         water: of `[F]` each.
         shots: the camera.
+        origin: `[3]` OpenGL counts from there: near its origin it has digits for small robots [m].
+        fine: how fine ripples are and how thin the haze is, next to films of one robot.
+        notes: what is laid over the frames.
         lost: time from which the trajectory is not finite, or None [s].
     """
 
-    episode: Episode
+    title: str
+    robots: tuple[FilmRobot, ...]
     fps: int
     size: tuple[int, int]
     time: np.ndarray
-    qpos: np.ndarray
     center: np.ndarray
-    radius: np.ndarray
-    way: np.ndarray
-    speed: np.ndarray
     water: Water
     shots: Shots
-    lost: float | None
+    origin: np.ndarray
+    fine: float
+    notes: EpisodeNotes | ColonyNotes
+    lost: float | None = None
 
     @property
-    def robot(self) -> Robot:
-        """The robot."""
-        return self.episode.robot
-
-    @property
-    def cast(self) -> int:
-        """How many robots there are."""
-        return 1
-
-    @property
-    def title(self) -> str:
-        """What is shown."""
-        return self.episode.title
-
-    @property
-    def origin(self) -> np.ndarray:
-        """`[3]` middle of the way [m]; OpenGL counts from there."""
-        return (self.center.min(axis=0) + self.center.max(axis=0)) / 2
+    def world(self) -> World:
+        """Around all robots."""
+        return self.robots[0].robot.world
 
 
 def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 30) -> Film:
-    """Chooses the frames, and plans the camera.
+    """Chooses the frames of an episode, and plans a camera that follows the robot.
 
     Args:
         episode: what to show.
@@ -124,19 +129,16 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
         InputError: the trajectory has no finite row.
     """
     robot, world = episode.robot, episode.robot.world
-    episode, lost = finite_part(episode)
+    episode, lost = finite_rows(episode)
     rows = np.asarray(episode.trajectory.time, float)
     # Times are multiples of the step from the start, which is one step before the first row.
     time = np.arange(max(1, round(float(rows[-1]) * fps))) / fps
-    qpos = np.array(episode.trajectory.qpos, float)
-    qpos[:, 3:7] = nearer_signs(qpos[:, 3:7])
-    qpos = np.stack([np.interp(time, rows, column) for column in qpos.T], axis=-1)
-    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    qpos = ReplayRobot("", robot, rows, np.asarray(episode.trajectory.qpos)).poses_at(time)
     parts = pose_robot(robot, qpos).parts
     center, radius = enclosing_balls(parts, np.linalg.norm(robot.fluid.half_size, axis=1))
     period = stroke_period(time, qpos[:, 7:])
     before = np.round(time / world.timestep).astype(int) - 1
-    water = water_at(robot, before, time, len(rows), episode.water)
+    water = water_at(world, before, time, len(rows), episode.water)
     shots = plan_shots(
         time,
         center,
@@ -147,8 +149,69 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
         along=_long_axis(parts[0]),
         bed=None if world.bed is None else partial(bed_at, world.bed),
     )
-    way, speed = smooth_path(time, center, period), speed_over(time, qpos[:, :3], period)
-    return Film(episode, fps, size, time, qpos, center, radius, way, speed, water, shots, lost)
+    score = ""
+    if episode.score is not None:
+        score = f"score {episode.score:.3g} {episode.score_unit}".rstrip()
+        score += f", mean over {episode.starts}"
+    fitness = episode.fitness
+    target = target_of(None if fitness is None else fitness.config.task, episode.trajectory)
+    if target is not None:
+        target = np.stack([np.interp(time, rows, x) for x in target[: len(rows)].T], axis=-1)
+    notes = EpisodeNotes(
+        score, smooth_path(time, center, period), radius, speed_over(time, qpos[:, :3], period),
+        water_velocity(world, water, center), target,
+    )  # fmt: skip
+    shown = FilmRobot(robot, qpos, np.ones(len(time), bool))
+    origin = (center.min(axis=0) + center.max(axis=0)) / 2
+    return Film(
+        episode.title, (shown,), fps, size, time, center, water, shots, origin, 1.0, notes, lost
+    )
+
+
+def make_colony_film(
+    recording: Recording, size: tuple[int, int] = (640, 480), fps: int = 30
+) -> Film:
+    """Chooses the frames of a colony, and plans a camera that circles over it.
+
+    Args:
+        recording: what to show.
+        size: width and height [pixels].
+        fps: frames per second.
+
+    Returns:
+        The film.
+    """
+    begin, end = recording.start, recording.end
+    time = begin + np.arange(max(1, round((end - begin) * fps))) / fps
+    starts = np.array([one.appears for one in recording.robots])
+    ends = np.array([np.inf if one.end is None else one.end for one in recording.robots])
+    robots = tuple(
+        FilmRobot(one.robot, one.poses_at(time, recording.leap), (time >= start) & (time < stop))
+        for one, start, stop in zip(recording.robots, starts, ends, strict=True)
+    )
+    world = robots[0].robot.world
+    surface, current, acceleration, _ = water_of(world)
+    fill = lambda x: np.full(len(time), x, np.float32)  # noqa: E731
+    water = Water(
+        fill(surface), tuple(map(fill, current)), tuple(map(fill, acceleration)), fill(0) + time
+    )
+    shots = plan_circle(
+        time,
+        np.stack([one.qpos[:, :3] for one in robots]),
+        np.stack([one.alive for one in robots]),
+        reach=max(one.robot.morphology.length for one in robots) / 2,
+        aspect=size[0] / size[1],
+        surface=world.surface_height,
+        waves=sum(wave.amplitude for wave in world.waves),
+        bed=None if world.bed is None else partial(bed_at, world.bed),
+    )
+    born, died = np.flatnonzero(starts > begin), np.flatnonzero(ends <= end)
+    notes = ColonyNotes(tuple(recording.marks), (starts[born], born), (ends[died], died))
+    # Colonies live around the world's origin.
+    return Film(
+        recording.title, robots, fps, size, time, shots.target, water, shots, np.zeros(3),
+        _FINE if shots.above else 1.0, notes,
+    )  # fmt: skip
 
 
 def enclosing_balls(parts: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

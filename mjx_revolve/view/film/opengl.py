@@ -2,7 +2,7 @@
 
 MuJoCo chooses OpenGL when it is imported, by the environment variable MUJOCO_GL, and then has no
 second try. Here each way of making a context is tried in a process of its own, where a driver that
-crashes does no harm. Nothing here imports MuJoCo, so it can be asked before.
+crashes does no harm. Nothing here imports MuJoCo, so it can run before that.
 """
 
 from __future__ import annotations
@@ -65,10 +65,10 @@ def find_opengl() -> str:
 def check_screen(
     option: str = "--view", hint: str = "without --view a film is written, which needs none"
 ) -> None:
-    """Refuses an option where nobody could see what it shows.
+    """Refuses an option that needs a screen where there is none.
 
     Args:
-        option: what asked for a screen.
+        option: that needs a screen.
         hint: what to do without one.
 
     Raises:

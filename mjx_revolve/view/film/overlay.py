@@ -1,13 +1,14 @@
-"""What is laid over a film's frames: motes in the water, marks along the way, and words.
+"""What is laid over a film's frames: motes in the water, marks, and words.
 
-Motes and marks show that the robot moves; the words say what is shown, how long, how fast, how
-deep, and how large things are.
+Motes and marks show that robots move; the words say what is shown, how long, how fast, how deep,
+and how large things are.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,55 +16,68 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mjx_revolve.view.course import bed_at, water_drift
 from mjx_revolve.view.film.camera import FOVY
-from mjx_revolve.view.film.film import Film, Shown
-from mjx_revolve.view.surroundings import moves, target_of, water_velocity
+from mjx_revolve.view.film.film import ColonyNotes, EpisodeNotes, Film
+from mjx_revolve.view.palette import ACCENT, BIRTH, CURRENT, DEATH, DUST, PLACE, RGB, TARGET
+from mjx_revolve.view.surroundings import bed_at, is_moving, water_drift
 
 # Motes in a cube around the camera, and its edge in camera distances.
 _MOTES, _CUBE = 1500, 6.0
 # The trail: a mark every so often, for so long [s].
 _MARK, _TRAIL = 0.25, 12.0
-# Red, green, blue of both.
-PALE, YELLOW = (0.86, 0.97, 1.0), (1.0, 0.88, 0.45)
 _REACH = 7  # of a dot [pixels]
-WHITE, _SHADE, SOFT = (255, 255, 255, 245), (4, 28, 44, 150), (226, 240, 246, 235)
-
-_AIM, _FLOW = (255, 92, 150, 255), (122, 255, 220, 255)  # target, current
+# Rings of births grow, those of deaths shrink, for so long [s].
+_RING = 2.0
+# From dot to dot of a ring, and their radius, in shares of the camera's distance.
+_SPACE, _DOT = 0.012, 0.0032
+# Colours of words and lines, with opacity, and of their shadow.
+_WHITE, _SHADE, _SOFT = (255, 255, 255, 245), (4, 28, 44, 150), (226, 240, 246, 235)
+AIM, FLOW = ((*(round(255 * x) for x in color), 255) for color in (TARGET, CURRENT))
 
 Overlay = Callable[[Any, np.ndarray, int], np.ndarray]
 _Dots = Callable[[np.ndarray, np.ndarray, int], None]
+_Words = Callable[["Pen", int], None]
 
 
 def make_overlay(film: Film) -> Overlay:
     """Prepares what is laid over frames.
 
     Args:
-        film: whose frames they are.
+        film: of the frames.
 
     Returns:
         A function of a picture `[height, width, 3]` uint8, its depths along the view `[height,
         width]` [m] and the frame's number, which returns a new picture.
     """
-    layers = (make_motes(film), _make_marks(film))
-    write = _make_captions(film)
+    layers: list[_Dots] = [] if film.shots.above else [_make_motes(film)]
+    if isinstance(film.notes, EpisodeNotes):
+        layers.append(_make_trail(film, film.notes))
+        words = _make_episode_words(film, film.notes)
+    else:
+        layers.append(_make_rings(film, film.notes))
+        words = _make_colony_words(film, film.notes)
 
     def overlay(picture: Any, depth: np.ndarray, frame: int) -> np.ndarray:
         picture = np.array(picture)
         for layer in layers:
             layer(picture, depth, frame)
-        return write(picture, frame)
+        pen = Pen(picture)
+        words(pen, frame)
+        return np.asarray(pen.image)
 
     return overlay
 
 
-def make_motes(film: Shown) -> _Dots:
-    """Motes that go where the water goes that is around the robot, waves apart."""
+# --- dots -----------------------------------------------------------------------------------------
+
+
+def _make_motes(film: Film) -> _Dots:
+    """Motes that go with the water around the middle of what is shown, waves apart."""
     random = np.random.default_rng(3)
     edge = _CUBE * film.shots.distance
     place = random.uniform(0.0, edge, (_MOTES, 3))
     weight = random.uniform(0.25, 1.0, _MOTES) ** 2
-    drift = water_drift(film.robot, film.water, film.center, 1 / film.fps)
+    drift = water_drift(film.world, film.water, film.center, 1 / film.fps)
     size = 0.0032 * film.shots.distance * (0.5 + weight)
 
     def draw(picture: np.ndarray, depth: np.ndarray, frame: int) -> None:
@@ -75,38 +89,62 @@ def make_motes(film: Shown) -> _Dots:
         # Not in the lens, and none that stands in the air.
         surface = np.asarray(film.water.surface_height)[frame]
         alpha *= np.clip(8.0 * off - 1.2, 0.0, 1.0) * (motes[:, 2] < surface - 0.02)
-        add_dots(picture, depth, film, frame, motes, alpha, size, PALE)
+        _add_dots(picture, depth, film, frame, motes, alpha, size, DUST)
 
-    return (lambda picture, depth, frame: None) if film.shots.above else draw
+    return draw
 
 
-def _make_marks(film: Film) -> _Dots:
+def _make_trail(film: Film, notes: EpisodeNotes) -> _Dots:
     """Marks along the way, that fade."""
     places = np.arange(0, len(film.time), max(1, round(_MARK * film.fps)))
 
     def draw(picture: np.ndarray, depth: np.ndarray, frame: int) -> None:
         age = (frame - places) / film.fps
         recent = (age > 0) & (age < _TRAIL)
-        marks, age = film.way[places[recent]], age[recent]
+        marks, age = notes.way[places[recent]], age[recent]
         # They come up behind the robot rather than inside it.
         away = np.linalg.norm(marks - film.center[frame], axis=1)
         alpha = 0.85 * (1.0 - age / _TRAIL)
-        alpha *= np.clip(4.0 * away / film.radius[frame] - 2.0, 0.0, 1.0)
+        alpha *= np.clip(4.0 * away / notes.radius[frame] - 2.0, 0.0, 1.0)
         size = np.full(len(marks), 0.0065 * film.shots.distance)
-        add_dots(picture, depth, film, frame, marks, alpha, size, YELLOW)
+        _add_dots(picture, depth, film, frame, marks, alpha, size, ACCENT)
 
     return draw
 
 
-def add_dots(
+def _make_rings(film: Film, notes: ColonyNotes) -> _Dots:
+    """Level rings of dots: around places, and around robots that are born or die."""
+    distance = film.shots.distance
+
+    def draw(picture: np.ndarray, depth: np.ndarray, frame: int) -> None:
+        def ring(middle: Any, radius: float, alpha: float, color: RGB) -> None:
+            count = max(12, round(2 * math.pi * radius / (_SPACE * distance)))
+            angle = 2 * np.pi * np.arange(count) / count
+            points = middle + radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+            faint, size = np.full(count, alpha), np.full(count, _DOT * distance)
+            _add_dots(picture, depth, film, frame, points, faint, size, color)
+
+        for mark in notes.marks:
+            ring(mark.place, mark.radius, 0.5, PLACE)
+        for (times, index), color, grows in ((notes.births, BIRTH, 1), (notes.deaths, DEATH, 0)):
+            for time, k in zip(times, index, strict=True):
+                age, one = (film.time[frame] - time) / _RING, film.robots[k]
+                if 0 <= age < 1:
+                    radius = one.robot.morphology.length * (0.6 + 1.4 * abs(1 - grows - age))
+                    ring(one.qpos[frame, :3], radius, 0.95 * math.sqrt(1 - age), color)
+
+    return draw
+
+
+def _add_dots(
     picture: np.ndarray,
     depth: np.ndarray,
-    film: Shown,
+    film: Film,
     frame: int,
     points: np.ndarray,
     alpha: np.ndarray,
     size: np.ndarray,
-    color: tuple[float, float, float],
+    color: RGB,
 ) -> None:
     """Lays soft dots of radii `size` [m] at points `[n, 3]` [m] over a picture, in place.
 
@@ -135,150 +173,146 @@ def add_dots(
     picture[place] = np.round(old + share * (255 * np.asarray(color) - old)).astype(np.uint8)
 
 
-def make_fonts(unit: float) -> tuple[Any, Any]:
-    """The bold and the plain font of captions, for a unit of so many pixels."""
-    fonts = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
-    bold = ImageFont.truetype(fonts / "DejaVuSans-Bold.ttf", round(15 * unit))
-    return bold, ImageFont.truetype(fonts / "DejaVuSans.ttf", round(12.5 * unit))
+# --- words ----------------------------------------------------------------------------------------
 
 
-def shorten(title: str, font: Any, room: float) -> str:
-    """A title that fits into so many pixels."""
-    if font.getlength(title) > room:
-        while title and font.getlength(title + "…") > room:
-            title = title[:-1]
-        title += "…"
-    return title
+@lru_cache
+def _font(name: str, size: int) -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name, size)
 
 
-def write_shaded(
-    draw: ImageDraw.ImageDraw, unit: float, x: float, y: float, words: str,
-    anchor: str, font: Any, color: Any,
-) -> None:  # fmt: skip
-    """Words with a shadow, at a place [pixels]."""
-    shift = max(1, round(unit))
-    draw.text((x + shift, y + shift), words, font=font, anchor=anchor, fill=_SHADE)
-    draw.text((x, y), words, font=font, anchor=anchor, fill=color)
+class Pen:
+    """Draws words, with a shadow, and lines over a picture `[height, width, 3]` uint8."""
 
-
-def _make_captions(film: Film) -> Callable[[np.ndarray, int], np.ndarray]:
-    """Words over a frame; they take a picture and a frame's number and return a new picture."""
-    (width, height), episode, shots = film.size, film.episode, film.shots
-    unit = max(min(film.size) / 480, 0.4)
-    bold, plain = make_fonts(unit)
-    edge, line, tick = round(14 * unit), round(19 * unit), 4 * unit
-    base, below = height - edge, _bed_words(film)
-    title = shorten(episode.title, bold, width - 2 * edge)
-    score = ""
-    if episode.score is not None:
-        score = f"score {episode.score:.3g} {episode.score_unit}".rstrip()
-        score += f", mean over {episode.starts}"
-
-    sign = _make_signs(film, unit)
-
-    def caption(picture: np.ndarray, frame: int) -> np.ndarray:
-        image = Image.fromarray(picture)
+    def __init__(self, picture: np.ndarray) -> None:
+        self.image = Image.fromarray(picture)
         # Draws half-transparent colours over an opaque picture.
-        draw = ImageDraw.Draw(image, "RGBA")
+        self.draw = ImageDraw.Draw(self.image, "RGBA")
+        self.width, self.height = self.image.size
+        self.unit = max(min(self.image.size) / 480, 0.4)  # of sizes [pixels]
+        self.bold = _font("DejaVuSans-Bold.ttf", round(15 * self.unit))
+        self.plain = _font("DejaVuSans.ttf", round(12.5 * self.unit))
+        self.edge, self.line = round(14 * self.unit), round(19 * self.unit)
+        self.base = self.height - self.edge
 
-        def write(x: float, y: float, words: str, anchor: str, font: Any, color: Any) -> None:
-            write_shaded(draw, unit, x, y, words, anchor, font, color)
+    def write(
+        self, x: float, y: float, words: str, anchor: str, color: Any = _SOFT, bold: bool = False
+    ) -> None:
+        """Words at a place [pixels]."""
+        font, shift = self.bold if bold else self.plain, max(1, round(self.unit))
+        for off, fill in ((shift, _SHADE), (0, color)):
+            self.draw.text((x + off, y + off), words, font=font, anchor=anchor, fill=fill)
 
-        for x, y, words, color in sign(draw, frame):
-            write(x, y, words, "mm", plain, color)
-        write(edge, edge, title, "la", bold, WHITE)
-        write(edge, edge + line, score, "la", plain, SOFT)
-        write(edge, base - line, f"{film.time[frame]:.1f} s", "ls", bold, WHITE)
+    def title(self, words: str) -> None:
+        """At the top, as much as there is room for."""
+        room, full = self.width - 2 * self.edge, words
+        while words and self.bold.getlength(words if words == full else words + "…") > room:
+            words = words[:-1]
+        words = words if words == full else words + "…"
+        self.write(self.edge, self.edge, words, "la", _WHITE, bold=True)
+
+    def arrow(self, middle: np.ndarray, along: np.ndarray, color: Any) -> None:
+        """An arrow around a place [pixels]."""
+        unit = self.unit
+        along = along / max(float(np.linalg.norm(along)), 1e-9)
+        across, tip = np.array([-along[1], along[0]]), middle + 20 * unit * along
+        neck, thick = tip - 9 * unit * along, max(2, round(2.5 * unit))
+        self.draw.line([tuple(middle - 20 * unit * along), tuple(neck)], fill=color, width=thick)
+        wings = (tip, neck + 5 * unit * across, neck - 5 * unit * across)
+        self.draw.polygon([tuple(point) for point in wings], fill=color)
+
+
+def _make_colony_words(film: Film, notes: ColonyNotes) -> _Words:
+    """Title, time, and how many robots are alive, were born and have died."""
+
+    def words(pen: Pen, frame: int) -> None:
+        pen.title(film.title)
+        now = film.time[frame]
+        pen.write(pen.edge, pen.base - pen.line, f"{now:.1f} s", "ls", _WHITE, bold=True)
+        pen.write(pen.edge, pen.base, count_words(film, notes, frame), "ls")
+
+    return words
+
+
+def count_words(film: Film, notes: ColonyNotes, frame: int) -> str:
+    """How many robots are alive in a frame, and births and deaths since the film began."""
+    counts = [
+        (sum(int(one.alive[frame]) for one in film.robots), "robot", "robots"),
+        (int((notes.births[0] <= film.time[frame]).sum()), "birth", "births"),
+        (int((notes.deaths[0] <= film.time[frame]).sum()), "death", "deaths"),
+    ]
+    return "   ".join(f"{n} {one if n == 1 else many}" for n, one, many in counts)
+
+
+def _make_episode_words(film: Film, notes: EpisodeNotes) -> _Words:
+    """Title, score, time, speed, depth, scale; the current and the target."""
+    shots, below, flows = film.shots, _bed_words(film), is_moving(notes.current)
+
+    def words(pen: Pen, frame: int) -> None:
+        if flows:
+            _sign_current(pen, film, notes.current[frame], frame)
+        if notes.target is not None:
+            _sign_target(pen, film, notes.target[frame], frame)
+        unit, edge, base, tick = pen.unit, pen.edge, pen.base, 4 * pen.unit
+        pen.title(film.title)
+        pen.write(edge, edge + pen.line, notes.score, "la")
+        pen.write(edge, base - pen.line, f"{film.time[frame]:.1f} s", "ls", _WHITE, bold=True)
         away = float(np.linalg.norm(shots.position[frame] - shots.target[frame]))
-        metre = height / 2 / (away * math.tan(FOVY / 2))
-        length = _round_length(min(110 * unit, 0.25 * width) / metre)
-        left, right = width - edge - length * metre, width - edge
-        facts = _facts(film, frame, below)
+        metre = pen.height / 2 / (away * math.tan(FOVY / 2))
+        length = _round_length(min(110 * unit, 0.25 * pen.width) / metre)
+        left, right = pen.width - edge - length * metre, pen.width - edge
+        facts = _facts(film, notes, frame, below)
         # In small pictures the last facts have no room beside the scale.
-        while len(facts) > 1 and plain.getlength("   ".join(facts)) > left - 3 * edge:
+        while len(facts) > 1 and pen.plain.getlength("   ".join(facts)) > left - 3 * edge:
             facts.pop()
-        write(edge, base, "   ".join(facts), "ls", plain, SOFT)
-        for shift, color in ((1, _SHADE), (0, WHITE)):
+        pen.write(edge, base, "   ".join(facts), "ls")
+        for shift, color in ((1, _SHADE), (0, _WHITE)):
             bar = [(left, base - tick), (left, base), (right, base), (right, base - tick)]
             bar = [(x + shift, y + shift) for x, y in bar]
-            draw.line(bar, fill=color, width=max(1, round(1.5 * unit)))
+            pen.draw.line(bar, fill=color, width=max(1, round(1.5 * unit)))
         named = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
-        write((left + right) / 2, base - 2 * tick, named, "ms", plain, SOFT)
-        return np.asarray(image)
+        pen.write((left + right) / 2, base - 2 * tick, named, "ms")
 
-    return caption
-
-
-_Sign = tuple[float, float, str, tuple[int, int, int, int]]
+    return words
 
 
-def _make_signs(film: Film, unit: float) -> Callable[[ImageDraw.ImageDraw, int], list[_Sign]]:
-    """The current as an arrow in a corner, and the target: marked, or pointed at from the edge.
-
-    Args:
-        film: whose frames they are.
-        unit: of sizes [pixels].
-
-    Returns:
-        A function of a picture's pen and the frame's number, which draws and returns words: where
-        their middle is [pixels], and their colour.
-    """
-    (width, height), shots = film.size, film.shots
-    fitness = film.episode.fitness
-    way = target_of(None if fitness is None else fitness.config.task, film.episode.trajectory)
-    if way is not None:
-        rows = np.asarray(film.episode.trajectory.time, float)
-        way = np.stack([np.interp(film.time, rows, x) for x in way[: len(rows)].T], axis=-1)
-    current = water_velocity(film.robot, film.water, film.center)
-    flows, arm, thick = moves(current), 20 * unit, max(2, round(2.5 * unit))
-
-    def arrow(draw: ImageDraw.ImageDraw, middle: np.ndarray, along: np.ndarray, color: Any) -> None:
-        along = along / max(float(np.linalg.norm(along)), 1e-9)
-        across, tip = np.array([-along[1], along[0]]), middle + arm * along
-        neck = tip - 9 * unit * along
-        draw.line([tuple(middle - arm * along), tuple(neck)], fill=color, width=thick)
-        wings = (tip, neck + 5 * unit * across, neck - 5 * unit * across)
-        draw.polygon([tuple(point) for point in wings], fill=color)
-
-    def sign(draw: ImageDraw.ImageDraw, frame: int) -> list[_Sign]:
-        words: list[_Sign] = []
-        if flows:
-            right, up = shots.axes(frame)[:2]
-            along = np.array([right @ current[frame], -(up @ current[frame])])
-            middle = np.array([width - 70 * unit, 62 * unit])
-            if np.linalg.norm(along) > 0.05 * np.linalg.norm(current[frame]):
-                arrow(draw, middle, along, _FLOW)
-            speed = f"current {np.linalg.norm(current[frame]):.2f} m/s"
-            words.append((middle[0], 24 * unit, speed, _FLOW))
-        if way is not None:
-            target = way[frame]
-            flat, away = shots.project(frame, target[None])
-            middle = np.array([width / 2, height / 2])
-            at = middle + height / 2 * flat[0] * (1, -1)
-            inside = away[0] > 0 and (at > 0).all() and (at < (width, height)).all()
-            left = f"{np.linalg.norm(target - film.center[frame]):.2g} m"
-            if inside:
-                for reach in (5 * unit, 10 * unit):
-                    draw.ellipse([*(at - reach), *(at + reach)], outline=_AIM, width=thick)
-                words.append((at[0], at[1] - 22 * unit, f"target, {left}", _AIM))
-            else:
-                along = (at - middle) * (1 if away[0] > 0 else -1)
-                room = middle - 80 * unit  # from the middle to where arrows stand
-                edge = middle + along / max(float(np.abs(along / room).max()), 1e-9)
-                arrow(draw, edge, along, _AIM)
-                words.append((edge[0], edge[1] - 30 * unit, f"target, {left}", _AIM))
-        return words
-
-    return sign
+def _sign_current(pen: Pen, film: Film, current: np.ndarray, frame: int) -> None:
+    """The current as an arrow in a corner."""
+    right, up = film.shots.axes(frame)[:2]
+    along, speed = np.array([right @ current, -(up @ current)]), float(np.linalg.norm(current))
+    x = pen.width - 70 * pen.unit
+    if np.linalg.norm(along) > 0.05 * speed:
+        pen.arrow(np.array([x, 62 * pen.unit]), along, FLOW)
+    pen.write(x, 24 * pen.unit, f"current {speed:.2f} m/s", "mm", FLOW)
 
 
-def _facts(film: Film, frame: int, below: str) -> list[str]:
-    """How fast, how deep, and what is known of the bed."""
-    speed = float(film.speed[frame])
+def _sign_target(pen: Pen, film: Film, target: np.ndarray, frame: int) -> None:
+    """The target: marked, or pointed at from the edge."""
+    unit = pen.unit
+    flat, away = film.shots.project(frame, target[None])
+    middle = np.array([pen.width / 2, pen.height / 2])
+    at = middle + pen.height / 2 * flat[0] * (1, -1)
+    words = f"target, {np.linalg.norm(target - film.center[frame]):.2g} m"
+    if away[0] > 0 and (at > 0).all() and (at < (pen.width, pen.height)).all():
+        for reach in (5 * unit, 10 * unit):
+            box, thick = [*(at - reach), *(at + reach)], max(2, round(2.5 * unit))
+            pen.draw.ellipse(box, outline=AIM, width=thick)
+        pen.write(at[0], at[1] - 22 * unit, words, "mm", AIM)
+    else:
+        along = (at - middle) * (1 if away[0] > 0 else -1)
+        room = middle - 80 * unit  # from the middle to where arrows stand
+        edge = middle + along / max(float(np.abs(along / room).max()), 1e-9)
+        pen.arrow(edge, along, AIM)
+        pen.write(edge[0], edge[1] - 30 * unit, words, "mm", AIM)
+
+
+def _facts(film: Film, notes: EpisodeNotes, frame: int, below: str) -> list[str]:
+    """Speed, depth, and what is known of the bed."""
+    speed = float(notes.speed[frame])
     depth = float(np.asarray(film.water.surface_height)[frame] - film.center[frame, 2])
     facts = [
         f"{speed:.2f} m/s" if speed >= 0.1 else f"{100 * speed:.1f} cm/s",
-        f"{speed / film.robot.morphology.length:.2f} body lengths/s",
+        f"{speed / film.robots[0].robot.morphology.length:.2f} body lengths/s",
         f"depth {depth:.2f} m" if depth >= -0.005 else f"{-depth:.2f} m above the water",
     ]
     return [*facts, below] if below else facts
@@ -286,7 +320,7 @@ def _facts(film: Film, frame: int, below: str) -> list[str]:
 
 def _bed_words(film: Film) -> str:
     """How far below the bed lies, where it is out of sight."""
-    bed, (x, y, z) = film.robot.world.bed, film.center.T
+    bed, (x, y, z) = film.world.bed, film.center.T
     if bed is None:
         return "no bed"
     below = float((z - bed_at(bed, x, y)).min())

@@ -1,7 +1,7 @@
-"""The robot as it is drawn: modules' meshes, the bed, light and haze, in a MuJoCo model of its own.
+"""Robots as they are drawn: meshes, the bed, light and haze, in a MuJoCo model of their own.
 
-The model has the bodies and joints of `robot.mj_model`, so the same qpos poses it, but meshes in
-place of the boxes that the physics weighs. It is for looking at (`draw`); its geoms touch nothing.
+The model has the bodies and joints of each `robot.mj_model`, so the same qpos poses them, but
+meshes in place of the boxes that the physics weighs. Nothing touches: it is for `draw` alone.
 """
 
 from __future__ import annotations
@@ -13,80 +13,50 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.view.course import bed_rings
+from mjx_revolve.numerics.spatial import matrix_to_quat
 from mjx_revolve.view.film.camera import FOVY
-from mjx_revolve.view.pieces import make_pieces, mount_piece
+from mjx_revolve.view.palette import SAND, SUN, WATER_AHEAD, WATER_DOWN, WATER_UP
+from mjx_revolve.view.pieces import make_pieces, mount_piece, smooth_mesh
+from mjx_revolve.view.surroundings import bed_rings
 from mjx_revolve.water.world import World
 
 # What is hidden of the model by default in MuJoCo's viewer is drawn in none of these groups.
 MODULES, SURFACE, _WEIGHTS = 0, 1, 4
-# Towards the light, world frame: high, from one side.
-SUN = np.array([-0.42, -0.28, 0.86]) / np.linalg.norm([-0.42, -0.28, 0.86])
 # What is drawn offscreen where nothing is: a colour of water, for the edges of things mix with it.
 BACKGROUND = (36 / 255, 110 / 255, 146 / 255)
-# The haze's colour where one looks straight ahead, for MuJoCo's viewer.
-_WATER = (0.09, 0.40, 0.55)
 
-# Edges of a part are sharp where its faces turn by more than this.
-_CREASE = math.radians(35.0)
 # The bed is drawn on rings around the middle of the way; its texture repeats after a tile.
 _RINGS = 64
 _TILE, _TEXELS = 1.6, 1024  # m, and texels along it
 
 
 def build_stage(
-    robot: Robot,
+    robots: Mapping[int, Robot],
+    world: World,
     size: tuple[int, int] = (640, 480),
     origin: ArrayLike = (0.0, 0.0, 0.0),
     way: float = 1.0,
     sight: float = 10.0,
     plain: bool = False,
 ) -> mujoco.MjModel:
-    """Builds what is drawn of a robot and the world around it.
-
-    Args:
-        robot: from `build_robot`; it stays as it is.
-        size: the largest picture that will be drawn offscreen [pixels].
-        origin: the place in the world that is the model's origin [m]; the bed is drawn around it.
-            Far from its origin OpenGL has too few digits for small robots.
-        way: how far from there the robot gets [m].
-        sight: how far one sees through the water [m].
-        plain: whether the background has one colour, for a film that paints the water itself.
-
-    Returns:
-        The model; `qpos` means the same as in `robot.mj_model`, but for the origin.
-    """
-    spec = _dressed(robot)
-    spec.modelname = f"{robot.morphology.name} to look at"
-    _add_surroundings(spec, robot.world, size, np.asarray(origin, float), way, sight, plain)
-    return spec.compile()
-
-
-def build_shared_stage(
-    robots: Mapping[int, Robot],
-    world: World,
-    way: float,
-    sight: float,
-    size: tuple[int, int] = (640, 480),
-    plain: bool = False,
-) -> mujoco.MjModel:
-    """Builds what is drawn of many robots and the world around them.
+    """Builds what is drawn of robots and the world around them.
 
     Args:
         robots: from `build_robot`, by number; they stay as they are.
         world: around them.
-        way: how far from the world's origin they get [m].
-        sight: see `build_stage`.
-        size: see `build_stage`.
-        plain: see `build_stage`.
+        size: the largest picture that will be drawn offscreen [pixels].
+        origin: the place in the world that is the model's origin [m]; the bed is drawn around it.
+            Far from its origin OpenGL has too few digits for small robots.
+        way: how far from there robots get [m].
+        sight: range of sight through the water [m].
+        plain: whether the background has one colour, for a film that paints the water itself.
 
     Returns:
-        The model; robot k's free joint is called `k/root`, and its qpos begins there.
+        The model; names of robot k begin with `k/`, its free joint is `k/root` (see `robot_qpos`).
     """
     spec = mujoco.MjSpec()
     spec.modelname = "robots to look at"
@@ -97,8 +67,31 @@ def build_shared_stage(
     for number, robot in robots.items():
         frame = spec.worldbody.add_frame()
         spec.attach(_dressed(robot), prefix=f"{number}/", frame=frame)
-    _add_surroundings(spec, world, size, np.zeros(3), way, sight, plain)
+    place = np.asarray(origin, float)
+    _add_bed(spec, world, place, way, sight)
+    # The still surface is for MuJoCo's viewer; films draw their own, which moves.
+    spec.add_material(name="surface", specular=0.9, shininess=0.9, rgba=[0.55, 0.85, 0.95, 0.22])
+    spec.worldbody.add_geom(
+        name="surface",
+        type=mujoco.mjtGeom.mjGEOM_BOX,  # a plane is invisible from below
+        size=[way + 4.0 * sight, way + 4.0 * sight, 5e-4],
+        pos=[0.0, 0.0, world.surface_height - place[2]],
+        material="surface",
+        group=SURFACE,
+    )
+    _add_light(spec, size, way, sight, plain)
+    for geom in spec.geoms:  # nothing touches anything
+        geom.contype = geom.conaffinity = 0
     return spec.compile()
+
+
+def robot_qpos(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> np.ndarray:
+    """A view of a robot's qpos in the data of a model from `build_stage`."""
+    root = model.joint(f"{number}/root")
+    begin, owner = int(root.qposadr[0]), model.body_rootid[model.jnt_bodyid]
+    count = 6 + int((owner == owner[root.id]).sum())
+    view: np.ndarray = data.qpos[begin : begin + count]
+    return view
 
 
 def _dressed(robot: Robot) -> mujoco.MjSpec:
@@ -115,32 +108,6 @@ def _dressed(robot: Robot) -> mujoco.MjSpec:
     return spec
 
 
-def _add_surroundings(
-    spec: mujoco.MjSpec,
-    world: World,
-    size: tuple[int, int],
-    place: np.ndarray,
-    way: float,
-    sight: float,
-    plain: bool,
-) -> None:
-    """Bed, surface and light; nothing touches anything."""
-    _add_bed(spec, world, place, way, sight)
-    # The still surface is for MuJoCo's viewer; films draw their own, which moves.
-    spec.add_material(name="surface", specular=0.9, shininess=0.9, rgba=[0.55, 0.85, 0.95, 0.22])
-    spec.worldbody.add_geom(
-        name="surface",
-        type=mujoco.mjtGeom.mjGEOM_BOX,  # a plane is invisible from below
-        size=[way + 4.0 * sight, way + 4.0 * sight, 5e-4],
-        pos=[0.0, 0.0, world.surface_height - place[2]],
-        material="surface",
-        group=SURFACE,
-    )
-    _add_light(spec, size, way, sight, plain)
-    for geom in spec.geoms:
-        geom.contype = geom.conaffinity = 0
-
-
 def _add_pieces(spec: mujoco.MjSpec, robot: Robot) -> None:
     """Meshes of all parts, each fixed to the body that carries its part's box."""
     spec.add_material(name="module", specular=0.35, shininess=0.35, rgba=[1, 1, 1, 1])
@@ -153,14 +120,12 @@ def _add_pieces(spec: mujoco.MjSpec, robot: Robot) -> None:
             mesh = smooth_mesh(piece.corners)
             _add_mesh(spec, name, mesh.vertices, mesh.faces, usernormal=mesh.vertex_normals.ravel())
         body, position, rotation = mount_piece(robot, piece)
-        quat = np.zeros(4)
-        mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation).ravel())
         bodies[robot.mj_model.body(body).name].add_geom(
             name=f"drawn {number}",
             type=mujoco.mjtGeom.mjGEOM_MESH,
             meshname=names[id(piece.corners)],
             pos=position,
-            quat=quat,
+            quat=matrix_to_quat(rotation),
             material="module",
             rgba=[*piece.color, 1.0],
             group=MODULES,
@@ -172,23 +137,10 @@ def _add_mesh(
     spec: mujoco.MjSpec, name: str, vertices: np.ndarray, faces: np.ndarray, **more: Any
 ) -> None:
     """Triangles `[m, 3]` between points `[n, 3]` [m]."""
-    # Thin or open parts have no volume to speak of; nothing asks for their inertia.
+    # Thin or open parts have no volume to speak of; their inertia is not used.
     shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     points, faces = np.asarray(vertices).ravel(), np.asarray(faces).ravel()
     spec.add_mesh(name=name, uservert=points, userface=faces, inertia=shell, **more)
-
-
-def smooth_mesh(corners: np.ndarray) -> trimesh.Trimesh:
-    """A mesh for shading: smooth but for its edges, along which it is cut open.
-
-    Args:
-        corners: `[m, 3, 3]` triangles [m].
-
-    Returns:
-        The mesh; `vertex_normals` are those to shade with.
-    """
-    mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners))
-    return trimesh.graph.smooth_shade(mesh, angle=_CREASE, facet_minarea=None)
 
 
 def _add_bed(
@@ -259,7 +211,7 @@ def make_sand(texels: int) -> np.ndarray:
     shade = 1.0 + 0.045 * hills + 0.075 * ripples + 0.045 * grain
     shells = noise(2.2 * unit)
     shade += 0.30 * np.clip(shells - 3.1, 0.0, 1.0) - 0.55 * np.clip(-shells - 2.9, 0.0, 1.0)
-    color = np.array([0.80, 0.72, 0.56]) * shade[..., None]
+    color = np.array(SAND) * shade[..., None]
     color[..., 2] *= 1.0 - 0.02 * hills
     return np.round(255 * np.clip(color, 0.0, 1.0)).astype(np.uint8)
 
@@ -271,8 +223,8 @@ def _add_light(
     spec.worldbody.add_light(
         name="sun",
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        pos=(20.0 * SUN).tolist(),
-        dir=(-SUN).tolist(),
+        pos=[20.0 * x for x in SUN],
+        dir=[-x for x in SUN],
         castshadow=True,
         ambient=[0.0, 0.0, 0.0],
         diffuse=[0.80, 0.80, 0.80],
@@ -282,8 +234,8 @@ def _add_light(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=BACKGROUND if plain else [0.42, 0.78, 0.88],
-        rgb2=BACKGROUND if plain else [0.01, 0.09, 0.18],
+        rgb1=BACKGROUND if plain else WATER_UP,
+        rgb2=BACKGROUND if plain else WATER_DOWN,
         width=256,
         height=256,
     )
@@ -301,5 +253,5 @@ def _add_light(
     visual.map.fogstart, visual.map.fogend = 0.15 * sight, 1.5 * sight
     # Within this radius of the light's target things cast shadows.
     visual.map.shadowclip = sight / 6.0
-    visual.rgba.fog = [*_WATER, 1.0]
-    visual.rgba.haze = [*_WATER, 1.0]
+    visual.rgba.fog = [*WATER_AHEAD, 1.0]
+    visual.rgba.haze = [*WATER_AHEAD, 1.0]

@@ -18,22 +18,18 @@ from PIL import Image
 from tqdm import tqdm
 
 from mjx_revolve.inputs.files import write_atomic
-from mjx_revolve.view.film.crowd import Crowd
-from mjx_revolve.view.film.crowd_draw import draw_crowd
 from mjx_revolve.view.film.draw import draw_frames
 from mjx_revolve.view.film.film import Film
 
-# Quality of x264 (18: nothing to be seen, 23: its default) and how long it may ponder.
+# Quality of x264 (18: nothing to be seen, 23: its default) and the speed of encoding.
 _QUALITY, _PRESET = 19, "veryfast"
 # A GIF has at most this many frames and bytes; it gets smaller until it fits.
 _MOST_FRAMES, _MOST_BYTES = 160, 7_500_000
 _GIF_WIDTH, _LEAST_WIDTH = 420, 80
-# Of its 256 colours, so many are for what covers much of the picture.
-_MAIN = 150
 
 
 def write_film(
-    film: Film | Crowd | Sequence[Film],
+    film: Film | Sequence[Film],
     opengl: str,
     mp4: str | Path | None = None,
     gif: str | Path | None = None,
@@ -43,8 +39,8 @@ def write_film(
     Files appear whole or not at all. On a terminal a bar shows how far it is.
 
     Args:
-        film: from `film.make_film` or `crowd.make_crowd`; or several of one size, to be shown one
-            after the other.
+        film: from `film.make_film` or `film.make_colony_film`; or several of one size, to be shown
+            one after the other.
         opengl: from `opengl.find_opengl`.
         mp4: where to write the MP4 (H.264), or None.
         gif: where to write the GIF, or None.
@@ -52,14 +48,14 @@ def write_film(
     Raises:
         OSError: a file cannot be written.
     """
-    films: list[Any] = [film] if isinstance(film, Film | Crowd) else list(film)
+    films = [film] if isinstance(film, Film) else list(film)
     (size,), (fps,) = {film.size for film in films}, {film.fps for film in films}
     count = sum(len(film.time) for film in films)
     every = gif_stride(fps, count)
     small: list[Image.Image] = []
 
     def draw() -> Iterator[np.ndarray]:
-        frames = (frame for film in films for frame in _frames_of(film, opengl))
+        frames = (frame for film in films for frame in draw_frames(film, opengl))
         bar = tqdm(frames, "drawing", count, leave=False, disable=None, unit="frame")
         for number, frame in enumerate(bar):
             if gif is not None and number % every == 0:
@@ -74,10 +70,6 @@ def write_film(
             pass
     if gif is not None:
         write_atomic(Path(gif), make_gif(small, every / fps))
-
-
-def _frames_of(film: Film | Crowd, opengl: str) -> Iterator[np.ndarray]:
-    return draw_crowd(film, opengl) if isinstance(film, Crowd) else draw_frames(film, opengl)
 
 
 def write_mp4(
@@ -144,9 +136,11 @@ def _shrink(frame: Image.Image, width: int) -> Image.Image:
 
 def _encode_gif(frames: Sequence[Image.Image], pause: float) -> bytes:
     """Frames with one palette for all: colours do not flicker, and the file is smaller."""
-    # A contact sheet of some frames stands for all.
+    # A contact sheet of some frames stands for all. A robot is small in its sea: its colours would
+    # drown among blues, unless the palette covers all that there are.
     some = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, 8).astype(int))]
-    palette = _make_palette(Image.fromarray(np.concatenate([np.asarray(frame) for frame in some])))
+    sheet = Image.fromarray(np.concatenate([np.asarray(frame) for frame in some]))
+    palette = sheet.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=3)
     first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     # GIF counts in hundredths of a second: each frame begins at its own, and the whole keeps time.
     ends = np.round(100 * pause * np.arange(1, len(frames) + 1))
@@ -162,19 +156,3 @@ def _encode_gif(frames: Sequence[Image.Image], pause: float) -> bytes:
         optimize=False,
     )
     return file.getvalue()
-
-
-def _make_palette(sheet: Image.Image) -> Image.Image:
-    """A palette for a picture: most of it for what covers much, the rest for what sticks out."""
-    main = sheet.quantize(_MAIN, method=Image.Quantize.MEDIANCUT)
-    pixels = np.asarray(sheet, np.int16).reshape(-1, 3)
-    missed = np.abs(np.asarray(main.convert("RGB"), np.int16).reshape(-1, 3) - pixels).max(axis=1)
-    # A robot is small in its sea: its colours would drown among blues.
-    odd = pixels[missed > max(8, np.quantile(missed, 0.93))].astype(np.uint8)
-    colors = list(main.getpalette() or [])[: 3 * _MAIN]
-    if len(odd):
-        rest = Image.fromarray(odd[None]).quantize(255 - _MAIN, method=Image.Quantize.MEDIANCUT)
-        colors += list(rest.getpalette() or [])[: 3 * (255 - _MAIN)]
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(colors)
-    return palette

@@ -20,7 +20,8 @@ import numpy as np
 
 from mjx_revolve.numerics.spatial import sincos
 from mjx_revolve.view.film.camera import FOVY
-from mjx_revolve.view.film.stage import BACKGROUND, SUN
+from mjx_revolve.view.film.stage import BACKGROUND
+from mjx_revolve.view.palette import SKY_HIGH, SKY_LOW, SUN, WATER_AHEAD, WATER_DOWN, WATER_UP
 from mjx_revolve.water.flow import Water, surface
 from mjx_revolve.water.world import World
 
@@ -30,11 +31,8 @@ _LOSS = np.array([0.40, 0.19, 0.15])
 # the bottom would be black.
 _FADING = np.array([0.14, 0.040, 0.028])
 _LEAST = np.array([0.30, 0.52, 0.60])
-# Colours of open water: looking up, straight ahead and down.
-_UP, _AHEAD, _DOWN = (np.array(c) for c in ((0.36, 0.78, 0.88), (0.075, 0.37, 0.51),
-                                            (0.008, 0.095, 0.185)))  # fmt: skip
 _BODY = np.array([0.03, 0.29, 0.37])  # of water that is looked into from above
-_SKY, _ZENITH = np.array([0.80, 0.88, 0.93]), np.array([0.36, 0.60, 0.86])
+_SKY, _ZENITH, _SUN = np.array(SKY_LOW), np.array(SKY_HIGH), np.array(SUN)
 _WINDOW = np.array([0.74, 0.95, 1.0])  # the sky through the surface, from below
 _SHINE = np.array([0.62, 0.95, 1.0])  # of shafts of light
 _INDEX = 1.333  # of refraction
@@ -77,7 +75,7 @@ class _View(NamedTuple):
     @property
     def own_light(self) -> Any:
         """Daylight where the camera is."""
-        return _daylight(self.depth(self.position[2]))
+        return daylight(self.depth(self.position[2]))
 
 
 def make_shader(
@@ -156,22 +154,22 @@ def _to_screen(light: Any) -> Any:
     return jnp.sqrt(jnp.clip(light + 0.5 * over, 0.0, 1.0))
 
 
-def _open_water(up: Any) -> Any:
+def open_water(up: Any) -> Any:
     """Light of water without end, `[..., 3]`, by the sine of the angle at which one looks up."""
     up = jnp.asarray(up)[..., None]
     rising = 1 - jnp.exp(-1.6 * jnp.maximum(up, 0.0))
     falling = 1 - jnp.exp(2.4 * jnp.minimum(up, 0.0))
-    ahead, top, low = (_to_light(c) for c in (_AHEAD, _UP, _DOWN))
+    ahead, top, low = (_to_light(np.array(c)) for c in (WATER_AHEAD, WATER_UP, WATER_DOWN))
     return ahead + (top - ahead) * rising + (low - ahead) * falling
 
 
-def _daylight(depth: Any) -> Any:
+def daylight(depth: Any) -> Any:
     """Share of the light that reaches a depth below the surface [m], `[..., 3]`; 1 above it."""
     left = jnp.exp(-_FADING * jnp.maximum(jnp.asarray(depth), 0.0)[..., None])
     return _LEAST + (1 - _LEAST) * left
 
 
-def _transmission(path: Any, distance: float) -> Any:
+def transmission(path: Any, distance: float) -> Any:
     """Share of light, `[..., 3]`, that passes through water of a length [m].
 
     Less of it is lost close to the camera than Beer and Lambert would have it, so that the robot
@@ -198,7 +196,7 @@ def _ripples(distance: float, gravity: float, time: Any, x: Any, y: Any) -> tupl
     return tuple(total[:2]), tuple(total[2:])
 
 
-def _bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> Any:
+def bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> Any:
     """Brightness, about 1 on average, of sunlight that ripples have gathered into lines.
 
     Rays that a surface of height h bends land at x + f ∇h, so light is denser by 1 / |det(1 + f
@@ -270,20 +268,20 @@ def _sunlit(view: _View, far: Any) -> Any:
     x, y, z = view.along(jnp.minimum(far, 1e3))
     depth = view.depth(z)
     through = _under_sun(view, x, y, depth)
-    lines = _bright_lines(view.distance, view.world.gravity, view.water.time, *through)
+    lines = bright_lines(view.distance, view.world.gravity, view.water.time, *through)
     share = _LINES * _step(_facing_up(view, far), 0.0, 0.8)
     share = share * jnp.exp(-far / (5 * view.distance)) * _step(depth, 0.0, 0.15 * view.distance)
-    return _daylight(depth) * (1 + share * (lines - 1))[..., None]
+    return daylight(depth) * (1 + share * (lines - 1))[..., None]
 
 
 def _in_water(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
     """What a camera in the water sees, and how clearly it sees the edges of things."""
-    ahead = _open_water(view.ray[..., 2]) * view.own_light
+    ahead = open_water(view.ray[..., 2]) * view.own_light
     s, slope = _meet_surface(view, _HORIZON * view.distance)
     backdrop = jax.lax.cond(
         jnp.isfinite(s).any(), lambda: _ceiling(view, s, slope, ahead), lambda: ahead
     )
-    through = _transmission(jnp.minimum(far, s), view.distance)
+    through = transmission(jnp.minimum(far, s), view.distance)
     things = scene * _sunlit(view, far) * through + ahead * (1 - through)
     picture = jnp.where((far < s)[..., None], things, backdrop)
     return picture + _shafts(view, jnp.minimum(far, s)) * view.own_light, 1.0
@@ -298,10 +296,10 @@ def _ceiling(view: _View, s: Any, slope: Any, ahead: Any) -> Any:
     outside = 1 - _INDEX**2 * (1 - cosine**2)
     window = _step(outside, -0.25, 0.6)[..., None]
     mirrored = view.ray[..., 2] - 2 * cosine * normal[..., 2]
-    lining = _open_water(0.8 * mirrored + 0.45) * view.own_light
+    lining = open_water(0.8 * mirrored + 0.45) * view.own_light
     sky = 1.25 * _to_light(_WINDOW)
     seen = lining + (sky - lining) * window
-    through = _transmission(0.7 * near, view.distance)
+    through = transmission(0.7 * near, view.distance)
     return jnp.where(jnp.isfinite(s)[..., None], seen * through + ahead * (1 - through), ahead)
 
 
@@ -344,11 +342,11 @@ def _from_air(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
     mirrored = view.ray + 2 * cosine[..., None] * normal
     # Schlick's approximation of what a surface mirrors.
     share = (0.02 + 0.98 * (1 - cosine) ** 5)[..., None]
-    glint = jnp.maximum((mirrored * SUN).sum(-1), 0.0)
+    glint = jnp.maximum((mirrored * _SUN).sum(-1), 0.0)
     mirror = _sky(mirrored[..., 2]) + (2.5 * glint**240 + 0.25 * glint**24)[..., None]
     # Through the surface: things, lit and dimmed by the water over and before them.
     path = jnp.maximum(far - near, 0.0)
-    through = _transmission(0.4 * distance + path, distance) ** 1.5
+    through = transmission(0.4 * distance + path, distance) ** 1.5
     below = scene * _sunlit(view, far) * through + _to_light(_BODY) * (1 - through)
     below = jnp.where(jnp.isfinite(far)[..., None], below, _to_light(_BODY))
     wet = below * (1 - share) + mirror * share

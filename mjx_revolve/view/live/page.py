@@ -6,31 +6,31 @@ import math
 
 import numpy as np
 
-from mjx_revolve.view.course import bed_at
-from mjx_revolve.view.live.stock import Stock
-from mjx_revolve.view.packed import pack_water
+from mjx_revolve.view.live.robot_catalogue import RobotCatalogue
+from mjx_revolve.view.page_data import pack_water
+from mjx_revolve.view.surroundings import bed_at
 from mjx_revolve.view.viewer import fill_page
 
 # Where robots are dropped at first, and how deep the page lets them be dropped. Choices [m].
 _DEPTH, _DEEPEST = 1.0, 10.0
 # Things around robots are drawn for robots of about this length: shipped ones have .3 to .5 m. The
-# page is made before anybody is built [m].
+# page is made before any robot is built [m].
 _LENGTH = 0.45
 _GRID = 2.0  # of the grid below the surface, where no bed is in sight [m]
 
 
-def live_page(stock: Stock, room: int) -> str:
+def live_page(catalogue: RobotCatalogue, room: int) -> str:
     """The page.
 
     Args:
-        stock: who may be dropped, and the world.
+        catalogue: robots that may be dropped, and the world.
         room: how many may be in the water at once.
 
     Returns:
-        The text of an HTML file. Its address must end in a slash: it asks for `events`, `wish` and
-        `body/N` beside it.
+        The text of an HTML file. Its address must end in a slash: it requests `events`
+        and `command` beside it.
     """
-    world = stock.world
+    world = catalogue.world
     bed = -math.inf
     if world.bed is not None:
         bed = float(bed_at(world.bed, np.zeros(1), np.zeros(1))[0])
@@ -41,13 +41,15 @@ def live_page(stock: Stock, room: int) -> str:
     water = pack_water(world, np.array([[0.0, 0.0, surface - depth]]), floor)
     data = {
         **water,
-        "length": _LENGTH,
+        "floor": floor,
+        "many": True,
+        "size": _LENGTH,
         "room": room,
         "depth": round(depth, 2),
         "deepest": round(deepest, 2),
-        "stock": [{"name": entry.name, "group": entry.group} for entry in stock.entries],
+        "catalogue": [{"name": entry.name, "group": entry.group} for entry in catalogue.entries],
     }
     name = world.name.replace("_", " ")
-    words = [name, f"{stock.mixed.config.controller.type} brains", "live"]
-    title = stock.title or "A running world"
-    return fill_page("live.html", title=title, subtitle=" \u00b7 ".join(words), data=data)
+    words = [name, f"{catalogue.mixed.config.controller.type} brains", "live"]
+    title = catalogue.title or "A running world"
+    return fill_page("live", maker="live", title=title, subtitle=" \u00b7 ".join(words), data=data)

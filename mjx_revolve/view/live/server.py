@@ -1,8 +1,8 @@
-"""A small HTTP server, for this machine alone: one page, a stream of what happens, and wishes.
+"""A small HTTP server, for this machine alone: one page, a stream of events, and commands.
 
-Whoever knows the page's address may watch and ask: it holds a random token, and is printed for the
-user only. Other web pages that the user's browser shows do not know it; and what they post all the
-same is refused by its `Origin`, as is what reaches us under another name (`Host`).
+The page's address is enough to watch and to post commands: it holds a random token, and is printed
+for the user only. Other web pages in the user's browser do not have it; what they post all the same
+is refused by its `Origin`, as are requests to another name of this machine (`Host`).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.live.keeper import Keeper
-from mjx_revolve.view.live.wishes import read_wish
+from mjx_revolve.view.live.commands import read_command
+from mjx_revolve.view.live.simulation import LiveSimulation
 
 HOST = "127.0.0.1"
 _LONGEST = 4096  # of what is posted [bytes]
 _PATIENCE = 1.5  # for an answer; what takes longer is announced on the page [s]
-_BEAT = 0.5  # how often pages are told the state, at least [s]
+_BEAT = 0.5  # from one state event to the next, at least [s]
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",  # the address is a secret
@@ -35,10 +35,10 @@ _HEADERS = {
 
 
 class LiveServer(ThreadingHTTPServer):
-    """Serves a keeper's world.
+    """Serves a running world.
 
     Attributes:
-        keeper: who runs it.
+        simulation: runs the world.
         page: the text of the page.
         token: what all paths begin with.
     """
@@ -46,9 +46,9 @@ class LiveServer(ThreadingHTTPServer):
     daemon_threads = True
     allow_reuse_address = True
 
-    def __init__(self, keeper: Keeper, page: str, port: int = 0) -> None:
+    def __init__(self, simulation: LiveSimulation, page: str, port: int = 0) -> None:
         super().__init__((HOST, port), _Handler)
-        self.keeper, self.page = keeper, page.encode()
+        self.simulation, self.page = simulation, page.encode()
         self.token = secrets.token_urlsafe(16)
         self.closing = threading.Event()
 
@@ -64,7 +64,7 @@ class LiveServer(ThreadingHTTPServer):
         return f"{self.origins[0]}/{self.token}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Says nothing of pages that were closed."""
+        """Logs no pages that were closed."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -73,7 +73,7 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "mjx_revolve", ""
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Says nothing of what was asked for."""
+        """Logs no requests."""
 
     def do_GET(self) -> None:
         place = self._place()
@@ -81,8 +81,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(self.server.page, "text/html; charset=utf-8")
         elif place == "events":
             self._stream()
-        elif place is not None and place.startswith("body/"):
-            self._body(place.removeprefix("body/"))
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "expected the page's own address; found another")
 
@@ -94,7 +92,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.BAD_REQUEST, f"expected at most {_LONGEST} bytes; found others")
             return
         text = self.rfile.read(size)
-        if self._place() != "wish":
+        if self._place() != "command":
             self._refuse(HTTPStatus.NOT_FOUND, "expected the page's own address; found another")
             return
         origin = self.headers.get("Origin")
@@ -108,8 +106,8 @@ class _Handler(BaseHTTPRequestHandler):
             )
             return
         try:
-            wish = read_wish(_read_json(text))
-            answer = self.server.keeper.ask(wish).result(_PATIENCE)
+            command = read_command(_read_json(text))
+            answer = self.server.simulation.ask(command).result(_PATIENCE)
         except NotYet:
             self._send(b'{"ok":true,"later":true}', "application/json", HTTPStatus.ACCEPTED)
         except InputError as error:
@@ -118,35 +116,24 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(json.dumps({"ok": True, "key": answer}).encode(), "application/json")
 
     def _place(self) -> str | None:
-        """What is asked for, without the token; None where that is wrong, or our name is."""
+        """The path after the token; None where the token or the host is wrong."""
         hosts = {origin.removeprefix("http://") for origin in self.server.origins}
         first, _, rest = self.path.lstrip("/").partition("/")
         known = secrets.compare_digest(first.encode(), self.server.token.encode())
         return rest if known and self.headers.get("Host") in hosts else None
 
-    def _body(self, text: str) -> None:
-        """A body and the shapes of its pieces."""
-        bodies = self.server.keeper.bodies
-        number = int(text) if text.isascii() and text.isdigit() and len(text) < 9 else -1
-        if not 0 <= number < len(bodies.data):
-            self._refuse(HTTPStatus.NOT_FOUND, "expected a body's number; found another")
-            return
-        data = bodies.data[number]
-        shapes = {piece[1]: bodies.shapes.packed[piece[1]] for piece in data["pieces"]}
-        self._send(json.dumps({**data, "shapes": shapes}).encode(), "application/json")
-
     def _stream(self) -> None:
         """Events until the page is closed, or the world ends."""
-        keeper = self.server.keeper
+        simulation = self.server.simulation
         self.close_connection = True
         self._head(HTTPStatus.OK, "text/event-stream")
-        listener = keeper.listen()
+        listener = simulation.listen()
         try:
             while not self.server.closing.is_set():
                 try:
                     text = listener.get(timeout=_BEAT)
                 except queue.Empty:
-                    text = keeper.state_now()
+                    text = simulation.state_event()
                 if text is None:
                     break
                 self.wfile.write(text.encode())
@@ -154,7 +141,7 @@ class _Handler(BaseHTTPRequestHandler):
         except OSError:  # the page was closed
             pass
         finally:
-            keeper.leave(listener)
+            simulation.leave(listener)
 
     def _refuse(self, status: HTTPStatus, why: str) -> None:
         self._send(json.dumps({"error": why}).encode(), "application/json", status)

@@ -1,8 +1,7 @@
-"""What a run's champion does: one episode, its score and measures, its oscillators."""
+"""A replay of a run's champion: one episode, its score and measures, its oscillators."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,9 +15,9 @@ from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.felt import Felt, feel_episode
 from mjx_revolve.view.motion import Motion, analyse_motion, count_finite, counted_time
 from mjx_revolve.view.report.record import RunRecord, number
+from mjx_revolve.view.sensor_log import SensorTrace, trace_sensors
 from mjx_revolve.view.surroundings import target_at_last
 
 # A replay further than this from the recorded mean is another swim: standard deviations over the
@@ -27,24 +26,24 @@ _DEVIATIONS, _SHARE = 5.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Replay:
+class ChampionReplay:
     """A champion's episode.
 
     Attributes:
-        motion: what it did, up to the first row that is not finite.
+        motion: up to the first row that is not finite.
         score: of this episode; NaN where it blew up.
         measures: of this episode, as in `metrics.csv`.
-        felt: what its brain was told of the declared sensors, up to the same row.
+        traces: readings of the declared sensors, up to the same row.
     """
 
     motion: Motion
     score: float
     measures: dict[str, float]
-    felt: tuple[Felt, ...] = ()
+    traces: tuple[SensorTrace, ...] = ()
 
 
-def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
-    """Lets a run's champion swim.
+def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
+    """Simulates a run's champion.
 
     Args:
         record: the run; what differs from what it recorded is added to its problems.
@@ -79,7 +78,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> Replay:
         target_at_last(fitness.config.task, trajectory),
     )  # fmt: skip
     finite = jax.tree.map(lambda x: x[:count], trajectory)
-    return Replay(motion, score, measures, feel_episode(fitness, finite, key))
+    return ChampionReplay(motion, score, measures, trace_sensors(fitness, finite, key))
 
 
 def has_phases(fitness: Fitness) -> bool:
@@ -89,8 +88,7 @@ def has_phases(fitness: Fitness) -> bool:
 
 def _compare(record: RunRecord, score: float) -> None:
     """Notes a replay that is not the swim that the run recorded."""
-    facts: Mapping[str, Any] = record.champion
-    mean, std = number(facts.get("score")), number(facts.get("score_std"))
+    mean, std = (number(record.champion.get(name)) for name in ("score", "score_std"))
     if mean is None or std is None or record.stand_in or not record.is_finished:
         return
     allowed = max(_DEVIATIONS * std, _SHARE * abs(mean))
@@ -106,7 +104,7 @@ def cpg_phases(fitness: Fitness, genes: np.ndarray, steps: int) -> np.ndarray:
     """Phases of the oscillators, which a trajectory does not hold.
 
     Args:
-        fitness: whose controller is a CPG.
+        fitness: its controller is a CPG.
         genes: `[G]`.
         steps: how many.
 

@@ -6,9 +6,7 @@ can be read, and everything else is named.
 
 from __future__ import annotations
 
-import csv
 import importlib.metadata
-import io
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -19,21 +17,20 @@ import numpy as np
 from pydantic import BaseModel
 
 import mjx_revolve
-from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import Config, make_config
-from mjx_revolve.episodes.lives import EVENTS, GENERATIONS, INDIVIDUALS
-from mjx_revolve.evolution.checkpoints import DamageError, read_checkpoint
-from mjx_revolve.evolution.runs import Run
-from mjx_revolve.inputs.errors import InputError, load_yaml, reading
+from mjx_revolve.episodes.individual_log import EVENTS, GENERATIONS, INDIVIDUALS
+from mjx_revolve.episodes.run_reader import RunReader, find_run, generation_of, read_metrics
+from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import resolve_inside
+from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.view.colony_history import read_history
 from mjx_revolve.view.population import read_population
-from mjx_revolve.view.report.record import Problem, RunRecord
+from mjx_revolve.view.report.record import RunRecord
 
 # Read one way or another, and shown; none of them may be a link to a file elsewhere.
 _FILES = ("config.yaml", "run.json", "metrics.csv", "champion/genes.yaml",
           "champion/morphology.yaml", INDIVIDUALS, GENERATIONS, EVENTS)  # fmt: skip
-# Whose version decides what a replay gives.
+# Packages on whose versions a replay depends.
 _PACKAGES = ("mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax")
 
 
@@ -44,7 +41,7 @@ def read_run(folder: str | Path) -> RunRecord:
         folder: the run folder; its `champion` folder will do.
 
     Returns:
-        The record; `problems` says what it lacks.
+        The record; `problems` lists what it lacks.
 
     Raises:
         InputError: there is no such folder, or nothing of a run in it.
@@ -53,8 +50,8 @@ def read_run(folder: str | Path) -> RunRecord:
     if not path.is_dir():
         found = "a file" if path.exists() else "none"
         raise InputError(f"{path}: expected a run folder; found {found}")
-    if path.name == "champion" and (path.parent / "config.yaml").is_file():
-        path = path.parent
+    with suppress(InputError):  # without a config.yaml, the rest is read
+        path = find_run(path)
     label = str(path) if str(path) not in (".", "..") else path.resolve().name
     record = RunRecord(path.absolute(), label)
     for name in _FILES:
@@ -62,9 +59,7 @@ def read_run(folder: str | Path) -> RunRecord:
             resolve_inside(name, path)
     _read_info(record)
     _read_config(record)
-    record.metrics, problems = read_metrics(record.folder / "metrics.csv")
-    for problem in problems:
-        record.note(problem.kind, problem.text)
+    _read_metrics(record)
     _read_population(record)
     _read_champion(record)
     _check_end(record)
@@ -114,7 +109,7 @@ def _read_info(record: RunRecord) -> None:
         record.note("missing", "run.json is missing: versions, machine and times are not known")
         return
     with record.noting_damage():
-        record.info = Run(record.folder).info
+        record.info = RunReader(record.folder).info
 
 
 # --- the configuration ----------------------------------------------------------------------------
@@ -173,64 +168,38 @@ def _read_config(record: RunRecord) -> None:
 # --- the metrics ----------------------------------------------------------------------------------
 
 
-def read_metrics(path: Path) -> tuple[dict[str, np.ndarray], list[Problem]]:
-    """Reads every line of a metrics file that is whole.
-
-    Args:
-        path: the CSV.
-
-    Returns:
-        Float columns `[T]` by name, in the order of generations, infinities as NaN, and what was
-        wrong.
-    """
+def _read_metrics(record: RunRecord) -> None:
+    """Every line that is whole; infinities count as NaN."""
+    path = record.folder / "metrics.csv"
     if not path.is_file():
-        return {}, [Problem("missing", f"{path.name} is missing: no convergence")]
-    try:
-        text = path.read_bytes().decode(errors="replace")
-        # A last line without an end is being written, or was cut there.
-        lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1])))
-    except OSError as error:
-        return {}, [Problem("damaged", f"{path.name}: cannot be read: {error.strerror}")]
-    except csv.Error as error:
-        return {}, [Problem("damaged", f"{path.name}: expected a CSV file; found: {error}")]
-    if not text.strip("\0 \r\n"):
-        return {}, [Problem("missing", f"{path.name} is empty: no generation was finished")]
-    header = lines[0] if lines else []
-    if "generation" not in header or len(set(header)) < len(header):
-        return {}, [Problem("damaged", f"{path.name}: expected a header with a column generation; "
-                            f"found {str(header)[:60]}")]  # fmt: skip
-    rows: dict[float, list[float]] = {}
-    place = header.index("generation")
-    bad = 0
-    for line in lines[1:]:
-        try:
-            row = [float(cell) for cell in line]
-        except ValueError:
-            row = []
-        if len(row) == len(header) and np.isfinite(row[place]):
-            rows[row[place]] = row  # of two, the later one is the resumed run's
-        else:
-            bad += 1
-    problems = []
+        record.note("missing", f"{path.name} is missing: no convergence")
+        return
+    columns, bad, damage = read_metrics(path)
+    if damage:
+        record.note("damaged", f"{path.name}: {damage}")
+        return
     if bad:
         what = "line is" if bad == 1 else "lines are"
-        problems.append(Problem("damaged", f"{path.name}: {bad} {what} damaged and left out"))
-    if not rows:
-        return {}, [*problems, Problem("missing", f"{path.name} has no generation")]
-    table = np.array([rows[generation] for generation in sorted(rows)])
-    table[~np.isfinite(table)] = np.nan
-    last = int(table[-1, place])
-    if len(table) != last:
-        gap = f"{last - len(table)} of {last} generations are not in it"
-        problems.append(Problem("damaged", f"{path.name}: {gap}"))
-    return dict(zip(header, table.T, strict=True)), problems
+        record.note("damaged", f"{path.name}: {bad} {what} damaged and left out")
+    if not columns:
+        record.note("missing", f"{path.name} is empty: no generation was finished")
+    elif not len(columns["generation"]):
+        record.note("missing", f"{path.name} has no generation")
+    else:
+        record.metrics = {
+            name: np.where(np.isfinite(column), column, np.nan) for name, column in columns.items()
+        }
+        found, last = len(columns["generation"]), int(columns["generation"][-1])
+        if found != last:
+            gap = f"{last - found} of {last} generations are not in it"
+            record.note("damaged", f"{path.name}: {gap}")
 
 
-# --- who lived ------------------------------------------------------------------------------------
+# --- individuals ----------------------------------------------------------------------------------
 
 
 def _read_population(record: RunRecord) -> None:
-    """All who lived in a run in which bodies evolved."""
+    """The individuals of a run in which bodies evolved."""
     if not record.settings.get("bodies") and not (record.folder / INDIVIDUALS).is_file():
         return
     record.population, problems = read_population(record.folder)
@@ -243,7 +212,7 @@ def _read_population(record: RunRecord) -> None:
         for problem in problems:
             record.note("damaged", problem)
     if not record.population.lives:
-        record.note("missing", f"{INDIVIDUALS} has nobody: neither bodies nor families")
+        record.note("missing", f"{INDIVIDUALS} is empty: neither bodies nor families")
 
 
 # --- the champion ---------------------------------------------------------------------------------
@@ -256,16 +225,15 @@ def _read_champion(record: RunRecord) -> None:
     if best is not None:
         with record.noting_damage():
             elite, origin = best.genes, f"{INDIVIDUALS}, number {best.number}"
-    path = record.folder / "champion" / "genes.yaml"
-    if not path.is_file():
+    run = RunReader(record.folder)
+    if run.champion_path is None:
         record.note("missing", "champion/genes.yaml is missing")
     else:
         with record.noting_damage():
-            genes = load_genes(path)
-            if not genes.size:
-                raise InputError(f"{path}: genes: expected finite numbers; found none")
-            record.genes = genes
-            record.champion = {k: fact for k, fact in load_yaml(path).items() if k != "genes"}
+            found = run.load_champion()
+            if not found.genes.size:
+                raise InputError(f"{found.path}: genes: expected finite numbers; found none")
+            record.genes, record.champion = found.genes, dict(found.facts)
     judged = record.info.get("champion")
     if isinstance(judged, dict):  # the same facts, and there even where genes.yaml is not
         record.champion = record.champion | judged
@@ -282,25 +250,25 @@ def _read_checkpoints(record: RunRecord) -> tuple[np.ndarray | None, str]:
 
     Where bodies evolve, none: genes alone are of no use.
     """
-    found: tuple[np.ndarray | None, str] = (None, "")
-    paths = Run(record.folder).checkpoints()
-    for path in paths:
-        try:
-            arrays = read_checkpoint(path).arrays
-            if record.population is not None:
-                continue
-            elites, scores = arrays["elites"], arrays["elite_scores"]
-            if elites.dtype.kind != "f" or elites.ndim != 2 or scores.shape != elites.shape[:1]:
-                raise DamageError(f"elites: expected genes; found {elites.dtype} {elites.shape}")
-        except (DamageError, KeyError) as error:
-            record.note("damaged", f"checkpoints/{path.name}: {error}")
+    run = RunReader(record.folder)
+    best: tuple[np.ndarray | None, str] = (None, "")
+    damaged: dict[str, str] = {}
+    for checkpoint in run.readable_checkpoints(damaged):
+        name, arrays = checkpoint.path.name, checkpoint.arrays
+        if record.population is not None:
+            continue
+        elites, scores = (arrays.get(key, np.zeros(0)) for key in ("elites", "elite_scores"))
+        if elites.dtype.kind != "f" or elites.ndim != 2 or scores.shape != elites.shape[:1]:
+            damaged[name] = f"elites: expected genes; found {elites.dtype} {elites.shape}"
             continue
         whole = np.isfinite(scores[:1]).all() and np.isfinite(elites[:1]).all()
-        if found[0] is None and len(elites) and whole:
-            found = np.asarray(elites[0], np.float32), f"checkpoints/{path.name}"
-    if not paths:
+        if best[0] is None and len(elites) and whole:
+            best = np.asarray(elites[0], np.float32), f"checkpoints/{name}"
+    for name, error in damaged.items():
+        record.note("damaged", f"checkpoints/{name}: {error}")
+    if not run.checkpoints():
         record.note("missing", "checkpoints/ has none: the run cannot be resumed")
-    return found
+    return best
 
 
 # --- whether it is whole --------------------------------------------------------------------------
@@ -309,8 +277,7 @@ def _read_checkpoints(record: RunRecord) -> tuple[np.ndarray | None, str]:
 def _check_end(record: RunRecord) -> None:
     """A run that stopped early, or that lost its last lines."""
     planned = record.setting("evolution.generations")
-    names = [path.stem for path in Run(record.folder).checkpoints()]
-    newest = max((int(name.rpartition("_")[2]) for name in names), default=0)
+    newest = max(map(generation_of, RunReader(record.folder).checkpoints()), default=0)
     ran = record.info.get("generations")
     reached = max(newest, ran if isinstance(ran, int) and "finished" in record.info else 0)
     if record.metrics and reached > record.generations:

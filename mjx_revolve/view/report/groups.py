@@ -1,116 +1,31 @@
-"""Runs of one configuration with different seeds belong together: groups, and their statistics."""
+"""Groups of runs: one configuration with different seeds."""
 
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from mjx_revolve.evolution.fingerprints import hash_text
-from mjx_revolve.inputs.own_code import content_name, parse_own
+from mjx_revolve.inputs.user_code import content_name, parse_user_function
 from mjx_revolve.view.report.record import RunRecord, number
 
 # Settings that do not make it another configuration: they only say how it is kept.
 _KEEPING = ("checkpoint_every", "keep_checkpoints", "tensorboard")
 # What groups are named by where it tells them apart, the most telling first; then all others.
-_TELLING = (
+_DISTINGUISHING = (
     "morphology", "task.type", "world.name", "controller.type", "evolution.strategy",
     "evolution.population_size", "evolution.generations",
 )  # fmt: skip
-LEVEL = 0.95  # of all confidence intervals
 _LABEL = 56  # longest name of a group in a legend [characters]
 
 
-class Interval(NamedTuple):
-    """A mean over seeds and how sure it is.
-
-    Attributes:
-        mean: of the finite values; NaN without any.
-        half: half width of its confidence interval; NaN below two values.
-        count: how many values.
-    """
-
-    mean: Any
-    half: Any
-    count: Any
-
-
-def mean_interval(values: Any) -> Interval:
-    """Mean over the first axis and its confidence interval.
-
-    The interval is Student's: ± t(0.975, n - 1) s / √n, with s the standard deviation with n - 1.
-    It takes the seeds' values as draws from a normal distribution, which few seeds cannot test.
-
-    Args:
-        values: `[n]` or `[n, T]`, a row for each seed; what is not finite does not count.
-
-    Returns:
-        Numbers, or `[T]` each.
-    """
-    x = np.asarray(values, float)
-    x = np.where(np.isfinite(x), x, np.nan)
-    count = np.isfinite(x).sum(axis=0)
-    with warnings.catch_warnings():  # of columns with too few values: NaN is the answer
-        warnings.simplefilter("ignore")
-        mean, error = np.nanmean(x, axis=0), stats.sem(x, axis=0, nan_policy="omit")
-        half = np.asarray(stats.t.ppf(0.5 + LEVEL / 2, count - 1) * error)
-    return Interval(mean[()], half[()], count[()])
-
-
-def mean_difference(values: Any, others: Any) -> Interval:
-    """Difference of two means and its confidence interval, without assuming equal spreads.
-
-    Welch (1947), Biometrika 34: degrees of freedom after Satterthwaite.
-
-    Args:
-        values: `[n]`, a value for each seed.
-        others: `[m]`, to be subtracted.
-
-    Returns:
-        The difference; `half` is NaN where a side has fewer than two values.
-    """
-    a, b = (np.asarray(x, float)[np.isfinite(x)] for x in (values, others))
-    count = min(len(a), len(b))
-    if not count:
-        return Interval(np.nan, np.nan, 0)
-    difference = float(a.mean() - b.mean())
-    if count > 1 and not np.ptp(a) and not np.ptp(b):
-        return Interval(difference, 0.0, count)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        welch = stats.ttest_ind(a, b, equal_var=False).confidence_interval(LEVEL)
-    return Interval(difference, float(welch.high - welch.low) / 2, count)
-
-
-def quantiles(values: np.ndarray, shares: Sequence[float]) -> np.ndarray:
-    """Quantiles `[q, T]` of values `[n, T]` over the seeds; NaN where there is no finite value."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return np.nanquantile(np.where(np.isfinite(values), values, np.nan), shares, axis=0)
-
-
-def format_interval(interval: Interval) -> str:
-    """`0.1537 ± 0.0042`: the mean to the digits that its interval bears; `–` without a value."""
-    if interval.count == 0 or not np.isfinite(interval.mean):
-        return "–"
-    if not interval.half > 1e-9 * abs(interval.mean):  # one value, or all of them the same
-        text = f"{interval.mean:.3g}"
-    elif (places := 1 - int(np.floor(np.log10(interval.half)))) > 8:
-        text = f"{interval.mean:.3g} ± {interval.half:.1g}"
-    else:
-        places = max(places, 0)
-        text = f"{interval.mean:.{places}f} ± {interval.half:.{places}f}"
-    return text.replace("-", "−")
-
-
 @dataclass(frozen=True, eq=False)
-class Group:
+class RunGroup:
     """Runs that differ in their seed only.
 
     Attributes:
@@ -123,7 +38,7 @@ class Group:
     name: str
     records: tuple[RunRecord, ...]
     copies: tuple[RunRecord, ...]
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
 
     @property
     def task(self) -> str:
@@ -145,28 +60,20 @@ class Group:
         """The last generation that every run of the group has reached."""
         return min((record.generations for record in self.shown), default=0)
 
-    def curve(self, column: str, over: str = "generation") -> tuple[np.ndarray, np.ndarray]:
-        """A column of all runs, as far as all of them reach.
-
-        Args:
-            column: of the metrics; NaN in a run that lacks it.
-            over: the column for the horizontal axis; the first run's counts.
+    def curve(self, column: str) -> tuple[np.ndarray, np.ndarray]:
+        """A column of all runs, as far as all of them reach; NaN in a run that lacks it.
 
         Returns:
-            `[T]` abscissae and `[n, T]` values, a row for each run.
+            `[T]` generations and `[n, T]` values, a row for each run.
         """
         if not self.shown:
             return np.zeros(0), np.zeros((0, 0))
-        steps = self.shown[0].metrics["generation"]
-        for record in self.shown[1:]:
-            steps = np.intersect1d(steps, record.metrics["generation"])
-        steps = steps[steps <= self.common_generations]
-        first = self.shown[0].metrics
-        x = first[over][np.isin(first["generation"], steps)]
+        tables = [record.metrics for record in self.shown]
+        x = reduce(np.intersect1d, [table["generation"] for table in tables])
         return x, np.array([
-            record.metrics[column][np.isin(record.metrics["generation"], steps)]
-            if column in record.metrics else np.full(len(steps), np.nan)
-            for record in self.shown
+            table[column][np.isin(table["generation"], x)]
+            if column in table else np.full(len(x), np.nan)
+            for table in tables
         ])  # fmt: skip
 
     def scores(self) -> list[float]:
@@ -195,8 +102,8 @@ class Group:
         return max(self.records, key=rank)
 
 
-def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def _flatten(data: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    flat: dict[str, object] = {}
     for key, value in data.items():
         if isinstance(value, Mapping) and value:
             flat |= _flatten(value, f"{prefix}{key}.")
@@ -205,7 +112,7 @@ def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _settings(record: RunRecord) -> dict[str, Any]:
+def _settings(record: RunRecord) -> dict[str, object]:
     """All that makes a configuration, files by what they hold rather than where they are."""
     data = dict(record.settings if record.config is None else record.config.model_dump())
     if isinstance(data.get("world"), str):
@@ -221,23 +128,24 @@ def _settings(record: RunRecord) -> dict[str, Any]:
             named = record.settings.get(key, value)  # another file may stand in for a lost one
             flat[key] = f"{Path(str(named)).stem} {hash_text(text)[:6]}"
     for key in ("task.type", "controller.type"):
-        if parse_own(flat.get(key)):
-            function, _, digest = content_name(flat[key]).partition(" ")
+        value = flat.get(key)
+        if isinstance(value, str) and parse_user_function(value):
+            function, _, digest = content_name(value).partition(" ")
             flat[key] = f"{function} {digest[:6]}"
     return flat
 
 
-def group_runs(records: Sequence[RunRecord]) -> list[Group]:
+def group_runs(records: Sequence[RunRecord]) -> list[RunGroup]:
     """Puts runs of the same configuration together.
 
     Args:
-        records: the runs; a run that repeats a seed of its group is told so.
+        records: the runs; a run that repeats a seed of its group gets a note.
 
     Returns:
         The groups, in the order of their first runs. A run without settings is alone.
     """
     groups: dict[str, list[RunRecord]] = {}
-    settings: dict[str, dict[str, Any]] = {}
+    settings: dict[str, dict[str, object]] = {}
     for record in records:
         flat = _settings(record)
         key = json.dumps(flat, sort_keys=True, default=str) if flat else str(record.folder)
@@ -246,49 +154,49 @@ def group_runs(records: Sequence[RunRecord]) -> list[Group]:
     names = _names(list(groups.values()), list(settings.values()))
     made = []
     for name, (key, members) in zip(names, groups.items(), strict=True):
-        kept: dict[Any, RunRecord] = {}
+        kept: dict[Path | int, RunRecord] = {}
         # Of two with one seed the one that went further counts.
         for record in sorted(members, key=lambda r: (r.is_finished, r.generations), reverse=True):
-            kept.setdefault(record.folder if record.seed is None else record.seed, record)
+            kept.setdefault(_identity(record), record)
         unique = tuple(record for record in members if record in kept.values())
         copies = tuple(record for record in members if record not in kept.values())
         for record in copies:
-            record.note("copy", f"the same configuration and seed as {kept[record.seed].label}: "
-                        "it counts once")  # fmt: skip
-        made.append(Group(name, unique, copies, settings[key]))
+            label = kept[_identity(record)].label
+            record.note("copy", f"the same configuration and seed as {label}: it counts once")
+        made.append(RunGroup(name, unique, copies, settings[key]))
     return made
 
 
-def differences(groups: Sequence[Group]) -> dict[str, list[Any]]:
-    """Settings in which groups differ.
+def _identity(record: RunRecord) -> Path | int:
+    """The seed, by which runs of a group are told apart, or else the folder."""
+    return record.folder if record.seed is None else record.seed
 
-    Args:
-        groups: the groups.
 
-    Returns:
-        By dotted name, the value of each group; None where it has none.
-    """
+def differences(groups: Sequence[RunGroup]) -> dict[str, list[object]]:
+    """Settings in which groups differ: by dotted name the value of each group, or None."""
     return _differences([group.settings for group in groups if group.settings])
 
 
-def _differences(settings: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+def _differences(settings: Sequence[Mapping[str, object]]) -> dict[str, list[object]]:
     keys = dict.fromkeys(key for flat in settings for key in flat)
     table = {key: [flat.get(key) for flat in settings] for key in keys}
     return {key: row for key, row in table.items() if any(value != row[0] for value in row)}
 
 
-def _names(groups: Sequence[Sequence[RunRecord]], settings: Sequence[dict[str, Any]]) -> list[str]:
+def _names(
+    groups: Sequence[Sequence[RunRecord]], settings: Sequence[dict[str, object]]
+) -> list[str]:
     """Short names that tell the groups apart: the fewest settings that do, or the file's name."""
     differ = _differences([flat for flat in settings if flat])
-    told: list[tuple[str, ...]] = [()] * len(groups)
-    for key in sorted(differ, key=lambda k: _TELLING.index(k) if k in _TELLING else len(_TELLING)):
-        more = [
-            (*words, _words(key, flat.get(key))) for words, flat in zip(told, settings, strict=True)
-        ]
-        if len(set(more)) > len(set(told)):
-            told = more
+    first = [key for key in _DISTINGUISHING if key in differ]
+    chosen: list[tuple[str, ...]] = [()] * len(groups)
+    for key in dict.fromkeys([*first, *differ]):
+        words = [_words(key, flat.get(key)) for flat in settings]
+        more = [(*before, word) for before, word in zip(chosen, words, strict=True)]
+        if len(set(more)) > len(set(chosen)):
+            chosen = more
     names = []
-    for records, words in zip(groups, told, strict=True):
+    for records, words in zip(groups, chosen, strict=True):
         source = records[0].info.get("config_file")
         file = Path(source).stem if isinstance(source, str) else records[0].folder.name
         name = ", ".join(word for word in words if word) or file
@@ -300,7 +208,7 @@ def _names(groups: Sequence[Sequence[RunRecord]], settings: Sequence[dict[str, A
     ]
 
 
-def _words(key: str, value: Any) -> str:
+def _words(key: str, value: object) -> str:
     """`controller.type: cpg` as "cpg", anything else as "name value"."""
     if value is None:
         return ""

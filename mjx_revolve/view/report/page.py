@@ -7,19 +7,16 @@ from __future__ import annotations
 
 import base64
 import datetime
-import io
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jinja2
-import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
-from PIL import Image
 
 from mjx_revolve import __version__
 from mjx_revolve.body.morphology import Morphology, load_morphology
@@ -29,18 +26,18 @@ from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.evolution.fingerprints import model_hash
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.trust import UntrustedError
-from mjx_revolve.view.colony_curves import plot_colony, plot_population
-from mjx_revolve.view.colony_history import History
-from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives
-from mjx_revolve.view.motion import Motion
-from mjx_revolve.view.plots import COLORS, figure_png, figure_svg, plot_fitness, plot_way
-from mjx_revolve.view.report import champion_pictures, run_pictures, tables
+from mjx_revolve.view import convergence, motion_plots
+from mjx_revolve.view.colony_history import ColonyHistory
+from mjx_revolve.view.colony_pictures import plot_history
+from mjx_revolve.view.plots import COLORS, figure_jpeg, figure_png, figure_svg, letter
+from mjx_revolve.view.report import tables
 from mjx_revolve.view.report.bodies import anchor, inline_svg, show_population, viewer_command
-from mjx_revolve.view.report.champion import Replay, replay_champion
-from mjx_revolve.view.report.groups import Group, group_runs
+from mjx_revolve.view.report.champion import ChampionReplay, replay_champion
+from mjx_revolve.view.report.groups import RunGroup, group_runs
 from mjx_revolve.view.report.record import RunRecord
 from mjx_revolve.view.report.repeat import environment, repeat_commands, sources
-from mjx_revolve.view.report.sense_pictures import plot_senses
+from mjx_revolve.view.sensor_plots import plot_sensors
+from mjx_revolve.view.statistics import COVERAGE
 from mjx_revolve.view.swim_picture import draw_motion
 
 GENERATOR = "mjx_revolve.report"  # tells our pages from others
@@ -53,12 +50,12 @@ def _make_templates() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     templates.filters["digits"] = tables.format_number
-    templates.filters["letter"] = run_pictures.letter
+    templates.filters["letter"] = letter
     templates.filters["color"] = lambda index: COLORS[index % len(COLORS)]
     templates.filters["png"] = lambda data: _source(data, "png")
     templates.filters["svg"] = lambda data: _source(data, "svg+xml")
     templates.filters["inline"] = lambda data: Markup(inline_svg(data))
-    templates.globals["episodes"] = REPORT_EPISODES
+    templates.globals |= {"episodes": REPORT_EPISODES, "coverage": COVERAGE}
     return templates
 
 
@@ -86,36 +83,59 @@ def make_report(
     """
     groups = group_runs(records)
     replays, robots = _replay(groups)
-    first, single = records[0], len(records) == 1
-    if single:
-        robot = f"{robots[0][1].name}: " if robots else ""
-        robot = robot if first.population is None else "evolved bodies: "
-        robot = robot if first.history is None else "a colony, its champion's "
-        title = f"{robot}{first.task.replace('_', ' ') or 'evolution'} ({Path(first.label).name})"
-    else:
-        title = f"{len(records)} runs"
-        title += f" of {groups[0].name}" if len(groups) == 1 else f", {len(groups)} configurations"
+    full = list(_in_full(groups, every_champion, RunGroup.best))
+    champions = _in_full(groups, every_champion, lambda group: _best_replayed(group, replays))
+    single = len(records) == 1
     content = [
         ("results", "Results", _results(groups)),
         ("convergence", "Convergence", _convergence(groups)),
-        *_colonies(groups, every_champion),
-        *_populations(groups, every_champion, Path(at)),
+        *((f"colony-{key}", f"The colony{words}", _colony(record, record.history))
+          for key, words, record in full if record.history is not None),
+        *((f"bodies-{key}", f"Bodies{words}", _population(record, Path(at)))
+          for key, words, record in full if record.population is not None),
         ("champions", "Champions side by side", _side_by_side(groups, replays)),
-        *_champions(groups, replays, every_champion),
+        *((f"champion-{key}", f"Champion{words}", _champion(record, replays.get(record.folder)))
+          for key, words, record in champions),
         ("robot", "Robot", _robots(robots)),
         ("runs", "Runs", "" if single else sections.runs(*tables.runs_table(groups))),
-        ("repeat", "Repeat it", _repeat(groups)),
-    ]
+        ("repeat", "Repeat it", _repeat([r for group in groups for r in group.records])),
+    ]  # fmt: skip
     kinds = {problem.kind for record in records for problem in record.problems}
     is_grave = bool(lost) or bool(kinds & {"damaged", "missing"})
     lead = sections.headline(tables.headline(groups))
-    if single and first.is_finished:
+    if single and records[0].is_finished:
         lead += sections.one_seed()
     lead += sections.problems([record for record in records if record.problems], lost, is_grave)
-    return make_page(title, ", ".join(record.label for record in records), lead, content)
+    labels = ", ".join(record.label for record in records)
+    return make_page(_title(groups, robots), labels, lead, content)
 
 
-def usual_place(folder: Path) -> Path:
+def _title(groups: Sequence[RunGroup], robots: Sequence[tuple[str, Morphology]]) -> str:
+    records = [record for group in groups for record in (*group.records, *group.copies)]
+    first = records[0]
+    if len(records) > 1:
+        of = f" of {groups[0].name}" if len(groups) == 1 else f", {len(groups)} configurations"
+        return f"{len(records)} runs{of}"
+    robot = f"{robots[0][1].name}: " if robots else ""
+    robot = robot if first.population is None else "evolved bodies: "
+    robot = robot if first.history is None else "a colony, its champion's "
+    return f"{robot}{first.task.replace('_', ' ') or 'evolution'} ({Path(first.label).name})"
+
+
+def _in_full(
+    groups: Sequence[RunGroup], every: bool, best_of: Callable[[RunGroup], RunRecord]
+) -> Iterator[tuple[str, str, RunRecord]]:
+    """Runs that are shown in full: a key, words that headings add, and the run."""
+    for k, group in enumerate(groups):
+        best = best_of(group)
+        for record in group.records if every else [best]:
+            words = f" of {letter(k)}, {group.name}" if len(groups) > 1 else ""
+            if len(group.records) > 1:
+                words += f": {'the best, ' if record is best else ''}seed {record.seed}"
+            yield f"{k}-{record.seed}", words, record
+
+
+def default_page(folder: Path) -> Path:
     """Where the page about a folder goes.
 
     Args:
@@ -125,7 +145,7 @@ def usual_place(folder: Path) -> Path:
         The path of its `report.html`.
 
     Raises:
-        InputError: somebody else's file has that name.
+        InputError: another program's file has that name.
     """
     path = folder / "report.html"
     if path.exists():
@@ -157,75 +177,40 @@ def make_page(title: str, words: str, lead: str, content: Sequence[tuple[str, st
     )  # fmt: skip
 
 
-def _heading(word: str, groups: Sequence[Group], k: int, record: RunRecord, best: RunRecord) -> str:
-    """The heading of a section about one run of the k-th group: whose, as far as there are more."""
-    if len(groups) > 1:
-        word += f" of {run_pictures.letter(k)}, {groups[k].name}"
-    if len(groups[k].records) > 1:
-        word += f": {'the best, ' if record is best else ''}seed {record.seed}"
-    return word
+# --- bodies and colonies --------------------------------------------------------------------------
 
 
-# --- who lived ------------------------------------------------------------------------------------
-
-
-def _colonies(groups: Sequence[Group], every: bool) -> list[tuple[str, str, str]]:
-    """A section about each colony that is shown in full: who lived when, of whom, and where."""
-    found = []
-    for k, group in enumerate(groups):
-        best = group.best()
-        for record in group.records:
-            if record.history is None or not (record is best or every):
-                continue
-            heading = _heading("The colony", groups, k, record, best)
-            found.append((f"colony-{k}-{record.seed}", heading, _colony(record, record.history)))
-    return found
-
-
-def _colony(record: RunRecord, history: History) -> str:
-    """All about one colony."""
+def _colony(record: RunRecord, history: ColonyHistory) -> str:
+    """A colony: births, lives, families and places."""
     if not history.spans:
         return ""
     colony = None if record.config is None else record.config.colony
     room = record.setting("evolution.population_size")
-    pictures = {
-        "population": plot_population(history, room if isinstance(room, int) else None),
-        "lives": plot_lives(history),
-        "families": plot_families(history, record.individual),
-        "arena": None if colony is None else plot_arena(history, colony),
-    }
+    figures = plot_history(
+        history, colony, room if isinstance(room, int) else None, record.individual
+    )
     # Thousands of lines and dots take less room as points of a picture.
-    sources = {name: figure and _source(figure_png(figure), "png")
-               for name, figure in pictures.items()}  # fmt: skip
+    sources = {name: _source(figure_png(figure), "png") for name, figure in figures.items()}
     command = shlex.join(["python", "-m", "mjx_revolve.viewer", record.label, "--colony"])
     return sections.colony(tables.colony_table(history), sources, command)
 
 
-def _populations(groups: Sequence[Group], every: bool, at: Path) -> list[tuple[str, str, str]]:
-    """A section about the bodies of each run that is shown in full."""
-    found = []
-    for k, group in enumerate(groups):
-        best = group.best()
-        for record in group.records:
-            if record.population is None or not (record is best or every):
-                continue
-            shown = show_population(record, at)
-            content = sections.population(
-                shown, partial(anchor, record), partial(viewer_command, record), record.round
-            )
-            heading = _heading("Bodies", groups, k, record, best)
-            found.append((f"bodies-{k}-{record.seed}", heading, content))
-    return found
+def _population(record: RunRecord, at: Path) -> str:
+    """The bodies of a run."""
+    shown = show_population(record, at)
+    return sections.population(
+        shown, partial(anchor, record), partial(viewer_command, record), record.round
+    )
 
 
 # --- what the champions do ------------------------------------------------------------------------
 
 
 def _replay(
-    groups: Sequence[Group],
-) -> tuple[dict[Path, Replay], list[tuple[str, Morphology]]]:
+    groups: Sequence[RunGroup],
+) -> tuple[dict[Path, ChampionReplay], list[tuple[str, Morphology]]]:
     """All champions' episodes by run folder, and the robots of the groups."""
-    replays: dict[Path, Replay] = {}
+    replays: dict[Path, ChampionReplay] = {}
     robots: list[tuple[str, Morphology]] = []
     for group in groups:
         fitness = None
@@ -266,7 +251,7 @@ def _champions_body(record: RunRecord, config: Config) -> Morphology:
     return body if number is None else replace(body, name=f"individual {number}")
 
 
-def _robot_alone(group: Group) -> list[tuple[str, Morphology]]:
+def _robot_alone(group: RunGroup) -> list[tuple[str, Morphology]]:
     """The body that a run left behind, where its configuration cannot be used."""
     for record in group.records:
         path = record.folder / "champion" / "morphology.yaml"
@@ -278,59 +263,36 @@ def _robot_alone(group: Group) -> list[tuple[str, Morphology]]:
     return []
 
 
-def _champions(
-    groups: Sequence[Group], replays: Mapping[Path, Replay], every: bool
-) -> list[tuple[str, str, str]]:
-    """A section for each champion that is shown in full."""
-    found = []
-    for k, group in enumerate(groups):
-        best = group.best()
-        if best.folder not in replays:  # another seed's, rather than none
-            best = next((r for r in group.records if r.folder in replays), best)
-        for record in group.records:
-            if record is not best and not every:
-                continue
-            replay = replays.get(record.folder)
-            content = _saved_pictures(record) if replay is None else _champion(record, replay)
-            heading = _heading("Champion", groups, k, record, best)
-            found.append((f"champion-{k}-{record.seed}", heading, content))
-    return found
+def _best_replayed(group: RunGroup, replays: Mapping[Path, ChampionReplay]) -> RunRecord:
+    """The best run; another seed's rather than one without a replay."""
+    best = group.best()
+    if best.folder in replays:
+        return best
+    return next((r for r in group.records if r.folder in replays), best)
 
 
-def _champion(record: RunRecord, replay: Replay) -> str:
-    """All about one champion."""
-    motion = replay.motion
-    robot = motion.robot
+def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
+    """A champion; without a replay, the pictures that its run left behind."""
+    if replay is None:
+        return _saved_pictures(record)
+    motion, robot = replay.motion, replay.motion.robot
     drawn = {
-        "way": plot_way(motion.time, motion.path, float(motion.surface[0])),
-        "joints": champion_pictures.plot_joints(motion) if robot.num_hinges else None,
-        "phases": None if motion.phases is None else champion_pictures.plot_phases(motion),
-        "thrusters": champion_pictures.plot_thrusters(motion) if robot.num_thrusters else None,
-        "energy": champion_pictures.plot_energy(motion),
-        "senses": plot_senses(_before(motion), replay.felt) if replay.felt else None,
-    }
+        "way": motion_plots.plot_path(motion.time, motion.path, float(motion.surface[0])),
+        "joints": motion_plots.plot_joints(motion) if robot.num_hinges else None,
+        "phases": None if motion.phases is None else motion_plots.plot_phases(motion),
+        "thrusters": motion_plots.plot_thrusters(motion) if robot.num_thrusters else None,
+        "energy": motion_plots.plot_energy(motion),
+        # Readings are of the moment before each step.
+        "senses": plot_sensors(motion.time - motion.time[0], replay.traces)
+        if replay.traces else None,
+    }  # fmt: skip
     pictures = {name: figure and svg_source(figure) for name, figure in drawn.items()}
-    pictures["swim"] = _source(_swim_jpeg(replay), "jpeg")
+    pictures["swim"] = _source(figure_jpeg(draw_motion(motion)), "jpeg")
     origin = record.stand_in or record.champion.get("origin")
     return sections.champion(
         robot.morphology.name, float(motion.time[-1]), motion.counted_from,
         origin if isinstance(origin, str) else "", tables.measures_table(record, replay), pictures,
     )  # fmt: skip
-
-
-def _before(motion: Motion) -> np.ndarray:
-    """`[T]` when each step began [s]."""
-    return motion.time - motion.time[0]
-
-
-def _swim_jpeg(replay: Replay) -> bytes:
-    """The swim picture as a JPEG, a quarter of the PNG's size."""
-    figure = draw_motion(replay.motion)
-    figure.canvas.draw()
-    pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "JPEG", quality=90, subsampling=0)
-    return buffer.getvalue()
 
 
 def _saved_pictures(record: RunRecord) -> str:
@@ -357,7 +319,7 @@ def svg_source(figure: Figure) -> str:
 # --- several runs ---------------------------------------------------------------------------------
 
 
-def _results(groups: Sequence[Group]) -> str:
+def _results(groups: Sequence[RunGroup]) -> str:
     """Final scores of all configurations, and in what they differ."""
     if len(groups) == 1 and len(groups[0].records) == 1:
         return ""
@@ -365,7 +327,7 @@ def _results(groups: Sequence[Group]) -> str:
     return sections.results(tables.task_tables(groups), differ, len(groups))
 
 
-def _convergence(groups: Sequence[Group]) -> str:
+def _convergence(groups: Sequence[RunGroup]) -> str:
     """How the fitness grew."""
     styles = {group.name: k for k, group in enumerate(groups)}
     shown = [group for group in groups if group.shown]
@@ -373,7 +335,7 @@ def _convergence(groups: Sequence[Group]) -> str:
     for task in dict.fromkeys(group.task for group in shown):
         members = [group for group in groups if group.task == task]
         if sum(bool(group.shown) for group in members) > 1 or len(members[0].shown) > 1:
-            comparisons.append(svg_source(run_pictures.plot_comparison(members, styles)))
+            comparisons.append(svg_source(convergence.plot_comparison(members, styles)))
     entries = []
     for group in shown:
         record, several = group.shown[0], len(group.shown) > 1
@@ -386,7 +348,7 @@ def _convergence(groups: Sequence[Group]) -> str:
             "below": "how far the search spreads" if record.population is None
             else "how full the archive is, or how large the living are",
             "band": "quartiles" if quartiles else "mean and standard deviation",
-            "seeds": svg_source(run_pictures.plot_seeds(group)) if several else None,
+            "seeds": svg_source(convergence.plot_seeds(group)) if several else None,
             "fitness": None if several else svg_source(_plot_fitness(record, label)),
             "colony": record.history is not None,
         })  # fmt: skip
@@ -397,11 +359,11 @@ def _plot_fitness(record: RunRecord, label: str) -> Figure:
     """One run's fitness: over generations, or over a colony's time."""
     needed = ("time", "best", "median", "lower_quartile", "upper_quartile", "champion")
     if record.history is not None and all(name in record.metrics for name in needed):
-        return plot_colony(record.metrics)
-    return plot_fitness(record.metrics, "", label)
+        return convergence.plot_colony(record.metrics)
+    return convergence.plot_fitness(record.metrics, "", label)
 
 
-def _side_by_side(groups: Sequence[Group], replays: Mapping[Path, Replay]) -> str:
+def _side_by_side(groups: Sequence[RunGroup], replays: Mapping[Path, ChampionReplay]) -> str:
     """All champions in one picture, where there are several."""
     members = [
         (group.name, k, [replays[r.folder].motion for r in group.records if r.folder in replays])
@@ -410,7 +372,7 @@ def _side_by_side(groups: Sequence[Group], replays: Mapping[Path, Replay]) -> st
     members = [member for member in members if member[2]]
     if sum(len(found) for *_, found in members) < 2:
         return ""
-    return sections.side_by_side(svg_source(run_pictures.plot_champions(members)))
+    return sections.side_by_side(svg_source(motion_plots.plot_champions(members)))
 
 
 # --- the end --------------------------------------------------------------------------------------
@@ -418,7 +380,8 @@ def _side_by_side(groups: Sequence[Group], replays: Mapping[Path, Replay]) -> st
 
 def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
     """The robots, each once."""
-    entries: list[dict[str, Any]] = []
+    entries = []
+    several = len({morphology.name for _, morphology in found}) > 1
     seen: list[Morphology] = []
     for name, morphology in found:
         if any(morphology == other for other in seen):
@@ -427,21 +390,19 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
         counts = f"{morphology.num_modules} modules, {morphology.num_hinges} hinges"
         if morphology.num_thrusters:
             counts += f", {morphology.num_thrusters} thrusters"
-        heading = f"{morphology.name}: {counts}"
-        heading += f" ({name})" if len({m.name for _, m in found}) > 1 else ""
         rows, foot = tables.count_modules(morphology)
-        modules = tables.list_modules(morphology)
         entries.append({
-            "heading": heading, "rows": rows, "foot": foot, "modules": modules,
+            "heading": f"{morphology.name}: {counts}" + (f" ({name})" if several else ""),
+            "rows": rows, "foot": foot, "modules": tables.list_modules(morphology),
             "descriptors": tables.list_descriptors(morphology),
         })  # fmt: skip
     return sections.robots(entries)
 
 
-def _repeat(groups: Sequence[Group]) -> str:
-    """How to get the same runs again."""
+def _repeat(records: Sequence[RunRecord]) -> str:
+    """Commands, versions and sources that repeat the runs."""
     return sections.repeat([
         {"label": record.label, "seed": record.seed, "commands": repeat_commands(record),
          "environment": environment(record), "sources": sources(record)}
-        for group in groups for record in group.records
+        for record in records
     ])  # fmt: skip

@@ -1,4 +1,4 @@
-"""What is known of a run, and what is wrong with its folder."""
+"""The record of a run for reports: what could be read of its folder, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.episodes.tasks import score_unit, shown_measure
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.own_code import content_name
 from mjx_revolve.inputs.trust import UntrustedError
-from mjx_revolve.view.colony_curves import LABEL
-from mjx_revolve.view.colony_history import History
+from mjx_revolve.inputs.user_code import content_name
+from mjx_revolve.view.colony_history import ColonyHistory
+from mjx_revolve.view.convergence import COLONY_LABEL
 from mjx_revolve.view.population import Population
 
 # Kinds of problems, gravest first, and what they make of the run.
@@ -57,11 +57,11 @@ class RunRecord:
         config: the same, checked; None where it cannot be used.
         metrics: columns of `metrics.csv`, `[T]` each, one row per generation; empty without any.
         genes: `[G]` of the champion; None without one.
-        population: all who lived, where bodies have evolved; else None.
-        history: when and where they lived, in a colony; else None.
+        population: all individuals, where bodies have evolved; else None.
+        history: their births, matings and deaths, in a colony; else None.
         champion: facts about it: score, score_std, origin, final, measures, individual.
         stand_in: where the genes are from, if they are not the champion's own.
-        problems: what is missing, damaged or otherwise to be known.
+        problems: what is missing, damaged or otherwise notable.
     """
 
     folder: Path
@@ -72,13 +72,13 @@ class RunRecord:
     metrics: dict[str, np.ndarray] = field(default_factory=dict)
     genes: np.ndarray | None = None
     population: Population | None = None
-    history: History | None = None
+    history: ColonyHistory | None = None
     champion: dict[str, Any] = field(default_factory=dict)
     stand_in: str = ""
     problems: list[Problem] = field(default_factory=list)
 
     def note(self, kind: str, text: str) -> None:
-        """Adds a problem; what it says of the folder is said once."""
+        """Adds a problem once, without the folder's path."""
         problem = Problem(kind, plain(text.replace(f"{self.folder}/", "")))
         if problem not in self.problems:
             self.problems.append(problem)
@@ -117,6 +117,11 @@ class RunRecord:
         return score_unit(self._task_type)
 
     @property
+    def measure(self) -> str:
+        """Name of the measure that reports show beside the score."""
+        return shown_measure(self._task_type)
+
+    @property
     def _task_type(self) -> str:
         task = self.setting("task.type", "")
         return task if isinstance(task, str) else ""
@@ -125,7 +130,7 @@ class RunRecord:
     def fitness(self) -> str:
         """What evolution goes by, with its unit: in a colony not what its champion's score is."""
         if self.history is not None:
-            return LABEL
+            return COLONY_LABEL
         return f"fitness ({self.unit})" if self.unit else "fitness"
 
     @property

@@ -1,4 +1,4 @@
-"""How to repeat a run: commands to paste, and what its bits depend on."""
+"""How to repeat a run: command lines, versions, and the machine that its bits depend on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.report.record import RunRecord
 
-# Set to 1 by the command itself where nobody sets them.
+# Set to 1 by the command itself where the environment does not set them.
 _THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -40,13 +40,10 @@ def repeat_commands(record: RunRecord) -> list[tuple[str, str]]:
 
 def _line(record: RunRecord, arguments: list[str]) -> str:
     """The command, with the environment that its bits depend on."""
-    before = []
-    threads = record.info.get("threads")
-    for name in _THREADS:
-        value = threads.get(name) if isinstance(threads, dict) else None
-        if isinstance(value, str) and value != "1":
-            before.append(f"{name}={shlex.quote(value)}")
-    flags = record.info.get("xla_flags")
+    threads, flags = record.info.get("threads"), record.info.get("xla_flags")
+    values = {name: threads.get(name) for name in _THREADS} if isinstance(threads, dict) else {}
+    before = [f"{name}={shlex.quote(value)}" for name, value in values.items()
+              if isinstance(value, str) and value != "1"]  # fmt: skip
     if isinstance(flags, str) and flags:
         before.append(f"XLA_FLAGS={shlex.quote(flags)}")
     return " ".join([*before, shlex.join(["python", "-m", "mjx_revolve.evolve", *arguments])])
@@ -60,8 +57,7 @@ def _started(record: RunRecord) -> list[str] | None:
     if not all(isinstance(setting, str) for setting in settings):
         return None
     try:
-        config = load_config(file, settings)
-        if not _is_same(config, record.config):
+        if not _is_same(load_config(file, settings), record.config):
             return None
     except (InputError, OSError):
         return None
@@ -76,16 +72,16 @@ def _started(record: RunRecord) -> list[str] | None:
 
 
 def _is_same(config: Config, other: Config) -> bool:
-    """Whether all settings are; files by what they hold, because a run has copies of its own."""
+    """Whether all settings are; files by their content, because a run has copies of its own."""
     return (
         settings_hash(config) == settings_hash(other)
         and config.evolution == other.evolution
-        and _held(config) == _held(other)
+        and _contents(config) == _contents(other)
     )
 
 
-def _held(config: Config) -> list[bytes | str | None]:
-    """What is in the files that a configuration names, or the names of what is no file."""
+def _contents(config: Config) -> list[bytes | str | None]:
+    """Contents of the files that a configuration names, or the names of what is no file."""
     world = config.world if isinstance(config.world, str) else config.world["name"]
     seeds = config.bodies.seeds if config.bodies else ()
     names = (config.morphology, *seeds, config.modules, world)
@@ -96,23 +92,19 @@ def environment(record: RunRecord) -> list[tuple[str, str]]:
     """What a run's bits depend on beside its settings, as far as `run.json` says: name, value."""
     info = record.info
     rows: list[tuple[str, str]] = []
-    versions = info.get("versions")
+    versions, threads, resumed = (info.get(n) for n in ("versions", "threads", "resumed"))
     if isinstance(versions, dict):
         rows.append(("versions", ", ".join(f"{name} {value}" for name, value in versions.items())))
-    git = info.get("git")
-    if isinstance(git, str):
+    if isinstance(git := info.get("git"), str):
         rows.append(("git revision", f"{git.rstrip('+')}{' with changes' * git.endswith('+')}"))
     names = {"platform": "platform", "cpu": "processor", "cpu_count": "cores", "device": "device"}
     rows += [(words, str(info[name])) for name, words in names.items() if info.get(name)]
-    threads = info.get("threads")
     if isinstance(threads, dict):
         known = ", ".join(f"{name} {value}" for name, value in threads.items() if value)
         rows.append(("threads", known))
-    times = [f"{words} {info[name]}" for name, words in
-             (("started", "started"), ("finished", "finished")) if info.get(name)]  # fmt: skip
+    times = [f"{name} {info[name]}" for name in ("started", "finished") if info.get(name)]
     if times:
         rows.append(("time", ", ".join(times)))
-    resumed = info.get("resumed")
     if isinstance(resumed, list) and resumed:
         after = [str(entry.get("generation")) for entry in resumed if isinstance(entry, dict)]
         rows.append(("resumed after generation", ", ".join(after)))
@@ -120,21 +112,16 @@ def environment(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def sources(record: RunRecord) -> list[tuple[str, str]]:
-    """Configuration, robot and genes of a run as text, so that the page alone is enough.
-
-    Each with what it is called.
-    """
-    found = []
-    # Never what lies elsewhere: a page is shown to others, and a run has copies of its own.
-    inside = record.folder.resolve()
-    if record.settings and (record.folder / "config.yaml").is_file():
-        found.append(record.folder / "config.yaml")
-    named = record.config.morphology if record.config is not None else None
+    """Names and texts of configuration, robot and genes, so that the page alone is enough."""
+    config, named = record.folder / "config.yaml", record.config and record.config.morphology
     robot = Path(named) if named else record.folder / "champion" / "morphology.yaml"
-    if robot.is_file():
-        found.append(robot)
-    found = [path for path in found if path.resolve().is_relative_to(inside)]
-    texts = [(path.name, path.read_text(encoding="utf-8", errors="replace")) for path in found]
+    paths = [config] * bool(record.settings) + [robot]
+    # Never files elsewhere: a page is shown to others, and a run has copies of its own.
+    inside = record.folder.resolve()
+    texts = [
+        (path.name, path.read_text(encoding="utf-8", errors="replace")) for path in paths
+        if path.is_file() and path.resolve().is_relative_to(inside)
+    ]  # fmt: skip
     if record.genes is not None:
         data = {"genes": [float(gene) for gene in record.genes]}
         genes = yaml.safe_dump(data, default_flow_style=None, width=90)

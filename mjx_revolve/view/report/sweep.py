@@ -5,32 +5,35 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
-from mjx_revolve.evolution.plans import Plan
-from mjx_revolve.evolution.sweeps import Sweep, read_sweep
+from mjx_revolve.episodes.run_reader import RunReader
+from mjx_revolve.evolution.sweeps import Plan, Sweep, read_sweep
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.inputs.grids import read_axes
-from mjx_revolve.view.outcomes import Outcome, by_case, find_outcomes, is_finished, write_csv
-from mjx_revolve.view.plots import LABELS, WIDE, new_figure
-from mjx_revolve.view.report.page import make_page, sections, svg_source, usual_place
-from mjx_revolve.view.report.run_pictures import letter
+from mjx_revolve.view.body_pictures import plot_bodies
+from mjx_revolve.view.convergence import plot_curves, plot_scores
+from mjx_revolve.view.outcomes import (
+    Outcome,
+    by_case,
+    find_outcomes,
+    write_csv,
+)
+from mjx_revolve.view.plots import label_of, letter
+from mjx_revolve.view.report.page import default_page, make_page, sections, svg_source
 from mjx_revolve.view.report.tables import format_number
 from mjx_revolve.view.statistics import (
     ALPHA,
-    COVERAGE,
     compare,
     difference,
     interval,
     smallest_p,
 )
-from mjx_revolve.view.sweep_pictures import draw_curves, draw_dots, plot_bodies
 
 TABLE = "sweep.csv"
 # Pairs of more cases than this are not tested: Holm's correction would leave nothing (a choice).
@@ -41,7 +44,7 @@ Numbered = Mapping[int, Sequence[Outcome]]
 """Outcomes by the number of their case in the sweep, which gives it letter and colour."""
 
 
-class Report(NamedTuple):
+class SweepReport(NamedTuple):
     """What was written about a sweep.
 
     Attributes:
@@ -59,7 +62,7 @@ class Report(NamedTuple):
     lost: list[str]
 
 
-def write_report(folder: str | Path, page: Path | None = None) -> Report:
+def write_report(folder: str | Path, page: Path | None = None) -> SweepReport:
     """Writes the page and the table, of what is finished.
 
     Args:
@@ -70,12 +73,12 @@ def write_report(folder: str | Path, page: Path | None = None) -> Report:
         What was written.
 
     Raises:
-        InputError: it is no sweep, no run is finished, or somebody else's file has the page's name.
+        InputError: it is no sweep, no run is finished, or another file has the page's name.
         OSError: a file cannot be written.
     """
     folder = Path(folder)
     sweep = read_sweep(folder)
-    page = page or usual_place(folder)
+    page = page or default_page(folder)
     plans = sweep.plans(folder)
     outcomes, lost = find_outcomes(plans)
     if not outcomes:
@@ -84,30 +87,26 @@ def write_report(folder: str | Path, page: Path | None = None) -> Report:
     text = make_report(sweep, folder, outcomes, lost, page.parent)
     write_csv(folder / TABLE, list_rows(sweep, outcomes))
     write_atomic(page, text.encode())
-    return Report(page, folder / TABLE, len(outcomes), len(plans), lost)
+    return SweepReport(page, folder / TABLE, len(outcomes), len(plans), lost)
 
 
 def list_rows(sweep: Sweep, outcomes: Sequence[Outcome]) -> list[dict[str, object]]:
-    """Rows of the table.
+    """Rows of the table, one for each finished run.
 
-    Args:
-        sweep: the sweep.
-        outcomes: of the finished runs.
-
-    Returns:
-        A row for each: case, settings in which cases differ as they were typed, seed, generations,
-        evaluations, seconds, and all figures of the champion.
+    Case, settings in which cases differ as they were typed, seed, generations, evaluations,
+    seconds, and all figures of the champion.
     """
     varied = [axis.key for axis in read_axes(sweep.settings) if len(axis.texts) > 1]
     rows = []
     for outcome in outcomes:
-        typed = dict(setting.split("=", 1) for setting in outcome.plan.settings)
-        row: dict[str, object] = {"case": outcome.plan.case}
-        row |= {key: typed[key] for key in varied} | {"seed": outcome.plan.seed}
-        row |= {name: int(outcome.metrics[name][-1]) for name in ("generation", "evaluations")}
-        row["seconds"] = float(outcome.metrics["seconds"][-1])
-        rows.append({"generations" if k == "generation" else k: v for k, v in row.items()}
-                    | dict(outcome.champion))  # fmt: skip
+        plan, metrics = outcome.plan, outcome.metrics
+        typed = dict(setting.split("=", 1) for setting in plan.settings)
+        rows.append(
+            {"case": plan.case, **{key: typed[key] for key in varied}, "seed": plan.seed,
+             "generations": int(metrics["generation"][-1]),
+             "evaluations": int(metrics["evaluations"][-1]),
+             "seconds": float(metrics["seconds"][-1])} | dict(outcome.champion)
+        )  # fmt: skip
     return rows
 
 
@@ -182,41 +181,37 @@ def _scores(members: Numbered, cases: Sequence[str]) -> str:
     unit = next(iter(members.values()))[0].unit
     header = ["", "case", "n\nseeds", f"mean score\n{unit}", f"best seed\n{unit}"]
     header += ["evaluations\neach", "time\ns each"]
-    rows = []
-    for k, found in members.items():
-        scores = _values(found, "score")
-        seconds = np.mean([o.metrics["seconds"][-1] for o in found])
-        rows.append([
-            k, cases[k], len(found), str(interval(scores)), format_number(np.max(scores)),
-            _range(found, "evaluations"), f"{seconds:.0f}",
-        ])  # fmt: skip
-    figure = new_figure(min(WIDE, 2.5 + 0.9 * len(members)), 3.2)
-    groups = {letter(k): _values(found, "score") for k, found in members.items()}
-    draw_dots(figure.subplots(), groups, f"champions' scores ({unit})", [*members])
-    return sections.sweep_scores(header, rows, svg_source(figure), COVERAGE)
+    scores = {k: _values(found, "score") for k, found in members.items()}
+    rows = [
+        [
+            k, cases[k], len(found), str(interval(scores[k])), format_number(np.max(scores[k])),
+            _range(found, "evaluations"),
+            f"{np.mean([o.metrics['seconds'][-1] for o in found]):.0f}",
+        ]
+        for k, found in members.items()
+    ]  # fmt: skip
+    named = {letter(k): values for k, values in scores.items()}
+    figure = plot_scores({f"champions' scores ({unit})": named}, [*members])
+    return sections.sweep_scores(header, rows, svg_source(figure))
 
 
 def _tests(members: Numbered, cases: Sequence[str]) -> str:
     """Whether cases differ, and which."""
     if len(members) < 2:
         return ""
-    scores = {k: _values(found, "score") for k, found in members.items()}
+    scores = {letter(k): _values(found, "score") for k, found in members.items()}
+    names = {letter(k): cases[k] for k in members}
     counts = sorted(map(len, scores.values()))
     said = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
-    if len(members) > _MOST_TESTED:
-        alone = compare({letter(k): values for k, values in scores.items()}, pairs=False)
-        return sections.sweep_tests(_p(alone.p), said, [], "", ALPHA, _MOST_TESTED)
-    pairs = list(combinations(scores, 2))
-    found = compare({letter(k): values for k, values in scores.items()})
-    least = smallest_p(counts[-1], counts[-2], len(pairs))
+    found = compare(scores, pairs=len(members) <= _MOST_TESTED)
     rows = [
         [
-            f"{letter(a)} − {letter(b)}", cases[a], cases[b],
-            str(difference(scores[a], scores[b])),
-            f"{len(scores[a])} + {len(scores[b])}", _p(found.pairs[letter(a), letter(b)]),
+            f"{a} − {b}", names[a], names[b], str(difference(scores[a], scores[b])),
+            f"{len(scores[a])} + {len(scores[b])}", _p(p),
         ]
-        for a, b in pairs
+        for (a, b), p in found.pairs.items()
     ]  # fmt: skip
+    least = smallest_p(counts[-1], counts[-2], len(rows)) if rows else 1.0
     return sections.sweep_tests(_p(found.p), said, rows, f"{least:.2g}", ALPHA, _MOST_TESTED)
 
 
@@ -226,36 +221,33 @@ def _p(value: float) -> str:
 
 
 def _measures(members: Numbered) -> str:
-    """Means and intervals of all that was measured of champions."""
+    """Means and intervals of all measures of champions."""
     everything = [o for found in members.values() for o in found]
     bodies = {name for o in everything if o.body is not None for name in o.body.descriptors}
     fixed = {name for name in bodies if len({o.champion[name] for o in everything}) == 1}
-    names = [n for n in dict.fromkeys(n for o in everything for n in o.champion) if n != "score"]
+    names = dict.fromkeys(name for o in everything for name in o.champion)
     rows = [
-        [LABELS.get(name, name.replace("_", " ")),
-         *(str(interval(_values(found, name))) for found in members.values())]
-        for name in names if name not in fixed
+        [label_of(name), *(str(interval(_values(found, name))) for found in members.values())]
+        for name in names if name != "score" and name not in fixed
     ]  # fmt: skip
     return sections.sweep_measures(["", *map(letter, members)], rows) if rows else ""
 
 
-# --- pictures -------------------------------------------------------------------------------------
-
-
 def _curves(members: Numbered, cases: Sequence[str]) -> str:
+    """Best scores so far over evaluated individuals."""
     unit = next(iter(members.values()))[0].unit
-    figure = new_figure(WIDE, 4.4)
     named = {f"{letter(k)}: {cases[k]}": found for k, found in members.items()}
-    draw_curves(figure.subplots(), named, f"best score so far ({unit})", [*members])
+    figure = plot_curves(named, f"best score so far ({unit})", [*members])
     return sections.sweep_curves(svg_source(figure))
 
 
 def _bodies(numbered: Numbered) -> str:
-    evolved = {letter(k): found for k, found in numbered.items() if found[0].evolved}
+    """The champions' bodies, where they evolve and are not too many."""
+    evolved = {k: found for k, found in numbered.items() if found[0].evolved}
     if not evolved or sum(map(len, evolved.values())) > _MOST_BODIES:
         return ""
-    numbers = [k for k, found in numbered.items() if found[0].evolved]
-    return sections.sweep_bodies(svg_source(plot_bodies(evolved, numbers)))
+    figure = plot_bodies({letter(k): found for k, found in evolved.items()}, [*evolved])
+    return sections.sweep_bodies(svg_source(figure))
 
 
 # --- runs -----------------------------------------------------------------------------------------
@@ -270,28 +262,26 @@ def _runs(
 ) -> str:
     """A line for each run, with links to its folder where these can be relative."""
     found = {o.plan: o for o in outcomes}
-    rows: list[list[Any]] = []
     near = folder.resolve() == at.resolve()
+    rows: list[list[str | int]] = []
     for plan in plans:
         outcome, link = found.get(plan), plan.folder.name
         if near and plan.folder.is_dir():
-            place = f"{plan.case}/{plan.folder.name}/"
-            link = Markup('<a href="{}">{}</a>').format(place, link)
-        row = [cases.index(plan.case), plan.case, link]
-        if outcome is None:
-            rows.append([*row, "–", "–", "–", _state(plan)])
-            continue
-        generations = int(outcome.metrics["generation"][-1])
-        score = format_number(outcome.champion["score"])
-        seconds = f"{outcome.metrics['seconds'][-1]:.0f}"
-        rows.append([*row, generations, score, seconds, "finished"])
+            address = f"{plan.case}/{plan.folder.name}/"
+            link = Markup('<a href="{}">{}</a>').format(address, link)
+        figures = ["–", "–", "–", _state(plan)]
+        if outcome is not None:
+            figures = [f"{outcome.metrics['generation'][-1]:.0f}",
+                       format_number(outcome.champion["score"]),
+                       f"{outcome.metrics['seconds'][-1]:.0f}", "finished"]  # fmt: skip
+        rows.append([cases.index(plan.case), plan.case, link, *figures])
     return sections.sweep_runs(rows)
 
 
 def _state(plan: Plan) -> str:
     """Of a run that has no outcome."""
     try:
-        if is_finished(plan):
+        if RunReader(plan.folder).is_finished:
             return "damaged"
     except InputError:
         return "damaged"

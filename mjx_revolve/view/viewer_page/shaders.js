@@ -4,6 +4,8 @@
 // drifts with the current and circles with the waves. Ripples (normals only), caustics, shafts of
 // light and haze are decoration: they give scale and depth and say nothing about the simulation.
 
+const glsl = (color) => `linear(vec3(${color.map((x) => x.toFixed(4)).join()}))`;
+
 // Of every shader.
 const UNIFORMS = /* glsl */ `
 precision highp float;
@@ -21,9 +23,10 @@ uniform float uFade[MAX_WAVES];  // k: orbits fade with e^(k z)
 const LIGHT = /* glsl */ `
 // Light in a clear lake: red is lost first.
 #define ABSORB (uHaze * vec3(0.34, 0.105, 0.085))  // 1/m
-const vec3 DEEP = vec3(0.0022, 0.020, 0.046);
-const vec3 MID = vec3(0.012, 0.115, 0.190);
-const vec3 BRIGHT = vec3(0.150, 0.520, 0.600);
+vec3 linear(vec3 c) { return pow(c, vec3(2.2)); }
+#define DEEP ${glsl(PALETTE.water_down)}
+#define MID ${glsl(PALETTE.water_ahead)}
+#define BRIGHT ${glsl(PALETTE.water_up)}
 
 float hash(vec2 p) { return fract(sin(dot(p, vec2(12.9898, 78.233))) * 43758.5453); }
 
@@ -57,12 +60,10 @@ vec3 finish(vec3 c) {
   return c + (hash(gl_FragCoord.xy) - 0.5) / 255.0;  // hides the bands of slow gradients
 }
 
-vec3 linear(vec3 c) { return pow(c, vec3(2.2)); }
-
 float daylight(float depth) { return 0.34 + 0.66 * exp(-0.09 * max(depth, 0.0)); }
 
 vec3 sky(vec3 d) {
-  vec3 c = mix(vec3(0.62, 0.78, 0.88), vec3(0.17, 0.40, 0.70), pow(clamp(d.z, 0.0, 1.0), 0.55));
+  vec3 c = mix(${glsl(PALETTE.sky_low)}, ${glsl(PALETTE.sky_high)}, pow(clamp(d.z, 0.0, 1.0), 0.55));
   if (d.z > 0.02) {
     float cloud = fbm(d.xy / (d.z + 0.15) * 1.3 + 4.0);
     c = mix(c, vec3(0.95, 0.97, 1.0), 0.75 * smoothstep(0.48, 0.80, cloud) * smoothstep(0.02, 0.3, d.z));
@@ -152,23 +153,15 @@ float sunlit(vec3 place, vec3 normal, float blur) {
 `;
 
 const SEA = /* glsl */ `
-float seaHeight(vec2 p, float spacing) {
-  float h = 0.0;
+// Slope (xy) and height (z) of the world's waves, without those that are finer than this spacing.
+vec3 sea(vec2 p, float spacing) {
+  vec3 sum = vec3(0.0);
   for (int i = 0; i < MAX_WAVES; i++) {
     vec4 w = uWaves[i];
-    float fine = spacing * length(w.xy);
-    h += w.z * cos(dot(w.xy, p) + w.w) * (1.0 - smoothstep(0.8, 2.5, fine));
+    float phase = dot(w.xy, p) + w.w, seen = 1.0 - smoothstep(0.6, 2.5, spacing * length(w.xy));
+    sum += w.z * seen * vec3(-w.xy * sin(phase), cos(phase));
   }
-  return h;
-}
-
-vec2 seaSlope(vec2 p, float pixel) {
-  vec2 s = vec2(0.0);
-  for (int i = 0; i < MAX_WAVES; i++) {
-    vec4 w = uWaves[i];
-    s -= w.z * w.xy * sin(dot(w.xy, p) + w.w) * (1.0 - smoothstep(0.5, 2.5, pixel * length(w.xy)));
-  }
-  return s;
+  return sum;
 }
 `;
 
@@ -197,51 +190,32 @@ void main() {
 }`,
 };
 
-// Where a point of a robot is: moved by its mesh, or, of many robots, by one of the robot's bodies.
+// Where a point of a robot is: moved by one of the robot's bodies.
 const BENT = /* glsl */ `
-#ifdef BODIES
 uniform vec4 uBodies[2 * BODIES];  // place [m] and quaternion x, y, z, w of each
 attribute float body;
 attribute vec3 tint;
 vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v); }
 vec3 placed() { int k = 2 * int(body + 0.5); return uBodies[k].xyz + turned(uBodies[k + 1], position); }
-vec3 facing() { return turned(uBodies[2 * int(body + 0.5) + 1], normal); }
-#else
-vec3 placed() { return (modelMatrix * vec4(position, 1.0)).xyz; }
-vec3 facing() { return mat3(modelMatrix) * normal; }
-#endif
 `;
 
 const ROBOT = {
   vertex: BENT + /* glsl */ `
-varying vec3 vPlace, vNormal;
-#ifdef BODIES
-varying vec3 vTint;
-#endif
+varying vec3 vPlace, vNormal, vTint;
 void main() {
   vPlace = placed();
-  vNormal = facing();
-#ifdef BODIES
+  vNormal = turned(uBodies[2 * int(body + 0.5) + 1], normal);
   vTint = tint;
-#endif
   gl_Position = projectionMatrix * viewMatrix * vec4(vPlace, 1.0);
 }`,
   fragment: /* glsl */ `
-#ifdef BODIES
-varying vec3 vTint;
-uniform float uSeen;  // 0 not there, 1 whole: who is born or dies dissolves
-uniform float uGlow;  // of who is pointed at
-#define uColor vTint
-#else
-uniform vec3 uColor;
-#endif
+uniform float uSeen;  // 0 not there, 1 whole: robots appear and vanish by dissolving
+uniform float uGlow;  // of a robot that is pointed at
 uniform float uLine;  // 1 for the dark lines along edges
-varying vec3 vPlace, vNormal;
+varying vec3 vPlace, vNormal, vTint;
 void main() {
-#ifdef BODIES
   if (hash(gl_FragCoord.xy * 0.37) >= uSeen) discard;
-#endif
-  vec3 n = normalize(vNormal), v = normalize(uEye - vPlace), albedo = 0.02 + 0.98 * linear(uColor);
+  vec3 n = normalize(vNormal), v = normalize(uEye - vPlace), albedo = 0.02 + 0.98 * linear(vTint);
   float below = uSurface - vPlace.z, under = smoothstep(-0.01, 0.01, below), day = daylight(below);
   if (uLine > 0.5) {
     vec3 c = throughWater(albedo * 0.10 * day, vPlace);
@@ -261,9 +235,7 @@ void main() {
   c += vec3(0.55, 0.65, 0.65) * pow(max(dot(n, h), 0.0), 48.0) * 0.45 * lit * day;
   float rim = pow(1.0 - max(dot(n, v), 0.0), 4.0);
   c += mix(sky(vec3(0.0, 0.0, 1.0)), waterBody(reflect(-v, n)), under) * rim * 0.35;
-#ifdef BODIES
   c += uGlow * vec3(1.0, 0.45, 0.12) * (0.06 + 0.5 * pow(1.0 - max(dot(n, v), 0.0), 2.0));
-#endif
   gl_FragColor = vec4(finish(throughWater(c, vPlace)), 1.0);
 }`,
 };
@@ -301,7 +273,7 @@ void main() {
   vec2 tilt = fine * 0.16 * cos(p.x * 9.0 + p.y * 3.0 + warp * 4.0) * vec2(0.95, 0.31);
   vec3 n = normalize(vNormal - vec3(tilt, 0.0));
   float grain = fine * (noise(p * 60.0) - 0.5) + (noise(p * 7.0) - 0.5) * 0.8 + (fbm(p * 0.4) - 0.5);
-  vec3 albedo = vec3(0.56, 0.44, 0.27) * (1.0 + 0.22 * grain + 0.10 * fine * ripple);
+  vec3 albedo = ${glsl(PALETTE.sand)} * (1.0 + 0.22 * grain + 0.10 * fine * ripple);
   albedo = mix(albedo, vec3(0.17, 0.22, 0.10), (1.0 - under) * smoothstep(0.2, 1.5, -below) * 0.8);
   float lit = mix(1.0, sunlit(vPlace, vec3(0.0, 0.0, 1.0), 9.0), under);
   float sun = max(dot(n, uSun), 0.0) * lit;
@@ -324,7 +296,7 @@ attribute float spacing;  // of the mesh here, m
 varying vec3 vPlace;
 void main() {
   vec2 p = position.xy + uCenter;
-  vPlace = vec3(p, uSurface + seaHeight(p, spacing));
+  vPlace = vec3(p, uSurface + sea(p, spacing).z);
   gl_Position = projectionMatrix * viewMatrix * vec4(vPlace, 1.0);
 }`,
   fragment: SEA + /* glsl */ `
@@ -350,7 +322,7 @@ void main() {
   vec3 ray = vPlace - uEye;
   float far = length(ray), pixel = length(fwidth(vPlace.xy));
   vec3 d = ray / far;
-  vec2 slope = seaSlope(vPlace.xy, pixel) + rippleSlope(vPlace.xy, pixel) * mix(1.0, 0.6, smoothstep(5.0, 60.0, far));
+  vec2 slope = sea(vPlace.xy, pixel).xy + rippleSlope(vPlace.xy, pixel) * mix(1.0, 0.6, smoothstep(5.0, 60.0, far));
   vec3 n = normalize(vec3(-slope, 1.0));
   if (uEye.z > vPlace.z) {
     float facing = max(dot(n, -d), 0.02);
@@ -446,48 +418,18 @@ void main() {
 varying float vAlpha;
 void main() {
   float r = length(gl_PointCoord - 0.5);
-  gl_FragColor = vec4(0.80, 0.97, 0.98, 0.42 * vAlpha * (1.0 - smoothstep(0.1, 0.5, r)));
+  gl_FragColor = vec4(${PALETTE.dust.map((x) => x.toFixed(3)).join()}, 0.42 * vAlpha * (1.0 - smoothstep(0.1, 0.5, r)));
 }`,
 };
 
-// The core's way: a line of constant width on the screen.
-const TRAIL = {
-  vertex: /* glsl */ `
-uniform vec2 uScreen;
-uniform float uWidth;
-attribute vec3 before, after;
-attribute float side, moment;
-varying float vMoment, vSide;
-varying vec3 vPlace;
-vec2 flat_(vec3 p) { vec4 c = projectionMatrix * viewMatrix * vec4(p, 1.0); return c.xy / max(c.w, 1e-4) * uScreen; }
-void main() {
-  vec4 here = projectionMatrix * viewMatrix * vec4(position, 1.0);
-  vec2 along = flat_(after) - flat_(before);
-  along = dot(along, along) > 1e-8 ? normalize(along) : vec2(1.0, 0.0);
-  here.xy += side * uWidth * vec2(-along.y, along.x) / uScreen * here.w;
-  vMoment = moment;
-  vSide = side;
-  vPlace = position;
-  gl_Position = here;
-}`,
-  fragment: /* glsl */ `
-uniform float uNow;
-varying float vMoment, vSide;
-varying vec3 vPlace;
-void main() {
-  float soft = 1.0 - smoothstep(0.55, 1.0, abs(vSide));
-  bool past = vMoment <= uNow;
-  float clear = exp(-0.10 * uHaze * length(vPlace - uEye));
-  vec3 c = past ? vec3(1.0, 0.17, 0.02) : vec3(0.65, 0.90, 0.95);
-  gl_FragColor = vec4(finish(c), soft * clear * (past ? 0.92 : 0.22));
-}`,
-};
-
+// Arrows, and the bars of a trail, of which `uThick` is the width at a metre from the eye.
 const ARROW = {
   vertex: /* glsl */ `
+uniform float uThick;
 varying vec3 vPlace, vNormal;
 void main() {
-  vec4 place = instanceMatrix * vec4(position, 1.0);
+  float wide = uThick > 0.0 ? uThick * length((instanceMatrix * vec4(0.0, 0.0, 0.0, 1.0)).xyz - uEye) : 1.0;
+  vec4 place = instanceMatrix * vec4(position * vec3(wide, 1.0, wide), 1.0);
   vPlace = place.xyz;
   vNormal = mat3(instanceMatrix) * normal;
   gl_Position = projectionMatrix * viewMatrix * place;

@@ -19,6 +19,24 @@ function digits(x) {
   return String(Number(x.toPrecision(2)));
 }
 
+// A colour of the palette as style sheets and canvases have it.
+function css(color, alpha = 1) {
+  return `rgba(${color.map((x) => Math.round(255 * x)).join()}, ${alpha})`;
+}
+
+// Words at a place, as `textAlign` and `textBaseline` say.
+function label(context, words, x, y, align = "center", base = "middle") {
+  context.textAlign = align;
+  context.textBaseline = base;
+  context.fillText(words, x, y);
+}
+
+function disc(context, x, y, radius) {
+  context.beginPath();
+  context.arc(x, y, radius, 0, 2 * Math.PI);
+  context.fill();
+}
+
 // Seen so that what swims along the heading swims to the right, a little towards the viewer.
 const VIEWS = {
   swim: { azimuth: -72, elevation: 11 },
@@ -55,7 +73,6 @@ function openStage(world, size) {
   const background = makeBackground(), surface = makeSurface(size);
   const dust = makeDust(size), shadow = makeShadow(size);
   scene.add(background.mesh, surface.mesh, dust.points);
-  if (world.bed !== null) scene.add(makeBed(world.bed));
 
   // ------------------------------------------------------------------ the camera
 
@@ -93,59 +110,42 @@ function openStage(world, size) {
     draw();
   }
 
-  const bedTable = world.bed && {
-    ...world.bed, radius: numbersOf(world.bed.radius), height: numbersOf(world.bed.height),
-  };
+  const bed = world.bed && { ...world.bed, radius: numbersOf(world.bed.radius), height: numbersOf(world.bed.height) };
+  if (bed) scene.add(makeBed(bed));
 
+  // Height of the bed, between its rings.
   function bedAt(x, y) {
-    if (world.bed === null) return -Infinity;
-    const { center: c, radius, height, sectors, rings } = bedTable;
-    const r = Math.hypot(x - c[0], y - c[1]), angle = Math.atan2(y - c[1], x - c[0]) / (2 * Math.PI);
-    let i = 0;
-    while (i + 2 < rings && radius[i + 1] < r) i++;
-    const s = Math.min(Math.max((r - radius[i]) / (radius[i + 1] - radius[i]), 0), 1);
+    if (!bed) return -Infinity;
+    const { center, radius, height, sectors, rings } = bed;
+    const r = Math.hypot(x - center[0], y - center[1]), angle = Math.atan2(y - center[1], x - center[0]) / (2 * Math.PI);
+    const i = Math.min(Math.max(countUpTo(radius, r) - 1, 0), rings - 2);
+    const s = Math.min((r - radius[i]) / (radius[i + 1] - radius[i]), 1);
     const j = (((angle % 1) + 1) % 1) * sectors, j0 = Math.floor(j), t = j - j0;
-    const at = (a, b) => height[a * sectors + (b % sectors)];
-    const ring = (a) => at(a, j0) * (1 - t) + at(a, j0 + 1) * t;
+    const ring = (a) => height[a * sectors + (j0 % sectors)] * (1 - t) + height[a * sectors + ((j0 + 1) % sectors)] * t;
     return ring(i) * (1 - s) + ring(i + 1) * s;
   }
 
-  function pixelsPerMetre() {
-    const far = camera.position.distanceTo(target);
+  // Pixels that a metre has at a distance [m].
+  function pixelsAt(far) {
     return renderer.domElement.clientHeight / (2 * far * Math.tan((camera.fov * Math.PI) / 360));
   }
 
-  // ------------------------------------------------------------------ switches and keys
-
-  // Buttons that are pressed or not, by id: what each shows.
-  function switches(shown) {
-    const toggle = (name, on) => {
-      const button = byId(name);
-      if (button.disabled) return;
-      const next = on ?? button.getAttribute("aria-pressed") !== "true";
-      button.setAttribute("aria-pressed", String(next));
-      shown[name](next);
-      draw();
-    };
-    for (const name in shown) {
-      const button = byId(name);
-      button.addEventListener("click", () => toggle(name));
-      shown[name](button.getAttribute("aria-pressed") === "true");
-    }
-    return toggle;
+  // Where a place is on the screen, and pixels per metre there; null behind the camera.
+  function onScreen(place) {
+    const { clientWidth: w, clientHeight: h } = renderer.domElement;
+    const p = place.clone().applyMatrix4(camera.matrixWorldInverse), pixels = pixelsAt(-p.z);
+    if (p.z > -camera.near) return null;
+    p.applyMatrix4(camera.projectionMatrix);
+    return { x: (p.x + 1) * 0.5 * w, y: (1 - p.y) * 0.5 * h, pixels };
   }
 
-  // What keys do, by name; letters by their small ones.
-  function listen(keys) {
-    addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;
-      if (event.target instanceof HTMLElement && event.target.matches("input:not([type=range])")) return;
-      if ([" ", "Enter"].includes(event.key) && event.target instanceof HTMLButtonElement) return; // presses it
-      const action = keys[event.key] ?? keys[event.key.toLowerCase()];
-      if (!action) return;
-      action(event);
-      event.preventDefault();
-    });
+  // Where a ray through a place on the screen meets a level plane; null above the horizon.
+  function onPlane(x, y, height) {
+    const { clientWidth: w, clientHeight: h } = renderer.domElement;
+    const ray = new THREE.Vector3((2 * x) / w - 1, 1 - (2 * y) / h, 0.5).unproject(camera).sub(camera.position).normalize();
+    const far = (height - camera.position.z) / ray.z;
+    if (!(far > 0) || far > 0.9 * controls.maxDistance) return null;
+    return camera.position.clone().addScaledVector(ray, far);
   }
 
   // ------------------------------------------------------------------ instruments
@@ -172,15 +172,13 @@ function openStage(world, size) {
     });
     along.sort((a, b) => a.d.z - b.d.z);
     c.lineWidth = 2;
-    c.textAlign = "center";
-    c.textBaseline = "middle";
     for (const { name, d, color } of along) {
       c.strokeStyle = c.fillStyle = color;
       c.beginPath();
       c.moveTo(w / 2, h / 2);
       c.lineTo(w / 2 + arm * d.x, h / 2 - arm * d.y);
       c.stroke();
-      c.fillText(name, w / 2 + (arm + 8) * d.x, h / 2 - (arm + 8) * d.y);
+      label(c, name, w / 2 + (arm + 8) * d.x, h / 2 - (arm + 8) * d.y);
     }
   }
 
@@ -195,26 +193,23 @@ function openStage(world, size) {
     c.fillStyle = water;
     c.fillRect(x, top, 7, bottom - top);
     c.fillStyle = c.strokeStyle = "rgba(235, 250, 252, 0.85)";
-    c.textAlign = "right";
-    c.textBaseline = "middle";
     for (let d = 0; d <= deepest * 1.001; d += tick) {
       c.fillRect(x - 4, y(d) - 0.5, 4, 1);
-      c.fillText(`${digits(d)}`, x - 7, y(d));
+      label(c, digits(d), x - 7, y(d), "right");
     }
-    c.textAlign = "left";
-    c.fillText("depth [m]", 4, 7);
+    label(c, "depth [m]", 4, 7, "left");
     if (floor < deepest) {
-      c.fillStyle = "#c9b07a";
+      c.fillStyle = css(PALETTE.sand);
       c.fillRect(x - 1, y(floor), 9, bottom - y(floor) + 3);
-      if (y(floor) - y(depth) > 13) c.fillText("bed", x + 13, Math.min(y(floor) + 5, h - 6));
+      if (y(floor) - y(depth) > 13) label(c, "bed", x + 13, Math.min(y(floor) + 5, h - 6), "left");
     }
-    c.fillStyle = "#ff8c3c";
+    c.fillStyle = css(PALETTE.accent);
     c.beginPath();
     c.moveTo(x + 8, y(depth));
     c.lineTo(x + 17, y(depth) - 6);
     c.lineTo(x + 17, y(depth) + 6);
     c.fill();
-    c.fillText(depth.toFixed(2), x + 20, y(depth));
+    label(c, depth.toFixed(2), x + 20, y(depth), "left");
   }
 
   function write(id, text) {
@@ -232,7 +227,6 @@ function openStage(world, size) {
     camera.aspect = innerWidth / innerHeight;
     camera.updateProjectionMatrix();
     dust.material.uniforms.uPixels.value = (innerHeight * pixelRatio) / (2 * Math.tan((camera.fov * Math.PI) / 360));
-    stage.resized?.();
     draw();
   }
   addEventListener("resize", resize);
@@ -265,15 +259,15 @@ function openStage(world, size) {
 
   let lastTick = performance.now(), slow = 0;
 
-  // Draws for ever: `moves(seconds)` says whether time goes on, `update` places what is seen, `told`
-  // writes what instruments show.
-  function run({ moves, update, told }) {
+  // Draws for ever: `page.moves(seconds)` says whether time goes on, `page.update(seconds)` places what
+  // is seen, `page.show()` writes what instruments show.
+  function run(page) {
     function tickFrame(now) {
       requestAnimationFrame(tickFrame);
       // The first tick may lie before the script's own time, and a hidden page has none for long.
       const passed = Math.min(Math.max((now - lastTick) / 1000, 0), 0.25);
       lastTick = now;
-      if (moves(passed)) {
+      if (page.moves(passed)) {
         dirty = true;
         // A slow machine gets plain panels, then fewer pixels, rather than fewer frames.
         slow = passed > 0.05 ? slow + (passed > 0.12 ? 4 : 1) : Math.max(0, slow - 1);
@@ -289,20 +283,19 @@ function openStage(world, size) {
       if (controls.update()) dirty = true;
       if (!dirty) return;
       dirty = false;
-      update();
-      shadow.render(renderer, scene, here, stage.bent);
+      page.update(passed);
+      shadow.render(renderer, scene, here, stage.meshes);
       renderer.clear();
       renderer.render(scene, camera);
-      told();
+      page.show();
       status.frames = ++frames;
     }
     requestAnimationFrame(tickFrame);
   }
 
   const stage = {
-    renderer, scene, camera, controls, target, here, surface, dust, shadow, resized: null, bent: [],
-    draw, look, zoom, bedAt, pixelsPerMetre, switches, listen, pen, drawAxes, drawGauge, write,
-    resize, place, run,
+    scene, camera, controls, target, here, surface, dust, shadow, meshes: [],
+    draw, look, zoom, bedAt, pixelsAt, onScreen, onPlane, pen, drawAxes, drawGauge, write, resize, place, run,
   };
   return stage;
 }

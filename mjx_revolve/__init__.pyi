@@ -1,0 +1,32 @@
+from .body.catalogue import MODULES as MODULES
+from .body.catalogue import THESIS_MODULES as THESIS_MODULES
+from .body.catalogue import load_modules as load_modules
+from .body.edits import add_module as add_module
+from .body.edits import exchange_subtrees as exchange_subtrees
+from .body.edits import free_slots as free_slots
+from .body.edits import graft_subtree as graft_subtree
+from .body.edits import remove_module as remove_module
+from .body.edits import replace_module as replace_module
+from .body.edits import swap_subtrees as swap_subtrees
+from .body.edits import turn_module as turn_module
+from .body.morphology import load_morphology as load_morphology
+from .body.morphology import make_morphology as make_morphology
+from .body.morphology import trim_neutral as trim_neutral
+from .body.tree import save_morphology as save_morphology
+from .control.controller import bind_genes as bind_genes
+from .control.cpg import make_cpg as make_cpg
+from .control.sine import make_sine as make_sine
+from .engine.robot import build_robot as build_robot
+from .engine.robot import export_mjcf as export_mjcf
+from .episodes.config import load_config as load_config
+from .episodes.fitness import make_fitness as make_fitness
+from .episodes.fitness import make_mixed_fitness as make_mixed_fitness
+from .episodes.simulate import simulate as simulate
+from .episodes.vector_env import make_vector_env as make_vector_env
+from .evolution.run_folder import load_archive as load_archive
+from .inputs.errors import InputError as InputError
+from .numerics.runtime import prepare_process as prepare_process
+from .water.world import load_world as load_world
+from .water.world import make_world as make_world
+
+__version__: str

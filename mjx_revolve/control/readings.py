@@ -1,0 +1,480 @@
+"""What sensors read of the engine's state, at the core and at modules, for every engine.
+
+The core is one of the places where a sensor may be mounted: the same function computes the readings
+of the core, of one module, and of a type of modules, from the pose and the motion of its frame.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.control.courses import Course
+from mjx_revolve.control.pursuit import Pursuer, PursuitLimits, init_pursuer, step_pursuer
+from mjx_revolve.engine.engines import Engine
+from mjx_revolve.engine.interaction import NO_NEIGHBOUR, InteractionForces
+from mjx_revolve.engine.plant import Plant
+from mjx_revolve.engine.sites import Sites
+from mjx_revolve.engine.state import RootState
+from mjx_revolve.numerics.inertia import BodyMotion
+from mjx_revolve.numerics.spatial import (
+    Mat,
+    Vec,
+    cross,
+    dot,
+    matmul,
+    matTvec,
+    matvec,
+    quat_to_mat,
+    vadd,
+    vscale,
+    vsub,
+)
+from mjx_revolve.water.bed import bed_height
+from mjx_revolve.water.flow import Water, flow
+from mjx_revolve.water.world import World
+
+OPTIONAL_SIGNALS = ("force", "load", "work", "touch", "nearest", "forces", "cells")
+"""Readings that cost something: computed only for a `Controller` that names them in `signals`.
+
+Most are fields of `SensorReadings`; `forces` is `force` at modules. Modules are signals, too: "at
+ID" is a module of one robot, "each TYPE" all modules of a type, in `SensorReadings.modules` by that
+name.
+"""
+NO_INTERACTION = InteractionForces()
+"""Each robot has a world to itself."""
+_GRAVITY = 9.81  # of accelerometers where there is no world [m/s²]
+
+
+def is_module_signal(name: str) -> bool:
+    """Whether a signal names modules: "at ID" or "each TYPE"."""
+    return name.startswith(("at ", "each "))
+
+
+class EpisodeContext(NamedTuple):
+    """What an episode adds to a robot's own state for sensors to read, `[lanes]` each or None.
+
+    Attributes:
+        target: initial position of the target, world frame, three of `[lanes]` [m].
+        drift: its velocity [m/s]; None if it does not move.
+        noise: seed of sensor noise, uint32 `[lanes]`, the same for all individuals in a trial.
+        sight: distance from which the target is visible [m]; None for any.
+        pursuit: speed and turning rate of a target that pursues the robot; None if it does not.
+        course: direction to keep to.
+    """
+
+    target: Any = None
+    drift: Any = None
+    noise: Any = None
+    sight: Any = None
+    pursuit: PursuitLimits | None = None
+    course: Course | None = None
+
+    def target_at(self, time: Any) -> Vec:
+        """Position of a target that does not pursue the robot, world frame [m], at a time [s]."""
+        if self.drift is None:
+            return tuple(self.target)
+        return vadd(self.target, vscale(time, self.drift))
+
+
+_NO_CONTEXT = EpisodeContext()
+
+
+class NearestRobot(NamedTuple):
+    """The nearest other robot in the same world.
+
+    Attributes:
+        toward: from core to core, core frame, three of `[lanes]` [m]; `NO_NEIGHBOUR` long if there
+            is none.
+        tag: number that tells robots apart, `[lanes]` [-]; 0 if there is none.
+    """
+
+    toward: Any
+    tag: Any
+
+
+class PreviousMotion(NamedTuple):
+    """Motion of the rigid bodies before the last step, `[1 + hinge rows, lanes]` each.
+
+    Attributes:
+        velocity: of their origins, world frame [m/s].
+        angular_velocity: body frame [rad/s].
+    """
+
+    velocity: Vec
+    angular_velocity: Vec
+
+
+class SensorMemory(NamedTuple):
+    """Part of the rollout state: what readings need of earlier steps; None where none needs it.
+
+    Attributes:
+        acceleration: of the core over the last step, world frame, three of `[lanes]` [m/s²].
+        ctrl: last command, `[n, lanes]` in the plant's order.
+        work: done so far, `[lanes]` [J].
+        past: motion of all rigid bodies before the last step.
+        pursuer: state of a target that pursues the robot.
+    """
+
+    acceleration: Any = None
+    ctrl: Any = None
+    work: Any = None
+    past: PreviousMotion | None = None
+    pursuer: Pursuer | None = None
+
+
+class SensorReadings(NamedTuple):
+    """True values at the core, or at modules: what a controller and its sensors read.
+
+    At the core and at one module `[lanes]` each, vectors three of them, in the frame of the core or
+    in that of the module's main box (of its moving part). On a type of modules `[1 + hinge rows,
+    lanes]`: of the first such module on the core's rigid body, and on what each hinge carries.
+
+    Attributes:
+        height: of the centre above the still surface, negative under water [m].
+        climb: vertical velocity [m/s].
+        up: the world's vertical [-].
+        angular_velocity: [rad/s].
+        north: the world's x axis [-]: a compass.
+        angle: of the hinges, `[hinge rows, lanes]` in the plant's order, 0 for rows without a
+            hinge; of a module its own hinge, None without one [rad].
+        speed: angular velocity of the hinges, as `angle` [rad/s].
+        flow: velocity of the water relative to the centre [m/s].
+        altitude: of the centre above the bed, straight down [m]; infinite without a bed.
+        target: from the centre to the target [m]; 0 without one, and beyond its visibility.
+        noise: seed of sensor noise, uint32 `[lanes]`; core only.
+        force: specific force, the mean acceleration over the last step less gravity's [m/s²];
+            optional: see `OPTIONAL_SIGNALS`.
+        load: torque of the servos under the last command, as `angle` [N·m]; optional.
+        work: done by servos and propellers so far [J]; core only, optional.
+        touch: normal force of the bed on the core's rigid body, then on what each hinge carries,
+            `[1 + hinge rows, lanes]` [N]; of a module on its rigid body; optional.
+        nearest: the nearest other robot; core only, optional.
+        modules: readings at modules, by signal; core only.
+        course: direction to keep to, a unit vector; 0 without; core only.
+        seen: whether the target is visible, `[lanes]`; None if it always is.
+        present: 1 where there is a module of the type, else 0; modules only.
+        cells: normal force of the bed on the left and the right half of one module [N]; optional.
+    """
+
+    height: Any
+    climb: Any
+    up: Vec
+    angular_velocity: Vec
+    north: Any = None
+    angle: Any = None
+    speed: Any = None
+    flow: Any = None
+    altitude: Any = None
+    target: Any = None
+    noise: Any = None
+    force: Any = None
+    load: Any = None
+    work: Any = None
+    touch: Any = None
+    nearest: NearestRobot | None = None
+    modules: Any = None
+    course: Any = None
+    seen: Any = None
+    present: Any = None
+    cells: Any = None
+
+    @property
+    def spin(self) -> Vec:
+        """Old name of `angular_velocity`, for one more release."""
+        return self.angular_velocity
+
+    @property
+    def places(self) -> Any:
+        """Old name of `modules`, for one more release."""
+        return self.modules
+
+
+class _Frame(NamedTuple):
+    """Pose and motion of the core or of modules, `[..., lanes]` each.
+
+    Attributes:
+        position: world frame [m].
+        rotation: world from module.
+        velocity: world frame [m/s].
+        angular_velocity: module frame [rad/s].
+        acceleration: over the last step, world frame [m/s²]; None where it is not computed.
+    """
+
+    position: Vec
+    rotation: Mat
+    velocity: Vec
+    angular_velocity: Vec
+    acceleration: Vec | None
+
+
+def _site_frame(
+    motion: BodyMotion, past: PreviousMotion | None, timestep: float, sites: Sites
+) -> _Frame:
+    """The frame of a module, or of a type of modules, from the motion of its rigid body."""
+    if sites.row is not None:
+        motion, past = jax.tree.map(lambda x: x[sites.row], (motion, past))
+    like = motion.height
+
+    def wide(x: Any) -> jax.Array:
+        x = np.asarray(x, like.dtype) if isinstance(x, np.ndarray) else x
+        return jnp.broadcast_to(x, like.shape)
+
+    offset, local = jax.tree.map(wide, (sites.position, sites.rotation))
+    body: Mat = (motion.x_axis, motion.y_axis, motion.z_axis)
+    spin = motion.angular_velocity
+    acceleration = None
+    if past is not None:
+        rate = 1 / timestep
+        gain = vscale(rate, vsub(matvec(body, motion.velocity), past.velocity))
+        turning = vscale(rate, vsub(spin, past.angular_velocity))
+        # In the middle of the step, so that the mean over it is good to second order.
+        middle = vscale(0.5, vadd(spin, past.angular_velocity))
+        own = vadd(cross(turning, offset), cross(middle, cross(middle, offset)))
+        acceleration = vadd(gain, matvec(body, own))
+    return _Frame(
+        vadd((*motion.xy, motion.height), matvec(body, offset)),
+        matmul(body, local),
+        matvec(body, vadd(motion.velocity, cross(spin, offset))),
+        matTvec(local, spin),
+        acceleration,
+    )
+
+
+def _read_frame(
+    world: World | None, water: Water, target: Vec | None, sight: Any, frame: _Frame
+) -> SensorReadings:
+    """The readings that follow from a frame."""
+    x, y, z = frame.position
+    zero = jnp.zeros_like(z)
+    moving: Vec = (zero, zero, zero)
+    altitude = zero + jnp.inf
+    if world is not None:
+        current, _ = flow(world, water, x, y, z)
+        moving = matTvec(frame.rotation, vsub(current, frame.velocity))
+        if world.bed is not None:
+            altitude = z - bed_height(world.bed, x, y)
+    toward: Vec = (zero, zero, zero)
+    seen = None
+    if target is not None:
+        toward = matTvec(frame.rotation, vsub(target, frame.position))
+        if sight is not None:
+            seen = dot(toward, toward) < sight * sight
+            toward = tuple(jnp.where(seen, component, 0.0) for component in toward)
+    force = None
+    if frame.acceleration is not None:
+        ahead, aside, rising = frame.acceleration
+        gravity = _GRAVITY if world is None else world.gravity
+        force = matTvec(frame.rotation, (ahead, aside, rising + gravity))
+    return SensorReadings(
+        height=z - water.surface_height,
+        climb=frame.velocity[2],
+        up=frame.rotation[2],
+        angular_velocity=frame.angular_velocity,
+        north=frame.rotation[0],
+        flow=moving,
+        altitude=altitude,
+        target=toward,
+        force=force,
+        seen=seen,
+    )
+
+
+def read_sensors(
+    world: World | None,
+    engine: Engine,
+    state: Any,
+    water: Water,
+    time: jax.Array,
+    context: EpisodeContext,
+    memory: SensorMemory,
+    signals: Sequence[str] = (),
+    meeting: InteractionForces = NO_INTERACTION,
+    motion: BodyMotion | None = None,
+) -> SensorReadings:
+    """The readings at the core, and at the modules that are named.
+
+    Args:
+        world: around the robots; None where no sensor reads water or bed.
+        engine: of the robots.
+        state: of the engine.
+        water: at this time; heights count from its still surface.
+        time: since the episode's start [s].
+        context: of the episode.
+        memory: from `init_memory` or `update_memory`.
+        signals: which of `OPTIONAL_SIGNALS`, and which modules.
+        meeting: interaction with the other robots of the same world.
+        motion: of all rigid bodies, where it is known already.
+
+    Raises:
+        InputError: there is no such module.
+    """
+    root = engine.root(state)
+    rotation = quat_to_mat(root.quat)
+    angle, speed = engine.joints(state)
+    zero = jnp.zeros_like(root.position[2])
+    target = None
+    if context.target is not None:
+        target = context.target_at(time) if memory.pursuer is None else memory.pursuer.position
+    frame = _Frame(
+        root.position, rotation, root.velocity, root.angular_velocity, memory.acceleration
+    )
+    nearest = None
+    if "nearest" in signals:
+        lone = meeting.nearest is None
+        toward = (zero, zero, zero + NO_NEIGHBOUR) if lone else meeting.nearest
+        nearest = NearestRobot(matTvec(rotation, toward), zero if lone else meeting.tag)
+    course = context.course
+    readings = _read_frame(world, water, target, context.sight, frame)._replace(
+        angle=angle,
+        speed=speed,
+        noise=context.noise,
+        load=None if memory.ctrl is None else engine.servo_torque(state, memory.ctrl),
+        work=memory.work,
+        touch=engine.contact_force(state, water) if "touch" in signals else None,
+        nearest=nearest,
+        course=(zero, zero, zero) if course is None else matTvec(rotation, course.at(time)),
+    )
+    names = tuple(filter(is_module_signal, signals))
+    if not names:
+        return readings
+    motion = engine.body_motions(state) if motion is None else motion
+    cells = engine.contact_by_half(state, water) if "cells" in signals else None
+    modules = {}
+    for name in names:
+        sites = engine.plant.site(name)
+        frame = _site_frame(motion, memory.past, engine.plant.timestep, sites)
+        here = _read_frame(world, water, target, context.sight, frame)
+        here = here._replace(present=jnp.broadcast_to(_plain(sites.there, zero), here.height.shape))
+        if sites.module is not None:
+            touch = None if readings.touch is None else readings.touch[sites.row]
+            here = here._replace(touch=touch, cells=None if cells is None else cells[sites.module])
+        if sites.hinge is not None:
+            load = None if readings.load is None else readings.load[sites.hinge]
+            hinge = sites.hinge
+            here = here._replace(angle=angle[hinge], speed=speed[hinge], load=load)
+        modules[name] = here
+    return readings._replace(modules=modules)
+
+
+def _plain(x: Any, like: jax.Array) -> Any:
+    """A NumPy array in the floating-point type of the rollout."""
+    return np.asarray(x, like.dtype) if isinstance(x, np.ndarray) else x
+
+
+def init_memory(
+    signals: Sequence[str], engine: Engine, state: Any, context: EpisodeContext = _NO_CONTEXT
+) -> SensorMemory:
+    """The memory before the first step: at rest, no work done, servos commanded to stay.
+
+    Args:
+        signals: which of `OPTIONAL_SIGNALS` are read.
+        engine: of the robots.
+        state: of the engine at the start.
+        context: of the episode.
+    """
+    position = engine.root(state).position
+    zero = jnp.zeros_like(position[0])
+    angle = engine.joints(state)[0]
+    pad = jnp.zeros((engine.plant.num_rows - angle.shape[0], *angle.shape[1:]), angle.dtype)
+    pursued = context.pursuit is not None
+    return SensorMemory(
+        acceleration=(zero, zero, zero) if "force" in signals else None,
+        ctrl=jnp.concatenate([angle, pad]) if "load" in signals else None,
+        work=zero if "work" in signals else None,
+        past=_motion_to_keep(engine.body_motions(state)) if "forces" in signals else None,
+        pursuer=init_pursuer(context.target, position) if pursued else None,
+    )
+
+
+def update_memory(
+    memory: SensorMemory,
+    before: RootState,
+    after: RootState,
+    ctrl: jax.Array,
+    work: jax.Array,
+    dt: float,
+    motion: BodyMotion | None = None,
+    context: EpisodeContext = _NO_CONTEXT,
+) -> SensorMemory:
+    """The memory after a step.
+
+    Args:
+        memory: before it.
+        before: core before it.
+        after: core after it.
+        ctrl: command, `[n, lanes]`.
+        work: done in the step, `[lanes]` [J].
+        dt: timestep [s].
+        motion: of all rigid bodies before it, where specific forces at modules are read.
+        context: of the episode.
+    """
+    acceleration, pursuer = memory.acceleration, memory.pursuer
+    if acceleration is not None:
+        acceleration = vscale(1 / dt, vsub(after.velocity, before.velocity))
+    if pursuer is not None and context.pursuit is not None:
+        pursuer = step_pursuer(pursuer, context.pursuit, before.position, dt)
+    return SensorMemory(
+        acceleration=acceleration,
+        ctrl=None if memory.ctrl is None else ctrl,
+        work=None if memory.work is None else memory.work + work,
+        past=None if motion is None else _motion_to_keep(motion),
+        pursuer=pursuer,
+    )
+
+
+def _motion_to_keep(motion: BodyMotion) -> PreviousMotion:
+    """What the next step needs of the bodies' motion."""
+    body: Mat = (motion.x_axis, motion.y_axis, motion.z_axis)
+    return PreviousMotion(matvec(body, motion.velocity), motion.angular_velocity)
+
+
+class _RestingEngine:
+    """The engine's functions that readings need, for robots at rest: gives shapes."""
+
+    def __init__(self, plant: Plant, lanes: int) -> None:
+        self.plant = plant
+        self._joints = jnp.zeros((plant.num_hinge_rows, lanes), jnp.float32)
+        self._bodies = jnp.zeros((1 + plant.num_hinge_rows, lanes), jnp.float32)
+
+    def root(self, state: Any) -> RootState:
+        x = self._bodies[0]
+        return RootState((x,) * 3, (x,) * 4, (x,) * 3, (x,) * 3)
+
+    def joints(self, state: Any) -> tuple[jax.Array, jax.Array]:
+        return self._joints, self._joints
+
+    def servo_torque(self, state: Any, ctrl: jax.Array) -> jax.Array:
+        return self._joints
+
+    def contact_force(self, state: Any, water: Water) -> jax.Array:
+        return self._bodies
+
+    def body_motions(self, state: Any) -> BodyMotion:
+        x = self._bodies
+        return BodyMotion((x,) * 3, (x,) * 3, (x,) * 3, x, (x,) * 3, (x,) * 3, (x, x))
+
+    def contact_by_half(self, state: Any, water: Water) -> Any:
+        x = self._bodies[0]
+        return defaultdict(lambda: (x, x))
+
+
+def readings_at_rest(plant: Plant, lanes: int, signals: Sequence[str]) -> SensorReadings:
+    """Readings of the right shapes, to try a controller on.
+
+    Raises:
+        InputError: there is no such module.
+    """
+    engine: Any = _RestingEngine(plant, lanes)
+    noise = jnp.zeros(lanes, jnp.uint32)
+    context = EpisodeContext(noise=noise)
+    memory = init_memory(signals, engine, (), context)
+    water = Water(0.0, (0.0, 0.0, 0.0))
+    return read_sensors(
+        None, engine, (), water, jnp.zeros((), jnp.float32), context, memory, signals
+    )

@@ -1,0 +1,43 @@
+"""The controllers by name. JAX is imported when one is made, not when a configuration is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any, NamedTuple
+
+
+class ControllerKind(NamedTuple):
+    """A kind of controller.
+
+    Attributes:
+        path: `module.function` in this package. The function takes a plant, and by their
+            names those settings of a `ControllerConfig` that its signature has.
+        settings: names of the settings that are of use to this kind only, or to few.
+        fixed: arguments that no setting gives.
+    """
+
+    path: str
+    settings: tuple[str, ...] = ()
+    fixed: Mapping[str, Any] = {}
+
+    @property
+    def make(self) -> Callable[..., Any]:
+        """The function."""
+        module, name = self.path.split(".")
+        made: Callable[..., Any] = getattr(import_module(f"mjx_revolve.control.{module}"), name)
+        return made
+
+
+_NETWORK = "joint_network.make_joint_network", ("sensors", "hidden", "messages")
+CONTROLLERS: dict[str, ControllerKind] = {
+    "cpg": ControllerKind("cpg.make_cpg"),
+    "sine": ControllerKind("sine.make_sine", ("harmonics",)),
+    "feedback": ControllerKind("feedback.make_feedback", ("gain", "depth")),
+    "mlp": ControllerKind(*_NETWORK),
+    "rnn": ControllerKind(*_NETWORK, {"recurrent": True}),
+    "sensory_cpg": ControllerKind("sensory_cpg.make_sensory_cpg", ("sensors", "gain")),
+    "splines": ControllerKind("splines.make_splines", ("points",)),
+    "brain": ControllerKind("neurons.make_neural_network", ("points",)),
+}
+"""`brain` runs what the robot's own file has, a network or splines."""

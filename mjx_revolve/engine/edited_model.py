@@ -1,0 +1,105 @@
+"""Numbers of a MuJoCo model that a user has edited, in place of those of the assembly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from mjx_revolve.engine.assembly import Assembly
+from mjx_revolve.engine.step_constants import LIMIT_OVERSHOOT, StepConstants, motor_line
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import Scalar, quat_to_matrix
+
+# What an edit must leave as it is: the tables of water and contact follow from it.
+_FIXED = ("body_parentid", "body_pos", "body_quat", "body_jntadr", "jnt_pos", "jnt_axis")
+_COUNTS = ("nbody", "nq", "nv", "nu")
+
+
+def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
+    """Refuses an edited model whose bodies, hinges or actuators are others.
+
+    Args:
+        model: the edited one.
+        built: the robot's.
+        name: of the robot.
+
+    Raises:
+        InputError: it differs in more than masses, inertias, hinges and servos.
+    """
+    changed = [x for x in _COUNTS if getattr(model, x) != getattr(built, x)]
+    if not changed:
+        pairs = [(x, getattr(model, x), getattr(built, x)) for x in _FIXED]
+        pairs += [(f"opt.{x}", *(getattr(m.opt, x) for m in (model, built)))
+                  for x in ("timestep", "gravity")]  # fmt: skip
+        changed = [x for x, new, old in pairs if not np.allclose(new, old, atol=1e-9)]
+    if changed:
+        raise InputError(
+            f"model of {name!r}: expected other masses, inertias, hinges or servos only; found "
+            f"another {', '.join(changed)} (edit the morphology or the world instead)"
+        )
+
+
+def edited_assembly(assembly: Assembly, model: mujoco.MjModel) -> Assembly:
+    """An assembly of one robot with the masses and inertias of a model."""
+    axes = quat_to_matrix(model.body_iquat)
+    return replace(
+        assembly,
+        mass=model.body_mass.copy(),
+        center=model.body_ipos.copy(),
+        inertia=np.einsum("bij,bj,bkj->bik", axes, model.body_inertia, axes),
+    )
+
+
+def edited_constants(
+    constants: StepConstants, model: mujoco.MjModel, servos: Sequence[int]
+) -> StepConstants:
+    """The constants of one robot with the hinges and servos of a model.
+
+    Args:
+        constants: as built.
+        model: the edited one.
+        servos: its actuators that turn hinges.
+
+    Returns:
+        The constants; those of the world and the root, which have no hinge, as they were.
+    """
+    if not servos:
+        return constants
+    joint = model.body_jntadr[2:]
+    servo = {int(model.actuator_trnid[k, 0]): k for k in servos}
+    act = np.array([servo[int(j)] for j in joint], int)
+    dof = model.jnt_dofadr[joint]
+    effort = _limits(model.actuator_forcerange[act], model.actuator_forcelimited[act])
+    target = _limits(model.actuator_ctrlrange[act], model.actuator_ctrllimited[act])
+    limits = _limits(model.jnt_range[joint], model.jnt_limited[joint])
+    strong = np.where(np.isfinite(effort[:, 1]), effort[:, 1], 1.0)
+    motor = motor_line(model.jnt_user[joint, 0], effort[:, 1], model.dof_damping[dof])
+
+    def filled(old: Scalar, new: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.asarray(old, float)[:2], new])
+
+    def pair(old: tuple[Scalar, Scalar], new: np.ndarray) -> tuple[Scalar, Scalar]:
+        return filled(old[0], new[:, 0]), filled(old[1], new[:, 1])
+
+    ours = constants.hinges
+    hinges = ours._replace(
+        armature=filled(ours.armature, model.dof_armature[dof]),
+        damping=filled(ours.damping, model.dof_damping[dof]),
+        gain=filled(ours.gain, model.actuator_gainprm[act, 0]),
+        stiffness=filled(ours.stiffness, -model.actuator_biasprm[act, 1]),
+        servo_damping=filled(ours.servo_damping, -model.actuator_biasprm[act, 2]),
+        effort=pair(ours.effort, effort),
+        target=pair(ours.target, target),
+        range=pair(ours.range, limits),
+        stop=filled(ours.stop, strong / LIMIT_OVERSHOOT),
+        motor=(*pair(ours.motor[:2], np.stack(motor[:2], 1)), filled(ours.motor[2], motor[2])),
+    )
+    return constants._replace(hinges=hinges)
+
+
+def _limits(ranges: np.ndarray, limited: np.ndarray) -> np.ndarray:
+    """`[n, 2]` ranges, infinite where there are none."""
+    return np.where(limited.astype(bool)[:, None], ranges, [-np.inf, np.inf])

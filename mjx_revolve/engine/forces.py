@@ -1,0 +1,215 @@
+"""Forces by themselves: on whole robots for tasks, on bodies for sensors, on parts for pictures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_revolve.engine.contact import bed_forces, bed_normal_force
+from mjx_revolve.engine.hydrodynamics import forces_on_parts, water_forces
+from mjx_revolve.engine.kinematics import forward_kinematics
+from mjx_revolve.engine.level import Level
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.servos import motor_torque
+from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
+from mjx_revolve.engine.state import State, effective_gravity
+from mjx_revolve.engine.step_constants import IMMOBILE_INERTIA
+from mjx_revolve.engine.tree import Tree
+from mjx_revolve.numerics.inertia import BodyMotion
+from mjx_revolve.numerics.spatial import (
+    Scalar,
+    Vec,
+    add,
+    dot,
+    safe_norm,
+    total,
+    vadd,
+    vscale,
+    vsub,
+)
+from mjx_revolve.water.flow import Water
+
+_ZERO = (0.0, 0.0, 0.0)
+
+
+def _in_current(tree: Tree, state: State, water: Water) -> tuple[BodyMotion, Any]:
+    """Motion of the root and of the bodies below it, relative to the uniform current."""
+    relative = state._replace(velocity=vsub(state.velocity, water.current))
+    root, below, _ = forward_kinematics(tree, relative, True)
+    return root, below
+
+
+def servo_torque(tree: Tree, state: State, targets: Any) -> Float[Array, "rows lanes"]:
+    """Torque of the servos under targets, in the plant's order [N·m]."""
+
+    def torque(level: Level, angle: Scalar, speed: Scalar, target: Scalar) -> Scalar:
+        assert level.hinges is not None
+        return motor_torque(level.hinges, angle, speed, target)
+
+    found = tree.map(torque, state.angle, state.speed, targets)
+    return tree.join_rows(found, state.position[0])
+
+
+def motor_torques(robot: Robot, qpos: Any, qvel: Any, ctrl: Any) -> np.ndarray:
+    """Torque of the motors along a trajectory, by the servos' law, without the joints' friction.
+
+    Args:
+        robot: from `build_robot`.
+        qpos: `[S, nq]` configurations.
+        qvel: `[S, nv]` velocities.
+        ctrl: `[S, nu]` commands.
+
+    Returns:
+        `[S, nhinge]` in the order of the hinges [N·m].
+    """
+    tree = make_single_tree(robot, contact=False)
+    hinges = (np.asarray(qpos)[:, 7:], np.asarray(qvel)[:, 6:], np.asarray(ctrl)[:, robot.servos])
+    angle, speed, targets = (tree.joints_to_tree(jnp.asarray(x.T)) for x in hinges)
+    still = (jnp.zeros(len(hinges[0])),) * 3
+    state = State(still, still, still, still, angle, speed)
+    rows = servo_torque(tree, state, targets)
+    return np.asarray(tree.tree_to_joints(tree.split_rows(rows), still[0])).T
+
+
+def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tuple[Vec, Vec]:
+    """Force of the bed and of the water on whole robots.
+
+    Weight is no force of the water's, and neither is the inertia of its added mass.
+
+    Args:
+        tree: the robots.
+        state: the population.
+        water: surface and current.
+        thrusts: of the thrusters, `[nthruster, lanes]` [N].
+
+    Returns:
+        (force of the bed, force of the water), world frame, three of `[lanes]` each [N].
+    """
+    root, moved = _in_current(tree, state, water)
+    world = tree.world
+
+    def forces(level: Level, children: Any, moved: tuple[BodyMotion, Any]) -> tuple[Any, Any, Any]:
+        motion = moved[0]
+        gravity = effective_gravity(world, water, motion)
+        external = water_forces(world, level, motion, gravity, water, thrusts)
+        bed: Vec = _ZERO
+        if level.points is not None:
+            bed = bed_forces(world, level, motion, level.points, water)[1]
+        wide = lambda x: add(x, jnp.zeros_like(motion.height))  # noqa: E731
+        turned = tuple(
+            tuple(wide(dot(axis, force)) for axis in motion.axes) for force in (bed, external.force)
+        )
+        return (), (), turned
+
+    _, _, below = tree.backward_pass(forces, ((), (_ZERO, _ZERO)), moved)
+    own = jax.tree.map(lambda x: x[0], forces(tree.root, None, (root, None))[2])
+    bed, wet = jax.tree.map(add, own, below)
+    return bed, wet
+
+
+def contact_force(tree: Tree, state: State, water: Water) -> Float[Array, "bodies lanes"]:
+    """Magnitude of the bed's force on each moving body.
+
+    Args:
+        tree: the robots.
+        state: the population.
+        water: surface and current.
+
+    Returns:
+        `[1 + nhinge, lanes]` on the core's rigid body, then on what each hinge carries, in the
+        order of `Tree.join_rows` [N]; 0 where there is no bed within reach.
+    """
+    like = state.position[0]
+    if not tree.touches:
+        hinges = tree.join_rows(state.angle, like)
+        return jnp.zeros((1 + hinges.shape[0], *like.shape), like.dtype)
+    root, moved = _in_current(tree, state, water)
+
+    def forces(level: Level, children: Any, moved: tuple[BodyMotion, Any]) -> tuple[Any, Any, Any]:
+        motion, force = moved[0], children
+        size = jnp.zeros((level.count, *like.shape), like.dtype)
+        if level.points is not None:
+            own = bed_forces(tree.world, level, motion, level.points, water)[1]
+            force = own if force is None else vadd(own, force)
+        if force is not None:
+            size = size + safe_norm(tuple(add(x, jnp.zeros_like(size)) for x in force))
+        # An overflow row of `BatchedTrees` is part of the body that it is fixed to.
+        share: Any = 0.0
+        if level.hinges is not None and isinstance(level.hinges.armature, jax.Array):
+            share = jnp.where(level.hinges.armature > IMMOBILE_INERTIA / 2, 1, 0).astype(like.dtype)
+        return vscale(share, force or _ZERO), size, ()
+
+    children, below, _ = tree.backward_pass(forces, (_ZERO, ()), moved)
+    core = forces(tree.root, children, (root, None))[1]
+    return jnp.concatenate([core, tree.join_rows(below, like)])
+
+
+def contact_by_half(
+    tree: SingleTree, state: State, water: Water
+) -> tuple[tuple[jax.Array, jax.Array], ...]:
+    """Force of the bed on the two halves of each module.
+
+    As the two cells of Revolve's touch sensor: left and right of the direction in which the module
+    is attached, its z up.
+
+    Args:
+        tree: the robot.
+        state: of the population.
+        water: surface and current.
+
+    Returns:
+        Of each module (left, right), the force along the bed's normal, without friction, `[lanes]`
+        each [N]; 0 where there is no bed within reach.
+    """
+    like, assembly = state.position[0], tree.robot.assembly
+    root, below = _in_current(tree, state, water)
+    part, right = assembly.point_part, assembly.point_right
+    found: list[tuple[list[Any], list[Any]]]
+    found = [([], []) for _ in range(tree.robot.morphology.num_modules)]
+    motions = (root, *(motion for motion, _ in below))
+    for level, motion, rows in zip(tree.all, motions, tree.point_rows, strict=True):
+        if level.points is None:
+            continue
+        push = bed_normal_force(tree.world, level, motion, level.points, water)
+        for slot, body in zip(*np.nonzero(rows >= 0), strict=True):
+            point = rows[slot, body]
+            module = assembly.layout.module[part[point]]
+            found[module][int(right[point])].append(push[slot, body])
+    none = jnp.zeros_like(like)
+    return tuple((total(none, *left), total(none, *right)) for left, right in found)
+
+
+def part_forces(
+    tree: SingleTree, state: State, water: Water, thrusts: Any
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Forces of the water on a robot's parts one by one: the terms that the step adds up.
+
+    Args:
+        tree: the robot.
+        state: of the population.
+        water: surface and current.
+        thrusts: of the thrusters, `[nthruster, lanes]` [N].
+
+    Returns:
+        Buoyancy, drag and thrust, world frame, `[lanes, npart, 3]` each [N]; parts in the order of
+        the fluid table.
+    """
+    root, below = _in_current(tree, state, water)
+    lanes, count = state.position[0].shape[0], len(tree.robot.fluid.volume)
+    found = [jnp.zeros((lanes, count, 3), state.position[0].dtype) for _ in range(3)]
+    motions = (root, *(motion for motion, _ in below))
+    for level, motion, groups in zip(tree.all, motions, tree.part_rows, strict=True):
+        gravity = effective_gravity(tree.world, water, motion)
+        terms = forces_on_parts(tree.world, level, motion, gravity, water, thrusts)
+        for rows, forces in zip(groups, terms, strict=True):
+            for k, force in enumerate(forces):
+                turned = [dot(axis, force) * jnp.ones(lanes) for axis in motion.axes]
+                stacked = jnp.stack(turned, -1)
+                for slot, body in zip(*np.nonzero(rows >= 0), strict=True):
+                    found[k] = found[k].at[:, rows[slot, body]].set(stacked[slot, body])
+    buoyancy, drag, thrust = found
+    return buoyancy, drag, thrust

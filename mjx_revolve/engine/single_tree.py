@@ -1,0 +1,265 @@
+"""The tree of one robot, level by level, for steps whose tree is known while they are traced.
+
+Bodies at equal depth are stacked on the first axis, so that one operation moves all of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.engine.edited_model import edited_constants
+from mjx_revolve.engine.level import Level, PartLaws, Thrusters
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.step_constants import StepConstants, read_constants, select_bodies
+from mjx_revolve.engine.thrusters import read_thrusters
+from mjx_revolve.engine.variation import Variation, vary_level
+from mjx_revolve.numerics.spatial import add, fold, namespace, total
+from mjx_revolve.water.world import World
+
+
+@dataclass(frozen=True, eq=False)
+class SingleTree:
+    """One robot as a `Tree`; its methods are described there.
+
+    Joint values are tuples of `[nbody, lanes]`, one for each level below the root.
+
+    Attributes:
+        world: around it.
+        root: constants of the root, numbers or `[1, 1]`.
+        below: of the levels below it, numbers or `[nbody, 1]`.
+        parents: of each level below, the index of each body's parent in the level above.
+        bodies: `[level][nbody]` MuJoCo ids, the root's level first.
+        frames: `[nbody, 3, 3]` of each level, MuJoCo's body frame from ours.
+        part_rows: `[level][group][npart, nbody]` rows of the fluid table, -1 for padding.
+        point_rows: `[level][npoint, nbody]` of the assembly's points, -1 for padding.
+        hinge_order: `[nhinge]` the robot's own numbers of the hinges, level by level.
+        thrusters: of the robot.
+        carries: whether any part has added mass.
+        robot: the source.
+    """
+
+    world: World
+    root: Level
+    below: tuple[Level, ...]
+    parents: tuple[tuple[int, ...], ...]
+    bodies: tuple[tuple[int, ...], ...]
+    frames: tuple[np.ndarray, ...]
+    part_rows: tuple[tuple[np.ndarray, ...], ...]
+    point_rows: tuple[np.ndarray, ...]
+    hinge_order: np.ndarray
+    thrusters: Thrusters
+    carries: bool
+    robot: Robot
+
+    @property
+    def all(self) -> tuple[Level, ...]:
+        """The root's level and those below."""
+        return (self.root, *self.below)
+
+    @property
+    def touches(self) -> bool:
+        """Whether any body may touch the bed."""
+        return any(level.points is not None for level in self.all)
+
+    def with_variation(self, variation: Variation) -> SingleTree:
+        """The same robot with other coefficients."""
+        below = tuple(vary_level(level, variation) for level in self.below)
+        return replace(self, root=vary_level(self.root, variation), below=below)
+
+    # Joint values, level by level and in the robot's order.
+
+    def joints_to_tree(self, values: jax.Array) -> tuple[jax.Array, ...]:
+        """`[nbody, lanes]` of each level from the robot's order."""
+        return self.split_rows(values[self.hinge_order]) if self.below else ()
+
+    def split_rows(self, rows: jax.Array) -> tuple[jax.Array, ...]:
+        """`[nbody, lanes]` of each level from the order of the levels."""
+        edges = np.cumsum([0] + [level.count for level in self.below])
+        return tuple(rows[a:b] for a, b in itertools.pairwise(edges))
+
+    def tree_to_joints(self, values: Sequence[jax.Array], like: jax.Array) -> jax.Array:
+        """`[nhinge, lanes]` in the robot's order."""
+        if not self.below:
+            return jnp.zeros((0, *like.shape), like.dtype)
+        return jnp.concatenate(values)[np.argsort(self.hinge_order).astype(np.int32)]
+
+    def join_rows(self, values: Sequence[jax.Array], like: jax.Array) -> jax.Array:
+        """`[nhinge, lanes]` in the order of the levels."""
+        return jnp.concatenate(values) if self.below else jnp.zeros((0, *like.shape), like.dtype)
+
+    def stack_saved(self, saved: Any, select: Callable[[Any], Any], like: jax.Array) -> Any:
+        """`[nhinge, lanes]` of what `select` takes; None without hinges."""
+        if not self.below:
+            return None
+
+        def join(*xs: Any) -> jax.Array:
+            pairs = zip(xs, self.below, strict=True)
+            wide = [jnp.broadcast_to(x, (level.count, *like.shape)) for x, level in pairs]
+            return jnp.concatenate(wide)
+
+        return jax.tree.map(join, *map(select, saved))
+
+    # Values of parts, group by group.
+
+    def unstack_parts(self, groups: tuple[jax.Array, ...]) -> tuple[Any, ...]:
+        """The groups themselves."""
+        return groups
+
+    def stack_parts(self, saved: Any, select: Callable[[Any], Any]) -> tuple[Any, ...]:
+        """What `select` takes of each level."""
+        return tuple(map(select, saved))
+
+    def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
+        """Ones, `[npart, nbody, lanes]` of each group and level."""
+
+        def ones(level: Level) -> tuple[jax.Array, ...]:
+            return tuple(jnp.ones((n, level.count, *lanes), dtype) for n in level.carrying)
+
+        return ones(self.root), tuple(map(ones, self.below))
+
+    # The passes.
+
+    def map(self, fun: Callable[..., Any], *xs: Any) -> Any:
+        """`fun` for each level."""
+        return tuple(fun(*args) for args in zip(self.below, *xs, strict=True))
+
+    def forward_pass(self, fun: Callable[..., Any], root: Any, *xs: Any) -> Any:
+        """Level after level from the root."""
+        value, found = root, []
+        for level, parents, *x in zip(self.below, self.parents, *xs, strict=True):
+            value, save = fun(level, _of_parents(parents, value), *x)
+            found.append(save)
+        return tuple(found)
+
+    def backward_pass(self, fun: Callable[..., Any], zero: Any, *xs: Any) -> tuple[Any, Any, Any]:
+        """Level after level from the tips."""
+        children, saved, sums = None, [], zero[1]
+        counts = [level.count for level in self.all]
+        for d in reversed(range(len(self.below))):
+            value, save, terms = fun(self.below[d], children, *(x[d] for x in xs))
+            children = _sum_of_children(self.parents[d], counts[d], value)
+            saved.append(save)
+            terms = jax.tree.map(lambda x: total(*[x[k] for k in range(x.shape[0])]), terms)
+            sums = jax.tree.map(add, sums, terms)
+        return children, tuple(reversed(saved)), sums
+
+
+def _of_parents(parents: tuple[int, ...], value: Any) -> Any:
+    """A value of the level above, for each body of this one."""
+
+    def pick(x: Any) -> Any:
+        if not hasattr(x, "shape") or x.shape[0] == 1 or parents == tuple(range(x.shape[0])):
+            return x
+        return namespace(x).concatenate([x[k : k + 1] for k in parents])
+
+    return jax.tree.map(pick, value)
+
+
+def _sum_of_children(parents: tuple[int, ...], above: int, value: Any) -> Any:
+    """The sum over each parent's children, for each body of the level above."""
+    n = len(parents)
+
+    def gather(x: Any) -> Any:
+        if parents == tuple(range(above)):
+            return x
+        if not isinstance(x, jax.Array):  # a constant stays one, so that it still folds away
+            return fold(np.equal.outer(range(above), parents) @ np.broadcast_to(x, (n, 1)))
+        if x.shape[0] == 1 and n > 1:
+            x = jnp.broadcast_to(x, (n, *x.shape[1:]))
+        if above == 1:
+            return total(*[x[k : k + 1] for k in range(n)])
+        sums = []
+        for parent in range(above):
+            children = [x[k : k + 1] for k in range(n) if parents[k] == parent]
+            sums.append(total(*children) if children else jnp.zeros_like(x[:1]))
+        return jnp.concatenate(sums)
+
+    return jax.tree.map(gather, value)
+
+
+@lru_cache(maxsize=32)
+def make_single_tree(robot: Robot, contact: bool = True) -> SingleTree:
+    """The constants of the step of one robot; the same object for the same arguments.
+
+    Args:
+        robot: from `build_robot`.
+        contact: whether the robot can touch the bed; without, its points are left out.
+
+    Returns:
+        The tree.
+    """
+    assembly = robot.assembly
+    columns = read_constants(assembly)
+    if robot.edited_model is not None:
+        columns = edited_constants(columns, robot.edited_model, robot.servos)
+    parent = assembly.parent.tolist()
+    depth = {1: 0}
+    for body in range(2, len(parent)):
+        depth[body] = depth[parent[body]] + 1
+    ids = [[b for b in depth if depth[b] == d] for d in range(max(depth.values()) + 1)]
+    made = [_make_level(columns, bodies, contact, d == 0) for d, bodies in enumerate(ids)]
+    parents = tuple(
+        tuple(above.index(parent[b]) for b in bodies) for above, bodies in itertools.pairwise(ids)
+    )
+    return SingleTree(
+        world=robot.world,
+        root=made[0][0],
+        below=tuple(level for level, _, _ in made[1:]),
+        parents=parents,
+        bodies=tuple(map(tuple, ids)),
+        frames=tuple(columns.frame[bodies] for bodies in ids),
+        part_rows=tuple(rows for _, rows, _ in made),
+        point_rows=tuple(rows for _, _, rows in made),
+        # Hinge k carries body k + 2: the root is 1.
+        hinge_order=np.array([b - 2 for bodies in ids[1:] for b in bodies], np.int32),
+        thrusters=read_thrusters(assembly, robot.num_thrusters),
+        carries=columns.parts.carried is not None,
+        robot=robot,
+    )
+
+
+def _make_level(
+    columns: StepConstants, bodies: list[int], contact: bool, root: bool
+) -> tuple[Level, tuple[np.ndarray, ...], np.ndarray]:
+    """One level, and the rows of the fluid table of each of its groups, and of the points."""
+    held: dict[PartLaws, list[list[int]]] = {}
+    for k, body in enumerate(bodies):
+        for part in np.flatnonzero(columns.part_body == body):
+            lists = held.setdefault(columns.laws[columns.part_laws[part]], [[] for _ in bodies])
+            lists[k].append(int(part))
+    parts = {
+        laws: _stack(rows)
+        for laws, rows in held.items()
+        # Nothing acts on a group that neither floats nor drags nor carries nor pushes.
+        if not laws.idle or _carries(columns, rows)
+    }
+    points = None
+    if contact:
+        lists = [np.flatnonzero(columns.point_body == b).tolist() for b in bodies]
+        points = _stack(lists) if any(lists) else None
+    finish = lambda x: x[..., None] if x.dtype.kind == "i" else fold(x[..., None])  # noqa: E731
+    level = select_bodies(columns, np.array(bodies), parts, points, root, len(bodies), finish)
+    none = np.zeros((0, len(bodies)), int)
+    rows = tuple(parts[laws] for laws in sorted(parts))
+    return level, rows, none if points is None else points
+
+
+def _stack(lists: list[list[int]]) -> np.ndarray:
+    """`[nbody][k]` ragged to `[kmax, nbody]`, padded with -1, the column of nothing."""
+    most = max(len(row) for row in lists)
+    return np.array([[row[k] if k < len(row) else -1 for row in lists] for k in range(most)])
+
+
+def _carries(columns: StepConstants, lists: list[list[int]]) -> bool:
+    if columns.parts.carried is None:
+        return False
+    rows = [p for row in lists for p in row]
+    return any(np.any(x[rows]) for x in jax.tree.leaves(columns.parts.carried.inertia.linear))

@@ -1,0 +1,233 @@
+"""Executors score a population in blocks: in this process, or with workers.
+
+Imports stand inside functions: workers start while NumPy and JAX are loaded.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from mjx_revolve.evolution.jobs import Job, WorkerError
+from mjx_revolve.inputs.errors import InputError
+
+if TYPE_CHECKING:
+    import jax
+    import numpy as np
+
+    from mjx_revolve.episodes.config import Config
+    from mjx_revolve.evolution.blocks import Block, Scored
+
+_log = logging.getLogger(__name__)
+AnyWorker = TypeVar("AnyWorker")
+
+
+class Executor:
+    """Scores a population in blocks, one after the other, in this process.
+
+    One after the other, because two at once can lock XLA's CPU back end up.
+
+    Attributes:
+        fitness: this process's own, for replays, and for scores if there are no workers.
+        block: individuals in a block; None: the whole population, whatever its size.
+        folder: where blocks are kept that had to be given up.
+        closed: whether it has ended.
+    """
+
+    place = ""
+    """The address of the cluster; "" on this machine."""
+
+    def __init__(self, fitness: Any, block: int | None = None) -> None:
+        """Makes an executor of a fitness; see `jobs.MakeFitness`."""
+        self.fitness = fitness
+        self.block = block
+        self.folder = Path(tempfile.gettempdir()) / "mjx_revolve"
+        self.closed = False
+
+    @property
+    def num_genes(self) -> int:
+        """Length of an individual's genes."""
+        return self.fitness.num_genes
+
+    @property
+    def worst_score(self) -> float:
+        """The score of a failed rollout; -inf for a fitness that has none."""
+        return self.fitness.worst_score if hasattr(self.fitness, "worst_score") else float("-inf")
+
+    @property
+    def num_workers(self) -> int:
+        """How many processes score."""
+        return 1
+
+    def __call__(self, population: Any, key: jax.Array) -> np.ndarray:
+        """Scores a population: `[P]`; see `evaluate`."""
+        return self.evaluate(population, key)[0]
+
+    def evaluate(self, population: Any, key: jax.Array) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Scores a population and measures how it moved.
+
+        Args:
+            population: `[P, num_genes]`.
+            key: draws the episodes' starts, the same for every individual.
+
+        Returns:
+            `[P]` scores and `[P]` measures, float32; see `score` for NaN.
+
+        Raises:
+            WorkerError: see `score`.
+            InputError: the population has another shape.
+        """
+        import numpy as np
+
+        from mjx_revolve.evolution.blocks import split_blocks
+
+        population = np.asarray(population, np.float32)
+        if population.ndim != 2 or population.shape[1] != self.num_genes or len(population) < 1:
+            raise InputError(
+                f"population: expected [P, {self.num_genes}]; found {list(population.shape)}"
+            )
+        blocks = split_blocks(population, self.block or len(population))
+        scores, measures = zip(*self.score([(block,) for block in blocks], key), strict=True)
+        size = len(population)
+        return np.concatenate(scores)[:size], {
+            name: np.concatenate([each[name] for each in measures])[:size] for name in measures[0]
+        }
+
+    def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored]:
+        """Scores blocks of whatever the fitness takes.
+
+        Args:
+            blocks: arguments of `fitness.evaluate` before the key, which can be pickled; the first
+                has one entry per individual.
+            key: draws the episodes' starts, the same for every individual.
+
+        Returns:
+            `[rows]` scores and measures of each. Those of a block that brings down worker after
+            worker are NaN; the log names the file from which it can be scored again.
+
+        Raises:
+            WorkerError: no worker is left, or not one block could be scored; the executor is
+                closed.
+        """
+        if self.closed:
+            raise RuntimeError("expected an open executor; found it closed")
+        try:
+            return self._score(blocks, key)
+        except BaseException:
+            # Interrupted anywhere: what the workers are doing is unknown.
+            self.close()
+            raise
+
+    def _score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored]:
+        from mjx_revolve.evolution.blocks import evaluate_block
+
+        return [evaluate_block(self.fitness, block, key) for block in blocks]
+
+    def describe(self) -> dict[str, Any]:
+        """Where scores come from, for `run.json`."""
+        return {"count": self.num_workers, "block": self.block}
+
+    def close(self) -> None:
+        """Ends the workers."""
+        self.closed = True
+
+    def __enter__(self) -> Executor:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class WorkerExecutor(Executor, ABC, Generic[AnyWorker]):
+    """An executor with workers: processes that score one block after the other.
+
+    A block is a pure function, so one whose worker was lost is scored again, and gives the same.
+    One that fails `Limits.tries` times is given up.
+
+    Attributes:
+        job: what the workers score.
+        identity: what they must have in common with this process; see `fingerprints.identify`.
+    """
+
+    def __init__(self, config: Config, job: Job) -> None:
+        """Makes this process's own fitness, while the workers make theirs."""
+        from mjx_revolve.evolution.blocks import choose_block
+        from mjx_revolve.evolution.fingerprints import identify
+
+        self.job = job
+        fitness = job.make_fitness(config)
+        super().__init__(fitness, choose_block(fitness) or config.evolution.population_size)
+        self.identity = identify(fitness)
+
+    @abstractmethod
+    def free(self) -> list[AnyWorker]:
+        """The workers that can take a block."""
+
+    @abstractmethod
+    def send(self, worker: AnyWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+        """Gives a block to a worker."""
+
+    @abstractmethod
+    def attend(self) -> list[tuple[int, Scored | str | None]]:
+        """Waits for news, but not for long.
+
+        Returns:
+            Numbers of blocks, with the scores of each, or why it failed, or None: it was not begun.
+        """
+
+    def _score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored]:
+        import numpy as np
+
+        from mjx_revolve.evolution.blocks import key_as_data
+
+        data = key_as_data(key)
+        waiting = deque(range(len(blocks)))
+        scored: dict[int, Scored] = {}
+        reasons: dict[int, list[str]] = {}
+        lost: dict[int, str] = {}
+        while len(scored) + len(lost) < len(blocks):
+            for worker in self.free():
+                if waiting:
+                    number = waiting.popleft()
+                    self.send(worker, number, blocks[number], data)
+            for number, result in self.attend():
+                if result is None:
+                    waiting.appendleft(number)
+                elif not isinstance(result, str):
+                    scored[number] = result
+                else:
+                    failed = reasons.setdefault(number, [])
+                    failed.append(result)
+                    if len(failed) < self.job.limits.tries:
+                        waiting.appendleft(number)
+                    else:
+                        lost[number] = ", ".join(dict.fromkeys(failed))
+        if not scored:
+            raise WorkerError(f"expected scores; every block failed: {lost[0]}")
+        names = next(iter(scored.values()))[1]
+        for number, reason in sorted(lost.items()):
+            self._keep(blocks[number], key, reason)
+            nothing = np.full(len(blocks[number][0]), np.nan, np.float32)
+            scored[number] = nothing, dict.fromkeys(names, nothing)
+        return [scored[number] for number in range(len(blocks))]
+
+    def _keep(self, block: Block, key: jax.Array, reason: str) -> None:
+        """Keeps a block that was given up, and names its file."""
+        from mjx_revolve.evolution.failed_blocks import save_failed_block
+
+        path = save_failed_block(self.folder, self.job, block, key)
+        _log.warning(
+            "%d individuals count as failed, because their workers do (%s); to see why: "
+            "python -m mjx_revolve.evolution.failed_blocks %s", len(block[0]), reason, path,
+        )  # fmt: skip

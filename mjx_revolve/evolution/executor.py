@@ -1,0 +1,92 @@
+"""The executor of a configuration: one process, its cores, or the workers of a cluster.
+
+    with make_executor("configs/lake_swim.yaml") as executor:
+        scores, measures = executor.evaluate(population, key)
+
+Imports stand inside functions: `make_executor` sets threads before NumPy and JAX are loaded, and
+workers start while the rest is.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mjx_revolve.evolution.block_executor import Executor as Executor
+from mjx_revolve.evolution.jobs import MakeFitness, choose_fitness
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics import runtime
+
+if TYPE_CHECKING:
+    from mjx_revolve.episodes.config import Config
+
+
+def choose_workers(config: Config) -> int:
+    """How many workers a run gets: one for each core, but none without a block of its own."""
+    from mjx_revolve.evolution.blocks import block_size
+
+    block = block_size(config.task.trials)
+    if block is None or config.colony is not None:  # a world is stepped as a whole
+        return 1
+    blocks = -(-config.evolution.population_size // block)
+    if config.bodies is not None:
+        count = config.bodies.selection.offspring or config.evolution.population_size
+        tried = config.bodies.learning.population_size
+        blocks = -(-count * tried // block)
+    return min(runtime.usable_cores(), blocks)
+
+
+def make_executor(
+    config: Config | str | Path,
+    workers: int | None = None,
+    make_fitness: MakeFitness | None = None,
+    cluster: str | None = None,
+) -> Executor:
+    """Builds a fitness and starts the workers that share its work, or finds them.
+
+    Args:
+        config: the configuration, or the path of its file.
+        workers: how many processes are to score on this machine; None: one for each core on a CPU,
+            and this one alone on an accelerator. With 1, this process does it itself.
+        make_fitness: makes the fitness, here and in each worker: a function that can be imported by
+            its name, see `jobs.MakeFitness`. None: the package's own. By default another one has no
+            workers.
+        cluster: a Dask scheduler's address, or the path of its scheduler file: its workers score.
+
+    Returns:
+        The executor; to be closed, or used in a `with`.
+
+    Raises:
+        InputError: the configuration is wrong, or there is no scheduler.
+        WorkerError: workers cannot be started.
+    """
+    cache = runtime.prepare_process()
+    from mjx_revolve.episodes.config import load_config
+
+    if isinstance(config, str | Path):
+        config = load_config(config)
+    if workers is None:
+        workers = 1 if make_fitness else choose_workers(config)
+    if workers == 1 and cluster is None:
+        from mjx_revolve.evolution.blocks import choose_block
+
+        fitness = (make_fitness or choose_fitness(config))(config)
+        return Executor(fitness, choose_block(fitness))
+    _expect_cpu("--cluster" if cluster else "--workers")
+    if cluster:
+        from mjx_revolve.evolution.cluster import ClusterExecutor
+
+        return ClusterExecutor(config, make_fitness, cluster)
+    from mjx_revolve.evolution.processes import ProcessExecutor
+
+    return ProcessExecutor(config, make_fitness, workers, cache)
+
+
+def _expect_cpu(option: str) -> None:
+    import jax
+
+    if jax.default_backend() != "cpu":
+        raise InputError(
+            f"{option}: expected JAX to run on the CPU (JAX_PLATFORMS=cpu), where work is spread "
+            f"over cores; found {jax.default_backend()}, which takes the whole population"
+        )

@@ -1,0 +1,202 @@
+"""What all searches share: a generation (ask, evaluate, tell), its row, the champion's choice.
+
+A search over genes, over bodies, and a colony differ in what they ask for and in what they do with
+the results. The clock, the order of the steps and the columns of `metrics.csv` stand here once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from mjx_revolve.body.tree import Morphology
+from mjx_revolve.episodes.scoring import REPORT_EPISODES, REPORT_STREAM, replay_key
+from mjx_revolve.evolution.strategies import FAILED_SCORE
+
+Scored = tuple[np.ndarray, dict[str, np.ndarray]]
+
+# Fresh episodes per candidate to choose the champion. The reported score comes from others
+# (`REPORT_EPISODES`), because the best of several means is biased upwards, too.
+CHOOSE_EPISODES = 8
+# A stream of random numbers that no generation uses.
+CHOOSE_STREAM = 2**32 - 1
+
+
+@dataclass(frozen=True)
+class Champion:
+    """The best individual of a run.
+
+    Attributes:
+        genes: `[G]`; those of the body's own controller.
+        score: mean over `REPORT_EPISODES` fresh keys; `FAILED_SCORE` stands for a failed rollout.
+            Before the final evaluation: the score in its own generation.
+        origin: where it came from, in words.
+        std: standard deviation over those keys; NaN before.
+        measures: mean of each measure over those keys.
+        key: the first of those keys, to replay; None before.
+        body: its body, where bodies have evolved.
+        individual: its number, where bodies have evolved.
+    """
+
+    genes: np.ndarray
+    score: float
+    origin: str
+    std: float = float("nan")
+    measures: Mapping[str, float] = field(default_factory=dict)
+    key: jax.Array | None = None
+    body: Morphology | None = None
+    individual: int | None = None
+
+
+class Generation(NamedTuple):
+    """A generation's result.
+
+    Attributes:
+        search: the search after it.
+        scores: `[P]` scores that its row summarises; not finite: failed.
+        champion: the best score so far.
+        columns: further columns of its row, in their order.
+        evaluated: individuals that it has scored.
+        evaluations: individuals that the search has scored so far.
+        simulated: simulated time [s], where the row tells how many times real time it went; or 0.
+    """
+
+    search: Any
+    scores: np.ndarray
+    champion: float
+    columns: Mapping[str, float]
+    evaluated: int
+    evaluations: int
+    simulated: float = 0.0
+
+
+class Evolution(Protocol):
+    """A kind of search. Its state is a frozen dataclass with `generation` and `seconds`.
+
+    All that passes from one generation to the next is that value, so a search that is read back
+    from disk continues with the same bits.
+    """
+
+    def start(self) -> Any:
+        """The search before its first generation."""
+
+    def ask(self, search: Any) -> Any:
+        """What the next generation evaluates."""
+
+    def evaluate(self, asked: Any) -> Any:
+        """The results of what `ask` returned."""
+
+    def tell(self, asked: Any, results: Any) -> Generation:
+        """The search with the results taken in."""
+
+    def to_arrays(self, search: Any) -> dict[str, Any]:
+        """The search as named arrays, for a checkpoint."""
+
+    def from_arrays(self, arrays: Mapping[str, np.ndarray]) -> Any:
+        """The inverse of `to_arrays`; raises `InputError` for arrays of another search."""
+
+    def logs(self, search: Any) -> Mapping[str, Sequence[str]]:
+        """Lines that the last generation adds to the run folder's logs, by the file's name."""
+
+    def files(self, search: Any) -> Mapping[str, bytes]:
+        """Files of the run folder that are written anew with each checkpoint, by name."""
+
+    def best(self, search: Any) -> Champion | None:
+        """The champion so far, not yet evaluated on fresh starts; None: every rollout failed."""
+
+    def choose_champion(self, search: Any) -> Champion:
+        """The champion of a finished search, evaluated on fresh starts."""
+
+
+def run_generations(
+    evolution: Evolution, generations: int, search: Any = None
+) -> Iterator[tuple[Any, dict[str, float]]]:
+    """Runs a search, one generation at a time.
+
+    Args:
+        evolution: the kind of search.
+        generations: how many there are in all.
+        search: where to continue; None starts a new search.
+
+    Yields:
+        The search after each generation, and the generation's row: generation, evaluations, the
+        statistics of `score_statistics`, champion (the best score so far), the search's own
+        columns, seconds (so far) and evaluations_per_second.
+    """
+    search = evolution.start() if search is None else search
+    while search.generation < generations:
+        began = time.perf_counter()
+        asked = evolution.ask(search)
+        found = evolution.tell(asked, evolution.evaluate(asked))
+        seconds = time.perf_counter() - began
+        search = replace(found.search, seconds=search.seconds + seconds)
+        row = {
+            "generation": search.generation,
+            "evaluations": found.evaluations,
+            **score_statistics(found.scores),
+            "champion": found.champion,
+            **found.columns,
+            "seconds": search.seconds,
+        }
+        if found.simulated:
+            row["times_real_time"] = found.simulated / seconds
+        yield search, row | {"evaluations_per_second": found.evaluated / seconds}
+
+
+def score_statistics(scores: np.ndarray) -> dict[str, float]:
+    """Best, mean, std, median and quartiles of the finite scores among `[P]`; NaN without any."""
+    finite = scores[np.isfinite(scores)].astype(np.float64)
+    if not finite.size:
+        names = ("best", "mean", "std", "median", "lower_quartile", "upper_quartile")
+        return dict.fromkeys(names, float("nan"))
+    return {
+        "best": float(finite.max()),
+        "mean": float(finite.mean()),
+        "std": float(finite.std()),
+        "median": float(np.median(finite)),
+        "lower_quartile": float(np.quantile(finite, 0.25)),
+        "upper_quartile": float(np.quantile(finite, 0.75)),
+    }
+
+
+def choose_candidate(
+    score: Callable[[Sequence[int], jax.Array], Scored], eligible: np.ndarray, seed: int
+) -> tuple[int, dict[str, Any]]:
+    """Chooses among candidates on fresh starts, and evaluates the winner on others.
+
+    The candidate with the best mean over `CHOOSE_EPISODES` fresh keys wins, of equal ones the
+    first; its score is then measured on `REPORT_EPISODES` others.
+
+    Args:
+        score: (indices of candidates, key) → their scores, not finite where a rollout failed, and
+            measures.
+        eligible: `[N]` whether a candidate may win.
+        seed: of the run.
+
+    Returns:
+        The winner's index, and `score`, `std`, `measures` and `key` of its `Champion`.
+    """
+    root = jax.random.key(seed)
+
+    def fresh(indices: Sequence[int], stream: int, episodes: int) -> Scored:
+        """`[episodes, indices]` scores, `FAILED_SCORE` for a failed rollout, and measures."""
+        keys = (jax.random.fold_in(jax.random.fold_in(root, stream), i) for i in range(episodes))
+        results = [score(indices, key) for key in keys]
+        scores = np.stack([np.where(np.isfinite(s), s, FAILED_SCORE) for s, _ in results])
+        measures = {name: np.stack([m[name] for _, m in results]) for name in results[0][1]}
+        return scores.astype(np.float64), measures
+
+    means = fresh(range(len(eligible)), CHOOSE_STREAM, CHOOSE_EPISODES)[0].mean(axis=0)
+    winner = int(np.argmax(np.where(eligible, means, -np.inf)))
+    scores, measures = fresh([winner], REPORT_STREAM, REPORT_EPISODES)
+    return winner, {
+        "score": float(scores.mean()),
+        "std": float(scores.std()),
+        "measures": {name: float(values.mean()) for name, values in measures.items()},
+        "key": replay_key(seed),
+    }

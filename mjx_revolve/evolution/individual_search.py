@@ -1,0 +1,90 @@
+"""What co-evolution and colony share: columns and lines about the living, elites, the champion."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.evolution.body_fitness import BodyFitness
+from mjx_revolve.evolution.executor import Executor
+from mjx_revolve.evolution.generations import Champion, Scored, choose_candidate
+from mjx_revolve.evolution.individuals import Individual, best_individuals
+from mjx_revolve.evolution.learning import score_brains
+from mjx_revolve.inputs.errors import InputError
+
+# Descriptors whose population mean goes into the metrics.
+MEAN_DESCRIPTORS = ("num_modules", "num_hinges", "length", "mass", "branching", "limbs", "symmetry")
+
+
+class IndividualEvolution:
+    """A search whose state has `elites` and `living`, both individuals."""
+
+    def __init__(self, config: Config, executor: Executor) -> None:
+        """Prepares a search with an executor over a `BodyFitness`."""
+        self.config, self.executor = config, executor
+        self.fitness: BodyFitness = executor.fitness
+
+    def best(self, search: Any) -> Champion | None:
+        """The first elite; in a colony without any, the fittest of the living."""
+        elites = _elites(search)
+        return self._champion(elites[0], score=elites[0].score) if elites else None
+
+    def choose_champion(self, search: Any) -> Champion:
+        """The best of the elites on fresh starts, each alone at the configuration's task.
+
+        Raises:
+            InputError: there is none: every individual failed.
+        """
+        elites = _elites(search)
+        if not elites:
+            raise InputError(
+                "champion: expected an individual with a score; found none: all failed"
+            )
+
+        def score(indices: Sequence[int], key: jax.Array) -> Scored:
+            chosen = [elites[k] for k in indices]
+            genes = [
+                self.fitness.mixed.pad_genes(
+                    np.array([one.genes], np.float32), self.fitness.build(one.body)
+                )
+                for one in chosen
+            ]
+            found = score_brains(self.executor, chosen, genes, key)
+            measures = {name: np.concatenate([m[name] for _, m in found]) for name in found[0][1]}
+            return np.concatenate([scores for scores, _ in found]), measures
+
+        seed = self.config.evolution.seed
+        winner, judged = choose_candidate(score, np.ones(len(elites), bool), seed)
+        return self._champion(elites[winner], **judged)
+
+    def _champion(self, one: Individual, **judged: Any) -> Champion:
+        origin = f"individual {one.number} of generation {one.born}, {one.origin}"
+        genes = np.array(one.genes, np.float32)
+        return Champion(genes=genes, origin=origin, body=one.body, individual=one.number, **judged)
+
+
+def _elites(search: Any) -> tuple[Individual, ...]:
+    return search.elites or best_individuals(search.living)
+
+
+def finite_mean(values: Sequence[float] | np.ndarray) -> float:
+    """The mean of the values that are not NaN; NaN where none is finite."""
+    found = np.asarray(values, float)
+    return float(np.nanmean(found)) if np.isfinite(found).any() else float("nan")
+
+
+def mean_descriptors(living: Sequence[Individual]) -> dict[str, float]:
+    """Columns of a row: means of `MEAN_DESCRIPTORS` over the population."""
+    values = {name: [one.feature(name) for one in living] for name in MEAN_DESCRIPTORS}
+    return {f"mean_{name}": finite_mean(found) for name, found in values.items()}
+
+
+def living_line(search: Any) -> str:
+    """A line of JSON: the numbers of the individuals that are alive after a generation."""
+    numbers = [individual.number for individual in search.living]
+    return json.dumps({"generation": search.generation, "living": numbers}, separators=(",", ":"))

@@ -1,0 +1,105 @@
+"""How an individual comes into being, in generations as in a colony: founders and children."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_revolve.body.tree import Morphology
+from mjx_revolve.evolution.body_fitness import BodyFitness
+from mjx_revolve.evolution.individuals import Individual
+
+
+def make_founder(
+    fitness: BodyFitness,
+    rng: np.random.Generator,
+    number: int,
+    generation: int,
+    seed: Morphology | None = None,
+    mutant: bool = False,
+) -> Individual:
+    """An individual without parents: random, a given robot or a mutant of it.
+
+    Args:
+        fitness: its genotype and brains.
+        rng: all randomness.
+        number: of the individual.
+        generation: in which it is born.
+        seed: the robot; None: a random body.
+        mutant: whether the robot is mutated.
+
+    Returns:
+        The individual, with a brain drawn anew.
+    """
+    genotype = fitness.genotype
+    if seed is None:
+        return _grow(fitness, rng, number, (), generation, "random", genotype.random(rng))
+    assert genotype.adopt is not None  # checked where the fitness is made
+    genome, origin = genotype.adopt(seed), f"seed {seed.name}"
+    if mutant:
+        genome, origin = genotype.mutate(rng, genome), f"mutant of {seed.name}"
+    return _grow(fitness, rng, number, (), generation, origin, genome)
+
+
+def make_child(
+    fitness: BodyFitness,
+    rng: np.random.Generator,
+    number: int,
+    generation: int,
+    first: Individual,
+    second: Individual,
+    both_brains: bool = False,
+) -> Individual:
+    """A child: crossover with probability `bodies.crossover`, then mutation.
+
+    A child that is not crossed is always mutated, one that is crossed with probability
+    `bodies.mutation`.
+
+    Args:
+        fitness: genotype, brains and probabilities.
+        rng: all randomness.
+        number: of the child.
+        generation: in which it is born.
+        first: the parent that gives the body.
+        second: the other one; `first` again: there is only one.
+        both_brains: whether the second counts as a parent, and gives its brain, where bodies are
+            not crossed.
+
+    Returns:
+        The child, with a brain inherited as `bodies.brains` says.
+    """
+    genotype, settings = fitness.genotype, fitness.bodies
+    genome, origin = first.genome, "mutation"
+    crossed = first is not second and rng.random() < settings.crossover
+    if crossed:
+        genome, origin = genotype.cross(rng, genome, second.genome), "crossover"
+    if not crossed or rng.random() < settings.mutation:
+        genome = genotype.mutate(rng, genome)
+        origin = "crossover, mutation" if crossed else "mutation"
+    parents = (first, second) if crossed or both_brains else (first,)
+    return _grow(fitness, rng, number, parents, generation, origin, genome)
+
+
+def _grow(
+    fitness: BodyFitness,
+    rng: np.random.Generator,
+    number: int,
+    parents: Sequence[Individual],
+    generation: int,
+    origin: str,
+    genome: Any,
+) -> Individual:
+    """The body that a genome develops into, and its brain at birth."""
+    body = fitness.genotype.develop(genome)
+    layout, brains = fitness.layout(body), fitness.brains
+    inheritance = fitness.bodies.brains.inheritance
+    if not parents or inheritance == "none":
+        brain = brains.draw(rng, layout)
+    else:
+        learnt = inheritance == "lamarckian"
+        inherited = [p.learnt if learnt and p.learnt is not None else p.brain for p in parents]
+        brain = brains.inherit(rng, inherited, layout)
+    numbers = tuple(parent.number for parent in parents)
+    return Individual(number, numbers, generation, origin, genome, body, brain)

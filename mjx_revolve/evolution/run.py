@@ -1,0 +1,470 @@
+"""A run: begun or resumed, evolved generation by generation, saved, and finished."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import logging
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+from mjx_revolve.episodes.config import Config, load_config, override_config
+from mjx_revolve.episodes.fitness import Fitness
+from mjx_revolve.episodes.settings import NamedFile, map_files
+from mjx_revolve.evolution.body_fitness import BodyFitness
+from mjx_revolve.evolution.executor import Executor
+from mjx_revolve.evolution.fingerprints import (
+    FREE_SETTINGS,
+    model_hash,
+    plain_settings,
+    settings_hash,
+)
+from mjx_revolve.evolution.generations import Champion, Evolution, run_generations
+from mjx_revolve.evolution.interrupts import Interrupts
+from mjx_revolve.evolution.jobs import WorkerError
+from mjx_revolve.evolution.kinds import make_evolution
+from mjx_revolve.evolution.memory import check_memory
+from mjx_revolve.evolution.progress import Progress
+from mjx_revolve.evolution.run_folder import (
+    Checkpoint,
+    RunFolder,
+    check_new_folder,
+    create_run_folder,
+    open_run_folder,
+)
+from mjx_revolve.evolution.tensorboard import TensorBoardLog, check_tensorboard
+from mjx_revolve.inputs.commands import check_place
+from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.files import with_path
+from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.inputs.user_code import announce
+from mjx_revolve.numerics import runtime
+
+# What the bits of a run depend on, besides its configuration.
+_HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
+_RUNS = Path("runs")
+_log = logging.getLogger(__name__)
+
+MakeExecutor = Callable[[Config], Executor]
+
+
+@dataclass
+class Run:
+    """A run, from `begin` or `resume`; after `evolve` it has its champion.
+
+    Attributes:
+        folder: its folder, locked.
+        config: its configuration, which names the folder's copies.
+        executor: scores its populations.
+        evolution: how genes or bodies are searched for.
+        search: the state after the last generation; None: before the first.
+        checkpoint: where `search` is from.
+        resumed: whether it was begun before.
+    """
+
+    folder: RunFolder
+    config: Config
+    executor: Executor
+    evolution: Evolution
+    search: Any = None
+    checkpoint: Checkpoint | None = None
+    resumed: bool = False
+    _steps: Iterator[tuple[Any, dict[str, float]]] | None = field(default=None, repr=False)
+    _unsaved: bool = field(default=False, repr=False)
+
+    @property
+    def generation(self) -> int:
+        """How many generations are done."""
+        return self.search.generation if self.search else 0
+
+    @property
+    def resumption(self) -> str:
+        """Where a resumed run goes on, in words."""
+        done = self.generation
+        return f"after generation {done}" if done else "from the start: it has no checkpoint yet"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it has all its generations and its champion already."""
+        done = self.generation >= self.config.evolution.generations
+        return done and "finished" in self.folder.info
+
+    # --- begin and resume ---
+
+    @classmethod
+    def begin(
+        cls,
+        path: str,
+        settings: Sequence[str],
+        out: str | None,
+        make_executor: MakeExecutor,
+        writing: contextlib.AbstractContextManager | None = None,
+    ) -> Run:
+        """Begins a new run.
+
+        Args:
+            path: the configuration: a file or a shipped one's name.
+            settings: what replaces its values, `KEY.PATH=VALUE` each.
+            out: the run folder; None: one below `runs/`, named after the configuration and the
+                time.
+            make_executor: makes the executor.
+            writing: entered while the folder is made, as by `Interrupts.writing`.
+
+        Raises:
+            InputError: the configuration is wrong, or the folder holds something.
+            WorkerError: workers cannot be started.
+        """
+        config = load_config(path, settings)
+        if config.evolution.tensorboard:
+            check_tensorboard(config.source)
+        if out:
+            check_new_folder(out)  # before the expensive part
+        place = Path(out) if out else _RUNS / "any"
+        check_place(place / "any", f"--out {place}")
+        executor = _prepare(config, make_executor)
+        check_search(config, executor)
+        info = {
+            "started": timestamp(),
+            "seed": config.evolution.seed,
+            "config_file": str(find_shipped(path, "configs").absolute()),
+            "settings": _portable(settings, config),
+            "model_hash": model_hash(executor.fitness),
+            "settings_hash": settings_hash(config),
+            **runtime.describe_process(),
+        }
+        with writing or contextlib.nullcontext():
+            folder, config = create_run_folder(out or _claim_folder(config), config, **info)
+        return cls(folder, config, executor, make_evolution(config, executor))
+
+    @classmethod
+    def resume(
+        cls, folder: str, path: str | None, settings: Sequence[str], make_executor: MakeExecutor
+    ) -> Run:
+        """Opens a run that was stopped, at its newest checkpoint that is whole.
+
+        One that was stopped before its first checkpoint begins anew.
+
+        Args:
+            folder: the run folder.
+            path: the configuration, if it was given again; it must be what the run has.
+            settings: what replaces its values, `KEY.PATH=VALUE` each.
+            make_executor: makes the executor.
+
+        Raises:
+            InputError: it is no run folder, has damaged checkpoints only, or would become another
+                run.
+            WorkerError: workers cannot be started.
+        """
+        label = f"--resume {folder}"
+        files = open_run_folder(folder)
+        old = files.load_config()
+        earlier = files.info.get("settings", [])
+        if path is None:
+            config = override_config(old, settings)
+        else:
+            config = load_config(path, [*earlier, *settings])
+        check_unchanged(old, config, label)
+        free = {key: getattr(config.evolution, key) for key in FREE_SETTINGS}
+        config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
+        if config.evolution.tensorboard:
+            check_tensorboard(label)
+        checkpoint = files.load_checkpoint() if files.checkpoints() else None
+        for name in checkpoint.damaged if checkpoint else ():
+            _log.warning("passed over a damaged checkpoint: %s", name)
+        begun = checkpoint.meta if checkpoint else files.info
+        settled = settings_hash(config)
+        if begun.get("settings_hash", settled) != settled:  # an older version's run.json has none
+            raise InputError(
+                f"{label}: expected the config.yaml that it began with; found it changed"
+            )
+        executor = _prepare(config, make_executor)
+        if begun.get("model_hash") != model_hash(executor.fitness):
+            raise InputError(
+                f"{label}: expected the robot and the world that it began with; found them changed "
+                "(a file that config.yaml names, or the program)"
+            )
+        files.update_info(settings=[*earlier, *_portable(settings, config)])
+        run = cls(files, config, executor, make_evolution(config, executor), resumed=True)
+        if checkpoint is not None:
+            if found := _differences(checkpoint.meta.get("host"), describe_host()):
+                _log.warning(
+                    "the run continues, but not bit for bit, because this process differs: %s",
+                    "; ".join(found),
+                )
+            with reading(checkpoint.path):
+                run.search = run.evolution.from_arrays(checkpoint.arrays)
+            run.checkpoint = checkpoint
+        return run
+
+    # --- generations ---
+
+    def evolve(
+        self,
+        interrupts: Interrupts,
+        draw: Callable[[Run, Champion], None],
+        out: TextIO | None = None,
+    ) -> Champion | None:
+        """The rest of the run, or as much of it as there is before an interrupt, saved.
+
+        Args:
+            interrupts: looked at after each generation.
+            draw: draws the run's pictures; see `finish`.
+            out: where progress is shown; None: standard output.
+
+        Returns:
+            The champion; None where generations are left.
+
+        Raises:
+            WorkerError: no worker is left to score; what was done until then is saved.
+            OSError: the disk is full.
+        """
+        with interrupts.writing:
+            self._write_start()
+        self._evolve(interrupts, out)
+        if interrupts.signal and self.generation < self.config.evolution.generations:
+            return None
+        return self.finish(draw)
+
+    def _write_start(self) -> None:
+        """Describes the run; a resumed one drops what came after its checkpoint."""
+        files = self.folder
+        if self.resumed:
+            files.rewind(self.checkpoint)
+            files.save_config(self.config)
+            resumption = {"time": timestamp(), "generation": self.generation, "argv": sys.argv}
+            resumed = [*files.info.get("resumed", []), resumption]
+            files.update_info(resumed=resumed, finished=None, champion=None)
+        self.executor.folder = files.path / "lost"
+        files.update_info(workers=self.executor.describe())
+        # Where the body is the same for all, it is there from the start.
+        if isinstance(self.executor.fitness, Fitness):
+            files.write("champion/morphology.yaml", self.executor.fitness.robot.morphology.save)
+
+    def _evolve(self, interrupts: Interrupts, out: TextIO | None) -> None:
+        """Generations until the last one, an interrupt, or the loss of all workers."""
+        evolution = self.config.evolution
+        log = self._open_log() if evolution.tensorboard else None
+        progress = Progress(self.generation, evolution.generations, out)
+        interrupts.rescue = self.save
+        try:
+            for _ in range(self.generation, evolution.generations):
+                progress.show(self.step(interrupts.writing, log))
+                if interrupts.signal:
+                    break
+            with interrupts.writing:
+                self.save()
+        except WorkerError as error:
+            if self.search is None:
+                self.search = self.evolution.start()
+            with interrupts.writing:
+                self._unsaved = True
+                self.save()
+            what = f"generation {self.generation}"
+            what = what if self.generation else "the start, before any generation,"
+            raise WorkerError(f"{error}; {what} is saved") from None
+        finally:
+            progress.close()
+            if log is not None:
+                log.close()
+
+    def step(
+        self, writing: contextlib.AbstractContextManager, log: TensorBoardLog | None = None
+    ) -> dict[str, float]:
+        """Evolves one generation, writes it down, and saves it if a checkpoint is due.
+
+        Args:
+            writing: entered while files are written.
+            log: a second log of the figures.
+
+        Returns:
+            The generation's figures, a row of `metrics.csv`.
+        """
+        evolution = self.config.evolution
+        if self._steps is None:
+            self._steps = run_generations(self.evolution, evolution.generations, self.search)
+        search, row = next(self._steps)
+        with writing:
+            self.folder.append_metrics(row)
+            for name, lines in self.evolution.logs(search).items():
+                self.folder.append_lines(name, lines)
+            if log is not None:
+                log.add(row)
+            self.search, self._unsaved = search, True
+            last = self.generation == evolution.generations
+            if last or self.generation % evolution.checkpoint_every == 0:
+                self.save()
+        return row
+
+    def _open_log(self) -> TensorBoardLog:
+        table = self.folder.load_metrics() if self.generation else {}
+        rows = [
+            dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True)
+        ]
+        return TensorBoardLog(self.folder.path / "tensorboard", self.generation, rows)
+
+    def save(self) -> None:
+        """Saves a checkpoint and the champion so far, if they are not saved yet."""
+        if not self._unsaved:
+            return
+        config, executor = self.config, self.executor
+        size = executor.block or config.evolution.population_size
+        meta = {
+            "settings_hash": settings_hash(config),
+            "model_hash": model_hash(executor.fitness),
+            "chunk_shape": [size, executor.num_genes],
+            "strategy": config.evolution.strategy if config.bodies is None else config.bodies.name,
+            "host": describe_host(),
+        }
+        keep = config.evolution.keep_checkpoints
+        arrays = self.evolution.to_arrays(self.search)
+        self.folder.save_checkpoint(self.generation, arrays, meta, keep)
+        if self.generation:
+            self._save_best()
+        self._unsaved = False
+
+    def _save_best(self) -> None:
+        """Writes the champion so far, and the search's files beside it."""
+        for name, content in self.evolution.files(self.search).items():
+            self.folder.write(name, content)
+        best = self.evolution.best(self.search)
+        if best is None:
+            return
+        number = {} if best.individual is None else {"individual": best.individual}
+        origin = f"{best.origin}, not yet judged on fresh starts"
+        self.folder.save_champion(
+            best.genes, best.body, score=best.score, final=False, origin=origin, **number
+        )
+
+    def finish(self, draw: Callable[[Run, Champion], None]) -> Champion:
+        """Judges the champion on fresh starts.
+
+        Args:
+            draw: draws the run's pictures; the run counts as finished once they are there.
+        """
+        config = self.config
+        champion = self.evolution.choose_champion(self.search)
+        facts: dict[str, Any] = {
+            "score": champion.score,
+            "score_std": champion.std,
+            "origin": champion.origin,
+            "controller": config.controller.name,
+            "task": config.task.name,
+            "measures": champion.measures,
+        }
+        if champion.individual is not None:
+            facts["individual"] = champion.individual
+        self.folder.save_champion(champion.genes, champion.body, final=True, **facts)
+        draw(self, champion)
+        self.folder.update_info(finished=timestamp(), generations=self.generation, champion=facts)
+        return champion
+
+    def close(self) -> None:
+        """Lets other processes open the folder."""
+        self.folder.close()
+
+
+# --- checks before a run --------------------------------------------------------------------------
+
+
+def _prepare(config: Config, make_executor: MakeExecutor) -> Executor:
+    """The executor, once the user's code may run and the population fits into memory."""
+    for file in config.files:  # before workers, whose errors are not seen here, run it
+        if file.kind == "code":
+            announce(file.text)
+    executor = make_executor(config)
+    fitness = executor.fitness
+    genotype = fitness.genotype if isinstance(fitness, BodyFitness) else None
+    check_memory(config, executor.num_genes, genotype)
+    return executor
+
+
+def check_search(config: Config, executor: Executor) -> None:
+    """Refuses settings that can be checked only with the fitness, such as a strategy's.
+
+    Raises:
+        InputError: they are wrong.
+    """
+    try:
+        make_evolution(config, executor)
+    except InputError as error:
+        if str(error).startswith(("evolution.", "bodies.")):
+            raise InputError(f"{config.source}: {error}") from None
+        raise
+
+
+def check_unchanged(old: Config, new: Config, label: str) -> None:
+    """Refuses a configuration that would make another run than the old one.
+
+    Files are the same where their content is: the run holds copies of them.
+
+    Raises:
+        InputError: they differ in more than `FREE_SETTINGS`.
+    """
+    known = {file.place: file for file in old.files}
+
+    def same(file: NamedFile) -> str:
+        before = known.get(file.place)
+        if before is None or before.function != file.function or not file.bundled:
+            return file.text
+        equal = Path(before.path).read_bytes() == Path(file.path).read_bytes()
+        return before.text if equal else file.text
+
+    found = _differences(plain_settings(old), map_files(plain_settings(new), same, Config))
+    if found:
+        more = f" (and {len(found) - 1} more)" if found[1:] else ""
+        free = f"evolution.{', '.join(FREE_SETTINGS)}"
+        raise InputError(f"{label}: {found[0]}{more}; only {free} may change")
+
+
+def _differences(old: Any, new: Any, place: str = "") -> list[str]:
+    """Places at which two nested values differ, with both values."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        return [
+            line
+            for key in old | new
+            for line in _differences(old.get(key), new.get(key), f"{place}.{key}".strip("."))
+        ]
+    return [] if old == new else [f"{place}: expected {old!r} as in the run; found {new!r}"]
+
+
+def _portable(settings: Sequence[str], config: Config) -> list[str]:
+    """Settings that mean the same in another folder: absolute paths of files."""
+    texts = {file.place: file.text for file in config.files}
+    world = texts.get("world") or texts.get("world.name")
+    texts |= {"world": world, "world.name": world} if world else {}
+    portable = []
+    for setting in settings:
+        key, _, value = setting.partition("=")
+        text = None if value.lstrip().startswith(("{", "[")) else texts.get(key.strip())
+        portable.append(f"{key}={text}" if text else setting)
+    return portable
+
+
+def describe_host() -> dict[str, Any]:
+    """What the bits of a run depend on, besides its configuration."""
+    info = runtime.describe_process()
+    return {key: info[key] for key in _HOST}
+
+
+def timestamp() -> str:
+    """Now, in ISO 8601 with the offset from UTC."""
+    return datetime.datetime.now().astimezone().isoformat(timespec="seconds")
+
+
+def _claim_folder(config: Config) -> Path:
+    """A new folder below `runs/`, unique even if other runs begin at the same time."""
+    stem = f"{config.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    count = 1
+    while True:
+        folder = _RUNS / (stem if count == 1 else f"{stem}-{count}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            count += 1
+        except OSError as error:
+            raise with_path(error, folder) from None
+        else:
+            return folder

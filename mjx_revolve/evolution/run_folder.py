@@ -1,0 +1,401 @@
+"""The run folder: everything that an evolution writes to disk.
+
+    config.yaml        the resolved configuration; inputs/ holds the robot, and code, that it names
+    run.json           versions, seed, arguments, platform, thread settings, times
+    metrics.csv        one line per generation (RFC 4180), readable while the run goes on
+    checkpoints/       the newest few, one npz each
+    individuals.jsonl  where bodies evolve: one line for each individual, at birth and after
+    generations.jsonl  where bodies evolve: one line per generation, with the numbers alive
+    events.jsonl       of a colony: births, matings and deaths, with time and place
+    champion/          genes.yaml, morphology.yaml, robot.xml
+    fitness.png, trajectory.png, swim.png, bodies.png
+
+Files appear whole or not at all: they are written beside their place, flushed to the disk, and
+moved there. The reader is `episodes.run_reader`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import yaml
+
+from mjx_revolve.body.tree import Morphology
+from mjx_revolve.episodes.config import Config, dump_config
+from mjx_revolve.episodes.individual_log import (
+    EVENTS,
+    GENERATIONS,
+    INDIVIDUALS,
+    LoggedIndividual,
+    find_individuals,
+)
+from mjx_revolve.episodes.run_reader import Checkpoint, DamageError, RunReader, generation_of
+from mjx_revolve.episodes.settings import NamedFile
+from mjx_revolve.evolution.archive import Archive, filled, from_arrays
+from mjx_revolve.inputs.errors import InputError, reading, show
+from mjx_revolve.inputs.files import resolve_inside, with_path, write_atomic
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there, nothing keeps two processes off one folder
+    fcntl = None  # type: ignore[assignment]
+
+LOGS = (INDIVIDUALS, GENERATIONS, EVENTS)
+"""Files that only grow, a line at a time; a run that goes on cuts them to its checkpoint."""
+# A folder with nothing else was begun by a process that died while making it.
+_BEGINNING = {"inputs", "checkpoints", ".lock", "run.json"}
+_TEMPORARY = re.compile(r"\.\d+-")
+
+
+@dataclass
+class RunFolder(RunReader):
+    """A run folder to write. Closing it, or the end of the process, lets others open it.
+
+    Attributes:
+        path: the folder.
+    """
+
+    _lock: IO[str] | None = field(default=None, repr=False)
+
+    # --- plain files ---
+
+    def update_info(self, **changes: Any) -> None:
+        """Sets entries of `run.json`; None removes one."""
+        info = (self.info if (self.path / "run.json").exists() else {}) | changes
+        info = {key: value for key, value in info.items() if value is not None}
+        text = json.dumps(info, indent=2, ensure_ascii=False) + "\n"
+        write_atomic(self.path / "run.json", text.encode())
+
+    def save_config(self, config: Config) -> None:
+        """Writes `config.yaml`, paths inside the folder relative to it."""
+        head = "# The resolved configuration of this run; it loads again as it stands.\n"
+        text = head + dump_config(config, self.path)
+        write_atomic(self.path / "config.yaml", text.encode())
+
+    def write(self, name: str, content: bytes | Callable[[Path], None]) -> Path:
+        """Writes any file below the folder, whole or not at all, and returns its path."""
+        write_atomic(self.path / name, content)
+        return self.path / name
+
+    # --- metrics ---
+
+    def append_metrics(self, row: Mapping[str, float]) -> None:
+        """Adds figures by column to `metrics.csv`, whose first line brings the columns."""
+        text = io.StringIO()
+        writer = csv.writer(text)
+        try:
+            columns: list[str] = []
+            if self.metrics_path.exists():
+                with open(self.metrics_path, encoding="utf-8", newline="") as file:
+                    columns = next(csv.reader(file), [])
+            if not columns:
+                columns = list(row)
+                writer.writerow(columns)
+            # A run that another version began may have other measures.
+            writer.writerow(_number(row.get(name, math.nan)) for name in columns)
+            with open(self.metrics_path, "ab") as file:
+                file.write(text.getvalue().encode())
+        except OSError as error:
+            raise with_path(error, self.metrics_path) from None
+
+    # --- logs ---
+
+    def append_lines(self, name: str, lines: Iterable[str]) -> None:
+        """Adds lines to one of `LOGS`."""
+        path = self.path / name
+        try:
+            with open(path, "ab") as file:
+                file.write("".join(f"{line}\n" for line in lines).encode())
+        except OSError as error:
+            raise with_path(error, path) from None
+
+    def _positions(self) -> dict[str, int]:
+        """The lengths of the files that only grow, flushed: a checkpoint will count on them."""
+        found = {}
+        for name in ("metrics.csv", *LOGS):
+            path = self.path / name
+            if path.exists():
+                with open(path, "rb+") as file:
+                    os.fsync(file.fileno())
+                    found[name] = file.seek(0, os.SEEK_END)
+        return found
+
+    # --- checkpoints ---
+
+    def save_checkpoint(
+        self, generation: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], keep: int
+    ) -> Path:
+        """Saves any arrays but object arrays, and values for JSON; the newest `keep` stay."""
+        logs = self._positions()
+        at = {"metrics_position": logs.pop("metrics.csv", 0), "positions": logs}
+        text = json.dumps({**meta, "generation": generation, "arrays": sorted(arrays), **at})
+        # Names go into the zip as they are; "meta" cannot collide with an "array:" one.
+        named: dict[str, Any] = {f"array:{name}": value for name, value in arrays.items()}
+        buffer = io.BytesIO()
+        np.savez(buffer, meta=np.frombuffer(text.encode(), np.uint8), **named)
+        path = self.path / "checkpoints" / f"generation_{generation:06d}.npz"
+        write_atomic(path, buffer.getvalue())
+        for old in self.checkpoints()[keep:]:
+            old.unlink(missing_ok=True)
+        return path
+
+    def load_checkpoint(self) -> Checkpoint:
+        """Reads the newest checkpoint that is whole.
+
+        Returns:
+            The checkpoint; `damaged` lists newer ones that were passed over.
+
+        Raises:
+            InputError: there is none.
+        """
+        damaged: dict[str, str] = {}
+        for checkpoint in self.readable_checkpoints(damaged):
+            try:
+                _check_meta(checkpoint.meta)
+                at = {"metrics.csv": checkpoint.meta["metrics_position"]}
+                for name, position in (at | checkpoint.meta.get("positions", {})).items():
+                    log = self.path / name
+                    have = log.stat().st_size if log.exists() else 0
+                    if have < position:
+                        raise DamageError(f"{name} lacks lines: {have} bytes long")
+            except DamageError as error:
+                damaged[checkpoint.path.name] = str(error)
+                continue
+            return replace(checkpoint, damaged=tuple(f"{k} ({v})" for k, v in damaged.items()))
+        lines = ", ".join(f"{name} ({why})" for name, why in damaged.items())
+        found = f"only damaged ones: {lines}" if damaged else "none"
+        raise InputError(
+            f"{self.path / 'checkpoints'}: expected a checkpoint to resume from; found {found}"
+        )
+
+    def rewind(self, checkpoint: Checkpoint | None) -> None:
+        """Forgets what came after a checkpoint: metrics, checkpoints, half-written files.
+
+        Args:
+            checkpoint: the checkpoint; None: the run's beginning.
+        """
+        if checkpoint is None:
+            for name in ("metrics.csv", *LOGS):
+                (self.path / name).unlink(missing_ok=True)
+        else:
+            positions = {"metrics.csv": checkpoint.meta["metrics_position"]}
+            for name, position in (positions | checkpoint.meta.get("positions", {})).items():
+                if (self.path / name).exists():
+                    os.truncate(self.path / name, position)
+            for path in self.checkpoints():
+                if generation_of(path) > checkpoint.meta["generation"]:
+                    path.unlink(missing_ok=True)
+        for path in self.path.rglob(".*"):
+            if _TEMPORARY.match(path.name):
+                path.unlink(missing_ok=True)
+
+    # --- champion ---
+
+    def save_champion(
+        self, genes: np.ndarray, body: Morphology | None = None, **facts: Any
+    ) -> None:
+        """Writes `champion/genes.yaml`: genes `[G]`, and plain values that go with them.
+
+        Where bodies have evolved, the champion's is written beside it.
+        """
+        data = {**facts, "config": "../config.yaml"}
+        if body is not None:
+            self.write("champion/morphology.yaml", body.save)
+            data["morphology"] = "morphology.yaml"
+        data["genes"] = [float(gene) for gene in genes]
+        text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
+        self.write("champion/genes.yaml", text.encode())
+
+    def close(self) -> None:
+        """Lets other processes open the folder."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
+def _number(value: float) -> str:
+    """Few digits, but enough to read the same float32 back."""
+    return str(value) if isinstance(value, int | np.integer) else f"{value:.9g}"
+
+
+def _check_meta(meta: Mapping[str, Any]) -> None:
+    """Refuses plain values by which a run could not go on, or would cut files not its own.
+
+    Raises:
+        DamageError: they are others.
+    """
+    logs = meta.get("positions", {})
+    if not isinstance(logs, dict) or not logs.keys() <= set(LOGS):
+        raise DamageError(f"meta: positions: expected those of {', '.join(LOGS)}; found others")
+    numbers = {"generation": meta.get("generation"), **meta, **logs}
+    for name in ("generation", "metrics_position", *logs):
+        value = numbers[name]
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise DamageError(f"meta: {name}: expected a whole number; found {show(value)}")
+
+
+def load_archive(folder: str | Path) -> tuple[Archive, list[LoggedIndividual]]:
+    """The archive of a run in which bodies evolved, as its newest checkpoint has it.
+
+    Args:
+        folder: the run folder, which may still be written to.
+
+    Returns:
+        The archive, and its individuals, in the order of `archive.filled` and `archive.rows`.
+
+    Raises:
+        InputError: it is no run folder, or has no archive yet.
+    """
+    run = RunFolder(Path(folder))
+    arrays = run.load_checkpoint().arrays
+    own = {k.removeprefix("archive."): v for k, v in arrays.items() if k.startswith("archive.")}
+    if not own:
+        raise InputError(f"{folder}: expected a run with bodies.archive; found none in it")
+    with reading(folder):
+        found = from_arrays(own)
+    return found, find_individuals(run.path, [int(number) for number in found.ids[filled(found)]])
+
+
+def is_new_folder(folder: Path) -> bool:
+    """Whether a folder is empty, or was being made by a process that has died."""
+    if not folder.is_dir():
+        return False
+    names = {path.name for path in folder.iterdir() if not _TEMPORARY.match(path.name)}
+    begun = ".lock" in names and not any(folder.glob("checkpoints/*"))
+    return not names or (begun and names <= _BEGINNING)
+
+
+def check_new_folder(folder: str | Path, option: str = "--out") -> None:
+    """Refuses a folder that holds something.
+
+    Args:
+        folder: where a new run is to go.
+        option: what messages call it.
+
+    Raises:
+        InputError: there is a file, or a folder that is not empty.
+    """
+    folder = Path(folder)
+    if is_new_folder(folder):
+        return
+    if folder.is_dir():
+        hint = "; continue it with --resume" if (folder / "run.json").exists() else ""
+        raise InputError(f"{option} {folder}: expected a new or empty folder; found files{hint}")
+    if folder.exists():
+        raise InputError(f"{option} {folder}: expected a new or empty folder; found a file")
+
+
+def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[RunFolder, Config]:
+    """Makes a run folder and writes down what will run.
+
+    Args:
+        folder: a new or empty folder.
+        config: the configuration. Its morphology, and the files of a task or controller of the
+            user's own, are copied into the folder, so that the run can be moved and still be read;
+            a world or modules file stays where it is, because it may refer to files beside it.
+        **info: entries for `run.json`.
+
+    Returns:
+        The run, and its configuration, which names the copies.
+
+    Raises:
+        InputError: the folder holds something.
+        OSError: it cannot be written.
+    """
+    check_new_folder(folder)
+    folder = Path(folder).absolute()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        run = _lock_run(folder)
+        (folder / "inputs").mkdir(exist_ok=True)
+        (folder / "checkpoints").mkdir(exist_ok=True)
+    except OSError as error:
+        raise with_path(error, folder) from None
+    config = _copy_files(config, folder / "inputs")
+    run.update_info(**info)
+    run.save_config(config)  # last: where it is, the run can be continued
+    return run, config
+
+
+def _copy_files(config: Config, folder: Path) -> Config:
+    """Keeps the files that can be copied alone, and names the copies."""
+    copies: dict[str, Path] = {}
+
+    def keep(file: NamedFile) -> str:
+        if file.kind not in ("morphology", "code"):
+            return file.text
+        copy = folder / Path(file.path).name
+        if file.path not in copies and copy in copies.values():  # two files of one name
+            own = file.place.partition(".")[0] if file.kind == "code" else len(copies)
+            copy = folder / f"{own}_{copy.name}"
+        if file.path not in copies:
+            write_atomic(copy, Path(file.path).read_bytes())
+        return file.at(copies.setdefault(file.path, copy))
+
+    return config.with_files(keep)
+
+
+def open_run_folder(folder: str | Path) -> RunFolder:
+    """Opens a run folder to continue it.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: it is no run folder, or another process is writing it.
+    """
+    folder = Path(folder).absolute()
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "none"
+        raise InputError(f"{folder}: expected a run folder; found {found}")
+    for name in ("config.yaml", "run.json"):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder}: expected a run folder; found no {name} in it")
+    for path in folder.iterdir():
+        _check_writable(path, folder)
+    return _lock_run(folder)
+
+
+def _check_writable(path: Path, folder: Path) -> None:
+    """Refuses what would have a run write, cut or delete files that are not its own, or hang."""
+    with reading(folder):
+        real = resolve_inside(path.name, folder)
+    if path.name in ("checkpoints", "champion", "inputs"):
+        what, fits = "a folder", real.is_dir()
+    elif path.name in (".lock", "metrics.csv", *LOGS):
+        what, fits = "a file", real.is_file()
+    else:
+        what, fits = "a file or a folder", real.is_file() or real.is_dir()
+    if not fits:
+        raise InputError(f"{path}: expected {what}; found something else")
+
+
+def _lock_run(folder: Path) -> RunFolder:
+    """Keeps a second process from writing the same folder; the lock dies with the process."""
+    if fcntl is None:
+        return RunFolder(folder)
+    try:
+        lock = open(folder / ".lock", "a", encoding="utf-8")  # noqa: SIM115  (kept open)
+    except OSError as error:
+        raise with_path(error, folder / ".lock") from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        raise InputError(f"{folder}: expected a run that has stopped; found it running") from None
+    except OSError:  # a file system without locks
+        pass
+    return RunFolder(folder, lock)

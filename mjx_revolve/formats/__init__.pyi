@@ -1,0 +1,9 @@
+from .export import export_robot as export_robot
+from .links import Joint as Joint
+from .links import Link as Link
+from .links import make_links as make_links
+from .links import make_meshes as make_meshes
+from .mjcf import make_mjcf as make_mjcf
+from .ros_bag import write_bag as write_bag
+from .sdf import make_sdf as make_sdf
+from .urdf import make_urdf as make_urdf

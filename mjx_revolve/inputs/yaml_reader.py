@@ -1,0 +1,155 @@
+"""YAML without its traps: numbers like `1e-3`, no duplicate keys, no bombs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mjx_revolve.inputs.errors import InputError, reading, show
+from mjx_revolve.inputs.trust import audit
+
+# Revolve's deepest evolved robots stay below 60 levels of YAML; Python's own recursion limit is
+# 1000. A file nested deeper than this is a mistake or an attack.
+_MAX_DEPTH = 200
+# An alias bomb is small in the file and huge when walked; our files need no aliases at all.
+_MAX_NODES = 200_000
+# PyYAML reads some 20,000 values in a second; a robot of a thousand modules has as many.
+_MAX_WRITTEN = 100_000
+# It reads some 500 kB in a second; a robot of a thousand modules is a fifth of that.
+_MAX_BYTES = 2_000_000
+# Python refuses to print integers of more than 4300 digits.
+_MAX_BITS = 14_000
+
+
+def _too_deep() -> InputError:
+    return InputError(f"expected at most {_MAX_DEPTH} levels of nesting; found more")
+
+
+class SafeLoader(yaml.SafeLoader):
+    """`yaml.SafeLoader` that reads `1e-3` as a number and refuses duplicate keys.
+
+    It also refuses tags beyond mappings, lists, texts, numbers, truth values and dates, and what is
+    nested too deeply or too large, as soon as possible.
+    """
+
+    _depth = _count = 0
+
+    def fetch_flow_collection_start(self, token: Any) -> None:
+        """Scans a `[` or a `{`; PyYAML's time grows with the square of how many are open."""
+        if self.flow_level > _MAX_DEPTH:
+            raise _too_deep()
+        super().fetch_flow_collection_start(token)
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """The next node and all within it."""
+        self._depth += 1
+        self._count += 1
+        if self._depth > _MAX_DEPTH:
+            raise _too_deep()
+        if self._count > _MAX_WRITTEN:
+            raise InputError(f"expected at most {_MAX_WRITTEN} values; found more")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """The value of a node; a text that its tag cannot have (`!!int x`) is an `InputError`."""
+        try:
+            return super().construct_object(node, deep)
+        except (InputError, yaml.YAMLError, RecursionError):
+            raise
+        except Exception as error:  # PyYAML's constructors take their tag's word for it
+            kind = node.tag.rpartition(":")[2]
+            reason = f": {error}" if isinstance(error, ValueError) else ""
+            raise InputError(
+                f"line {node.start_mark.line + 1}: expected valid YAML; found {show(node.value)} "
+                f"as {kind}{reason}"
+            ) from None
+
+
+# YAML 1.1 wants a dot in floats and no sign before it; people write 1e-3 and -.5 and mean it.
+SafeLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"^[-+]?(?:(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+|\.[0-9][0-9_]*)$"
+    ),
+    list("-+.0123456789"),
+)
+
+
+def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hashable, Any]:
+    mapping: dict[Hashable, Any] = {}
+    for key_node, value_node in node.value:
+        key = loader.construct_object(key_node, deep=True)
+        place = f"line {key_node.start_mark.line + 1}"
+        if not isinstance(key, Hashable):
+            raise InputError(f"{place}: expected a plain key; found {show(key)}")
+        if key in mapping:
+            raise InputError(f"{place}: expected each key once; found {show(key)} twice")
+        mapping[key] = loader.construct_object(value_node, deep=True)
+    return mapping
+
+
+def _construct_int(loader: SafeLoader, node: yaml.ScalarNode) -> int:
+    value = yaml.SafeLoader.construct_yaml_int(loader, node)
+    if value.bit_length() > _MAX_BITS:  # hexadecimal digits may be as many as there are
+        place = f"line {node.start_mark.line + 1}"
+        raise InputError(f"{place}: expected a whole number of a few digits; found a huge integer")
+    return value
+
+
+def _refuse_tag(loader: SafeLoader, node: yaml.Node) -> None:
+    loader.construct_undefined(node)
+
+
+SafeLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
+SafeLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
+for _name in ("binary", "omap", "pairs", "set"):  # bytes, tuples and sets: no file of ours has any
+    SafeLoader.add_constructor(f"tag:yaml.org,2002:{_name}", _refuse_tag)
+
+
+def _check_size(data: Any) -> None:
+    stack, count = [(data, 0)], 0
+    while stack:
+        item, depth = stack.pop()
+        count += 1
+        if depth > _MAX_DEPTH:
+            raise _too_deep()
+        if count > _MAX_NODES:
+            raise InputError(f"expected at most {_MAX_NODES} values; found more (aliases?)")
+        if isinstance(item, dict):
+            stack.extend((value, depth + 1) for value in item.values())
+        elif isinstance(item, list):
+            stack.extend((value, depth + 1) for value in item)
+
+
+def load_yaml(path: str | Path) -> Any:
+    """Reads one YAML document as plain values (dict, list, str, int, float, bool, None).
+
+    Raises:
+        InputError: the file is missing, unreadable, no valid YAML, nested too deeply, or repeats a
+            key.
+    """
+    with reading(path):
+        with open(path, "rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise InputError(f"expected at most {_MAX_BYTES // 10**6} MB of YAML; found more")
+    audit(path, "data", content)
+    with reading(path):
+        text = content.decode("utf-8")
+        try:
+            data = yaml.load(text, Loader=SafeLoader)
+            _check_size(data)
+        except RecursionError:
+            raise _too_deep() from None
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            place = f"line {mark.line + 1}: " if mark else ""
+            problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+            raise InputError(f"{place}expected valid YAML; found: {problem}") from None
+    return data

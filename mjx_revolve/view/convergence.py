@@ -1,0 +1,371 @@
+"""Pictures of how well evolution went: fitness over generations, and champions' final scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from mjx_revolve.view.plots import (
+    BLUE,
+    COLORS,
+    DEEP,
+    GREEN,
+    GREY,
+    LABELS,
+    ORANGE,
+    PALE,
+    WIDE,
+    curve_with_band,
+    in_style,
+    label_of,
+    legend_above,
+    legend_outside,
+    letter,
+    limit_to_most,
+    new_figure,
+    panels,
+    style_of,
+    whole_numbers,
+)
+from mjx_revolve.view.statistics import FEWEST, interval, mean_and_half, quantiles
+
+if TYPE_CHECKING:
+    from mjx_revolve.view.outcomes import Outcome
+    from mjx_revolve.view.report.groups import RunGroup
+
+Metrics = Mapping[str, np.ndarray]
+"""Columns of `metrics.csv` by name, `[T]` each."""
+Curve = tuple[np.ndarray, np.ndarray]
+"""Abscissae and best score so far of a run, `[T]` each."""
+
+_FITNESS = {
+    "generation", "evaluations", "best", "mean", "std", "median", "lower_quartile",
+    "upper_quartile", "champion", "step_size", "failed", "restarts", "seconds",
+    "evaluations_per_second",
+}  # fmt: skip
+# What is drawn of evolving bodies in place of the step size, the first that there is.
+_BODIES = {
+    "coverage": "share of the\narchive's cells", "mean_num_modules": "modules, mean\nof the living"
+}  # fmt: skip
+# Curves of runs that differ in length by more than this share a logarithmic axis.
+_LOG_FROM = 5.0
+
+COLONY_LABEL = "fitness in the colony"
+"""Name of a colony's fitness, which is not its champion's score."""
+_SECONDS, _MINUTES = 180.0, 3 * 3600.0  # ends of time axes in seconds and in minutes [s]
+
+
+def scale_time(end: float) -> tuple[float, str]:
+    """Seconds in a unit that suits a time axis up to `end` [s], and the axis' label."""
+    if end < _SECONDS:
+        return 1.0, "time (s)"
+    return (60.0, "time (min)") if end <= _MINUTES else (3600.0, "time (h)")
+
+
+# --- one run --------------------------------------------------------------------------------------
+
+
+def _three_axes(title: str, xlabel: str, x: np.ndarray) -> tuple[Figure, Axes, Axes, Axes]:
+    """A figure with a wide panel above two narrow ones that share its horizontal axis."""
+    figure = new_figure(8.0, 6.0, title)
+    grid = figure.add_gridspec(2, 2, height_ratios=(2.4, 1.0))
+    top = figure.add_subplot(grid[0, :])
+    left, right = (figure.add_subplot(grid[1, k], sharex=top) for k in (0, 1))
+    for axes in (top, left, right):
+        axes.set_xlabel(xlabel)
+    margin = 0.015 * max(float(x[-1] - x[0]), 1.0)
+    top.set_xlim(x[0] - margin, x[-1] + margin)
+    return figure, top, left, right
+
+
+def _draw_fitness(axes: Axes, x: np.ndarray, metrics: Metrics, best: str, ever: str) -> None:
+    """Middle and spread of the population, the best, and the best so far, as far as known."""
+    dot = "o" if len(x) < 3 else None
+    low = metrics.get("best", np.full(len(x), np.nan))
+    dash: str | tuple = "-"
+    if "lower_quartile" in metrics and "upper_quartile" in metrics:
+        low = metrics["lower_quartile"]
+        curve_with_band(axes, x, None, low, metrics["upper_quartile"], BLUE, band="quartiles")
+    elif "mean" in metrics and "std" in metrics:
+        mean, std = metrics["mean"], metrics["std"]
+        low, dash = mean - std, (0, (2, 1.2))
+        curve_with_band(axes, x, mean, low, mean + std, BLUE, label="mean",
+                        band="mean ± standard deviation", marker=dot)  # fmt: skip
+    if "median" in metrics:
+        axes.plot(x, metrics["median"], color=GREEN, linestyle=dash, label="median", marker=dot)
+    if "best" in metrics:
+        axes.plot(x, metrics["best"], color=ORANGE, linewidth=1.1, label=best, marker=dot)
+    if "champion" in metrics:
+        axes.step(x, metrics["champion"], where="post", color=DEEP, linewidth=1.4,
+                  linestyle=(0, (5, 2)), label=ever)  # fmt: skip
+    highs = [metrics[name] for name in ("best", "champion") if name in metrics]
+    limit_to_most(axes, [low], highs or [low])
+    legend_above(axes, 0.0)
+
+
+@in_style
+def plot_fitness(metrics: Metrics, title: str = "", label: str = "fitness") -> Figure:
+    """Draws how the fitness grew.
+
+    Args:
+        metrics: generation, and as far as they are known best, mean, std, median, the quartiles,
+            champion, step_size and measures of each generation's best.
+        title: a line above the picture.
+        label: what the fitness measures, with its unit.
+
+    Returns:
+        The figure: fitness on top, below it a measure (the speed, if there) and the step size, or
+        where bodies evolve how full the archive is, or how large they are.
+    """
+    metrics = {name: np.asarray(column) for name, column in metrics.items()}
+    x = metrics["generation"]
+    dot = "o" if len(x) < 3 else None
+    figure, top, left, right = _three_axes(title, "generation", x)
+    _draw_fitness(top, x, metrics, "best", "best so far")
+    top.set_ylabel(label)
+    whole_numbers(top)
+    measures = [name for name in metrics if name not in _FITNESS]
+    known = [name for name in LABELS if name in measures]
+    rate = ["evaluations_per_second"] if "evaluations_per_second" in metrics else []
+    if names := known + measures + rate:
+        left.plot(x, metrics[names[0]], color=ORANGE, linewidth=1.1, marker=dot)
+        of = "\nof the best" if measures else ""
+        left.set_ylabel(label_of(names[0]).replace(" (", "\n(") + of, fontsize=9)
+    bodies = [name for name in _BODIES if name in metrics]
+    if "step_size" in metrics:
+        right.plot(x, metrics["step_size"], color=GREY, marker=dot)
+        right.set_ylabel("step size\n(gene units)", fontsize=9)
+        if np.all(metrics["step_size"] > 0):
+            right.set_yscale("log")
+            right.tick_params(which="minor", labelsize=8)
+            # Few decades need more numbers than the powers of ten, but not so many that they meet.
+            decades = float(np.ptp(np.log10(metrics["step_size"])))
+            digits = "123456789" if decades < 0.4 else "1235" if decades < 1.2 else "1"
+            plain = FuncFormatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in digits else "")
+            right.yaxis.set_major_formatter(plain)
+            right.yaxis.set_minor_formatter(plain)
+    elif bodies:
+        right.plot(x, metrics[bodies[0]], color=GREY, marker=dot)
+        right.set_ylabel(_BODIES[bodies[0]], fontsize=9)
+    else:
+        right.remove()
+    return figure
+
+
+@in_style
+def plot_colony(metrics: Metrics, title: str = "") -> Figure:
+    """Draws the fitness of a colony's robots.
+
+    Args:
+        metrics: time, best, median, the quartiles and champion; mean_age, mean_num_modules and
+            mean_num_hinges where they are there.
+        title: a line above the picture.
+
+    Returns:
+        The figure: fitness of the living on top, below it their mean age and size.
+    """
+    scale, words = scale_time(float(metrics["time"][-1]))
+    time = metrics["time"] / scale
+    dot = "o" if len(time) < 3 else None
+    figure, top, ages, sizes = _three_axes(title, words, time)
+    _draw_fitness(top, time, metrics, "best alive", "fittest ever")
+    top.set_xlim(-0.012 * time[-1], 1.012 * time[-1])
+    top.set_ylabel(COLONY_LABEL)
+    if "mean_age" in metrics:
+        age, unit = scale_time(float(np.nanmax(metrics["mean_age"], initial=0.0)))
+        ages.plot(time, metrics["mean_age"] / age, color=GREY, marker=dot)
+        ages.set_ylabel(f"mean age\nof the living{unit.removeprefix('time')}", fontsize=9)
+    for name in ("modules", "hinges"):
+        if f"mean_num_{name}" in metrics:
+            sizes.plot(time, metrics[f"mean_num_{name}"], marker=dot, label=name)
+    sizes.set_ylabel("mean of\nthe living", fontsize=9)
+    legend_above(sizes)
+    for axes in (ages, sizes):
+        axes.set_ylim(bottom=0)
+    return figure
+
+
+# --- several runs ---------------------------------------------------------------------------------
+
+
+def draw_curves(
+    axes: Axes,
+    cases: Mapping[str, Sequence[Curve]],
+    numbers: Sequence[int] | None = None,
+) -> None:
+    """Draws the best score so far of each case: mean over the seeds, its band, and each seed.
+
+    Args:
+        axes: to draw into.
+        cases: runs by case. The mean reaches from where all of them have begun to where the first
+            one ends; it has its 95 % confidence band from three runs on.
+        numbers: of the cases, for their colours and dashes; None: as they come.
+    """
+    limits = []
+    for k, (name, curves) in zip(numbers or range(len(cases)), cases.items(), strict=True):
+        style = style_of(k)
+        for x, y in curves:
+            axes.plot(x, y, linewidth=0.7, alpha=0.4, zorder=2, **style)
+        grid = np.unique(np.concatenate([x for x, _ in curves]))
+        first, last = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+        grid = grid[(grid >= first) & (grid <= last)]
+        mean, half, _ = mean_and_half([np.interp(grid, x, y) for x, y in curves])
+        half = half if len(curves) >= FEWEST else np.full(len(grid), np.nan)
+        curve_with_band(axes, grid, mean, mean - half, mean + half, linewidth=2.0, zorder=3,
+                        label=f"{name}, n = {len(curves)}", **style)  # fmt: skip
+        limits += [y for _, y in curves] + [mean - half, mean + half]
+    limit_to_most(axes, limits, limits)
+    ends = [float(x[-1]) for curves in cases.values() for x, _ in curves]
+    if max(ends) > _LOG_FROM * min(ends):
+        axes.set_xscale("log")
+    else:
+        whole_numbers(axes, 7)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+
+
+def draw_scores(
+    axes: Axes, groups: Mapping[str, Sequence[float]], numbers: Sequence[int] | None = None
+) -> None:
+    """Draws a dot for each seed, and beside them mean and 95 % interval (from three seeds on).
+
+    Args:
+        axes: to draw into.
+        groups: values by case; the names are the ticks.
+        numbers: of the cases, for their colours; None: as they come.
+    """
+    for k, (number, values) in enumerate(
+        zip(numbers or range(len(groups)), groups.values(), strict=True)
+    ):
+        color = COLORS[number % len(COLORS)]
+        reach = min(0.03 * (len(values) - 1), 0.2)
+        axes.plot(k - 0.1 + np.linspace(-reach, reach, len(values)), values, "o", color=color,
+                  alpha=0.5, markersize=5, markeredgewidth=0)  # fmt: skip
+        found = interval(values)
+        half = found.half if found.size >= FEWEST else np.nan
+        axes.errorbar(k + 0.2, found.mean, yerr=half, fmt="D", color=color, markersize=5, capsize=3)
+    axes.set_xticks(range(len(groups)), [name.replace("_", "\n") for name in groups])
+    axes.set_xlim(-0.5, len(groups) - 0.5)
+    axes.grid(False, axis="x")
+
+
+@in_style
+def plot_curves(
+    cases: Mapping[str, Sequence[Outcome]], label: str, numbers: Sequence[int] | None = None
+) -> Figure:
+    """The figure of `draw_outcomes`."""
+    figure = new_figure(WIDE, 4.4)
+    axes = figure.subplots()
+    draw_outcomes(axes, cases, label, numbers)
+    return figure
+
+
+def draw_outcomes(
+    axes: Axes,
+    cases: Mapping[str, Sequence[Outcome]],
+    label: str,
+    numbers: Sequence[int] | None = None,
+) -> None:
+    """Draws `draw_curves` of runs by case over evaluated individuals; `label` names the score."""
+    curves = {name: [(o.metrics["evaluations"], o.metrics["champion"]) for o in outcomes]
+              for name, outcomes in cases.items()}  # fmt: skip
+    draw_curves(axes, curves, numbers)
+    axes.set(xlabel="evaluated individuals", ylabel=label)
+    axes.legend(loc="best")
+
+
+@in_style
+def plot_scores(
+    groups: Mapping[str, Mapping[str, Sequence[float]]], numbers: Sequence[int] | None = None
+) -> Figure:
+    """A panel of `draw_scores` for each title of `groups`, three beside each other."""
+    columns = min(len(groups), 3)
+    most = max(map(len, groups.values()))
+    wide = WIDE if columns > 1 else min(WIDE, 2.5 + 0.9 * most)
+    figure = new_figure(wide, 2.1 * -(-len(groups) // columns) if columns > 1 else 3.2)
+    grid = panels(figure, len(groups), columns)
+    for axes, (title, values) in zip(grid, groups.items(), strict=True):
+        draw_scores(axes, values, numbers)
+        axes.set_title(title)
+    return figure
+
+
+@in_style
+def plot_seeds(group: RunGroup) -> Figure:
+    """Draws how the runs of one configuration went.
+
+    Args:
+        group: at least one run with metrics.
+
+    Returns:
+        The figure: best so far on the left, the middle of the population on the right; over the
+        seeds the best, the median and the quartiles, as far as all runs reach, and each run as a
+        thin line as far as it goes.
+    """
+    figure = new_figure(WIDE, 3.9)
+    middle = "median" if all("median" in r.metrics for r in group.shown) else "mean"
+    both = figure.subplots(1, 2, sharex=True)
+    for axes, column, words in zip(
+        both, ("champion", middle), ("best so far", f"population's {middle}"), strict=True
+    ):
+        curves = [r.metrics[column] for r in group.shown if column in r.metrics]
+        for record in group.shown:
+            if column in record.metrics:
+                x = record.metrics["generation"]
+                axes.plot(x, record.metrics[column], color=PALE, linewidth=0.7, zorder=1)
+        x, values = group.curve(column)
+        if len(x) and np.isfinite(values).any():
+            low, median, high, best = quantiles(values, (0.25, 0.5, 0.75, 1.0))
+            curve_with_band(axes, x, median, low, high, BLUE, label="median", band="quartiles")
+            axes.plot(x, best, color=ORANGE, label="best")
+            axes.plot([], [], color=PALE, linewidth=0.9, label="each run")
+        axes.set(xlabel=group.shown[0].round, ylabel=group.shown[0].fitness)
+        axes.set_title(f"{words}, over {len(group.shown)} seeds")
+        whole_numbers(axes)
+        limit_to_most(axes, curves, curves)
+    legend_outside(figure, both[0], 4)
+    return figure
+
+
+@in_style
+def plot_comparison(groups: Sequence[RunGroup], numbers: Mapping[str, int]) -> Figure:
+    """Draws configurations beside each other.
+
+    Args:
+        groups: configurations of one task.
+        numbers: of the groups by name, for their colours.
+
+    Returns:
+        The figure: `draw_curves` of the best so far, and `draw_scores` of the champions.
+    """
+    shown = [group for group in groups if group.shown]
+    records = [record for group in shown for record in group.shown]
+    sizes = {group.settings.get("evolution.population_size") for group in shown}
+    counted = len(sizes) > 1 and all("evaluations" in r.metrics for r in records)
+    over = "evaluations" if counted else "generation"
+    figure = new_figure(WIDE, 4.4)
+    left, right = figure.subplots(1, 2, width_ratios=(2.3, 1.0))
+    cases = {
+        group.name: [(r.metrics[over], r.metrics["champion"]) for r in group.shown
+                     if "champion" in r.metrics] for group in shown
+    }  # fmt: skip
+    cases = {name: curves for name, curves in cases.items() if curves}
+    if cases:
+        named = {f"{letter(numbers[name])}: {name}": curves for name, curves in cases.items()}
+        draw_curves(left, named, [numbers[name] for name in cases])
+    left.set_xlabel("evaluated individuals" if counted or not records else records[0].round)
+    what = records[0].fitness if records else "fitness"
+    left.set_ylabel(f"best {what.replace('fitness', 'fitness so far', 1)}")
+    left.set_title("mean over seeds and 95 % confidence band")
+    legend_outside(figure, left, 2)
+    chosen = [numbers[group.name] for group in groups]
+    scores = {letter(k): group.scores() for k, group in zip(chosen, groups, strict=True)}
+    draw_scores(right, scores, chosen)
+    unit = groups[0].unit
+    right.set_ylabel(f"champion's score ({unit})" if unit else "champion's score")
+    right.set_title("final, on fresh starts")
+    return figure

@@ -1,0 +1,236 @@
+"""The robots that can be added to a live simulation: a run's, and those of morphologies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.spheres import count_spheres
+from mjx_revolve.episodes.config import Config, load_config, override_config
+from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness, read_modules
+from mjx_revolve.episodes.individual_log import INDIVIDUALS, read_individuals
+from mjx_revolve.episodes.run_reader import RunReader, find_run
+from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.shipped import find_shipped, list_shipped
+from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.view.live.simulation import CatalogueEntry
+from mjx_revolve.water.world import World, load_world
+
+# The configuration whose water and controller are used by default.
+_USUAL = "lake_swim"
+_FIRST = "spider"  # of the shipped robots
+# Robots live on, and may come to a bed that they could not reach in an episode [s]. A choice.
+_WHILE = 600.0
+# How many of a run's individuals are offered, the best first. A choice.
+_MOST_INDIVIDUALS = 12
+
+
+_Genes = Callable[[int], np.ndarray | None]
+
+
+class _Draft(NamedTuple):
+    """An entry, before the robot is built.
+
+    Attributes:
+        name, short, group: see `simulation.CatalogueEntry`.
+        body: trimmed.
+        genes: a function of their number; None: drawn as in evolution's first generation.
+    """
+
+    name: str
+    short: str
+    group: str
+    body: Morphology
+    genes: _Genes | None
+
+
+@dataclass(frozen=True, eq=False)
+class RobotCatalogue:
+    """All robots that can be added to a live simulation.
+
+    Attributes:
+        mixed: controller, world, and room for all.
+        entries: the robots; the first is there at the beginning.
+        title: what is shown, in a few words.
+    """
+
+    mixed: MixedFitness
+    entries: tuple[CatalogueEntry, ...]
+    title: str
+
+    @property
+    def world(self) -> World:
+        """The world of all robots."""
+        return self.mixed.world
+
+    @property
+    def spheres(self) -> int:
+        """The most contact spheres of any of the robots."""
+        return count_spheres([entry.robot for entry in self.entries])
+
+
+def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatalogue:
+    """Reads the robots that a user has named.
+
+    Args:
+        paths: run folders, configurations and morphologies, or shipped ones' names. The first run
+            or configuration names the controller and the world; without one these are
+            lake_swim's.
+        world: another world: a name or a YAML; None: the one above.
+
+    Returns:
+        The named robots, then all shipped morphologies.
+
+    Raises:
+        InputError: a file is missing or wrong, or a run has another controller.
+    """
+    named = [(path, _kind(path)) for path in paths]
+    sources = [path for path, kind in named if kind != "body"]
+    config = _read_config(sources[0] if sources else _USUAL)
+    changes: dict[str, Any] = {"engine": "population", "task.duration": _WHILE}
+    config = override_config(config, changes | ({} if world is None else {"world": world}))
+    water = load_world(config.world_name, **config.world_overrides)
+    drafts: list[_Draft] = []
+    for path, kind in named:
+        if kind == "body":
+            drafts += _bodies(config, water, find_shipped(path, "morphologies"))
+            continue
+        own = _read_config(path)
+        if own.controller != config.controller:
+            raise InputError(
+                f"{path}: controller: expected that of {sources[0]}, as all robots of a world have "
+                f"one kind; found another ({own.controller.type})"
+            )
+        if kind == "run":
+            drafts += _run_drafts(own, water, Path(path))
+        elif own.bodies is None:
+            assert own.morphology is not None
+            drafts += _bodies(config, water, Path(own.morphology))
+        else:
+            for seed in own.bodies.seeds:
+                drafts += _bodies(config, water, Path(seed))
+    shipped = list_shipped("morphologies")
+    for name in sorted(shipped, key=lambda name: (name != _FIRST, name)):
+        known = {(draft.short, draft.name) for draft in drafts}
+        more = _bodies(config, water, shipped[name], "shipped")
+        alike = config.controller.sensors is not None or more[0].body.sensors is None
+        drafts += [x for x in more if alike and (x.short, x.name) not in known]
+    title = " and ".join(Path(path).stem or path for path in paths)
+    mixed = make_mixed_fitness(config, [draft.body for draft in drafts])
+    return RobotCatalogue(mixed, tuple(_entry(mixed, draft) for draft in drafts), title)
+
+
+def _entry(mixed: MixedFitness, draft: _Draft) -> CatalogueEntry:
+    """A draft with its robot built."""
+    robot = build_robot(draft.body, mixed.world)
+
+    def genes() -> np.ndarray | None:
+        count = mixed.controller_of(robot).num_genes
+        if draft.genes is not None:
+            return draft.genes(count)
+        draw = np.random.default_rng().standard_normal(count)
+        return (mixed.config.evolution.std_init * draw).astype(np.float32)
+
+    return CatalogueEntry(draft.name, draft.short, draft.group, robot, genes)
+
+
+def _kind(path: str) -> str:
+    """The kind of a path: "run", "config" or "body"; InputError for anything else."""
+    place = Path(path)
+    if place.is_dir():
+        find_run(place)
+        return "run"
+    configs, bodies = list_shipped("configs"), list_shipped("morphologies")
+    if not place.exists() and path in configs:
+        return "config"
+    if not place.exists() and path in bodies:
+        return "body"
+    if not place.is_file():
+        raise InputError(
+            f"{path}: expected a run folder, a configuration or a morphology; found none, and no "
+            f"shipped one of this name ({', '.join((*configs, *bodies))})"
+        )
+    data = load_yaml(place)
+    if isinstance(data, dict) and "body" in data:
+        return "body"
+    if isinstance(data, dict) and "task" in data:
+        return "config"
+    raise InputError(
+        f"{path}: expected a run folder, a configuration or a morphology; found a file with "
+        "neither task nor body"
+    )
+
+
+def _read_config(path: str) -> Config:
+    return RunReader(find_run(path)).load_config() if Path(path).is_dir() else load_config(path)
+
+
+# --- morphologies ---------------------------------------------------------------------------------
+
+
+def _bodies(config: Config, water: World, path: Path, group: str = "") -> list[_Draft]:
+    """A morphology whose genes are drawn, and one that keeps still."""
+    morphology = load_morphology(path, read_modules(config), config.allow_overlap)
+    with suppress(InputError):  # what floats, floats
+        morphology = trim_neutral(morphology, water.density)
+    name = path.stem
+    group = group or name
+    drafts = [_Draft(f"{name}, still", name, group, morphology, lambda _: None)]
+    if morphology.num_hinges + morphology.num_thrusters > 0:
+        drafts.insert(0, _Draft(f"{name}, a brain by chance", name, group, morphology, None))
+    return drafts
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+def _run_drafts(own: Config, water: World, folder: Path) -> list[_Draft]:
+    """A run's champion, and, where bodies evolve, its best individuals."""
+    unit, group = score_unit(own.task.type), folder.absolute().name
+    run, drafts = RunReader(find_run(folder)), []
+    if run.champion_path is not None:
+        champion = run.load_champion()
+        score = champion.score
+        words = "" if score is None else f": {score:.3g} {unit}"
+        named = champion.load_config().morphology
+        assert named is not None
+        body = load_morphology(named, read_modules(own), allow_overlap=True)
+        genes = _known(champion.genes, str(champion.path))
+        drafts.append(
+            _Draft(f"champion{words}", "champion", group, _trimmed(own, body, water), genes)
+        )
+    if own.bodies is not None and (run.path / INDIVIDUALS).is_file():
+        lives, _ = read_individuals(run.path)
+        scored = [life for life in lives.values() if math.isfinite(life.score)]
+        for life in sorted(scored, key=lambda life: (-life.score, life.number))[:_MOST_INDIVIDUALS]:
+            short = f"individual {life.number}"
+            body = _trimmed(own, life.grow(read_modules(own)), water)
+            name = f"{short}: {life.score:.3g} {unit}"
+            drafts.append(_Draft(name, short, group, body, _known(life.genes, short)))
+    if not drafts:
+        raise InputError(f"{folder}: expected a champion or individuals; found none yet")
+    return drafts
+
+
+def _trimmed(own: Config, morphology: Morphology, water: World) -> Morphology:
+    return trim_neutral(morphology, water.density) if own.trim == "neutral" else morphology
+
+
+def _known(genes: np.ndarray | None, place: str) -> _Genes:
+    """Genes that must be as many as a body's controller takes."""
+
+    def find(count: int) -> np.ndarray | None:
+        if genes is not None and len(genes) != count:
+            raise InputError(f"{place}: genes: expected {count}; found {len(genes)}")
+        return genes
+
+    return find

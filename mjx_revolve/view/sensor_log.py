@@ -1,0 +1,174 @@
+"""Sensor traces: what the sensors gave along an episode, in their units, and the true values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_revolve.body.sensors import Sensor
+from mjx_revolve.control.readings import EpisodeContext, SensorReadings
+from mjx_revolve.control.sensors import Observation, Observer
+from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.episodes.fitness import Fitness
+from mjx_revolve.episodes.rollout import Rollout, RolloutState, StepInputs, with_variation
+from mjx_revolve.episodes.simulate import Trajectory
+from mjx_revolve.numerics.xla import jit
+from mjx_revolve.water.flow import water_of
+
+
+class SensorTrace(NamedTuple):
+    """One sensor over time.
+
+    Attributes:
+        sensor: as it is declared.
+        rows: names of the rigid bodies or hinges that it speaks of, "" for the robot as a whole.
+        given: `[T, parts, rows]` input of the controller before each step, in the sensor's unit.
+        true: `[T, parts, rows]` what was so at that time; infinite where there is no such value,
+            as without a bed.
+    """
+
+    sensor: Sensor
+    rows: tuple[str, ...]
+    given: np.ndarray
+    true: np.ndarray
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the values given are the true ones, but for the range."""
+        own = self.sensor
+        return own.noise == 0 and own.rate is None and own.delay == 0
+
+
+def trace_sensors(
+    fitness: Fitness, trajectory: Trajectory, key: jax.Array, trial: int = 0
+) -> tuple[SensorTrace, ...]:
+    """What a controller was given in an episode, by its own observer.
+
+    Args:
+        fitness: of one body.
+        trajectory: of its `replay`, or its first rows, finite ones.
+        key: as of the `replay`.
+        trial: as of the `replay`.
+
+    Returns:
+        The sensors in their order, as far as the robot has any such hinges or modules; none where
+        the controller takes no declared ones.
+    """
+    observer = fitness.controller.observer
+    if observer is None:
+        return ()
+    steps, robot = len(trajectory.time), fitness.robot
+    start = np.asarray(fitness.starts(key)[0])[:, trial]
+    given = fitness.water(key, trial)
+    water = water_of(robot.world) if given is None else given
+    rows = (
+        np.concatenate([start[None], trajectory.qpos]),
+        np.concatenate([np.zeros_like(trajectory.qvel[:1]), trajectory.qvel]),
+        np.asarray(trajectory.ctrl)[:, actuators_of(robot)],
+        np.asarray(trajectory.power),
+        jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), _long(x, steps))[:steps], water),
+    )
+    found = _compiled(fitness, steps)(
+        jax.tree.map(lambda x: jnp.asarray(x, start.dtype), rows),
+        jax.tree.map(lambda x: jnp.asarray(x)[..., None], fitness.context(key, trial)),
+        fitness.variation(key, trial),
+    )
+    given, true = jax.tree.map(np.asarray, found)
+    plant = fitness.engine.plant
+    order = np.argsort(np.asarray(plant.source)[: plant.num_hinge_rows, 0])
+    hinges = plant.names[: plant.num_hinges]
+    core = robot.morphology.modules[0].name
+    traces = []
+    for sensor, a, b in zip(
+        observer.sensors,
+        _split(observer, given, order, steps),
+        _split(observer, true, order, steps),
+        strict=True,
+    ):
+        names: tuple[str, ...] = ("",)
+        if sensor.where != "robot":
+            names = hinges if sensor.where == "joint" else (core, *hinges)
+        if sensor.each is not None:
+            there = np.asarray(plant.site(sensor.place).there)[:, 0]
+            kept = np.flatnonzero(np.concatenate([there[:1], there[1:][order]]))
+            names, a, b = tuple(names[k] for k in kept), a[..., kept], b[..., kept]
+        zero, scale = sensor.scaling
+        if names:
+            traces.append(SensorTrace(sensor, names, a / scale + zero, b))
+    return tuple(traces)
+
+
+def _long(x: Any, steps: int) -> tuple[int, ...]:
+    """The shape of a number or `[T]` as rows of an episode, at least as many as there are."""
+    return (max(np.size(x), steps),)
+
+
+def _split(
+    observer: Observer, found: Observation, order: np.ndarray, steps: int
+) -> Iterator[np.ndarray]:
+    """`[T, parts, rows]` of sensor after sensor, hinges in the robot's order."""
+    robot, joint = iter(found.robot), iter(found.joint)
+    for sensor in observer.sensors:
+        count = len(sensor.kind.parts)
+        columns = [np.zeros((steps, count, 0))]
+        if sensor.where != "joint":
+            columns.append(np.stack([next(robot) for _ in range(count)], 1))
+        if sensor.where != "robot" and len(order):
+            columns.append(np.stack([next(joint)[:, order, 0] for _ in range(count)], 1))
+        yield np.concatenate([np.reshape(x, (*x.shape[:2], -1)) for x in columns], 2)
+
+
+def _plain(sensors: Sequence[Sensor], sense: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """What is true, as an `Observation` has its numbers, in the sensors' units."""
+    robot: list[Any] = []
+    joint: list[Any] = []
+    for sensor in sensors:
+        source = sense.modules[sensor.place] if sensor.place else sense
+        for value in sensor.kind.signal(source):
+            if sensor.where == "robot":
+                robot.append(value)
+            elif sensor.where == "joint":
+                joint.append(value)
+            else:
+                robot.append(value[0])
+                joint.append(value[1:])
+    return tuple(robot), tuple(joint)
+
+
+@lru_cache(maxsize=4)
+def _compiled(fitness: Fitness, steps: int) -> Any:
+    """Rows of an episode → what the observer gave and what was true, `[T, ...]` each."""
+    observer = fitness.controller.observer
+    assert observer is not None
+
+    def run(rows: Any, context: EpisodeContext, variation: Any) -> Any:
+        engine = with_variation(fitness.engine, variation)
+        qpos, qvel, ctrl, power, water = rows
+        number = jnp.asarray(engine.plant.source[: engine.plant.num_hinge_rows])
+        state_at = lambda k: engine.init(qpos[k][:, None], qvel[k][:, None])  # noqa: E731
+
+        def policy(state: Any, time: Any, readings: SensorReadings, ctrl: Any) -> Any:
+            seen, observed = observer.observe(state[0], time, readings, number)
+            return (seen, observed, Observation(*_plain(observer.sensors, readings))), ctrl
+
+        rollout = Rollout(
+            engine, policy, fitness.world, water_of(fitness.world), context, observer.signals
+        )
+
+        def step(now: RolloutState, k: jax.Array) -> Any:
+            own = jax.tree.map(lambda x: x[k][None], water)
+            inputs = StepInputs(own, engine.plant.arrange(ctrl[k][:, None]))
+            (seen, *found), asked, _, motion = rollout.act(now, inputs)
+            then = rollout.update(now, state_at(k + 1), power[k][None], (seen,), asked, motion)
+            return then, found
+
+        state = state_at(0)
+        now = rollout.init(state, (observer.init(engine.joints(state)[0]),))
+        return jax.lax.scan(step, now, jnp.arange(steps))[1]
+
+    return jit(run, fast=fitness.config.engine == "population")

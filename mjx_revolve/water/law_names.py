@@ -1,0 +1,84 @@
+"""Names of laws, and coefficients of laws by name, as users write them in worlds and modules.
+
+They are checked against the tables of laws. These are imported when the first name is read and not
+before, so that bodies that name no law are read without JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BeforeValidator
+
+from mjx_revolve.inputs.errors import ConstraintError, show
+from mjx_revolve.inputs.schema import LARGEST, Number, Text, words
+
+if TYPE_CHECKING:
+    from mjx_revolve.water.laws import Coefficient
+
+
+def drag_names(of_parts: bool = False) -> str:
+    """The drag laws that a world can choose, or a part of a module, in words."""
+    from mjx_revolve.water.drag import DRAG_LAWS
+    from mjx_revolve.water.laws import BodyDragLaw
+
+    whole = [name for name, law in DRAG_LAWS.items() if isinstance(law, BodyDragLaw)]
+    if not of_parts:
+        return f"one of {', '.join(DRAG_LAWS)}"
+    own = ", ".join(name for name in DRAG_LAWS if name not in whole)
+    return f"one of {own} ({', '.join(whole)} is a law of whole bodies)"
+
+
+def buoyancy_names() -> str:
+    """The buoyancy laws, in words."""
+    from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
+
+    return f"one of {', '.join(BUOYANCY_LAWS)}"
+
+
+def list_coefficients() -> list[tuple[str, Coefficient]]:
+    """Every coefficient that users may give for a module, after the law that reads it."""
+    from mjx_revolve.water.added_mass import COEFFICIENTS
+    from mjx_revolve.water.drag import DRAG_LAWS
+
+    found = [(name, c) for name, law in DRAG_LAWS.items() for c in law.coefficients]
+    return found + [("added_mass", c) for c in COEFFICIENTS]
+
+
+def _check(value: Any, known: str) -> str:
+    name = "off" if value is False else value  # YAML 1.1 reads a bare `off` as False
+    names = known.removeprefix("one of ").partition(" (")[0].split(", ")
+    if not isinstance(name, str) or name not in names:
+        raise ConstraintError("", known, show(value))
+    return name
+
+
+def _read_coefficients(value: Any) -> Any:
+    """A mapping from names to numbers as sorted pairs, each within its coefficient's bounds."""
+    if not value:
+        return ()
+    if not isinstance(value, Mapping | tuple):
+        raise ConstraintError("", "a mapping from coefficients to numbers", show(value))
+    given, known = dict(value), {c.name: c for _, c in list_coefficients() if not c.own_field}
+    for name, number in given.items():
+        if name not in known:
+            names = f"({', '.join(known) or 'there is none without a field of its own'})"
+            raise ConstraintError("", f"names of coefficients {names}", show(name))
+        c, plain = known[name], isinstance(number, int | float) and not isinstance(number, bool)
+        if not plain or not c.low <= number <= min(c.high, LARGEST):
+            raise ConstraintError(
+                name, f"a number from {c.low:g} to {c.high:g} [{c.unit}]", show(number)
+            )
+    return tuple(sorted(given.items()))
+
+
+DragName = Annotated[str, BeforeValidator(lambda value: _check(value, drag_names()))]
+PartDrag = Annotated[str, BeforeValidator(lambda value: _check(value, drag_names(of_parts=True)))]
+BuoyancyName = Annotated[str, BeforeValidator(lambda value: _check(value, buoyancy_names()))]
+Coefficients = Annotated[
+    tuple[tuple[Text, Number], ...],
+    BeforeValidator(_read_coefficients),
+    words("a mapping from coefficients of laws to numbers"),
+]
+"""Coefficients of laws by name; what is not given has the law's default."""

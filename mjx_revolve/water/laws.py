@@ -1,0 +1,333 @@
+"""What a law of the water is: a value that owns its numbers, its force, and what is said of it.
+
+A drag law or a buoyancy law is one value in one dictionary (`drag.DRAG_LAWS`,
+`buoyancy.BUOYANCY_LAWS`). World and module files, the step's tables, padding, `task.robust`, the
+check of the time step, exporters and the tests read that value; nothing else lists laws.
+
+A law's numbers are a `law_numbers` dataclass, one field for each number of a part. Its fields carry
+a `PartField`: what the step does with the number is stated where the number is declared, and
+nowhere else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import operator
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, dataclass_transform
+
+import jax
+import numpy as np
+
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import Scalar, Vec, mul
+
+if TYPE_CHECKING:
+    from mjx_revolve.water.world import World
+
+L = TypeVar("L")
+T = TypeVar("T")
+
+# ------------------------------------------------------------------------- numbers of a part
+
+
+class PartField(NamedTuple):
+    """What the tables of a step need to know of one number of a part.
+
+    Attributes:
+        unit: of the number.
+        blank: its value in the part of no effect that pads tables, or a function of the world that
+            gives it.
+        axes: how it turns with the axes that describe the part: "vector" (components change their
+            sign), "size" (they change places only) or "none" (a number, or already in the body's
+            frame).
+        varied: factors of `Variation` that multiply it.
+        fixed: why no factor does; exactly one of `varied` and `fixed` is given.
+    """
+
+    unit: str
+    blank: Any
+    axes: Literal["vector", "size", "none"]
+    varied: tuple[str, ...]
+    fixed: str
+
+
+def part_field(
+    unit: str,
+    *,
+    blank: Any = 0.0,
+    axes: Literal["vector", "size", "none"] = "none",
+    varied: tuple[str, ...] = (),
+    fixed: str = "",
+    **field: Any,
+) -> Any:
+    """Declares a field of a `law_numbers` dataclass; see `PartField`.
+
+    Raises:
+        TypeError: neither or both of `varied` and `fixed`.
+    """
+    if bool(varied) == bool(fixed):
+        raise TypeError("part_field: expected either varied=(...) or fixed='why not'")
+    about = PartField(unit, blank, axes, varied, fixed)
+    return dataclasses.field(metadata={"part": about}, **field)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(part_field, dataclasses.field))
+def law_numbers(kind: type[T]) -> type[T]:
+    """Makes a class a frozen dataclass and a pytree; fields that are no `part_field` are static."""
+    made = dataclass(frozen=True)(kind)
+    data = list(part_fields(made))
+    static = [field.name for field in dataclasses.fields(made) if field.name not in data]  # type: ignore[arg-type]
+    jax.tree_util.register_dataclass(made, data_fields=data, meta_fields=static)
+    return made
+
+
+def part_fields(kind: type) -> dict[str, PartField]:
+    """The numbers of a `law_numbers` dataclass, by name."""
+    fields = dataclasses.fields(kind)
+    return {field.name: field.metadata["part"] for field in fields if "part" in field.metadata}
+
+
+def map_fields(fun: Callable[[PartField, Any], Any], numbers: Any) -> Any:
+    """Applies `fun` to every number, with what its field says; into numbers inside numbers.
+
+    Numbers of a law may stand in a dictionary by the law's name. None stays None.
+    """
+    if isinstance(numbers, dict):
+        return {name: map_fields(fun, value) for name, value in numbers.items()}
+    changed = {}
+    for name, field in part_fields(type(numbers)).items():
+        value = getattr(numbers, name)
+        if dataclasses.is_dataclass(value) or isinstance(value, dict):
+            changed[name] = map_fields(fun, value)
+        elif value is not None:
+            changed[name] = fun(field, value)
+    return dataclasses.replace(numbers, **changed)
+
+
+def scale_numbers(numbers: T, factors: Mapping[str, Scalar]) -> T:
+    """Numbers of parts times the factors that their fields name; plain zeros stay so."""
+
+    def scale(field: PartField, value: Any) -> Any:
+        if not field.varied:
+            return value
+        factor = functools.reduce(operator.mul, (factors[name] for name in field.varied))
+        return jax.tree.map(lambda x: mul(x, factor), value)
+
+    found: T = map_fields(scale, numbers)
+    return found
+
+
+def as_components(numbers: T) -> T:
+    """Numbers `[..., 3]` along axes as tuples of three, as force functions take them."""
+
+    def split(field: PartField, x: Any) -> Any:
+        return x if field.axes == "none" else tuple(np.moveaxis(np.asarray(x), -1, 0))
+
+    found: T = map_fields(split, numbers)
+    return found
+
+
+@law_numbers
+class NoNumbers:
+    """The numbers of a law that needs none."""
+
+
+# ------------------------------------------------------------------------- coefficients of users
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """A number of a law that users give for a module or for a world.
+
+    Attributes:
+        name: its key.
+        unit: its unit.
+        meaning: one line of documentation.
+        default: its value where it is not given.
+        low: least value.
+        high: greatest value.
+        own_field: whether modules have a field of this name; others stand under `coefficients`.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    default: float
+    low: float = 0.0
+    high: float = math.inf
+    own_field: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks that it is documented."""
+        if not self.meaning or not self.unit:
+            raise TypeError(f"coefficient {self.name}: expected a meaning and a unit")
+
+
+# ------------------------------------------------------------------------- laws
+
+
+class Export(NamedTuple):
+    """What a file format can say of a law.
+
+    Attributes:
+        stand_in: name of the law by which the other program's water comes nearest; "" for none.
+        note: what the file's comment says of that.
+        missing: what it says is lost.
+    """
+
+    stand_in: str
+    note: str = ""
+    missing: str = ""
+
+
+class PartShapes(Protocol):
+    """What laws take their numbers from: n parts, each in its own frame; NumPy."""
+
+    @property
+    def half_size(self) -> np.ndarray:
+        """`[n, 3]` half edges of the boxes [m]."""
+
+    @property
+    def silhouette(self) -> np.ndarray:
+        """`[n, 3]` area seen along each axis [m²]."""
+
+    @property
+    def exposed(self) -> np.ndarray:
+        """`[n, 3]` share of each pair of faces that the water reaches [-]."""
+
+    @property
+    def coefficients(self) -> Mapping[str, np.ndarray]:
+        """`[n]` each: every `Coefficient` of the laws, by name."""
+
+    @property
+    def parameters(self) -> Mapping[str, tuple[Any, ...]]:
+        """`[n]` each: the parameters of laws that have a class of them, by the law's name."""
+
+
+class PartFlow(NamedTuple):
+    """How the water flows past parts, along the part's axes, `[npart, nbody, lanes]` each.
+
+    Attributes:
+        velocity: of the box's centre relative to the water (Fossen's ν_r) [m/s].
+        angular_velocity: of the part [rad/s].
+        submerged: submerged fraction [-].
+    """
+
+    velocity: Vec
+    angular_velocity: Vec
+    submerged: Scalar
+
+
+class Drag(NamedTuple):
+    """What a drag law does to parts, along the part's axes, at the box's centre.
+
+    Attributes:
+        force: [N].
+        torque: [N·m].
+        damping: how fast the force along each axis falls with velocity [N·s/m]: a step takes it
+            implicitly. None for a law that a step takes explicitly.
+    """
+
+    force: Vec
+    torque: Vec
+    damping: Vec | None
+
+
+_ZERO: Vec = (0.0, 0.0, 0.0)
+NO_DRAG = Drag(_ZERO, _ZERO, None)
+
+
+@dataclass(frozen=True)
+class DragLaw:
+    """What all drag laws have.
+
+    Attributes:
+        name: its name in world and module files.
+        summary: one line for documents.
+        mjcf: what an MJCF file can say of it.
+        sdf: what an SDF file can say of it.
+        explicit: whether a step takes it explicitly, which limits the time step.
+        varied: whether `task.robust` varies it.
+        coefficients: what users may give for it.
+        parameters: checked class of more of them, which worlds and modules have under its name.
+        mj_fluidcoef: MuJoCo's `fluidcoef`, if MuJoCo's geoms have this law under that attribute.
+    """
+
+    name: str
+    summary: str
+    mjcf: Export
+    sdf: Export
+    explicit: bool
+    varied: bool
+    coefficients: tuple[Coefficient, ...] = ()
+    parameters: type | None = None
+    mj_fluidcoef: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class PartDragLaw(DragLaw):
+    """A drag law that acts on each part by itself.
+
+    Attributes:
+        numbers: (parts, world) → `law_numbers` of the parts, `[n]` or `[n, 3]` each.
+        force: (flow, numbers, world) → drag, element-wise. Numbers are then constants that
+            broadcast against the flow, vectors as tuples of three.
+        angular: numbers → coefficients c of drag against turning, -c |ω| ω about each axis
+            [kg·m²], which a step takes implicitly; None for none.
+    """
+
+    numbers: Callable[[PartShapes, World], Any] = lambda parts, world: NoNumbers()
+    force: Callable[[PartFlow, Any, World], Drag] = lambda flow, numbers, world: NO_DRAG
+    angular: Callable[[Any], Vec] | None = None
+
+
+@dataclass(frozen=True)
+class BodyDragLaw(DragLaw):
+    """A drag law that acts on a moving body as a whole; only a world can choose it.
+
+    Attributes:
+        body_force: (velocity of the centre of mass relative to the water [m/s], angular velocity
+            [rad/s], edges of the box of equal inertia [m], density, viscosity) → force [N] and
+            torque [N·m], inertial frame, at the centre of mass.
+    """
+
+    body_force: Callable[[Vec, Vec, Vec, float, float], tuple[Vec, Vec]] = lambda *_: (_ZERO, _ZERO)
+
+
+@dataclass(frozen=True)
+class BuoyancyLaw:
+    """A rule for how much of a part the surface leaves under water.
+
+    Attributes:
+        name: its name in world and module files.
+        summary: one line for documents.
+        mjcf: what an MJCF file can say of it.
+        sdf: what an SDF file can say of it.
+        submersion: (vertical in the part's axes, depth of the box's centre [m], half edges [m]) →
+            submerged fraction [-], and fraction times centre of the submerged piece, from the box's
+            centre, part's axes [m].
+        lifts: whether the water's pressure and surface act; drag needs the submerged fraction
+            either way.
+    """
+
+    name: str
+    summary: str
+    mjcf: Export
+    sdf: Export
+    submersion: Callable[[Vec, Scalar, Vec], tuple[Scalar, Vec]]
+    lifts: bool = True
+
+
+def find_law(laws: Mapping[str, L], name: str) -> L:
+    """A law by its name.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    if name not in laws:
+        raise InputError(f"law: expected one of {', '.join(laws)}; found {name!r}")
+    return laws[name]

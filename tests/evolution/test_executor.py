@@ -1,0 +1,559 @@
+"""Workers: the same bits whatever their number, and whatever happens to them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import toys
+from laboratory import ROOT, XLA_FLAGS
+from mjx_revolve import evolve as command
+from mjx_revolve.episodes.config import load_config
+from mjx_revolve.evolution import failed_blocks as lost
+from mjx_revolve.evolution import jobs
+from mjx_revolve.evolution import run_folder as runs
+from mjx_revolve.evolution.blocks import block_size, evaluate_block, split_blocks
+from mjx_revolve.evolution.executor import Executor, make_executor
+from mjx_revolve.evolution.failed_blocks import save_failed_block, score_failed_block
+from mjx_revolve.evolution.gene_search import GeneEvolution
+from mjx_revolve.evolution.generations import run_generations
+from mjx_revolve.evolution.jobs import Limits, WorkerError, make_job, open_job
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.trust import UntrustedError
+from mjx_revolve.numerics import runtime
+from toys import contents, wait_for
+
+KEY = jax.random.key(1)
+needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="lists processes by /proc")
+
+
+@pytest.fixture(autouse=True)
+def own_settings(monkeypatch):
+    """Workers compile as this process does, and nothing goes into the user's cache."""
+    for name, value in XLA_FLAGS.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a config, current."""
+    monkeypatch.chdir(tmp_path)
+    toys.write_config(tmp_path / "toy.yaml", population_size=10, checkpoint_every=4)
+    return tmp_path
+
+
+def toy_config(path, **evolution):
+    return load_config(toys.write_config(path / "toy.yaml", **evolution))
+
+
+def workers_of(pid):
+    """Worker processes that a process has started and that have not ended."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                state, parent = (entry / "stat").read_text().rpartition(")")[2].split()[:2]
+                command_line = (entry / "cmdline").read_bytes()
+                if (
+                    int(parent) == pid
+                    and state != "Z"
+                    and b"mjx_revolve.evolution.processes" in command_line
+                ):
+                    found.append(int(entry.name))
+    return sorted(found)
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def run_main(*argv, make_fitness=toys.make_toy):
+    return run_command(lambda argv: command.main(argv, make_fitness), [str(a) for a in argv])
+
+
+# --- blocks ---
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 5, 8, 11])
+def test_blocks_have_one_shape_and_are_padded_with_their_first_row(size):
+    population = np.arange(2 * size, dtype=np.float32).reshape(size, 2)
+    blocks = split_blocks(population, 4)
+    assert [block.shape for block in blocks] == [(4, 2)] * -(-size // 4)
+    assert np.array_equal(np.concatenate(blocks)[:size], population)
+    assert all((row == blocks[-1][0]).all() for row in np.concatenate(blocks)[size:])
+
+
+@pytest.mark.parametrize(("trials", "size"), [(1, 64), (3, 21), (64, 1), (100, 1)])
+def test_a_block_fills_a_chunk_of_lanes(trials, size):
+    assert block_size(trials) == size
+
+
+def test_without_workers_or_blocks_a_pool_is_its_fitness():
+    fitness = toys.Toy()
+    population = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
+    key = jax.random.key(3)
+    with Executor(fitness, None) as executor:
+        scores, measures = executor.evaluate(population, key)
+        expected, expected_measures = fitness.evaluate(population, key)
+        assert np.array_equal(scores, expected)
+        assert np.array_equal(measures["distance_m"], expected_measures["distance_m"])
+        assert np.array_equal(executor(population, key), scores)
+    with pytest.raises(RuntimeError, match="expected an open executor"):
+        executor.evaluate(population, key)
+
+
+@pytest.fixture(scope="module")
+def crowd(tmp_path_factory):
+    """Three workers."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in XLA_FLAGS.items():
+            patch.setenv(name, value)
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+        config = toy_config(tmp_path_factory.mktemp("crowd"), population_size=10, generations=6)
+        with make_executor(config, 3, toys.make_toy) as executor:
+            yield config, executor
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1, 4, 5, 10, 33])
+def test_scores_do_not_depend_on_the_workers(crowd, size):
+    _, executor = crowd
+    population = np.random.default_rng(size).normal(size=(size, 5)).astype(np.float32)
+    key = jax.random.key(size)
+    scores, measures = executor.evaluate(population, key)
+    alone, alone_measures = Executor(toys.Toy(), 4).evaluate(population, key)
+    assert scores.dtype == np.float32 and scores.shape == (size,)
+    assert scores.tobytes() == alone.tobytes()
+    assert measures.keys() == alone_measures.keys() == {"distance_m"}
+    assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
+
+
+@pytest.mark.slow
+def test_workers_know_other_kinds_of_keys(crowd):
+    _, executor = crowd
+    population = np.random.default_rng(0).normal(size=(6, 5)).astype(np.float32)
+    key = jax.random.key(7, impl="rbg")
+    assert np.array_equal(executor(population, key), Executor(toys.Toy(), 4)(population, key))
+
+
+def test_the_champion_does_not_depend_on_blocks(crowd):
+    config, executor = crowd
+    whole = Executor(toys.Toy())
+    evolutions = [GeneEvolution(config.evolution, each) for each in (executor, whole)]
+    generations = config.evolution.generations
+    searches = [list(run_generations(each, generations))[-1][0] for each in evolutions]
+    assert np.array_equal(searches[0].elites, searches[1].elites)
+    champions = [each.choose_champion(searches[0]) for each in evolutions]
+    assert np.array_equal(champions[0].genes, champions[1].genes)
+    assert champions[0].score == champions[1].score
+    assert champions[0].origin == champions[1].origin
+
+
+@pytest.mark.parametrize("shape", [(5,), (0, 5), (3, 4)])
+def test_a_population_of_another_shape_leaves_the_pool_as_it_is(crowd, shape):
+    _, executor = crowd
+    with pytest.raises(InputError, match=r"population: expected \[P, 5\]; found"):
+        executor.evaluate(np.zeros(shape), jax.random.key(0))
+    assert len(executor(np.zeros((2, 5)), jax.random.key(0))) == 2
+
+
+def test_each_worker_has_a_core_of_its_own(crowd):
+    _, executor = crowd
+    if not hasattr(os, "sched_getaffinity"):
+        pytest.skip("this system does not pin processes")
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) > 3:
+        pytest.skip("fewer workers than cores are not pinned")
+    processes = [worker.process for worker in executor.workers]
+    expected = [{cores[i % len(cores)]} for i in range(3)]
+    wait_for(lambda: [os.sched_getaffinity(p.pid) for p in processes] == expected)
+    for process, core in zip(processes, expected, strict=True):
+        threads = [int(name) for name in os.listdir(f"/proc/{process.pid}/task")]
+        assert all(os.sched_getaffinity(thread) == core for thread in threads)
+
+
+def test_workers_ignore_interrupts(crowd):
+    _, executor = crowd
+    for worker in executor.workers:
+        worker.process.send_signal(signal.SIGINT)
+        worker.process.send_signal(signal.SIGTERM)
+    before = workers_of(os.getpid())
+    assert len(executor(np.zeros((12, 5)), jax.random.key(0))) == 12
+    assert workers_of(os.getpid()) == before
+
+
+def test_functions_without_a_name_cannot_have_workers(tmp_path):
+    with pytest.raises(ValueError, match="expected a function that can be imported; found"):
+        make_executor(toy_config(tmp_path), 2, lambda config: toys.Toy())
+
+
+@pytest.mark.slow
+def test_blocks_of_bodies(tmp_path):
+    """Whatever `evaluate` takes before the key; the same function in one process as in two."""
+    config = toy_config(tmp_path)
+    rng = np.random.default_rng(0)
+    blocks = [([1.0 * i, 2.0], rng.normal(size=(2, 2)).astype(np.float32)) for i in range(5)]
+    with make_executor(config, 2, toys.make_weights) as executor:
+        found = executor.score(blocks, KEY)
+    expected = Executor(toys.Weights(), 2).score(blocks, KEY)
+    for (scores, measures), (same, also) in zip(found, expected, strict=True):
+        assert scores.tobytes() == same.tobytes() and np.ptp(scores) > 0
+        assert measures["weight"].tolist() == also["weight"].tolist()
+    assert [m["weight"].tolist() for _, m in found] == [[1.0 * i, 2.0] for i in range(5)]
+
+
+# --- jobs ---
+
+
+def test_a_job_takes_robot_and_code_along(tmp_path):
+    """So that workers elsewhere, and those that replace others, see what the run began with."""
+    (tmp_path / "mine.py").write_text("def stay(track, settings):\n    return track.time[0]\n")
+    config = load_config(
+        toys.write_config(tmp_path / "toy.yaml"), [f"task.type={tmp_path / 'mine.py'}:stay"]
+    )
+    job = make_job(config, read_back)
+    for name in ("mine.py", "robot.yaml"):
+        (tmp_path / name).unlink()
+    assert open_job(job) == ("id: robot\n", "def stay(track, settings):")
+
+
+def read_back(config):
+    path, _, function = config.task.type.rpartition(":")
+    assert function == "stay"
+    return Path(config.morphology).read_text(), Path(path).read_text().splitlines()[0]
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """JAX's compilation cache."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_one_compiles_and_the_others_wait(cache):
+    entered, first_may_go = [], threading.Event()
+    together = threading.Barrier(2, timeout=20)
+
+    def first():
+        with runtime.compile_lock("program"):
+            entered.append("first")
+            assert first_may_go.wait(20)
+            entered.append("first is done")
+
+    def other():
+        with runtime.compile_lock("program"):
+            entered.append("other")
+            together.wait()  # both are inside at once
+
+    threads = [threading.Thread(target=first)]
+    threads[0].start()
+    wait_for(lambda: entered)
+    threads += [threading.Thread(target=other) for _ in range(2)]
+    for thread in threads[1:]:
+        thread.start()
+    time.sleep(0.2)
+    first_may_go.set()
+    for thread in threads:
+        thread.join(20)
+    assert entered == ["first", "first is done", "other", "other"]
+    assert not together.broken
+
+
+# --- trouble ---
+
+
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory):
+    """Two workers, and a file that says what happens to one of them."""
+    folder = tmp_path_factory.mktemp("troubled")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in XLA_FLAGS.items():
+            patch.setenv(name, value)
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+        patch.setenv("TOY_TROUBLE", str(folder / "order"))
+        patch.setattr(jobs, "LIMITS", Limits(block=15.0))
+        with make_executor(toy_config(folder), 2, toys.make_troubled) as executor:
+            executor.folder = folder / "lost"
+            executor(np.zeros((12, 5)), KEY)
+            yield executor, folder / "order"
+
+
+def pids_of(executor):
+    return [worker.process.pid for worker in executor.workers]
+
+
+@pytest.mark.slow
+@needs_proc
+@pytest.mark.parametrize(
+    ("kind", "how"),
+    [
+        ("kill", "killed by SIGKILL"),
+        ("stop", r"no answer for \d+ s"),
+        ("exit", "exit code 3: out of luck"),
+        ("raise", None),
+    ],
+)
+def test_a_lost_worker_is_replaced_and_costs_nothing(troubled, kind, how, caplog):
+    executor, order = troubled
+    before = pids_of(executor)
+    order.write_text(kind)
+    population = np.random.default_rng(3).normal(size=(22, 5)).astype(np.float32)
+    scores, measures = executor.evaluate(population, KEY)
+    alone, alone_measures = Executor(toys.Toy(), 4).evaluate(population, KEY)
+    assert scores.tobytes() == alone.tobytes()
+    assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
+    hit = int(next(order.parent.glob("order.*")).suffix[1:])
+    order.with_suffix(f".{hit}").unlink()
+    assert hit in before and is_alive(hit) == (kind == "raise")
+    after = pids_of(executor)
+    assert len(after) == 2 and {*after} <= {*workers_of(os.getpid())}
+    assert (hit in after) == (kind == "raise")
+    said = [record.getMessage() for record in caplog.records]
+    if how is None:
+        assert said == []
+    else:
+        assert len(said) == 1 and re.fullmatch(rf"a worker is replaced \({how}\)", said[0]), said
+
+
+@pytest.mark.slow
+def test_a_block_that_kills_scores_worst_and_is_named(troubled, caplog):
+    executor, _ = troubled
+    population = np.random.default_rng(4).normal(size=(10, 5)).astype(np.float32)
+    population[5] = 200.0
+    scores, measures = executor.evaluate(population, KEY)
+    alone, _ = Executor(toys.Toy(), 4).evaluate(population, KEY)
+    assert np.isnan(scores[4:8]).all() and np.isnan(measures["distance_m"][4:8]).all()
+    rest = [0, 1, 2, 3, 8, 9]
+    assert scores[rest].tobytes() == alone[rest].tobytes()
+    said = [record.getMessage() for record in caplog.records]
+    assert said[:-1] == 3 * ["a worker is replaced (killed by SIGKILL)"]
+    path = re.fullmatch(
+        r"4 individuals count as failed, because their workers do \(killed by SIGKILL\); to see "
+        r"why: python -m mjx_revolve.evolution.failed_blocks (.+)", said[-1],
+    )[1]  # fmt: skip
+    assert Path(path).parent == executor.folder
+    done = subprocess.run(
+        [sys.executable, "-m", "mjx_revolve.evolution.failed_blocks", path, "--trust"], cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}", "TOY_TROUBLE": "no"},
+    )  # fmt: skip
+    assert done.returncode == -signal.SIGKILL
+
+
+def test_a_lost_block_can_be_scored_again(tmp_path):
+    job = make_job(toy_config(tmp_path), toys.make_toy)
+    block = (np.random.default_rng(0).normal(size=(4, 5)).astype(np.float32),)
+    path = save_failed_block(tmp_path / "lost", job, block, KEY)
+    scores, _ = score_failed_block(path, trust=True)
+    assert scores.tobytes() == Executor(toys.Toy(), 4)(block[0], KEY).tobytes()
+    with pytest.raises(UntrustedError, match=r"make: expected .*; found 'toys:make_toy'"):
+        score_failed_block(path)
+
+
+class Spell:
+    """What does something when it is unpickled."""
+
+    def __reduce__(self):
+        return Path.touch, (Path("was run"),)
+
+
+def test_a_strangers_block_runs_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("a.pickle").write_bytes(pickle.dumps(Spell()))
+    Path("b.npz").write_bytes(b"PK")
+    np.savez("c.npz", kept=np.array([Spell()], object))
+    np.savez("d.npz", kept=np.frombuffer(b"[]", np.uint8))
+    for name in ("a.pickle", "b.npz", "c.npz", "d.npz", "none.npz"):
+        assert run_command(lost.main, [name, "--trust"]) == 2
+        err = capsys.readouterr().err
+        assert err.startswith(f"error: {name}: expected ") and err.count("\n") == 1
+    assert not Path("was run").exists()
+
+
+def test_a_lost_block_of_bodies_can_be_scored_again(tmp_path):
+    config = load_config(toys.write_bodies_config(tmp_path / "bodies.yaml"))
+    fitness = toys.make_toy_bodies(config)
+    rng = np.random.default_rng(0)
+    bodies = [fitness.genotype.develop(fitness.genotype.random(rng)) for _ in range(3)]
+    genes = rng.normal(size=(8, fitness.num_genes)).astype(np.float32)
+    block = (genes, np.array([0, 1, 2, 0, 1, 2, 0, 0], np.int32), bodies)
+    path = save_failed_block(tmp_path / "lost", make_job(config, toys.make_toy_bodies), block, KEY)
+    scores, _ = score_failed_block(path, trust=True)
+    assert scores.tobytes() == evaluate_block(fitness, block, KEY)[0].tobytes()
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_when_workers_are_killed(folder, capsys, monkeypatch):
+    """At any moment; the same bits as in this process alone."""
+    monkeypatch.setenv("TOY_TROUBLE", str(folder / "order"))
+    more = ("--set", "evolution.generations=40")
+    others = {*workers_of(os.getpid())}
+    killed = []
+
+    def kill():
+        wait_for((folder / "run" / "metrics.csv").exists)
+        victim = min({*workers_of(os.getpid())} - others)
+        os.kill(victim, signal.SIGKILL)
+        killed.append(victim)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    argv = ("toy.yaml", "--out", "run", "--workers", 2)
+    assert run_main(*argv, *more, make_fitness=toys.make_troubled) == 0
+    killer.join()
+    shown = capsys.readouterr()
+    assert len(killed) == 1 and "a worker is replaced (killed by SIGKILL)" in shown.err
+    assert " cores, 2 workers | " in next(x for x in shown.out.splitlines() if x.endswith("run"))
+    assert run_main("toy.yaml", "--out", "whole", *more) == 0
+    assert contents(folder / "run") == contents(folder / "whole")
+    info = json.loads((folder / "run" / "run.json").read_text())["workers"]
+    assert info == {"count": 2, "block": 4}
+    host = runs.RunFolder(folder / "run").load_checkpoint().meta["host"]
+    assert host == runs.RunFolder(folder / "whole").load_checkpoint().meta["host"]
+
+
+@pytest.mark.slow
+def test_workers_that_cannot_be_built(folder, capsys, monkeypatch):
+    monkeypatch.setenv("TOY_LEADER", str(os.getpid()))
+    argv = ("toy.yaml", "--out", "run", "--workers", 2)
+    assert run_main(*argv, make_fitness=toys.make_broken) == 1
+    lines = capsys.readouterr().err.splitlines()
+    why = r"\(RuntimeError: no such luck\)"
+    assert re.fullmatch(rf"note: the run goes on with fewer workers, 1 {why}", lines[0])
+    assert re.fullmatch(
+        rf"error: no worker can be started {why}; the start, before any generation, is saved",
+        lines[1],
+    )
+    assert re.fullmatch(r"resume: \S*python\S* -m mjx_revolve.evolve --resume run", lines[2])
+    assert run_main("--resume", "run") == 0
+    assert run_main("toy.yaml", "--out", "whole") == 0
+    assert contents(folder / "run") == contents(folder / "whole")
+
+
+@pytest.mark.slow
+def test_workers_of_another_program_score_nothing(tmp_path, caplog):
+    """As when somebody edits the package or the world's file while the run goes on."""
+    with make_executor(toy_config(tmp_path), 2, toys.make_toy) as executor:
+        executor.identity |= {"mjx_revolve": "abc"}
+        found = r"mjx_revolve: expected abc as the run has it; found \w+"
+        with pytest.raises(WorkerError, match=rf"no worker can be started \({found}\)"):
+            executor(np.zeros((8, 5)), KEY)
+    with pytest.raises(RuntimeError, match="expected an open executor"):
+        executor(np.zeros((8, 5)), KEY)
+    assert len(caplog.records) == 1
+
+
+SCRIPT = """
+import sys
+import toys
+from mjx_revolve import evolve
+from mjx_revolve.inputs.commands import run_command
+
+sys.exit(run_command(lambda argv: evolve.main(argv, toys.make_slow), sys.argv[1:]))
+"""
+
+
+def start(folder, *argv, **environment):
+    """The command in a process of its own, as from a terminal."""
+    (folder / "script.py").write_text(SCRIPT)
+    path = f"{ROOT}{os.pathsep}{ROOT / 'tests'}"
+    return subprocess.Popen(
+        [sys.executable, str(folder / "script.py"), *map(str, argv)], cwd=folder, text=True,
+        env=os.environ | {"PYTHONPATH": path} | environment, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+
+
+LONG = ("toy.yaml", "--out", "run", "--workers", 2, "--set", "evolution.generations=5000")
+
+
+@pytest.mark.slow
+@needs_proc
+def test_ctrl_c_finishes_the_generation(folder):
+    process = start(folder, *LONG)
+    toys.read_until(process, "generation 1/")
+    workers = workers_of(process.pid)
+    assert len(workers) == 2
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == 130, out
+    assert "finishing what is under way; press Ctrl-C again to quit at once" in out
+    assert re.search(r"resume: \S*python\S* -m mjx_revolve.evolve --resume run\n$", out)
+    done = int(re.search(r"stopped after generation (\d+); all of it is saved", out)[1])
+    assert not any(map(is_alive, workers))
+    end = f"evolution.generations={done + 2}"
+    assert run_main("--resume", "run", "--set", end) == 0
+    assert run_main("toy.yaml", "--out", "whole", "--set", end) == 0
+    assert contents(folder / "run") == contents(folder / "whole")
+
+
+@pytest.mark.slow
+@needs_proc
+def test_workers_do_not_outlive_their_leader(folder):
+    process = start(folder, *LONG)
+    toys.read_until(process, "generation 1/")
+    workers = workers_of(process.pid)
+    assert len(workers) == 2
+    os.kill(workers[0], signal.SIGSTOP)  # it is not asked
+    process.kill()
+    process.communicate(timeout=120)
+    wait_for(lambda: not any(map(is_alive, workers)))
+
+
+def test_an_accelerator_takes_the_whole_population(tmp_path, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert block_size(1) is None
+    with pytest.raises(InputError, match="--workers: expected JAX to run on the CPU"):
+        make_executor(toy_config(tmp_path), 2, toys.make_toy)
+
+
+# --- a real robot ---
+
+ROBOT = """
+id: knee
+body:
+  id: core
+  type: Core
+  children:
+    1: {id: knee, type: ActiveHinge, children: {1: {id: foot, type: FixedBrick}}}
+"""
+
+
+@pytest.mark.slow
+def test_a_robot_does_not_depend_on_its_workers(tmp_path, monkeypatch):
+    """10 individuals of 16 episodes: three blocks of 4, the last of which is padded."""
+    (tmp_path / "cache").mkdir()
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    path = toys.write_config(tmp_path / "knee.yaml", population_size=10)
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    config = load_config(path, ["task.trials=16", "task.duration=0.2", "task.settle=0.05"])
+    found = []
+    for count in (2, 1):
+        with make_executor(config, count) as executor:
+            genes = (
+                np.random.default_rng(0).normal(size=(10, executor.num_genes)).astype(np.float32)
+            )
+            found.append(executor.evaluate(genes, KEY))
+    (scores, measures), (alone, alone_measures) = found
+    assert scores.tobytes() == alone.tobytes() and np.ptp(scores) > 0
+    for name, values in measures.items():
+        assert values.tobytes() == alone_measures[name].tobytes()
