@@ -147,8 +147,10 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     layers = list_layers()
     modules = [name for found in layers.values() for name in found]
     package = importlib.import_module(PACKAGE)
-    for name in package.__all__:  # they are imported when they are first used
-        getattr(package, name)
+    for layer in ["", *layers]:  # their names are imported when they are first used
+        door = importlib.import_module(f"{PACKAGE}.{layer}".rstrip("."))
+        for name in getattr(door, "__all__", ()):
+            getattr(door, name)
     pages = {"index": ("README", ROOT / "README.md")}
     pages |= {path.stem: (title_of(path), path) for path in list_pages()}
     documents: dict[str, pdoc.doc.Module] = {

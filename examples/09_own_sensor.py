@@ -9,9 +9,10 @@ settings = {
     "task.duration": 4.0,
     "task.trials": 1,
     "controller.type": "mlp",
+    "controller.harmonics": 1,  # of the sines that this replaces
     "controller.hidden": 8,
     "controller.sensors": [
-        {"type": "joint_angle"},
+        {"type": "angle"},
         {"type": "depth", "range": [0, 2], "noise": 0.01},
         {"type": "gyro", "rate": 20, "delay": 0.05},
     ],

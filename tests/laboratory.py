@@ -69,11 +69,11 @@ def face_drag(robot: Robot) -> FaceNumbers:
 
 
 def limp(robot):
-    """The robot without servos, friction and end stops; before anything compiles it."""
-    model = robot.mj_model
+    """The robot without servos, friction and end stops."""
+    model = copy.copy(robot.mj_model)
     model.actuator_gainprm[:, 0], model.actuator_biasprm[:] = 1e-12, 0.0
     model.dof_damping[:], model.jnt_limited[:], model.jnt_user[:] = 0.0, 0, np.inf
-    return robot
+    return robot.with_model(model)
 
 
 def random_states(robot: Robot, lanes: int, seed: int = 0, speed: float = 1.0, depth: float = 5.0):

@@ -44,7 +44,9 @@ def test_the_best_open_loop_counts():
     lazy = scores | {"still": [1.3]}
     assert senses.best_open(lazy) == "still"
     found = senses.compare(lazy)
-    assert found.mean == pytest.approx(1.2) and found.low == pytest.approx(0.7)
+    # Student's t of one degree of freedom, 12.706, times the standard error of 2 and 3.
+    assert found.mean == pytest.approx(1.2)
+    assert found.low == pytest.approx(1.2 - 12.7062 * 0.5, abs=1e-3)
     assert senses.best_open({"closed": [1.0]}) == ""
 
 
@@ -57,8 +59,10 @@ def test_the_report_says_which_is_better(tmp_path):
         )
     }
     lines = senses.write_report(tmp_path, found)
-    assert lines[2].startswith("| `auv_escape` [of the first distance] | 60 × 64 × 8 | 3 | 0.867 ")
-    assert lines[2].endswith("| 0.5 [0.5, 0.5] (`cpg`) | 0.367 [0.3, 0.4] | yes |")
+    assert lines[2].startswith(
+        "| `auv_escape` [of the first distance] | 60 × 64 × 8 | 3 | 0.87 ± 0.14 "
+    )
+    assert lines[2].endswith("| 0.5 (`cpg`) | 0.37 ± 0.14 | yes |")
     assert lines[3].endswith(" | no |") and "(`sine`)" in lines[3]
     text = (tmp_path / "senses.md").read_text()
     assert all(line in text for line in lines)

@@ -323,7 +323,7 @@ def test_a_body_with_a_population_of_its_own(config, fitness):
 
 OWN = """
 import jax.numpy as jnp
-from mjx_revolve.control.controller import make_controller, of_actuators
+from mjx_revolve.control import GeneBlocks, make_controller
 
 def make_wave(plant, settings):
     def decode(genes, plant):
@@ -333,7 +333,8 @@ def make_wave(plant, settings):
         late, reach, middle = parameters
         return state, middle + reach * jnp.sin(6.0 * time + late) * jnp.tanh(10 * time)
 
-    return make_controller(plant, of_actuators(plant, "late"), decode, lambda p: (), step)
+    genes = GeneBlocks(plant, ("late", "actuator")).genes
+    return make_controller(plant, genes, decode, lambda p: (), step)
 """
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -261,10 +263,11 @@ def test_jointed_without_water_it_is_mujocos_step():
     Until MJX leaves a corner out: of a box, it takes those within 1 mm of the deepest.
     """
     robot = elbow_robot(world(gravity=G, bed=FLAT))
-    model = robot.mj_model
+    model = copy.copy(robot.mj_model)
     # MuJoCo knows no top speed, and its solver does not see the hinges' friction, as ours does.
     model.jnt_user[:], model.dof_damping[:] = np.inf, 0.0
     model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = 0.3, -0.3
+    robot = robot.with_model(model)
     qpos, qvel = at_rest(robot, 1, FLAT["height"] + 0.1)
     qpos[3:7, 0] = np.array([9, 2, 1, 0]) / np.sqrt(86)
     time, q, v, _ = march(robot, 0.125, qpos, qvel, engine="mjx")

@@ -187,4 +187,4 @@ def test_a_report_shows_what_was_felt(tmp_path, monkeypatch):
     (tmp_path / "swim.yaml").write_text(yaml.safe_dump(data))
     assert evolve.main(["swim.yaml", "--out", "run"]) == 0
     assert report.main(["run", "--out", "run.html"]) == 0
-    assert "What it felt" in (tmp_path / "run.html").read_text()
+    assert "Readings of each declared sensor" in (tmp_path / "run.html").read_text()
