@@ -315,7 +315,7 @@ class EpisodeSpec(ABC):
         position: Float[Array, "3 lanes"],
         geometry: BodyGeometry,
         context: EpisodeContext,
-        clock: Int[Array, ...],
+        clock: Int[Array, "..."],
     ) -> tuple[Float[Array, " lanes"], Array]:
         """Scores of episodes under way, as if from now on nothing moved.
 

@@ -69,7 +69,7 @@ class Policy(Protocol):
     def __call__(
         self,
         controller_state: Any,
-        time: Float[Array, ...],
+        time: Float[Array, "..."],
         readings: SensorReadings,
         ctrl: Float[Array, "n lanes"] | None,
         /,
@@ -95,7 +95,7 @@ def held(ctrl: Float[Array, "n lanes"]) -> Policy:
 
 
 def open_loop(
-    state: Any, time: Float[Array, ...], readings: SensorReadings, ctrl: Any
+    state: Any, time: Float[Array, "..."], readings: SensorReadings, ctrl: Any
 ) -> tuple[Any, Float[Array, "n lanes"]]:
     """The policy of the commands in `StepInputs.ctrl`."""
     return state, ctrl
@@ -146,7 +146,7 @@ class Rollout:
         memory = init_memory(self.signals, self.engine, state, self.context)
         return RolloutState(state, controller_state, memory, energy, jnp.zeros((), jnp.int32))
 
-    def _seconds(self, steps: Any, like: Float[Array, " lanes"]) -> Float[Array, ...]:
+    def _seconds(self, steps: Any, like: Float[Array, " lanes"]) -> Float[Array, "..."]:
         return steps.astype(like.dtype) * self.world.timestep
 
     def water_at(self, steps: Any, now: RolloutState, inputs: StepInputs) -> Water:
@@ -156,7 +156,7 @@ class Rollout:
             return water
         return water._replace(time=water.time + self._episode_time(steps, now))
 
-    def _episode_time(self, steps: Any, now: RolloutState) -> Float[Array, ...]:
+    def _episode_time(self, steps: Any, now: RolloutState) -> Float[Array, "..."]:
         return self._seconds(steps if self.clock is None else self.clock + steps, now.energy)
 
     def read(
@@ -165,7 +165,7 @@ class Rollout:
         inputs: StepInputs = NO_INPUTS,
         forces: InteractionForces = NO_INTERACTION,
         motion: BodyMotion | None = None,
-    ) -> tuple[Float[Array, ...], Water, SensorReadings]:
+    ) -> tuple[Float[Array, "..."], Water, SensorReadings]:
         """Time [s], water and sensor readings; `motion`: of all bodies, where it is known."""
         time, water = self._episode_time(now.steps, now), self.water_at(now.steps, now, inputs)
         readings = read_sensors(

@@ -73,7 +73,7 @@ def first_scored_row(task: TaskConfig, timestep: float) -> int:
 
 
 def extend_track(
-    track: Mapping[str, jax.Array], rows: Mapping[str, jax.Array], first: Int[Array, ...]
+    track: Mapping[str, jax.Array], rows: Mapping[str, jax.Array], first: Int[Array, "..."]
 ) -> dict[str, jax.Array]:
     """A track with new rows, the last of which stands in all rows to come.
 

@@ -247,7 +247,7 @@ def steady_water(world: World, starts: Starts) -> Water:
 
 
 def gust_rows(
-    world: World, starts: Starts, steps: int, first: Int[Array, ...] | None = None
+    world: World, starts: Starts, steps: int, first: Int[Array, "..."] | None = None
 ) -> Water | None:
     """The water of each timestep of episodes in gusts.
 

@@ -253,7 +253,9 @@ def plot_families(history: ColonyHistory, champion: int | None = None, title: st
     row = {span.number: k for k, span in enumerate(spans)}
     lines = _lifelines(spans, scale, 330.0)
     lines.set_color(hues)
-    _draw_descent(low, history, row, hues, scale, max(0.45, 0.3 * lines.get_linewidths()[0]))
+    _draw_descent(
+        low, history, row, hues, scale, max(0.45, 0.3 * float(np.ravel(lines.get_linewidth())[0]))
+    )
     low.add_collection(lines)
     if champion in row:
         _draw_line(low, history, champion, row, scale)
@@ -382,8 +384,9 @@ def _draw_arena(axes: Axes, colony: ColonyConfig) -> None:
     dash = "-" if colony.arena.edge == "lost" else (0, (4, 3))
     axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor=_WATER, edgecolor=GREY,
                              linewidth=1.0, linestyle=dash, zorder=0))  # fmt: skip
-    for x, y, _ in () if energy is None else energy.chargers:
-        axes.add_patch(Circle((x, y), energy.reach, facecolor="none", edgecolor=_CHARGER,
+    chargers, reach = ((), 0.0) if energy is None else (energy.chargers, energy.reach)
+    for x, y, _ in chargers:
+        axes.add_patch(Circle((x, y), reach, facecolor="none", edgecolor=_CHARGER,
                               linewidth=1.2, linestyle=(0, (2, 2)), zorder=2))  # fmt: skip
         axes.plot(x, y, "P", color=_CHARGER, markersize=8, markeredgecolor="white", zorder=4)
 

@@ -251,7 +251,7 @@ def replay_data(
     ends = [float(one.end) for one in robots if one.end is not None]
     return {
         "size": float(np.median([one.robot.morphology.length for one in robots])),
-        "begin": min(one["start"] for one in listed),
+        "begin": min(round(one.appears, 4) for one in robots),
         "last": max([*ends, *(float(one.time[-1]) for one in robots)]),
         "low": places.min(0).tolist(),
         "high": places.max(0).tolist(),

@@ -110,9 +110,12 @@ def show_population(record: RunRecord, at: Path) -> ShownPopulation:
     sizes = plot_descriptors(population, _named(record), record.round)
     return ShownPopulation(
         [(generation, list(map(make, lives))) for generation, lives in groups.items()],
-        [FamilyStep(make(s.life), s.mate and make(s.mate), s.skipped) for s in family],
-        sizes and figure_svg(sizes),
-        archive and _draw_archive(record, archive, elites, at),
+        [
+            FamilyStep(make(s.life), None if s.mate is None else make(s.mate), s.skipped)
+            for s in family
+        ],
+        None if sizes is None else figure_svg(sizes),
+        None if archive is None else _draw_archive(record, archive, elites, at),
         list(map(make, elites)),
     )
 

@@ -196,10 +196,10 @@ def _names(
         if len(set(more)) > len(set(chosen)):
             chosen = more
     names = []
-    for records, words in zip(groups, chosen, strict=True):
+    for records, parts in zip(groups, chosen, strict=True):
         source = records[0].info.get("config_file")
         file = Path(source).stem if isinstance(source, str) else records[0].folder.name
-        name = ", ".join(word for word in words if word) or file
+        name = ", ".join(word for word in parts if word) or file
         names.append(name if len(name) <= _LABEL else name[: _LABEL - 1] + "…")
     # Whatever is still the same gets a letter.
     return [
