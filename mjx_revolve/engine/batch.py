@@ -591,8 +591,7 @@ def assemble_all(robots: Sequence[Robot]) -> Assembly:
     if not robots:
         raise InputError("robots: expected at least one; found none")
     for robot in robots:
-        robot.check_model()
-        if robot.edited_model is not None:
+        if robot.as_edited().edited_model is not None:
             raise InputError(
                 f"robot {robot.morphology.name!r}: expected it as built, as batches of robots have "
                 "no edited models; found one from with_model"

@@ -120,10 +120,9 @@ def make_engine(robot: Robot, engine: str = "population", contact: bool = True) 
 
     Raises:
         InputError: an unknown engine, or a world that it cannot step, or a model that was edited
-            in place (see `Robot.with_model`).
+            beyond what `Robot.with_model` takes.
     """
-    robot.check_model()
-    return _make_engine(robot, engine, contact)
+    return _make_engine(robot.as_edited(), engine, contact)
 
 
 @lru_cache(maxsize=32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -110,25 +111,34 @@ class Robot:
     def mj_model(self) -> mujoco.MjModel:
         """The compiled model, to be read. Its own fluid (`opt.density`, `opt.viscosity`) is off.
 
-        To change it, edit `mj_spec` or a copy and use `with_model`; engines refuse a model that
-        was edited in place.
+        To change it, edit `mj_spec` or a copy and use `with_model`. An edit in place counts from
+        the next engine on, with a warning (for one more release).
         """
         return self._compiled[1]
 
-    def check_model(self) -> None:
-        """Refuses a model that was edited in place.
+    def as_edited(self) -> Robot:
+        """The robot with what was edited in place in `mj_model`; itself if nothing was.
 
         Raises:
-            InputError: it was.
+            InputError: more was edited than `with_model` takes.
         """
-        if "_compiled" in self.__dict__:
-            _, model, before = self._compiled
-            if _bytes_of(model) != before:
-                raise InputError(
-                    f"mj_model of {self.morphology.name!r}: expected it as compiled; found it "
-                    "edited in place, which engines would ignore (edit a copy, model = "
-                    "copy.copy(robot.mj_model), and use robot.with_model(model))"
-                )
+        if "_compiled" not in self.__dict__:
+            return self
+        _, model, before = self._compiled
+        now = _bytes_of(model)
+        if now == before:
+            return self
+        found, edited = self.__dict__.get("_edited_in_place", (b"", self))
+        if found != now:
+            warnings.warn(
+                f"mj_model of {self.morphology.name!r} was edited in place: edit a copy "
+                "(copy.copy(robot.mj_model)) and use robot.with_model(model)",
+                DeprecationWarning,
+                stacklevel=3,
+            )
+            edited = Robot(self.morphology, self.world, self.edited_model).with_model(model)
+            self.__dict__["_edited_in_place"] = now, edited
+        return edited
 
     @cached_property
     def mjx_model(self) -> Any:
@@ -207,7 +217,10 @@ class Robot:
 
 
 def _bytes_of(model: mujoco.MjModel) -> bytes:
-    """The whole model, binary."""
+    """The model, binary, without what concerns MuJoCo's own steps only."""
+    model = copy.copy(model)
+    model.opt.density = model.opt.viscosity = model.opt.integrator = model.opt.enableflags = 0
+    model.opt.wind[:] = 0.0
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()

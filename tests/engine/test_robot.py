@@ -16,7 +16,6 @@ from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot, check_timestep, export_mjcf
 from mjx_revolve.engine.single_tree import make_single_tree
-from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height
 from mjx_revolve.water.lift_drag import LIFT_DRAG
@@ -346,14 +345,19 @@ def test_what_an_edited_model_may_not_change():
         fit_capacity([heavy])
 
 
-def test_a_model_edited_in_place_is_refused():
-    """Before and after the first use of the robot."""
+def test_a_model_edited_in_place_counts_from_the_next_engine_on():
+    """Before and after the first use of the robot; MuJoCo's own water may be set at will."""
     robot = build_robot(body("snake"), world())
+    plain = make_engine(robot)
+    robot.mj_model.opt.density = 1000.0
+    assert make_engine(robot) is plain
     robot.mj_model.body_mass[2] *= 2
-    with pytest.raises(InputError, match="edited in place"):
+    with pytest.warns(DeprecationWarning, match="edited in place"):
+        heavy = make_engine(robot)
+    assert make_engine(robot) is heavy is not plain
+    assert robot.as_edited().assembly.mass[2] == 2 * robot.assembly.mass[2]
+    with pytest.raises(InputError, match="expected it as built"):
+        fit_capacity([robot])
+    robot.mj_model.body_pos[3] += 0.1
+    with pytest.raises(InputError, match="found another body_pos"):
         make_engine(robot)
-    robot = build_robot(body("snake"), world())
-    make_engine(robot)
-    robot.mj_model.body_mass[2] *= 2
-    with pytest.raises(InputError, match="edited in place"):
-        simulate(robot, None, 0.1)
