@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve import make_fitness
-from mjx_revolve.control import Controller
+from mjx_revolve.control import Gene, make_controller
 
 
 def make_wave(plant, settings):
@@ -22,7 +22,8 @@ def make_wave(plant, settings):
         wave = swing * jnp.sin(2 * np.pi * frequency * time - phase)
         return state, middle + reach * jnp.clip(wave + turn, -1, 1)  # joint targets [rad]
 
-    return Controller(4, ("swing", "rate", "lag", "turn"), decode, lambda parameters: (), step)
+    genes = [Gene(name, "robot") for name in ("swing", "rate", "lag", "turn")]
+    return make_controller(plant, genes, decode, lambda parameters: (), step)
 
 
 if __name__ == "__main__":

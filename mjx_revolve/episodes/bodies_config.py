@@ -123,7 +123,7 @@ class BodiesConfig(Settings):
     """Settings of evolving bodies."""
 
     genotype: Annotated[str, one_of(GENOTYPES), File("code")] = "tree"
-    """`tree`, `plasticoding`, `cppn`, or FILE.py:FUNCTION, a function like those in `genotypes`."""
+    """What bodies are grown from: a genotype of `docs/evolution.md`, or FILE.py:FUNCTION."""
     modules: Annotated[TupleOf[str], MinLen(1)] = ("FixedBrick", "ActiveHinge")
     """Types of modules that bodies are grown of, beside the core."""
     core: Annotated[str, MinLen(1)] = "Core"

@@ -168,9 +168,7 @@ class TaskConfig(Section):
     """What the robot is scored for, and how its episodes start."""
 
     type: Annotated[str, one_of(TASKS), File("code")]
-    """`directed_swim` (along `direction`, over ground), `speed` (through the water, any way),
-    `reach_target`, `hold_depth`, `hold_heading`, `follow_course`, `search`, `escape`, `follow_bed`,
-    `crawl`, or FILE.py:FUNCTION, a function like those in `tasks`."""
+    """What is scored: a task, see the table above, or FILE.py:FUNCTION, a function like those."""
     duration: Annotated[Positive, Unit("s")] = 10.0
     """Length of an episode [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0

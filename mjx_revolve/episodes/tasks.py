@@ -32,6 +32,8 @@ from mjx_revolve.water.world import World
 
 # What a task may have recorded beside the core's position and the energy: see `Track`.
 RECORDS = ("core", "joints", "contacts", "forces", "water", "target", "course")
+# Settings of which one must be given, so that there is such a record.
+_GIVEN = {"target": ("target", "target_distance"), "course": ("course_spread",)}
 
 
 @partial(
@@ -337,6 +339,12 @@ def find_task(settings: Any, source: str = "config") -> Task:
     """
     name = settings.type
     task = TASKS[name] if name in TASKS else _load_task(name, f"{source}: task.type")
+    for record, fields in _GIVEN.items():
+        if record in task.records and all(getattr(settings, field) is None for field in fields):
+            raise InputError(
+                f"{source}: task: expected {' or '.join(fields)}, as {short_name(name)} records "
+                f"the {record}; found none"
+            )
     records = dict.fromkeys((*task.records, *records_of(settings.measures)))
     task = replace(task, records=tuple(records))
     if name in TASKS:

@@ -864,7 +864,7 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
         ),
         (
             HINGE_ON % "params: {drag: inertia_box}",
-            "ellipsoid, off (inertia_box is a law of whole bodies); found 'inertia_box'",
+            "off (inertia_box is a law of whole bodies); found 'inertia_box'",
         ),
         (
             HINGE_ON % "params: {thrust: 1}",

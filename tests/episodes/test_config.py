@@ -63,8 +63,7 @@ def test_it_is_frozen(folder):
         ("task.duration=abc", "--set task.duration: expected a number > 0 [s]; found 'abc'"),
         ("task.settle=10", "task.settle: expected a time below task.duration (10 s); found 10"),
         ("task.trials=0", "task.trials: expected a whole number >= 1; found 0"),
-        ("task.type=swim", "task.type: expected one of directed_swim, speed, reach_target, "
-         "hold_depth, hold_heading, follow_course, search, escape, follow_bed, crawl, or "
+        ("task.type=swim", f"task.type: expected one of {', '.join(config.TASKS)}, or "
          "FILE.py:FUNCTION; found 'swim'"),
         ("task.type=follow_bed", "task.height: expected a number > 0 [m], because task.type is "
          "follow_bed; found none"),

@@ -10,6 +10,7 @@ import pytest
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height, bed_slope, sample_bed
+from mjx_revolve.water.law_names import drag_names
 from mjx_revolve.water.world import (
     CurrentField,
     Gust,
@@ -209,7 +210,7 @@ WRONG = [
     ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
     (
         {"drag": "boxes"},
-        "drag: expected one of faces, lift_drag, inertia_box, ellipsoid, off; found 'boxes'",
+        f"drag: expected one of {drag_names()}; found 'boxes'",
     ),
     ({"added_mass": "yes"}, "added_mass: expected true or false; found 'yes'"),
     ({"added_mass": 1}, "added_mass: expected true or false; found 1"),
