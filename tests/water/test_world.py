@@ -210,7 +210,7 @@ WRONG = [
     ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
     (
         {"drag": "boxes"},
-        f"drag: expected one of {drag_names()}; found 'boxes'",
+        f"drag: expected {drag_names()}; found 'boxes'",
     ),
     ({"added_mass": "yes"}, "added_mass: expected true or false; found 'yes'"),
     ({"added_mass": 1}, "added_mass: expected true or false; found 1"),
