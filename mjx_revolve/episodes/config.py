@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,7 +30,16 @@ from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.episodes.bodies_config import BodiesConfig, LearningConfig, SelectionConfig
 from mjx_revolve.episodes.colony_config import ColonyConfig
 from mjx_revolve.episodes.measure_table import MEASURES
-from mjx_revolve.episodes.settings import File, NamedFile, Section, Settings, map_files, one_of
+from mjx_revolve.episodes.settings import (
+    File,
+    NamedFile,
+    Section,
+    Settings,
+    find_copies,
+    locate_files,
+    map_files,
+    one_of,
+)
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
 from mjx_revolve.inputs.schema import (
@@ -46,6 +55,7 @@ from mjx_revolve.inputs.schema import (
     words,
 )
 from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
@@ -373,10 +383,6 @@ class Config(Settings):
         map_files(self.model_dump(), found.append, Config)
         return tuple(found)
 
-    def with_files(self, change: Callable[[NamedFile], str]) -> Config:
-        """The same with other files; `change` gives a setting's new text."""
-        return make_config(map_files(self.model_dump(), change, Config), "/", source=self.source)
-
     def for_body(self, morphology: str | Path) -> Config:
         """The same for one body alone, from a morphology's path; only its brain would evolve."""
         return self.model_copy(update={"morphology": str(morphology), "bodies": None})
@@ -478,6 +484,8 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
     if not isinstance(data, dict):
         found = "an empty file" if data is None else show(data)
         raise InputError(f"{path}: expected a mapping of settings; found {found}")
+    if is_run_config(path):
+        data = locate_files(data, find_copies(path.parent.absolute()))
     return make_config(data, path.parent, overrides, str(path))
 
 
@@ -511,7 +519,7 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
 
     def shorten(file: NamedFile) -> str:
         path, root = Path(file.path), Path(folder or "").absolute()
-        if folder is None or file.kind == "data" or not path.is_relative_to(root):
+        if folder is None or not path.is_relative_to(root):
             return file.text
         return file.at(path.relative_to(root).as_posix())
 

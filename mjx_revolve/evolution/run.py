@@ -176,7 +176,8 @@ class Run:
             _log.warning("passed over a damaged checkpoint: %s", name)
         begun = checkpoint.meta if checkpoint else files.info
         settled = settings_hash(config)
-        if begun.get("settings_hash", settled) != settled:  # an older version's run.json has none
+        known = begun.get("settings_hash", settled)  # an older version's run.json has none
+        if known not in (settled, settings_hash(config, by_path=True)):
             raise InputError(
                 f"{label}: expected the config.yaml that it began with; found it changed"
             )
@@ -403,16 +404,18 @@ def check_unchanged(old: Config, new: Config, label: str) -> None:
     Raises:
         InputError: they differ in more than `FREE_SETTINGS`.
     """
-    known = {file.place: file for file in old.files}
+    known: dict[str, NamedFile] = {}
+    settings = map_files(
+        plain_settings(old), lambda file: known.setdefault(file.place, file).text, Config
+    )
 
     def same(file: NamedFile) -> str:
         before = known.get(file.place)
-        if before is None or before.function != file.function or not file.bundled:
+        if before is None or before.function != file.function:
             return file.text
-        equal = Path(before.path).read_bytes() == Path(file.path).read_bytes()
-        return before.text if equal else file.text
+        return before.text if before.digest() == file.digest() else file.text
 
-    found = _differences(plain_settings(old), map_files(plain_settings(new), same, Config))
+    found = _differences(settings, map_files(plain_settings(new), same, Config))
     if found:
         more = f" (and {len(found) - 1} more)" if found[1:] else ""
         free = f"evolution.{', '.join(FREE_SETTINGS)}"

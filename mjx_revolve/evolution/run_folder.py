@@ -1,7 +1,8 @@
 """The run folder: everything that an evolution writes to disk.
 
-    config.yaml        the resolved configuration; inputs/ holds the robot, and code, that it names
-    run.json           versions, seed, arguments, platform, thread settings, times
+    config.yaml        the resolved configuration
+    inputs/            copies of all files that it names: robots, modules, world, code, data
+    run.json           versions, seed, arguments, platform, threads, times, hashes of the copies
     metrics.csv        one line per generation (RFC 4180), readable while the run goes on
     checkpoints/       the newest few, one npz each
     individuals.jsonl  where bodies evolve: one line for each individual, at birth and after
@@ -17,6 +18,7 @@ moved there. The reader is `episodes.run_reader`.
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -31,7 +33,7 @@ import numpy as np
 import yaml
 
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.episodes.config import Config, dump_config
+from mjx_revolve.episodes.config import Config, dump_config, make_config
 from mjx_revolve.episodes.individual_log import (
     EVENTS,
     GENERATIONS,
@@ -40,7 +42,7 @@ from mjx_revolve.episodes.individual_log import (
     find_individuals,
 )
 from mjx_revolve.episodes.run_reader import Checkpoint, DamageError, RunReader, generation_of
-from mjx_revolve.episodes.settings import NamedFile
+from mjx_revolve.episodes.settings import copy_files, locate_files
 from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import resolve_inside, with_path, write_atomic
@@ -300,9 +302,8 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
 
     Args:
         folder: a new or empty folder.
-        config: the configuration. Its morphology, and the files of a task or controller of the
-            user's own, are copied into the folder, so that the run can be moved and still be read;
-            a world or modules file stays where it is, because it may refer to files beside it.
+        config: the configuration. All files that it names are copied into the folder, so that the
+            run can be moved, and depends on nothing else.
         **info: entries for `run.json`.
 
     Returns:
@@ -321,28 +322,15 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
         (folder / "checkpoints").mkdir(exist_ok=True)
     except OSError as error:
         raise with_path(error, folder) from None
-    config = _copy_files(config, folder / "inputs")
-    run.update_info(**info)
+    settings, copies = copy_files(config.model_dump(), Config)
+    for name, content in copies.items():
+        run.write(name, content)
+    places = {name: folder / name for name in copies}
+    config = make_config(locate_files(settings, places), source=config.source)
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in copies.items()}
+    run.update_info(**info, inputs=hashes)
     run.save_config(config)  # last: where it is, the run can be continued
     return run, config
-
-
-def _copy_files(config: Config, folder: Path) -> Config:
-    """Keeps the files that can be copied alone, and names the copies."""
-    copies: dict[str, Path] = {}
-
-    def keep(file: NamedFile) -> str:
-        if file.kind not in ("morphology", "code"):
-            return file.text
-        copy = folder / Path(file.path).name
-        if file.path not in copies and copy in copies.values():  # two files of one name
-            own = file.place.partition(".")[0] if file.kind == "code" else len(copies)
-            copy = folder / f"{own}_{copy.name}"
-        if file.path not in copies:
-            write_atomic(copy, Path(file.path).read_bytes())
-        return file.at(copies.setdefault(file.path, copy))
-
-    return config.with_files(keep)
 
 
 def open_run_folder(folder: str | Path) -> RunFolder:

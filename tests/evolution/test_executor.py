@@ -232,7 +232,7 @@ def test_a_job_takes_robot_and_code_along(tmp_path):
     job = make_job(config, read_back)
     for name in ("mine.py", "robot.yaml"):
         (tmp_path / name).unlink()
-    assert open_job(job) == ("id: robot\n", "def stay(track, settings):")
+    assert open_job(job, tmp_path / "scratch") == ("id: robot\n", "def stay(track, settings):")
 
 
 def read_back(config):

@@ -180,6 +180,7 @@ def test_names_move_no_cursor_and_write_no_markup(folder, capsys):
     nasty = "<script>alert(1)</script>\x1b]0;x\x07\u202e"
     change(folder, **{nasty: 1, "task": {"type": "speed"}})
     body = folder / "run" / "inputs" / "elbow.yaml"
+    (folder / "run" / "run.json").write_text("{}")  # no hashes, or the ones that suit
     body.write_text(body.read_text().replace("id:", f"id: {json.dumps(nasty)} # ", 1))
     assert run_command(report.main, ["run", "--out", "report.html"]) == 0
     assert run_command(viewer.main, ["run", "--out", "page.html"]) == 2
@@ -219,7 +220,7 @@ def test_a_huge_yaml_is_refused_at_once(tmp_path):
     (tmp_path / "big.yaml").write_text("- [1, 2, 3]\n" * 900_000)
     with pytest.raises(InputError, match="expected at most 2 MB of YAML; found more"):
         load_yaml(tmp_path / "big.yaml")
-    with pytest.raises(InputError, match="expected at most 2 MB"):
+    with pytest.raises(InputError, match="expected a file; found a pipe or a device"):
         load_yaml(os.devnull.replace("null", "zero"))
 
 
