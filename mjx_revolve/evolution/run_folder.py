@@ -18,6 +18,7 @@ moved there. The reader is `episodes.run_reader`.
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import io
 import json
@@ -74,18 +75,20 @@ class RunFolder(RunReader):
     def update_info(self, **changes: Any) -> None:
         """Sets entries of `run.json`; None removes one."""
         info = (self.info if (self.path / "run.json").exists() else {}) | changes
-        info = {key: value for key, value in info.items() if value is not None}
-        text = json.dumps(info, indent=2, ensure_ascii=False) + "\n"
-        write_atomic(self.path / "run.json", text.encode())
+        self.write("run.json", _info_text(info))
 
     def save_config(self, config: Config) -> None:
         """Writes `config.yaml`, paths inside the folder relative to it."""
-        head = "# The resolved configuration of this run; it loads again as it stands.\n"
-        text = head + dump_config(config, self.path)
-        write_atomic(self.path / "config.yaml", text.encode())
+        self.write("config.yaml", _config_text(config, self.path))
 
     def write(self, name: str, content: bytes | Callable[[Path], None]) -> Path:
-        """Writes any file below the folder, whole or not at all, and returns its path."""
+        """Writes any file below the folder, whole or not at all, and returns its path.
+
+        Raises:
+            OSError: the disk is full, or the folder was removed: it is not made anew in parts.
+        """
+        if not (self.path / "config.yaml").exists():
+            raise OSError(errno.ENOENT, "the run folder was removed", str(self.path))
         write_atomic(self.path / name, content)
         return self.path / name
 
@@ -145,8 +148,8 @@ class RunFolder(RunReader):
         named: dict[str, Any] = {f"array:{name}": value for name, value in arrays.items()}
         buffer = io.BytesIO()
         np.savez(buffer, meta=np.frombuffer(text.encode(), np.uint8), **named)
-        path = self.path / "checkpoints" / f"generation_{generation:06d}.npz"
-        write_atomic(path, buffer.getvalue())
+        name = f"checkpoints/generation_{generation:06d}.npz"
+        path = self.write(name, buffer.getvalue())
         for old in self.checkpoints()[keep:]:
             old.unlink(missing_ok=True)
         return path
@@ -223,6 +226,18 @@ class RunFolder(RunReader):
         if self._lock is not None:
             self._lock.close()
             self._lock = None
+
+
+def _info_text(info: Mapping[str, Any]) -> bytes:
+    """The text of `run.json`; entries that are None are left out."""
+    kept = {key: value for key, value in info.items() if value is not None}
+    return (json.dumps(kept, indent=2, ensure_ascii=False) + "\n").encode()
+
+
+def _config_text(config: Config, folder: Path) -> bytes:
+    """The text of `config.yaml`."""
+    head = "# The resolved configuration of this run; it loads again as it stands.\n"
+    return (head + dump_config(config, folder)).encode()
 
 
 def _number(value: float) -> str:
@@ -324,12 +339,13 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
         raise with_path(error, folder) from None
     settings, copies = copy_files(config.model_dump(), Config)
     for name, content in copies.items():
-        run.write(name, content)
+        write_atomic(folder / name, content)
     places = {name: folder / name for name in copies}
     config = make_config(locate_files(settings, places), source=config.source)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in copies.items()}
-    run.update_info(**info, inputs=hashes)
-    run.save_config(config)  # last: where it is, the run can be continued
+    write_atomic(folder / "run.json", _info_text(info | {"inputs": hashes}))
+    # Last: where it is, the run can be continued.
+    write_atomic(folder / "config.yaml", _config_text(config, folder))
     return run, config
 
 
@@ -348,6 +364,9 @@ def open_run_folder(folder: str | Path) -> RunFolder:
     folder = Path(folder).absolute()
     if not folder.is_dir():
         found = "a file" if folder.exists() else "none"
+        raise InputError(f"{folder}: expected a run folder; found {found}")
+    if (folder / ".lock").exists() and is_new_folder(folder):
+        found = "one that was not begun; begin it with --out"
         raise InputError(f"{folder}: expected a run folder; found {found}")
     for name in ("config.yaml", "run.json"):
         if not (folder / name).is_file():

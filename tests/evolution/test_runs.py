@@ -152,6 +152,24 @@ def test_full_folder_is_refused(tmp_path, config):
         runs.check_new_folder(tmp_path / "robot.yaml")
 
 
+def test_a_folder_whose_making_was_cut_short_is_a_new_one(tmp_path, run, config):
+    """As kill -9 leaves it, at the last moment."""
+    run.close()
+    os.rename(run.path / "config.yaml", run.path / ".123-config.yaml")
+    with pytest.raises(InputError, match="found one that was not begun; begin it with --out"):
+        runs.open_run_folder(run.path)
+    again, _ = runs.create_run_folder(run.path, config)
+    again.close()
+
+
+def test_a_folder_that_was_removed_is_not_made_anew_in_parts(run):
+    shutil.rmtree(run.path)
+    for write in (lambda: run.save_checkpoint(1, ARRAYS, {}, 3), lambda: run.update_info(a=1)):
+        with pytest.raises(OSError, match="the run folder was removed"):
+            write()
+    assert not run.path.exists()
+
+
 def test_only_run_folders_open(tmp_path):
     with pytest.raises(InputError, match="nowhere: expected a run folder; found none"):
         runs.open_run_folder(tmp_path / "nowhere")
