@@ -150,6 +150,20 @@ def test_genes_elsewhere_may_name_a_runs_configuration(folder, capsys):
     assert not (folder / "was run").exists()
 
 
+@pytest.mark.parametrize("place", ["stranger", "stranger/champion/genes.yaml"])
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_champion_names_no_run_of_the_readers_own(folder, place, whole, capsys):
+    change(folder, task={"type": "speed"})
+    (folder / "stranger" / "champion").mkdir(parents=True)
+    if whole:
+        shutil.copy("run/config.yaml", "stranger/config.yaml")
+        shutil.copy("run/run.json", "stranger/run.json")
+    genes = json.dumps({"config": "../../run/config.yaml", "genes": [0, 0, 0]})
+    (folder / "stranger" / "champion" / "genes.yaml").write_text(genes)
+    assert run_command(viewer.main, [place, "--out", "page.html"]) == 2
+    assert "expected a file inside the run folder" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("how", ["named", "link", "config", "body"])
 def test_private_files_are_not_shown(folder, how, capsys):
     private = folder / "private.yaml"
