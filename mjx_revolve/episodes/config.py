@@ -181,8 +181,8 @@ class TaskConfig(Section):
     """`directed_swim` (along `direction`, over ground), `speed` (through the water, any way),
     `reach_target`, `hold_depth`, `hold_heading`, `follow_course`, `search`, `escape`, `follow_bed`,
     `crawl`, or FILE.py:FUNCTION, a function like those in `tasks`."""
-    duration: Annotated[Positive, Unit("s")] = 10.0
-    """Length of an episode [s]."""
+    duration: Annotated[Positive, Le(86_400), Unit("s")] = 10.0
+    """Length of an episode, a day at most [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
     """Time at the start of an episode that does not count [s]."""
     trials: Annotated[Integer, Ge(1)] = 2

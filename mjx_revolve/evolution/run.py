@@ -37,7 +37,7 @@ from mjx_revolve.evolution.run_folder import (
 )
 from mjx_revolve.evolution.tensorboard import TensorBoardLog, check_tensorboard
 from mjx_revolve.inputs.commands import check_place
-from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import with_path
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.user_code import announce
@@ -377,6 +377,12 @@ def _prepare(config: Config, make_executor: MakeExecutor) -> Executor:
             announce(file.text)
     executor = make_executor(config)
     fitness = executor.fitness
+    if isinstance(fitness, Fitness) and not fitness.engine.plant.num_actuators:
+        name = show(fitness.robot.morphology.name)
+        raise InputError(
+            f"{config.source}: morphology: expected a robot with hinges or thrusters, as its "
+            f"controller is to evolve; found none in {name}"
+        )
     genotype = fitness.genotype if isinstance(fitness, BodyFitness) else None
     check_memory(config, executor.num_genes, genotype)
     return executor

@@ -19,9 +19,10 @@ from jax.experimental.compilation_cache import compilation_cache
 from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import load_config, make_config, override_config
+from mjx_revolve.episodes.fitness import make_fitness
 from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.fingerprints import settings_hash
-from mjx_revolve.evolution.run import check_unchanged
+from mjx_revolve.evolution.run import _prepare, check_unchanged
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.numerics import runtime
@@ -140,6 +141,12 @@ def test_older_run_folders_open(tmp_path, config):
     run.close()
     (run.path / "inputs" / "robot.yaml").write_text("id: edited\n")
     assert load_world(run.load_config().world_name).density == 1030.0
+
+
+def test_a_robot_that_nothing_moves_does_not_evolve():
+    config = load_config("smoke", {"morphology": "core"})
+    with pytest.raises(InputError, match=r"expected a robot with hinges or thrusters.*found none"):
+        _prepare(config, lambda config: SimpleNamespace(fitness=make_fitness(config)))
 
 
 def test_full_folder_is_refused(tmp_path, config):
