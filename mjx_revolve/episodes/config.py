@@ -40,7 +40,8 @@ from mjx_revolve.episodes.settings import (
     map_files,
     one_of,
 )
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.files import check_path
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
 from mjx_revolve.inputs.schema import (
     ConstraintError,
@@ -451,14 +452,15 @@ def _resolve(file: NamedFile, folder: Path, before: str) -> str:
     """The setting with an absolute path; `before` stands before its place in messages."""
     if file.kind == "data":
         return file.text
-    found = folder / Path(file.path).expanduser()
+    place = before + file.place
+    named = Path(os.path.expanduser(file.path))
     if file.kind == "morphology":
-        named = Path(file.path).expanduser()
-        found = find_shipped(named, "morphologies", folder, before + file.place)
-    path = Path(os.path.abspath(found))
+        named = find_shipped(named, "morphologies", folder, place)
+    with reading(place):
+        path = check_path(os.path.abspath(folder / named))
     if not path.is_file():
         what = "a folder" if path.is_dir() else "none"
-        raise InputError(f"{before}{file.place}: expected a file; found {what} at {path}")
+        raise InputError(f"{place}: expected a file; found {what} at {path}")
     return file.at(path)
 
 

@@ -46,7 +46,7 @@ from mjx_revolve.episodes.run_reader import Checkpoint, DamageError, RunReader, 
 from mjx_revolve.episodes.settings import copy_files, locate_files
 from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.inputs.errors import InputError, reading, show
-from mjx_revolve.inputs.files import resolve_inside, with_path, write_atomic
+from mjx_revolve.inputs.files import check_path, resolve_inside, with_path, write_atomic
 
 try:
     import fcntl
@@ -273,7 +273,7 @@ def load_archive(folder: str | Path) -> tuple[Archive, list[LoggedIndividual]]:
     Raises:
         InputError: it is no run folder, or has no archive yet.
     """
-    run = RunFolder(Path(folder))
+    run = RunFolder(check_path(folder))
     arrays = run.load_checkpoint().arrays
     own = {k.removeprefix("archive."): v for k, v in arrays.items() if k.startswith("archive.")}
     if not own:

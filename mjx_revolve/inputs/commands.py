@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.files import check_path
 from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.inputs.terminal import spell_unencodable
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -39,6 +40,10 @@ def read_path(text: str) -> str:
     """Reads a path, for `add_argument(type=read_path)`: refuses what an unset variable leaves."""
     if not text.strip():
         raise argparse.ArgumentTypeError(f"expected a path; found {text!r}")
+    try:
+        check_path(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     return text
 
 

@@ -26,7 +26,9 @@ def check_path(path: object) -> Path:
     try:
         os.stat(path)
     except ValueError:
-        raise InputError(f"{str(path)!r}: expected a path; found characters of none") from None
+        raise InputError(
+            f"{str(path)!r}: expected a path; found characters that none has"
+        ) from None
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
             raise InputError(f"{path}: expected a path; found: {error.strerror}") from None

@@ -18,7 +18,7 @@ from annotated_types import Ge, Le, MinLen, Unit
 from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 
 from mjx_revolve.inputs.errors import ConstraintError, InputError, reading, show
-from mjx_revolve.inputs.files import read_file
+from mjx_revolve.inputs.files import check_path, read_file
 from mjx_revolve.inputs.schema import (
     Boolean,
     NonNegative,
@@ -210,7 +210,8 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     """
     shipped = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
     if not isinstance(name, str | Path):
-        raise InputError(f"world: expected a name or a path; found {name!r}")
+        raise InputError(f"world: expected a name or a path; found {show(name)}")
+    check_path(name)
     path = _FOLDER / f"{name}.yaml" if str(name) in shipped else Path(name)
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         raise InputError(
