@@ -158,8 +158,23 @@ class Run:
                 run.
             WorkerError: workers cannot be started.
         """
-        label = f"--resume {folder}"
         files = open_run_folder(folder)
+        try:
+            return cls._reopen(files, f"--resume {folder}", path, settings, make_executor)
+        except BaseException:
+            files.abandon()
+            raise
+
+    @classmethod
+    def _reopen(
+        cls,
+        files: RunFolder,
+        label: str,
+        path: str | None,
+        settings: Sequence[str],
+        make_executor: MakeExecutor,
+    ) -> Run:
+        """A run of a folder that is locked; see `resume`."""
         old = files.load_config()
         earlier = files.info.get("settings", [])
         if path is None:

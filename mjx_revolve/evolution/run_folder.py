@@ -69,6 +69,7 @@ class RunFolder(RunReader):
     """
 
     _lock: IO[str] | None = field(default=None, repr=False)
+    _made_lock: bool = field(default=False, repr=False)
 
     # --- plain files ---
 
@@ -226,6 +227,12 @@ class RunFolder(RunReader):
         if self._lock is not None:
             self._lock.close()
             self._lock = None
+
+    def abandon(self) -> None:
+        """Closes it as it was found: without a lock file that was not there before."""
+        if self._made_lock:
+            (self.path / ".lock").unlink(missing_ok=True)
+        self.close()
 
 
 def _info_text(info: Mapping[str, Any]) -> bytes:
@@ -394,6 +401,7 @@ def _lock_run(folder: Path) -> RunFolder:
     """Keeps a second process from writing the same folder; the lock dies with the process."""
     if fcntl is None:
         return RunFolder(folder)
+    made = not (folder / ".lock").exists()
     try:
         lock = open(folder / ".lock", "a", encoding="utf-8")  # noqa: SIM115  (kept open)
     except OSError as error:
@@ -405,4 +413,7 @@ def _lock_run(folder: Path) -> RunFolder:
         raise InputError(f"{folder}: expected a run that has stopped; found it running") from None
     except OSError:  # a file system without locks
         pass
-    return RunFolder(folder, lock)
+    if os.fstat(lock.fileno()).st_nlink == 0:  # removed meanwhile by another that gave up
+        lock.close()
+        return _lock_run(folder)
+    return RunFolder(folder, lock, made)

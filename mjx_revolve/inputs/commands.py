@@ -245,6 +245,12 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         reason = str(error).partition("\n")[0].removeprefix("RESOURCE_EXHAUSTED:").strip()
         print(f"error: too little memory: {reason or 'none is left'}", file=sys.stderr)
         return 1
+    finally:
+        # From here on Ctrl-C ends the process at once; what JAX does at its end would be cut short
+        # by a traceback.
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        early_sigint.running = False
 
 
 def describe_refusal(error: OSError) -> str:
