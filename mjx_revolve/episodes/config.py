@@ -487,7 +487,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         found = "an empty file" if data is None else show(data)
         raise InputError(f"{path}: expected a mapping of settings; found {found}")
     if is_run_config(path):
-        data = locate_files(data, find_copies(path.parent.absolute()))
+        data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
     return make_config(data, path.parent, overrides, str(path))
 
 
