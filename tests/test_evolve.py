@@ -6,6 +6,7 @@ Bits are compared within one process or on one machine with the same thread sett
 import datetime
 import errno
 import json
+import os
 import re
 import shutil
 import struct
@@ -176,14 +177,16 @@ def stopped(folder):
         (["--set", "evolution.population_size=16", "--set", "task.trials=1"], "(and 1 more)"),
         (["changed.yaml"], "run: task.type: expected 'speed' as in the run; found 'crawl'"),
         (["--out", "there"], "--resume run: expected no --out beside it; found there"),
-        (["--set", "task.duration=-1"], "--set task.duration: expected a number > 0 [s]; found -1"),
+        (["--set", "task.duration=-1"], "--set task.duration: expected a number > 0 and <="),
     ],
 )  # fmt: skip
 def test_a_run_stays_the_same_run(stopped, argv, message, capsys):
     (stopped / "other.yaml").write_text("id: other\n")
     changed = (stopped / "toy.yaml").read_text().replace("speed", "crawl")
     (stopped / "changed.yaml").write_text(changed)
+    (stopped / "run" / ".lock").unlink()  # as where the folder was copied
     assert run_main("--resume", "run", *argv) == 2
+    assert not (stopped / "run" / ".lock").exists()
     err = capsys.readouterr().err
     assert message in err
     assert err.count("\n") == 1
@@ -237,6 +240,13 @@ def test_wrong_commands_leave_nothing_behind(folder, argv, message, capsys):
     assert message in err
     assert err.count("\n") == 1
     assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("number", "words"), [(errno.EACCES, "allow writing"), (errno.ENOSPC, "make room")]
+)
+def test_the_advice_fits_the_error(number, words):
+    assert command._remedy(OSError(number, os.strerror(number))) == words
 
 
 @pytest.mark.slow

@@ -7,13 +7,16 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from annotated_types import MinLen
+from annotated_types import MaxLen, MinLen
 
 from mjx_revolve.body.boxes import union_measure
 from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Name, Part, Slot, Vector
 from mjx_revolve.body.sensors import SensorRow
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import Boolean, TupleOf, checked, read, words
+
+# Boxes of a part: the memory for their union grows with the cube of their number, 70 MB here.
+_MOST = 100
 
 
 @checked
@@ -89,7 +92,9 @@ def _read_part(item: dict[str, Any], index: int, place: str) -> Part:
     if "size" in item:
         boxes = (read(Box, {"size": item["size"]}, place),)
     else:
-        several = Annotated[TupleOf[Box], MinLen(1), words("a list of boxes")]
+        several = Annotated[
+            TupleOf[Box], MinLen(1), MaxLen(_MOST), words(f"a list of 1 to {_MOST} boxes")
+        ]
         boxes = read(several, item["boxes"], f"{place}.boxes")
     center = np.array([box.position for box in boxes])
     half = np.array([box.size for box in boxes]) / 2

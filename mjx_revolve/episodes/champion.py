@@ -36,6 +36,7 @@ from mjx_revolve.episodes.starts import gusty_water
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.commands import opening_episode
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import check_path
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.inputs.yaml_reader import load_yaml
@@ -107,7 +108,7 @@ def load_episode(
         InputError: there is no champion or individual, a file holds something else, or it is to
             swim in another world or be made of other modules.
     """
-    path = Path(path)
+    path = check_path(path)
     if individual is not None:
         refuse_world(world, modules)
         return _individual(path, individual, duration, seed)
@@ -324,5 +325,5 @@ def load_genes(path: str | Path) -> np.ndarray:
     Raises:
         InputError: there is no champion, or its file holds something else.
     """
-    path = Path(path)
+    path = check_path(path)
     return (RunReader(path).load_champion() if path.is_dir() else read_champion(path)).genes

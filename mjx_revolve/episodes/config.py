@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,8 +30,18 @@ from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.episodes.bodies_config import BodiesConfig, LearningConfig, SelectionConfig
 from mjx_revolve.episodes.colony_config import ColonyConfig
 from mjx_revolve.episodes.measure_table import MEASURES
-from mjx_revolve.episodes.settings import File, NamedFile, Section, Settings, map_files, one_of
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.episodes.settings import (
+    File,
+    NamedFile,
+    Section,
+    Settings,
+    find_copies,
+    locate_files,
+    map_files,
+    one_of,
+)
+from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.files import check_path
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
 from mjx_revolve.inputs.schema import (
     ConstraintError,
@@ -46,6 +56,7 @@ from mjx_revolve.inputs.schema import (
     words,
 )
 from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
@@ -169,8 +180,8 @@ class TaskConfig(Section):
 
     type: Annotated[str, one_of(TASKS), File("code")]
     """What is scored: a task, see the table above, or FILE.py:FUNCTION, a function like those."""
-    duration: Annotated[Positive, Unit("s")] = 10.0
-    """Length of an episode [s]."""
+    duration: Annotated[Positive, Le(86_400), Unit("s")] = 10.0
+    """Length of an episode, a day at most [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
     """Time at the start of an episode that does not count [s]."""
     trials: Annotated[Integer, Ge(1)] = 2
@@ -371,10 +382,6 @@ class Config(Settings):
         map_files(self.model_dump(), found.append, Config)
         return tuple(found)
 
-    def with_files(self, change: Callable[[NamedFile], str]) -> Config:
-        """The same with other files; `change` gives a setting's new text."""
-        return make_config(map_files(self.model_dump(), change, Config), "/", source=self.source)
-
     def for_body(self, morphology: str | Path) -> Config:
         """The same for one body alone, from a morphology's path; only its brain would evolve."""
         return self.model_copy(update={"morphology": str(morphology), "bodies": None})
@@ -443,14 +450,15 @@ def _resolve(file: NamedFile, folder: Path, before: str) -> str:
     """The setting with an absolute path; `before` stands before its place in messages."""
     if file.kind == "data":
         return file.text
-    found = folder / Path(file.path).expanduser()
+    place = before + file.place
+    named = Path(os.path.expanduser(file.path))
     if file.kind == "morphology":
-        named = Path(file.path).expanduser()
-        found = find_shipped(named, "morphologies", folder, before + file.place)
-    path = Path(os.path.abspath(found))
+        named = find_shipped(named, "morphologies", folder, place)
+    with reading(place):
+        path = check_path(os.path.abspath(folder / named))
     if not path.is_file():
         what = "a folder" if path.is_dir() else "none"
-        raise InputError(f"{before}{file.place}: expected a file; found {what} at {path}")
+        raise InputError(f"{place}: expected a file; found {what} at {path}")
     return file.at(path)
 
 
@@ -476,6 +484,8 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
     if not isinstance(data, dict):
         found = "an empty file" if data is None else show(data)
         raise InputError(f"{path}: expected a mapping of settings; found {found}")
+    if is_run_config(path):
+        data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
     return make_config(data, path.parent, overrides, str(path))
 
 
@@ -509,7 +519,7 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
 
     def shorten(file: NamedFile) -> str:
         path, root = Path(file.path), Path(folder or "").absolute()
-        if folder is None or file.kind == "data" or not path.is_relative_to(root):
+        if folder is None or not path.is_relative_to(root):
             return file.text
         return file.at(path.relative_to(root).as_posix())
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.files import check_path, read_file
 from mjx_revolve.inputs.schema import LARGEST
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
@@ -33,7 +34,7 @@ def find_run(path: str | Path) -> Path:
     Raises:
         InputError: it is neither.
     """
-    folder = Path(path)
+    folder = check_path(path)
     if folder.name == "champion" and not (folder / "config.yaml").is_file():
         folder = folder.parent
     if not (folder / "config.yaml").is_file():
@@ -55,11 +56,10 @@ class RunReader:
     def info(self) -> dict[str, Any]:
         """The contents of `run.json`."""
         path = self.path / "run.json"
+        content = read_file(path)
         try:
-            info = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(f"{path}: expected a file; found none") from None
-        except (OSError, ValueError) as error:
+            info = json.loads(content)
+        except ValueError as error:
             raise InputError(f"{path}: expected JSON; found: {error}") from None
         if not isinstance(info, dict):
             raise InputError(f"{path}: expected a JSON object; found {type(info).__name__}")
@@ -176,7 +176,7 @@ def load_metrics(path: str | Path) -> dict[str, np.ndarray]:
     Raises:
         InputError: there is no such file, or it holds something else.
     """
-    path = Path(path)
+    path = check_path(path)
     if not path.is_file():
         raise InputError(f"{path}: expected a file; found none")
     columns, bad, damage = read_metrics(path)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import itertools
+import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -10,8 +13,12 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import read_file, resolve_inside
 from mjx_revolve.inputs.schema import ConstraintError
+from mjx_revolve.inputs.trust import audit
 from mjx_revolve.inputs.user_code import parse_user_function, short_name
+from mjx_revolve.water.world import read_world_files
 
 # --- files ----------------------------------------------------------------------------------------
 
@@ -34,7 +41,7 @@ class NamedFile(NamedTuple):
 
     Attributes:
         place: the setting's dotted name.
-        kind: see `File`.
+        kind: see `File`; `field` for the current field of a world's mapping.
         path: the file.
         function: of code, the function in it; else "".
     """
@@ -53,10 +60,23 @@ class NamedFile(NamedTuple):
         """The setting's text."""
         return self.at(self.path)
 
-    @property
-    def bundled(self) -> bool:
-        """Whether the file can be copied alone; a world or modules file may refer to others."""
-        return self.kind not in ("modules", "world")
+    def contents(self) -> dict[str, bytes]:
+        """Contents of the file, and of those that it names, by paths relative to its folder.
+
+        Raises:
+            InputError: one cannot be read.
+        """
+        if self.kind == "world":
+            return read_world_files(self.path)
+        content = read_file(self.path)
+        if self.kind == "data":  # others are audited where they are used
+            audit(self.path, "data", content)
+        return {Path(self.path).name: content}
+
+    def digest(self) -> str:
+        """SHA-256 of what `contents` has, whatever the files are called."""
+        parts = [hashlib.sha256(content).digest() for content in self.contents().values()]
+        return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 Change = Callable[[NamedFile], Any]
@@ -117,7 +137,9 @@ def _map_value(kind: str, place: str, value: Any, change: Change) -> Any:
         return value if own is None else change(NamedFile(place, kind, own.path, own.function))
     if kind == "data" and not (os.path.isabs(value) and os.path.isfile(value)):
         return value
-    if kind == "world" and not (place.endswith(".current_field") or _is_path(value)):
+    if kind == "world" and place.endswith(".current_field"):
+        kind = "field"
+    elif kind == "world" and not _is_path(value):
         return value
     return change(NamedFile(place, kind, value))
 
@@ -125,6 +147,84 @@ def _map_value(kind: str, place: str, value: Any, change: Change) -> Any:
 def _is_path(world: str) -> bool:
     """Whether a world is given as a file rather than by name."""
     return world.endswith((".yaml", ".yml")) or "/" in world or os.sep in world
+
+
+def copy_files(
+    settings: Mapping[str, Any], model: type[BaseModel]
+) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """All files that settings name, so that they can be moved together with the settings.
+
+    Args:
+        settings: nested plain values, with absolute paths.
+        model: as for `map_files`.
+
+    Returns:
+        The settings with relative paths, below `inputs/`; the contents of the files by these paths.
+        Files keep their names, after which robots and worlds may be called.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    copies: dict[str, bytes] = {}
+    names: dict[str, str] = {}
+
+    def name(file: NamedFile) -> str:
+        if file.path not in names:
+            found = file.contents()
+            taken = {path.casefold() for path in copies}
+            folders = itertools.chain(["inputs"], (f"inputs/{k}" for k in itertools.count(2)))
+            folder = next(
+                x for x in folders if taken.isdisjoint(f"{x}/{path}".casefold() for path in found)
+            )
+            copies.update({f"{folder}/{path}": content for path, content in found.items()})
+            names[file.path] = f"{folder}/{Path(file.path).name}"
+        return file.at(names[file.path])
+
+    return map_files(settings, name, model), copies
+
+
+def locate_files(settings: Any, places: Mapping[str, Path]) -> Any:
+    """Settings in which files have other paths.
+
+    Args:
+        settings: nested plain values; they stay as they are.
+        places: the new paths by the old ones, as from `copy_files`.
+    """
+    if isinstance(settings, Mapping):
+        return {key: locate_files(value, places) for key, value in settings.items()}
+    if isinstance(settings, list | tuple):
+        return [locate_files(value, places) for value in settings]
+    own = parse_user_function(settings)
+    path = own.path if own else settings
+    if not isinstance(path, str) or path not in places:
+        return settings
+    return f"{places[path]}:{own.function}" if own else str(places[path])
+
+
+def find_copies(folder: Path) -> dict[str, Path]:
+    """The copies of files that a run folder holds, by relative paths.
+
+    Args:
+        folder: the run folder. Its `run.json` lists them with their SHA-256; those of older runs
+            list none.
+
+    Raises:
+        InputError: a copy is no longer what the run began with.
+    """
+    try:
+        listed = json.loads((folder / "run.json").read_bytes()).get("inputs", {})
+    except (OSError, ValueError, AttributeError):  # told where the rest of it is needed
+        return {}
+    found = {}
+    for name, digest in listed.items() if isinstance(listed, dict) else ():
+        path = resolve_inside(name, folder)
+        # A missing one is told where it is used.
+        if path.is_file() and hashlib.sha256(read_file(path)).hexdigest() != digest:
+            raise InputError(
+                f"{folder / name}: expected the file that the run began with; found it changed"
+            )
+        found[name] = folder / name
+    return found
 
 
 # --- sections -------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import logging
 import os
 import pickle
 import queue
+import tempfile
 import threading
 import time
 from collections import deque
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 from mjx_revolve.evolution.block_executor import WorkerExecutor
 from mjx_revolve.evolution.fingerprints import find_difference
 from mjx_revolve.evolution.jobs import (
+    SCRATCH,
     Job,
     Limits,
     MakeFitness,
@@ -70,16 +72,17 @@ def _watched(seconds: float) -> Iterator[None]:
 
 
 @functools.lru_cache(maxsize=4)
-def _open(pickled: bytes) -> tuple[Any, deque[float]]:
-    """The fitness of a job, and the times of its last blocks [s]."""
+def _open(pickled: bytes) -> tuple[Any, deque[float], tempfile.TemporaryDirectory[str]]:
+    """The fitness of a job, the times of its last blocks [s], and the folder of its files."""
     os.environ["JAX_PLATFORMS"] = "cpu"  # before JAX is imported
     cache, cores = runtime.prepare_process(), runtime.list_cores()
     # Any core: so that XLA has one thread, as there is a process for each.
     runtime.prepare_worker(cores[0] if cores else None, str(cache) if cache else None)
     job: Job = pickle.loads(pickled)
-    fitness = open_job(job)
+    scratch = tempfile.TemporaryDirectory(prefix=SCRATCH)
+    fitness = open_job(job, scratch.name)
     compile_job(job, fitness)
-    return fitness, deque(maxlen=101)
+    return fitness, deque(maxlen=101), scratch
 
 
 def prepare(limits: Limits, pickled: bytes) -> tuple[dict[str, Any], dict[str, str]]:
@@ -99,7 +102,7 @@ def score(limits: Limits, pickled: bytes, block: Block, key: tuple[Any, str]) ->
     """Scores a block."""
     from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
 
-    fitness, times = _open(pickled)
+    fitness, times, _ = _open(pickled)
     with _watched(limits.patience(times)):
         began = time.perf_counter()
         result = evaluate_block(fitness, block, key_from_data(key))

@@ -109,7 +109,7 @@ def score_failed_block(path: str | Path, trust: bool = False) -> Scored:
         with reading(path):
             make = pkgutil.resolve_name(kept.make)
             job = Job(kept.config, kept.source, tuple(files), make, LIMITS)
-            fitness = open_job(job, Path(scratch))
+            fitness = open_job(job, scratch)
             block: list[Any] = [arrays["block0"]]
             if block[0].shape[1:] != (fitness.num_genes,) or block[0].dtype != np.float32:
                 raise InputError(
@@ -142,7 +142,7 @@ def _read(path: Path) -> tuple[_Kept, dict[str, Any]]:
         if missing := sorted(needed - arrays.keys()):
             raise InputError(f"expected an array {missing[0]}; found none")
         for name in kept.paths:  # a copy of each is written
-            if not name.isprintable() or Path(name).name in ("", ".."):
+            if not name.isprintable() or Path(name).name == "" or ".." in Path(name).parts:
                 raise InputError(f"paths: expected those of files; found {show(name)}")
     return kept, arrays
 

@@ -46,11 +46,15 @@ def plain_settings(config: Config) -> dict[str, Any]:
     return data
 
 
-def settings_hash(config: Config) -> str:
+def settings_hash(config: Config, by_path: bool = False) -> str:
     """Of all settings that may not change while a run goes on.
 
     Files count by their content, not by their path; so do the users' own tasks and controllers.
     The robot and the world have a fingerprint of their own (`model_hash`).
+
+    Args:
+        config: of the run.
+        by_path: whether current fields and data count by their path, as they did in older runs.
     """
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.episodes.settings import map_files
@@ -58,7 +62,9 @@ def settings_hash(config: Config) -> str:
     def by_content(file: NamedFile) -> str:
         if file.kind == "morphology":
             return hash_text(Path(file.path).read_text("utf-8"))
-        return content_name(file.text) if file.kind == "code" else file.text
+        if file.kind == "code":
+            return content_name(file.text)
+        return file.text if file.kind == "world" or by_path else file.digest()
 
     data = plain_settings(config)
     del data["morphology"], data["modules"]
@@ -106,8 +112,7 @@ def fitness_hash(config: Config) -> str:
     from mjx_revolve.episodes.settings import map_files
 
     def by_content(file: NamedFile) -> str:
-        digest = hashlib.sha256(Path(file.path).read_bytes()).hexdigest()
-        return f"{Path(file.path).name} {file.function} {digest}"
+        return f"{Path(file.path).name} {file.function} {file.digest()}"
 
     data = plain_settings(config)
     data["evolution"] = config.evolution.population_size

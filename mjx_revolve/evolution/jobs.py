@@ -5,20 +5,18 @@ Imports stand inside functions: a worker's threads are set before NumPy and JAX 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import statistics
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mjx_revolve.inputs.files import write_atomic
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.episodes.settings import NamedFile
 
 MakeFitness = Callable[["Config"], Any]
 """Makes a fitness: any object with `evaluate(*block, key)`.
@@ -54,6 +52,8 @@ class Limits:
 
 
 LIMITS = Limits()
+SCRATCH = "mjx_revolve_"
+"""The beginning of the names of workers' temporary folders."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,7 @@ class Job:
     Attributes:
         config: the configuration as JSON.
         source: what messages call it.
-        files: the files that it names, by path; a world or modules file stays where it is, because
-            it may refer to files beside it.
+        files: the files that it names, by the relative paths that it has for them.
         make_fitness: makes the fitness; pickled by its name.
         limits: how long to wait.
     """
@@ -102,41 +101,38 @@ def make_job(config: Config, make_fitness: MakeFitness | None = None) -> Job:
     Raises:
         ValueError: the function cannot be imported by its name.
     """
+    from mjx_revolve.episodes.config import Config
+    from mjx_revolve.episodes.settings import copy_files
+
     make = make_fitness or choose_fitness(config)
     name = function_name(make)
     if make.__module__ == "__main__" or "<" in name:
         raise ValueError(f"make_fitness: expected a function that can be imported; found {name}")
-    paths = dict.fromkeys(file.path for file in config.files if file.bundled)
-    files = tuple((path, Path(path).read_bytes()) for path in paths)
-    return Job(json.dumps(config.model_dump()), config.source, files, make, LIMITS)
+    settings, files = copy_files(config.model_dump(), Config)
+    return Job(json.dumps(settings), config.source, tuple(files.items()), make, LIMITS)
 
 
-def open_job(job: Job, scratch: Path | None = None) -> Any:
+def open_job(job: Job, scratch: str | Path) -> Any:
     """The fitness of a job.
 
     Args:
         job: the job.
-        scratch: an empty folder for copies of its files; None: one that is removed afterwards.
+        scratch: an empty folder for copies of its files, which users' functions may read later.
 
     Raises:
-        InputError: a file that its configuration names is missing or wrong here.
+        InputError: a file that its configuration names is wrong.
     """
-    from mjx_revolve.episodes.config import Config, make_config
-    from mjx_revolve.episodes.settings import map_files
+    from mjx_revolve.episodes.config import make_config
+    from mjx_revolve.episodes.settings import locate_files
 
-    with contextlib.ExitStack() as made:
-        folder = scratch or made.enter_context(tempfile.TemporaryDirectory(prefix="mjx_revolve_"))
-        copies = {}
-        for number, (path, content) in enumerate(job.files):
-            copies[path] = Path(folder) / str(number) / Path(path).name
-            copies[path].parent.mkdir()
-            copies[path].write_bytes(content)
-
-        def move(file: NamedFile) -> str:
-            return file.at(copies.get(file.path, file.path))
-
-        settings = map_files(json.loads(job.config), move, Config)
-        return job.make_fitness(make_config(settings, "/", source=job.source))
+    places = {}
+    for number, (name, content) in enumerate(job.files):
+        # Older blocks that were given up have absolute paths.
+        own = f"{number}/{Path(name).name}" if Path(name).is_absolute() else name
+        places[name] = Path(scratch) / own
+        write_atomic(places[name], content)
+    settings = locate_files(json.loads(job.config), places)
+    return job.make_fitness(make_config(settings, "/", source=job.source))
 
 
 def compile_job(job: Job, fitness: Any) -> None:

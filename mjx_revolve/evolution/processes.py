@@ -27,6 +27,7 @@ from typing import IO, TYPE_CHECKING, Any, NoReturn
 from mjx_revolve.evolution.block_executor import WorkerExecutor
 from mjx_revolve.evolution.fingerprints import find_difference
 from mjx_revolve.evolution.jobs import (
+    SCRATCH,
     MakeFitness,
     WorkerError,
     compile_job,
@@ -84,8 +85,8 @@ def _work(channel: Connection) -> None:
         from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
         from mjx_revolve.evolution.fingerprints import identify
 
-        job = channel.recv()
-        fitness = open_job(job)
+        job, scratch = channel.recv()
+        fitness = open_job(job, scratch)
         compile_job(job, fitness)
         if core is not None:
             runtime.pin_process([core])
@@ -196,6 +197,8 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
             WorkerError: the system refuses to start so many.
         """
         self.workers: list[LocalWorker] = []
+        # Theirs, kept here, as they are killed.
+        self._scratch = tempfile.TemporaryDirectory(prefix=SCRATCH)
         self._cache = cache
         self._times: deque[float] = deque(maxlen=101)
         self._false_starts = 0
@@ -207,7 +210,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
                 self.workers.append(LocalWorker(core, cache))
             job = make_job(config, make_fitness)
             for worker in self.workers:
-                worker.send(job)
+                worker.send((job, self._scratch.name))
             super().__init__(config, job)
         except BaseException as error:
             begun = len(self.workers)
@@ -280,7 +283,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         except OSError as error:
             self._dismiss(worker, describe_error(error))
         else:
-            another.send(self.job)
+            another.send((self.job, self._scratch.name))
             self.workers[self.workers.index(worker)] = another
         return [] if worker.block is None else [(worker.block, how)]
 
@@ -299,3 +302,4 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
             worker.process.kill()
         while self.workers:
             self.workers.pop().end()
+        self._scratch.cleanup()

@@ -37,7 +37,7 @@ from mjx_revolve.evolution.run_folder import (
 )
 from mjx_revolve.evolution.tensorboard import TensorBoardLog, check_tensorboard
 from mjx_revolve.inputs.commands import check_place
-from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import with_path
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.user_code import announce
@@ -158,8 +158,23 @@ class Run:
                 run.
             WorkerError: workers cannot be started.
         """
-        label = f"--resume {folder}"
         files = open_run_folder(folder)
+        try:
+            return cls._reopen(files, f"--resume {folder}", path, settings, make_executor)
+        except BaseException:
+            files.abandon()
+            raise
+
+    @classmethod
+    def _reopen(
+        cls,
+        files: RunFolder,
+        label: str,
+        path: str | None,
+        settings: Sequence[str],
+        make_executor: MakeExecutor,
+    ) -> Run:
+        """A run of a folder that is locked; see `resume`."""
         old = files.load_config()
         earlier = files.info.get("settings", [])
         if path is None:
@@ -176,7 +191,8 @@ class Run:
             _log.warning("passed over a damaged checkpoint: %s", name)
         begun = checkpoint.meta if checkpoint else files.info
         settled = settings_hash(config)
-        if begun.get("settings_hash", settled) != settled:  # an older version's run.json has none
+        known = begun.get("settings_hash", settled)  # an older version's run.json has none
+        if known not in (settled, settings_hash(config, by_path=True)):
             raise InputError(
                 f"{label}: expected the config.yaml that it began with; found it changed"
             )
@@ -376,6 +392,12 @@ def _prepare(config: Config, make_executor: MakeExecutor) -> Executor:
             announce(file.text)
     executor = make_executor(config)
     fitness = executor.fitness
+    if isinstance(fitness, Fitness) and not fitness.engine.plant.num_actuators:
+        name = show(fitness.robot.morphology.name)
+        raise InputError(
+            f"{config.source}: morphology: expected a robot with hinges or thrusters, as its "
+            f"controller is to evolve; found none in {name}"
+        )
     genotype = fitness.genotype if isinstance(fitness, BodyFitness) else None
     check_memory(config, executor.num_genes, genotype)
     return executor
@@ -403,16 +425,18 @@ def check_unchanged(old: Config, new: Config, label: str) -> None:
     Raises:
         InputError: they differ in more than `FREE_SETTINGS`.
     """
-    known = {file.place: file for file in old.files}
+    known: dict[str, NamedFile] = {}
+    settings = map_files(
+        plain_settings(old), lambda file: known.setdefault(file.place, file).text, Config
+    )
 
     def same(file: NamedFile) -> str:
         before = known.get(file.place)
-        if before is None or before.function != file.function or not file.bundled:
+        if before is None or before.function != file.function:
             return file.text
-        equal = Path(before.path).read_bytes() == Path(file.path).read_bytes()
-        return before.text if equal else file.text
+        return before.text if before.digest() == file.digest() else file.text
 
-    found = _differences(plain_settings(old), map_files(plain_settings(new), same, Config))
+    found = _differences(settings, map_files(plain_settings(new), same, Config))
     if found:
         more = f" (and {len(found) - 1} more)" if found[1:] else ""
         free = f"evolution.{', '.join(FREE_SETTINGS)}"

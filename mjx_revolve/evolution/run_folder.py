@@ -1,7 +1,8 @@
 """The run folder: everything that an evolution writes to disk.
 
-    config.yaml        the resolved configuration; inputs/ holds the robot, and code, that it names
-    run.json           versions, seed, arguments, platform, thread settings, times
+    config.yaml        the resolved configuration
+    inputs/            copies of all files that it names: robots, modules, world, code, data
+    run.json           versions, seed, arguments, platform, threads, times, hashes of the copies
     metrics.csv        one line per generation (RFC 4180), readable while the run goes on
     checkpoints/       the newest few, one npz each
     individuals.jsonl  where bodies evolve: one line for each individual, at birth and after
@@ -17,6 +18,8 @@ moved there. The reader is `episodes.run_reader`.
 from __future__ import annotations
 
 import csv
+import errno
+import hashlib
 import io
 import json
 import math
@@ -31,7 +34,7 @@ import numpy as np
 import yaml
 
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.episodes.config import Config, dump_config
+from mjx_revolve.episodes.config import Config, dump_config, make_config
 from mjx_revolve.episodes.individual_log import (
     EVENTS,
     GENERATIONS,
@@ -40,10 +43,10 @@ from mjx_revolve.episodes.individual_log import (
     find_individuals,
 )
 from mjx_revolve.episodes.run_reader import Checkpoint, DamageError, RunReader, generation_of
-from mjx_revolve.episodes.settings import NamedFile
+from mjx_revolve.episodes.settings import copy_files, locate_files
 from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.inputs.errors import InputError, reading, show
-from mjx_revolve.inputs.files import resolve_inside, with_path, write_atomic
+from mjx_revolve.inputs.files import check_path, resolve_inside, with_path, write_atomic
 
 try:
     import fcntl
@@ -66,24 +69,27 @@ class RunFolder(RunReader):
     """
 
     _lock: IO[str] | None = field(default=None, repr=False)
+    _made_lock: bool = field(default=False, repr=False)
 
     # --- plain files ---
 
     def update_info(self, **changes: Any) -> None:
         """Sets entries of `run.json`; None removes one."""
         info = (self.info if (self.path / "run.json").exists() else {}) | changes
-        info = {key: value for key, value in info.items() if value is not None}
-        text = json.dumps(info, indent=2, ensure_ascii=False) + "\n"
-        write_atomic(self.path / "run.json", text.encode())
+        self.write("run.json", _info_text(info))
 
     def save_config(self, config: Config) -> None:
         """Writes `config.yaml`, paths inside the folder relative to it."""
-        head = "# The resolved configuration of this run; it loads again as it stands.\n"
-        text = head + dump_config(config, self.path)
-        write_atomic(self.path / "config.yaml", text.encode())
+        self.write("config.yaml", _config_text(config, self.path))
 
     def write(self, name: str, content: bytes | Callable[[Path], None]) -> Path:
-        """Writes any file below the folder, whole or not at all, and returns its path."""
+        """Writes any file below the folder, whole or not at all, and returns its path.
+
+        Raises:
+            OSError: the disk is full, or the folder was removed: it is not made anew in parts.
+        """
+        if not (self.path / "config.yaml").exists():
+            raise OSError(errno.ENOENT, "the run folder was removed", str(self.path))
         write_atomic(self.path / name, content)
         return self.path / name
 
@@ -143,8 +149,8 @@ class RunFolder(RunReader):
         named: dict[str, Any] = {f"array:{name}": value for name, value in arrays.items()}
         buffer = io.BytesIO()
         np.savez(buffer, meta=np.frombuffer(text.encode(), np.uint8), **named)
-        path = self.path / "checkpoints" / f"generation_{generation:06d}.npz"
-        write_atomic(path, buffer.getvalue())
+        name = f"checkpoints/generation_{generation:06d}.npz"
+        path = self.write(name, buffer.getvalue())
         for old in self.checkpoints()[keep:]:
             old.unlink(missing_ok=True)
         return path
@@ -222,6 +228,24 @@ class RunFolder(RunReader):
             self._lock.close()
             self._lock = None
 
+    def abandon(self) -> None:
+        """Closes it as it was found: without a lock file that was not there before."""
+        if self._made_lock:
+            (self.path / ".lock").unlink(missing_ok=True)
+        self.close()
+
+
+def _info_text(info: Mapping[str, Any]) -> bytes:
+    """The text of `run.json`; entries that are None are left out."""
+    kept = {key: value for key, value in info.items() if value is not None}
+    return (json.dumps(kept, indent=2, ensure_ascii=False) + "\n").encode()
+
+
+def _config_text(config: Config, folder: Path) -> bytes:
+    """The text of `config.yaml`."""
+    head = "# The resolved configuration of this run; it loads again as it stands.\n"
+    return (head + dump_config(config, folder)).encode()
+
 
 def _number(value: float) -> str:
     """Few digits, but enough to read the same float32 back."""
@@ -256,7 +280,7 @@ def load_archive(folder: str | Path) -> tuple[Archive, list[LoggedIndividual]]:
     Raises:
         InputError: it is no run folder, or has no archive yet.
     """
-    run = RunFolder(Path(folder))
+    run = RunFolder(check_path(folder))
     arrays = run.load_checkpoint().arrays
     own = {k.removeprefix("archive."): v for k, v in arrays.items() if k.startswith("archive.")}
     if not own:
@@ -300,9 +324,8 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
 
     Args:
         folder: a new or empty folder.
-        config: the configuration. Its morphology, and the files of a task or controller of the
-            user's own, are copied into the folder, so that the run can be moved and still be read;
-            a world or modules file stays where it is, because it may refer to files beside it.
+        config: the configuration. All files that it names are copied into the folder, so that the
+            run can be moved, and depends on nothing else.
         **info: entries for `run.json`.
 
     Returns:
@@ -321,28 +344,16 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
         (folder / "checkpoints").mkdir(exist_ok=True)
     except OSError as error:
         raise with_path(error, folder) from None
-    config = _copy_files(config, folder / "inputs")
-    run.update_info(**info)
-    run.save_config(config)  # last: where it is, the run can be continued
+    settings, copies = copy_files(config.model_dump(), Config)
+    for name, content in copies.items():
+        write_atomic(folder / name, content)
+    places = {name: folder / name for name in copies}
+    config = make_config(locate_files(settings, places), source=config.source)
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in copies.items()}
+    write_atomic(folder / "run.json", _info_text(info | {"inputs": hashes}))
+    # Last: where it is, the run can be continued.
+    write_atomic(folder / "config.yaml", _config_text(config, folder))
     return run, config
-
-
-def _copy_files(config: Config, folder: Path) -> Config:
-    """Keeps the files that can be copied alone, and names the copies."""
-    copies: dict[str, Path] = {}
-
-    def keep(file: NamedFile) -> str:
-        if file.kind not in ("morphology", "code"):
-            return file.text
-        copy = folder / Path(file.path).name
-        if file.path not in copies and copy in copies.values():  # two files of one name
-            own = file.place.partition(".")[0] if file.kind == "code" else len(copies)
-            copy = folder / f"{own}_{copy.name}"
-        if file.path not in copies:
-            write_atomic(copy, Path(file.path).read_bytes())
-        return file.at(copies.setdefault(file.path, copy))
-
-    return config.with_files(keep)
 
 
 def open_run_folder(folder: str | Path) -> RunFolder:
@@ -360,6 +371,9 @@ def open_run_folder(folder: str | Path) -> RunFolder:
     folder = Path(folder).absolute()
     if not folder.is_dir():
         found = "a file" if folder.exists() else "none"
+        raise InputError(f"{folder}: expected a run folder; found {found}")
+    if (folder / ".lock").exists() and is_new_folder(folder):
+        found = "one that was not begun; begin it with --out"
         raise InputError(f"{folder}: expected a run folder; found {found}")
     for name in ("config.yaml", "run.json"):
         if not (folder / name).is_file():
@@ -387,6 +401,7 @@ def _lock_run(folder: Path) -> RunFolder:
     """Keeps a second process from writing the same folder; the lock dies with the process."""
     if fcntl is None:
         return RunFolder(folder)
+    made = not (folder / ".lock").exists()
     try:
         lock = open(folder / ".lock", "a", encoding="utf-8")  # noqa: SIM115  (kept open)
     except OSError as error:
@@ -398,4 +413,7 @@ def _lock_run(folder: Path) -> RunFolder:
         raise InputError(f"{folder}: expected a run that has stopped; found it running") from None
     except OSError:  # a file system without locks
         pass
-    return RunFolder(folder, lock)
+    if os.fstat(lock.fileno()).st_nlink == 0:  # removed meanwhile by another that gave up
+        lock.close()
+        return _lock_run(folder)
+    return RunFolder(folder, lock, made)

@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.files import check_path
 from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.inputs.terminal import spell_unencodable
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -39,6 +40,10 @@ def read_path(text: str) -> str:
     """Reads a path, for `add_argument(type=read_path)`: refuses what an unset variable leaves."""
     if not text.strip():
         raise argparse.ArgumentTypeError(f"expected a path; found {text!r}")
+    try:
+        check_path(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     return text
 
 
@@ -240,6 +245,12 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         reason = str(error).partition("\n")[0].removeprefix("RESOURCE_EXHAUSTED:").strip()
         print(f"error: too little memory: {reason or 'none is left'}", file=sys.stderr)
         return 1
+    finally:
+        # From here on Ctrl-C ends the process at once; what JAX does at its end would be cut short
+        # by a traceback.
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        early_sigint.running = False
 
 
 def describe_refusal(error: OSError) -> str:

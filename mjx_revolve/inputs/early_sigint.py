@@ -7,7 +7,7 @@ import signal
 import sys
 from types import FrameType
 
-# Set by `run_command` once it can turn a KeyboardInterrupt into a line.
+# Set by `run_command` as long as it can turn a KeyboardInterrupt into a line.
 running = False
 # Whether Ctrl-C came: compiled code may turn a KeyboardInterrupt into another exception.
 interrupted = False
@@ -23,7 +23,7 @@ def watch_imports() -> None:
 
 
 def on_sigint(number: int, frame: FrameType | None) -> None:
-    """Raises KeyboardInterrupt; during imports, which may lose it, ends the process instead."""
+    """Raises KeyboardInterrupt; during imports, which may lose it, and after a command it exits."""
     global interrupted
     if not running or _is_importing(frame):
         os.write(2, b"interrupted\n")

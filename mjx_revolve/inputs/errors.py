@@ -18,6 +18,9 @@ _MAX_VALUE = 200
 _LONG = re.compile(
     rf"(?<![^\s(\[])(['\"])(?:(?!\1).){{{_MAX_VALUE},}}\1(?!\w)|\S{{{2 * _MAX_VALUE},}}"
 )
+# The longest message that is not shortened [characters], and lists of many names in longer ones.
+_MAX_MESSAGE = 400
+_MANY = re.compile(r"(?:[\w.:/-]+, ){9,}")
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
 
@@ -35,15 +38,23 @@ def _cut(match: re.Match[str]) -> str:
     return f"{match[0][:half]}…{match[0][-half:]}"
 
 
+def _leave_out(match: re.Match[str]) -> str:
+    """The first names of many."""
+    names = match[0].removesuffix(", ").split(", ")
+    return f"{', '.join(names[:5])}, … ({len(names) - 5} more), "
+
+
 class InputError(ValueError):
     """A user's input is wrong; the message says where, what was expected and what was found.
 
-    Names in it may come from a stranger's files: it is one printable line, long values are cut.
+    Names in it may come from a stranger's files: it is one printable line; long values are cut, and
+    so are lists of names in a long message.
     """
 
     def __init__(self, message: object = "") -> None:
         """Takes the message."""
-        super().__init__(_LONG.sub(_cut, plain(str(message))))
+        text = _LONG.sub(_cut, plain(str(message)))
+        super().__init__(_MANY.sub(_leave_out, text) if len(text) > _MAX_MESSAGE else text)
 
 
 class ConstraintError(ValueError):

@@ -3,14 +3,55 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, reading, show
 
 PAGES = (".html", ".htm")
 """Suffixes of pages for browsers."""
+
+
+def check_path(path: object) -> Path:
+    """A path that a user gave from Python.
+
+    Raises:
+        InputError: it is neither text nor path, or one that no file can have.
+    """
+    if not isinstance(path, str | Path):
+        raise InputError(f"expected a path; found {show(path)}")
+    try:
+        os.stat(path)
+    except ValueError:
+        raise InputError(
+            f"{str(path)!r}: expected a path; found characters that none has"
+        ) from None
+    except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+            raise InputError(f"{path}: expected a path; found: {error.strerror}") from None
+    return Path(path)
+
+
+def read_file(path: str | Path, most: int | None = None) -> bytes:
+    """The content of a file; never waits for a pipe.
+
+    Args:
+        path: of the file.
+        most: bytes to read; None: all.
+
+    Raises:
+        InputError: it is missing, no regular file, or not readable.
+    """
+    path = check_path(path)
+    with reading(path):
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise InputError("expected a file; found a pipe or a device")
+        with open(path, "rb") as file:
+            return file.read(-1 if most is None else most)
 
 
 def check_name(path: str | Path, endings: Sequence[str], label: str | None = None) -> Path:

@@ -5,10 +5,12 @@ They lie at the top of a checkout, and inside an installed package.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Literal
 
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.files import check_path
 
 Kind = Literal["configs", "morphologies"]
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -43,9 +45,10 @@ def find_shipped(
         The path; unchanged if it has a folder or a suffix, so that the reader reports its errors.
 
     Raises:
-        InputError: there is neither such a file nor such a name.
+        InputError: there is neither such a file nor such a name, or it is no path.
     """
-    path = Path(path)
+    with reading(label) if label else contextlib.nullcontext():
+        path = check_path(path)
     here = folder / path
     if here.is_file() or path.suffix or len(path.parts) != 1:
         return here

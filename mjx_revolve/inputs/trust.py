@@ -79,11 +79,13 @@ def opening(*places: str | Path, trust: bool) -> contextlib.AbstractContextManag
     if trust:
         return remembering()
     roots = [_root_of(Path(place)) for place in places]
+    # Genes outside of all run folders may name any run's configuration: that run is opened, too. A
+    # run's own champion may not, or it would show another run as its own.
+    own = any(Path(place).is_file() and not _belongs_to_run(Path(place)) for place in places)
 
     def check(path: Path, kind: Kind, content: bytes) -> None:
         real = path.resolve()
-        if kind == "data" and is_run_config(real):
-            # Genes of one's own may name any run's configuration: that run is opened, too.
+        if own and kind == "data" and is_run_config(real):
             roots.append(real.parent)
         inside = any(real.is_relative_to(root) for root in roots)
         if is_shipped(real) or (kind == "data" and inside) or _is_known(kind, content):
@@ -126,6 +128,12 @@ def _root_of(place: Path) -> Path:
     # Any other folder's parent may hold a configuration that has nothing to do with it.
     inner = base.name in ("champion", "lost") and not (base / "config.yaml").is_file()
     return base.parent if inner and (base.parent / "config.yaml").is_file() else base
+
+
+def _belongs_to_run(file: Path) -> bool:
+    """Whether a file is one of a run folder's, even if that has lost its configuration."""
+    folder = file.resolve().parent
+    return folder.name == "champion" or (folder / "config.yaml").is_file()
 
 
 def _digest(kind: Kind, content: bytes) -> str:

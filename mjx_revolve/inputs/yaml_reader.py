@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from mjx_revolve.inputs.errors import InputError, reading, show
+from mjx_revolve.inputs.files import read_file
 from mjx_revolve.inputs.trust import audit
 
 # Revolve's deepest evolved robots stay below 60 levels of YAML; Python's own recursion limit is
@@ -134,11 +135,9 @@ def load_yaml(path: str | Path) -> Any:
         InputError: the file is missing, unreadable, no valid YAML, nested too deeply, or repeats a
             key.
     """
-    with reading(path):
-        with open(path, "rb") as file:
-            content = file.read(_MAX_BYTES + 1)
-        if len(content) > _MAX_BYTES:
-            raise InputError(f"expected at most {_MAX_BYTES // 10**6} MB of YAML; found more")
+    content = read_file(path, _MAX_BYTES + 1)
+    if len(content) > _MAX_BYTES:
+        raise InputError(f"{path}: expected at most {_MAX_BYTES // 10**6} MB of YAML; found more")
     audit(path, "data", content)
     with reading(path):
         text = content.decode("utf-8")

@@ -19,7 +19,7 @@ from annotated_types import Ge, Le, Unit
 from pydantic import BeforeValidator
 
 from mjx_revolve.inputs.errors import ConstraintError, InputError, reading
-from mjx_revolve.inputs.files import resolve_inside
+from mjx_revolve.inputs.files import check_path, read_file, resolve_inside
 from mjx_revolve.inputs.schema import NonNegative, Number, Triple, Vector, checked, words
 from mjx_revolve.inputs.trust import audit
 
@@ -286,11 +286,8 @@ def load_current_field(path: str | Path) -> CurrentField:
     Raises:
         InputError: it cannot be read or is no full grid; the message names file and place.
     """
-    path = Path(path)
-    if path.is_file():
-        with reading(path):
-            content = path.read_bytes()
-        audit(path, "data", content)
+    path = check_path(path)
+    audit(path, "data", read_file(path))
     with reading(path):
         if path.suffix.lower() == ".npz":
             return _read_arrays(path)

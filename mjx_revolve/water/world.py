@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import yaml
 from annotated_types import Ge, Le, MinLen, Unit
 from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 
 from mjx_revolve.inputs.errors import ConstraintError, InputError, reading, show
+from mjx_revolve.inputs.files import check_path, read_file
 from mjx_revolve.inputs.schema import (
     Boolean,
     NonNegative,
@@ -208,7 +210,8 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     """
     shipped = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
     if not isinstance(name, str | Path):
-        raise InputError(f"world: expected a name or a path; found {name!r}")
+        raise InputError(f"world: expected a name or a path; found {show(name)}")
+    check_path(name)
     path = _FOLDER / f"{name}.yaml" if str(name) in shipped else Path(name)
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         raise InputError(
@@ -232,3 +235,31 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     with reading(f"world {world.name}"):
         world = read(World, fields | {"current_field": world.current_field} | overrides)
     return world
+
+
+def read_world_files(path: str | Path) -> dict[str, bytes]:
+    """The files that a world is made of, so that they can be moved together.
+
+    Args:
+        path: of the world's YAML.
+
+    Returns:
+        Contents by paths relative to a common folder: the YAML, and the file of its current field.
+        A field that lies elsewhere is put beside the YAML, which then names it there.
+
+    Raises:
+        InputError: one of them cannot be read.
+    """
+    path = Path(path)
+    content, data = read_file(path), load_yaml(path)
+    named = data.get("current_field") if isinstance(data, dict) else None
+    if not isinstance(named, str) or not named:
+        return {path.name: content}
+    with reading(path):
+        field = read_file(find_field(named, path.parent))
+    beside = Path(named)
+    if beside.is_absolute() or ".." in beside.parts:
+        beside = Path(beside.name)
+        data["current_field"] = beside.name
+        content = yaml.safe_dump(data, sort_keys=False, allow_unicode=True).encode()
+    return {path.name: content, beside.as_posix(): field}

@@ -468,6 +468,10 @@ def _drop(*keys):
             "modules.Fin.parts.1: expected one of size and boxes; found both or neither",
         ),
         (
+            _changed(_set("Fin", "parts", 1, {"boxes": [{"size": [1, 1, 1]}] * 101, "mass": 1})),
+            "modules.Fin.parts.1.boxes: expected a list of 1 to 100 boxes",
+        ),
+        (
             _changed(_set("Fin", "parts", 1, "lift_drag", {"clap": 1})),
             "modules.Fin.parts.1.lift_drag.clap: expected one of a0, cla, cda",
         ),

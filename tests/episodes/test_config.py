@@ -60,7 +60,9 @@ def test_it_is_frozen(folder):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("task.duration=abc", "--set task.duration: expected a number > 0 [s]; found 'abc'"),
+        ("task.duration=abc", "--set task.duration: expected a number > 0 and <= 86400 [s]; found "
+         "'abc'"),
+        ("task.duration=1e9", "task.duration: expected a number > 0 and <= 86400 [s]; found 1"),
         ("task.settle=10", "task.settle: expected a time below task.duration (10 s); found 10"),
         ("task.trials=0", "task.trials: expected a whole number >= 1; found 0"),
         ("task.type=swim", f"task.type: expected one of {', '.join(config.TASKS)}, or "
@@ -125,7 +127,7 @@ def test_wrong_settings(folder, setting, message):
         ("world: lake\ntask: {type: speed}", "bad.yaml: morphology: expected the path of a "
          "morphology YAML, or bodies: how they evolve; found nothing"),
         (GOOD + "bodies: {genotype: tree}", "bad.yaml: morphology: expected none, as bodies ev"),
-        (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0 [s]; found -3"),
+        (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0 and <="),
         (GOOD + "  2: 3", "bad.yaml: task.2: expected the name of a setting"),
         (GOOD + "3: 3", "bad.yaml: 3: expected the name of a setting"),
         (GOOD + "world: lake", "bad.yaml: line 6: expected each key once; found 'world' twice"),
@@ -160,8 +162,8 @@ def test_missing_file(folder):
 
 def test_several_problems_are_one_line(folder):
     check_message(
-        "--set task.duration: expected a number > 0 [s]; found -1 (and 2 more: task.trials, "
-        "evolution.seed)",
+        "--set task.duration: expected a number > 0 and <= 86400 [s]; found -1 (and 2 more: "
+        "task.trials, evolution.seed)",
         lambda: load_config(
             folder / "good.yaml", ["task.duration=-1", "task.trials=0", "evolution.seed=-1"]
         ),

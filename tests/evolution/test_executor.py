@@ -35,6 +35,7 @@ from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.numerics import runtime
+from mjx_revolve.water.world import load_world
 from toys import contents, wait_for
 
 KEY = jax.random.key(1)
@@ -223,22 +224,35 @@ def test_blocks_of_bodies(tmp_path):
 # --- jobs ---
 
 
-def test_a_job_takes_robot_and_code_along(tmp_path):
+def test_a_job_takes_all_files_along(tmp_path):
     """So that workers elsewhere, and those that replace others, see what the run began with."""
+    (tmp_path / "sea.yaml").write_text("current_field: river.csv\n")
+    (tmp_path / "river.csv").write_text("x,y,z,u,v,w\n0,0,0,1,0,0\n")
+    (tmp_path / "grid.bin").write_bytes(b"grid")
     (tmp_path / "mine.py").write_text("def stay(track, settings):\n    return track.time[0]\n")
     config = load_config(
-        toys.write_config(tmp_path / "toy.yaml"), [f"task.type={tmp_path / 'mine.py'}:stay"]
+        toys.write_config(tmp_path / "toy.yaml"),
+        [
+            f"task.type={tmp_path / 'mine.py'}:stay",
+            f"world={tmp_path / 'sea.yaml'}",
+            f"task.params.grid={tmp_path / 'grid.bin'}",
+        ],
     )
     job = make_job(config, read_back)
-    for name in ("mine.py", "robot.yaml"):
+    for name in ("mine.py", "robot.yaml", "sea.yaml", "river.csv", "grid.bin"):
         (tmp_path / name).unlink()
-    assert open_job(job) == ("id: robot\n", "def stay(track, settings):")
+    found = open_job(job, tmp_path / "scratch")
+    assert found == ("id: robot\n", "def stay(track, settings):", "sea", b"grid")
 
 
 def read_back(config):
     path, _, function = config.task.type.rpartition(":")
     assert function == "stay"
-    return Path(config.morphology).read_text(), Path(path).read_text().splitlines()[0]
+    world = load_world(config.world_name)
+    assert world.current_field is not None
+    code = Path(path).read_text().splitlines()[0]
+    grid = Path(config.task.params["grid"]).read_bytes()
+    return Path(config.morphology).read_text(), code, world.name, grid
 
 
 @pytest.fixture

@@ -54,6 +54,35 @@ def heard():
         signal.signal(number, signal.SIG_IGN)
 
 
+ENDING = """
+import atexit, sys, time
+
+from mjx_revolve.inputs.commands import run_command
+
+
+def leave():
+    print("leaving", flush=True)
+    time.sleep(60)
+
+
+atexit.register(leave)
+sys.exit(run_command(lambda argv: 0))
+"""
+
+
+def test_ctrl_c_while_the_process_ends_is_no_traceback(tmp_path):
+    """As where JAX clears its caches."""
+    (tmp_path / "mjx-revolve").write_text(ENDING)
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "mjx-revolve")], text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": PATH},
+    )  # fmt: skip
+    toys.read_until(process, "leaving")
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (130, "interrupted\n")
+
+
 @pytest.fixture
 def folder(tmp_path):
     """A configuration that saves nothing by itself."""

@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 import zlib
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -15,14 +16,20 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
+from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.episodes.champion import load_genes
-from mjx_revolve.episodes.config import load_config, make_config
+from mjx_revolve.episodes.config import load_config, make_config, override_config
+from mjx_revolve.episodes.fitness import make_fitness
 from mjx_revolve.evolution import run_folder as runs
+from mjx_revolve.evolution.fingerprints import settings_hash
+from mjx_revolve.evolution.run import _prepare, check_unchanged
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.numerics import runtime
 from mjx_revolve.view.convergence import plot_fitness
 from mjx_revolve.view.motion_plots import plot_trajectory
 from mjx_revolve.view.plots import figure_png
+from mjx_revolve.water.world import load_world
 
 ARRAYS = {
     "state['algorithm'].mean": np.arange(5, dtype=np.float32),
@@ -57,15 +64,89 @@ def save(run, generation, keep=3):
 def test_new_folder(tmp_path, config):
     run, own = runs.create_run_folder(tmp_path / "a" / "run", config, seed=3, model_hash="ab")
     assert own.morphology == str(tmp_path / "a" / "run" / "inputs" / "robot.yaml")
-    assert run.info == {"seed": 3, "model_hash": "ab"}
-    assert "morphology: inputs/robot.yaml" in (run.path / "config.yaml").read_text()
+    copies = run.info.pop("inputs")
+    assert run.info == {"seed": 3, "model_hash": "ab", "inputs": copies}
+    assert list(copies) == ["inputs/robot.yaml"]
     run.close()
-    # The folder can be moved, and the original may go.
-    (tmp_path / "robot.yaml").unlink()
+
+
+@pytest.mark.parametrize("elsewhere", [False, True], ids=["beside", "elsewhere"])
+def test_a_run_folder_is_whole(tmp_path, monkeypatch, elsewhere):
+    """All that a configuration names is copied; the folder moves, and the originals may go."""
+    monkeypatch.chdir(tmp_path)
+    mine = tmp_path / "mine"
+    for name in ("mine/fields", "mine/twin", "sea"):
+        (tmp_path / name).mkdir(parents=True)
+    field = "x,y,z,u,v,w\n0,0,0,1,0,0\n1,0,0,2,0,0\n"
+    place = "sea" if elsewhere else "mine/fields"
+    (tmp_path / place / "river.csv").write_text(field)
+    named = tmp_path / "sea/river.csv" if elsewhere else "fields/river.csv"
+    (mine / "sea.yaml").write_text(f"density: 1030.0\ncurrent_field: {named}\n")
+    types = "modules: {M: {mount: null, parts: [{size: [.1, .1, .1], mass: .5}], slots: {1: +y}}}"
+    (mine / "types.yaml").write_text(types)
+    (mine / "own.py").write_text("def swim(track, settings): return 0.0\n")
+    (mine / "grid.bin").write_bytes(b"\0\1")
+    for name in ("robot.yaml", "twin/robot.yaml"):
+        (mine / name).write_text(f"body: {{type: Core, id: {name[0]}}}\n")
+    params = {"grid": str(mine / "grid.bin"), "words": "inputs", "list": [str(mine / "grid.bin")]}
+    config = make_config(
+        {"modules": "types.yaml", "world": "sea.yaml",
+         "task": {"type": "own.py:swim", "params": params},
+         "bodies": {"seeds": ["robot.yaml", "twin/robot.yaml"]}},
+        mine,
+    )  # fmt: skip
+    world, began = load_world(config.world_name), settings_hash(config)
+    run, own = runs.create_run_folder(tmp_path / "run", config)
+    run.close()
+    text = (run.path / "config.yaml").read_text()
+    assert str(tmp_path) not in text
+    check_unchanged(own, config, "--resume")
     os.rename(run.path, tmp_path / "moved")
-    with_moved = runs.open_run_folder(tmp_path / "moved")
-    assert with_moved.load_config().task.type == "speed"
-    with_moved.close()
+    shutil.rmtree(mine)
+    shutil.rmtree(tmp_path / "sea")
+    moved = load_config(tmp_path / "moved" / "config.yaml")
+    assert all(file.path.startswith(str(tmp_path / "moved" / "inputs")) for file in moved.files)
+    assert len({file.path for file in moved.files}) == len(moved.files) - 1  # the grid, twice
+    assert load_world(moved.world_name) == world and world.current_field is not None
+    assert load_modules(moved.modules)
+    assert [load_yaml(seed)["body"]["id"] for seed in moved.bodies.seeds] == ["r", "t"]
+    assert Path(moved.task.params["grid"]).read_bytes() == b"\0\1"
+    assert moved.task.params["words"] == "inputs"
+    assert settings_hash(moved) == began
+    # A copy that was edited is not taken for what the run began with.
+    copy = tmp_path / "moved" / "inputs" / "sea.yaml"
+    copy.write_text(copy.read_text().replace("1030", "1000"))
+    with pytest.raises(InputError, match=r"sea.yaml: expected the file that the run began with"):
+        load_config(tmp_path / "moved" / "config.yaml")
+
+
+def test_a_world_mapping_keeps_its_field(tmp_path, config):
+    (tmp_path / "river.csv").write_text("x,y,z,u,v,w\n0,0,0,1,0,0\n")
+    river = {"world.current_field": str(tmp_path / "river.csv")}
+    run, own = runs.create_run_folder(tmp_path / "run", override_config(config, river))
+    run.close()
+    assert own.world == {"name": "lake", "current_field": str(run.path / "inputs" / "river.csv")}
+    assert settings_hash(own) == settings_hash(override_config(config, river))
+    # Runs of older versions counted its path.
+    by_path = settings_hash(own, by_path=True)
+    assert by_path != settings_hash(override_config(config, river), by_path=True)
+
+
+def test_older_run_folders_open(tmp_path, config):
+    """They name a world of the user's by its absolute path, and have no hashes of copies."""
+    (tmp_path / "sea.yaml").write_text("density: 1030.0\n")
+    run, _ = runs.create_run_folder(tmp_path / "run", config)
+    run.save_config(override_config(run.load_config(), {"world": str(tmp_path / "sea.yaml")}))
+    run.update_info(inputs=None)
+    run.close()
+    (run.path / "inputs" / "robot.yaml").write_text("id: edited\n")
+    assert load_world(run.load_config().world_name).density == 1030.0
+
+
+def test_a_robot_that_nothing_moves_does_not_evolve():
+    config = load_config("smoke", {"morphology": "core"})
+    with pytest.raises(InputError, match=r"expected a robot with hinges or thrusters.*found none"):
+        _prepare(config, lambda config: SimpleNamespace(fitness=make_fitness(config)))
 
 
 def test_full_folder_is_refused(tmp_path, config):
@@ -76,6 +157,24 @@ def test_full_folder_is_refused(tmp_path, config):
         runs.create_run_folder(tmp_path / "run", config)
     with pytest.raises(InputError, match="expected a new or empty folder; found a file"):
         runs.check_new_folder(tmp_path / "robot.yaml")
+
+
+def test_a_folder_whose_making_was_cut_short_is_a_new_one(tmp_path, run, config):
+    """As kill -9 leaves it, at the last moment."""
+    run.close()
+    os.rename(run.path / "config.yaml", run.path / ".123-config.yaml")
+    with pytest.raises(InputError, match="found one that was not begun; begin it with --out"):
+        runs.open_run_folder(run.path)
+    again, _ = runs.create_run_folder(run.path, config)
+    again.close()
+
+
+def test_a_folder_that_was_removed_is_not_made_anew_in_parts(run):
+    shutil.rmtree(run.path)
+    for write in (lambda: run.save_checkpoint(1, ARRAYS, {}, 3), lambda: run.update_info(a=1)):
+        with pytest.raises(OSError, match="the run folder was removed"):
+            write()
+    assert not run.path.exists()
 
 
 def test_only_run_folders_open(tmp_path):
@@ -96,7 +195,7 @@ def test_one_process_at_a_time(run):
 
 
 def test_info_is_json(run):
-    run.update_info(seed=None, finished="now")
+    run.update_info(seed=None, inputs=None, finished="now")
     assert json.loads((run.path / "run.json").read_text()) == {"finished": "now"}
     (run.path / "run.json").write_text("{")
     with pytest.raises(InputError, match=r"run.json: expected JSON; found"):

@@ -16,6 +16,7 @@ import pytest
 
 from laboratory import _ELBOW as ELBOW
 from laboratory import XLA_FLAGS
+from mjx_revolve import export
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.config import load_config, override_config
 from mjx_revolve.episodes.fitness import make_fitness
@@ -240,8 +241,8 @@ def test_two_files_of_one_name_are_both_kept(folder):
     run, kept = runs.create_run_folder("run", config)
     run.close()
     assert kept.controller.type.endswith("inputs/own.py:make_hold")
-    assert kept.task.type.endswith("inputs/task_own.py:rise")
-    assert (folder / "run" / "inputs" / "task_own.py").read_text().endswith("# another\n")
+    assert kept.task.type.endswith("inputs/2/own.py:rise")
+    assert (folder / "run" / "inputs" / "2" / "own.py").read_text().endswith("# another\n")
 
 
 def test_reports_group_runs_by_what_the_code_says(folder):
@@ -274,16 +275,24 @@ def test_evolving_with_workers_and_resuming(folder):
         there = {**os.environ, **XLA_FLAGS, "PYTHONPATH": path}
         return subprocess.run(run, capture_output=True, text=True, cwd=folder, env=there)
 
+    (folder / "sea.yaml").write_text("current: [0.1, 0, 0]\n")
     many = ["--set", "task.trials=16", "--set", "evolution.population_size=8"]  # two blocks
+    many += ["--set", "world=sea.yaml"]
     done = command("swim.yaml", *many, "--out", "run", "--workers", "2")
     assert done.returncode == 0, done.stderr
-    assert "rise in lake" in done.stdout and " kg over 16 fresh starts" in done.stdout
+    assert "rise in sea" in done.stdout and " kg over 16 fresh starts" in done.stdout
     assert "2 workers" in done.stdout
     facts = json.loads((folder / "run" / "run.json").read_text())["champion"]
     assert (facts["task"], facts["controller"]) == ("rise", "make_hold")
-    (folder / "mine" / "own.py").rename(folder / "mine" / "old.py")
-    done = command("--resume", "run", "--workers", "1")
-    assert done.returncode == 0 and "finished after 2 generations" in done.stdout, done.stderr
+    # The folder is all that the run needs, wherever it lies.
+    shutil.move("run", folder / "moved")
+    shutil.rmtree("mine")
+    for name in ("sea.yaml", "elbow.yaml", "swim.yaml"):
+        (folder / name).unlink()
+    done = command("--resume", "moved", "--workers", "1", "--set", "evolution.generations=3")
+    assert done.returncode == 0 and "resuming after generation 2" in done.stdout, done.stderr
+    assert "bit for bit" not in done.stderr
+    assert export.main(["moved", "--sdf", "robot.sdf"]) == 0
 
 
 def test_only_the_same_code_goes_on_with_a_run(folder):

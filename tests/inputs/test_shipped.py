@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 
 import pytest
 
+from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.episodes.champion import load_episode, load_genes
 from mjx_revolve.episodes.config import load_config
+from mjx_revolve.episodes.fitness import make_fitness
+from mjx_revolve.episodes.run_reader import load_metrics
+from mjx_revolve.evolution.run_folder import load_archive
 from mjx_revolve.inputs.commands import check_episode_path
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
+from mjx_revolve.view.report.data import read_run
+from mjx_revolve.water.currents import load_current_field
+from mjx_revolve.water.world import load_world
 
 
 def test_names_and_paths_mean_the_same(monkeypatch, tmp_path):
@@ -47,3 +56,24 @@ def test_wrong_names_list_the_shipped_ones(monkeypatch, tmp_path):
     ):  # fmt: skip
         with pytest.raises(InputError, match=words):
             read()
+
+
+LOADERS = (
+    load_config, load_morphology, load_modules, load_world, load_current_field, make_fitness,
+    load_archive, load_episode, load_genes, load_metrics, read_run,
+)  # fmt: skip
+STRANGE = {
+    "none": None, "number": 5, "null byte": "a\0b.yaml", "no text": "\ud800.csv",
+    "long": 5000 * "x" + ".yaml", "pipe": "pipe.yaml", "another pipe": "pipe.npz",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("load", LOADERS, ids=lambda load: load.__name__)
+@pytest.mark.parametrize("path", STRANGE.values(), ids=STRANGE)
+def test_what_is_no_path_and_no_file_is_refused_in_one_line(monkeypatch, tmp_path, load, path):
+    monkeypatch.chdir(tmp_path)
+    for name in ("pipe.yaml", "pipe.npz"):
+        os.mkfifo(name)
+    with pytest.raises(InputError, match=r"expected .*; found") as error:
+        load(path)
+    assert len(str(error.value)) <= 400

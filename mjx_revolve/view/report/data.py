@@ -20,8 +20,9 @@ import mjx_revolve
 from mjx_revolve.episodes.config import Config, make_config
 from mjx_revolve.episodes.individual_log import EVENTS, GENERATIONS, INDIVIDUALS
 from mjx_revolve.episodes.run_reader import RunReader, find_run, generation_of, read_metrics
+from mjx_revolve.episodes.settings import find_copies, locate_files
 from mjx_revolve.inputs.errors import InputError, reading
-from mjx_revolve.inputs.files import resolve_inside
+from mjx_revolve.inputs.files import check_path, resolve_inside
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.view.colony_history import read_history
 from mjx_revolve.view.population import read_population
@@ -46,7 +47,7 @@ def read_run(folder: str | Path) -> RunRecord:
     Raises:
         InputError: there is no such folder, or nothing of a run in it.
     """
-    path = Path(folder)
+    path = check_path(folder)
     if not path.is_dir():
         found = "a file" if path.exists() else "none"
         raise InputError(f"{path}: expected a run folder; found {found}")
@@ -152,6 +153,7 @@ def _read_config(record: RunRecord) -> None:
         names = ", ".join(unknown)
         record.note("version", f"config.yaml: this version does not know {names}; read without")
     try:
+        known = locate_files(known, find_copies(record.folder))
         record.config = make_config(known, record.folder, source=str(path))
     except InputError as error:
         spare = record.folder / "champion" / "morphology.yaml"
