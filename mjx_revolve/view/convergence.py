@@ -101,8 +101,9 @@ def _draw_fitness(axes: Axes, x: np.ndarray, metrics: Metrics, best: str, ever: 
     if "best" in metrics:
         axes.plot(x, metrics["best"], color=ORANGE, linewidth=1.1, label=best, marker=dot)
     if "champion" in metrics:
-        axes.step(x, metrics["champion"], where="post", color=DEEP, linewidth=1.4,
-                  linestyle=(0, (5, 2)), label=ever)  # fmt: skip
+        # Straight as the best's line is: a step would lie below it between two rows.
+        axes.plot(x, metrics["champion"], color=DEEP, linewidth=1.4, linestyle=(0, (5, 2)),
+                  label=ever)  # fmt: skip
     highs = [metrics[name] for name in ("best", "champion") if name in metrics]
     limit_to_most(axes, [low], highs or [low])
     legend_above(axes, 0.0)
@@ -167,7 +168,8 @@ def plot_colony(metrics: Metrics, title: str = "") -> Figure:
         title: a line above the picture.
 
     Returns:
-        The figure: fitness of the living on top, below it their mean age and size.
+        The figure: on top, fitness of the living that have lived as long as it is measured; below
+        it, mean age and size of all.
     """
     scale, words = scale_time(float(metrics["time"][-1]))
     time = metrics["time"] / scale

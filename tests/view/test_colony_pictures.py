@@ -199,9 +199,9 @@ def test_what_is_watched_is_what_happened(run):
 
 @pytest.mark.slow
 def test_the_page_of_a_run(run, capsys):
-    argv = [str(run), "--colony", "--duration", "2"]
+    argv = [str(run), "--colony", "--duration", "1"]  # half an interval
     assert run_command(viewer.main, argv) == 0
-    assert "16 to 18 s" in capsys.readouterr().out
+    assert "16 to 17 s" in capsys.readouterr().out
     text = (run / "colony.html").read_text()
     assert '"leap":1.0' in text and "clinic" in text
     assert run_command(viewer.main, argv) == 2  # it is there already
