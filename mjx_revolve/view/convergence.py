@@ -333,7 +333,6 @@ def plot_seeds(group: RunGroup) -> Figure:
     return figure
 
 
-@in_style
 def plot_comparison(groups: Sequence[RunGroup], numbers: Mapping[str, int]) -> Figure:
     """Draws configurations beside each other.
 
@@ -349,25 +348,52 @@ def plot_comparison(groups: Sequence[RunGroup], numbers: Mapping[str, int]) -> F
     sizes = {group.settings.get("evolution.population_size") for group in shown}
     counted = len(sizes) > 1 and all("evaluations" in r.metrics for r in records)
     over = "evaluations" if counted else "generation"
-    figure = new_figure(WIDE, 4.4)
-    left, right = figure.subplots(1, 2, width_ratios=(2.3, 1.0))
-    cases = {
-        group.name: [(r.metrics[over], r.metrics["champion"]) for r in group.shown
-                     if "champion" in r.metrics] for group in shown
+    curves = {
+        numbers[group.name]: [(r.metrics[over], r.metrics["champion"]) for r in group.shown
+                              if "champion" in r.metrics] for group in shown
     }  # fmt: skip
-    cases = {name: curves for name, curves in cases.items() if curves}
-    if cases:
-        named = {f"{letter(numbers[name])}: {name}": curves for name, curves in cases.items()}
-        draw_curves(left, named, [numbers[name] for name in cases])
-    left.set_xlabel("evaluated individuals" if counted or not records else records[0].round)
     what = records[0].fitness if records else "fitness"
-    left.set_ylabel(f"best {what.replace('fitness', 'fitness so far', 1)}")
-    left.set_title("mean over seeds and 95 % confidence band")
+    return plot_cases(
+        {number: name for name, number in numbers.items()},
+        {number: own for number, own in curves.items() if own},
+        {numbers[group.name]: group.scores() for group in groups},
+        "evaluated individuals" if counted or not records else records[0].round,
+        f"best {what.replace('fitness', 'fitness so far', 1)}",
+        groups[0].unit,
+    )
+
+
+@in_style
+def plot_cases(
+    names: Mapping[int, str],
+    curves: Mapping[int, Sequence[Curve]],
+    scores: Mapping[int, Sequence[float]],
+    over: str,
+    best: str,
+    unit: str,
+) -> Figure:
+    """Draws cases beside each other: the best so far of each, and the champions' final scores.
+
+    Args:
+        names: of the cases by number, which gives letter and colour.
+        curves: of each case with any, see `draw_curves`.
+        scores: of each case, see `draw_scores`.
+        over: label of the curves' abscissa.
+        best: label of their ordinate.
+        unit: of the scores; "" where it is not known.
+
+    Returns:
+        The figure.
+    """
+    figure = new_figure(WIDE, 4.4)
+    wide = min(max(1.0, 0.16 * len(scores)), 2.3)
+    left, right = figure.subplots(1, 2, width_ratios=(2.3, wide))
+    if curves:
+        named = {f"{letter(k)}: {names[k]}": own for k, own in curves.items()}
+        draw_curves(left, named, list(curves))
+    left.set(xlabel=over, ylabel=best, title="mean over seeds and 95 % confidence band")
     legend_outside(figure, left, 2)
-    chosen = [numbers[group.name] for group in groups]
-    scores = {letter(k): group.scores() for k, group in zip(chosen, groups, strict=True)}
-    draw_scores(right, scores, chosen)
-    unit = groups[0].unit
-    right.set_ylabel(f"champion's score ({unit})" if unit else "champion's score")
+    draw_scores(right, {letter(k): own for k, own in scores.items()}, list(scores))
+    right.set(ylabel=f"champion's score ({unit})" if unit else "champion's score")
     right.set_title("final, on fresh starts")
     return figure
