@@ -28,14 +28,12 @@ from mjx_revolve.view.plots import (
     letter,
     limit_to_most,
     new_figure,
-    panels,
     style_of,
     whole_numbers,
 )
 from mjx_revolve.view.statistics import FEWEST, interval, mean_and_half, quantiles
 
 if TYPE_CHECKING:
-    from mjx_revolve.view.outcomes import Outcome
     from mjx_revolve.view.report.groups import RunGroup
 
 Metrics = Mapping[str, np.ndarray]
@@ -253,47 +251,6 @@ def draw_scores(
     axes.set_xticks(range(len(groups)), [name.replace("_", "\n") for name in groups])
     axes.set_xlim(-0.5, len(groups) - 0.5)
     axes.grid(False, axis="x")
-
-
-@in_style
-def plot_curves(
-    cases: Mapping[str, Sequence[Outcome]], label: str, numbers: Sequence[int] | None = None
-) -> Figure:
-    """The figure of `draw_outcomes`."""
-    figure = new_figure(WIDE, 4.4)
-    axes = figure.subplots()
-    draw_outcomes(axes, cases, label, numbers)
-    return figure
-
-
-def draw_outcomes(
-    axes: Axes,
-    cases: Mapping[str, Sequence[Outcome]],
-    label: str,
-    numbers: Sequence[int] | None = None,
-) -> None:
-    """Draws `draw_curves` of runs by case over evaluated individuals; `label` names the score."""
-    curves = {name: [(o.metrics["evaluations"], o.metrics["champion"]) for o in outcomes]
-              for name, outcomes in cases.items()}  # fmt: skip
-    draw_curves(axes, curves, numbers)
-    axes.set(xlabel="evaluated individuals", ylabel=label)
-    axes.legend(loc="best")
-
-
-@in_style
-def plot_scores(
-    groups: Mapping[str, Mapping[str, Sequence[float]]], numbers: Sequence[int] | None = None
-) -> Figure:
-    """A panel of `draw_scores` for each title of `groups`, three beside each other."""
-    columns = min(len(groups), 3)
-    most = max(map(len, groups.values()))
-    wide = WIDE if columns > 1 else min(WIDE, 2.5 + 0.9 * most)
-    figure = new_figure(wide, 2.1 * -(-len(groups) // columns) if columns > 1 else 3.2)
-    grid = panels(figure, len(groups), columns)
-    for axes, (title, values) in zip(grid, groups.items(), strict=True):
-        draw_scores(axes, values, numbers)
-        axes.set_title(title)
-    return figure
 
 
 @in_style
