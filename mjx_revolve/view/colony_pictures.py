@@ -105,7 +105,8 @@ def plot_population(history: ColonyHistory, room: int | None = None, title: str 
 
 def _bins(end: float) -> np.ndarray:
     """Edges of round, equal bins from 0 to `end` [s]."""
-    return MaxNLocator(nbins=_BINS, steps=[1, 2, 3, 6, 10]).tick_values(0.0, max(end, 1.0))
+    bins = MaxNLocator(nbins=_BINS, steps=[1, 2, 3, 6, 10])
+    return np.asarray(bins.tick_values(0.0, max(end, 1.0)))
 
 
 def _draw_turnover(axes: Axes, history: ColonyHistory, edges: np.ndarray, scale: float) -> None:

@@ -53,6 +53,9 @@ _BODIES = {
 # Curves of runs that differ in length by more than this share a logarithmic axis.
 _LOG_FROM = 5.0
 
+# Cases whose scores have room beside curves, more stand below them; and which legends name.
+_MOST_BESIDE, _MOST_NAMED = 20, 10
+
 COLONY_LABEL = "fitness in the colony"
 """Name of a colony's fitness, which is not its champion's score."""
 _SECONDS, _MINUTES = 180.0, 3 * 3600.0  # ends of time axes in seconds and in minutes [s]
@@ -340,16 +343,21 @@ def plot_cases(
         unit: of the scores; "" where it is not known.
 
     Returns:
-        The figure.
+        The figure; scores of many cases are below the curves.
     """
-    figure = new_figure(WIDE, 4.4)
-    wide = min(max(1.0, 0.16 * len(scores)), 2.3)
-    left, right = figure.subplots(1, 2, width_ratios=(2.3, wide))
+    if len(scores) <= _MOST_BESIDE:
+        figure = new_figure(WIDE, 4.4)
+        left, right = figure.subplots(1, 2, width_ratios=(2.3, max(1.0, 0.12 * len(scores))))
+    else:
+        figure = new_figure(WIDE, 8.0)
+        left, right = figure.subplots(2, 1)
     if curves:
-        named = {f"{letter(k)}: {names[k]}": own for k, own in curves.items()}
+        # Names of many cases would take more room than their curves; tables have them.
+        more = "" if len(curves) > _MOST_NAMED else ": {}"
+        named = {letter(k) + more.format(names[k]): own for k, own in curves.items()}
         draw_curves(left, named, list(curves))
     left.set(xlabel=over, ylabel=best, title="mean over seeds and 95 % confidence band")
-    legend_outside(figure, left, 2)
+    legend_outside(figure, left, 2 if len(curves) <= _MOST_NAMED else 8)
     draw_scores(right, {letter(k): own for k, own in scores.items()}, list(scores))
     right.set(ylabel=f"champion's score ({unit})" if unit else "champion's score")
     right.set_title("final, on fresh starts")
