@@ -18,6 +18,7 @@ from experiments.studies import (
     BASE,
     Case,
     describe_runs,
+    draw_outcomes,
     fill,
     study_main,
 )
@@ -25,7 +26,7 @@ from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import write_atomic
 from mjx_revolve.view.body_pictures import plot_bodies
-from mjx_revolve.view.convergence import draw_outcomes, draw_scores
+from mjx_revolve.view.convergence import draw_scores
 from mjx_revolve.view.outcomes import Outcome, by_case, write_csv
 from mjx_revolve.view.plots import WIDE, figure_png, in_style, new_figure
 from mjx_revolve.view.statistics import COVERAGE, difference, holm, rank_test

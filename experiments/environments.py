@@ -12,11 +12,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from matplotlib.figure import Figure
 from scipy import stats
 
 from experiments.studies import (
     Case,
     describe_runs,
+    draw_outcomes,
     fill,
     study_main,
 )
@@ -25,9 +27,9 @@ from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import write_atomic
 from mjx_revolve.view.body_pictures import plot_bodies
-from mjx_revolve.view.convergence import plot_curves, plot_scores
+from mjx_revolve.view.convergence import draw_scores
 from mjx_revolve.view.outcomes import Figures, Outcome, by_case, write_csv
-from mjx_revolve.view.plots import figure_png
+from mjx_revolve.view.plots import WIDE, figure_png, in_style, new_figure, panels
 from mjx_revolve.view.statistics import (
     ALPHA,
     COVERAGE,
@@ -262,9 +264,10 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
         "",
         "![learning curves](environments_curves.png)",
     ]
-    curves = plot_curves(cases, "best score so far (body lengths/s)")
-    panels = {FIGURES[figure.name]: figure.values for figure in compared["champion"]}
-    pictures = {"bodies": plot_bodies(cases), "figures": plot_scores(panels), "curves": curves}
+    shown = {FIGURES[figure.name]: figure.values for figure in compared["champion"]}
+    pictures = {
+        "bodies": plot_bodies(cases), "figures": plot_scores(shown), "curves": plot_curves(cases)
+    }  # fmt: skip
     for name, picture in pictures.items():
         write_atomic(folder / f"environments_{name}.png", figure_png(picture))
     rows = [
@@ -275,6 +278,25 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
     write_csv(folder / "environments.csv", rows)
     write_atomic(folder / "environments.md", ("\n".join(text) + "\n").encode())
     return words
+
+
+@in_style
+def plot_curves(cases: Mapping[str, Sequence[Outcome]]) -> Figure:
+    """The best so far of each case over evaluated individuals."""
+    figure = new_figure(WIDE, 4.4)
+    draw_outcomes(figure.subplots(), cases, "best score so far (body lengths/s)")
+    return figure
+
+
+@in_style
+def plot_scores(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
+    """A panel of `draw_scores` for each title of `groups`, three beside each other."""
+    figure = new_figure(WIDE, 2.1 * -(-len(groups) // 3))
+    grid = panels(figure, len(groups), min(len(groups), 3))
+    for axes, (title, values) in zip(grid, groups.items(), strict=True):
+        draw_scores(axes, values)
+        axes.set_title(title)
+    return figure
 
 
 def main(argv: list[str] | None = None) -> int:

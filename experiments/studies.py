@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from experiments.common import make_folder, make_parser
 from mjx_revolve.evolution.executor import make_executor
@@ -26,6 +27,7 @@ from mjx_revolve.inputs.commands import Parser, whole
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.numerics.runtime import prepare_process
+from mjx_revolve.view.convergence import draw_curves
 from mjx_revolve.view.outcomes import Figures, Outcome, by_case, find_outcomes
 from mjx_revolve.view.results import save_pictures
 from mjx_revolve.view.statistics import interval
@@ -268,6 +270,19 @@ def describe_runs(cases: Mapping[str, Sequence[Outcome]], known: Mapping[str, Ca
 _STILL = """Scores are in body lengths/s, of each run's champion on fresh starts. A body that does
 not start in the attitude in which it hangs in the water turns, and its core moves without any work
 of a joint: only what a champion scores beyond its score with all joints at rest is its doing."""
+
+
+def draw_outcomes(
+    axes: Axes,
+    cases: Mapping[str, Sequence[Outcome]],
+    label: str,
+) -> None:
+    """Draws `draw_curves` of runs by case over evaluated individuals; `label` names the score."""
+    curves = {name: [(o.metrics["evaluations"], o.metrics["champion"]) for o in outcomes]
+              for name, outcomes in cases.items()}  # fmt: skip
+    draw_curves(axes, curves)
+    axes.set(xlabel="evaluated individuals", ylabel=label)
+    axes.legend(loc="best")
 
 
 def fill(text: str) -> str:

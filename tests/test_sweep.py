@@ -18,7 +18,9 @@ import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve, report, sweep
 from mjx_revolve.evolution.run_folder import RunFolder
+from mjx_revolve.evolution.sweeps import Sweep
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.view.report.sweep import case_words
 from mjx_revolve.view.statistics import interval
 from toys import DroppedError, contents, dropping, make_toy
 
@@ -81,7 +83,7 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     page = (folder / "out" / "report.html").read_text()
     scores = [float(row["score"]) for row in rows]
     mean = str(interval(scores[2:]))
-    assert f"strategy=CMA_ES</td><td>2</td><td>{mean}</td>" in page
+    assert f"CMA_ES</td><td>2</td><td>{mean}</td>" in page
     # A report of the runs alone says the same of the same numbers.
     alone = [f"out/{name}" for name in RUNS]
     assert run_command(report.main, [*alone, "--out", "runs.html"]) == 0
@@ -107,6 +109,15 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     again = (folder / "out" / "report.html").read_text()
     assert "6 of 6</b>runs finished" in again
     assert run_command(report.main, ["out", "alone"]) == 2
+
+
+def test_cases_have_names_to_read():
+    grid = Sweep("a.yaml", 2, ("bodies.modules=[ActiveHinge],[FixedBrick,ActiveHinge]",
+                               "morphology=m/spider.yaml,gecko"))  # fmt: skip
+    assert [case_words(grid, case) for case in grid.cases] == [
+        "modules ActiveHinge; spider", "modules ActiveHinge; gecko",
+        "modules FixedBrick, ActiveHinge; spider", "modules FixedBrick, ActiveHinge; gecko",
+    ]  # fmt: skip
 
 
 @pytest.mark.slow

@@ -92,7 +92,7 @@ class Colony:
         tank: arrays of the tank; see `Tank.to_arrays`.
         seconds: time spent [s]; not reproducible.
         born: in the last interval; not part of what passes on, nor are the two below.
-        died: in the last interval, as they were at its end.
+        died: in the last interval, as they were at its end; see `Rules.measured`.
         events: of the last interval.
     """
 
@@ -141,6 +141,14 @@ class Rules(NamedTuple):
     def surface(self) -> float:
         """Height of the water's surface [m]."""
         return self.fitness.mixed.world.surface_height
+
+    def measured(self, member: Member) -> Individual:
+        """A member's individual, its score NaN until it has lived as long as fitness is measured.
+
+        Before, its fitness rests on a shorter time, in which a start or a collision weighs more.
+        """
+        known = len(member.track) >= self.window
+        return member.individual if known else replace(member.individual, score=float("nan"))
 
     def inside(self, position: np.ndarray) -> np.ndarray:
         """Positions `[..., 3]` within the arena, where its edges wrap [m]."""
@@ -264,7 +272,7 @@ def remove_dead(
     """The colony without the members that have died; `died` has these as they were."""
     now, alive, died, events = float(trajectory.time[-1]), {}, [], []
     for number, member in colony.members.items():
-        age, individual = now - member.born, member.individual
+        age, individual = now - member.born, rules.measured(member)
         cause = _cause_of_death(member, age, trajectory, rules)
         if cause is None:
             alive[number] = member

@@ -79,7 +79,8 @@ def observe_colony(
             own = trajectory.qpos[:, : 7 + member.individual.body.num_hinges, member.slot]
             whole = np.isfinite(own).all(1).cumprod().astype(bool)
             poses.setdefault(number, []).append((trajectory.time[whole], own[whole]))
-        members |= {**asked.colony.members, **search.members}
+        members |= asked.colony.members
+        members |= {n: replace(m, individual=rules.measured(m)) for n, m in search.members.items()}
         members |= {i.number: replace(members[i.number], individual=i) for i in search.died}
         events += search.events
     deaths = {event["id"]: event for event in events if event["event"] == "death"}

@@ -117,7 +117,7 @@ class ColonyEvolution(IndividualEvolution):
 
         Columns: failed, living, living_mean, time [s], births, matings, deaths by cause, expected
         (children to come), mean_age [s], mean_charge [J] where there is energy, the living's mean
-        of `MEAN_DESCRIPTORS`. Scores are the fitness of the living.
+        of `MEAN_DESCRIPTORS`. Scores are the fitness of the living, see `Rules.measured`.
         """
         rules, rng = self.rules, asked.rng
         trajectory = _thin(results, len(results.time) // rules.looks)
@@ -129,17 +129,14 @@ class ColonyEvolution(IndividualEvolution):
         colony, births = give_birth(colony, now, rules, rng)
         self._synchronize(asked.colony, colony, shift)
         self._held = self.tank.to_arrays()
-        # Only robots that have lived for as long as fitness is measured count.
-        full = rules.look * (rules.window - 1) - 1e-9
-        died = [one for one in colony.died if one.measures["age"] >= full]
-        known = [m.individual for m in colony.members.values() if len(m.track) >= rules.window]
+        living = [self.rules.measured(member) for member in colony.members.values()]
         colony = replace(
             colony,
-            elites=best_individuals([*colony.elites, *died, *known]),
+            elites=best_individuals([*colony.elites, *colony.died, *living]),
             tank=self._held,
             events=(*colony.events, *deaths, *matings, *births),
         )
-        scores = np.array([individual.score for individual in colony.living])
+        scores = np.array([individual.score for individual in living])
         champion = colony.elites[0].score if colony.elites else float("nan")
         return Generation(
             colony, scores, champion, self._columns(colony, scores, now), len(colony.born),
@@ -211,7 +208,7 @@ class ColonyEvolution(IndividualEvolution):
         """Individuals at birth and again at death (the later line counts), the living, events."""
         logged = [*search.born, *search.died]
         if search.generation == self.config.evolution.generations:
-            logged += search.living
+            logged += map(self.rules.measured, search.members.values())
         return {
             INDIVIDUALS: [to_text(individual, self.fitness.genotype) for individual in logged],
             GENERATIONS: [living_line(search)],

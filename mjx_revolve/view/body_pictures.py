@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.episodes.individual_log import LoggedIndividual
@@ -21,11 +20,11 @@ from mjx_revolve.view.plots import (
     BLUE,
     COLORS,
     INK,
-    LABELS,
     ORANGE,
     WIDE,
     curve_with_band,
     in_style,
+    label_of,
     legend_outside,
     new_figure,
     panels,
@@ -199,17 +198,9 @@ def plot_descriptors(
                         band="quartiles", marker=dot, markersize=4)  # fmt: skip
         axes.plot(x, table[0, some], color=ORANGE, linewidth=1.1, marker=dot, markersize=4,
                   label="the best of them")  # fmt: skip
-        axes.set_title(_words(name), fontsize=9.5)
+        axes.set_title(label_of(name), fontsize=9.5)
         axes.tick_params(labelsize=8.5)
         whole_numbers(axes, 5)
         axes.yaxis.set_major_locator(MaxNLocator(nbins=5))
     legend_outside(figure, grid[0], 3, "upper left")
     return figure
-
-
-def _words(name: str) -> str:
-    """Name and unit of a descriptor or measure."""
-    unit = UNITS.get(name, "-")
-    plain = name.removeprefix("num_").replace("_", " ")
-    plain += "" if unit in ("-", "modules") else f" ({unit.replace('3', '³')})"
-    return LABELS.get(name, plain)

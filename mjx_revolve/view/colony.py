@@ -28,7 +28,7 @@ def record_colony(
     Args:
         folder: the run folder; it stays as it is.
         begin: where the recording begins [s]; None: at the newest checkpoint.
-        duration: how long it is, to the end of an interval [s].
+        duration: how long it is [s].
 
     Returns:
         The recording.
@@ -43,32 +43,37 @@ def record_colony(
     if not observed:
         raise InputError(f"{folder}: expected robots alive from {begin:g} s on; found none")
     start = min(float(one.time[0]) for one in observed) - _GAP
+    # A colony lives on to the end of an interval.
+    end = min(start + duration, max(float(one.time[-1]) for one in observed))
     depth = fitness.mixed.world.surface_height - config.task.depth
     marks = [Mark("clinic", (0.0, 0.0, depth), colony.birth.radius)]
     if colony.energy is not None:
         marks += [Mark("charger", place, colony.energy.reach) for place in colony.energy.chargers]
     return Recording(
         title=f"{folder.resolve().name}: a colony",
-        robots=[_replayed(one, start) for one in observed],
+        robots=[_replayed(one, start, end) for one in observed if one.time[0] <= end],
         start=start,
-        end=max(float(one.time[-1]) for one in observed),
+        end=end,
         marks=marks,
         # No robot swims half of the arena from one pose to the next.
         leap=colony.arena.size / 2 if colony.arena.edge == "wrap" else None,
     )
 
 
-def _replayed(observed: ObservedRobot, start: float) -> ReplayRobot:
-    one = observed.individual
+def _replayed(observed: ObservedRobot, start: float, end: float) -> ReplayRobot:
+    one, shown = observed.individual, observed.time <= end + 1e-6
+    died = observed.end is not None and observed.end <= end + 1e-6
     info: dict[str, str | float] = {
         "born": f"{observed.born:.0f} s",  # which may be long before the recording begins
         "parents": " and ".join(f"#{number}" for number in one.parents) or "none",
-        "fitness": "not known" if math.isnan(one.score) else f"{one.score:.3g}",
-        "modules": f"{one.body.num_modules}, {one.body.num_hinges} hinges",
+        "fitness": "not measured yet" if math.isnan(one.score) else f"{one.score:.3g}",
+        "modules": str(one.body.num_modules),
+        "hinges": str(one.body.num_hinges),
     }
-    if observed.cause:
+    if died:
         info["dies"] = _CAUSES.get(observed.cause, observed.cause)
     return ReplayRobot(
-        name=f"#{one.number}", robot=observed.robot, time=observed.time, qpos=observed.qpos,
-        start=max(observed.born, start), end=observed.end, info=info,
+        name=f"#{one.number}", robot=observed.robot, time=observed.time[shown],
+        qpos=observed.qpos[shown], start=max(observed.born, start),
+        end=observed.end if died else None, info=info,
     )  # fmt: skip

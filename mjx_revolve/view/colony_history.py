@@ -88,17 +88,6 @@ class ColonyHistory:
         gone = np.sort([span.end for span in these if span.cause])
         return np.searchsorted(born, times, "right") - np.searchsorted(gone, times, "right")
 
-    def line(self, number: int) -> list[int]:
-        """A robot and the ancestors that gave its body, the oldest first."""
-        found: list[int] = []
-        while number in self.spans:
-            found.append(number)
-            parents = self.spans[number].parents
-            if not parents:
-                break
-            number = parents[0]
-        return found[::-1]
-
 
 def read_history(folder: Path, until: float = 0.0) -> tuple[ColonyHistory, list[str]]:
     """Reads the history of a colony.

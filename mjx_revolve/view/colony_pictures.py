@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -28,6 +27,7 @@ from mjx_revolve.view.plots import (
     legend_above,
     new_figure,
 )
+from mjx_revolve.view.population import trace_line
 
 _CAUSES = {
     "age": ("#8894a0", "died of age"),
@@ -105,10 +105,8 @@ def plot_population(history: ColonyHistory, room: int | None = None, title: str 
 
 def _bins(end: float) -> np.ndarray:
     """Edges of round, equal bins from 0 to `end` [s]."""
-    least = max(end, 1.0) / _BINS
-    power = 10.0 ** math.floor(math.log10(least))
-    width = next(k * power for k in (1, 2, 3, 6, 10) if k * power >= least * (1 - 1e-9))
-    return width * np.arange(max(1, math.ceil(end / width + 1e-9)) + 1)
+    bins = MaxNLocator(nbins=_BINS, steps=[1, 2, 3, 6, 10])
+    return np.asarray(bins.tick_values(0.0, max(end, 1.0)))
 
 
 def _draw_turnover(axes: Axes, history: ColonyHistory, edges: np.ndarray, scale: float) -> None:
@@ -308,7 +306,7 @@ def _draw_line(
     axes: Axes, history: ColonyHistory, number: int, row: Mapping[int, int], scale: float
 ) -> None:
     """The line of descent of one robot, over all others."""
-    line = [history.spans[one] for one in history.line(number)]
+    line = trace_line(history.spans, number)
     ends = [*(child.born for child in line[1:]), line[-1].end]
     points = [
         (time / scale, row[span.number])

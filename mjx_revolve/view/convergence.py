@@ -28,14 +28,12 @@ from mjx_revolve.view.plots import (
     letter,
     limit_to_most,
     new_figure,
-    panels,
     style_of,
     whole_numbers,
 )
 from mjx_revolve.view.statistics import FEWEST, interval, mean_and_half, quantiles
 
 if TYPE_CHECKING:
-    from mjx_revolve.view.outcomes import Outcome
     from mjx_revolve.view.report.groups import RunGroup
 
 Metrics = Mapping[str, np.ndarray]
@@ -54,6 +52,9 @@ _BODIES = {
 }  # fmt: skip
 # Curves of runs that differ in length by more than this share a logarithmic axis.
 _LOG_FROM = 5.0
+
+# Cases whose scores have room beside curves, more stand below them; and which legends name.
+_MOST_BESIDE, _MOST_NAMED = 20, 10
 
 COLONY_LABEL = "fitness in the colony"
 """Name of a colony's fitness, which is not its champion's score."""
@@ -101,8 +102,9 @@ def _draw_fitness(axes: Axes, x: np.ndarray, metrics: Metrics, best: str, ever: 
     if "best" in metrics:
         axes.plot(x, metrics["best"], color=ORANGE, linewidth=1.1, label=best, marker=dot)
     if "champion" in metrics:
-        axes.step(x, metrics["champion"], where="post", color=DEEP, linewidth=1.4,
-                  linestyle=(0, (5, 2)), label=ever)  # fmt: skip
+        # Straight as the best's line is: a step would lie below it between two rows.
+        axes.plot(x, metrics["champion"], color=DEEP, linewidth=1.4, linestyle=(0, (5, 2)),
+                  label=ever)  # fmt: skip
     highs = [metrics[name] for name in ("best", "champion") if name in metrics]
     limit_to_most(axes, [low], highs or [low])
     legend_above(axes, 0.0)
@@ -167,7 +169,8 @@ def plot_colony(metrics: Metrics, title: str = "") -> Figure:
         title: a line above the picture.
 
     Returns:
-        The figure: fitness of the living on top, below it their mean age and size.
+        The figure: on top, fitness of the living that have lived as long as it is measured; below
+        it, mean age and size of all.
     """
     scale, words = scale_time(float(metrics["time"][-1]))
     time = metrics["time"] / scale
@@ -254,47 +257,6 @@ def draw_scores(
 
 
 @in_style
-def plot_curves(
-    cases: Mapping[str, Sequence[Outcome]], label: str, numbers: Sequence[int] | None = None
-) -> Figure:
-    """The figure of `draw_outcomes`."""
-    figure = new_figure(WIDE, 4.4)
-    axes = figure.subplots()
-    draw_outcomes(axes, cases, label, numbers)
-    return figure
-
-
-def draw_outcomes(
-    axes: Axes,
-    cases: Mapping[str, Sequence[Outcome]],
-    label: str,
-    numbers: Sequence[int] | None = None,
-) -> None:
-    """Draws `draw_curves` of runs by case over evaluated individuals; `label` names the score."""
-    curves = {name: [(o.metrics["evaluations"], o.metrics["champion"]) for o in outcomes]
-              for name, outcomes in cases.items()}  # fmt: skip
-    draw_curves(axes, curves, numbers)
-    axes.set(xlabel="evaluated individuals", ylabel=label)
-    axes.legend(loc="best")
-
-
-@in_style
-def plot_scores(
-    groups: Mapping[str, Mapping[str, Sequence[float]]], numbers: Sequence[int] | None = None
-) -> Figure:
-    """A panel of `draw_scores` for each title of `groups`, three beside each other."""
-    columns = min(len(groups), 3)
-    most = max(map(len, groups.values()))
-    wide = WIDE if columns > 1 else min(WIDE, 2.5 + 0.9 * most)
-    figure = new_figure(wide, 2.1 * -(-len(groups) // columns) if columns > 1 else 3.2)
-    grid = panels(figure, len(groups), columns)
-    for axes, (title, values) in zip(grid, groups.items(), strict=True):
-        draw_scores(axes, values, numbers)
-        axes.set_title(title)
-    return figure
-
-
-@in_style
 def plot_seeds(group: RunGroup) -> Figure:
     """Draws how the runs of one configuration went.
 
@@ -331,7 +293,6 @@ def plot_seeds(group: RunGroup) -> Figure:
     return figure
 
 
-@in_style
 def plot_comparison(groups: Sequence[RunGroup], numbers: Mapping[str, int]) -> Figure:
     """Draws configurations beside each other.
 
@@ -347,25 +308,57 @@ def plot_comparison(groups: Sequence[RunGroup], numbers: Mapping[str, int]) -> F
     sizes = {group.settings.get("evolution.population_size") for group in shown}
     counted = len(sizes) > 1 and all("evaluations" in r.metrics for r in records)
     over = "evaluations" if counted else "generation"
-    figure = new_figure(WIDE, 4.4)
-    left, right = figure.subplots(1, 2, width_ratios=(2.3, 1.0))
-    cases = {
-        group.name: [(r.metrics[over], r.metrics["champion"]) for r in group.shown
-                     if "champion" in r.metrics] for group in shown
+    curves = {
+        numbers[group.name]: [(r.metrics[over], r.metrics["champion"]) for r in group.shown
+                              if "champion" in r.metrics] for group in shown
     }  # fmt: skip
-    cases = {name: curves for name, curves in cases.items() if curves}
-    if cases:
-        named = {f"{letter(numbers[name])}: {name}": curves for name, curves in cases.items()}
-        draw_curves(left, named, [numbers[name] for name in cases])
-    left.set_xlabel("evaluated individuals" if counted or not records else records[0].round)
     what = records[0].fitness if records else "fitness"
-    left.set_ylabel(f"best {what.replace('fitness', 'fitness so far', 1)}")
-    left.set_title("mean over seeds and 95 % confidence band")
-    legend_outside(figure, left, 2)
-    chosen = [numbers[group.name] for group in groups]
-    scores = {letter(k): group.scores() for k, group in zip(chosen, groups, strict=True)}
-    draw_scores(right, scores, chosen)
-    unit = groups[0].unit
-    right.set_ylabel(f"champion's score ({unit})" if unit else "champion's score")
+    return plot_cases(
+        {number: name for name, number in numbers.items()},
+        {number: own for number, own in curves.items() if own},
+        {numbers[group.name]: group.scores() for group in groups},
+        "evaluated individuals" if counted or not records else records[0].round,
+        f"best {what.replace('fitness', 'fitness so far', 1)}",
+        groups[0].unit,
+    )
+
+
+@in_style
+def plot_cases(
+    names: Mapping[int, str],
+    curves: Mapping[int, Sequence[Curve]],
+    scores: Mapping[int, Sequence[float]],
+    over: str,
+    best: str,
+    unit: str,
+) -> Figure:
+    """Draws cases beside each other: the best so far of each, and the champions' final scores.
+
+    Args:
+        names: of the cases by number, which gives letter and colour.
+        curves: of each case with any, see `draw_curves`.
+        scores: of each case, see `draw_scores`.
+        over: label of the curves' abscissa.
+        best: label of their ordinate.
+        unit: of the scores; "" where it is not known.
+
+    Returns:
+        The figure; scores of many cases are below the curves.
+    """
+    if len(scores) <= _MOST_BESIDE:
+        figure = new_figure(WIDE, 4.4)
+        left, right = figure.subplots(1, 2, width_ratios=(2.3, max(1.0, 0.12 * len(scores))))
+    else:
+        figure = new_figure(WIDE, 8.0)
+        left, right = figure.subplots(2, 1)
+    if curves:
+        # Names of many cases would take more room than their curves; tables have them.
+        more = "" if len(curves) > _MOST_NAMED else ": {}"
+        named = {letter(k) + more.format(names[k]): own for k, own in curves.items()}
+        draw_curves(left, named, list(curves))
+    left.set(xlabel=over, ylabel=best, title="mean over seeds and 95 % confidence band")
+    legend_outside(figure, left, 2 if len(curves) <= _MOST_NAMED else 8)
+    draw_scores(right, {letter(k): own for k, own in scores.items()}, list(scores))
+    right.set(ylabel=f"champion's score ({unit})" if unit else "champion's score")
     right.set_title("final, on fresh starts")
     return figure

@@ -22,6 +22,7 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
+from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.episodes.measure_table import MEASURES
 
 STYLE = rc_params_from_file(
@@ -32,7 +33,7 @@ in_style = rc_context(STYLE)
 COLORS: tuple[str, ...] = tuple(STYLE["axes.prop_cycle"].by_key()["color"])
 BLUE, ORANGE, GREEN = COLORS[:3]
 INK, GREY, PALE, DEEP = "#222222", "#6b7680", "#b9c6cf", "#0b3c5d"
-# Axis labels of the measures; others are shown by their name.
+# Axis labels of the measures.
 LABELS = {name: f"{m.words} ({m.unit.replace('-', '–')})" for name, m in MEASURES.items()}
 WIDE = 9.0  # width of most figures [inches]
 _DASHES: tuple[str | tuple, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
@@ -56,8 +57,10 @@ def new_figure(width: float, height: float, title: str = "") -> Figure:
 
 
 def label_of(name: str) -> str:
-    """Name and unit of a measure; any other name as words."""
-    return LABELS.get(name, name.replace("_", " "))
+    """Name and unit of a measure or descriptor; any other name as words."""
+    unit = UNITS.get(name, "-").replace("m3", "m³")
+    words = name.replace("num_", "number of ").replace("_", " ")
+    return LABELS.get(name, words if unit in ("-", "modules") else f"{words} ({unit})")
 
 
 def style_of(index: int) -> dict[str, Any]:

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from mjx_revolve.episodes.individual_log import LoggedIndividual, read_generations, read_individuals
 
 Picked = TypeVar("Picked")
+
+
+class _HasParents(Protocol):
+    @property
+    def parents(self) -> tuple[int, ...]: ...
+
+
+Born = TypeVar("Born", bound=_HasParents)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +43,7 @@ class Population:
     def alive(self, generation: int) -> list[LoggedIndividual]:
         """Individuals alive after a generation, the best first, failures last."""
         found = [self.lives[n] for n in self.living.get(generation, ()) if n in self.lives]
-        return sorted(found, key=_rank)
+        return sorted(found, key=rank)
 
     def figures(self, generation: int, name: str) -> np.ndarray:
         """`[N]` a feature of the individuals alive after a generation, the best first."""
@@ -44,19 +52,23 @@ class Population:
     def best(self) -> LoggedIndividual | None:
         """The best of all, of equals the oldest; None: none has a score."""
         known = [life for life in self.lives.values() if not math.isnan(life.score)]
-        return min(known, key=_rank, default=None)
+        return min(known, key=rank, default=None)
 
     def line(self, number: int) -> list[LoggedIndividual]:
         """An individual and the ancestors that gave its body, the oldest first."""
-        found: list[LoggedIndividual] = []
-        life = self.lives.get(number)
-        while life is not None:
-            found.append(life)
-            life = self.lives.get(life.parents[0]) if life.parents else None
-        return found[::-1]
+        return trace_line(self.lives, number)
 
 
-def _rank(life: LoggedIndividual) -> tuple[float, int]:
+def trace_line(lives: Mapping[int, Born], number: int) -> list[Born]:
+    """One of these by number, and the ancestors that gave its body, the oldest first."""
+    found = [lives[number]] if number in lives else []
+    while found and found[-1].parents and found[-1].parents[0] in lives:
+        found.append(lives[found[-1].parents[0]])
+    return found[::-1]
+
+
+def rank(life: LoggedIndividual) -> tuple[float, int]:
+    """Sorts the best first, of equals the oldest, and failures last."""
     return math.inf if math.isnan(life.score) else -life.score, life.number
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.inputs.errors import InputError
@@ -68,16 +69,26 @@ class ReplayRobot:
             leap: a robot that is farther than this from its pose before was put there, and holds
                 the pose until then [m]; None: never.
         """
-        rows, qpos = np.asarray(self.time, float), np.array(self.qpos, float)
-        qpos[:, 3:7] = continuous_quaternions(qpos[:, 3:7])
-        found = np.stack([np.interp(time, rows, column) for column in qpos.T], axis=-1)
-        if leap is not None:
-            far = np.linalg.norm(np.diff(qpos[:, :3], axis=0), axis=1) > leap
-            before = np.clip(np.searchsorted(rows, time, side="right") - 1, 0, len(rows) - 1)
-            held = np.r_[far, False][before]
-            found[held] = qpos[before[held]]
-        found[:, 3:7] /= np.linalg.norm(found[:, 3:7], axis=1, keepdims=True)
-        return found
+        return interpolate_poses(np.asarray(self.time, float), self.qpos, time, leap)
+
+
+def interpolate_poses(
+    rows: np.ndarray, qpos: ArrayLike, time: np.ndarray, leap: float | None = None
+) -> np.ndarray:
+    """Poses `[F, nq]` at times `[F]` between poses `qpos` `[T, nq]` at times `rows` `[T]`.
+
+    See `ReplayRobot.poses_at`.
+    """
+    qpos = np.array(qpos, float)
+    qpos[:, 3:7] = continuous_quaternions(qpos[:, 3:7])
+    found = np.stack([np.interp(time, rows, column) for column in qpos.T], axis=-1)
+    if leap is not None:
+        far = np.linalg.norm(np.diff(qpos[:, :3], axis=0), axis=1) > leap
+        before = np.clip(np.searchsorted(rows, time, side="right") - 1, 0, len(rows) - 1)
+        held = np.r_[far, False][before]
+        found[held] = qpos[before[held]]
+    found[:, 3:7] /= np.linalg.norm(found[:, 3:7], axis=1, keepdims=True)
+    return found
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
 from mjx_revolve.view.palette import page_palette
 
 if TYPE_CHECKING:
+    from mjx_revolve.body.morphology import Morphology
     from mjx_revolve.episodes.champion import Episode
     from mjx_revolve.view.recording import Mark, ReplayRobot
 
@@ -159,10 +160,7 @@ def _episode_subtitle(episode: Episode) -> str:
     words = []
     if episode.score is not None:
         words.append(f"{episode.score:.3g} {episode.score_unit} over {episode.starts}")
-    counts = {
-        "module": body.num_modules, "hinge": body.num_hinges, "thruster": body.num_thrusters,
-    }  # fmt: skip
-    words += [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
+    words += body_words(body)
     words.append(world.name.replace("_", " "))
     if any(world.current):
         words.append(f"current {math.hypot(*world.current):.2g} m/s")
@@ -172,6 +170,14 @@ def _episode_subtitle(episode: Episode) -> str:
         height = 2 * math.hypot(*(wave.amplitude for wave in world.waves))
         words.append(f"waves of {height:.2g} m")
     return " \u00b7 ".join(words)
+
+
+def body_words(body: Morphology) -> list[str]:
+    """Numbers of modules, hinges and thrusters, as far as there are any, in words."""
+    counts = {
+        "module": body.num_modules, "hinge": body.num_hinges, "thruster": body.num_thrusters,
+    }  # fmt: skip
+    return [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
 
 
 def _fit(

@@ -160,7 +160,9 @@ def test_deaths(fitness, rules):
     assert list(left.members) == [0]
     assert {e["id"]: e["cause"] for e in events} == {1: "lost", 2: "age", 3: "energy", 4: "failed"}
     assert {e["cause"] for e in events} == set(CAUSES)
-    assert np.isnan(left.died[-1].score)
+    assert np.isnan([one.score for one in left.died]).all()  # too young for their fitness to count
+    whole = replace(left.members[0], track=np.zeros((rules.window, 3)))
+    assert rules.measured(whole).score == 0.2
     assert left.died[0].measures == {"age": 13.0, "children": 0.0}
 
 
@@ -237,6 +239,7 @@ def test_births_and_deaths_add_up(history, config):
         slots = [member.slot for member in search.members.values()]
         assert len(set(slots)) == len(slots)
         assert row["time"] == pytest.approx(4.0 * search.generation)
+        assert not row["best"] > row["champion"]  # newborns' short spurts do not count
     events = [e["event"] for search, _ in found for e in search.events]
     assert {"birth", "mating", "death"} == set(events)  # this seed has all of them
     children = [i for search, _ in found for i in search.born if i.parents]

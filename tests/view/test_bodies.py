@@ -246,8 +246,8 @@ def test_sizes_over_the_generations(run):
     population, _ = read_population(run)
     figure = plot_descriptors(population, ("speed_m_s",))
     panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
-    assert list(panels)[:3] == ["speed over ground (m/s)", "modules", "hinges"]
-    mean, best = panels["hinges"].lines
+    assert list(panels)[:3] == ["speed over ground (m/s)", "number of modules", "number of hinges"]
+    mean, best = panels["number of hinges"].lines
     assert mean.get_xdata().tolist() == [1, 2, 3]
     assert np.allclose(mean.get_ydata(), [2.0, 5 / 3, 2.0])
     assert best.get_ydata().tolist() == [2.0, 2.0, 3.0]

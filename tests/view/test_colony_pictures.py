@@ -19,6 +19,7 @@ from mjx_revolve.view.colony_history import make_history
 from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives, plot_population
 from mjx_revolve.view.convergence import plot_colony, scale_time
 from mjx_revolve.view.plots import figure_png
+from mjx_revolve.view.population import trace_line
 from mjx_revolve.view.report.data import read_run
 
 NOWHERE = np.zeros(3)
@@ -75,7 +76,8 @@ def test_history_by_hand(history):
     assert history.count_living(times).tolist() == [2, 3, 2, 4, 3, 3]
     assert history.count_living(times, 0).tolist() == [1, 2, 1, 2, 1, 1]
     assert history.families == [0, 1, 4]  # 80, 60 and 20 s together
-    assert history.line(3) == [0, 2, 3] and history.children[0] == [2]
+    line = [span.number for span in trace_line(history.spans, 3)]
+    assert line == [0, 2, 3] and history.children[0] == [2]
     assert history.spans[2].score == 0.3 and np.isnan(history.spans[1].score)
 
 
@@ -199,9 +201,9 @@ def test_what_is_watched_is_what_happened(run):
 
 @pytest.mark.slow
 def test_the_page_of_a_run(run, capsys):
-    argv = [str(run), "--colony", "--duration", "2"]
+    argv = [str(run), "--colony", "--duration", "1"]  # half an interval
     assert run_command(viewer.main, argv) == 0
-    assert "16 to 18 s" in capsys.readouterr().out
+    assert "16 to 17 s" in capsys.readouterr().out
     text = (run / "colony.html").read_text()
     assert '"leap":1.0' in text and "clinic" in text
     assert run_command(viewer.main, argv) == 2  # it is there already

@@ -7,6 +7,7 @@ import base64
 import http.client
 import json
 import signal
+import socket
 import threading
 from types import SimpleNamespace
 
@@ -292,6 +293,27 @@ def test_strangers_are_refused(served):
     assert command(served, stop, Host="evil.example")[0] == 404
     assert not served.simulation.paused
     assert request(served, "PUT", "wish", "{}")[0] == 501
+
+
+def test_an_address_without_its_slash(served):
+    connection = http.client.HTTPConnection("127.0.0.1", served.server_address[1], timeout=PATIENCE)
+    connection.request("GET", f"/{served.token}")
+    answer = connection.getresponse()
+    assert (answer.status, answer.headers["Location"]) == (308, f"/{served.token}/")
+    connection.close()
+
+
+def test_silent_connections(served, monkeypatch):
+    """So many and no more; those that say nothing are closed, and make room again."""
+    monkeypatch.setattr("mjx_revolve.view.live.server._Handler.timeout", 1.0)
+    monkeypatch.setattr(served, "_room", threading.Semaphore(2))
+    place = "127.0.0.1", served.server_address[1]
+    made = [socket.create_connection(place, PATIENCE) for _ in range(6)]
+    said = {one.recv(100).partition(b"\r\n")[0] for one in made}
+    assert said == {b"", b"HTTP/1.1 503 Service Unavailable"}
+    for one in made:
+        one.close()
+    assert request(served, "GET", "")[0] == 200
 
 
 def test_malformed_commands(served):

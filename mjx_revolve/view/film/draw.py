@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import math
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,8 +18,8 @@ import jax
 import mujoco
 import numpy as np
 
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.film.film import Film
+from mjx_revolve.view.film.opengl import open_window
 from mjx_revolve.view.film.overlay import make_overlay
 from mjx_revolve.view.film.stage import SURFACE, build_stage, robot_qpos
 from mjx_revolve.view.film.waterlight import make_shader
@@ -194,18 +193,9 @@ def show_film(film: Film) -> None:
     Raises:
         InputError: there is no screen with OpenGL.
     """
-    import mujoco.viewer
-
-    model = _stage_of(film, plain=False)
+    model, target = _stage_of(film, plain=False), film.shots.target
     data = mujoco.MjData(model)
-    before = set(threading.enumerate())
-    try:
-        window = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
-    except Exception as error:  # GLFW's, X's and macOS's reasons come in many kinds
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise InputError(f"--view: expected a screen with OpenGL; found: {reason}") from None
-    target = film.shots.target
-    with window:
+    with open_window("--view", model, data) as window:
         with window.lock():
             _aim(window.cam, film, 0)
         begun, last = time.monotonic(), 0
@@ -219,6 +209,3 @@ def show_film(film: Film) -> None:
             last = frame
             window.sync()
             time.sleep(0.5 / film.fps)
-    # The viewer's thread must be through with GLFW before Python ends, and GLFW with it.
-    for thread in set(threading.enumerate()) - before:
-        thread.join(timeout=10.0)

@@ -15,7 +15,7 @@ from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.view.film.camera import Shots, plan_circle, plan_shots
 from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
 from mjx_revolve.view.poses import finite_rows, pose_robot
-from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
+from mjx_revolve.view.recording import Mark, Recording, interpolate_poses
 from mjx_revolve.view.surroundings import bed_at, target_of, water_at, water_velocity
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World
@@ -133,7 +133,7 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
     rows = np.asarray(episode.trajectory.time, float)
     # Times are multiples of the step from the start, which is one step before the first row.
     time = np.arange(max(1, round(float(rows[-1]) * fps))) / fps
-    qpos = ReplayRobot("", robot, rows, np.asarray(episode.trajectory.qpos)).poses_at(time)
+    qpos = interpolate_poses(rows, np.asarray(episode.trajectory.qpos), time)
     parts = pose_robot(robot, qpos).parts
     center, radius = enclosing_balls(parts, np.linalg.norm(robot.fluid.half_size, axis=1))
     period = stroke_period(time, qpos[:, 7:])

@@ -10,7 +10,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 from mjx_revolve.inputs.errors import InputError
 
@@ -87,6 +91,40 @@ def check_screen(
             raise InputError(
                 f"{option}: expected a screen; found none that lets us open a window ({hint})"
             )
+
+
+@contextmanager
+def open_window(option: str, model: Any, data: Any, **more: Any) -> Iterator[Any]:
+    """MuJoCo's viewer without its side panels.
+
+    Args:
+        option: that asked for it.
+        model: MuJoCo's.
+        data: its state.
+        more: arguments of `mujoco.viewer.launch_passive`.
+
+    Yields:
+        The window's handle.
+
+    Raises:
+        InputError: there is no screen with OpenGL.
+    """
+    import mujoco.viewer
+
+    before = set(threading.enumerate())
+    try:
+        window = mujoco.viewer.launch_passive(
+            model, data, show_left_ui=False, show_right_ui=False, **more
+        )
+    except Exception as error:  # GLFW's, X's and macOS's reasons come in many kinds
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"{option}: expected a screen with OpenGL; found: {reason}") from None
+    with window:
+        yield window
+    # The viewer's thread must be through with GLFW before Python ends, and GLFW with it.
+    for thread in set(threading.enumerate()) - before:
+        if "_launch" in thread.name:
+            thread.join(timeout=10.0)
 
 
 def _has_display() -> bool:

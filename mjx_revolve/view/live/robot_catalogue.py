@@ -23,6 +23,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.view.live.simulation import CatalogueEntry
+from mjx_revolve.view.population import rank
 from mjx_revolve.water.world import World, load_world
 
 # The configuration whose water and controller are used by default.
@@ -211,7 +212,7 @@ def _run_drafts(own: Config, water: World, folder: Path) -> list[_Draft]:
     if own.bodies is not None and (run.path / INDIVIDUALS).is_file():
         lives, _ = read_individuals(run.path)
         scored = [life for life in lives.values() if math.isfinite(life.score)]
-        for life in sorted(scored, key=lambda life: (-life.score, life.number))[:_MOST_INDIVIDUALS]:
+        for life in sorted(scored, key=rank)[:_MOST_INDIVIDUALS]:
             short = f"individual {life.number}"
             body = _trimmed(own, life.grow(read_modules(own)), water)
             name = f"{short}: {life.score:.3g} {unit}"

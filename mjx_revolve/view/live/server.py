@@ -23,6 +23,9 @@ from mjx_revolve.view.live.simulation import LiveSimulation
 
 HOST = "127.0.0.1"
 _LONGEST = 4096  # of what is posted [bytes]
+# Connections at once, of which a browser opens six at most; and how long one of them may be silent,
+# or leave unread what is sent to it [s]. Choices.
+_MOST, _SILENT = 32, 20.0
 _PATIENCE = 1.5  # for an answer; what takes longer is announced on the page [s]
 _BEAT = 0.5  # from one state event to the next, at least [s]
 _HEADERS = {
@@ -51,6 +54,23 @@ class LiveServer(ThreadingHTTPServer):
         self.simulation, self.page = simulation, page.encode()
         self.token = secrets.token_urlsafe(16)
         self.closing = threading.Event()
+        self._room = threading.Semaphore(_MOST)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answers in a thread of its own, as long as there are not too many."""
+        if self._room.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            with suppress(OSError):
+                request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\n\r\n")
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answers, and makes room for another connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._room.release()
 
     @property
     def origins(self) -> tuple[str, ...]:
@@ -70,6 +90,7 @@ class LiveServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: LiveServer
     protocol_version = "HTTP/1.1"
+    timeout = _SILENT
     server_version, sys_version = "mjx_revolve", ""
 
     def log_message(self, format: str, *args: Any) -> None:
@@ -77,7 +98,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         place = self._place()
-        if place == "":
+        if place == "" and not self.path.endswith("/"):
+            # What the page asks for is beside it.
+            there = f"/{self.server.token}/"
+            self._send(b"", "text/plain", HTTPStatus.PERMANENT_REDIRECT, Location=there)
+        elif place == "":
             self._send(self.server.page, "text/html; charset=utf-8")
         elif place == "events":
             self._stream()
@@ -146,18 +171,17 @@ class _Handler(BaseHTTPRequestHandler):
     def _refuse(self, status: HTTPStatus, why: str) -> None:
         self._send(json.dumps({"error": why}).encode(), "application/json", status)
 
-    def _send(self, content: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+    def _send(
+        self, content: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK, **headers: str
+    ) -> None:
         with suppress(OSError):
-            self._head(status, kind, len(content))
+            self._head(status, kind, **{"Content-Length": str(len(content)), **headers})
             self.wfile.write(content)
 
-    def _head(self, status: HTTPStatus, kind: str, length: int | None = None) -> None:
+    def _head(self, status: HTTPStatus, kind: str, **headers: str) -> None:
         self.send_response(status)
-        for name, value in _HEADERS.items():
+        for name, value in {**_HEADERS, "Content-Type": kind, **headers}.items():
             self.send_header(name, value)
-        self.send_header("Content-Type", kind)
-        if length is not None:
-            self.send_header("Content-Length", str(length))
         if self.close_connection:
             self.send_header("Connection", "close")
         self.end_headers()

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -26,8 +26,12 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.live.commands import Command, Current, Drop, Pause, Rate, Remove, Reset
 from mjx_revolve.view.page_data import RobotMeshes, pack_waves
+from mjx_revolve.view.recording import interpolate_poses
 from mjx_revolve.view.surroundings import bed_at
 from mjx_revolve.water.world import World
+
+if TYPE_CHECKING:
+    from mjx_revolve.episodes.tank import Tank
 
 # The world is stepped in slices of this length, each with poses this far apart. A choice: commands
 # are done within a tenth of a second, and between two poses motion is straight [s].
@@ -40,26 +44,6 @@ _REPORT = 0.5  # from one event of the world's state to the next [s]
 _IDLE = 0.2  # from one look at the queue to the next, where there is nothing to do [s]
 _BACKLOG = 100  # events that a listener may be behind; then it is dropped
 _SPREAD = 0.6  # robots are dropped so far apart, in shares of their two lengths
-
-
-class TankLike(Protocol):
-    """A running world, as `tank.Tank` is one: robots come and go, all are stepped together."""
-
-    @property
-    def time(self) -> float:
-        """Since its beginning [s]."""
-
-    def add(self, robot: Robot, genes: Any, position: Any, quat: Any = (1, 0, 0, 0)) -> int:
-        """Puts a robot there and returns its slot."""
-
-    def remove(self, place: int) -> None:
-        """Takes it away."""
-
-    def set_current(self, current: Any) -> None:
-        """Makes the water flow so everywhere [m/s]."""
-
-    def advance(self, duration: float, every: float) -> Any:
-        """Steps all for some time [s]: a trajectory with a row each so often [s]."""
 
 
 class CatalogueEntry(NamedTuple):
@@ -119,7 +103,7 @@ class LiveSimulation:
 
     def __init__(
         self,
-        tank: TankLike,
+        tank: Tank,
         world: World,
         catalogue: Sequence[CatalogueEntry],
         first: Sequence[Drop] = (Drop(0),),
@@ -205,19 +189,12 @@ class LiveSimulation:
 
     def poses_at(self, moment: float) -> dict[int, np.ndarray]:
         """Poses by key at a moment not long ago [s], between those that are known."""
-        recent = list(self._recent)
-        if not recent:
-            return dict(self.qpos)
-        k = next((k for k, (when, _) in enumerate(recent) if when >= moment), len(recent) - 1)
-        late, after = recent[k]
-        early, before = recent[max(k - 1, 0)]
-        share = 1.0 if late <= early else min(max((moment - early) / (late - early), 0.0), 1.0)
-        found = {}
-        for key, pose in after.items():
-            other = before.get(key, pose).copy()
-            if other[3:7] @ pose[3:7] < 0:
-                other[3:7] *= -1
-            found[key] = (1 - share) * other + share * pose  # not normalised
+        recent, found = list(self._recent), dict(self.qpos)
+        for key in found:
+            rows = [(when, poses[key]) for when, poses in recent if key in poses]
+            if rows:
+                times, qpos = map(np.array, zip(*rows, strict=True))
+                found[key] = interpolate_poses(times, qpos, np.array([moment]))[0]
         return found
 
     def state_event(self) -> str:

@@ -6,7 +6,6 @@ When robots come or go, the window loads another model.
 from __future__ import annotations
 
 import math
-import threading
 import time
 from typing import Any
 
@@ -14,6 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.film.opengl import open_window
 from mjx_revolve.view.film.stage import SURFACE, build_stage, robot_qpos
 from mjx_revolve.view.live.commands import Command, Current, Drop, Pause, Remove, Reset
 from mjx_revolve.view.live.simulation import LiveSimulation
@@ -126,19 +126,9 @@ def show_window(simulation: LiveSimulation) -> None:
     Raises:
         InputError: there is no screen with OpenGL.
     """
-    import mujoco.viewer
-
     keys, scene = KeyBindings(simulation), LiveScene(simulation)
-    before = set(threading.enumerate())
-    try:
-        window = mujoco.viewer.launch_passive(
-            scene.model, scene.data, key_callback=keys.press, show_left_ui=False,
-            show_right_ui=False,
-        )  # fmt: skip
-    except Exception as error:  # GLFW's, X's and macOS's reasons come in many kinds
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise InputError(f"--mujoco: expected a screen with OpenGL; found: {reason}") from None
-    with window:
+    shown = open_window("--mujoco", scene.model, scene.data, key_callback=keys.press)
+    with shown as window:
         with window.lock():
             window.cam.lookat[:] = (0.0, 0.0, simulation.world.surface_height - 1.0)
             window.cam.distance, window.cam.azimuth, window.cam.elevation = 3.0, 110.0, -18.0
@@ -164,10 +154,6 @@ def show_window(simulation: LiveSimulation) -> None:
             ])  # fmt: skip
             window.sync()
             time.sleep(1.0 / _FPS)
-    # The viewer's thread must be through with GLFW before Python ends, and GLFW with it.
-    for thread in set(threading.enumerate()) - before:
-        if "_launch" in thread.name:
-            thread.join(timeout=10.0)
 
 
 def _load(window: Any, scene: LiveScene) -> None:

@@ -24,7 +24,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.archive_map import plot_archive
 from mjx_revolve.view.body_pictures import count_modules, draw_bodies, plot_descriptors
 from mjx_revolve.view.plots import figure_svg
-from mjx_revolve.view.population import LineageStep, pick_evenly, trace_lineage
+from mjx_revolve.view.population import LineageStep, pick_evenly, rank, trace_lineage
 from mjx_revolve.view.report.record import RunRecord
 from mjx_revolve.view.report.tables import format_number
 from mjx_revolve.view.viewer import write_viewer
@@ -57,30 +57,24 @@ class Card(NamedTuple):
     page: str
 
 
-class FamilyStep(NamedTuple):
-    """An ancestor of the champion: its card, that of the other parent, and ancestors left out."""
-
-    card: Card
-    mate: Card | None
-    skipped: int
-
-
 class ShownPopulation(NamedTuple):
     """Content of the section about a run's bodies.
 
     Attributes:
-        generations: a generation and its cards each, the last one first.
+        generations: a generation and its best individuals each, the last one first.
         family: of the champion, the oldest first.
         sizes: SVG of descriptors over the generations, or None.
         archive: SVG, or None without an archive.
-        elites: cards of the archive's individuals.
+        elites: the archive's individuals.
+        card: makes the card of any of them.
     """
 
-    generations: list[tuple[int, list[Card]]]
-    family: list[FamilyStep]
+    generations: dict[int, list[LoggedIndividual]]
+    family: list[LineageStep]
     sizes: bytes | None
     archive: bytes | None
-    elites: list[Card]
+    elites: list[LoggedIndividual]
+    card: Callable[[LoggedIndividual], Card]
 
 
 def show_population(record: RunRecord, at: Path) -> ShownPopulation:
@@ -103,21 +97,15 @@ def show_population(record: RunRecord, at: Path) -> ShownPopulation:
     elites: list[LoggedIndividual] = []
     if archive is not None:
         elites = [population.lives[n] for n in archive.ids[archives.filled(archive)].tolist()]
-        elites.sort(key=lambda life: (-life.score, life.number))
+        elites.sort(key=rank)
     pictured = [life for lives in groups.values() for life in lives] + elites[:_ELITES]
     pictured += [life for step in family for life in (step.life, step.mate) if life is not None]
-    make = _make_cards(record, pictured, at)
     sizes = plot_descriptors(population, _named(record), record.round)
     return ShownPopulation(
-        [(generation, list(map(make, lives))) for generation, lives in groups.items()],
-        [
-            FamilyStep(make(s.life), None if s.mate is None else make(s.mate), s.skipped)
-            for s in family
-        ],
-        None if sizes is None else figure_svg(sizes),
-        None if archive is None else _draw_archive(record, archive, elites, at),
-        list(map(make, elites)),
-    )
+        groups, family, None if sizes is None else figure_svg(sizes),
+        None if archive is None else _draw_archive(record, archive, elites, at), elites,
+        _make_cards(record, pictured, at),
+    )  # fmt: skip
 
 
 def _champion(record: RunRecord) -> int | None:

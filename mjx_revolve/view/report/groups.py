@@ -191,7 +191,7 @@ def _names(
     first = [key for key in _DISTINGUISHING if key in differ]
     chosen: list[tuple[str, ...]] = [()] * len(groups)
     for key in dict.fromkeys([*first, *differ]):
-        words = [_words(key, flat.get(key)) for flat in settings]
+        words = [setting_words(key, flat.get(key)) for flat in settings]
         more = [(*before, word) for before, word in zip(chosen, words, strict=True)]
         if len(set(more)) > len(set(chosen)):
             chosen = more
@@ -208,13 +208,13 @@ def _names(
     ]
 
 
-def _words(key: str, value: object) -> str:
+def setting_words(key: str, value: object) -> str:
     """`controller.type: cpg` as "cpg", anything else as "name value"."""
     if value is None:
         return ""
     section, _, leaf = key.rpartition(".")
     if key in ("morphology", "modules", "world.name"):
-        return str(value).split(" ")[0] if key != "world.name" else Path(str(value)).stem
+        return Path(str(value).split(" ")[0]).stem
     if leaf in ("type", "strategy") and section:
         return str(value).split(" ")[0]
     if leaf == "generations":

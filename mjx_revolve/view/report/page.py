@@ -39,6 +39,7 @@ from mjx_revolve.view.report.repeat import environment, repeat_commands, sources
 from mjx_revolve.view.sensor_plots import plot_sensors
 from mjx_revolve.view.statistics import COVERAGE
 from mjx_revolve.view.swim_picture import draw_motion
+from mjx_revolve.view.viewer import body_words
 
 GENERATOR = "mjx_revolve.report"  # tells our pages from others
 
@@ -387,9 +388,7 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
         if any(morphology == other for other in seen):
             continue
         seen.append(morphology)
-        counts = f"{morphology.num_modules} modules, {morphology.num_hinges} hinges"
-        if morphology.num_thrusters:
-            counts += f", {morphology.num_thrusters} thrusters"
+        counts = ", ".join(body_words(morphology))
         rows, foot = tables.count_modules(morphology)
         entries.append({
             "heading": f"{morphology.name}: {counts}" + (f" ({name})" if several else ""),

@@ -17,7 +17,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.inputs.grids import read_axes
 from mjx_revolve.view.body_pictures import plot_bodies
-from mjx_revolve.view.convergence import plot_curves, plot_scores
+from mjx_revolve.view.convergence import plot_cases
 from mjx_revolve.view.outcomes import (
     Outcome,
     by_case,
@@ -25,6 +25,7 @@ from mjx_revolve.view.outcomes import (
     write_csv,
 )
 from mjx_revolve.view.plots import label_of, letter
+from mjx_revolve.view.report.groups import setting_words
 from mjx_revolve.view.report.page import default_page, make_page, sections, svg_source
 from mjx_revolve.view.report.tables import format_number
 from mjx_revolve.view.statistics import (
@@ -127,6 +128,9 @@ def make_report(
     """
     cases = list(sweep.cases)
     plans = sweep.plans(folder)
+    names = [case_words(sweep, case) for case in cases]
+    named = dict(zip(cases, names, strict=True))
+    settings = [(named[case], typed) for case, typed in sweep.cases.items()]
     known = by_case(outcomes, cases)
     numbered = {cases.index(case): found for case, found in known.items()}
     tasks = dict.fromkeys(found[0].task for found in numbered.values())
@@ -135,15 +139,14 @@ def make_report(
         members = {k: found for k, found in numbered.items() if found[0].task == task}
         of = f": {task.replace('_', ' ')}" if len(tasks) > 1 else ""
         content += [
-            (f"scores-{n}", f"Scores{of}", _scores(members, cases)),
-            (f"tests-{n}", f"Tests{of}", _tests(members, cases)),
+            (f"scores-{n}", f"Scores{of}", _scores(members, names)),
+            (f"tests-{n}", f"Tests{of}", _tests(members, names)),
             (f"measures-{n}", f"Measures{of}", _measures(members)),
-            (f"curves-{n}", f"Curves{of}", _curves(members, cases)),
         ]
     content += [
         ("bodies", "Bodies", _bodies(numbered)),
-        ("runs", "Runs", _runs(plans, outcomes, cases, folder, at)),
-        ("repeat", "Repeat it", sections.sweep_repeat(_command(sweep), list(sweep.cases.items()))),
+        ("runs", "Runs", _runs(plans, outcomes, named, folder, at)),
+        ("repeat", "Repeat it", sections.sweep_repeat(_command(sweep), settings)),
     ]
     lead = sections.headline([
         (f"{len(outcomes)} of {len(plans)}", "runs finished"),
@@ -153,6 +156,14 @@ def make_report(
     lead += sections.problems([], lost, True)
     title = f"Sweep of {Path(sweep.config).stem}"
     return make_page(title, short_path(folder), lead, content)
+
+
+def case_words(sweep: Sweep, case: str) -> str:
+    """The settings that set a case apart, in words; its folder's name is no text to read."""
+    varied = [axis.key for axis in read_axes(sweep.settings) if len(axis.texts) > 1]
+    typed = (setting.split("=", 1) for setting in sweep.cases[case])
+    words = [(key, text.strip("[]{}\"' ").replace(",", ", ")) for key, text in typed]
+    return "; ".join(setting_words(*pair) for pair in words if pair[0] in varied) or case
 
 
 def _command(sweep: Sweep) -> str:
@@ -177,10 +188,10 @@ def _range(outcomes: Sequence[Outcome], name: str) -> str:
 
 
 def _scores(members: Numbered, cases: Sequence[str]) -> str:
-    """Means and intervals of the champions' scores, and a dot for each seed."""
+    """Means and intervals of the champions' scores, a dot for each seed, and the way there."""
     unit = next(iter(members.values()))[0].unit
     header = ["", "case", "n\nseeds", f"mean score\n{unit}", f"best seed\n{unit}"]
-    header += ["evaluations\neach", "time\ns each"]
+    header += ["evaluations\neach", "time of generations\ns each"]
     scores = {k: _values(found, "score") for k, found in members.items()}
     rows = [
         [
@@ -190,8 +201,10 @@ def _scores(members: Numbered, cases: Sequence[str]) -> str:
         ]
         for k, found in members.items()
     ]  # fmt: skip
-    named = {letter(k): values for k, values in scores.items()}
-    figure = plot_scores({f"champions' scores ({unit})": named}, [*members])
+    curves = {k: [(o.metrics["evaluations"], o.metrics["champion"]) for o in found]
+              for k, found in members.items()}  # fmt: skip
+    best = f"best score so far ({unit})" if unit else "best score so far"
+    figure = plot_cases(dict(enumerate(cases)), curves, scores, "evaluated individuals", best, unit)
     return sections.sweep_scores(header, rows, svg_source(figure))
 
 
@@ -233,14 +246,6 @@ def _measures(members: Numbered) -> str:
     return sections.sweep_measures(["", *map(letter, members)], rows) if rows else ""
 
 
-def _curves(members: Numbered, cases: Sequence[str]) -> str:
-    """Best scores so far over evaluated individuals."""
-    unit = next(iter(members.values()))[0].unit
-    named = {f"{letter(k)}: {cases[k]}": found for k, found in members.items()}
-    figure = plot_curves(named, f"best score so far ({unit})", [*members])
-    return sections.sweep_curves(svg_source(figure))
-
-
 def _bodies(numbered: Numbered) -> str:
     """The champions' bodies, where they evolve and are not too many."""
     evolved = {k: found for k, found in numbered.items() if found[0].evolved}
@@ -256,7 +261,7 @@ def _bodies(numbered: Numbered) -> str:
 def _runs(
     plans: Sequence[Plan],
     outcomes: Sequence[Outcome],
-    cases: Sequence[str],
+    cases: Mapping[str, str],
     folder: Path,
     at: Path,
 ) -> str:
@@ -274,7 +279,7 @@ def _runs(
             figures = [f"{outcome.metrics['generation'][-1]:.0f}",
                        format_number(outcome.champion["score"]),
                        f"{outcome.metrics['seconds'][-1]:.0f}", "finished"]  # fmt: skip
-        rows.append([cases.index(plan.case), plan.case, link, *figures])
+        rows.append([[*cases].index(plan.case), cases[plan.case], link, *figures])
     return sections.sweep_runs(rows)
 
 

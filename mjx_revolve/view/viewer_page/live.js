@@ -9,7 +9,7 @@ class Live extends Page {
     Object.assign(this, {
       clock: null, newest: null, paused: false, rate: 1, speed: 0, flow: data.current, drift: new THREE.Vector3(),
       cast: [], bodies: {}, wanted: null, // a robot to follow once it is there
-      aiming: false, over: null, written: 0, busy: true,
+      aiming: false, over: null, written: 0, busy: true, fresh: true,
     });
     stage.controls.maxDistance = 120 * this.size;
     this.switches();
@@ -54,12 +54,6 @@ class Live extends Page {
 
   command() {
     const { data } = this, catalogue = byId("catalogue"), deep = byId("deep");
-    for (const group of new Set(data.catalogue.map((entry) => entry.group))) {
-      const box = catalogue.appendChild(document.createElement("optgroup"));
-      box.label = group;
-      data.catalogue.forEach((entry, k) => entry.group === group && box.append(new Option(entry.name, k)));
-    }
-    catalogue.value = "0";
     catalogue.addEventListener("change", () => catalogue.blur());
     const showDepth = () => (byId("deepness").textContent = `${Number(deep.value).toFixed(2)} m`);
     deep.addEventListener("input", showDepth);
@@ -72,9 +66,7 @@ class Live extends Page {
       still: () => this.pour([0, 0, 0]),
       usual: () => this.pour([...data.current]),
     };
-    for (const id in acts) byId(id).addEventListener("click", acts[id]);
-    this.listen({
-      " ": acts.play, d: acts.drop, e: acts.aim, R: acts.reset,
+    this.listen(acts, {
       Delete: () => this.followed !== null && this.ask({ do: "remove", key: this.followed }),
       Escape: () => (this.aiming ? this.setAim(false) : this.follow(null)),
     }, [0.05, 0.1, 0.25, 0.5, 1, 2, 4]);
@@ -177,8 +169,7 @@ class Live extends Page {
     if (this.followed !== null && !keys.has(this.followed)) this.follow(null);
     for (const robot of this.cast) if (!this.robots.there.has(robot.key)) this.admit(robot);
     this.list(this.cast, (line, { key, name }) => {
-      const out = line.appendChild(document.createElement("button"));
-      out.textContent = "×";
+      const out = line.lastElementChild;
       out.title = out.ariaLabel = `take ${name} out`;
       out.addEventListener("click", (event) => {
         event.stopPropagation();
@@ -190,18 +181,19 @@ class Live extends Page {
   }
 
   admit({ key, body, name, color, born, start }) {
-    const facts = { name, color, born, from: start, times: [], poses: [], way: [] };
+    const facts = { name, color, born, from: new THREE.Vector3(...start), track: new Poses(), way: [] };
     this.robots.add(key, this.robots.bodyOf(body, this.bodies[body]), facts);
     if (this.wanted !== key) return;
     this.follow(key);
     this.wanted = null;
   }
 
-  takePose({ times, poses, way }, time, pose) {
-    if (times.length && time <= times[times.length - 1]) return;
+  takePose({ track: { times, rows }, way }, time, pose) {
+    if (time <= times[times.length - 1]) return;
     times.push(time);
-    poses.push(pose);
-    if (!way.length || time - way[way.length - 1][0] >= 0.25) way.push([time, pose[0], pose[1], pose[2]]);
+    rows.push(pose);
+    if (times.length > 200) times.splice(0, 100), rows.splice(0, 100);
+    if (!way.length || time - way[way.length - 1][0] >= 0.25) way.push([time, pose[0], pose[1]]);
     if (way.length > 480) way.shift();
   }
 
@@ -239,9 +231,9 @@ class Live extends Page {
 
   setFlow(velocity) {
     const { stage, size } = this, [x, y, z] = velocity, level = Math.hypot(x, y), all = Math.hypot(level, z);
-    stage.write("flow", all < 5e-4 ? "still" : `${all.toFixed(3)} m/s`);
+    byId("flow").textContent = all < 5e-4 ? "still" : `${all.toFixed(3)} m/s`;
     const angle = ((Math.atan2(y, x) * 180) / Math.PI + 360) % 360;
-    stage.write("bearing", level < 5e-4 ? "" : `${angle.toFixed(0)}° from x towards y`);
+    byId("bearing").textContent = level < 5e-4 ? "" : `${angle.toFixed(0)}° from x towards y`;
     if (!this.holding) byId("lift").value = z;
     if (this.arrow && velocity.join() === this.flow.join()) return;
     this.flow = velocity;
@@ -257,7 +249,7 @@ class Live extends Page {
   compass() {
     const compass = byId("compass"), lift = byId("lift");
     const drag = (event) => {
-      const box = compass.getBoundingClientRect(), r = box.width / 2 - 11;
+      const box = compass.getBoundingClientRect(), r = (45 / 112) * box.width;
       const x = (event.clientX - box.left - box.width / 2) / r, y = -(event.clientY - box.top - box.height / 2) / r;
       const far = Math.hypot(x, y), share = far < 0.06 ? 0 : FASTEST / Math.max(far, 1);
       this.pour([share * x, share * y, this.flow[2]]);
@@ -280,51 +272,14 @@ class Live extends Page {
     lift.addEventListener("input", () => this.pour([this.flow[0], this.flow[1], Number(lift.value)]));
   }
 
-  drawCompass() {
-    const { context: c, w, h } = this.stage.pen("compass"), r = w / 2 - 11, mx = w / 2, my = h / 2;
-    const at = (angle, far) => [mx + far * Math.cos(angle), my - far * Math.sin(angle)];
-    const line = (from, to) => {
-      c.beginPath();
-      c.moveTo(...from);
-      c.lineTo(...to);
-      c.stroke();
-    };
-    c.fillStyle = "rgba(120, 220, 230, 0.14)";
-    c.strokeStyle = "rgba(200, 240, 250, 0.35)";
-    c.lineWidth = 1;
-    for (const share of [1, 0.5]) {
-      disc(c, mx, my, share * r);
-      c.stroke();
-    }
-    for (let k = 0; k < 24; k++) line(at((k * Math.PI) / 12, r), at((k * Math.PI) / 12, r - (k % 6 ? 3 : 6)));
-    const { target, camera } = this.stage;
-    c.fillStyle = "rgba(235, 250, 252, 0.8)";
-    disc(c, ...at(Math.atan2(target.y - camera.position.y, target.x - camera.position.x), r + 5), 2.5); // where it looks
-    c.font = "10px system-ui, sans-serif";
-    label(c, "x", mx + r - 12, my - 7);
-    label(c, "y", mx + 8, my - r + 12);
-    label(c, FASTEST, mx + 0.72 * r, my + 0.86 * r);
-    const [x, y] = this.flow, angle = Math.atan2(y, x), long = Math.min(1, Math.hypot(x, y) / FASTEST) * r;
-    c.strokeStyle = c.fillStyle = css(PALETTE.current);
-    c.lineWidth = 3;
-    c.lineCap = "round";
-    disc(c, mx, my, 3.5);
-    if (long <= 1) return;
-    line([mx, my], at(angle, long));
-    for (const side of [0.85, -0.85]) line(at(angle, long), at(angle + side * Math.min(0.5, 5 / long), Math.max(long - 8, 0)));
+  showCompass() {
+    const [x, y] = this.flow, level = Math.hypot(x, y), long = (45 * Math.min(1, level / FASTEST)) / Math.max(level, 1e-9);
+    set(byId("stream"), { x2: long * x, y2: -long * y, visibility: level * long > 1 ? "visible" : "hidden" });
+    const { x: right, y: ahead } = this.stage.target.clone().sub(this.stage.camera.position).setZ(0).setLength(50);
+    set(byId("gaze"), { cx: right, cy: -ahead });
   }
 
   // ------------------------------------------------------------------ frames
-
-  // Where a robot is at the clock's time; null before its first pose.
-  poseAt({ times, poses }) {
-    if (!times.length) return null;
-    const i = Math.max(countUpTo(times, this.clock) - 1, 0), j = Math.min(i + 1, times.length - 1);
-    const share = j > i ? Math.min(Math.max((this.clock - times[i]) / (times[j] - times[i]), 0), 1) : 0;
-    const pose = mixPoses(poses[i], 0, poses[j], 0, share, poses[i].length, []);
-    if (i > 40) times.splice(0, i - 20), poses.splice(0, i - 20);
-    return pose;
-  }
 
   moves(passed) {
     if (this.clock === null) return !this.busy || this.robots.there.size > 0;
@@ -341,11 +296,14 @@ class Live extends Page {
     return true;
   }
 
+  speedOf({ track }) {
+    return track.speed(this.clock - 1, this.clock) || 0;
+  }
+
   update(seconds) {
-    for (const robot of this.robots.there.values()) {
-      const pose = this.poseAt(robot);
-      if (pose) robot.pose(pose);
-    }
+    for (const robot of this.robots.there.values()) if (robot.track.times.length) robot.pose(robot.track.at(this.clock));
+    if (this.fresh && this.robots.living.some(({ posed }) => posed)) this.all();
+    this.fresh &&= this.clock === null;
     this.robots.settle(seconds, this.followed);
     this.aim(this.clock ?? 0, seconds);
     this.stage.dust.material.uniforms.uDrift.value.copy(this.drift);
@@ -367,22 +325,21 @@ class Live extends Page {
       this.written = performance.now();
       for (const robot of there) {
         const line = this.lines.get(robot.key);
-        if (line && robot.posed) line.children[2].textContent = `${speedOf(robot).toFixed(2)} m/s`;
+        if (line && robot.posed) line.children[2].textContent = `${this.speedOf(robot).toFixed(2)} m/s`;
       }
       const robot = this.robots.there.get(this.followed);
       if (!robot?.posed) this.describe(null);
       else {
-        const [x, y, z] = robot.from, p = robot.place;
         this.describe(robot, {
           age: `${Math.max(0, clock - robot.born).toFixed(0)} s`,
-          speed: { text: `${speedOf(robot).toFixed(3)} m/s`, title: "over ground, over the last second" },
-          depth: `${(world.surface - p.z).toFixed(2)} m`,
-          "from start": `${Math.hypot(p.x - x, p.y - y, p.z - z).toFixed(2)} m`,
+          speed: { text: `${this.speedOf(robot).toFixed(3)} m/s`, title: "over ground, over the last second" },
+          depth: `${(world.surface - robot.place.z).toFixed(2)} m`,
+          "from start": `${robot.place.distanceTo(robot.from).toFixed(2)} m`,
         });
       }
     }
     stage.drawAxes();
-    this.drawCompass();
+    this.showCompass();
     const places = [stage.target, ...there.map(({ place }) => place)], reach = 3 * size + 1;
     const [low, high] = [-1, 1].map((side) => ["x", "y"].map((k) => side * (Math.max(...places.map((p) => side * p[k])) + reach)));
     this.overlay.drawMap(low, high, this.followed, (c, x, y) => {
@@ -400,12 +357,4 @@ class Live extends Page {
   }
 }
 
-// Over ground, over the last second or so.
-function speedOf({ way }) {
-  if (way.length < 2) return 0;
-  const b = way[way.length - 1], a = way[Math.max(0, way.length - 5)];
-  return Math.hypot(b[1] - a[1], b[2] - a[2], b[3] - a[3]) / Math.max(b[0] - a[0], 1e-6);
-}
-
-const data = JSON.parse(byId("data").textContent), stage = openStage(data.world, data.size);
-if (stage !== null) new Live(stage, data).start();
+openPage((stage, data) => new Live(stage, data));

@@ -51,22 +51,21 @@ class Page {
     this.stage.draw();
   }
 
-  // What keys do, by name, letters by their small ones; and buttons of views and rates.
-  listen(keys, rates) {
-    const letters = { n: "names", g: "grid", w: "water", t: "trail", b: "buoyancy", d: "drag", h: "thrust" };
+  // What buttons do, by id, and keys, by name; buttons have keys of their own, letters by their small ones.
+  listen(acts, keys, rates) {
+    const clicks = { follow: () => this.toggleFollow(), all: () => this.all(), ...acts };
+    for (const id in clicks) byId(id)?.addEventListener("click", clicks[id]);
     const all = {
-      "+": () => this.stage.zoom(0.85),
-      "-": () => this.stage.zoom(1 / 0.85),
+      "+": () => this.stage.controls.dollyIn(0.85),
+      "-": () => this.stage.controls.dollyOut(0.85),
       "[": () => this.step(-1),
       "]": () => this.step(1),
       ArrowUp: () => this.setRate(rates[Math.min(rates.indexOf(this.rate) + 1, rates.length - 1)]),
       ArrowDown: () => this.setRate(rates[Math.max(rates.indexOf(this.rate) - 1, 0)]),
       Escape: () => this.follow(null),
-      f: () => this.toggleFollow(),
+      ...keys,
     };
-    for (const letter in letters) if (letters[letter] in this.shown) all[letter] = () => this.toggle(letters[letter]);
-    Object.values(VIEWS).forEach((view, k) => (all[k + 1] = () => this.look(view)));
-    Object.assign(all, keys);
+    for (const button of document.querySelectorAll("[data-key]")) all[button.dataset.key] = () => button.click();
     addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
       if (event.target instanceof HTMLElement && event.target.matches("input:not([type=range])")) return;
@@ -85,7 +84,6 @@ class Page {
       this.setRate(Number(select.value));
       select.blur();
     });
-    byId("follow").addEventListener("click", () => this.toggleFollow());
     this.point();
   }
 
@@ -122,11 +120,7 @@ class Page {
 
   onMap({ key, place }) {
     this.follow(key);
-    if (key !== null) return;
-    const { target, camera, draw } = this.stage, to = new THREE.Vector3(...place, target.z);
-    camera.position.add(to).sub(target);
-    target.copy(to);
-    draw();
+    if (key === null) this.stage.go(new THREE.Vector3(...place, this.stage.target.z));
   }
 
   playing(on, words) {
@@ -144,9 +138,7 @@ class Page {
     for (const robot of robots) {
       const { key, name, color } = robot;
       if (this.lines.has(key)) continue;
-      const line = document.createElement("li");
-      line.setAttribute("role", "option");
-      line.innerHTML = "<i></i><b></b><em></em>";
+      const line = byId("entry").content.firstElementChild.cloneNode(true);
       line.children[0].style.background = color;
       line.children[1].textContent = line.children[1].title = name;
       line.addEventListener("click", () => this.follow(this.followed === key ? null : key));
@@ -182,10 +174,9 @@ class Page {
 
   // The name and the facts of the robot that is followed; facts may hold several times.
   describe(robot, facts) {
-    const box = byId("followed");
+    const box = byId("followed"), [mark, name] = box.firstElementChild.children;
     box.hidden = !robot;
     if (!robot) return;
-    const [mark, name] = box.firstElementChild.children;
     mark.style.background = robot.color;
     name.textContent = robot.name;
     this.tell(facts, box.lastElementChild);
@@ -197,8 +188,7 @@ class Page {
     for (const [name, fact] of Object.entries(facts)) {
       let row = [...box.children].find(({ dataset }) => dataset.name === name);
       if (!row) {
-        row = box.appendChild(document.createElement("div"));
-        row.innerHTML = "<dt></dt><dd></dd><dd class=more></dd>";
+        row = box.appendChild(byId("fact").content.firstElementChild.cloneNode(true));
         row.dataset.name = row.children[0].textContent = name;
         row.children[1].dataset.fact = name;
       }
@@ -212,6 +202,18 @@ class Page {
 
   look(view) {
     this.stage.look({ distance: this.followed === null ? 2.1 : 1, ...view }, this.heading);
+  }
+
+  // Shows all robots at once, several from above and beside.
+  all() {
+    this.follow(null);
+    const places = this.robots.living.map(({ place }) => place);
+    if (!places.length) return;
+    const low = places[0].clone(), high = places[0].clone();
+    for (const place of places) low.min(place), high.max(place);
+    this.stage.target.copy(low).add(high).multiplyScalar(0.5);
+    const wide = Math.max(high.distanceTo(low), 2 * this.size) / this.size, distance = Math.max(0.47 * wide, 1.6);
+    this.look(places.length > 1 ? { azimuth: 118, elevation: 34, distance } : VIEWS.swim);
   }
 
   // Water, camera and light at a time, for the robot that is followed, towards which the camera glides.
@@ -235,7 +237,20 @@ class Page {
 
   start() {
     if (this.options.has("plain")) document.body.classList.add("plain");
+    if (innerWidth <= 760) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
     status.ready = "true";
     this.stage.run(this);
+  }
+}
+
+// Opens the page on its data, if it can be drawn.
+async function openPage(make) {
+  const data = JSON.parse(byId("data").textContent), stage = openStage(data.world, data.size);
+  if (stage === null) return;
+  try {
+    (await make(stage, data)).start();
+  } catch (error) {
+    fail(`This page could not be shown: ${error}`);
+    throw error;
   }
 }

@@ -1,42 +1,5 @@
 // The replay of an episode, or of a colony: an episode is a colony of one robot with forces besides.
 
-// The poses of a robot: times [T] and rows [T, width] of qpos.
-class Poses {
-  constructor(time, values, width, leap) {
-    Object.assign(this, { time, values, width, leap, pose: [] });
-  }
-
-  // Whether the robot was put elsewhere after a row, as beyond the edge of an arena.
-  leaps(row) {
-    const { values: v, width } = this, a = row * width, far = (k) => v[a + width + k] - v[a + k];
-    return Math.hypot(far(0), far(1), far(2)) > this.leap;
-  }
-
-  // Between rows places go along a curve, as swimming robots do; all else goes straight.
-  at(time) {
-    const { time: t, values: v, width, pose } = this, i = Math.max(countUpTo(t, time) - 1, 0), a = i * width, b = a + width;
-    if (i + 1 >= t.length || time <= t[i] || this.leaps(i)) return mixPoses(v, a, v, a, 0, width, pose);
-    const span = t[i + 1] - t[i], s = (time - t[i]) / span, s2 = s * s, s3 = s2 * s;
-    mixPoses(v, a, v, b, s, width, pose);
-    if (i > 0 && i + 2 < t.length && !this.leaps(i - 1) && !this.leaps(i + 1)) {
-      const before = span / (t[i + 1] - t[i - 1]), after = span / (t[i + 2] - t[i]);
-      for (let k = 0; k < 3; k++) {
-        const m = (v[b + k] - v[a - width + k]) * before, n = (v[b + width + k] - v[a + k]) * after;
-        pose[k] = (2 * s3 - 3 * s2 + 1) * v[a + k] + (s3 - 2 * s2 + s) * m + (3 * s2 - 2 * s3) * v[b + k] + (s3 - s2) * n;
-      }
-    }
-    return pose;
-  }
-
-  // The way as a line in the picture, at most 4000 points of it.
-  trail() {
-    const { time } = this, from = time[0], span = Math.max(time[time.length - 1] - from, 1e-6);
-    const count = Math.min(Math.max(2, 4 * time.length), 4000), points = new Float32Array(3 * count);
-    for (let k = 0; k < count; k++) points.set(this.at(from + (span * k) / (count - 1)).slice(0, 3), 3 * k);
-    return { ...makeTrail(points, span / (count - 1), this.leap), from };
-  }
-}
-
 // The poses of all robots, as `page_data.pack_poses` has packed them.
 async function unpackPoses(data) {
   const packed = new Blob([bytesOf(data.poses)]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -46,15 +9,16 @@ async function unpackPoses(data) {
   const [places, turns, hinges] = data.steps;
   let at = 0, row = 0;
   return data.rows.map((n, k) => {
-    const width = 7 + data.bodies[data.robots[k].body].tree.length - 1, values = new Float32Array(n * width);
+    const width = 7 + data.bodies[data.robots[k].body].tree.length - 1;
+    const own = Array.from({ length: n }, () => new Float32Array(width));
     for (let c = 0; c < width; c++) {
       const step = c < 3 ? places : c < 7 ? turns : hinges, origin = c < 3 ? data.origins[k][c] : 0;
       for (let i = 0, whole = 0; i < n; i++, at++) {
         whole += ((bytes[at] | (bytes[count + at] << 8)) << 16) >> 16;
-        values[i * width + c] = origin + whole * step;
+        own[i][c] = origin + whole * step;
       }
     }
-    return new Poses(times.slice(row, (row += n)), values, width, data.leap ?? Infinity);
+    return new Poses(times.slice(row, (row += n)), own, data.leap ?? Infinity);
   });
 }
 
@@ -115,7 +79,7 @@ class EpisodeParts {
 
   show(time) {
     const { stage, page, world } = this, t = time - this.begin, [{ place }] = page.robots.there.values();
-    const v = this.speed.at(t, 0, 1, [0])[0], depth = world.surface - place.z, start = page.actors[0].track.values;
+    const v = this.speed.at(t, 0, 1, [0])[0], depth = world.surface - place.z, [start] = page.actors[0].track.rows;
     const facts = {
       time: `${time.toFixed(2)} s`,
       [this.speedName]: {
@@ -152,14 +116,11 @@ class ColonyParts {
     Object.assign(this, { page, data, stage, listed: "", written: 0 });
     this.births = actors.map(({ start }) => start).sort((a, b) => a - b);
     this.deaths = actors.map(({ end }) => end).filter(isFinite).sort((a, b) => a - b);
-    const changes = [...this.births.map((t) => [t, 1]), ...this.deaths.map((t) => [t, -1])];
     const points = [[data.begin, 0]];
-    let alive = 0;
-    for (const [time, by] of changes.sort((a, b) => a[0] - b[0] || a[1] - b[1])) {
-      const t = Math.max(time, data.begin);
-      points.push([t, alive], [t, (alive += by)]);
+    for (const time of [...this.births, ...this.deaths, data.last].sort((a, b) => a - b)) {
+      const t = Math.max(time, data.begin), before = points[points.length - 1][1];
+      points.push([t, before], [t, countUpTo(this.births, t) - countUpTo(this.deaths, t)]);
     }
-    points.push([data.last, alive]);
     const most = points.reduce((a, [, n]) => Math.max(a, n), 1);
     this.curve = { points, most, words: `alive, up to ${most}` };
   }
@@ -190,7 +151,7 @@ class ColonyParts {
     });
     if (performance.now() > this.written + 200) this.describe(time);
     page.overlay.drawMap(data.low, data.high, page.followed, (c, x, y, scale) => {
-      c.strokeStyle = css(PALETTE.place, 0.85);
+      c.strokeStyle = PLACE;
       for (const { place, radius } of data.marks) {
         c.beginPath();
         c.arc(x(place[0]), y(place[1]), radius * scale, 0, 2 * Math.PI);
@@ -203,16 +164,13 @@ class ColonyParts {
   // What is known of the robot that is followed.
   describe(time) {
     this.written = performance.now();
-    const { page, data } = this, actor = page.actors[page.followed], robot = page.robots.there.get(page.followed);
+    const { page } = this, actor = page.actors[page.followed], robot = page.robots.there.get(page.followed);
     if (!actor) return page.describe(null);
     if (!robot) return undefined;
-    const { track, start, end, info } = actor, t = track.time;
-    const [a, b] = [Math.max(time - 0.5, t[0]), Math.min(time + 0.5, t[t.length - 1])];
-    const from = track.at(a).slice(0, 3), to = track.at(b).slice(0, 3);
-    const way = Math.hypot(...from.map((p, k) => to[k] - p));
+    const { track, start, end, info } = actor, speed = track.speed(time - 0.5, time + 0.5);
     const facts = {
       born: page.clock(start), depth: `${(page.world.surface - robot.place.z).toFixed(2)} m`,
-      speed: b > a && way < (data.leap ?? Infinity) ? `${(way / (b - a)).toFixed(3)} m/s` : "–", ...info,
+      speed: isFinite(speed) ? `${speed.toFixed(3)} m/s` : "–", ...info,
     };
     if (isFinite(end)) facts.gone = page.clock(end);
     return page.describe(robot, facts);
@@ -233,21 +191,19 @@ class Replay extends Page {
     stage.controls.maxDistance = Math.max(60 * this.size, 2 * reach);
     this.seek(begin);
     this.parts = episode ? new EpisodeParts(this) : new ColonyParts(this);
+    this.layCurve(this.parts.curve);
     this.switches({ trail: (on) => this.trail && (this.trail.group.visible = on), ...this.parts.switches });
     const rates = [0.25, 0.5, 1, 2, 4, 10, 30, 100, 300, 1000].filter((x) => x <= Math.max(4, this.length / 10));
     const nudge = (by, far) => this.seek(this.time + by * (far ? (episode ? 1 : 0.05 * this.length) : episode ? 0.1 : this.rate));
-    this.listen({
-      " ": () => this.play(!this.on),
+    this.listen({ play: () => this.play(!this.on) }, {
       ArrowLeft: ({ shiftKey }) => nudge(-1, shiftKey),
       ArrowRight: ({ shiftKey }) => nudge(1, shiftKey),
       Home: () => this.seek(begin),
       End: () => this.seek(last),
       ...(episode
         ? { "[": () => this.parts.stretch(1 / 1.25), "]": () => this.parts.stretch(1.25) }
-        : { a: () => this.all() }),
+        : {}),
     }, rates);
-    byId("play").addEventListener("click", () => this.play(!this.on));
-    byId("all")?.addEventListener("click", () => this.all());
     const scrub = byId("scrub");
     Object.assign(scrub, { min: begin, max: last, step: Math.min(0.005, this.length / 1000) || 1 });
     scrub.addEventListener("input", () => this.seek(Number(scrub.value)));
@@ -341,18 +297,6 @@ class Replay extends Page {
     this.trail.group.visible = this.isOn("trail");
   }
 
-  // Shows all robots at once, from above and beside.
-  all() {
-    this.follow(null);
-    const places = this.robots.living.map(({ place }) => place);
-    if (!places.length) return;
-    const low = places[0].clone(), high = places[0].clone();
-    for (const place of places) low.min(place), high.max(place);
-    this.stage.target.copy(low).add(high).multiplyScalar(0.5);
-    const wide = Math.max(high.distanceTo(low), 2 * this.size) / this.size;
-    this.look({ azimuth: 118, elevation: 34, distance: Math.max(0.47 * wide, 1.6) });
-  }
-
   // ------------------------------------------------------------------ frames
 
   moves(passed) {
@@ -377,49 +321,31 @@ class Replay extends Page {
     this.parts.show(this.time);
     byId("clock").textContent = `${this.clock(this.time)} / ${this.clock(this.last)}`;
     byId("scrub").value = this.time;
-    this.drawCurve(this.parts.curve);
+    this.showCurve();
     this.stage.drawAxes();
     status.time = this.time.toFixed(4);
   }
 
-  // A curve over time below the time bar; points are [time, value], rising.
-  drawCurve({ points, most, words }) {
-    const { context: c, w, h } = this.stage.pen("chart"), pad = 8, span = w - 2 * pad, { begin, length, data } = this;
-    const x = (time) => pad + ((time - begin) / Math.max(length, 1e-9)) * span, y = (v) => h - 3 - (v / most) * (h - 9);
-    const area = new Path2D(), now = x(this.time), life = data.many && this.actors[this.followed];
-    area.moveTo(pad, h);
-    for (const [time, value] of points) area.lineTo(x(time), y(value));
-    area.lineTo(x(points[points.length - 1][0]), h);
-    for (const [color, from, to] of [["rgba(190, 235, 240, 0.22)", now, w], [css(PALETTE.accent, 0.75), 0, now]]) {
-      c.save();
-      c.beginPath();
-      c.rect(from, 0, to - from, h);
-      c.clip();
-      c.fillStyle = color;
-      c.fill(area);
-      c.restore();
-    }
-    if (life) {
-      const from = x(Math.max(life.start, begin)), to = x(Math.min(life.end, this.last));
-      c.fillStyle = life.color;
-      c.fillRect(from, h - 3, Math.max(2, to - from), 3);
-    }
-    c.fillStyle = "#fff";
-    c.fillRect(now - 1, 0, 2, h);
-    c.fillStyle = "rgba(235, 250, 252, 0.8)";
-    label(c, words, w - pad - 4, 2, "right", "top");
+  // Draws the curve below the time bar: points are [time, value], rising.
+  layCurve({ points, most, words }) {
+    const at = ([time, value]) => `${this.share(time)} ${37 - (31 * value) / most}`, [end] = points[points.length - 1];
+    const d = `M0 40L${points.map(at).join("L")}L${this.share(end)} 40Z`;
+    for (const path of byId("chart").querySelectorAll("path")) set(path, { d });
+    byId("curve").textContent = words;
+  }
+
+  // Where a time is along the time bar, from 0 to 1.
+  share(time) {
+    return (Math.min(Math.max(time, this.begin), this.last) - this.begin) / Math.max(this.length, 1e-9);
+  }
+
+  showCurve() {
+    const now = this.share(this.time), life = this.data.many && this.actors[this.followed];
+    set(byId("past"), { width: now });
+    set(byId("now"), { x1: now, x2: now });
+    const x = life ? this.share(life.start) : 0, width = life ? Math.max(0.003, this.share(life.end) - x) : 0;
+    set(byId("life"), { x, width, fill: life ? life.color : "none" });
   }
 }
 
-async function start() {
-  const data = JSON.parse(byId("data").textContent), stage = openStage(data.world, data.size);
-  if (stage === null) return;
-  try {
-    new Replay(stage, data, await unpackPoses(data)).start();
-  } catch (error) {
-    fail(`This page could not be shown: ${error}`);
-    throw error;
-  }
-}
-
-start();
+openPage(async (stage, data) => new Replay(stage, data, await unpackPoses(data)));

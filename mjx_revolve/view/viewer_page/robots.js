@@ -4,15 +4,48 @@
 const FADE = 0.8; // s of real time that a robot takes to appear or to vanish
 const CHUNK = 96; // bodies of one mesh: uniforms of a vertex shader, two for each body
 
-// Between two poses, from i and j on: straight but for the turn, which is the shorter one.
-function mixPoses(a, i, b, j, share, width, out) {
-  let dot = 0;
-  for (let k = 3; k < 7; k++) dot += a[i + k] * b[j + k];
-  for (let k = 0; k < width; k++) {
-    const sign = dot < 0 && k > 2 && k < 7 ? -1 : 1;
-    out[k] = a[i + k] * (1 - share) + sign * b[j + k] * share;
+// The poses of a robot: rising times and a row of qpos for each.
+class Poses {
+  constructor(times = [], rows = [], leap = Infinity) {
+    Object.assign(this, { times, rows, leap, pose: [] });
   }
-  return out;
+
+  // Whether the robot was put elsewhere after a row, as beyond the edge of an arena.
+  leaps(i) {
+    const a = this.rows[i], b = this.rows[i + 1];
+    return Math.hypot(b[0] - a[0], b[1] - a[1], b[2] - a[2]) > this.leap;
+  }
+
+  // Between rows places go along a curve, as swimming robots do, and all else straight; a turn is the shorter one.
+  at(time) {
+    const { times: t, rows, pose } = this, i = Math.max(countUpTo(t, time) - 1, 0), a = rows[i];
+    const last = i + 1 >= t.length || time <= t[i] || this.leaps(i), b = last ? a : rows[i + 1];
+    const span = t[i + 1] - t[i], s = last ? 0 : (time - t[i]) / span, s2 = s * s, s3 = s2 * s;
+    const dot = a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6];
+    for (let k = 0; k < a.length; k++) pose[k] = a[k] * (1 - s) + (dot < 0 && k > 2 && k < 7 ? -s : s) * b[k];
+    if (last || i === 0 || i + 2 >= t.length || this.leaps(i - 1) || this.leaps(i + 1)) return pose;
+    const before = span / (t[i + 1] - t[i - 1]), after = span / (t[i + 2] - t[i]);
+    for (let k = 0; k < 3; k++) {
+      const m = (b[k] - rows[i - 1][k]) * before, n = (rows[i + 2][k] - a[k]) * after;
+      pose[k] = (2 * s3 - 3 * s2 + 1) * a[k] + (s3 - 2 * s2 + s) * m + (3 * s2 - 2 * s3) * b[k] + (s3 - s2) * n;
+    }
+    return pose;
+  }
+
+  // Net, over ground, between two times as far as they are known [m/s]; NaN where that is not known.
+  speed(from, to) {
+    const t = this.times, a = Math.max(from, t[0]), b = Math.min(to, t[t.length - 1]);
+    const [x, y, z] = this.at(a), [u, v, w] = this.at(b), way = Math.hypot(u - x, v - y, w - z);
+    return b > a && way < this.leap ? way / (b - a) : NaN;
+  }
+
+  // The way as a line in the picture, at most 4000 points of it.
+  trail() {
+    const { times } = this, from = times[0], span = Math.max(times[times.length - 1] - from, 1e-6);
+    const count = Math.min(Math.max(2, 4 * times.length), 4000), points = new Float32Array(3 * count);
+    for (let k = 0; k < count; k++) points.set(this.at(from + (span * k) / (count - 1)).slice(0, 3), 3 * k);
+    return { ...makeTrail(points, span / (count - 1), this.leap), from };
+  }
 }
 
 // A colour for each robot, as far as possible from those before it.
@@ -94,11 +127,12 @@ class RobotMesh {
     this.bones = new Float32Array(8 * size);
     for (let k = 0; k < size; k++) this.bones[8 * k + 7] = 1;
     this.group = new THREE.Group();
+    this.look = { uSeen: { value: 1 }, uGlow: { value: 0 } };
     this.faces = body.chunks.map(({ first, bodies, faces, edges }) => {
       const uBodies = this.bones.subarray(8 * first, 8 * (first + bodies));
-      const uniforms = { uBodies, uSeen: 1, uGlow: 0, uLine: 0 }, defines = { BODIES: bodies };
-      const light = makeMaterial(ROBOT, uniforms, { defines }), dark = makeMaterial(SHADOW, uniforms, { defines });
-      const line = makeMaterial(ROBOT, { ...uniforms, uLine: 1 }, { defines, ...FLAT });
+      const uniforms = { uBodies, uLine: 0 }, defines = { BODIES: bodies };
+      const light = makeMaterial(ROBOT, uniforms, { defines }, this.look), dark = makeMaterial(SHADOW, uniforms, { defines });
+      const line = makeMaterial(ROBOT, { ...uniforms, uLine: 1 }, { defines, ...FLAT }, this.look);
       dark.fragmentShader = SHADOW.fragment;
       const mesh = makeMesh(faces, light);
       mesh.layers.enable(1); // throws shadows
@@ -110,12 +144,8 @@ class RobotMesh {
 
   // How much of it is there, from 0 to 1, and how bright it is where it is pointed at.
   show(seen, glow) {
-    for (const { light, line } of this.faces) {
-      for (const { uniforms } of [light, line]) {
-        uniforms.uSeen.value = seen;
-        uniforms.uGlow.value = glow;
-      }
-    }
+    this.look.uSeen.value = seen;
+    this.look.uGlow.value = glow;
     this.group.visible = seen > 0 && this.posed;
   }
 
@@ -154,7 +184,6 @@ class Robots {
     const robot = new RobotMesh(body, { key, ...facts });
     this.there.set(key, robot);
     this.stage.scene.add(robot.group);
-    return robot;
   }
 
   remove(key) {
@@ -245,7 +274,7 @@ class Overlay {
   // A level ring around a place, as it is seen.
   ring(c, { place: [x, y, z], radius, name }) {
     const point = new THREE.Vector3();
-    c.strokeStyle = c.fillStyle = css(PALETTE.place, 0.85);
+    c.strokeStyle = c.fillStyle = PLACE;
     c.lineWidth = 1.5;
     c.beginPath();
     let before = null;
@@ -292,7 +321,8 @@ class Overlay {
     c.globalAlpha = 1;
     c.fillStyle = "rgba(226, 244, 247, 0.72)";
     c.fillRect(w - 6 - step * scale, h - 5, step * scale, 1.5);
-    label(c, `${step} m`, w - 6, h - 7, "right", "bottom");
+    c.textAlign = "right";
+    c.fillText(`${step} m`, w - 6, h - 9);
   }
 
   // The robot, and the place [x, y] in the world, that a click on the map means.

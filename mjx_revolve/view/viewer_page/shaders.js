@@ -6,9 +6,11 @@
 
 const glsl = (color) => `linear(vec3(${color.map((x) => x.toFixed(4)).join()}))`;
 
-// Of every shader.
+// Of every shader, with what vertices tell fragments: place [m], normal and colour.
 const UNIFORMS = /* glsl */ `
 precision highp float;
+varying vec3 vPlace, vNormal, vTint;
+uniform vec3 uTarget;     // what is looked at, m
 uniform float uTime;      // s
 uniform vec3 uEye;        // m
 uniform float uSurface;   // z of the still surface, m
@@ -17,6 +19,17 @@ uniform float uSize;      // body length, m: decoration scales with it
 uniform float uHaze;      // 1; less where one looks from far away, or nothing would be seen
 uniform vec4 uWaves[MAX_WAVES];  // kx, ky [rad/m], amplitude [m], phase now [rad]
 uniform float uFade[MAX_WAVES];  // k: orbits fade with e^(k z)
+
+// Slope (xy) and height (z) of the world's waves, without those that are finer than this spacing.
+vec3 sea(vec2 p, float spacing) {
+  vec3 sum = vec3(0.0);
+  for (int i = 0; i < MAX_WAVES; i++) {
+    vec4 w = uWaves[i];
+    float phase = dot(w.xy, p) + w.w, seen = 1.0 - smoothstep(0.6, 2.5, spacing * length(w.xy));
+    sum += w.z * seen * vec3(-w.xy * sin(phase), cos(phase));
+  }
+  return sum;
+}
 `;
 
 // Of every fragment shader: light, water, air.
@@ -139,7 +152,7 @@ uniform mat4 uShadowMatrix;
 
 // Share of sunlight that the robot leaves; blur in texels.
 float sunlit(vec3 place, vec3 normal, float blur) {
-  vec4 at = uShadowMatrix * vec4(place + normal * 0.012 * uSize, 1.0);
+  vec3 at = 0.5 + 0.5 * (uShadowMatrix * vec4(place + normal * 0.012 * uSize, 1.0)).xyz;
   if (any(lessThan(at.xy, vec2(0.0))) || any(greaterThan(at.xy, vec2(1.0)))) return 1.0;
   float lit = 0.0, turn = 6.2832 * hash(gl_FragCoord.xy);
   for (int i = 0; i < 12; i++) {
@@ -152,34 +165,18 @@ float sunlit(vec3 place, vec3 normal, float blur) {
 }
 `;
 
-const SEA = /* glsl */ `
-// Slope (xy) and height (z) of the world's waves, without those that are finer than this spacing.
-vec3 sea(vec2 p, float spacing) {
-  vec3 sum = vec3(0.0);
-  for (int i = 0; i < MAX_WAVES; i++) {
-    vec4 w = uWaves[i];
-    float phase = dot(w.xy, p) + w.w, seen = 1.0 - smoothstep(0.6, 2.5, spacing * length(w.xy));
-    sum += w.z * seen * vec3(-w.xy * sin(phase), cos(phase));
-  }
-  return sum;
-}
-`;
-
 // Fills the screen behind everything.
 const BACKGROUND = {
   vertex: /* glsl */ `
-varying vec3 vRay;
 uniform mat4 uUnproject;
 void main() {
   vec4 far = uUnproject * vec4(position.xy, 1.0, 1.0);
-  vRay = far.xyz / far.w;
+  vPlace = far.xyz / far.w;
   gl_Position = vec4(position.xy, 1.0, 1.0);
 }`,
   fragment: /* glsl */ `
-varying vec3 vRay;
-
 void main() {
-  vec3 d = normalize(vRay - uEye), c;
+  vec3 d = normalize(vPlace - uEye), c;
   if (uEye.z < uSurface) {
     c = waterBody(d) + shafts(d, 100.0);
   } else {
@@ -201,7 +198,6 @@ vec3 placed() { int k = 2 * int(body + 0.5); return uBodies[k].xyz + turned(uBod
 
 const ROBOT = {
   vertex: BENT + /* glsl */ `
-varying vec3 vPlace, vNormal, vTint;
 void main() {
   vPlace = placed();
   vNormal = turned(uBodies[2 * int(body + 0.5) + 1], normal);
@@ -212,7 +208,6 @@ void main() {
 uniform float uSeen;  // 0 not there, 1 whole: robots appear and vanish by dissolving
 uniform float uGlow;  // of a robot that is pointed at
 uniform float uLine;  // 1 for the dark lines along edges
-varying vec3 vPlace, vNormal, vTint;
 void main() {
   if (hash(gl_FragCoord.xy * 0.37) >= uSeen) discard;
   vec3 n = normalize(vNormal), v = normalize(uEye - vPlace), albedo = 0.02 + 0.98 * linear(vTint);
@@ -253,15 +248,12 @@ void main() {
 
 const BED = {
   vertex: /* glsl */ `
-varying vec3 vPlace, vNormal;
 void main() {
   vPlace = position;
   vNormal = normal;
   gl_Position = projectionMatrix * viewMatrix * vec4(position, 1.0);
 }`,
   fragment: /* glsl */ `
-varying vec3 vPlace, vNormal;
-uniform vec3 uTarget;
 void main() {
   float below = uSurface - vPlace.z, under = smoothstep(-0.05, 0.05, below);
   vec2 p = vPlace.xy / uSize;
@@ -290,18 +282,15 @@ void main() {
 };
 
 const SURFACE = {
-  vertex: SEA + /* glsl */ `
+  vertex: /* glsl */ `
 uniform vec2 uCenter;
 attribute float spacing;  // of the mesh here, m
-varying vec3 vPlace;
 void main() {
   vec2 p = position.xy + uCenter;
   vPlace = vec3(p, uSurface + sea(p, spacing).z);
   gl_Position = projectionMatrix * viewMatrix * vec4(vPlace, 1.0);
 }`,
-  fragment: SEA + /* glsl */ `
-varying vec3 vPlace;
-
+  fragment: /* glsl */ `
 // Slope of wind ripples: decoration, in normals only. Short ones fade where a pixel is larger.
 vec2 rippleSlope(vec2 p, float pixel) {
   vec2 s = vec2(0.0);
@@ -359,16 +348,12 @@ void main() {
 // Lines to measure by, level with the robot's lowest place, and its shadow.
 const GRID = {
   vertex: /* glsl */ `
-uniform vec3 uTarget;
 uniform float uHeight, uReach;
-varying vec3 vPlace;
 void main() {
   vPlace = vec3(uTarget.xy + position.xy * uReach, uHeight);
   gl_Position = projectionMatrix * viewMatrix * vec4(vPlace, 1.0);
 }`,
   fragment: /* glsl */ `
-varying vec3 vPlace;
-uniform vec3 uTarget;
 uniform float uReach, uStep, uShade;
 float lines(vec2 p) {
   vec2 w = fwidth(p), d = abs(fract(p - 0.5) - 0.5) / w;
@@ -390,7 +375,7 @@ void main() {
 // Dust that drifts with the water.
 const DUST = {
   vertex: /* glsl */ `
-uniform vec3 uTarget, uDrift;
+uniform vec3 uDrift;
 uniform float uBox, uPixels;
 attribute float weight;
 varying float vAlpha;
@@ -426,7 +411,6 @@ void main() {
 const ARROW = {
   vertex: /* glsl */ `
 uniform float uThick;
-varying vec3 vPlace, vNormal;
 void main() {
   float wide = uThick > 0.0 ? uThick * length((instanceMatrix * vec4(0.0, 0.0, 0.0, 1.0)).xyz - uEye) : 1.0;
   vec4 place = instanceMatrix * vec4(position * vec3(wide, 1.0, wide), 1.0);
@@ -437,7 +421,6 @@ void main() {
   fragment: /* glsl */ `
 uniform vec3 uColor;
 uniform float uAlpha;
-varying vec3 vPlace, vNormal;
 void main() {
   vec3 n = normalize(vNormal);
   float light = 0.75 + 0.25 * n.z + 0.15 * max(dot(n, normalize(uEye - vPlace)), 0.0);

@@ -19,16 +19,11 @@ function digits(x) {
   return String(Number(x.toPrecision(2)));
 }
 
-// A colour of the palette as style sheets and canvases have it.
-function css(color, alpha = 1) {
-  return `rgba(${color.map((x) => Math.round(255 * x)).join()}, ${alpha})`;
-}
+// Of rings around places, as canvases have it.
+const PLACE = `rgba(${PALETTE.place.map((x) => Math.round(255 * x)).join()}, 0.85)`;
 
-// Words at a place, as `textAlign` and `textBaseline` say.
-function label(context, words, x, y, align = "center", base = "middle") {
-  context.textAlign = align;
-  context.textBaseline = base;
-  context.fillText(words, x, y);
+function set(element, attributes) {
+  for (const name in attributes) element.setAttribute(name, attributes[name]);
 }
 
 function disc(context, x, y, radius) {
@@ -82,7 +77,7 @@ function openStage(world, size) {
   controls.minDistance = 0.3 * size;
   controls.maxDistance = 60 * size;
   controls.zoomSpeed = 0.8;
-  const target = controls.target, here = new THREE.Vector3(), before = new THREE.Vector3();
+  const target = controls.target, here = new THREE.Vector3();
   let dirty = true, frames = 0;
   const draw = () => (dirty = true);
   controls.addEventListener("change", draw);
@@ -103,13 +98,6 @@ function openStage(world, size) {
     draw();
   }
 
-  function zoom(by) {
-    const arm = camera.position.clone().sub(target).multiplyScalar(by);
-    arm.setLength(Math.min(Math.max(arm.length(), controls.minDistance), controls.maxDistance));
-    camera.position.copy(target).add(arm);
-    draw();
-  }
-
   const bed = world.bed && { ...world.bed, radius: numbersOf(world.bed.radius), height: numbersOf(world.bed.height) };
   if (bed) scene.add(makeBed(bed));
 
@@ -125,6 +113,12 @@ function openStage(world, size) {
     return ring(i) * (1 - s) + ring(i + 1) * s;
   }
 
+  // The camera goes along to another target.
+  function go(to) {
+    camera.position.add(to).sub(target);
+    target.copy(to);
+  }
+
   // Pixels that a metre has at a distance [m].
   function pixelsAt(far) {
     return renderer.domElement.clientHeight / (2 * far * Math.tan((camera.fov * Math.PI) / 360));
@@ -133,10 +127,8 @@ function openStage(world, size) {
   // Where a place is on the screen, and pixels per metre there; null behind the camera.
   function onScreen(place) {
     const { clientWidth: w, clientHeight: h } = renderer.domElement;
-    const p = place.clone().applyMatrix4(camera.matrixWorldInverse), pixels = pixelsAt(-p.z);
-    if (p.z > -camera.near) return null;
-    p.applyMatrix4(camera.projectionMatrix);
-    return { x: (p.x + 1) * 0.5 * w, y: (1 - p.y) * 0.5 * h, pixels };
+    const p = place.clone().project(camera), pixels = pixelsAt(camera.position.distanceTo(place));
+    return Math.abs(p.z) < 1 ? { x: (p.x + 1) * 0.5 * w, y: (1 - p.y) * 0.5 * h, pixels } : null;
   }
 
   // Where a ray through a place on the screen meets a level plane; null above the horizon.
@@ -164,57 +156,32 @@ function openStage(world, size) {
     return { context, w, h };
   }
 
+  // The world's axes as the camera sees them, the nearest on top.
+  const arms = [...byId("axes").children].map((arm, k) => ({ arm, k, along: new THREE.Vector3() }));
   function drawAxes() {
-    const { context: c, w, h } = pen("axes"), arm = 0.32 * w;
-    const along = ["x", "y", "z"].map((name, k) => {
-      const d = new THREE.Vector3().setComponent(k, 1).applyQuaternion(camera.quaternion.clone().invert());
-      return { name, d, color: ["#ff7b6b", "#8fe388", "#7cc4ff"][k] };
-    });
-    along.sort((a, b) => a.d.z - b.d.z);
-    c.lineWidth = 2;
-    for (const { name, d, color } of along) {
-      c.strokeStyle = c.fillStyle = color;
-      c.beginPath();
-      c.moveTo(w / 2, h / 2);
-      c.lineTo(w / 2 + arm * d.x, h / 2 - arm * d.y);
-      c.stroke();
-      label(c, name, w / 2 + (arm + 8) * d.x, h / 2 - (arm + 8) * d.y);
+    const turn = camera.quaternion.clone().invert();
+    for (const { arm, k, along } of arms) {
+      const { x, y } = along.set(0, 0, 0).setComponent(k, 1).applyQuaternion(turn);
+      set(arm.firstChild, { x2: 23 * x, y2: -23 * y });
+      set(arm.lastChild, { x: 31 * x, y: -31 * y });
     }
+    byId("axes").append(...arms.sort((a, b) => a.along.z - b.along.z).map(({ arm }) => arm));
   }
 
   // Depths below the surface, down to the bed or to the deepest; the floor is that below a place.
   function drawGauge(depth, deepest, floor) {
-    const { context: c, w, h } = pen("gauge"), top = 27, bottom = h - 10, x = 40;
-    const tick = roundNumber(deepest / 3.2);
-    const y = (d) => top + ((bottom - top) * Math.min(Math.max(d, -0.05 * deepest), deepest)) / deepest;
-    const water = c.createLinearGradient(0, top, 0, bottom);
-    water.addColorStop(0, "rgba(120, 220, 230, 0.85)");
-    water.addColorStop(1, "rgba(10, 50, 90, 0.85)");
-    c.fillStyle = water;
-    c.fillRect(x, top, 7, bottom - top);
-    c.fillStyle = c.strokeStyle = "rgba(235, 250, 252, 0.85)";
-    for (let d = 0; d <= deepest * 1.001; d += tick) {
-      c.fillRect(x - 4, y(d) - 0.5, 4, 1);
-      label(c, digits(d), x - 7, y(d), "right");
-    }
-    label(c, "depth [m]", 4, 7, "left");
-    if (floor < deepest) {
-      c.fillStyle = css(PALETTE.sand);
-      c.fillRect(x - 1, y(floor), 9, bottom - y(floor) + 3);
-      if (y(floor) - y(depth) > 13) label(c, "bed", x + 13, Math.min(y(floor) + 5, h - 6), "left");
-    }
-    c.fillStyle = css(PALETTE.accent);
-    c.beginPath();
-    c.moveTo(x + 8, y(depth));
-    c.lineTo(x + 17, y(depth) - 6);
-    c.lineTo(x + 17, y(depth) + 6);
-    c.fill();
-    label(c, depth.toFixed(2), x + 20, y(depth), "left");
-  }
-
-  function write(id, text) {
-    const place = byId(id);
-    if (place.textContent !== text) place.textContent = text;
+    const y = (d) => 27 + (139 * Math.min(Math.max(d, -0.05 * deepest), deepest)) / deepest;
+    const scale = byId("scale"), [sand, name] = byId("floor").children, [mark, value] = byId("here").children;
+    const line = (d) => `<path d="M36 ${y(d)}h4"/><text x="33" y="${y(d)}">${digits(d)}</text>`;
+    const step = roundNumber(deepest / 3.2), count = Math.floor((1.001 * deepest) / step) + 1;
+    if (!scale.innerHTML) scale.innerHTML = Array.from({ length: count }, (_, k) => line(k * step)).join("");
+    byId("floor").style.display = floor < deepest ? "" : "none";
+    set(sand, { y: y(floor), height: 169 - y(floor) });
+    name.textContent = y(floor) - y(depth) > 13 ? "bed" : "";
+    set(name, { y: Math.min(y(floor) + 5, 170) });
+    set(mark, { transform: `translate(0 ${y(depth)})` });
+    set(value, { y: y(depth) });
+    value.textContent = depth.toFixed(2);
   }
 
   // ------------------------------------------------------------------ frames
@@ -239,11 +206,7 @@ function openStage(world, size) {
       shared.uWaves.value[k].set(wave.k * wave.x, wave.k * wave.y, wave.amplitude, phase % (2 * Math.PI));
     });
     here.copy(at);
-    if (follow) {
-      before.copy(target);
-      target.copy(here);
-      camera.position.add(before.subVectors(target, before));
-    }
+    if (follow) go(here);
     controls.update();
     const ground = bedAt(camera.position.x, camera.position.y) + 0.06 * size;
     if (camera.position.z < ground) {
@@ -271,12 +234,10 @@ function openStage(world, size) {
         dirty = true;
         // A slow machine gets plain panels, then fewer pixels, rather than fewer frames.
         slow = passed > 0.05 ? slow + (passed > 0.12 ? 4 : 1) : Math.max(0, slow - 1);
-        if (slow > 12 && !document.body.classList.contains("plain")) {
+        if (slow > 12) {
+          slow = 0;
+          pixelRatio = document.body.classList.contains("plain") ? Math.max(0.5, pixelRatio * 0.75) : pixelRatio;
           document.body.classList.add("plain");
-          slow = 0;
-        } else if (slow > 12 && pixelRatio > 0.5) {
-          pixelRatio = Math.max(0.5, pixelRatio * 0.75);
-          slow = 0;
           resize();
         }
       }
@@ -295,7 +256,7 @@ function openStage(world, size) {
 
   const stage = {
     scene, camera, controls, target, here, surface, dust, shadow, meshes: [],
-    draw, look, zoom, bedAt, pixelsAt, onScreen, onPlane, pen, drawAxes, drawGauge, write, resize, place, run,
+    draw, look, go, bedAt, pixelsAt, onScreen, onPlane, pen, drawAxes, drawGauge, resize, place, run,
   };
   return stage;
 }

@@ -3,11 +3,7 @@
 
 // --------------------------------------------------------------------- data of the page
 
-function bytesOf(text) {
-  const raw = atob(text), bytes = new Uint8Array(raw.length);
-  for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
-  return bytes.buffer;
-}
+const bytesOf = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 
 // {f32: base64}, {i16: base64, scale} or {values} as Float32Array.
 function numbersOf(packed) {
@@ -66,8 +62,9 @@ const shared = {
 };
 let maxWaves = 1;
 
-function makeMaterial(shader, uniforms = {}, options = {}) {
-  const all = { ...shared };
+// Uniforms by their values; `more` are those that materials share.
+function makeMaterial(shader, uniforms = {}, options = {}, more = {}) {
+  const all = { ...shared, ...more };
   for (const name in uniforms) all[name] = { value: uniforms[name] };
   const { defines, ...rest } = options;
   return new THREE.ShaderMaterial({
@@ -252,19 +249,15 @@ function makeCurrent(velocity, scale, step, size) {
 
 // A diamond where the robot is to go.
 function makeTarget(size) {
-  const group = new THREE.Group(), matrix = new THREE.Matrix4();
-  const halves = [1, -1].map((up) => {
-    const half = new THREE.ConeGeometry(0.6, 1, 24).translate(0, 0.5, 0).rotateX((up * Math.PI) / 2);
-    return makeCopies(half, PALETTE.target, 1, group);
-  });
+  const group = new THREE.Group(), matrix = new THREE.Matrix4().makeScale(0.12 * size, 0.12 * size, 0.12 * size);
+  const diamond = makeRings([0, 0.6, 0], 24, [0, 0], (k) => 1 - Math.floor(k / 24));
+  diamond.computeVertexNormals();
+  const mesh = makeCopies(diamond, PALETTE.target, 1, group);
   return {
     group,
     update(place) {
-      matrix.makeScale(0.12 * size, 0.12 * size, 0.12 * size).setPosition(place);
-      for (const half of halves) {
-        half.setMatrixAt(0, matrix);
-        half.instanceMatrix.needsUpdate = true;
-      }
+      mesh.setMatrixAt(0, matrix.setPosition(place));
+      mesh.instanceMatrix.needsUpdate = true;
     },
   };
 }
@@ -277,7 +270,6 @@ function makeShadow(size) {
   });
   const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, 0, 1);
   camera.layers.set(1);
-  const half = new THREE.Matrix4().set(0.5, 0, 0, 0.5, 0, 0.5, 0, 0.5, 0, 0, 0.5, 0.5, 0, 0, 0, 1);
   shared.uShadow.value = target.texture;
   return {
     reach: 0.85 * size, // around what is looked at [m]
@@ -292,7 +284,7 @@ function makeShadow(size) {
       camera.up.set(0, 1, 0);
       camera.lookAt(around);
       camera.updateMatrixWorld(true);
-      shared.uShadowMatrix.value.copy(half).multiply(camera.projectionMatrix).multiply(camera.matrixWorldInverse);
+      shared.uShadowMatrix.value.multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse);
       // A texture cannot be read while it is drawn.
       shared.uShadow.value = null;
       for (const { mesh, dark } of meshes) mesh.material = dark;
