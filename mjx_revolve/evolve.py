@@ -96,8 +96,6 @@ def _lead(
     interrupts: Interrupts,
 ) -> int:
     """A whole run; `executors` ends its workers."""
-    from mjx_revolve.evolution.run import Run
-
     def make(config: Config) -> Executor:
         from mjx_revolve.evolution.executor import make_executor
 
@@ -110,6 +108,9 @@ def _lead(
     if folder is not None and arguments.out is not None:
         raise InputError(f"--resume {folder}: expected no --out beside it; found {arguments.out}")
     trust = arguments.trust
+    print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
+    from mjx_revolve.evolution.run import Run
+
     if folder is None:
         with opening_config(path, trust):
             run = Run.begin(path, settings, arguments.out, make, interrupts.writing)
@@ -139,7 +140,7 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     config, place = run.config, short_path(run.folder.path)
     if run.is_finished:
         print(
-            f"{place}: finished after {run.generation} generations; to go on: "
+            f"{place}: finished after {run.generation} {run.unit}s; to go on: "
             f"--set evolution.generations={2 * run.generation}"
         )
         return 0
@@ -149,7 +150,7 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     interrupts.be_patient("finishing what is under way")
     champion = run.evolve(interrupts, save_pictures)
     if champion is None:
-        saved = f"stopped after generation {run.generation}; all of it is saved"
+        saved = f"stopped after {run.unit} {run.generation}; all of it is saved"
         print(f"{saved}\n{_resume_hint(run)}", flush=True)
         return interrupts.exit_code
     print(f"champion: {describe_score(champion, config)} ({champion.origin})")

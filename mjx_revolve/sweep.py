@@ -24,6 +24,7 @@ from mjx_revolve.inputs.commands import (
     run_command,
     whole,
 )
+from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.grids import MOST_SEEDS
 from mjx_revolve.inputs.shipped import find_shipped
@@ -70,6 +71,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     argv = sys.argv[1:] if argv is None else argv
     arguments = _parser().parse_args(argv)
     check_run_arguments(arguments)
+    print(plain(f"loading {arguments.config}"), flush=True)  # it takes seconds
     runtime.prepare_process()
     from mjx_revolve.evolution.executor import make_executor
     from mjx_revolve.evolution.sweeps import (
@@ -103,6 +105,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     )
     if code:
         return code
+    print("writing the report", flush=True)
     report = write_report(folder)
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)
