@@ -19,6 +19,7 @@ from mjx_revolve.inputs.commands import (
     check_episode_path,
     check_place,
     individual_name,
+    program,
     read_path,
     run_command,
 )
@@ -37,7 +38,7 @@ _FORMATS = {
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
-        prog="python -m mjx_revolve.export",
+        prog=program("export"),
         description="Write a champion, or a morphology, for MuJoCo, ROS and Gazebo: all formats "
         "into a folder, or those that are given a file.",
     )

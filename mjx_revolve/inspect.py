@@ -13,7 +13,7 @@ from collections.abc import Callable
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.table import module_table, summary, thruster_table
-from mjx_revolve.inputs.commands import Parser, read_path, run_command
+from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
 from mjx_revolve.inputs.errors import plain
 
 # Fresh water at 15 °C, the thesis's value [kg/m³].
@@ -49,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
         InputError: an argument or a file is wrong.
     """
     parser = Parser(
-        prog="python -m mjx_revolve.inspect",
+        prog=program("inspect"),
         description="Show the modules, weights and descriptors of a morphology.",
     )
     parser.add_argument("file", type=read_path, help="morphology YAML")

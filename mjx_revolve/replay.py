@@ -23,6 +23,7 @@ from mjx_revolve.inputs.commands import (
     check_place,
     individual_name,
     opening_episode,
+    program,
     read_path,
     run_command,
     whole,
@@ -44,7 +45,7 @@ _VIEW_FPS = 60  # in MuJoCo's viewer
 
 def _parser() -> Parser:
     parser = Parser(
-        prog="python -m mjx_revolve.replay",
+        prog=program("replay"),
         description="Film a champion, or a morphology in the water: MP4, GIF and viewer.html; or a "
         "whole colony: colony.mp4.",
     )

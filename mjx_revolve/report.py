@@ -13,7 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from mjx_revolve.inputs.commands import Parser, read_path, run_command
+from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -22,7 +22,7 @@ from mjx_revolve.numerics import runtime
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
-        prog="python -m mjx_revolve.report",
+        prog=program("report"),
         description="Writes a page about runs: one HTML file that needs nothing else.",
     )
     parser.add_argument("runs", nargs="+", type=read_path, metavar="RUN",

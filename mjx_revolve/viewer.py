@@ -20,6 +20,7 @@ from mjx_revolve.inputs.commands import (
     check_place,
     individual_name,
     opening_episode,
+    program,
     read_path,
     run_command,
 )
@@ -42,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
         OSError: the file cannot be written.
     """
     parser = Parser(
-        prog="python -m mjx_revolve.viewer",
+        prog=program("viewer"),
         description="Write one HTML file that replays an episode in any browser, offline.",
     )
     add_episode_arguments(parser)

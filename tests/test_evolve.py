@@ -44,13 +44,13 @@ def run_main(*argv, make_fitness=toy):
 def test_a_run_documents_itself(folder, capsys):
     assert run_main("toy.yaml", "--out", "run", "--seed", 5, "--set", "task.duration=4") == 0
     out = capsys.readouterr().out
-    lines = out.splitlines()
+    assert out.startswith("loading toy.yaml\n")
+    lines = out.splitlines()[1:]
     assert lines[0].startswith("5 genes | speed in lake | SNES 8 x 7, seed 5 | cpu with ")
-    assert [line.split("  ")[0] for line in lines[1:8]] == [
-        f"generation {i}/7" for i in range(1, 8)
-    ]
-    assert re.search(r"  best -?[\d.]+  mean -?[\d.]+  evaluations/s [\d.]+", lines[1])
-    assert re.match(r"champion: -?\S+ ± \S+ body lengths/s over 16 fresh starts \(", lines[8])
+    assert [line.split("  ")[0] for line in lines[1:9]] == [f"generation {i}/7" for i in range(8)]
+    assert re.search(r"  best -?[\d.]+  mean -?[\d.]+  evaluations/s [\d.]+", lines[2])
+    assert lines[9:11] == ["judging the champion on fresh starts", "drawing pictures"]
+    assert re.match(r"champion: -?\S+ ± \S+ body lengths/s over 16 fresh starts \(", lines[11])
     assert lines[-1] == "run folder: run"
     run = folder / "run"
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
@@ -129,7 +129,7 @@ def test_a_finished_run(folder, capsys):
     capsys.readouterr()
     assert run_main("--resume", "run") == 0
     assert capsys.readouterr().out == (
-        "run: finished after 4 generations; to go on: --set evolution.generations=8\n"
+        "loading run\nrun: finished after 4 generations; to go on: --set evolution.generations=8\n"
     )
     assert contents(folder / "run") == before
     # Going on gives what a longer run would have given.

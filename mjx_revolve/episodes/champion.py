@@ -185,7 +185,7 @@ def _episode(
     """An episode of a run."""
     return Episode(
         f"{name}: {config.task.name.replace('_', ' ')}", robot, trajectory,
-        score_unit=score_unit(config.task.type),
+        score_unit=score_unit(config.task.type, config.task.unit),
         folder=Path(config.source).parent.absolute(), **more,
     )  # fmt: skip
 

@@ -171,6 +171,9 @@ class TaskConfig(Section):
     """`directed_swim` (along `direction`, over ground), `speed` (through the water, any way),
     `reach_target`, `hold_depth`, `hold_heading`, `follow_course`, `search`, `escape`, `follow_bed`,
     `crawl`, or FILE.py:FUNCTION, a function like those in `tasks`."""
+    unit: Literal["body_lengths", "m"] = "body_lengths"
+    """What ways are measured in by tasks whose scores have body lengths in their unit. Where bodies
+    evolve, a body length at rest is a choice of theirs: `m` compares them by what they swim."""
     duration: Annotated[Positive, Unit("s")] = 10.0
     """Length of an episode [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0

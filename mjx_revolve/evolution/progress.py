@@ -39,7 +39,7 @@ class _Line(tqdm):
         rate = rate or (done - facts["initial"]) / (facts["elapsed"] or 1)
         head = f"{done}/{total}".ljust(2 * len(str(total)) + 1 if width else 0)
         if not width or width >= _WORDY:
-            head = f"{self.desc or self.unit} {head}"
+            head = f"{(width and self.desc) or self.unit} {head}"
         if self.words:
             return "  ".join((head, self.words))[: width or None]
         left = self.format_interval((total - done) / rate) if rate else "?"

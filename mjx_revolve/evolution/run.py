@@ -346,9 +346,7 @@ class Run:
             best.genes, best.body, score=best.score, final=False, origin=origin, **number
         )
 
-    def finish(
-        self, draw: Callable[[Run, Champion], None], say: Callable[[str], None]
-    ) -> Champion:
+    def finish(self, draw: Callable[[Run, Champion], None], say: Callable[[str], None]) -> Champion:
         """Judges the champion on fresh starts.
 
         Args:

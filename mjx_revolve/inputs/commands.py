@@ -27,6 +27,20 @@ _SEEDS = 2**32  # what JAX's keys take, and a run's configuration
 _LONGEST = 86_400.0
 
 
+def program(name: str, python: str = "python") -> str:
+    """How a command was called, to call it again.
+
+    Args:
+        name: of the command.
+        python: the path of Python, where it is the first word.
+    """
+    own = Path(sys.argv[0])
+    if own.name == "mjx-revolve":
+        return f"{own.name} {name}"
+    whole = (own.parent.name, own.name) == ("mjx_revolve", "__main__.py")
+    return f"{python} -m mjx_revolve{' ' if whole else '.'}{name}"
+
+
 class Parser(argparse.ArgumentParser):
     """Argument parser with errors of one line, like those about files."""
 

@@ -140,7 +140,8 @@ def test_dumb_terminals_get_plain_lines(clock, monkeypatch):
     out = Terminal()
     progress.Progress(0, 4, out).show(row(1))
     assert out.getvalue() == (
-        "generation 0/4  compiling\ngeneration 1/4  best 0.25  mean 0.3333  evaluations/s 1234  left ?\n"
+        "generation 0/4  compiling\n"
+        "generation 1/4  best 0.25  mean 0.3333  evaluations/s 1234  left ?\n"
     )
 
 

@@ -108,18 +108,25 @@ class RunRecord:
 
     @property
     def task(self) -> str:
-        """The task's type; a user's own by what its file holds; "" where it is not known."""
-        return content_name(self._task_type)
+        """The task's type; a user's own by what its file holds; "" where it is not known.
+
+        Scores in metres are those of another task.
+        """
+        return content_name(self._task_type) + " in metres" * (self._length_unit == "m")
 
     @property
     def unit(self) -> str:
         """Of the fitness; "" where it is not known."""
-        return score_unit(self._task_type)
+        return score_unit(self._task_type, self._length_unit)
 
     @property
     def measure(self) -> str:
         """Name of the measure that reports show beside the score."""
-        return shown_measure(self._task_type)
+        return shown_measure(self._task_type, self._length_unit)
+
+    @property
+    def _length_unit(self) -> str:
+        return str(self.setting("task.unit", "body_lengths"))
 
     @property
     def _task_type(self) -> str:
