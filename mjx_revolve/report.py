@@ -110,13 +110,13 @@ def main(argv: list[str] | None = None) -> int:
 
 def _report(arguments: argparse.Namespace) -> int:
     """Writes the page, and those of individuals."""
-    from mjx_revolve.evolution.sweeps import FILE
+    from mjx_revolve.inputs.files import SWEEP
     from mjx_revolve.view.report.bodies import PAGE_FOLDER, choose_individuals, write_pages
     from mjx_revolve.view.report.data import read_runs
     from mjx_revolve.view.report.page import make_report
 
     for name in arguments.runs:
-        if (Path(name) / FILE).is_file():
+        if (Path(name) / SWEEP).is_file():
             return _report_sweep(name, arguments)
     records, lost = read_runs(arguments.runs)
     folder = Path(records[0].label)

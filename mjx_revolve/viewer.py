@@ -15,6 +15,7 @@ from mjx_revolve.inputs.commands import (
     Parser,
     add_colony_arguments,
     add_episode_arguments,
+    check_absent,
     check_colony_arguments,
     check_episode_path,
     check_place,
@@ -24,7 +25,7 @@ from mjx_revolve.inputs.commands import (
     read_path,
     run_command,
 )
-from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.files import PAGES, check_name
 from mjx_revolve.view.viewer import write_colony_page, write_viewer
 
@@ -52,7 +53,8 @@ def main(argv: list[str] | None = None) -> int:
         type=read_path,
         metavar="FILE.html",
         help="default: viewer.html in the run folder (of an individual, individuals/N.html there; "
-        "with --colony, colony.html), or the morphology's name in the current folder",
+        "with --colony, colony.html), made anew each time; or the morphology's name in the current "
+        "folder, where no file is replaced",
     )
     add_colony_arguments(parser)
     arguments = parser.parse_args(argv)
@@ -97,11 +99,11 @@ def _write_colony(arguments: argparse.Namespace) -> int:
 
 
 def _usual_path(folder: Path | None, inside: str, name: str) -> Path:
-    """Where a page goes that was given no name: never over a file that is there."""
-    own = Path(f"{name}.html").name  # a robot's name may lead elsewhere
-    path = Path(os.path.normpath(folder / f"{inside}.html")) if folder else Path(own)
-    if path.exists():
-        raise InputError(f"{path}: expected no such file yet; name it with --out to replace it")
+    """Where a page goes that was given no name: in a run folder it is made anew."""
+    if folder:
+        return Path(os.path.normpath(folder / f"{inside}.html"))
+    path = Path(Path(f"{name}.html").name)  # a robot's name may lead elsewhere
+    check_absent(path)
     return path
 
 

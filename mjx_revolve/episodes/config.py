@@ -11,6 +11,7 @@ import difflib
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,6 +33,7 @@ from mjx_revolve.episodes.colony_config import ColonyConfig
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.episodes.settings import File, NamedFile, Section, Settings, map_files, one_of
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
 from mjx_revolve.inputs.schema import (
     ConstraintError,
@@ -295,6 +297,19 @@ class EvolutionConfig(Settings):
     """Settings of the strategy itself, by evosax's names."""
 
 
+@dataclass(frozen=True)
+class _Overrides:
+    """What was typed beside a file; a configuration with it equals one without.
+
+    Attributes:
+        settings: values by dotted key.
+        label: of messages about them.
+    """
+
+    settings: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    label: str = field(default="", compare=False)
+
+
 class Config(Settings):
     """A whole run. Paths are absolute once it went through `make_config` or `load_config`."""
 
@@ -358,11 +373,17 @@ class Config(Settings):
             raise ConstraintError("colony.birth.initial", most, str(self.colony.birth.initial))
 
     _source: str = PrivateAttr("config")
+    _overrides: _Overrides = PrivateAttr(_Overrides())
 
     @property
     def source(self) -> str:
         """The file this came from, for messages; `config` when made in code."""
         return self._source
+
+    def origin(self, place: str) -> str:
+        """What a message about a setting begins with: the option that set it, or the file."""
+        typed = sets(self._overrides.settings, place)
+        return f"{self._overrides.label} " if typed else f"{self._source}: "
 
     @property
     def name(self) -> str:
@@ -439,9 +460,23 @@ def make_config(
         config = Config.model_validate(merged)
     except ValidationError as error:
         problems = find_problems(error, Config, merged)
-        raise refuse(problems, lambda place: origin(place)[1]) from None
-    config._source = source
+        at = f"{label} {', '.join(settings)}: "
+        blamed = bool(settings) and _is_valid(data, folder)  # without what was typed
+
+        def before(place: str) -> str:
+            return at if blamed and not sets(settings, place) else origin(place)[1]
+
+        raise refuse(problems, before) from None
+    config._source, config._overrides = source, _Overrides(settings, label)
     return config
+
+
+def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
+    try:
+        make_config(data, folder)
+    except InputError:
+        return False
+    return True
 
 
 def _resolve(file: NamedFile, folder: Path, before: str) -> str:
@@ -455,7 +490,9 @@ def _resolve(file: NamedFile, folder: Path, before: str) -> str:
     path = Path(os.path.abspath(found))
     if not path.is_file():
         what = "a folder" if path.is_dir() else "none"
-        raise InputError(f"{before}{file.place}: expected a file; found {what} at {path}")
+        raise InputError(
+            f"{before}{file.place}: expected a file; found {what} at {short_path(path)}"
+        )
     return file.at(path)
 
 
@@ -480,8 +517,8 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
     data = load_yaml(path)
     if not isinstance(data, dict):
         found = "an empty file" if data is None else show(data)
-        raise InputError(f"{path}: expected a mapping of settings; found {found}")
-    return make_config(data, path.parent, overrides, str(path))
+        raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
+    return make_config(data, path.parent, overrides, short_path(path))
 
 
 def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:

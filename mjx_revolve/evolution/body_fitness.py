@@ -187,8 +187,8 @@ def make_body_fitness(config: Config) -> BodyFitness:
         brains = make_brain_encoding(bodies.brains, mixed.controller)
     except InputError as error:
         text = str(error)
-        place = "" if text.startswith(config.source) else f"{config.source}: "
-        raise InputError(place + text) from None
+        named = text.startswith((config.source, "--set "))
+        raise InputError(text if named else config.origin(text.partition(":")[0]) + text) from None
 
     return BodyFitness(config, genotype, mixed, brains, seeds)
 

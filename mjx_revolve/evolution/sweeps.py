@@ -34,14 +34,11 @@ from mjx_revolve.evolution.run_folder import RunFolder, is_new_folder, open_run_
 from mjx_revolve.evolution.tensorboard import check_tensorboard
 from mjx_revolve.inputs.commands import check_place, describe_refusal
 from mjx_revolve.inputs.errors import InputError, reading
-from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.inputs.files import SWEEP, short_path, write_atomic
 from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
 from mjx_revolve.inputs.schema import Integer, Text, TupleOf, checked, read
 from mjx_revolve.inputs.trust import opening, opening_config
 from mjx_revolve.inputs.yaml_reader import load_yaml
-
-FILE = "sweep.yaml"
-"""The file in a sweep's folder that describes its runs."""
 
 
 class Plan(NamedTuple):
@@ -181,7 +178,7 @@ def read_sweep(folder: str | Path) -> Sweep:
     Raises:
         InputError: it is missing, or holds something else.
     """
-    path = Path(folder) / FILE
+    path = Path(folder) / SWEEP
     data = load_yaml(path)
     with reading(path):
         sweep = read(Sweep, data)
@@ -193,18 +190,18 @@ def check_folder(folder: Path) -> None:
     """Raises `InputError` for a folder that is not new, empty or a sweep's; see `next_step`."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: expected a folder; found a file")
-    if not (folder / FILE).is_file() and folder.is_dir() and any(folder.iterdir()):
+    if not (folder / SWEEP).is_file() and folder.is_dir() and any(folder.iterdir()):
         raise InputError(
             f"--out {folder}: expected a new or empty folder, or that of a sweep; found files"
         )
-    check_place(folder / FILE, f"--out {folder}")
+    check_place(folder / SWEEP, f"--out {folder}")
 
 
 def write_sweep(folder: Path, sweep: Sweep) -> None:
     """Writes `sweep.yaml`."""
     data = {"config": sweep.config, "seeds": sweep.seeds, "settings": list(sweep.settings)}
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
-    write_atomic(folder / FILE, f"# What the runs of this folder are.\n{text}".encode())
+    write_atomic(folder / SWEEP, f"# What the runs of this folder are.\n{text}".encode())
 
 
 class SharedExecutor:

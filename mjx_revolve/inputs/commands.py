@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.files import SWEEP
 from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.inputs.terminal import spell_unencodable
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -173,6 +174,10 @@ def check_episode_path(path: str | Path) -> None:
     This precedes the imports of JAX and MuJoCo.
     """
     shipped = list_shipped("morphologies")
+    if (Path(path) / SWEEP).is_file():
+        runs = sorted(Path(path).glob("*/seed_*/config.yaml"))
+        such = f", such as {runs[0].parent}" if runs else ""
+        raise InputError(f"{path}: expected one run; found a sweep of several{such}")
     if not Path(path).exists() and str(path) not in shipped:
         raise InputError(
             f"{path}: expected a run folder, a genes.yaml or a morphology; found none, and no "
@@ -196,6 +201,12 @@ def check_place(path: str | Path, label: str) -> None:
             return
         if folder.exists():
             raise InputError(f"{label}: expected the folder {folder}; found a file")
+
+
+def check_absent(path: Path, what: str = "file") -> None:
+    """Raises `InputError` where the user was not asked, and something of theirs would be lost."""
+    if path.exists():
+        raise InputError(f"{path}: expected no such {what} yet; name it with --out to replace it")
 
 
 class _Note(logging.Formatter):

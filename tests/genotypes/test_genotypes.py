@@ -282,7 +282,9 @@ def test_spaces_are_made_of_types_that_there_are():
     assert refusal(max_of={"Fin": 1}) == (
         "bodies.max_of: expected any of bodies.modules, FixedBrick, ActiveHinge; found Fin"
     )
-    assert make_space(config(max_of={"Brick": 1}), MODULES).max_of == {"FixedBrick": 1}
+    assert make_space(config(modules=ALL, max_of={"FixedBrickSensor": 1}), MODULES).max_of == {
+        "TouchSensor": 1
+    }
     assert make_space(config(modules=("FixedBrick",), min_hinges=0), MODULES).modules == (
         "FixedBrick",
     )
