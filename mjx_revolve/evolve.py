@@ -181,8 +181,7 @@ def _describe(run: Run) -> str:
     body = ""
     if isinstance(executor.fitness, Fitness):
         robot = executor.fitness.robot
-        counts = f"{robot.num_hinges} hinges, {robot.morphology.num_modules} modules"
-        body = f"{robot.morphology.name} ({counts}), "
+        body = f"{robot.morphology.name} ({robot.morphology.counts}), "
     if config.bodies is not None:
         body = f"bodies ({config.bodies.name}, at most {config.bodies.max_modules} modules), "
     evolution = config.evolution

@@ -9,6 +9,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
@@ -58,10 +59,10 @@ def main(argv: list[str] | None = None) -> int:
         "--density",
         type=_positive("kg/m3"),
         default=_DENSITY,
-        help="of the water [kg/m3] (default %(default)s)",
+        help="of the water, kg/m³ (default %(default)s)",
     )
     parser.add_argument(
-        "--gravity", type=_positive("m/s2"), default=_GRAVITY, help="[m/s2] (default %(default)s)"
+        "--gravity", type=_positive("m/s2"), default=_GRAVITY, help="m/s² (default %(default)s)"
     )
     parser.add_argument(
         "--modules", type=read_path, metavar="MY.yaml", help="module types of your own"
@@ -79,7 +80,8 @@ def main(argv: list[str] | None = None) -> int:
         from mjx_revolve.view.pictures import draw_morphology
 
         draw_morphology(morphology, arguments.picture)
-    print(plain(f"{arguments.file}: {morphology.name}"), end="\n\n")
+    named = "" if Path(arguments.file).stem == morphology.name else f": {morphology.name}"
+    print(plain(f"{arguments.file}{named}"), end="\n\n")
     for table in (module_table(morphology), thruster_table(morphology)):
         if table:
             print("\n".join(map(plain, table)), end="\n\n")

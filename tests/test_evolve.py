@@ -50,7 +50,8 @@ def test_a_run_documents_itself(folder, capsys):
     assert [line.split("  ")[0] for line in lines[1:9]] == [f"generation {i}/7" for i in range(8)]
     assert re.search(r"  best -?[\d.]+  mean -?[\d.]+  evaluations/s [\d.]+", lines[2])
     assert lines[9:11] == ["judging the champion on fresh starts", "drawing pictures"]
-    assert re.match(r"champion: -?\S+ ± \S+ body lengths/s over 16 fresh starts \(", lines[11])
+    words = "body lengths/s, mean ± SD over 16 fresh starts"
+    assert re.match(rf"champion: -?\S+ ± \S+ {words} \(", lines[11])
     assert lines[-1] == "run folder: run"
     run = folder / "run"
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}

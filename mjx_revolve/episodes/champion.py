@@ -174,7 +174,7 @@ def _champion(champion: ChampionRecord, duration: float | None, seed: int | None
     champion.check_genes(fitness.num_genes, Path(config.source).name)
     key = _key(config, seed)
     return _episode(
-        config, fitness.robot.morphology.name, fitness.robot, fitness.replay(champion.genes, key),
+        config, fitness.robot.morphology.title, fitness.robot, fitness.replay(champion.genes, key),
         water=fitness.water(key), score=champion.score, genes=champion.genes, fitness=fitness,
     )  # fmt: skip
 

@@ -179,7 +179,8 @@ class TaskConfig(Section):
     duration: Annotated[Positive, Unit("s")] = 10.0
     """Length of an episode [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
-    """Time at the start of an episode that does not count [s]."""
+    """Time at the start of an episode that does not count; what counts begins with the sample
+    after it, 0.1 s later at most [s]."""
     trials: Annotated[Integer, Ge(1)] = 2
     """Episodes averaged per individual, each from its own start [-]."""
     direction: Annotated[Vector, Unit("-")] = (1.0, 0.0, 0.0)

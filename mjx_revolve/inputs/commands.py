@@ -113,7 +113,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         "path", type=read_path, help="run folder, genes.yaml, or morphology (YAML or name)"
     )
     parser.add_argument(
-        "--duration", type=read_seconds, metavar="S", help="[s] (default: the task's, or 10)"
+        "--duration", type=read_seconds, metavar="S", help="seconds (default: the task's, or 10)"
     )
     parser.add_argument("--seed", type=read_seed, metavar="N", help="draws another start")
     parser.add_argument(
@@ -140,7 +140,7 @@ def add_colony_arguments(parser: argparse.ArgumentParser) -> None:
         "--time",
         type=read_seconds,
         metavar="S",
-        help="with --colony: from this time of its life on [s]",
+        help="with --colony: from this time of its life on, in seconds",
     )
 
 

@@ -64,7 +64,7 @@ def _replayed(observed: ObservedRobot, start: float) -> ReplayRobot:
         "born": f"{observed.born:.0f} s",  # which may be long before the recording begins
         "parents": " and ".join(f"#{number}" for number in one.parents) or "none",
         "fitness": "not known" if math.isnan(one.score) else f"{one.score:.3g}",
-        "modules": f"{one.body.num_modules}, {one.body.num_hinges} hinges",
+        "modules": one.body.counts.replace(" modules", "", 1),
     }
     if observed.cause:
         info["dies"] = _CAUSES.get(observed.cause, observed.cause)

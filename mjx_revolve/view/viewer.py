@@ -159,18 +159,16 @@ def _episode_subtitle(episode: Episode) -> str:
     words = []
     if episode.score is not None:
         words.append(f"{episode.score:.3g} {episode.score_unit} over {episode.starts}")
-    counts = {
-        "module": body.num_modules, "hinge": body.num_hinges, "thruster": body.num_thrusters,
-    }  # fmt: skip
-    words += [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
+    words += body.counts.split(", ")
     words.append(world.name.replace("_", " "))
     if any(world.current):
         words.append(f"current {math.hypot(*world.current):.2g} m/s")
     moving = {"gusts": world.gust, "shear": world.shear, "a field of currents": world.current_field}
     words += [name for name, value in moving.items() if value is not None]
     if world.waves:
-        height = 2 * math.hypot(*(wave.amplitude for wave in world.waves))
-        words.append(f"waves of {height:.2g} m")
+        largest = max(wave.amplitude for wave in world.waves)
+        upto = " up to" * (len(world.waves) > 1)
+        words.append(f"waves of amplitude{upto} {largest:.2g} m")
     return " \u00b7 ".join(words)
 
 

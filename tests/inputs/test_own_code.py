@@ -277,7 +277,7 @@ def test_evolving_with_workers_and_resuming(folder):
     many = ["--set", "task.trials=16", "--set", "evolution.population_size=8"]  # two blocks
     done = command("swim.yaml", *many, "--out", "run", "--workers", "2")
     assert done.returncode == 0, done.stderr
-    assert "rise in lake" in done.stdout and " kg over 16 fresh starts" in done.stdout
+    assert "rise in lake" in done.stdout and " kg, mean ± SD over 16 fresh starts" in done.stdout
     assert "2 workers" in done.stdout
     facts = json.loads((folder / "run" / "run.json").read_text())["champion"]
     assert (facts["task"], facts["controller"]) == ("rise", "make_hold")

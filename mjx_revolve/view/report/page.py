@@ -290,7 +290,7 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
     pictures["swim"] = _source(figure_jpeg(draw_motion(motion)), "jpeg")
     origin = record.stand_in or record.champion.get("origin")
     return sections.champion(
-        robot.morphology.name, float(motion.time[-1]), motion.counted_from,
+        robot.morphology.title, float(motion.time[-1]), motion.counted_from,
         origin if isinstance(origin, str) else "", tables.measures_table(record, replay), pictures,
     )  # fmt: skip
 
@@ -387,12 +387,10 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
         if any(morphology == other for other in seen):
             continue
         seen.append(morphology)
-        counts = f"{morphology.num_modules} modules, {morphology.num_hinges} hinges"
-        if morphology.num_thrusters:
-            counts += f", {morphology.num_thrusters} thrusters"
+        counts = morphology.counts
         rows, foot = tables.count_modules(morphology)
         entries.append({
-            "heading": f"{morphology.name}: {counts}" + (f" ({name})" if several else ""),
+            "heading": f"{morphology.title}: {counts}" + (f" ({name})" if several else ""),
             "rows": rows, "foot": foot, "modules": tables.list_modules(morphology),
             "descriptors": tables.list_descriptors(morphology),
         })  # fmt: skip
