@@ -223,7 +223,7 @@ def test_another_host_is_mentioned(stopped, capsys, monkeypatch):
         (["toy.yaml", "--out", "full/file/run"], "expected the folder full/file; found a file"),
         (["toy.yaml", "--set", "evolution.strategy=CMA_SE"], "did you mean CMA_ES?"),
         (["toy.yaml", "--set", "evolution.strategy=PGPE", "--set", "evolution.population_size=9"],
-         "toy.yaml: evolution.population_size: expected an even number for PGPE; found 9"),
+         "--set evolution.population_size: expected an even number for PGPE; found 9"),
         (["toy.yaml", "--out", "full"], "--out full: expected a new or empty folder; found files"),
         (["--resume", "nowhere"], "nowhere: expected a run folder; found none"),
     ],

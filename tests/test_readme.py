@@ -54,7 +54,7 @@ def given_by(tree):
             yield (node.asname or node.name).partition(".")[0]
         elif isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load):
             yield node.id
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef | ast.ExceptHandler) and node.name:
             yield node.name
         elif isinstance(node, ast.arg):
             yield node.arg

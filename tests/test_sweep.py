@@ -227,7 +227,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(folder, no_picture
             ["--set", "task.duration=5,-6"],
             "duration=-6: --set task.duration: expected a number >",
         ),
-        (["--set", "evolution.strategy=SNES,Magic"], "=Magic: toy.yaml: evolution.strategy: expec"),
+        (["--set", "evolution.strategy=SNES,Magic"], "=Magic: --set evolution.strategy: expected"),
         (
             ["--set", "evolution.population_size=8,16", "--set", "task.settle=1,11"],
             "population_size=8+settle=11: --set task.settle: expected a time below task.duration",

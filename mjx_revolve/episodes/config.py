@@ -386,6 +386,13 @@ class Config(Settings):
         typed = sets(self._overrides.settings, place)
         return f"{self._overrides.label} " if typed else f"{self._source}: "
 
+    def blame(self, error: InputError) -> InputError:
+        """The same error with its place behind the option that set it, or behind the file."""
+        label, text = self._overrides.label, str(error).removeprefix(f"{self._source}: ")
+        if label and text.startswith(f"{label} "):
+            return error
+        return InputError(self.origin(text.partition(":")[0]) + text)
+
     @property
     def name(self) -> str:
         """A short name: the file's name without its suffix."""

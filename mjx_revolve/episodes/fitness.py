@@ -637,7 +637,11 @@ def _place(config: Config) -> tuple[World, Task]:
         before = config.origin(place)
         typed = name != "world" and before != config.origin("")
         raise InputError(before + (f"world.{text}" if typed else str(error))) from None
-    task = find_task(config.task, config.origin("task.type").rstrip(": "))
+    try:
+        task = find_task(config.task, config.source)
+    except InputError as error:
+        about = str(error).startswith(f"{config.source}: ")  # rather than about a user's own file
+        raise (config.blame(error) if about else error) from None
     if task.on_bed and world.bed is None:
         raise InputError(
             f"{config.origin('task.type')}task.type: {config.task.name} expected a world with a "

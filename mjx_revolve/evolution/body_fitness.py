@@ -186,9 +186,7 @@ def make_body_fitness(config: Config) -> BodyFitness:
         )
         brains = make_brain_encoding(bodies.brains, mixed.controller)
     except InputError as error:
-        text = str(error)
-        named = text.startswith((config.source, "--set "))
-        raise InputError(text if named else config.origin(text.partition(":")[0]) + text) from None
+        raise config.blame(error) from None
 
     return BodyFitness(config, genotype, mixed, brains, seeds)
 

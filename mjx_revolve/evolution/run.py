@@ -402,7 +402,7 @@ def check_search(config: Config, executor: Executor) -> None:
         make_evolution(config, executor)
     except InputError as error:
         if str(error).startswith(("evolution.", "bodies.")):
-            raise InputError(f"{config.origin(str(error).partition(':')[0])}{error}") from None
+            raise config.blame(error) from None
         raise
 
 

@@ -158,7 +158,7 @@ def check_line(message, action):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "swim.yaml: task.type: expected a function rise in {own}; found no function in it"),
+        ("", "override task.type: expected a function rise in {own}; found no function in it"),
         ("x = 1\ny = x +\n", "{own}: line 2: expected Python that runs; found SyntaxError"),
         ("import jax\n\nfrom nowhere import nothing", "{own}: line 3: expected Python that runs; "
          "found ModuleNotFoundError: No module named 'nowhere'"),

@@ -14,6 +14,7 @@ import numpy as np
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.tasks import score_unit, shown_measure
 from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.inputs.user_code import content_name
 from mjx_revolve.view.colony_history import ColonyHistory
@@ -79,7 +80,9 @@ class RunRecord:
 
     def note(self, kind: str, text: str) -> None:
         """Adds a problem once, without the folder's path."""
-        problem = Problem(kind, plain(text.replace(f"{self.folder}/", "")))
+        for folder in (str(self.folder), short_path(self.folder)):
+            text = text.replace(f"{folder}/", "")
+        problem = Problem(kind, plain(text))
         if problem not in self.problems:
             self.problems.append(problem)
 
