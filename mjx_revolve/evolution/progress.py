@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TextIO
 
-from tqdm.std import Bar, tqdm
+from tqdm import tqdm
 
 # A log gets about this many lines, however long the run, and never stays silent for longer [s].
 _LINES = 60
@@ -57,8 +57,8 @@ class _Line(tqdm):
             shown.append(last)
             bar -= len(last) + 2
         if bar >= _BAR:
-            charset = Bar.ASCII if facts["ascii"] is True else Bar.UTF
-            shown.insert(1, f"{Bar(done / total, bar, charset)}")
+            drawn = {"ncols": bar, "ascii": facts["ascii"], "bar_format": "{bar}"}
+            shown.insert(1, self.format_meter(done, total, 1.0, **drawn))
         return "  ".join((*shown, end))[:width]
 
 

@@ -71,10 +71,10 @@ def _problem(error: Any, kind: Any, data: Any) -> tuple[str, str]:
         _, annotation = _follow(kind, steps[:-1])
         known = list(fields_of(_open(annotation)[0]))
         hint = _suggest(str(steps[-1]), known, steps[:-1], kind)
-        names = ", ".join(known)
-        if hint and len(names) > _MAX_NAMES:
-            names = f"{len(known)} keys"
-        return place, f"expected one of {names}; found an unknown key{hint}"
+        listed = ", ".join(known)
+        if hint and len(listed) > _MAX_NAMES:
+            listed = f"{len(known)} keys"
+        return place, f"expected one of {listed}; found an unknown key{hint}"
     missing = error["type"] == "missing"
     if missing and isinstance(steps[-1], int):  # a vector that is too short: all of it
         missing = False
