@@ -25,7 +25,7 @@ from mjx_revolve.inputs.commands import (
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import check_name
+from mjx_revolve.inputs.files import check_name, short_path
 from mjx_revolve.numerics import runtime
 
 # By option: what its file is called in a folder, what it may end in, and what it is.
@@ -130,7 +130,7 @@ def main(argv: list[str] | None = None) -> int:
             lacking = error
             del files["mcap"]
     for path, words in export_robot(episode.robot, files, episode.trajectory, arguments.meshes):
-        print(plain(f"{path}: {words}"))
+        print(plain(f"{short_path(path)}: {words}"))
     if lacking is not None:
         print(f"no bag: {lacking}", file=sys.stderr)
     return 0

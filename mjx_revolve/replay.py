@@ -30,6 +30,7 @@ from mjx_revolve.inputs.commands import (
     whole,
 )
 from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.files import short_path
 from mjx_revolve.view.film.opengl import check_screen, find_opengl
 
 if TYPE_CHECKING:
@@ -279,7 +280,8 @@ def _say_films(paths: dict[str, Path], films: Sequence[Film]) -> None:
 def _say(paths: dict[str, Path], kind: str, words: str) -> None:
     """Says what was written, if it was."""
     if kind in paths:
-        print(plain(f"{paths[kind]}: {words}, {paths[kind].stat().st_size / 1e6:.2f} MB"))
+        place = short_path(paths[kind])
+        print(plain(f"{place}: {words}, {paths[kind].stat().st_size / 1e6:.2f} MB"))
 
 
 if __name__ == "__main__":

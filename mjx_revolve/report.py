@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
+from mjx_revolve.inputs.files import PAGES, SWEEP, check_name, short_path, write_atomic
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics import runtime
 
@@ -85,7 +85,7 @@ def _report_sweep(sweep: str, arguments: argparse.Namespace) -> int:
     report = write_report(sweep, arguments.out and _named_page(arguments, Path(sweep)))
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)
-    print(f"report: {report.page}; {report.table}")
+    print(f"report: {short_path(report.page)}; {short_path(report.table)}")
     return 0
 
 
@@ -110,7 +110,6 @@ def main(argv: list[str] | None = None) -> int:
 
 def _report(arguments: argparse.Namespace) -> int:
     """Writes the page, and those of individuals."""
-    from mjx_revolve.inputs.files import SWEEP
     from mjx_revolve.view.report.bodies import PAGE_FOLDER, choose_individuals, write_pages
     from mjx_revolve.view.report.data import read_runs
     from mjx_revolve.view.report.page import make_report
@@ -136,7 +135,7 @@ def _report(arguments: argparse.Namespace) -> int:
         if record.problems:
             print(f"warning: {plain(record.warning)}", file=sys.stderr)
     write_atomic(path, page)
-    print(f"report: {path} ({len(page) / 1e6:.1f} MB)")
+    print(f"report: {short_path(path)} ({len(page) / 1e6:.1f} MB)")
     return 0
 
 

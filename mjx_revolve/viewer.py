@@ -26,7 +26,7 @@ from mjx_revolve.inputs.commands import (
     run_command,
 )
 from mjx_revolve.inputs.errors import plain
-from mjx_revolve.inputs.files import PAGES, check_name
+from mjx_revolve.inputs.files import PAGES, check_name, short_path
 from mjx_revolve.view.viewer import write_colony_page, write_viewer
 
 
@@ -75,7 +75,7 @@ def main(argv: list[str] | None = None) -> int:
     write_viewer(episode, out)
     size = Path(out).stat().st_size / 1e6
     length = f"{episode.trajectory.time[-1]:.4g} s"
-    print(plain(f"{out}: {length}, {size:.2f} MB; open it in a browser"))
+    print(plain(f"{short_path(out)}: {length}, {size:.2f} MB; open it in a browser"))
     return 0
 
 
@@ -94,7 +94,7 @@ def _write_colony(arguments: argparse.Namespace) -> int:
         window=(seen.start, seen.end),
     )  # fmt: skip
     span = f"{len(seen.robots)} robots, {seen.start:.4g} to {seen.end:.4g} s"
-    print(plain(f"{out}: {span}, {written.bytes / 1e6:.2f} MB; open it in a browser"))
+    print(plain(f"{short_path(out)}: {span}, {written.bytes / 1e6:.2f} MB; open it in a browser"))
     return 0
 
 
