@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import shutil
 import sys
 import textwrap
 from pathlib import Path
@@ -70,15 +71,21 @@ def _help() -> str:
         "configurations that come with the package; a path to your own does as well:",
         *_columns(configs),
         "",
-        textwrap.fill(f"robots: {robots}", 80, subsequent_indent="  "),
+        _fill(f"robots: {robots}", 2),
         "",
         "--version prints the version.",
     ))  # fmt: skip
 
 
 def _columns(words: dict[str, str]) -> list[str]:
-    width = max(map(len, words))
-    return [f"  {name:{width}}  {text}" for name, text in words.items()]
+    indent = max(map(len, words)) + 4
+    lines = (f"  {name}".ljust(indent) + text for name, text in words.items())
+    return [_fill(line, indent) for line in lines]
+
+
+def _fill(line: str, indent: int) -> str:
+    width = shutil.get_terminal_size().columns - 2  # as argparse has it
+    return textwrap.fill(line, max(width, indent + 20), subsequent_indent=" " * indent)
 
 
 def _first_words(path: Path) -> str:
