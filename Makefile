@@ -15,9 +15,12 @@ help:  ## list the targets
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: expected Python 3.11 or newer; found $$($(PYTHON) --version) (set PYTHON=...)"; exit 2; }
-	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@echo "setting up $(VENV) from requirements.lock: one to three minutes, 2 GB"
+	@$(PYTHON) -m venv $(VENV)
+	@echo "downloading and installing packages"
+	@$(VENV)/bin/pip install --quiet --disable-pip-version-check -r requirements.lock
+	@echo "installing mjx_revolve itself"
+	@$(VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --editable .
 	@touch $(READY)
 
 install: $(READY)  ## set up .venv

@@ -7,7 +7,7 @@ continuous actions (Huang et al. 2022, "The 37 implementation details of PPO"): 
 generalised advantage estimation (Schulman et al. 2015, arXiv:1506.02438), two small networks, Adam.
 The fish of `configs/fish_swim.yaml` learns to swim ahead from what it feels; no gait is given. At
 the end, its mean action is judged on fresh episodes beside doing nothing and acting at random.
-Needs gymnasium: ``pip install 'mjx_revolve[gym]'``.
+Needs gymnasium: ``pip install 'gymnasium>=1.1'``.
 """
 
 from __future__ import annotations

@@ -3,13 +3,32 @@
 from __future__ import annotations
 
 import importlib
+import re
+import shutil
 import sys
+import textwrap
+from pathlib import Path
 
-from mjx_revolve.inputs.commands import run_command
+import mjx_revolve
+from mjx_revolve.inputs.commands import program, run_command
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.shipped import list_shipped
 
-_COMMANDS = ("evolve", "sweep", "inspect", "viewer", "replay", "live", "report", "export")
-_USAGE = f"usage: mjx-revolve {{{','.join(_COMMANDS)}}} ... (each explains itself with --help)"
+_COMMANDS = {
+    "evolve": "evolve a robot's brain, bodies with their brains, or a colony: a run folder",
+    "sweep": "a grid of such runs, several seeds of each, and one report",
+    "inspect": "a robot's modules, and what it weighs in air and in water; its picture",
+    "viewer": "a page that replays a run's champion, or a robot, in any browser",
+    "replay": "a film of it: MP4 and GIF",
+    "live": "a running world in a browser, to drop robots into",
+    "report": "a page about one run, several, or a sweep",
+    "export": "a champion, or a robot, for MuJoCo, ROS and Gazebo",
+}
+_EXAMPLES = (
+    "inspect spider --picture spider.png",
+    "evolve lake_swim --set task.duration=8 --out runs/mine",
+    "viewer runs/mine",
+)
 
 
 def main() -> int:
@@ -24,11 +43,54 @@ def main() -> int:
 def _main(argv: list[str] | None) -> int:
     name, *rest = argv or ["--help"]
     if name in ("-h", "--help"):
-        print(_USAGE)
+        print(_help())
+        return 0
+    if name == "--version":
+        print(f"mjx_revolve {mjx_revolve.__version__}")
         return 0
     if name not in _COMMANDS:
-        raise InputError(f"expected one of {', '.join(_COMMANDS)}; found {name!r}")
+        raise InputError(f"expected one of {', '.join(_COMMANDS)}; found {name!r} (see --help)")
     return importlib.import_module(f"mjx_revolve.{name}").main(rest)
+
+
+def _help() -> str:
+    """All commands, examples, and what comes with the package."""
+    configs = {name: _first_words(path) for name, path in list_shipped("configs").items()}
+    robots = ", ".join(list_shipped("morphologies"))
+    return "\n".join((
+        f"usage: {program('COMMAND')} ...",
+        "",
+        "Evolves modular robots that swim and crawl under water.",
+        "",
+        "commands, each of which explains itself with --help:",
+        *_columns(_COMMANDS),
+        "",
+        "examples:",
+        *(f"  {program(line)}" for line in _EXAMPLES),
+        "",
+        "configurations that come with the package; a path to your own does as well:",
+        *_columns(configs),
+        "",
+        _fill(f"robots: {robots}", 2),
+        "",
+        "--version prints the version.",
+    ))  # fmt: skip
+
+
+def _columns(words: dict[str, str]) -> list[str]:
+    indent = max(map(len, words)) + 4
+    lines = (f"  {name}".ljust(indent) + text for name, text in words.items())
+    return [_fill(line, indent) for line in lines]
+
+
+def _fill(line: str, indent: int) -> str:
+    width = shutil.get_terminal_size().columns - 2  # as argparse has it
+    return textwrap.fill(line, max(width, indent + 20), subsequent_indent=" " * indent)
+
+
+def _first_words(path: Path) -> str:
+    """The comment that a file begins with, up to its first stop or colon."""
+    return re.split(r"[.:]", path.read_text("utf-8").removeprefix("# "))[0]
 
 
 if __name__ == "__main__":

@@ -28,12 +28,14 @@ from mjx_revolve.inputs.commands import (
     add_run_arguments,
     check_run_arguments,
     describe_refusal,
+    program,
     read_path,
     read_seed,
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
+from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.trust import add_trust_argument, opening, opening_config
 from mjx_revolve.numerics import runtime
 
@@ -45,8 +47,13 @@ if TYPE_CHECKING:
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
-        prog="python -m mjx_revolve.evolve",
-        description="Evolves a robot's controller and documents the run in a folder.",
+        prog=program("evolve"),
+        description="Evolves the controller of one robot; or, where the configuration has "
+        "`bodies`, bodies together with their brains; or, where it has `colony` as well, robots "
+        "that meet, mate, are born and die in one world. All of it is documented in a run folder.",
+        epilog=f"Configurations that come with the package: {', '.join(list_shipped('configs'))}. "
+        "lake_coevolve, bed_coevolve and lake_map_elites evolve bodies, lake_colony is a colony. "
+        "docs/settings.md lists all settings.",
     )
     add = parser.add_argument
     add("config", nargs="?", type=read_path, metavar="CONFIG",
@@ -97,7 +104,6 @@ def _lead(
     interrupts: Interrupts,
 ) -> int:
     """A whole run; `executors` ends its workers."""
-    from mjx_revolve.evolution.run import Run
 
     def make(config: Config) -> Executor:
         from mjx_revolve.evolution.executor import make_executor
@@ -111,6 +117,11 @@ def _lead(
     if folder is not None and arguments.out is not None:
         raise InputError(f"--resume {folder}: expected no --out beside it; found {arguments.out}")
     trust = arguments.trust
+    if path is not None:
+        find_shipped(path, "configs")  # a name that there is not is known at once
+    print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
+    from mjx_revolve.evolution.run import Run
+
     if folder is None:
         with opening_config(path, trust):
             run = Run.begin(path, settings, arguments.out, make, interrupts.writing)
@@ -140,7 +151,7 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     config, place = run.config, short_path(run.folder.path)
     if run.is_finished:
         print(
-            f"{place}: finished after {run.generation} generations; to go on: "
+            f"{place}: finished after {run.generation} {run.unit}s; to go on: "
             f"--set evolution.generations={2 * run.generation}"
         )
         return 0
@@ -150,7 +161,7 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     interrupts.be_patient("finishing what is under way")
     champion = run.evolve(interrupts, save_pictures)
     if champion is None:
-        saved = f"stopped after generation {run.generation}; all of it is saved"
+        saved = f"stopped after {run.unit} {run.generation}; all of it is saved"
         print(f"{saved}\n{_resume_hint(run)}", flush=True)
         return interrupts.exit_code
     print(f"champion: {describe_score(champion, config)} ({champion.origin})")
@@ -171,8 +182,7 @@ def _describe(run: Run) -> str:
     body = ""
     if isinstance(executor.fitness, Fitness):
         robot = executor.fitness.robot
-        counts = f"{robot.num_hinges} hinges, {robot.morphology.num_modules} modules"
-        body = f"{robot.morphology.name} ({counts}), "
+        body = f"{robot.morphology.name} ({robot.morphology.counts}), "
     if config.bodies is not None:
         body = f"bodies ({config.bodies.name}, at most {config.bodies.max_modules} modules), "
     evolution = config.evolution
@@ -211,8 +221,8 @@ def _remedy(error: OSError) -> str:
 def _resume_hint(run: Run) -> str:
     python = Path(sys.executable)
     name = short_path(python) if python.is_relative_to(Path.cwd()) else "python"
-    words = [name, "-m", "mjx_revolve.evolve", "--resume", short_path(run.folder.path)]
-    return f"resume: {shlex.join(words)}"
+    place = shlex.quote(short_path(run.folder.path))
+    return f"resume: {program('evolve', shlex.quote(name))} --resume {place}"
 
 
 if __name__ == "__main__":

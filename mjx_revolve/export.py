@@ -16,14 +16,16 @@ from pathlib import Path
 from mjx_revolve.inputs.commands import (
     Parser,
     add_episode_arguments,
+    check_absent,
     check_episode_path,
     check_place,
     individual_name,
+    program,
     read_path,
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import check_name
+from mjx_revolve.inputs.files import check_name, short_path
 from mjx_revolve.numerics import runtime
 
 # By option: what its file is called in a folder, what it may end in, and what it is.
@@ -37,7 +39,7 @@ _FORMATS = {
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
-        prog="python -m mjx_revolve.export",
+        prog=program("export"),
         description="Write a champion, or a morphology, for MuJoCo, ROS and Gazebo: all formats "
         "into a folder, or those that are given a file.",
     )
@@ -49,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
         type=read_path,
         metavar="DIR",
         help="all formats into this folder (default: export in the run folder, individuals/N there "
-        "of an individual, or MORPHOLOGY_export here)",
+        "of an individual, made anew each time, or MORPHOLOGY_export here, if there is none yet)",
     )
     parser.add_argument(
         "--meshes",
@@ -74,6 +76,8 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
         label = f"--{name} {getattr(arguments, name)}"
         files[name] = check_name(getattr(arguments, name), endings, label)
         check_place(files[name], label)
+        if not files[name].parent.is_dir():
+            raise InputError(f"{label}: expected the folder {files[name].parent}; found none")
     if arguments.out is None:
         return files
     if files:
@@ -110,15 +114,13 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.mcap is not None:
         check_rosbags()
     episode = load_asked(arguments)
-    if not files:  # never over what is there
-        folder = Path(f"{Path(episode.robot.morphology.name).name}_export")
+    if not files:
         if episode.folder is not None:
             name = individual_name(arguments.individual) or "export"
             folder = Path(os.path.normpath(episode.folder / name))
-        if folder.exists():
-            raise InputError(
-                f"{folder}: expected no such folder yet; name it with --out to replace it"
-            )
+        else:
+            folder = Path(f"{Path(episode.robot.morphology.name).name}_export")
+            check_absent(folder, "folder")
         files = _all_files(folder)
     lacking = None
     if arguments.mcap is None and "mcap" in files:
@@ -128,7 +130,7 @@ def main(argv: list[str] | None = None) -> int:
             lacking = error
             del files["mcap"]
     for path, words in export_robot(episode.robot, files, episode.trajectory, arguments.meshes):
-        print(plain(f"{path}: {words}"))
+        print(plain(f"{short_path(path)}: {words}"))
     if lacking is not None:
         print(f"no bag: {lacking}", file=sys.stderr)
     return 0

@@ -9,11 +9,12 @@ import argparse
 import math
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.table import module_table, summary, thruster_table
-from mjx_revolve.inputs.commands import Parser, read_path, run_command
+from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
 from mjx_revolve.inputs.errors import plain
 
 # Fresh water at 15 °C, the thesis's value [kg/m³].
@@ -49,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
         InputError: an argument or a file is wrong.
     """
     parser = Parser(
-        prog="python -m mjx_revolve.inspect",
+        prog=program("inspect"),
         description="Show the modules, weights and descriptors of a morphology.",
     )
     parser.add_argument("file", type=read_path, help="morphology YAML")
@@ -58,10 +59,10 @@ def main(argv: list[str] | None = None) -> int:
         "--density",
         type=_positive("kg/m3"),
         default=_DENSITY,
-        help="of the water [kg/m3] (default %(default)s)",
+        help="of the water, kg/m³ (default %(default)s)",
     )
     parser.add_argument(
-        "--gravity", type=_positive("m/s2"), default=_GRAVITY, help="[m/s2] (default %(default)s)"
+        "--gravity", type=_positive("m/s2"), default=_GRAVITY, help="m/s² (default %(default)s)"
     )
     parser.add_argument(
         "--modules", type=read_path, metavar="MY.yaml", help="module types of your own"
@@ -79,7 +80,8 @@ def main(argv: list[str] | None = None) -> int:
         from mjx_revolve.view.pictures import draw_morphology
 
         draw_morphology(morphology, arguments.picture)
-    print(plain(f"{arguments.file}: {morphology.name}"), end="\n\n")
+    named = "" if Path(arguments.file).stem == morphology.name else f": {morphology.name}"
+    print(plain(f"{arguments.file}{named}"), end="\n\n")
     for table in (module_table(morphology), thruster_table(morphology)):
         if table:
             print("\n".join(map(plain, table)), end="\n\n")

@@ -11,7 +11,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from mjx_revolve.inputs.commands import Parser, read_path, run_command, whole
+from mjx_revolve.inputs.commands import Parser, program, read_path, run_command, whole
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 
@@ -36,7 +36,7 @@ def main(argv: list[str] | None = None) -> int:
         OSError: the port is taken.
     """
     parser = Parser(
-        prog="python -m mjx_revolve.live",
+        prog=program("live"),
         description="Run a world in real time and show it in a browser: drop robots, change the "
         "current, watch. Only this machine can open the page.",
     )

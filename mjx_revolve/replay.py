@@ -18,16 +18,19 @@ from mjx_revolve.inputs.commands import (
     Parser,
     add_colony_arguments,
     add_episode_arguments,
+    check_absent,
     check_colony_arguments,
     check_episode_path,
     check_place,
     individual_name,
     opening_episode,
+    program,
     read_path,
     run_command,
     whole,
 )
 from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.files import short_path
 from mjx_revolve.view.film.opengl import check_screen, find_opengl
 
 if TYPE_CHECKING:
@@ -44,7 +47,7 @@ _VIEW_FPS = 60  # in MuJoCo's viewer
 
 def _parser() -> Parser:
     parser = Parser(
-        prog="python -m mjx_revolve.replay",
+        prog=program("replay"),
         description="Film a champion, or a morphology in the water: MP4, GIF and viewer.html; or a "
         "whole colony: colony.mp4.",
     )
@@ -54,7 +57,8 @@ def _parser() -> Parser:
         type=read_path,
         metavar="DIR_OR_FILE",
         help="a folder for all three, or one file that ends in .mp4, .gif or .html (default: the "
-        "run folder, or files of the morphology's name in the current folder)",
+        "run folder, made anew each time, or files of the morphology's name in the current folder, "
+        "where none is replaced)",
     )
     parser.add_argument(
         "--size",
@@ -126,22 +130,6 @@ def _named_paths(out: str, kinds: Sequence[str], name: str) -> dict[str, Path]:
     return _paths_in(path, name, kinds)
 
 
-def _usual_paths(place: Path, name: str, kinds: Sequence[str]) -> dict[str, Path]:
-    """Where files go that were given no name: never over files that are there.
-
-    A page that is there already does not keep a film from being made.
-    """
-    paths = _paths_in(place, name, kinds)
-    if len(kinds) > 1 and paths[".html"].exists():
-        print(f"{paths.pop('.html')}: there already, and left as it is")
-    for path in paths.values():
-        if path.exists():
-            raise InputError(
-                f"{path}: expected no such file yet; say where with --out to replace it"
-            )
-    return paths
-
-
 def _run_folder(path: Path) -> Path | None:
     """The run folder that a path belongs to, before anything is read."""
     if path.is_file() and path.name != "genes.yaml":
@@ -189,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
             name, kinds = f"{name}-ancestors".removeprefix("swim-"), kinds[:1]
         if arguments.colony:
             name, kinds = "colony", kinds[:1]
-        paths = _usual_paths(folder, name, kinds)
+        paths = _paths_in(folder, name, kinds)
     check_episode_path(path)
     check_colony_arguments(arguments)
     # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
@@ -211,7 +199,9 @@ def main(argv: list[str] | None = None) -> int:
         made = []
         if paths is None:
             name = Path(f"{episode.robot.morphology.name}.").name[:-1]  # it may lead elsewhere
-            paths = {} if view else _usual_paths(Path(), name, kinds)
+            paths = {} if view else _paths_in(Path(), name, kinds)
+            for file in paths.values():
+                check_absent(file)
         if view or films:
             from mjx_revolve.view.film.film import make_film
 
@@ -290,7 +280,8 @@ def _say_films(paths: dict[str, Path], films: Sequence[Film]) -> None:
 def _say(paths: dict[str, Path], kind: str, words: str) -> None:
     """Says what was written, if it was."""
     if kind in paths:
-        print(plain(f"{paths[kind]}: {words}, {paths[kind].stat().st_size / 1e6:.2f} MB"))
+        place = short_path(paths[kind])
+        print(plain(f"{place}: {words}, {paths[kind].stat().st_size / 1e6:.2f} MB"))
 
 
 if __name__ == "__main__":

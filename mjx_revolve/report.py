@@ -13,16 +13,16 @@ import argparse
 import sys
 from pathlib import Path
 
-from mjx_revolve.inputs.commands import Parser, read_path, run_command
+from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
+from mjx_revolve.inputs.files import PAGES, SWEEP, check_name, short_path, write_atomic
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics import runtime
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
-        prog="python -m mjx_revolve.report",
+        prog=program("report"),
         description="Writes a page about runs: one HTML file that needs nothing else.",
     )
     parser.add_argument("runs", nargs="+", type=read_path, metavar="RUN",
@@ -85,7 +85,7 @@ def _report_sweep(sweep: str, arguments: argparse.Namespace) -> int:
     report = write_report(sweep, arguments.out and _named_page(arguments, Path(sweep)))
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)
-    print(f"report: {report.page}; {report.table}")
+    print(f"report: {short_path(report.page)}; {short_path(report.table)}")
     return 0
 
 
@@ -110,13 +110,12 @@ def main(argv: list[str] | None = None) -> int:
 
 def _report(arguments: argparse.Namespace) -> int:
     """Writes the page, and those of individuals."""
-    from mjx_revolve.evolution.sweeps import FILE
     from mjx_revolve.view.report.bodies import PAGE_FOLDER, choose_individuals, write_pages
     from mjx_revolve.view.report.data import read_runs
     from mjx_revolve.view.report.page import make_report
 
     for name in arguments.runs:
-        if (Path(name) / FILE).is_file():
+        if (Path(name) / SWEEP).is_file():
             return _report_sweep(name, arguments)
     records, lost = read_runs(arguments.runs)
     folder = Path(records[0].label)
@@ -136,7 +135,7 @@ def _report(arguments: argparse.Namespace) -> int:
         if record.problems:
             print(f"warning: {plain(record.warning)}", file=sys.stderr)
     write_atomic(path, page)
-    print(f"report: {path} ({len(page) / 1e6:.1f} MB)")
+    print(f"report: {short_path(path)} ({len(page) / 1e6:.1f} MB)")
     return 0
 
 

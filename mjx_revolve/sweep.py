@@ -20,10 +20,12 @@ from mjx_revolve.inputs.commands import (
     Parser,
     add_run_arguments,
     check_run_arguments,
+    program,
     read_path,
     run_command,
     whole,
 )
+from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.grids import MOST_SEEDS
 from mjx_revolve.inputs.shipped import find_shipped
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
-        prog="python -m mjx_revolve.sweep",
+        prog=program("sweep"),
         description="Runs a grid of evolutions, several seeds of each, and reports on all of them. "
         "Started again, it skips what is finished and goes on with the rest.",
     )
@@ -70,6 +72,8 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     argv = sys.argv[1:] if argv is None else argv
     arguments = _parser().parse_args(argv)
     check_run_arguments(arguments)
+    path = find_shipped(arguments.config, "configs").absolute()
+    print(plain(f"loading {arguments.config}"), flush=True)  # it takes seconds
     runtime.prepare_process()
     from mjx_revolve.evolution.executor import make_executor
     from mjx_revolve.evolution.sweeps import (
@@ -83,7 +87,6 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     from mjx_revolve.view.report.sweep import write_report
     from mjx_revolve.view.results import save_pictures
 
-    path = find_shipped(arguments.config, "configs").absolute()
     sweep = Sweep(str(path), arguments.seeds, tuple(arguments.settings))
     folder = Path(arguments.out) if arguments.out else _usual_folder(sweep)
     check_folder(folder)
@@ -93,7 +96,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     cases = len(sweep.cases)
     print(f"{cases} case{'s' * (cases > 1)}, {sweep.seeds} seed{'s' * (sweep.seeds > 1)} each | "
           f"{short_path(folder)}", flush=True)  # fmt: skip
-    again = shlex.join(["python", "-m", "mjx_revolve.sweep", *argv])
+    again = f"{program('sweep')} {shlex.join(argv)}"
     workers, cluster = arguments.workers, arguments.cluster
     code = run_plans(
         steps,
@@ -103,6 +106,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     )
     if code:
         return code
+    print("writing the report", flush=True)
     report = write_report(folder)
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)

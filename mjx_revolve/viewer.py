@@ -15,16 +15,18 @@ from mjx_revolve.inputs.commands import (
     Parser,
     add_colony_arguments,
     add_episode_arguments,
+    check_absent,
     check_colony_arguments,
     check_episode_path,
     check_place,
     individual_name,
     opening_episode,
+    program,
     read_path,
     run_command,
 )
-from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import PAGES, check_name
+from mjx_revolve.inputs.errors import plain
+from mjx_revolve.inputs.files import PAGES, check_name, short_path
 from mjx_revolve.view.viewer import write_colony_page, write_viewer
 
 
@@ -42,7 +44,7 @@ def main(argv: list[str] | None = None) -> int:
         OSError: the file cannot be written.
     """
     parser = Parser(
-        prog="python -m mjx_revolve.viewer",
+        prog=program("viewer"),
         description="Write one HTML file that replays an episode in any browser, offline.",
     )
     add_episode_arguments(parser)
@@ -51,7 +53,8 @@ def main(argv: list[str] | None = None) -> int:
         type=read_path,
         metavar="FILE.html",
         help="default: viewer.html in the run folder (of an individual, individuals/N.html there; "
-        "with --colony, colony.html), or the morphology's name in the current folder",
+        "with --colony, colony.html), made anew each time; or the morphology's name in the current "
+        "folder, where no file is replaced",
     )
     add_colony_arguments(parser)
     arguments = parser.parse_args(argv)
@@ -72,7 +75,7 @@ def main(argv: list[str] | None = None) -> int:
     write_viewer(episode, out)
     size = Path(out).stat().st_size / 1e6
     length = f"{episode.trajectory.time[-1]:.4g} s"
-    print(plain(f"{out}: {length}, {size:.2f} MB; open it in a browser"))
+    print(plain(f"{short_path(out)}: {length}, {size:.2f} MB; open it in a browser"))
     return 0
 
 
@@ -91,16 +94,16 @@ def _write_colony(arguments: argparse.Namespace) -> int:
         window=(seen.start, seen.end),
     )  # fmt: skip
     span = f"{len(seen.robots)} robots, {seen.start:.4g} to {seen.end:.4g} s"
-    print(plain(f"{out}: {span}, {written.bytes / 1e6:.2f} MB; open it in a browser"))
+    print(plain(f"{short_path(out)}: {span}, {written.bytes / 1e6:.2f} MB; open it in a browser"))
     return 0
 
 
 def _usual_path(folder: Path | None, inside: str, name: str) -> Path:
-    """Where a page goes that was given no name: never over a file that is there."""
-    own = Path(f"{name}.html").name  # a robot's name may lead elsewhere
-    path = Path(os.path.normpath(folder / f"{inside}.html")) if folder else Path(own)
-    if path.exists():
-        raise InputError(f"{path}: expected no such file yet; name it with --out to replace it")
+    """Where a page goes that was given no name: in a run folder it is made anew."""
+    if folder:
+        return Path(os.path.normpath(folder / f"{inside}.html"))
+    path = Path(Path(f"{name}.html").name)  # a robot's name may lead elsewhere
+    check_absent(path)
     return path
 
 

@@ -13,6 +13,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
 
@@ -338,3 +339,13 @@ def test_every_text_is_a_page_and_links_lead_somewhere(site):
 def test_nothing_is_fetched_from_elsewhere(site):
     for path in site.rglob("*.html"):
         assert not re.search(r'(?:src|rel="stylesheet" href)="http', path.read_text()), path.name
+
+
+def test_messages_name_what_can_be_installed():
+    """This package is on no index, so that its extras cannot be named there."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    known = {name for extra in project["optional-dependencies"].values() for name in extra}
+    texts = [p.read_text("utf-8") for p in [*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]]
+    texts += [p.read_text("utf-8") for p in (ROOT / "mjx_revolve").rglob("*.py")]
+    named = {x for text in texts for x in re.findall(r"pip install[ \"\n]*'([^']+)'", text)}
+    assert len(named) == 5 and named <= known

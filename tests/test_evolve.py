@@ -45,13 +45,14 @@ def run_main(*argv, make_fitness=toy):
 def test_a_run_documents_itself(folder, capsys):
     assert run_main("toy.yaml", "--out", "run", "--seed", 5, "--set", "task.duration=4") == 0
     out = capsys.readouterr().out
-    lines = out.splitlines()
+    assert out.startswith("loading toy.yaml\n")
+    lines = out.splitlines()[1:]
     assert lines[0].startswith("5 genes | speed in lake | SNES 8 x 7, seed 5 | cpu with ")
-    assert [line.split("  ")[0] for line in lines[1:8]] == [
-        f"generation {i}/7" for i in range(1, 8)
-    ]
-    assert re.search(r"  best -?[\d.]+  mean -?[\d.]+  evaluations/s [\d.]+", lines[1])
-    assert re.match(r"champion: -?\S+ ± \S+ body lengths/s over 16 fresh starts \(", lines[8])
+    assert [line.split("  ")[0] for line in lines[1:9]] == [f"generation {i}/7" for i in range(8)]
+    assert re.search(r"  best -?[\d.]+  mean -?[\d.]+  evaluations/s [\d.]+", lines[2])
+    assert lines[9:11] == ["judging the champion on fresh starts", "drawing pictures"]
+    words = "body lengths/s, mean ± SD over 16 fresh starts"
+    assert re.match(rf"champion: -?\S+ ± \S+ {words} \(", lines[11])
     assert lines[-1] == "run folder: run"
     run = folder / "run"
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
@@ -130,7 +131,7 @@ def test_a_finished_run(folder, capsys):
     capsys.readouterr()
     assert run_main("--resume", "run") == 0
     assert capsys.readouterr().out == (
-        "run: finished after 4 generations; to go on: --set evolution.generations=8\n"
+        "loading run\nrun: finished after 4 generations; to go on: --set evolution.generations=8\n"
     )
     assert contents(folder / "run") == before
     # Going on gives what a longer run would have given.
@@ -225,7 +226,7 @@ def test_another_host_is_mentioned(stopped, capsys, monkeypatch):
         (["toy.yaml", "--out", "full/file/run"], "expected the folder full/file; found a file"),
         (["toy.yaml", "--set", "evolution.strategy=CMA_SE"], "did you mean CMA_ES?"),
         (["toy.yaml", "--set", "evolution.strategy=PGPE", "--set", "evolution.population_size=9"],
-         "toy.yaml: evolution.population_size: expected an even number for PGPE; found 9"),
+         "--set evolution.population_size: expected an even number for PGPE; found 9"),
         (["toy.yaml", "--out", "full"], "--out full: expected a new or empty folder; found files"),
         (["--resume", "nowhere"], "nowhere: expected a run folder; found none"),
     ],

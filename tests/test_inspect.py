@@ -67,7 +67,7 @@ def test_the_spider_weighs_what_the_thesis_says(spider, capsys):
     assert _value(out, "mass") == pytest.approx(0.2572)
     assert _value(out, "volume (displaced)") == pytest.approx(241.516, abs=1e-3)
     assert _value(out, "weight in air") == pytest.approx(2.5231, abs=1e-4)
-    assert _value(out, "buoyancy in water of 999.103 kg/m3") == pytest.approx(2.3671, abs=1e-4)
+    assert _value(out, "buoyancy in water of 999.103 kg/m³") == pytest.approx(2.3671, abs=1e-4)
     assert _value(out, "net weight in water") == pytest.approx(0.156, abs=1e-3)
     assert _value(out, "relative density") == pytest.approx(1 / 0.93818, rel=1e-5)
     assert "(sinks)" in out
@@ -79,7 +79,7 @@ def test_the_table_is_aligned_with_units_in_its_header(spider):
     assert lines[0].split() == [
         "#", "name", "type", "parent", "slot", "turn", "x", "y", "z", "mass", "volume"
     ]  # fmt: skip
-    assert lines[1].split() == ["[deg]", "[m]", "[m]", "[m]", "[kg]", "[cm3]"]
+    assert lines[1].split() == ["(deg)", "(m)", "(m)", "(m)", "(kg)", "(cm³)"]
     assert len({len(line) for line in lines}) == 1  # the last column is set to the right
     # The foot along +x: x .17905, as in Revolve's SDF; brick 10.70 cm³, .0102 kg.
     foot = next(line.split() for line in lines if " foot2 " in line)
@@ -102,7 +102,7 @@ def test_the_table_is_aligned_with_units_in_its_header(spider):
 def test_density_and_gravity_change_the_weights(spider, capsys, arguments, buoyancy, net, verdict):
     assert run(spider, *arguments) == 0
     out = capsys.readouterr().out
-    assert _value(out, f"buoyancy in water of {_density(arguments):g} kg/m3") == pytest.approx(
+    assert _value(out, f"buoyancy in water of {_density(arguments):g} kg/m³") == pytest.approx(
         buoyancy, abs=1e-4
     )
     assert _value(out, "net weight in water") == pytest.approx(net, abs=1e-4)

@@ -60,15 +60,15 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     # Once for the checks and once for all runs: neither seed nor strategy makes another fitness.
     assert made == ["SNES", "SNES"]
     out = capsys.readouterr().out.splitlines()
-    assert out[0] == "2 cases, 2 seeds each | out"
-    assert [re.match(r"\[\d/4\] (\S+): running ... -", line)[1] for line in out[1:5]] == RUNS
-    assert out[5] == "report: out/report.html; out/sweep.csv"
+    assert out[:2] == ["loading toy.yaml", "2 cases, 2 seeds each | out"]
+    assert [re.match(r"\[\d/4\] (\S+): running ... -", line)[1] for line in out[2:6]] == RUNS
+    assert out[6:] == ["writing the report", "report: out/report.html; out/sweep.csv"]
 
     alone = ["toy.yaml", "--seed", "1", "--out", "alone", "--set", "evolution.strategy=CMA_ES"]
     assert run_command(lambda argv: evolve.main(argv, make_toy), alone) == 0
     assert contents(folder / "alone") == contents(folder / "out" / RUNS[-1])
     log = (folder / "out" / f"{RUNS[-1]}.log").read_text()
-    assert log.startswith("beginning strategy=CMA_ES/seed_1\ngeneration 1/5  best ")
+    assert log.startswith("beginning strategy=CMA_ES/seed_1\ngeneration 0/5  compiling\n")
 
     with (folder / "out" / "sweep.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -238,7 +238,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(folder, no_picture
             ["--set", "task.duration=5,-6"],
             "duration=-6: --set task.duration: expected a number >",
         ),
-        (["--set", "evolution.strategy=SNES,Magic"], "=Magic: toy.yaml: evolution.strategy: expec"),
+        (["--set", "evolution.strategy=SNES,Magic"], "=Magic: --set evolution.strategy: expected"),
         (
             ["--set", "evolution.population_size=8,16", "--set", "task.settle=1,11"],
             "population_size=8+settle=11: --set task.settle: expected a time below task.duration",

@@ -22,7 +22,7 @@ from mjx_revolve.body.params import apply_overrides, check_overrides, read_numbe
 from mjx_revolve.body.placement import Module, attach, check_overlaps, frozen
 from mjx_revolve.body.sensors import Sensor, SensorRow
 from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
-from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.errors import InputError, note, show
 from mjx_revolve.inputs.schema import Positive, read, words
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
@@ -182,7 +182,7 @@ def _read_tree(body: Any, modules: Mapping[str, ModuleType], source: str) -> tup
             (child, f"{where}.children.{number}", index, number)
             for number, child in reversed(_read_children(item, place, module).items())
         )
-    return _with_unique_names(found)
+    return _with_unique_names(found, source)
 
 
 def read_module(
@@ -361,7 +361,7 @@ def _read_params(
     return (levels["red"], levels["green"], levels["blue"]), rest
 
 
-def _with_unique_names(modules: list[Module]) -> tuple[Module, ...]:
+def _with_unique_names(modules: list[Module], source: str) -> tuple[Module, ...]:
     """Tells apart the modules that share a name, or have one that MuJoCo needs."""
     names = [m.name for m in modules]
     taken, seen = {*names}, {*RESERVED}
@@ -375,6 +375,11 @@ def _with_unique_names(modules: list[Module]) -> tuple[Module, ...]:
         taken.add(name)
         seen.add(name)
         names[i] = name
+    pairs = [(m.name, name) for m, name in zip(modules, names, strict=True) if m.name != name]
+    if pairs:
+        changed = ", ".join(f"{old} is now {new}" for old, new in pairs[:3])
+        more = f", and {len(pairs) - 3} more" if pairs[3:] else ""
+        note(f"{source}: ids that repeat, or that MuJoCo needs, are changed: {changed}{more}")
     return tuple(
         m if m.name == name else replace(m, name=name)
         for m, name in zip(modules, names, strict=True)

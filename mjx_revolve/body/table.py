@@ -32,7 +32,7 @@ def module_table(morphology: Morphology) -> list[str]:
     """The modules of a morphology as lines of an aligned table, units in the header."""
     rows = [
         ["#", "name", "type", "parent", "slot", "turn", "x", "y", "z", "mass", "volume"],
-        ["", "", "", "", "", "[deg]", "[m]", "[m]", "[m]", "[kg]", "[cm3]"],
+        ["", "", "", "", "", "(deg)", "(m)", "(m)", "(m)", "(kg)", "(cm³)"],
     ]
     for k, module in enumerate(morphology.modules):
         place = [str(module.parent), str(module.slot), f"{module.orientation:g}"]
@@ -58,7 +58,7 @@ def thruster_table(morphology: Morphology) -> list[str]:
     """
     rows = [
         ["#", "thruster", "x", "y", "z", "axis x", "y", "z", "astern", "ahead", "lag", "torque"],
-        ["", "", "[m]", "[m]", "[m]", "[-]", "[-]", "[-]", "[N]", "[N]", "[s]", "[m]"],
+        ["", "", "(m)", "(m)", "(m)", "", "", "", "(N)", "(N)", "(s)", "(m)"],
     ]
     for index, k in morphology.thrusters:
         module = morphology.modules[index]
@@ -100,13 +100,13 @@ def summary(morphology: Morphology, density: float, gravity: float) -> list[str]
         ("thrusters", f"{morphology.num_thrusters}", ""),
         ("fins", f"{morphology.num_fins}", ""),
         ("mass", f"{mass:.6g}", "kg"),
-        ("volume (displaced)", f"{1e6 * volume:.6g}", "cm3"),
-        ("volume of the boxes", f"{1e6 * morphology.box_volume:.6g}", "cm3"),
+        ("volume (displaced)", f"{1e6 * volume:.6g}", "cm³"),
+        ("volume of the boxes", f"{1e6 * morphology.box_volume:.6g}", "cm³"),
         ("extent at rest", " x ".join(f"{edge:.4f}" for edge in morphology.extent), "m"),
         ("centre of mass at rest", " ".join(_meters(morphology.center_of_mass)), "m"),
         ("centre of volume at rest", " ".join(_meters(morphology.center_of_volume)), "m"),
         ("weight in air", f"{weight:.4f}", "N"),
-        (f"buoyancy in water of {density:g} kg/m3", f"{buoyancy:.4f}", "N"),
+        (f"buoyancy in water of {density:g} kg/m³", f"{buoyancy:.4f}", "N"),
         ("net weight in water", f"{net:.4f}", f"N ({verdict})"),
         ("relative density", f"{relative:.5f}", "mass / mass of displaced water"),
     ]

@@ -180,6 +180,19 @@ class Morphology:
         """All parts and boxes at rest as arrays."""
         return rest_pose(self.modules)
 
+    @property
+    def title(self) -> str:
+        """The name that heads pictures: `robot` is what all bodies are called that have grown."""
+        return "evolved body" if self.name == "robot" else self.name
+
+    @property
+    def counts(self) -> str:
+        """How many modules, hinges and thrusters, as far as there are any, in words."""
+        counts = {
+            "module": self.num_modules, "hinge": self.num_hinges, "thruster": self.num_thrusters,
+        }  # fmt: skip
+        return ", ".join(f"{n} {name}{'s' * (n > 1)}" for name, n in counts.items() if n)
+
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """`[3]` lowest and `[3]` highest corner of all boxes at rest, core frame [m]."""

@@ -133,6 +133,8 @@ class BodiesConfig(Settings):
     max_modules: Annotated[Integer, Ge(2)] = 16
     min_hinges: Annotated[Integer, Ge(0)] = 1
     max_hinges: Annotated[Integer, Ge(1)] = 8
+    max_of: dict[str, Annotated[Integer, Ge(0)]] = Field({})
+    """Most modules of a type by its name, such as `{Thruster: 4}`; of others, any number."""
     max_length: Annotated[Positive, Unit("m")] | None = None
     """Longest edge of the bounding box at rest [m]."""
     max_mass: Annotated[Positive, Unit("kg")] | None = None

@@ -175,7 +175,7 @@ def _champion(champion: ChampionRecord, duration: float | None, seed: int | None
     champion.check_genes(fitness.num_genes, Path(config.source).name)
     key = _key(config, seed)
     return _episode(
-        config, fitness.robot.morphology.name, fitness.robot, fitness.replay(champion.genes, key),
+        config, fitness.robot.morphology.title, fitness.robot, fitness.replay(champion.genes, key),
         water=fitness.water(key), score=champion.score, genes=champion.genes, fitness=fitness,
     )  # fmt: skip
 
@@ -186,7 +186,7 @@ def _episode(
     """An episode of a run."""
     return Episode(
         f"{name}: {config.task.name.replace('_', ' ')}", robot, trajectory,
-        score_unit=score_unit(config.task.type),
+        score_unit=score_unit(config.task.type, config.task.unit),
         folder=Path(config.source).parent.absolute(), **more,
     )  # fmt: skip
 

@@ -11,6 +11,7 @@ import difflib
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -41,7 +42,7 @@ from mjx_revolve.episodes.settings import (
     one_of,
 )
 from mjx_revolve.inputs.errors import InputError, reading
-from mjx_revolve.inputs.files import check_path
+from mjx_revolve.inputs.files import check_path, short_path
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
 from mjx_revolve.inputs.schema import (
     ConstraintError,
@@ -180,10 +181,14 @@ class TaskConfig(Section):
 
     type: Annotated[str, one_of(TASKS), File("code")]
     """What is scored: a task, see the table above, or FILE.py:FUNCTION, a function like those."""
+    unit: Literal["body_lengths", "m"] = "body_lengths"
+    """What ways are measured in by tasks whose scores have body lengths in their unit. Where bodies
+    evolve, a body length at rest is a choice of theirs: `m` compares them by what they swim."""
     duration: Annotated[Positive, Le(86_400), Unit("s")] = 10.0
     """Length of an episode, a day at most [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
-    """Time at the start of an episode that does not count [s]."""
+    """Time at the start of an episode that does not count; what counts begins with the sample
+    after it, 0.1 s later at most [s]."""
     trials: Annotated[Integer, Ge(1)] = 2
     """Episodes averaged per individual, each from its own start [-]."""
     direction: Annotated[Vector, Unit("-")] = (1.0, 0.0, 0.0)
@@ -301,6 +306,19 @@ class EvolutionConfig(Settings):
     """Settings of the strategy itself, by evosax's names."""
 
 
+@dataclass(frozen=True)
+class _Overrides:
+    """What was typed beside a file; a configuration with it equals one without.
+
+    Attributes:
+        settings: values by dotted key.
+        label: of messages about them.
+    """
+
+    settings: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    label: str = field(default="", compare=False)
+
+
 class Config(Settings):
     """A whole run. Paths are absolute once it went through `make_config` or `load_config`."""
 
@@ -364,11 +382,24 @@ class Config(Settings):
             raise ConstraintError("colony.birth.initial", most, str(self.colony.birth.initial))
 
     _source: str = PrivateAttr("config")
+    _overrides: _Overrides = PrivateAttr(_Overrides())
 
     @property
     def source(self) -> str:
         """The file this came from, for messages; `config` when made in code."""
         return self._source
+
+    def origin(self, place: str) -> str:
+        """What a message about a setting begins with: the option that set it, or the file."""
+        typed = sets(self._overrides.settings, place)
+        return f"{self._overrides.label} " if typed else f"{self._source}: "
+
+    def blame(self, error: InputError) -> InputError:
+        """The same error with its place behind the option that set it, or behind the file."""
+        label, text = self._overrides.label, str(error).removeprefix(f"{self._source}: ")
+        if label and text.startswith(f"{label} "):
+            return error
+        return InputError(self.origin(text.partition(":")[0]) + text)
 
     @property
     def name(self) -> str:
@@ -441,9 +472,23 @@ def make_config(
         config = Config.model_validate(merged)
     except ValidationError as error:
         problems = find_problems(error, Config, merged)
-        raise refuse(problems, lambda place: origin(place)[1]) from None
-    config._source = source
+        at = f"{label} {', '.join(settings)}: "
+        blamed = bool(settings) and _is_valid(data, folder)  # without what was typed
+
+        def before(place: str) -> str:
+            return at if blamed and not sets(settings, place) else origin(place)[1]
+
+        raise refuse(problems, before) from None
+    config._source, config._overrides = source, _Overrides(settings, label)
     return config
+
+
+def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
+    try:
+        make_config(data, folder)
+    except InputError:
+        return False
+    return True
 
 
 def _resolve(file: NamedFile, folder: Path, before: str) -> str:
@@ -458,7 +503,7 @@ def _resolve(file: NamedFile, folder: Path, before: str) -> str:
         path = check_path(os.path.abspath(folder / named))
     if not path.is_file():
         what = "a folder" if path.is_dir() else "none"
-        raise InputError(f"{place}: expected a file; found {what} at {path}")
+        raise InputError(f"{place}: expected a file; found {what} at {short_path(path)}")
     return file.at(path)
 
 
@@ -483,10 +528,10 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
     data = load_yaml(path)
     if not isinstance(data, dict):
         found = "an empty file" if data is None else show(data)
-        raise InputError(f"{path}: expected a mapping of settings; found {found}")
+        raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
-    return make_config(data, path.parent, overrides, str(path))
+    return make_config(data, path.parent, overrides, short_path(path))
 
 
 def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:

@@ -630,17 +630,27 @@ def _place(config: Config) -> tuple[World, Task]:
     try:
         world = load_world(config.world_name, **config.world_overrides)
     except InputError as error:
-        raise InputError(f"{config.source}: {error}") from None
-    task = find_task(config.task, config.source)
+        name, _, text = str(error).partition(": ")
+        place = {"world": "world"}.get(name, "")
+        if name.startswith("world "):  # "world lake: density: expected ..."
+            place = f"world.{text.partition(':')[0]}"
+        before = config.origin(place)
+        typed = name != "world" and before != config.origin("")
+        raise InputError(before + (f"world.{text}" if typed else str(error))) from None
+    try:
+        task = find_task(config.task, config.source)
+    except InputError as error:
+        about = str(error).startswith(f"{config.source}: ")  # rather than about a user's own file
+        raise (config.blame(error) if about else error) from None
     if task.on_bed and world.bed is None:
         raise InputError(
-            f"{config.source}: task.type: {config.task.name} expected a world with a bed; found "
-            "none"
+            f"{config.origin('task.type')}task.type: {config.task.name} expected a world with a "
+            "bed; found none"
         )
     if task.on_bed and config.task.start_attitude != "level":
         raise InputError(
-            f"{config.source}: task.start_attitude: expected level, as {config.task.name} starts "
-            f"on the bed; found {config.task.start_attitude}"
+            f"{config.origin('task.start_attitude')}task.start_attitude: expected level, as "
+            f"{config.task.name} starts on the bed; found {config.task.start_attitude}"
         )
     _check_robust(config, world)
     return world, task

@@ -347,6 +347,14 @@ def find_task(settings: Any, source: str = "config") -> Task:
             )
     records = dict.fromkeys((*task.records, *records_of(settings.measures)))
     task = replace(task, records=tuple(records))
+    if settings.unit == "m":
+        unit = score_unit(name, "m")
+        if unit == task.unit:
+            raise InputError(
+                f"{source}: task.unit: expected body_lengths, as the scores of {short_name(name)} "
+                "do not say that they are in body lengths; found m"
+            )
+        task = replace(task, score=partial(_score_in_metres, task.score), unit=unit)
     if name in TASKS:
         return task
     found = call_user_function(
@@ -365,6 +373,11 @@ def find_task(settings: Any, source: str = "config") -> Task:
             f"position of [{_ROWS}, 3, {_LANES}]; found {shown}"
         )
     return task
+
+
+def _score_in_metres(score: Callable, track: Track, settings: Any) -> jax.Array:
+    """The score of a body of length 1 m."""
+    return score(replace(track, length=1.0), settings)
 
 
 def _load_task(name: str, label: str) -> Task:
@@ -412,13 +425,15 @@ def _find_task(name: str) -> Task | None:
         return None
 
 
-def score_unit(name: str) -> str:
-    """Unit of the scores of a task's `type`; "" where it is not known."""
+def score_unit(name: str, unit: str = "body_lengths") -> str:
+    """Unit of the scores of a task's `type` and `unit`; "" where it is not known."""
     task = _find_task(name)
-    return "" if task is None else task.unit
+    found = "" if task is None else task.unit
+    return found.replace("body lengths", "m") if unit == "m" else found
 
 
-def shown_measure(name: str) -> str:
-    """Name of the measure that reports show beside the score of a task's `type`."""
+def shown_measure(name: str, unit: str = "body_lengths") -> str:
+    """Name of the measure that reports show beside the score of a task's `type` and `unit`."""
     task = _find_task(name)
-    return Task.measure if task is None else task.measure
+    found = Task.measure if task is None else task.measure
+    return "speed_bl_s" if (found, unit) == ("speed_m_s", "m") else found

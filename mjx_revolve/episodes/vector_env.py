@@ -1,6 +1,6 @@
 """Our water as a vector environment of Gymnasium, for whatever learns by its interface.
 
-`gymnasium` is an extra, `pip install 'mjx_revolve[gym]'`, imported when the first environment is
+`gymnasium` is an extra, `pip install 'gymnasium>=1.1'`, imported when the first environment is
 made. All environments are stepped in one compiled call.
 """
 
@@ -299,7 +299,7 @@ def make_vector_env(
     """
     if importlib.util.find_spec("gymnasium") is None:
         raise InputError(
-            "make_vector_env: expected the package gymnasium (pip install 'mjx_revolve[gym]'); "
+            "make_vector_env: expected the package gymnasium (pip install 'gymnasium>=1.1'); "
             "found none"
         )
     whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)

@@ -257,7 +257,7 @@ def to_ribs(archive: Archive, solutions: Sequence[object]) -> Any:
     """
     if importlib.util.find_spec("ribs") is None:
         raise InputError(
-            "archive: expected the package ribs; found none (pip install 'mjx_revolve[ribs]')"
+            "archive: expected the package ribs; found none (pip install 'ribs>=0.12,<0.13')"
         )
     from ribs.archives import CVTArchive, GridArchive
 

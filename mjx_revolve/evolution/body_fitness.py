@@ -186,9 +186,7 @@ def make_body_fitness(config: Config) -> BodyFitness:
         )
         brains = make_brain_encoding(bodies.brains, mixed.controller)
     except InputError as error:
-        text = str(error)
-        place = "" if text.startswith(config.source) else f"{config.source}: "
-        raise InputError(place + text) from None
+        raise config.blame(error) from None
 
     return BodyFitness(config, genotype, mixed, brains, seeds)
 

@@ -153,7 +153,7 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
             import distributed
         except ImportError:
             raise InputError(
-                "--cluster: expected Dask (pip install 'mjx_revolve[cluster]'); found none"
+                "--cluster: expected Dask (pip install 'distributed>=2025.1'); found none"
             ) from None
         is_file = place.endswith(".json") or os.path.isfile(place)
         if is_file and not os.path.isfile(place):  # Dask would wait for it

@@ -21,7 +21,7 @@ FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorb
 # Settings of a task that older versions lack: with their default values they are left out of
 # fingerprints, so that older runs can go on.
 _LATER_IN_TASK = (
-    "target_turn", "sight", "touch",
+    "unit", "target_turn", "sight", "touch",
     "course_spread", "course_changes", "course_turn", "course_rate",
 )  # fmt: skip
 # Their versions must be the same in all processes of a run.
@@ -85,6 +85,8 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     for name in ("measures", *_LATER_IN_TASK):
         if data["task"][name] == type(config.task).model_fields[name].default:
             del data["task"][name]
+    if data["bodies"] is not None and not data["bodies"]["max_of"]:
+        del data["bodies"]["max_of"]
     for name in ("colony", "bodies"):
         if data[name] is None:
             del data[name]

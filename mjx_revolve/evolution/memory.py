@@ -72,8 +72,8 @@ def _check(config: Config, place: str, found: int, need: Callable[[int], int], f
     if need(found) > free:
         most = max(0, bisect.bisect_right(range(found), free, key=need) - 1)
         raise InputError(
-            f"{config.source}: {place}: expected at most {most}, as {free / 1e9:.3g} GB of memory "
-            f"are free; found {found}"
+            f"{config.origin(place)}{place}: expected at most {most}, as {free / 1e9:.3g} GB of "
+            f"memory are free; found {found}"
         )
 
 

@@ -7,7 +7,7 @@ import io
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TextIO
 
 from tqdm import tqdm
@@ -15,15 +15,51 @@ from tqdm import tqdm
 # A log gets about this many lines, however long the run, and never stays silent for longer [s].
 _LINES = 60
 _SILENCE = 30.0
-_LINE = "generation {n_fmt}/{total_fmt}  {desc}  left {remaining}"
-_LIVE = "generation {n_fmt}/{total_fmt}  {bar}  {desc}  left {remaining}"
-_WIDEST = 120  # of the live line [columns]
+# Of the live line [columns]: the widest one, that of a terminal that does not know its size, the
+# narrowest with a word before the count, and of the bar at least.
+_WIDEST, _USUAL, _WORDY, _BAR = 120, 80, 60, 10
 
 
-class _Bar(tqdm):
-    """tqdm without the thread that redraws bars which have gone silent."""
+class _Line(tqdm):
+    """tqdm's clock and screen, with a line that leaves out what there is no room for.
 
-    monitor_interval = 0
+    Attributes:
+        figures: in words, the most important first; the last one is left out before the bar is.
+        words: what is under way, shown in place of the figures; "" for none.
+    """
+
+    monitor_interval = 0  # no thread that redraws bars which have gone silent
+    words = "compiling"
+    figures: Sequence[str] = ()
+
+    def __str__(self) -> str:
+        """The line; without a bar, and with everything, where it has no width."""
+        facts, width = self.format_dict, self.ncols or 0
+        done, total, rate = facts["n"], facts["total"], facts["rate"]
+        rate = rate or (done - facts["initial"]) / (facts["elapsed"] or 1)
+        head = f"{done}/{total}".ljust(2 * len(str(total)) + 1 if width else 0)
+        if not width or width >= _WORDY:
+            head = f"{(width and self.desc) or self.unit} {head}"
+        if self.words:
+            return "  ".join((head, self.words))[: width or None]
+        left = self.format_interval((total - done) / rate) if rate else "?"
+        end = f"left {left:>{5 if width else 0}}"
+        if not width:
+            return "  ".join((head, *self.figures, end))
+        *figures, last = self.figures
+        shown, bar = [head], width - len(head) - len(end) - 4
+        for text in figures:
+            if len(text) > bar:
+                return "  ".join((*shown, end))[:width]
+            shown.append(text)
+            bar -= len(text) + 2
+        if bar - len(last) - 2 >= _BAR:
+            shown.append(last)
+            bar -= len(last) + 2
+        if bar >= _BAR:
+            drawn = {"ncols": bar, "ascii": facts["ascii"], "bar_format": "{bar}"}
+            shown.insert(1, self.format_meter(done, total, 1.0, **drawn))
+        return "  ".join((*shown, end))[:width]
 
 
 class _Nowhere(io.StringIO):
@@ -32,6 +68,11 @@ class _Nowhere(io.StringIO):
     def write(self, text: str) -> int:
         """Forgets it."""
         return len(text)
+
+
+def is_live(out: TextIO) -> bool:
+    """Whether a line can be drawn anew where this is written."""
+    return out.isatty() and os.environ.get("TERM") != "dumb"
 
 
 def choose_stride(total: int) -> int:
@@ -45,58 +86,88 @@ def choose_stride(total: int) -> int:
 
 
 class Progress:
-    """Shows the progress of a run, generation by generation.
+    """Shows the progress of a run, generation by generation, or a colony's interval by interval.
 
     On a terminal it is one line that is drawn anew. Elsewhere (a pipe, a log) it is one line each
     for the first generation, the last one, and those between at equal steps, at most about sixty in
     all; where generations are slow, one at least every thirty seconds.
     """
 
-    def __init__(self, done: int, total: int, out: TextIO | None = None) -> None:
+    def __init__(
+        self,
+        done: int,
+        total: int,
+        out: TextIO | None = None,
+        unit: str = "generation",
+        log: TextIO | None = None,
+        label: str = "",
+    ) -> None:
         """Begins.
 
         Args:
             done: generations that are done already.
             total: generations of the whole run.
             out: where to write; None: standard output.
+            unit: what is counted.
+            log: gets plain lines in any case. The live line then vanishes at the end, and elsewhere
+                than on a terminal `out` gets nothing.
+            label: in the live line in place of `unit`.
         """
         self._total = total
         self._out = sys.stdout if out is None else out
-        self._live = self._out.isatty() and os.environ.get("TERM") != "dumb"
-        file, line = (self._out, _LIVE) if self._live else (_Nowhere(), _LINE)
-        self._bar = _Bar(
-            total=total, initial=done, desc="compiling", file=file, miniters=1,
-            ncols=self._columns(), bar_format=line,
+        self._live = is_live(self._out)
+        self._plain = log or (None if self._live else self._out)
+        self._leave = log is None
+        if self._live and log is not None:  # a line that was begun
+            self._out.write("\r\x1b[K")
+        self._bar = _Line(
+            total=total, initial=done, file=self._out if self._live else _Nowhere(), miniters=1,
+            ncols=self._columns(), unit=unit, desc=label, leave=self._leave,
+            position=0, nrows=24,  # on a terminal without a height tqdm draws nothing
         )  # fmt: skip
+        self._widths: dict[str, int] = {}
         self._stride = choose_stride(total)
         self._written = time.monotonic()
         self._first = True
+        with self._forgiving():
+            self._write()
 
     def show(self, row: Mapping[str, float]) -> None:
         """Shows a generation.
 
         Args:
             row: its figures: generation, best, mean, evaluations_per_second, and failed where
-                there is such a column.
+                there is such a column; a colony's: living, time [s] and times_real_time, too.
         """
-        try:
+        with self._forgiving():
             self._show(row)
-        except OSError:  # the terminal or the pipe is gone: no reason to end a run of days
-            self._out, self._live = _Nowhere(), False
-            self._bar.disable = True
+
+    def say(self, words: str) -> None:
+        """Says what is under way when all generations are done."""
+        with self._forgiving():
+            if self._live and not self._leave:
+                self._bar.words = words
+                self._bar.refresh()
+            elif self._live:
+                self.close()
+                print(words, file=self._out, flush=True)
+            if self._plain is not None:
+                print(words, file=self._plain, flush=True)
+
+    @contextlib.contextmanager
+    def _forgiving(self) -> Iterator[None]:
+        """Goes on where the terminal or the pipe is gone: no reason to end a run of days."""
+        try:
+            yield
+        except OSError:
+            self._live, self._bar.disable = False, True
+            self._plain = None if self._leave else self._plain
 
     def _show(self, row: Mapping[str, float]) -> None:
         generation = int(row["generation"])
-        figures = {
-            "best": f"{row['best']:.4g}",
-            "mean": f"{row['mean']:.4g}",
-            "evaluations/s": f"{row['evaluations_per_second']:.4g}",
-        }
-        if row.get("failed", 0) > 0:
-            figures["failed"] = f"{row['failed']:.0f}"
-        words = "  ".join(f"{name} {value}" for name, value in figures.items())
-        self._bar.set_description_str(words, refresh=False)
         self._bar.ncols = self._columns()
+        self._bar.figures = self._figures(row)
+        self._bar.words = ""
         first, self._first = self._first, False
         if first:  # compiling took most of it: the time left follows from the next ones
             self._bar.unpause()
@@ -105,11 +176,35 @@ class Progress:
         else:
             self._bar.update(generation - self._bar.n)
         last = generation >= self._total
-        now = time.monotonic()
-        silent = now - self._written > _SILENCE
-        if not self._live and (first or last or silent or generation % self._stride == 0):
-            print(self._bar, file=self._out, flush=True)
-            self._written = now
+        silent = time.monotonic() - self._written > _SILENCE
+        if first or last or silent or generation % self._stride == 0:
+            self._write()
+
+    def _write(self) -> None:
+        """A plain line."""
+        if self._plain is None:
+            return
+        width, self._bar.ncols = self._bar.ncols, None
+        print(self._bar, file=self._plain, flush=True)
+        self._bar.ncols = width
+        self._written = time.monotonic()
+
+    def _figures(self, row: Mapping[str, float]) -> list[str]:
+        """What is shown of a row; the live line's figures keep their places as they grow."""
+        figures = {"best": f"{row['best']:.4g}", "mean": f"{row['mean']:.4g}"}
+        rate = row["evaluations_per_second"]
+        speed = "evaluations/s", f"{rate:.0f}" if rate >= 1000 else f"{rate:.4g}"
+        if "times_real_time" in row:
+            figures = {"alive": f"{row['living']:.0f}", "time": f"{row['time']:.0f} s"} | figures
+            speed = "times real time", f"{row['times_real_time']:.3g}"
+        if row.get("failed", 0) > 0:
+            figures["failed"] = f"{row['failed']:.0f}"
+        shown = []
+        for name, value in (*figures.items(), speed):
+            if self._live:
+                self._widths[name] = max(len(value), self._widths.get(name, 0))
+            shown.append(f"{name} {value:<{self._widths.get(name, 0)}}")
+        return shown
 
     def _columns(self) -> int | None:
         """The width of the live line; plain ones have any."""
@@ -120,7 +215,7 @@ class Progress:
         except (OSError, ValueError):
             columns = 0
         # Some terminals wrap at the last column, and some do not know their size.
-        return min(columns - 1, _WIDEST) if columns > 1 else _WIDEST
+        return min(columns if columns > 1 else _USUAL, _WIDEST) - 1
 
     def close(self) -> None:
         """Leaves the last state of the line where it stands."""

@@ -81,10 +81,15 @@ class Run:
         return self.search.generation if self.search else 0
 
     @property
+    def unit(self) -> str:
+        """What its generations are called: those of a colony are intervals."""
+        return "generation" if self.config.colony is None else "interval"
+
+    @property
     def resumption(self) -> str:
         """Where a resumed run goes on, in words."""
         done = self.generation
-        return f"after generation {done}" if done else "from the start: it has no checkpoint yet"
+        return f"after {self.unit} {done}" if done else "from the start: it has no checkpoint yet"
 
     @property
     def is_finished(self) -> bool:
@@ -221,14 +226,16 @@ class Run:
         self,
         interrupts: Interrupts,
         draw: Callable[[Run, Champion], None],
-        out: TextIO | None = None,
+        log: TextIO | None = None,
+        label: str = "",
     ) -> Champion | None:
         """The rest of the run, or as much of it as there is before an interrupt, saved.
 
         Args:
             interrupts: looked at after each generation.
             draw: draws the run's pictures; see `finish`.
-            out: where progress is shown; None: standard output.
+            log: gets the progress in plain lines; None: standard output shows it.
+            label: of the live line that a terminal has beside the log.
 
         Returns:
             The champion; None where generations are left.
@@ -239,10 +246,13 @@ class Run:
         """
         with interrupts.writing:
             self._write_start()
-        self._evolve(interrupts, out)
-        if interrupts.signal and self.generation < self.config.evolution.generations:
-            return None
-        return self.finish(draw)
+        total = self.config.evolution.generations
+        progress = Progress(self.generation, total, unit=self.unit, log=log, label=label)
+        with contextlib.closing(progress):
+            self._evolve(interrupts, progress)
+            if interrupts.signal and self.generation < total:
+                return None
+            return self.finish(draw, progress.say)
 
     def _write_start(self) -> None:
         """Describes the run; a resumed one drops what came after its checkpoint."""
@@ -259,11 +269,10 @@ class Run:
         if isinstance(self.executor.fitness, Fitness):
             files.write("champion/morphology.yaml", self.executor.fitness.robot.morphology.save)
 
-    def _evolve(self, interrupts: Interrupts, out: TextIO | None) -> None:
+    def _evolve(self, interrupts: Interrupts, progress: Progress) -> None:
         """Generations until the last one, an interrupt, or the loss of all workers."""
         evolution = self.config.evolution
         log = self._open_log() if evolution.tensorboard else None
-        progress = Progress(self.generation, evolution.generations, out)
         interrupts.rescue = self.save
         try:
             for _ in range(self.generation, evolution.generations):
@@ -278,11 +287,10 @@ class Run:
             with interrupts.writing:
                 self._unsaved = True
                 self.save()
-            what = f"generation {self.generation}"
-            what = what if self.generation else "the start, before any generation,"
+            what = f"{self.unit} {self.generation}"
+            what = what if self.generation else f"the start, before any {self.unit},"
             raise WorkerError(f"{error}; {what} is saved") from None
         finally:
-            progress.close()
             if log is not None:
                 log.close()
 
@@ -354,13 +362,15 @@ class Run:
             best.genes, best.body, score=best.score, final=False, origin=origin, **number
         )
 
-    def finish(self, draw: Callable[[Run, Champion], None]) -> Champion:
+    def finish(self, draw: Callable[[Run, Champion], None], say: Callable[[str], None]) -> Champion:
         """Judges the champion on fresh starts.
 
         Args:
             draw: draws the run's pictures; the run counts as finished once they are there.
+            say: says what is under way.
         """
         config = self.config
+        say("judging the champion on fresh starts")
         champion = self.evolution.choose_champion(self.search)
         facts: dict[str, Any] = {
             "score": champion.score,
@@ -373,6 +383,7 @@ class Run:
         if champion.individual is not None:
             facts["individual"] = champion.individual
         self.folder.save_champion(champion.genes, champion.body, final=True, **facts)
+        say("drawing pictures")
         draw(self, champion)
         self.folder.update_info(finished=timestamp(), generations=self.generation, champion=facts)
         return champion
@@ -413,7 +424,7 @@ def check_search(config: Config, executor: Executor) -> None:
         make_evolution(config, executor)
     except InputError as error:
         if str(error).startswith(("evolution.", "bodies.")):
-            raise InputError(f"{config.source}: {error}") from None
+            raise config.blame(error) from None
         raise
 
 

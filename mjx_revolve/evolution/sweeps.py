@@ -28,19 +28,17 @@ from mjx_revolve.evolution.fingerprints import FREE_SETTINGS, fitness_hash
 from mjx_revolve.evolution.generations import Champion
 from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.evolution.jobs import MakeFitness, WorkerError
+from mjx_revolve.evolution.progress import is_live
 from mjx_revolve.evolution.run import MakeExecutor, Run, check_search, check_unchanged
 from mjx_revolve.evolution.run_folder import RunFolder, is_new_folder, open_run_folder
 from mjx_revolve.evolution.tensorboard import check_tensorboard
 from mjx_revolve.inputs.commands import check_place, describe_refusal
 from mjx_revolve.inputs.errors import InputError, reading
-from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.inputs.files import SWEEP, short_path, write_atomic
 from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
 from mjx_revolve.inputs.schema import Integer, Text, TupleOf, checked, read
 from mjx_revolve.inputs.trust import opening, opening_config
 from mjx_revolve.inputs.yaml_reader import load_yaml
-
-FILE = "sweep.yaml"
-"""The file in a sweep's folder that describes its runs."""
 
 
 class Plan(NamedTuple):
@@ -180,7 +178,7 @@ def read_sweep(folder: str | Path) -> Sweep:
     Raises:
         InputError: it is missing, or holds something else.
     """
-    path = Path(folder) / FILE
+    path = Path(folder) / SWEEP
     data = load_yaml(path)
     with reading(path):
         sweep = read(Sweep, data)
@@ -192,18 +190,18 @@ def check_folder(folder: Path) -> None:
     """Raises `InputError` for a folder that is not new, empty or a sweep's; see `next_step`."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: expected a folder; found a file")
-    if not (folder / FILE).is_file() and folder.is_dir() and any(folder.iterdir()):
+    if not (folder / SWEEP).is_file() and folder.is_dir() and any(folder.iterdir()):
         raise InputError(
             f"--out {folder}: expected a new or empty folder, or that of a sweep; found files"
         )
-    check_place(folder / FILE, f"--out {folder}")
+    check_place(folder / SWEEP, f"--out {folder}")
 
 
 def write_sweep(folder: Path, sweep: Sweep) -> None:
     """Writes `sweep.yaml`."""
     data = {"config": sweep.config, "seeds": sweep.seeds, "settings": list(sweep.settings)}
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
-    write_atomic(folder / FILE, f"# What the runs of this folder are.\n{text}".encode())
+    write_atomic(folder / SWEEP, f"# What the runs of this folder are.\n{text}".encode())
 
 
 class SharedExecutor:
@@ -299,30 +297,33 @@ def run_plans(
         for k, (plan, step) in enumerate(steps.items()):
             if interrupts.signal:
                 break
-            print(f"[{k + 1:{width}}/{len(steps)}] {plan.name}: ", end="")
+            number = f"[{k + 1:{width}}/{len(steps)}]"
+            begin = f"{number} {plan.name}: "
             if step == "finished":
-                print(_result(plan, "finished before"))
+                print(begin + _result(plan, "finished before"))
                 continue
-            print("running ... ", end="", flush=True)
+            # A terminal's line is drawn over by the run's progress.
+            over = f"\r\x1b[K{begin}" if is_live(sys.stdout) else ""
+            print(f"{begin}running ... ", end="", flush=True)
             started = time.perf_counter()
             try:
-                champion = _run(plan, step, executors, draw, interrupts)
+                champion = _run(plan, step, executors, draw, interrupts, number)
             except (WorkerError, OSError) as error:
                 words = describe_refusal(error) if isinstance(error, OSError) else str(error)
-                print(f"failed\ngo on: {again}", flush=True)
+                print(f"{over}failed\ngo on: {again}", flush=True)
                 print(f"error: {plan.name}: {words}", file=sys.stderr)
                 return 1
             except BaseException:
-                print("failed", flush=True)
+                print(f"{over}failed", flush=True)
                 raise
             if champion is None:
-                print("stopped", flush=True)
+                print(f"{over}stopped", flush=True)
                 break
             ran += 1
             left -= 1
             rest = left * (time.perf_counter() - began) / ran
             more = f", some {max(1, round(rest / 60))} min left" if left else ""
-            print(_result(plan, f"{time.perf_counter() - started:.0f} s{more}"), flush=True)
+            print(over + _result(plan, f"{time.perf_counter() - started:.0f} s{more}"), flush=True)
     if interrupts.signal and left:
         print(f"go on: {again}", flush=True)
         return interrupts.exit_code
@@ -335,6 +336,7 @@ def _run(
     executors: SharedExecutor,
     draw: Callable[[Run, Champion], None],
     interrupts: Interrupts,
+    label: str,
 ) -> Champion | None:
     """Begins a run or goes on with it; None where it was interrupted before its end."""
     folder, log = plan.folder, plan.folder.with_name(f"{plan.folder.name}.log")
@@ -353,7 +355,7 @@ def _run(
                 )
             print(f"beginning {plan.name}", file=out, flush=True)
         opened.callback(run.close)
-        champion = run.evolve(interrupts, draw, out)
+        champion = run.evolve(interrupts, draw, out, label)
         words = "stopped" if champion is None else f"champion: {champion.score:.3g}"
         print(words, file=out)
         return champion

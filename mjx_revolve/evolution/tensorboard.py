@@ -31,7 +31,7 @@ def check_tensorboard(source: str) -> None:
     if importlib.util.find_spec("tensorboardX") is None:
         raise InputError(
             f"{source}: evolution.tensorboard: expected the package tensorboardX (pip install "
-            "'mjx_revolve[tensorboard]'); found none"
+            "'tensorboardX>=2.6'); found none"
         )
 
 

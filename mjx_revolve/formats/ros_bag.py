@@ -41,7 +41,7 @@ def check_rosbags() -> None:
     """
     if importlib.util.find_spec("rosbags") is None:
         raise InputError(
-            "--mcap: expected the package rosbags; found none (pip install 'mjx_revolve[ros]')"
+            "--mcap: expected the package rosbags; found none (pip install 'rosbags>=0.11')"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
@@ -76,6 +76,7 @@ class Space:
         max_hinges: most of them.
         max_length: longest edge of the bounding box at rest [m]; None: any.
         max_mass: [kg]; None: any.
+        max_of: most modules of a type, by its name; of others, any number.
         accepts: whether a body within these bounds will do.
     """
 
@@ -88,6 +89,7 @@ class Space:
     max_hinges: int
     max_length: float | None = None
     max_mass: float | None = None
+    max_of: Mapping[str, int] = field(default_factory=dict)
     accepts: Callable[[Morphology], bool] = accept_all
 
     @cached_property
@@ -107,6 +109,10 @@ class Space:
             least, most = getattr(self, f"min_{what}"), getattr(self, f"max_{what}")
             if not least <= count <= most:
                 return f"expected {least} to {most} {what}; found {count}"
+        for name, most in self.max_of.items():
+            count = sum(module.kind.name == name for module in body.modules)
+            if count > most:
+                return f"expected at most {most} {name} (max_of); found {count}"
         if self.max_mass is not None and body.mass > self.max_mass * SLACK:
             return f"expected at most {self.max_mass:g} kg (max_mass); found {body.mass:g}"
         if self.max_length is not None and body.length > self.max_length * SLACK:
@@ -147,6 +153,13 @@ def make_space(
     for i, name in enumerate(names):
         if name in names[:i]:
             raise InputError(f"bodies.modules.{i}: expected each type once; found {name!r} again")
+    max_of = {find("max_of", name, False): most for name, most in bodies.max_of.items()}
+    for name in max_of:
+        if name not in names:
+            known = ", ".join(names)
+            raise InputError(
+                f"bodies.max_of: expected any of bodies.modules, {known}; found {name}"
+            )
     if bodies.min_hinges > 0 and all(catalogue[name].hinge is None for name in names):
         raise InputError(
             f"bodies.modules: expected a type with a hinge, since min_hinges is "
@@ -162,6 +175,7 @@ def make_space(
         max_hinges=bodies.max_hinges,
         max_length=bodies.max_length,
         max_mass=bodies.max_mass,
+        max_of=max_of,
         accepts=accepts,
     )
 

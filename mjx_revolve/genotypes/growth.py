@@ -67,6 +67,13 @@ class Growth:
         """Whether there is room for no further module."""
         return len(self.modules) >= self._space.max_modules
 
+    def has_room(self, kind: ModuleType) -> bool:
+        """Whether the bounds on hinges and on the type allow another module of it."""
+        if kind.hinge is not None and self.num_hinges >= self._space.max_hinges:
+            return False
+        most = self._space.max_of.get(kind.name)
+        return most is None or sum(module.kind.name == kind.name for module in self.modules) < most
+
     def child(self, parent: int, slot: int) -> int | None:
         """Index of the module at a slot; None where it is free."""
         found = (i for i in self._children[parent] if self.modules[i].slot == slot)
@@ -98,9 +105,7 @@ class Growth:
             Its index; None where it was left out.
         """
         space, above = self._space, self.modules[parent]
-        if self.is_full or self.child(parent, slot) is not None:
-            return None
-        if kind.hinge is not None and self.num_hinges >= space.max_hinges:
+        if self.is_full or self.child(parent, slot) is not None or not self.has_room(kind):
             return None
         if space.max_mass is not None and self._mass + kind.mass > space.max_mass * SLACK:
             return None

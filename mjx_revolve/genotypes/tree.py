@@ -132,7 +132,7 @@ def _grow(space: Space, rng: np.random.Generator) -> Morphology:
         kinds = [
             kind
             for kind in space.kinds
-            if (kind.hinge is None or growth.num_hinges < space.max_hinges)
+            if growth.has_room(kind)
             and (kind.hinge is not None or missing < size - len(growth.modules))
             and (kind.slots or free)
         ]

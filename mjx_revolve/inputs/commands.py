@@ -18,7 +18,7 @@ from typing import NoReturn
 
 from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import check_path
+from mjx_revolve.inputs.files import SWEEP, check_path
 from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.inputs.terminal import spell_unencodable
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -26,6 +26,20 @@ from mjx_revolve.inputs.trust import add_trust_argument, opening
 _SEEDS = 2**32  # what JAX's keys take, and a run's configuration
 # A day [s]: its poses already take several GB.
 _LONGEST = 86_400.0
+
+
+def program(name: str, python: str = "python") -> str:
+    """How a command was called, to call it again.
+
+    Args:
+        name: of the command.
+        python: the path of Python, where it is the first word.
+    """
+    own = Path(sys.argv[0])
+    if own.name == "mjx-revolve":
+        return f"{own.name} {name}"
+    whole = (own.parent.name, own.name) == ("mjx_revolve", "__main__.py")
+    return f"{python} -m mjx_revolve{' ' if whole else '.'}{name}"
 
 
 class Parser(argparse.ArgumentParser):
@@ -103,7 +117,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         "path", type=read_path, help="run folder, genes.yaml, or morphology (YAML or name)"
     )
     parser.add_argument(
-        "--duration", type=read_seconds, metavar="S", help="[s] (default: the task's, or 10)"
+        "--duration", type=read_seconds, metavar="S", help="seconds (default: the task's, or 10)"
     )
     parser.add_argument("--seed", type=read_seed, metavar="N", help="draws another start")
     parser.add_argument(
@@ -130,7 +144,7 @@ def add_colony_arguments(parser: argparse.ArgumentParser) -> None:
         "--time",
         type=read_seconds,
         metavar="S",
-        help="with --colony: from this time of its life on [s]",
+        help="with --colony: from this time of its life on, in seconds",
     )
 
 
@@ -164,6 +178,10 @@ def check_episode_path(path: str | Path) -> None:
     This precedes the imports of JAX and MuJoCo.
     """
     shipped = list_shipped("morphologies")
+    if (Path(path) / SWEEP).is_file():
+        runs = sorted(Path(path).glob("*/seed_*/config.yaml"))
+        such = f", such as {runs[0].parent}" if runs else ""
+        raise InputError(f"{path}: expected one run; found a sweep of several{such}")
     if not Path(path).exists() and str(path) not in shipped:
         raise InputError(
             f"{path}: expected a run folder, a genes.yaml or a morphology; found none, and no "
@@ -187,6 +205,12 @@ def check_place(path: str | Path, label: str) -> None:
             return
         if folder.exists():
             raise InputError(f"{label}: expected the folder {folder}; found a file")
+
+
+def check_absent(path: Path, what: str = "file") -> None:
+    """Raises `InputError` where the user was not asked, and something of theirs would be lost."""
+    if path.exists():
+        raise InputError(f"{path}: expected no such {what} yet; name it with --out to replace it")
 
 
 class _Note(logging.Formatter):

@@ -7,6 +7,8 @@ turn it into exit code 2 (`run_command`).
 from __future__ import annotations
 
 import contextlib
+import functools
+import logging
 import re
 import reprlib
 from collections.abc import Iterator
@@ -70,6 +72,12 @@ class ConstraintError(ValueError):
         """
         super().__init__(f"{place}: expected {expected}; found {found}")
         self.place, self.expected, self.found = place, expected, found
+
+
+@functools.cache
+def note(text: str) -> None:
+    """Logs what a user should know of their input although it is not refused: once in a process."""
+    logging.getLogger(__name__).warning("%s", plain(text))
 
 
 def show(value: Any) -> str:

@@ -99,6 +99,10 @@ def resolve_inside(path: str | Path, folder: str | Path) -> Path:
     return full
 
 
+SWEEP = "sweep.yaml"
+"""The file in a sweep's folder that describes its runs."""
+
+
 def short_path(path: str | Path) -> str:
     """A path as short as it can be typed here."""
     path = Path(path).absolute()

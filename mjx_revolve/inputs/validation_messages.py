@@ -29,6 +29,8 @@ def refuse(problems: Mapping[str, str], origin: Callable[[str], str] = lambda _:
     return InputError(f"{origin(place)}{line}{more}")
 
 
+# The longest list of names before a suggestion [characters].
+_MAX_NAMES = 100
 # What pydantic calls a key of a model or of a dataclass that there is no field for.
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
@@ -69,7 +71,10 @@ def _problem(error: Any, kind: Any, data: Any) -> tuple[str, str]:
         _, annotation = _follow(kind, steps[:-1])
         known = list(fields_of(_open(annotation)[0]))
         hint = _suggest(str(steps[-1]), known, steps[:-1], kind)
-        return place, f"expected one of {', '.join(known)}; found an unknown key{hint}"
+        listed = ", ".join(known)
+        if hint and len(listed) > _MAX_NAMES:
+            listed = f"{len(known)} keys"
+        return place, f"expected one of {listed}; found an unknown key{hint}"
     missing = error["type"] == "missing"
     if missing and isinstance(steps[-1], int):  # a vector that is too short: all of it
         missing = False

@@ -67,8 +67,7 @@ def _replayed(observed: ObservedRobot, start: float, end: float) -> ReplayRobot:
         "born": f"{observed.born:.0f} s",  # which may be long before the recording begins
         "parents": " and ".join(f"#{number}" for number in one.parents) or "none",
         "fitness": "not measured yet" if math.isnan(one.score) else f"{one.score:.3g}",
-        "modules": str(one.body.num_modules),
-        "hinges": str(one.body.num_hinges),
+        "modules": one.body.counts.replace(" modules", "", 1),
     }
     if died:
         info["dies"] = _CAUSES.get(observed.cause, observed.cause)

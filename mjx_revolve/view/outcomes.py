@@ -14,7 +14,7 @@ from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.episodes.run_reader import RunReader
-from mjx_revolve.episodes.tasks import TASKS
+from mjx_revolve.episodes.tasks import TASKS, score_unit
 from mjx_revolve.evolution.sweeps import Plan
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.view.population import read_population
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
             brains evolve.
         metrics: the columns of `metrics.csv`.
         body: the champion's; None where nothing is known of it.
-        task: the task's type.
+        task: the task's type, and "in metres" where its scores are.
         unit: of the scores; "" where it is not known.
         evolved: whether bodies have evolved.
     """
@@ -98,7 +98,8 @@ def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome
     for name in ("generation", "evaluations", "seconds", "champion"):
         _ = metrics[name][-1]
     task = config.task.type
-    unit = TASKS[task].unit if task in TASKS else ""
+    unit = score_unit(task, config.task.unit) if task in TASKS else ""
+    task += " in metres" * (config.task.unit == "m")
     evolved = config.bodies is not None
     return Outcome(plan, champion, population, metrics, body, task, unit, evolved)
 

@@ -65,7 +65,7 @@ def _compose(morphology: Morphology) -> Figure:
         f"{morphology.mass:.4g} kg, {1e6 * morphology.volume:.4g} cm³",
     ])  # fmt: skip
     look: dict[str, Any] = {"y": 1 - 0.38 / height, "color": _INK, "va": "center"}
-    figure.text(x=0.3 / width, s=morphology.name, fontsize=15, **look)
+    figure.text(x=0.3 / width, s=morphology.title, fontsize=15, **look)
     figure.text(x=1 - 0.35 / width, s=words, fontsize=10, ha="right", **look)
 
     room = np.array([8.3, height - 0.75])

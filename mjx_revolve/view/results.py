@@ -24,10 +24,10 @@ from mjx_revolve.view.swim_picture import plot_swim
 
 
 def describe_score(champion: Champion, config: Config) -> str:
-    """The result of a run in words: `0.158 ± 0.0025 body lengths/s over 16 fresh starts`."""
-    unit = score_unit(config.task.type)
+    """The result of a run: `0.158 ± 0.0025 body lengths/s, mean ± SD over 16 fresh starts`."""
+    unit = score_unit(config.task.type, config.task.unit)
     score = f"{champion.score:.3g} ± {champion.std:.2g} {unit}".rstrip()
-    return f"{score} over {REPORT_EPISODES} fresh starts"
+    return f"{score}, mean ± SD over {REPORT_EPISODES} fresh starts"
 
 
 def save_pictures(run: Run, champion: Champion) -> None:
@@ -41,7 +41,7 @@ def save_pictures(run: Run, champion: Champion) -> None:
         OSError: the disk is full.
     """
     folder, fitness, config = run.folder, run.executor.fitness, run.config
-    unit = score_unit(config.task.type)
+    unit = score_unit(config.task.type, config.task.unit)
     if config.bodies is not None:
         fitness = fitness.body_fitness(champion.body)
     title = f"{folder.path.name}: {describe_score(champion, config)}"

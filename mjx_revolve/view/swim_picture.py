@@ -114,7 +114,7 @@ def draw_motion(motion: Motion) -> Figure:
 
 def _headline(motion: Motion) -> str:
     """Name, and mean speed while it counts."""
-    name = str(motion.robot.morphology.name)
+    name = motion.robot.morphology.title
     if motion.seconds <= 0.0:
         return name
     words = f"{name}: {motion.speed / motion.length:.2g} body lengths/s ({motion.speed:.2g} m/s)"
@@ -127,7 +127,7 @@ def _headline(motion: Motion) -> str:
 def _facts(motion: Motion) -> str:
     """Distance and time while it counts."""
     begun = motion.time[motion.first]
-    when = f"after the first {begun:.3g} s" if motion.first else "getting under way included"
+    when = f"from {begun:.3g} s on" if motion.first else "getting under way included"
     return (
         f"{motion.distance:.2g} m ({motion.distance / motion.length:.2g} body lengths) in "
         f"{motion.seconds:.3g} s, {when}"

@@ -22,7 +22,6 @@ from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
 from mjx_revolve.view.palette import page_palette
 
 if TYPE_CHECKING:
-    from mjx_revolve.body.morphology import Morphology
     from mjx_revolve.episodes.champion import Episode
     from mjx_revolve.view.recording import Mark, ReplayRobot
 
@@ -160,24 +159,17 @@ def _episode_subtitle(episode: Episode) -> str:
     words = []
     if episode.score is not None:
         words.append(f"{episode.score:.3g} {episode.score_unit} over {episode.starts}")
-    words += body_words(body)
+    words += body.counts.split(", ")
     words.append(world.name.replace("_", " "))
     if any(world.current):
         words.append(f"current {math.hypot(*world.current):.2g} m/s")
     moving = {"gusts": world.gust, "shear": world.shear, "a field of currents": world.current_field}
     words += [name for name, value in moving.items() if value is not None]
     if world.waves:
-        height = 2 * math.hypot(*(wave.amplitude for wave in world.waves))
-        words.append(f"waves of {height:.2g} m")
+        largest = max(wave.amplitude for wave in world.waves)
+        upto = " up to" * (len(world.waves) > 1)
+        words.append(f"waves of amplitude{upto} {largest:.2g} m")
     return " \u00b7 ".join(words)
-
-
-def body_words(body: Morphology) -> list[str]:
-    """Numbers of modules, hinges and thrusters, as far as there are any, in words."""
-    counts = {
-        "module": body.num_modules, "hinge": body.num_hinges, "thruster": body.num_thrusters,
-    }  # fmt: skip
-    return [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
 
 
 def _fit(

@@ -17,7 +17,7 @@ import yaml
 from annotated_types import Ge, Le, MinLen, Unit
 from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 
-from mjx_revolve.inputs.errors import ConstraintError, InputError, reading, show
+from mjx_revolve.inputs.errors import ConstraintError, InputError, note, reading, show
 from mjx_revolve.inputs.files import check_path, read_file
 from mjx_revolve.inputs.schema import (
     Boolean,
@@ -53,6 +53,7 @@ from mjx_revolve.water.law_names import (
 )
 from mjx_revolve.water.plates import LiftDrag
 
+_DENSITIES = 600, 1500  # of what robots can be meant to swim in [kg/m³]
 _FOLDER = Path(__file__).parent / "worlds"
 
 
@@ -225,7 +226,7 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         # A world file names its field's file from where it stands itself.
         world: World = read(World, fields, context=path.parent)
     if not overrides:
-        return world
+        return _note_of_density(world)
     for key, value in overrides.items():
         # A mapping changes what it names and keeps the rest: a bed's friction, not its whole shape.
         below = fields.get(key)
@@ -234,6 +235,17 @@ def load_world(name: str | Path, **overrides: Any) -> World:
             overrides[key] = {**below, **value} if alike else value
     with reading(f"world {world.name}"):
         world = read(World, fields | {"current_field": world.current_field} | overrides)
+    return _note_of_density(world)
+
+
+def _note_of_density(world: World) -> World:
+    """The world; a note where its density is that of no water (brines have up to 1,350 kg/m³)."""
+    low, high = _DENSITIES
+    if not low <= world.density <= high:
+        note(
+            f"world {world.name}: density: found {world.density:g} kg/m³, which is no water's "
+            f"({low} to {high})"
+        )
     return world
 
 

@@ -473,7 +473,7 @@ def _drop(*keys):
         ),
         (
             _changed(_set("Fin", "parts", 1, "lift_drag", {"clap": 1})),
-            "modules.Fin.parts.1.lift_drag.clap: expected one of a0, cla, cda",
+            "modules.Fin.parts.1.lift_drag.clap: expected one of 14 keys; found an unknown",
         ),
         (_changed(_set("Fin", "mount", "-z")), "Fin.mount: expected -x, +x, -y, +y or a mapping"),
         (_changed(_set("Fin", "mount", None)), "modules.Fin.mount: expected one, since it has"),

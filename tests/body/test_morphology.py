@@ -248,8 +248,12 @@ brain: [neurons, 1e-3]
 """
 
 
-def test_loose_spellings_are_understood(tmp_path):
+def test_loose_spellings_are_understood(tmp_path, caplog):
     robot = read(tmp_path, WILD)
+    assert caplog.messages[0].endswith(
+        ": ids that repeat, or that MuJoCo needs, are changed: Leg is now Leg_2, world is now "
+        "world_2"
+    )
     assert robot.name == "7"
     assert [m.name for m in robot.modules] == ["1", "ActiveHinge1", "Leg", "Leg_2", "world_2"]
     assert [m.slot for m in robot.modules] == [-1, 1, 1, 3, 0]

@@ -12,8 +12,9 @@ import pytest
 
 from laboratory import QUICK, ROOT, SLOPE, read, swimmer
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
+from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.scoring import WORST
-from mjx_revolve.episodes.tasks import TASKS, Track
+from mjx_revolve.episodes.tasks import TASKS, Track, find_task, score_unit, shown_measure
 
 KEY = jax.random.key(7)
 # The smallest robot with joints: compiles fast.
@@ -205,6 +206,20 @@ SETTINGS = SimpleNamespace(
 )
 def test_tasks_with_known_scores(task, given, score):
     assert float(TASKS[task].score(given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
+
+
+def test_scores_in_metres_leave_the_body_length_out():
+    given = track([0, 1, 2])
+    swim = find_task(TaskConfig(type="directed_swim", unit="m"))
+    assert float(swim.score(given, SETTINGS)[0]) == pytest.approx(1.0) and swim.unit == "m/s"
+    assert score_unit("hold_heading", "m") == "m + rad"
+    assert shown_measure("speed", "m") == "speed_bl_s" != shown_measure("speed")
+    with pytest.raises(InputError) as error:
+        find_task(TaskConfig(type="search", unit="m", target_distance=1, sight=1), "my.yaml")
+    assert str(error.value) == (
+        "my.yaml: task.unit: expected body_lengths, as the scores of search do not say that they "
+        "are in body lengths; found m"
+    )
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from mjx_revolve.episodes import vector_env
 from mjx_revolve.episodes.scoring import WORST
 
 gymnasium = pytest.importorskip(
-    "gymnasium", reason="vector environments need gymnasium (pip install 'mjx_revolve[gym]')"
+    "gymnasium", reason="vector environments need gymnasium (pip install 'gymnasium>=1.1')"
 )
 
 NUM, STEPS = 5, 20
@@ -330,7 +330,7 @@ def test_what_is_wrong_gets_one_message(config, monkeypatch):
     refuses("expected one, as this is the fitness of one body", config, 1, **bodies)
     refuses("expected a hinge or a thruster", config, 1, morphology="core")
     monkeypatch.setattr(vector_env.importlib.util, "find_spec", lambda name: None)
-    refuses("pip install 'mjx_revolve[gym]'", config, 1)
+    refuses("pip install 'gymnasium>=1.1'", config, 1)
 
 
 def test_wrong_calls_get_one_message(config):

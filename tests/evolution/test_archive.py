@@ -167,12 +167,12 @@ def test_rows_of_a_table():
 
 # ------------------------------------------------------------------ ribs
 
-NO_RIBS = "ribs is not installed (pip install 'mjx_revolve[ribs]')"
+NO_RIBS = "ribs is not installed (pip install 'ribs>=0.12,<0.13')"
 
 
 def test_ribs_is_asked_for_by_name_where_it_is_missing(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"package ribs; found none .*mjx_revolve\[ribs\]"):
+    with pytest.raises(InputError, match=r"package ribs; found none .*'ribs>=0.12,<0.13'"):
         to_ribs(grid(), [])
 
 

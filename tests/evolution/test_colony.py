@@ -288,7 +288,7 @@ def test_the_command_writes_and_resumes_a_run(tmp_path, history, capsys):
         assert individuals[number].score == pytest.approx(score, nan_ok=True)
     assert (run / "champion" / "genes.yaml").is_file()
     out = capsys.readouterr().out
-    assert "champion:" in out and "generation 10/10" in out
+    assert "champion:" in out and "interval 10/10" in out
 
 
 def test_what_cannot_be_a_colony_is_refused():

@@ -153,7 +153,7 @@ def test_a_population_beyond_the_memory_is_refused_beforehand(folder, capsys):
     for more in ((), ("--set", "evolution.strategy=DifferentialEvolution")):
         assert run_main("toy.yaml", "--out", "run", "--set", huge, *more) == 2
         err = capsys.readouterr().err
-        assert "toy.yaml: evolution.population_size: expected at most " in err
+        assert "--set evolution.population_size: expected at most " in err
         assert err.endswith(" GB of memory are free; found 1000000000000\n")
         assert not os.path.exists("run")
 
@@ -221,4 +221,4 @@ def test_bodies_beyond_the_memory_are_refused_beforehand(folder, capsys, monkeyp
 def config_of(strategy, size):
     """As much of a configuration as counts."""
     evolution = SimpleNamespace(strategy=strategy, population_size=size)
-    return SimpleNamespace(bodies=None, source="toy.yaml", evolution=evolution)
+    return SimpleNamespace(bodies=None, origin=lambda place: "toy.yaml: ", evolution=evolution)

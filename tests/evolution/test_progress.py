@@ -53,7 +53,7 @@ def test_a_log_has_sixty_lines_at_most(total, stride, clock):
     shown.close()
     told = [int(line.split("/")[0].split()[1]) for line in out.getvalue().splitlines()]
     middle = range(stride, total + 1, stride)
-    assert told == sorted({1, total, *middle})
+    assert told == sorted({0, 1, total, *middle})
 
 
 def test_a_log_is_never_silent_for_long(clock):
@@ -62,7 +62,7 @@ def test_a_log_is_never_silent_for_long(clock):
     for generation in range(1, 6):
         shown.show(row(generation))
         clock[0] += 31.0
-    assert len(out.getvalue().splitlines()) == 5
+    assert len(out.getvalue().splitlines()) == 6
 
 
 def test_plain_lines_tell_the_time_left(clock):
@@ -72,32 +72,54 @@ def test_plain_lines_tell_the_time_left(clock):
     shown.show(row(5))
     clock[0] += 15.0
     shown.show(row(6, failed=3))
+    shown.say("drawing")
     assert out.getvalue().splitlines() == [
+        "generation 4/10  compiling",
         "generation 5/10  best 0.25  mean 0.3333  evaluations/s 1234  left ?",
-        "generation 6/10  best 0.25  mean 0.3333  evaluations/s 1234  failed 3  left 01:00",
+        "generation 6/10  best 0.25  mean 0.3333  failed 3  evaluations/s 1234  left 01:00",
+        "drawing",
     ]
 
 
-@pytest.mark.parametrize("columns", [20, 200])
+def test_a_colonys_line_tells_of_intervals(clock):
+    out = io.StringIO()
+    shown = progress.Progress(0, 6, out, "interval")
+    shown.show(row(1, living=14, time=10.0, times_real_time=35.2))
+    assert out.getvalue().splitlines()[1] == (
+        "interval 1/6  alive 14  time 10 s  best 0.25  mean 0.3333  times real time 35.2  left ?"
+    )
+
+
+LINES = {  # columns: what stands there, bar aside; nothing is cut in the middle
+    20: ["3/4", "left 00:02"],
+    40: ["3/4", "best 0.25", "left 00:02"],
+    0: ["generation 3/4", "bar", "best 0.25", "mean 0.3333", "left 00:02"],
+    200: ["generation 3/4", "bar", "best 0.25", "mean 0.3333", "evaluations/s 1234", "left 00:02"],
+}
+
+
+@pytest.mark.parametrize("columns", LINES)
 def test_the_live_line_fits_its_terminal(columns, clock, monkeypatch):
-    monkeypatch.setattr(progress.Progress, "_columns", lambda self: columns - 1)
+    size = os.terminal_size((columns, 0))  # as of terminals that do not know their height
+    monkeypatch.setattr(os, "get_terminal_size", lambda _: size)
     out = Terminal()
+    out.fileno = lambda: 1
+    columns = columns or 80
     shown = progress.Progress(0, 4, out)
     for generation in (1, 2, 3):
         clock[0] += 2.0
-        shown.show(row(generation))
+        shown.show(row(generation, best=0.25 if generation == 3 else -0.001234))
     clock[0] += 0.01
     shown.show(row(4))  # the last one, too soon for any other
     shown.close()
     assert all(len(line.rstrip("\n")) < columns for line in out.drawn)
-    assert out.drawn[0].startswith("generation 0/4  ")
-    assert out.drawn[-1].startswith("generation 4/4  ")
+    assert out.drawn[0].split("  ")[0].endswith("0/4")
     assert len(out.drawn) == 5
     assert out.getvalue().endswith("\n")
-    if columns == 200:
-        head, bar, *figures = re.split("  +", out.drawn[3])
-        assert head == "generation 3/4" and set(bar[:-1]) == {"█"}
-        assert figures == ["best 0.25", "mean 0.3333", "evaluations/s 1234", "left 00:02"]
+    found = re.sub("█+.", "bar", out.drawn[3]).strip()
+    assert re.split("  +", found) == LINES[size.columns]
+    # Figures keep their places.
+    assert [line.rfind("left") for line in out.drawn[2:4]] == [out.drawn[3].rfind("left")] * 2
 
 
 def test_the_live_line_is_not_drawn_too_often(clock, monkeypatch):
@@ -109,7 +131,7 @@ def test_the_live_line_is_not_drawn_too_often(clock, monkeypatch):
         shown.show(row(generation))
     assert len(out.drawn) < 15
     shown.close()  # interrupted: the last generation is there
-    assert out.drawn[-1].startswith("generation 100/1000  ###")
+    assert out.drawn[-1].startswith("generation 100/1000   ###")
     out.getvalue().encode("ascii")
 
 
@@ -118,6 +140,7 @@ def test_dumb_terminals_get_plain_lines(clock, monkeypatch):
     out = Terminal()
     progress.Progress(0, 4, out).show(row(1))
     assert out.getvalue() == (
+        "generation 0/4  compiling\n"
         "generation 1/4  best 0.25  mean 0.3333  evaluations/s 1234  left ?\n"
     )
 

@@ -64,8 +64,10 @@ def test_command_writes_everything_once(quick, capsys):
 
 
 def test_command_writes_only_what_is_named(quick, capsys):
-    code, _, _ = run(capsys, "odd.yaml", "--mjcf", quick / "new" / "a.xml")
-    assert code == 0
+    code, _, err = run(capsys, "odd.yaml", "--mjcf", "new/a.xml")
+    assert (code, err) == (2, "error: --mjcf new/a.xml: expected the folder new; found none\n")
+    (quick / "new").mkdir()
+    assert run(capsys, "odd.yaml", "--mjcf", "new/a.xml")[0] == 0
     assert [path.name for path in quick.rglob("*.xml")] == ["a.xml"]
 
 

@@ -36,7 +36,7 @@ SPACES = {
     "tight": make_space(
         bodies_config.BodiesConfig(
             modules=ALL, min_modules=4, max_modules=9, min_hinges=2, max_hinges=3, max_length=0.3,
-            max_mass=0.18,
+            max_mass=0.18, max_of={"Thruster": 1},
         ),
         MODULES,
         accepts=lambda body: sum(m.type == "Fin" for m in body.modules) <= 1,
@@ -105,6 +105,8 @@ def test_bodies_are_valid_and_in_the_space(families, name, space):
         assert body.length <= (space.max_length or np.inf) + 1e-9
         assert body.mass <= (space.max_mass or np.inf) + 1e-9
         assert {m.type for m in body.modules[1:]} <= {*space.modules}
+        types = [m.type for m in body.modules]
+        assert all(types.count(name) <= most for name, most in space.max_of.items())
         assert len({m.name for m in body.modules}) == body.num_modules
         # Laid out as a file's would be, in the same order.
         assert make_morphology(body.to_mapping()) == body
@@ -246,6 +248,8 @@ def test_the_space_says_what_it_refuses():
     assert loose.refuses(spider) == "expected at most 0.3 m (max_length); found 0.3991"
     loose = replace(loose, max_length=0.3991)
     assert loose.refuses(spider) is None
+    few = replace(loose, max_of={"FixedBrick": 7})
+    assert few.refuses(spider) == "expected at most 7 FixedBrick (max_of); found 8"
     assert replace(loose, accepts=lambda body: False).refuses(spider) is not None
     assert "found 'ActiveHinge'" in replace(loose, catalogue={"Core": MODULES["Core"]}).refuses(
         spider
@@ -275,6 +279,12 @@ def test_spaces_are_made_of_types_that_there_are():
         "bodies.modules.2: expected each type once; found 'TouchSensor' again"
     )
     assert refusal(modules=("FixedBrick",)).startswith("bodies.modules: expected a type with a hin")
+    assert refusal(max_of={"Fin": 1}) == (
+        "bodies.max_of: expected any of bodies.modules, FixedBrick, ActiveHinge; found Fin"
+    )
+    assert make_space(config(modules=ALL, max_of={"FixedBrickSensor": 1}), MODULES).max_of == {
+        "TouchSensor": 1
+    }
     assert make_space(config(modules=("FixedBrick",), min_hinges=0), MODULES).modules == (
         "FixedBrick",
     )

@@ -12,6 +12,7 @@ from laboratory import ROOT
 from mjx_revolve.inputs.commands import (
     Parser,
     check_place,
+    program,
     read_path,
     read_seconds,
     run_command,
@@ -46,6 +47,19 @@ def test_help_loads_nothing_heavy(name, words):
     )
     assert done.returncode == 0, done.stderr
     assert words in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("called", "words"),
+    [
+        ("/venv/bin/mjx-revolve", "mjx-revolve viewer"),
+        ("/lib/mjx_revolve/__main__.py", "python -m mjx_revolve viewer"),
+        ("/lib/mjx_revolve/viewer.py", "python -m mjx_revolve.viewer"),
+    ],
+)
+def test_commands_name_themselves_as_they_were_called(called, words, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [called])
+    assert program("viewer") == words
 
 
 @pytest.mark.parametrize(

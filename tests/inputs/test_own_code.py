@@ -159,7 +159,7 @@ def check_line(message, action):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "swim.yaml: task.type: expected a function rise in {own}; found no function in it"),
+        ("", "override task.type: expected a function rise in {own}; found no function in it"),
         ("x = 1\ny = x +\n", "{own}: line 2: expected Python that runs; found SyntaxError"),
         ("import jax\n\nfrom nowhere import nothing", "{own}: line 3: expected Python that runs; "
          "found ModuleNotFoundError: No module named 'nowhere'"),
@@ -280,7 +280,7 @@ def test_evolving_with_workers_and_resuming(folder):
     many += ["--set", "world=sea.yaml"]
     done = command("swim.yaml", *many, "--out", "run", "--workers", "2")
     assert done.returncode == 0, done.stderr
-    assert "rise in sea" in done.stdout and " kg over 16 fresh starts" in done.stdout
+    assert "rise in sea" in done.stdout and " kg, mean ± SD over 16 fresh starts" in done.stdout
     assert "2 workers" in done.stdout
     facts = json.loads((folder / "run" / "run.json").read_text())["champion"]
     assert (facts["task"], facts["controller"]) == ("rise", "make_hold")

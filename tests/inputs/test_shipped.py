@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 
+from mjx_revolve import __main__, __version__
 from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.episodes.champion import load_episode, load_genes
@@ -14,7 +15,7 @@ from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.fitness import make_fitness
 from mjx_revolve.episodes.run_reader import load_metrics
 from mjx_revolve.evolution.run_folder import load_archive
-from mjx_revolve.inputs.commands import check_episode_path
+from mjx_revolve.inputs.commands import check_episode_path, run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.view.report.data import read_run
@@ -31,6 +32,24 @@ def test_names_and_paths_mean_the_same(monkeypatch, tmp_path):
     assert load_morphology("spider").num_modules > 8
     assert load_config("smoke", ["morphology=snake"]).morphology.endswith("snake.yaml")
     check_episode_path("spider")
+
+
+def test_help_lists_what_comes_with_the_package(capsys):
+    for option in ("--help", "--version"):
+        assert run_command(__main__._main, [option]) == 0
+    out = capsys.readouterr().out
+    assert "\n  lake_colony " in out and "auv, centipede, " in out
+    assert out.endswith(f"mjx_revolve {__version__}\n")
+
+
+def test_one_run_of_a_sweep_is_to_be_named(tmp_path):
+    (tmp_path / "a" / "seed_0").mkdir(parents=True)
+    for name in ("sweep.yaml", "a/seed_0/config.yaml"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError) as error:
+        check_episode_path(tmp_path)
+    found = f"found a sweep of several, such as {tmp_path}/a/seed_0"
+    assert str(error.value) == f"{tmp_path}: expected one run; {found}"
 
 
 def test_a_file_of_that_path_wins(monkeypatch, tmp_path):

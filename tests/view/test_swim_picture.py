@@ -104,7 +104,7 @@ def test_getting_under_way_does_not_count(small):
     late.qpos[:, 0] += SPEED * np.maximum(TIME - 2.0, 0)
     said = " | ".join(words_of(small, late, counted_from=2.0))
     assert f"core: {2 * SPEED / small.morphology.length:.2g} body lengths/s (0.1 m/s)" in said
-    assert "0.4 m" in said and "in 4 s, after the first 2 s" in said
+    assert "0.4 m" in said and "in 4 s, from 2 s on" in said
 
 
 @pytest.mark.slow

@@ -196,7 +196,7 @@ def _bodies(config: Config, water: World, path: Path, group: str = "") -> list[_
 
 def _run_drafts(own: Config, water: World, folder: Path) -> list[_Draft]:
     """A run's champion, and, where bodies evolve, its best individuals."""
-    unit, group = score_unit(own.task.type), folder.absolute().name
+    unit, group = score_unit(own.task.type, own.task.unit), folder.absolute().name
     run, drafts = RunReader(find_run(folder)), []
     if run.champion_path is not None:
         champion = run.load_champion()

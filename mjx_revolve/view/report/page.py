@@ -39,7 +39,6 @@ from mjx_revolve.view.report.repeat import environment, repeat_commands, sources
 from mjx_revolve.view.sensor_plots import plot_sensors
 from mjx_revolve.view.statistics import COVERAGE
 from mjx_revolve.view.swim_picture import draw_motion
-from mjx_revolve.view.viewer import body_words
 
 GENERATOR = "mjx_revolve.report"  # tells our pages from others
 
@@ -291,7 +290,7 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
     pictures["swim"] = _source(figure_jpeg(draw_motion(motion)), "jpeg")
     origin = record.stand_in or record.champion.get("origin")
     return sections.champion(
-        robot.morphology.name, float(motion.time[-1]), motion.counted_from,
+        robot.morphology.title, float(motion.time[-1]), motion.counted_from,
         origin if isinstance(origin, str) else "", tables.measures_table(record, replay), pictures,
     )  # fmt: skip
 
@@ -388,10 +387,10 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
         if any(morphology == other for other in seen):
             continue
         seen.append(morphology)
-        counts = ", ".join(body_words(morphology))
+        counts = morphology.counts
         rows, foot = tables.count_modules(morphology)
         entries.append({
-            "heading": f"{morphology.name}: {counts}" + (f" ({name})" if several else ""),
+            "heading": f"{morphology.title}: {counts}" + (f" ({name})" if several else ""),
             "rows": rows, "foot": foot, "modules": tables.list_modules(morphology),
             "descriptors": tables.list_descriptors(morphology),
         })  # fmt: skip

@@ -14,6 +14,7 @@ import numpy as np
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.tasks import score_unit, shown_measure
 from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.inputs.user_code import content_name
 from mjx_revolve.view.colony_history import ColonyHistory
@@ -79,7 +80,9 @@ class RunRecord:
 
     def note(self, kind: str, text: str) -> None:
         """Adds a problem once, without the folder's path."""
-        problem = Problem(kind, plain(text.replace(f"{self.folder}/", "")))
+        for folder in (str(self.folder), short_path(self.folder)):
+            text = text.replace(f"{folder}/", "")
+        problem = Problem(kind, plain(text))
         if problem not in self.problems:
             self.problems.append(problem)
 
@@ -108,18 +111,25 @@ class RunRecord:
 
     @property
     def task(self) -> str:
-        """The task's type; a user's own by what its file holds; "" where it is not known."""
-        return content_name(self._task_type)
+        """The task's type; a user's own by what its file holds; "" where it is not known.
+
+        Scores in metres are those of another task.
+        """
+        return content_name(self._task_type) + " in metres" * (self._length_unit == "m")
 
     @property
     def unit(self) -> str:
         """Of the fitness; "" where it is not known."""
-        return score_unit(self._task_type)
+        return score_unit(self._task_type, self._length_unit)
 
     @property
     def measure(self) -> str:
         """Name of the measure that reports show beside the score."""
-        return shown_measure(self._task_type)
+        return shown_measure(self._task_type, self._length_unit)
+
+    @property
+    def _length_unit(self) -> str:
+        return str(self.setting("task.unit", "body_lengths"))
 
     @property
     def _task_type(self) -> str:
