@@ -22,6 +22,7 @@ from mjx_revolve.body.module_files import read_modules
 from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Part, Slot
 from mjx_revolve.inputs.errors import reading
 from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.plates import LiftDrag
 from mjx_revolve.water.propellers import Thruster
 
@@ -140,9 +141,9 @@ _LIFT_THRUSTER = ModuleType(
 # square plate across the flow (Hoerner, Fluid-Dynamic Drag, 1965, chapter 3). That friction is left
 # out, and that the centre of pressure stays in the middle, are choices: a tail works at large
 # angles.
-_FIN_STALL = math.pi / 6
+_FIN_STALL = math.radians(TODAY["fin_stall"].value)
 _FIN_LIFT = 2 * math.pi * (50 / 60) / (2 + math.hypot(50 / 60, 2))
-_FIN_DRAG = 0.465
+_FIN_DRAG = TODAY["fin_drag"].value
 _TO_ACROSS = math.pi / 2 - _FIN_STALL  # from the stall to a plate across the flow [rad]
 _FIN = ModuleType(
     name="Fin",
@@ -157,7 +158,7 @@ _FIN = ModuleType(
                 cda=_FIN_DRAG,
                 alpha_stall=_FIN_STALL,
                 cla_stall=-_FIN_LIFT * _FIN_STALL / _TO_ACROSS,
-                cda_stall=(1.17 - _FIN_DRAG * _FIN_STALL) / _TO_ACROSS,
+                cda_stall=(TODAY["plate_drag"].value - _FIN_DRAG * _FIN_STALL) / _TO_ACROSS,
                 forward=(-1.0, 0.0, 0.0),
                 upward=(0.0, 0.0, 1.0),
             ),

@@ -10,9 +10,9 @@ from annotated_types import Gt, Le, Unit
 
 from mjx_revolve.inputs.errors import ConstraintError, show
 from mjx_revolve.inputs.schema import Boolean, Direction, NonNegative, Number, Vector, checked
+from mjx_revolve.water.coefficients import TODAY
 
-# Drag of a cube that faces the flow: Hoerner, Fluid-Dynamic Drag, 1965, chapter 3.
-CUBE_DRAG = 1.05
+CUBE_DRAG = TODAY["cube_drag"].value  # of a cube that faces the flow
 
 
 @checked
