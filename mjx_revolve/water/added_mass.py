@@ -19,7 +19,12 @@ from mjx_revolve.water.laws import Coefficient, law_numbers, part_field
 
 COEFFICIENTS = (
     Coefficient(
-        "added_mass_coefficient", "-", "multiplies the envelope's added mass", 1.0, own_field=True
+        "added_mass_coefficient",
+        "-",
+        "multiplies the envelope's added mass",
+        1.0,
+        own_field=True,
+        per_axis=True,
     ),
     Coefficient(
         "entrained_water",

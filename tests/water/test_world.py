@@ -209,7 +209,8 @@ WRONG = [
     ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
     (
         {"drag": "boxes"},
-        "drag: expected one of faces, lift_drag, inertia_box, ellipsoid, off; found 'boxes'",
+        "drag: expected one of faces, lift_drag, fossen, inertia_box, ellipsoid, off; "
+        "found 'boxes'",
     ),
     ({"added_mass": "yes"}, "added_mass: expected true or false; found 'yes'"),
     ({"added_mass": 1}, "added_mass: expected true or false; found 1"),
