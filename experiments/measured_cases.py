@@ -275,8 +275,8 @@ def oscillating(numbers: Sequence[float] = (3, 5, 8, 15, 30, 60, 120), phases: i
 _SAMPLES = 20  # steps from one record to the next
 
 
-def _pool(timestep: float = 0.001) -> World:
-    return tank(gravity=G, buoyancy="partial", drag="faces", added_mass=True, timestep=timestep)
+def _pool(drag: str = "faces", timestep: float = 0.001) -> World:
+    return tank(gravity=G, buoyancy="partial", drag=drag, added_mass=True, timestep=timestep)
 
 
 def _floating(robot: Robot) -> float:
@@ -326,9 +326,9 @@ def swim(
     return np.array(speeds), float(np.nanmax(np.where(size > 0, error, 0.0)))
 
 
-def amphibot_glide() -> Found:
+def amphibot_glide(drag: str = "faces") -> Found:
     """Way and rotation of a chain with frozen joints that glides at the surface."""
-    glide, robot = data.AMPHIBOT_GLIDE, body("ChainHead", _pool(), "ChainModule", 6)
+    glide, robot = data.AMPHIBOT_GLIDE, body("ChainHead", _pool(drag), "ChainModule", 6)
     angles, half = np.radians(glide.angles), data.CHAIN_MODULE / 2
 
     def marks(q: np.ndarray) -> np.ndarray:
@@ -363,19 +363,19 @@ def amphibot_glide() -> Found:
     return Found(rows, {"way": (time, way), "rotation": (time, rotation)})
 
 
-def swimmers() -> Found:
+def swimmers(drag: str = "faces") -> Found:
     """Speeds of chains that swim by their joints: AmphiBot, the lamprey robot, Mamba's ratio."""
-    gait = data.AMPHIBOT_SWIM
-    [speed], _ = swim(body("ChainHead", _pool(), "ChainModule", 6), [gait])
+    gait, pool = data.AMPHIBOT_SWIM, _pool(drag)
+    [speed], _ = swim(body("ChainHead", pool, "ChainModule", 6), [gait])
     rows = [Row("AmphiBot", "swim", gait.speed, speed, "m/s")]
-    speeds, _ = swim(body("ChainHead", _pool(), "ChainModule", 5), data.LAMPREY)
+    speeds, _ = swim(body("ChainHead", pool, "ChainModule", 5), data.LAMPREY)
     for gait, ours in zip(data.LAMPREY, speeds, strict=True):
         name = f"{gait.amplitude:g}°, φ {5 * gait.lag:.3g}"
         rows.append(Row("lamprey robot", name, gait.speed, ours, "m/s"))
     joint = np.arange(8, 0, -1)[:, None]  # from the head; 1 is at the tail
     shares = np.concatenate([np.ones((8, 1)), (9 - joint) / 10], 1)
     gait = data.Gait(1 / 3, 40.0, 1 / 9, 0.0)
-    mamba = body("MambaHead", _pool(0.004), "MambaLink", 8)
+    mamba = body("MambaHead", _pool(drag, 0.004), "MambaLink", 8)
     speeds, _ = swim(mamba, [gait, gait], shares, 15.0)
     measured = data.MAMBA["eel-like"] / data.MAMBA["lateral"]
     rows.append(Row("Mamba", "eel-like over lateral speed", measured, speeds[1] / speeds[0], "-"))

@@ -78,6 +78,13 @@ def test_a_chain_that_glides_turns_too_far():
 
 
 @pytest.mark.slow
+def test_a_chain_glides_as_far_as_measured_with_drag_across_it():
+    found = ratios(measured_cases.amphibot_glide("cross_flow").rows)
+    assert all(abs(x - 1) < 0.05 for name, x in found.items() if "way" in name)
+    assert found["glide, rotation after 4.4 s"] == pytest.approx(2.4, abs=0.02)
+
+
+@pytest.mark.slow
 def test_a_chain_that_swims_reaches_two_thirds_of_the_speed():
     pool = measured_cases._pool()
     chain = measured_cases.body("ChainHead", pool, "ChainModule", 6)

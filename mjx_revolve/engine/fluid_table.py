@@ -23,6 +23,7 @@ from mjx_revolve.water.drag import DRAG_LAWS
 from mjx_revolve.water.face_drag import beside, split_axes
 from mjx_revolve.water.law_names import list_coefficients
 from mjx_revolve.water.laws import Coefficient
+from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
 from mjx_revolve.water.world import World
 
 _NOTHING = ((0.0,) * 6,) * 6
@@ -106,7 +107,7 @@ def drag_law(part: Part, world: World) -> str:
     """
     if world.drag == "off":
         return "off"
-    if part.drag is not None or world.drag not in ("faces", "lift_drag"):
+    if part.drag is not None or world.drag in (INERTIA_BOX.name, ELLIPSOID.name):
         return part.drag or world.drag
     if part.fossen is not None:
         return "fossen"

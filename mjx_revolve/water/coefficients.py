@@ -78,7 +78,7 @@ COMING: dict[str, Sourced] = {
         "not the 2.0 of a rod from wall to wall (NACA TR-619): a chain has ends",
     ),
     "chain_head_drag": Sourced(
-        2.0, "-", "C_d along a chain, on the area of its head (ρ w h |v| v)", _SWIMMERS
+        1.0, "-", "C_d along a chain, on the area of its head (½ ρ w h |v| v)", _SWIMMERS
     ),
     "friction": Sourced(
         0.455, "-", "a in C_f = a / (log10 Re)^b on side faces", "Prandtl and Schlichting",

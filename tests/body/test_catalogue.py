@@ -246,8 +246,8 @@ MOUNT = Mount((-0.5, 0, 0), (1, 0, 0))
         ),
         (
             lambda: replace(PART, drag="inertia_box"),
-            "part 'p': drag: expected one of faces, lift_drag, fossen, ellipsoid, off (inertia_box "
-            "is a law of whole bodies); found 'inertia_box'",
+            "part 'p': drag: expected one of faces, lift_drag, fossen, cross_flow, ellipsoid, "
+            "off (inertia_box is a law of whole bodies); found 'inertia_box'",
         ),
         (lambda: replace(PART, lift_drag={"clap": 1}), "part 'p': lift_drag.clap: expected one of"),
         (lambda: Thruster(axis=(0, 0, 0)), "thruster: axis: expected a direction, not zero"),

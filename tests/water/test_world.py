@@ -209,7 +209,7 @@ WRONG = [
     ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
     (
         {"drag": "boxes"},
-        "drag: expected one of faces, lift_drag, fossen, inertia_box, ellipsoid, off; "
+        "drag: expected one of faces, lift_drag, fossen, cross_flow, inertia_box, ellipsoid, off; "
         "found 'boxes'",
     ),
     ({"added_mass": "yes"}, "added_mass: expected true or false; found 'yes'"),
