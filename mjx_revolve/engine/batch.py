@@ -657,10 +657,11 @@ def _check_fit(
     for k, laws in enumerate(columns.laws):
         if laws not in room and not laws.idle:
             part = int(np.argmax(columns.part_laws == k))
-            known = [tuple(x) for x in room]
+            shown = lambda x: tuple(x) if x.coupled else tuple(x)[:3]  # noqa: E731
+            known = [shown(x) for x in room]
             raise InputError(
                 f"robot {names[assembly.layout.body[part]]!r}: expected parts under one of the "
-                f"laws {known} (buoyancy, drag, thruster, coupled); found {tuple(laws)}"
+                f"laws {known} (buoyancy, drag, thruster, stated 6×6); found {shown(laws)}"
             )
     slots = np.ones(len(order.length), int)
     np.maximum.at(slots, order.robot, 1 + order.slot)
