@@ -28,7 +28,7 @@ from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
 from mjx_revolve.water.currents import Gust, Shear, Wave
 from mjx_revolve.water.drag import DRAG_LAWS
 from mjx_revolve.water.law_names import list_coefficients
-from mjx_revolve.water.plates import LiftDrag
+from mjx_revolve.water.plates import Fossen, LiftDrag
 from mjx_revolve.water.world import SurfaceTension, World
 
 PAGE = Path(__file__).with_name("settings.md")
@@ -70,6 +70,8 @@ def usual(field: Any) -> str:
         return "none"
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple) and value and isinstance(value[0], tuple):
+        return "all 0"
     if isinstance(value, tuple):
         return f"`[{', '.join(f'{x:.7g}' if isinstance(x, float) else str(x) for x in value)}]`"
     if isinstance(value, int | float | str | dict):
@@ -123,7 +125,8 @@ def law_tables() -> list[str]:
     lines += ["| coefficient | law | unit | usual | meaning |", "|---|---|---|---|---|"]
     for law_name, c in list_coefficients():
         where = c.name if c.own_field else f"coefficients.{c.name}"
-        lines.append(f"| `{where}` | `{law_name}` | {c.unit} | `{c.default:g}` | {c.meaning} |")
+        meaning = f"{c.meaning}; or three, along the part's axes" if c.per_axis else c.meaning
+        lines.append(f"| `{where}` | `{law_name}` | {c.unit} | `{c.default:g}` | {meaning} |")
     return [*lines, ""]
 
 
@@ -151,8 +154,9 @@ def make_page() -> str:
     lines += ["", "## A world", "", "`docs/physics.md` has the laws.", ""]
     lines += table(World)
     lines += law_tables()
-    for name, kind in _PARTS.items():
-        lines += [f"### `{name}`: {first_paragraph(kind)}", ""]
+    for name, kind in (_PARTS | {"fossen": Fossen}).items():
+        of = " (of a module)" if kind is Fossen else ""
+        lines += [f"### `{name}`{of}: {first_paragraph(kind)}", ""]
         lines += table(kind, f"{name}.")
     return "\n".join(lines).rstrip() + "\n"
 

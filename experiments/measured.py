@@ -54,7 +54,7 @@ def _finish(*all_axes: Any, legends: bool = True) -> None:
 @in_style
 def draw_drag(steady: Found, oscillating: Found) -> Any:
     """C_d of bodies in a steady flow, and of a plate in an oscillating one."""
-    from experiments.measured_data import plate_drag
+    from experiments.measured_data import plate_drag, plate_drag_at_bilge
     from mjx_revolve.view.plots import COLORS
 
     figure, left, right = _pair()
@@ -67,6 +67,8 @@ def draw_drag(steady: Found, oscillating: Found) -> Any:
     number, ours = oscillating.lines["faces"]
     fine = np.geomspace(number[0], number[-1], 100)
     right.plot(fine, [plate_drag(x) for x in fine], color=_GREY, label="measured (fit)")
+    bilge = [plate_drag_at_bilge(x) for x in fine]
+    right.plot(fine, bilge, color=_GREY, linestyle=":", label="measured (bilge keels)")
     right.plot(number, ours, "o-", color=COLORS[0], label="ours", markersize=4)
     right.axvspan(5, 15, color=COLORS[4], alpha=0.12, linewidth=0)
     right.text(8.6, 0.15, "limbs", fontsize=8, ha="center", color="#8a6000")
@@ -79,6 +81,36 @@ def draw_drag(steady: Found, oscillating: Found) -> Any:
     right.set_title("a plate across an oscillating flow")
     _finish(left, right)
     left.grid(visible=False, axis="y")
+    return figure
+
+
+@in_style
+def draw_swimmers(glide: Found, swum: Found) -> Any:
+    """Speeds of chains that swim, ours over measured; and a chain that glides."""
+    from experiments.measured_data import AMPHIBOT_GLIDE
+    from mjx_revolve.view.plots import COLORS
+
+    figure, left, right = _pair()
+    for case, mark in (("lamprey robot", "o"), ("AmphiBot", "s")):
+        rows = [r for r in swum.rows if r.case == case]
+        left.plot([r.measured for r in rows], [r.ours for r in rows], mark, color=COLORS[0],
+                  markersize=5, label=case)  # fmt: skip
+    left.plot([0, 0.7], [0, 0.7], color=_GREY, linewidth=1, label="as measured")
+    left.set_xlabel("speed measured (m/s)", fontsize=9)
+    left.set_ylabel("ours (m/s)", fontsize=9)
+    left.set_title("robots that swim by their joints")
+    for color, what, scale, unit in (
+        (COLORS[0], "way", 100, "cm"),
+        (COLORS[1], "rotation", -1, "°"),
+    ):
+        time, ours = glide.lines[what]
+        theirs = scale * np.array(getattr(AMPHIBOT_GLIDE, what))
+        right.plot(AMPHIBOT_GLIDE.time, theirs, "o", color=color, markersize=4.5,
+                   label=f"measured, {what} ({unit})")  # fmt: skip
+        right.plot(time, scale * ours, color=color, label=f"ours, {what} ({unit})")
+    right.set_xlabel("time (s)", fontsize=9)
+    right.set_title("AmphiBot glides, joints frozen")
+    _finish(left, right)
     return figure
 
 
@@ -212,13 +244,18 @@ def main(argv: list[str] | None = None) -> int:
 
     steady, swung = cases.steady_drag(), cases.oscillating()
     plates, falls, vehicle = cases.polars(), cases.coins(), cases.rov()
+    glide, swum = cases.amphibot_glide(), cases.swimmers()
     figures = {
+        "measured_swimmers": draw_swimmers(glide, swum),
         "measured_drag": draw_drag(steady, swung),
         "measured_plates": draw_polars(plates),
         "measured_coins": draw_coins(falls),
         "measured_rov": draw_rov(vehicle),
     }
     rows = [
+        *glide.rows,
+        *swum.rows,
+        *cases.foil(),
         *steady.rows,
         cases.sinking_plate(),
         *swung.rows,
@@ -235,6 +272,8 @@ def main(argv: list[str] | None = None) -> int:
     for law in cases.LAWS[1:]:
         numbers = ", ".join(f"{r.ours:.2f} {r.what}" for r in cases.steady_drag(law).rows)
         print(f"steady C_d by drag: {law}: {numbers}")
+    bias, scatter = cases.log_scatter([r for r in swum.rows if r.case == "lamprey robot"][:-1])
+    print(f"lamprey robot, nine gaits: bias {bias:.2f}, scatter {scatter:.2f}")
     text = io.StringIO()
     csv.writer(text).writerows(lines)
     write_atomic(folder / "measured.csv", text.getvalue().encode())

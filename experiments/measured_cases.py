@@ -74,10 +74,13 @@ def _types() -> Mapping[str, Any]:
     return load_modules(ROOT / "experiments" / "measured.yaml")
 
 
-def body(name: str, world: World) -> Robot:
-    """A robot that is one module of measured.yaml."""
-    shape = make_morphology({"id": name, "body": {"id": "core", "type": name}}, modules=_types())
-    return build_robot(shape, world)
+def body(name: str, world: World, links: str = "", count: int = 0) -> Robot:
+    """A robot that is one module of measured.yaml, or a chain with `count` links behind it."""
+    chain: dict[str, Any] = {}
+    for k in reversed(range(count)):
+        chain = {"children": {1: {"id": f"link{k}", "type": links} | chain}}
+    tree = {"id": "core", "type": name} | chain
+    return build_robot(make_morphology({"id": name, "body": tree}, modules=_types()), world)
 
 
 def sizes(robot: Robot) -> np.ndarray:
@@ -92,22 +95,35 @@ def tilt(degrees: Any) -> np.ndarray:
 
 
 def forces(robot: Robot, velocity: Any, degrees: Any = 0.0, flow: Water | None = None) -> Any:
-    """Forces on a body that is held, or moves steadily.
+    """Forces on a body that is held, or moves steadily: the first three of `loads` [N]."""
+    return loads(robot, velocity, degrees, flow=flow)[:3]
+
+
+def loads(
+    robot: Robot,
+    velocity: Any,
+    degrees: Any = 0.0,
+    turning: Any = 0.0,
+    flow: Water | None = None,
+) -> Any:
+    """Forces and torques on a body whose motion is prescribed.
 
     Args:
-        robot: a single box.
+        robot: a single box without carried water.
         velocity: `[3, n]` of the body, world frame [m/s].
         degrees: `[n]` or a number: turn about y [deg].
+        turning: likewise: how fast it turns about y [rad/s].
         flow: the water; still by default.
 
     Returns:
-        `[3, n]` its mass times its acceleration: all forces of the water, world frame [N].
+        `[4, n]` its mass times its acceleration: all forces of the water, world frame [N], and
+        torque about y at its centre [N·m].
     """
     velocity = np.asarray(velocity, float)
     lanes = velocity.shape[1]
     qpos, qvel = at_rest(robot, lanes, -5.0)
     qpos[3:7] = np.broadcast_to(tilt(degrees), (4, lanes))
-    qvel[:3] = velocity
+    qvel[:3], qvel[4] = velocity, turning
     still = Water(0.0, (0.0, 0.0, 0.0))
 
     def run(qpos: Any, qvel: Any, water: Water) -> Any:
@@ -118,7 +134,9 @@ def forces(robot: Robot, velocity: Any, degrees: Any = 0.0, flow: Water | None =
         found = jax.jit(run, compiler_options=quick_options())(
             jnp.asarray(qpos), jnp.asarray(qvel), water
         )
-        return float(robot.mj_model.body_mass.sum()) * np.asarray(found)[:3]
+        model = robot.mj_model
+        weights = [float(model.body_mass.sum())] * 3 + [float(model.body_inertia[1, 1])]
+        return np.array(weights)[:, None] * np.asarray(found)[[0, 1, 2, 4]]
 
 
 # ------------------------------------------------------------------------- steady drag
@@ -245,10 +263,163 @@ def oscillating(numbers: Sequence[float] = (3, 5, 8, 15, 30, 60, 120), phases: i
         terms = np.stack([scale * np.abs(flow) * flow, change], -1)
         ours = np.linalg.lstsq(terms, push, rcond=None)[0][0]
         found.append(ours)
-        if number in (5, 8, 15, 30, 60):
-            name = f"C_d of a plate, U T / b = {number:g}"
+        if number in (3, 5, 8, 15, 30, 60):
+            name, bilge = f"C_d of a plate, U T / b = {number:g}", data.plate_drag_at_bilge(number)
             rows.append(Row("oscillating plate", name, data.plate_drag(number), ours, "-"))
+            rows.append(Row("oscillating plate", f"{name}, bilge keels", bilge, ours, "-"))
     return Found(rows, {"faces": (np.asarray(numbers, float), np.array(found))})
+
+
+# ------------------------------------------------------------------------- swimming chains
+
+_SAMPLES = 20  # steps from one record to the next
+
+
+def _pool(drag: str = "faces", timestep: float = 0.001) -> World:
+    return tank(gravity=G, buoyancy="partial", drag=drag, added_mass=True, timestep=timestep)
+
+
+def _floating(robot: Robot) -> float:
+    """Height of the middle of a chain's boxes at which it floats [m]; neutral ones lie 1 m deep."""
+    relative = robot.morphology.mass / (robot.world.density * robot.morphology.volume)
+    return -1.0 if relative > 0.995 else float(sizes(robot)[2]) * (0.5 - relative)
+
+
+def swim(
+    robot: Robot, gaits: Sequence[data.Gait], shares: Any = 1.0, settle: float = 5.0
+) -> tuple[np.ndarray, float]:
+    """Speeds of a chain whose joints do what gaits prescribe.
+
+    Args:
+        robot: the chain, its core the head.
+        gaits: one for each lane.
+        shares: `[joints, lanes]` of the gaits' amplitudes, or a number.
+        settle: before windows begin [s]; they end ten periods and as much later.
+
+    Returns:
+        `[gaits]` median over windows of two periods of the head's displacement in them over their
+        time [m/s], and the largest error of a joint over its amplitude, after `settle` [-].
+    """
+    frequency, amplitude, lag = np.array([(g.frequency, g.amplitude, g.lag) for g in gaits]).T
+    joint = np.arange(robot.num_hinges)[:, None]
+    size = np.radians(amplitude) * shares
+
+    def angles(time: Any) -> np.ndarray:
+        """`[T, joints, lanes]` [rad]."""
+        turns = frequency * np.asarray(time)[:, None, None] - joint * lag
+        return size * np.sin(2 * np.pi * turns)
+
+    dt = robot.world.timestep
+    count = round((settle + 10 / frequency.min()) / dt / _SAMPLES) * _SAMPLES
+    targets = angles(dt * np.arange(1, count + 1))
+    qpos, qvel = at_rest(robot, len(gaits), _floating(robot))
+    qpos[7:] = angles([0.0])[0]
+    qvel[6:] = (angles([1e-4])[0] - angles([-1e-4])[0]) / 2e-4
+    time, q, *_ = march(robot, count * dt, qpos, qvel, targets, every=_SAMPLES)
+    late = time > settle
+    error = np.abs(q[:, 7:] - angles(time))[late] / size
+    speeds = []
+    for k, rate in enumerate(frequency):
+        window = round(2 / rate / (dt * _SAMPLES))
+        way = np.hypot(*(q[late][window:, :2, k] - q[late][:-window, :2, k]).T)
+        speeds.append(np.median(way) / (window * dt * _SAMPLES))
+    return np.array(speeds), float(np.nanmax(np.where(size > 0, error, 0.0)))
+
+
+def amphibot_glide(drag: str = "faces") -> Found:
+    """Way and rotation of a chain with frozen joints that glides at the surface."""
+    glide, robot = data.AMPHIBOT_GLIDE, body("ChainHead", _pool(drag), "ChainModule", 6)
+    angles, half = np.radians(glide.angles), data.CHAIN_MODULE / 2
+
+    def marks(q: np.ndarray) -> np.ndarray:
+        """`[T, 2]` mean of the marks: modules' middles, and hinges between them [m]."""
+        along = 2 * np.arctan2(q[:, 6, 0], q[:, 3, 0])
+        place, found = q[:, :2, 0], [q[:, :2, 0]]
+        for k in range(len(angles)):
+            for turn in (0.0, angles[k]):  # to the hinge, and on to the next middle
+                along = along + turn
+                place = place + half * np.stack([np.cos(along), np.sin(along)], 1)
+                found.append(place)
+        return np.mean(found, 0)
+
+    qpos, qvel = at_rest(robot, 1, _floating(robot))
+    start = np.radians(glide.heading)
+    qpos[3], qpos[6], qpos[7:] = np.cos(start / 2), np.sin(start / 2), angles[:, None]
+    rate = np.radians(glide.turning)
+    arm = marks(qpos[None])[0] - qpos[:2, 0]
+    qvel[:2, 0] = glide.velocity - rate * np.array([-arm[1], arm[0]])
+    qvel[5] = rate
+    time, q, *_ = march(robot, glide.time[-1] + 0.1, qpos, qvel, angles[:, None])
+    way = np.linalg.norm(marks(q) - marks(qpos[None]), axis=1)
+    rotation = np.degrees(2 * np.unwrap(np.arctan2(q[:, 6, 0], q[:, 3, 0])) - start)
+    rows = []
+    for what, theirs, ours, unit in (
+        ("way", glide.way, way, "m"),
+        ("rotation", glide.rotation, rotation, "deg"),
+    ):
+        for at, value in zip(glide.time, theirs, strict=True):
+            found = float(np.interp(at, time, ours))
+            rows.append(Row("AmphiBot", f"glide, {what} after {at:g} s", value, found, unit))
+    return Found(rows, {"way": (time, way), "rotation": (time, rotation)})
+
+
+def swimmers(drag: str = "faces") -> Found:
+    """Speeds of chains that swim by their joints: AmphiBot, the lamprey robot, Mamba's ratio."""
+    gait, pool = data.AMPHIBOT_SWIM, _pool(drag)
+    [speed], _ = swim(body("ChainHead", pool, "ChainModule", 6), [gait])
+    rows = [Row("AmphiBot", "swim", gait.speed, speed, "m/s")]
+    speeds, _ = swim(body("ChainHead", pool, "ChainModule", 5), data.LAMPREY)
+    for gait, ours in zip(data.LAMPREY, speeds, strict=True):
+        name = f"{gait.amplitude:g}°, φ {5 * gait.lag:.3g}"
+        rows.append(Row("lamprey robot", name, gait.speed, ours, "m/s"))
+    joint = np.arange(8, 0, -1)[:, None]  # from the head; 1 is at the tail
+    shares = np.concatenate([np.ones((8, 1)), (9 - joint) / 10], 1)
+    gait = data.Gait(1 / 3, 40.0, 1 / 9, 0.0)
+    mamba = body("MambaHead", _pool(drag, 0.004), "MambaLink", 8)
+    speeds, _ = swim(mamba, [gait, gait], shares, 15.0)
+    measured = data.MAMBA["eel-like"] / data.MAMBA["lateral"]
+    rows.append(Row("Mamba", "eel-like over lateral speed", measured, speeds[1] / speeds[0], "-"))
+    return Found(rows)
+
+
+def log_scatter(rows: Sequence[Row]) -> tuple[float, float]:
+    """Bias and scatter of rows: mean ratio and standard deviation, both of its logarithm [-]."""
+    ratio = np.log([row.ratio for row in rows])
+    return float(np.exp(ratio.mean())), float(ratio.std(ddof=1))
+
+
+# ------------------------------------------------------------------------- a flapping foil
+
+
+def foil(phases: int = 512) -> list[Row]:
+    """Thrust and efficiency of a foil that heaves and pitches while it is towed.
+
+    Its added mass is left out: in a motion that repeats, its mean force and power are 0.
+    """
+    robot, rows = body("FlappingFoil", tank(drag="faces")), []
+    chord, span, _ = sizes(robot)
+    speed, heave, behind = data.FOIL_SPEED, data.FOIL_HEAVE, (0.5 - data.FOIL_PIVOT) * chord
+    scale = 0.5 * robot.world.density * speed**2 * chord * span
+    phase = 2 * np.pi * (np.arange(phases) + 0.5) / phases
+    for case in data.FLAPPING:
+        omega = np.pi * case.strouhal * speed / heave
+        most = np.arctan(np.pi * case.strouhal) - np.radians(case.angle)
+        rising = omega * heave * np.cos(phase)
+        pitch, rate = most * np.cos(phase), -most * omega * np.sin(phase)  # nose up
+        # The centre lies behind the pivot; turns about y are nose down.
+        velocity = np.stack([speed + 0 * phase, 0 * phase, rising])
+        velocity += behind * rate * np.stack([np.sin(pitch), 0 * pitch, -np.cos(pitch)])
+        push = loads(robot, velocity, -np.degrees(pitch), -rate)
+        thrust = push[0].mean()
+        power = -(push[2] * rising).mean()
+        power += (rate * (push[3] - behind * (push[0] * np.sin(pitch) - push[2] * np.cos(pitch)))
+                  ).mean()  # fmt: skip
+        rows.append(Row(_FOIL, f"C_T, {case.who}", case.thrust, thrust / scale, "-"))
+        rows.append(Row(_FOIL, f"η, {case.who}", case.efficiency, thrust * speed / power, "-"))
+    return rows
+
+
+_FOIL = "flapping foil"
 
 
 # ------------------------------------------------------------------------- BlueROV2 Heavy

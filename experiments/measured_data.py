@@ -116,6 +116,127 @@ def plate_drag(number: float) -> float:
     return max(10 * number ** (-1 / 3), 1.95)
 
 
+def plate_drag_at_bilge(number: float) -> float:
+    """The same by a second fit, 22.5 / K + 2.4, of bilge keels [-].
+
+    Ikeda, Himeno and Tanaka, in the ITTC's recommended procedure for roll damping.
+    """
+    return 22.5 / number + 2.4
+
+
+# ------------------------------------------------------------------------- swimming chains
+
+
+class Glide(NamedTuple):
+    """A chain of modules with frozen joints that glides at the surface.
+
+    Attributes:
+        angles: of the joints, positive where the next module is turned to the left [deg].
+        heading: from the middle of the first module along it, pool frame [deg].
+        velocity: of the mean of 13 marks, on hinges and modules' middles, pool frame [m/s].
+        turning: [deg/s].
+        time: since then [s].
+        way: distance of the marks' mean from where it was [m].
+        rotation: since then [deg].
+    """
+
+    angles: tuple[float, ...]
+    heading: float
+    velocity: tuple[float, float]
+    turning: float
+    time: tuple[float, ...]
+    way: tuple[float, ...]
+    rotation: tuple[float, ...]
+
+
+AMPHIBOT_GLIDE = Glide(
+    (16.8, -1.6, -16.3, -29.0, -28.9, -26.8), -31.0, (0.1747, -0.1255), -19.9,
+    (0.13, 0.47, 1.00, 1.47, 2.00, 2.47, 3.00, 3.47, 4.00, 4.40),
+    (0.027, 0.086, 0.165, 0.221, 0.273, 0.312, 0.350, 0.378, 0.409, 0.431),
+    (-2.4, -7.4, -13.9, -18.7, -22.3, -24.3, -25.8, -27.1, -28.5, -29.9),
+)  # fmt: skip
+"""EPFL's AmphiBot after its motors stop, from the marks' tracks in the repository
+FluidsSim/lilytorch, lilytorch/farms_examples/amphibot/experimental_data (commit 1bcd9bf), 15
+frames/s, from the frame at 989.051 s. Angles and heading are ours: seven links of .097 m, as the
+marks have them, fitted by least squares to the marks' mean shape from that frame on; what is left
+is 1.4 mm, and the shape itself changes by 1 to 4 mm. Numbers are the marks', so the first module is
+the one with the first mark. The pool's own currents were up to 1 cm/s."""
+
+
+class Gait(NamedTuple):
+    """A wave that runs along a chain of joints, a sin(2π (f t - j lag)), j = 0 next to the head.
+
+    Attributes:
+        frequency: f [Hz].
+        amplitude: a [deg].
+        lag: from joint to joint [cycles].
+        speed: of the head, over two periods [m/s].
+    """
+
+    frequency: float
+    amplitude: float
+    lag: float
+    speed: float
+
+
+AMPHIBOT_SWIM = Gait(1 / 0.697, 29.5, 0.0805, 0.62)
+"""AmphiBot, six joints: asked for 30°, which the joints did up to 29.5°; the same repository,
+lilytorch/examples/amphibot/experimental_data (commit 707aee5)."""
+LAMPREY = tuple(
+    Gait(1.0, amplitude, lag / 5, speed)
+    for amplitude, lag, speed in (
+        (40, 0.5, 0.440), (40, 0.75, 0.409), (40, 1.0, 0.307), (40, 1.25, 0.169),
+        (35, 0.5, 0.479), (35, 0.8, 0.372), (35, 1.2, 0.150),
+        (20, 0.5, 0.400), (20, 0.8, 0.27), (20, 1.2, 0.03),
+    )
+)  # fmt: skip
+"""EPFL's lamprey robot, five joints, in the course "Robotics practicals": the first four in the
+repository Nayeuls/TP_8_Robotics_Practicals (commit dabaa2e), the others in
+grilloandrea6/robotics-practicals, practical8 (commit 57211be), of which the last two are .26 to .28
+and about .03. Speeds are ours, from the head's track: medians over windows of two periods after 2.5
+s and away from the walls. Groups of other years differ by up to 20 % for like gaits."""
+CHAIN_MODULE = 0.095
+"""From hinge to hinge [m]. This module and its mass are EPFL's Webots model's, in the repository
+cyberbotics/webots, projects/robots/epfl/biorob/protos/Salamander.proto."""
+
+MAMBA = {"lateral": 0.1288, "eel-like": 0.0894}
+"""Speeds [m/s] of Mamba, nine links, at 40°, 120°/s and 40° from joint to joint, with amplitudes
+g(i) = 1 and (n - i) / (n + 1), i = 1 at the tail: Kelasidi et al., IEEE Robotics & Automation
+Magazine, March 2016, p. 54. Links as in PMC4679098, quoted in markaren/threepp,
+python/examples/snake/snake_model.py. Only the ratio is compared."""
+
+
+# ------------------------------------------------------------------------- a flapping foil
+
+
+class Flapping(NamedTuple):
+    """A foil that heaves and pitches a quarter of a period apart.
+
+    Attributes:
+        who: measured it.
+        strouhal: 2 f h / U [-].
+        angle: of attack at most, atan(ḣ / U) - θ [deg].
+        thrust: mean coefficient, on ½ ρ U² c s [-].
+        efficiency: thrust times U over the mean power [-].
+    """
+
+    who: str
+    strouhal: float
+    angle: float
+    thrust: float
+    efficiency: float
+
+
+FOIL_SPEED, FOIL_HEAVE, FOIL_PIVOT = 0.4, 0.075, 1 / 3  # U [m/s], h [m], pivot behind the nose [c]
+FLAPPING = (
+    Flapping("Schouveiler", 0.25, 15.0, 0.32, 0.73),
+    Flapping("Read", 0.6, 35.0, 2.4, 0.43),
+)
+"""NACA 0012, chord .1 m, span .6 m. L. Schouveiler, F. S. Hover and M. S. Triantafyllou 2005; D. A.
+Read, F. S. Hover and M. S. Triantafyllou 2003, its largest thrust. Second hand: three places agree
+on the numbers, the papers themselves could not be read."""
+
+
 # ------------------------------------------------------------------------- BlueROV2 Heavy
 
 ROV_DRAG = {"surge": (13.7, 141.0), "sway": (0.0, 217.0), "heave": (33.0, 190.0)}

@@ -18,7 +18,7 @@ from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.population import robot_acceleration
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.episodes.rollout import Rollout, held
+from mjx_revolve.episodes.rollout import NO_INPUTS, Rollout, StepInputs, held, open_loop
 from mjx_revolve.numerics.xla import fuse, on_cpu
 from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.world import World, load_world
@@ -90,10 +90,13 @@ def _marcher(robot: Robot, records: int, every: int, engine: str, still: bool) -
 
     def run(qpos: Any, qvel: Any, targets: Any, water: Any) -> Any:
         current = water_of(robot.world) if still else water
-        rollout = Rollout(simulator, held(targets), robot.world, current)
+        rows = targets.ndim == 3
+        policy = open_loop if rows else held(targets)
+        inputs = StepInputs(ctrl=targets) if rows else NO_INPUTS
+        rollout = Rollout(simulator, policy, robot.world, current)
         record = lambda now, ctrl, water: (*simulator.observe(now.state), now.energy)  # noqa: E731
         start = rollout.init(simulator.init(qpos, qvel))
-        return rollout.advance(start, record, records, every)[1]
+        return rollout.advance(start, record, records, every, inputs)[1]
 
     return jax.jit(run, compiler_options=quick_options())
 
@@ -110,14 +113,14 @@ def march(
     engine: str = "population",
     x64: bool = True,
 ) -> tuple[np.ndarray, ...]:
-    """Steps lanes of one robot with held joint targets.
+    """Steps lanes of one robot with joint targets that are held or prescribed.
 
     Args:
         robot: from `build_robot`.
         duration: [s].
         qpos: `[nq, lanes]`.
         qvel: `[nv, lanes]`.
-        ctrl: `[nu, lanes]`, by default 0.
+        ctrl: `[nu, lanes]`, by default 0, or `[steps, nu, lanes]`, a row for each step.
         water: surface and current, by default the world's.
         every: steps between the rows of the result.
         engine: "population" or "mjx".
@@ -133,8 +136,9 @@ def march(
         kind = jnp.float64 if x64 else jnp.float32
         lanes = np.shape(qpos)[-1]
         ctrl = np.zeros((robot.mj_model.nu, lanes)) if ctrl is None else ctrl
-        own = np.asarray(ctrl)[actuators_of(robot)]
-        asked = make_engine(robot, engine).plant.arrange(jnp.asarray(own, kind))
+        own = jnp.asarray(np.asarray(ctrl)[..., actuators_of(robot), :], kind)
+        arrange = make_engine(robot, engine).plant.arrange
+        asked = jax.vmap(arrange)(own) if own.ndim == 3 else arrange(own)
         arrays = [*(jnp.asarray(x, kind) for x in (qpos, qvel)), asked]
         run = _marcher(robot, records, every, engine, water is None)
         kept = [np.asarray(x, np.float64) for x in run(*arrays, water)]

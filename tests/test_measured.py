@@ -69,6 +69,43 @@ def test_coins_fall_as_fast_as_measured_and_far_too_straight():
             assert row.ratio < 0.05  # they do not glide: faces have no lift
 
 
+@pytest.mark.slow
+def test_a_chain_that_glides_turns_too_far():
+    found = ratios(measured_cases.amphibot_glide().rows)
+    assert found["glide, way after 0.13 s"] == pytest.approx(1.0, abs=0.05)
+    assert found["glide, way after 4.4 s"] == pytest.approx(1.14, abs=0.01)
+    assert found["glide, rotation after 4.4 s"] == pytest.approx(2.7, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_chain_glides_as_far_as_measured_with_drag_across_it():
+    found = ratios(measured_cases.amphibot_glide("cross_flow").rows)
+    assert all(abs(x - 1) < 0.05 for name, x in found.items() if "way" in name)
+    assert found["glide, rotation after 4.4 s"] == pytest.approx(2.4, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_chain_that_swims_reaches_two_thirds_of_the_speed():
+    pool = measured_cases._pool()
+    chain = measured_cases.body("ChainHead", pool, "ChainModule", 6)
+    [speed], error = measured_cases.swim(chain, [data.AMPHIBOT_SWIM], settle=3.0)
+    assert speed / data.AMPHIBOT_SWIM.speed == pytest.approx(0.63, abs=0.01)
+    assert error < 0.02  # the joints do what is prescribed
+
+
+def test_bias_and_scatter_of_ratios():
+    rows = [measured_cases.Row("", "", 1.0, x, "") for x in (0.5, 2.0)]
+    assert measured_cases.log_scatter(rows) == pytest.approx((1.0, np.log(4) / np.sqrt(2)))
+
+
+def test_a_flapping_foil_thrusts_too_much():
+    found = ratios(measured_cases.foil())
+    assert 1.5 < found["C_T, Schouveiler"] < 1.75
+    assert 1.65 < found["C_T, Read"] < 1.85
+    # Drag has no thrust, and none is without power.
+    assert 0.0 < found["η, Read"] * 0.43 < 1.0
+
+
 def test_an_oscillating_plate_drags_several_times_too_little():
     found = measured_cases.oscillating((8, 30, 120))
     # Whatever the number: ours knows no vortices that stay with the plate.
@@ -93,11 +130,13 @@ def test_a_vehicles_outer_box_says_its_drag_and_added_mass_within_a_factor_of_fo
 def test_pictures_and_the_table(steady, polars, vehicle):
     swung = measured_cases.Found([], {"faces": (np.array([3.0, 120.0]), np.ones(2))})
     line = np.array([0.5, 1.0]), np.ones(2)
+    glide = measured_cases.Found([], {"way": line, "rotation": line})
     coins = [
         measured_cases.Row("coins", "a coin", 1.0, 1.0, u) for u in ("m/s", "cm") for _ in range(4)
     ]
     section = measured_cases.Found([], {"heave": line, "roll": line})
     for figure in (
+        measured.draw_swimmers(glide, measured_cases.Found([])),
         measured.draw_drag(steady, swung),
         measured.draw_polars(polars),
         measured.draw_coins(measured_cases.Found(coins)),
@@ -130,5 +169,5 @@ def test_the_command(tmp_path, capsys):
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
         "measured.csv", "measured_coins.png", "measured_drag.png", "measured_plates.png",
-        "measured_rov.png",
+        "measured_rov.png", "measured_swimmers.png",
     }  # fmt: skip

@@ -22,7 +22,8 @@ from mjx_revolve.body.module_files import read_modules
 from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Part, Slot
 from mjx_revolve.inputs.errors import reading
 from mjx_revolve.inputs.yaml_reader import load_yaml
-from mjx_revolve.water.plates import LiftDrag
+from mjx_revolve.water.coefficients import TODAY
+from mjx_revolve.water.plates import Fossen, LiftDrag
 from mjx_revolve.water.propellers import Thruster
 
 # ------------------------------------------------------------------------- the catalogue
@@ -131,6 +132,99 @@ _LIFT_THRUSTER = ModuleType(
     mount=Mount((-_DUCT / 2, 0.0, 0.0), (1.0, 0.0, 0.0)),
 )
 
+# Blue Robotics' T200 at 16 V: thrust over (PWM - 1500 µs) / 400 µs from their Public Performance
+# Data 10-20V (September 2019), every 50 µs, as the BlueROV2 node of CentraleNantesROV has it in its
+# map from thrust to PWM; a propeller 76 mm across, from their bluerov2_description. Mass and
+# density, 0.3603 kg and 1880 kg/m³, from Blue Robotics' documentation as quoted in
+# SSModelGit/TAMU_ROVm, T200Parameters.mo. Its length, and that half of its room goes along, are
+# choices; a lag and a torque of the propeller were not found.
+_T200_LENGTH, _T200_ACROSS = 0.088, 0.076
+_T200 = ModuleType(
+    name="T200",
+    parts=(
+        Part(
+            "duct",
+            (Box((_T200_LENGTH, _T200_ACROSS, _T200_ACROSS)),),
+            mass=0.3603,
+            volume=0.3603 / 1880,
+            entrained_water=0.5,
+            thruster=Thruster(
+                axis=(1.0, 0.0, 0.0),
+                curve="interpolated",
+                commands=(
+                    -1, -0.875, -0.75, -0.625, -0.5, -0.375, -0.25, -0.125, -0.05,
+                    0.05, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1,
+                ),
+                thrusts=(
+                    -39.92, -34.2, -26.56, -20.14, -14.11, -9.06, -4.72, -1.13, 0,
+                    0, 1.38, 5.92, 11.41, 17.89, 25.65, 33.55, 43.61, 51.45,
+                ),
+            ),
+        ),
+    ),
+    mount=Mount((-_T200_LENGTH / 2, 0.0, 0.0), (1.0, 0.0, 0.0)),
+)  # fmt: skip
+
+# The frame of a BlueROV2 Heavy without its eight T200, ahead is +x: M. von Benzon et al., An
+# Open-Source Benchmark Simulator: Control of a BlueROV2 Underwater Robot, JMSE 10 (2022), 1898,
+# table A1: 13.5 kg, 13.4 l, centre of buoyancy 1 cm above that of mass, inertia 0.26, 0.23, 0.37
+# kg m², added mass, damping, and the thrusters' places and directions, y and z turned to ours; as
+# quoted in AndreasKing-Goks/0_THESIS, BlueROV2_param.m, and elsewhere alike. Three boxes hold what
+# the thrusters leave of masses and volumes, of such sizes that the whole has the published inertia
+# and centres, inside the vehicle's outer sizes, 0.457 × 0.575 × 0.254 m. In its slots, T200 are
+# held by their backs.
+_HALF = math.sqrt(0.5)
+_BLUEROV2_THRUSTERS = (
+    ((0.156, -0.111, -0.085), (_HALF, _HALF, 0.0)),
+    ((0.156, 0.111, -0.085), (_HALF, -_HALF, 0.0)),
+    ((-0.156, -0.111, -0.085), (-_HALF, _HALF, 0.0)),
+    ((-0.156, 0.111, -0.085), (-_HALF, -_HALF, 0.0)),
+    ((0.12, -0.218, 0.0), (0.0, 0.0, 1.0)),
+    ((0.12, 0.218, 0.0), (0.0, 0.0, -1.0)),
+    ((-0.12, -0.218, 0.0), (0.0, 0.0, -1.0)),
+    ((-0.12, 0.218, 0.0), (0.0, 0.0, 1.0)),
+)
+
+
+def _t200_slot(place: tuple[float, ...], direction: tuple[float, float, float]) -> Slot:
+    """Where a T200 is held whose middle comes to lie at a place."""
+    x, y, z = (p - _T200_LENGTH / 2 * d for p, d in zip(place, direction, strict=True))
+    return Slot((x, y, z), direction, (1.0, 0.0, 0.0) if direction[2] else (0.0, 0.0, 1.0))
+
+
+_BLUEROV2 = ModuleType(
+    name="BlueROV2",
+    parts=(
+        Part(
+            "hull",
+            (Box((0.35684, 0.34, 0.088)),),
+            mass=4.9384,
+            volume=7.5374e-3,
+            fossen=Fossen(
+                added_mass=(6.3567, 7.1206, 18.6863, 0.1858, 0.1348, 0.2215),  # type: ignore[arg-type]
+                linear_damping=(13.7, 0.0, 33.0, 0.0, 0.8, 0.0),  # type: ignore[arg-type]
+                quadratic_damping=(141.0, 217.0, 190.0, 1.192, 0.47, 1.5),
+                whole=True,
+            ),
+        ),
+        Part(
+            "float",
+            (Box((0.35684, 0.46306, 0.083)),),
+            mass=3.556,
+            volume=3.3294e-3,
+            position=(0.0, 0.0, 0.0855),
+        ),
+        Part(
+            "skid",
+            (Box((0.35684, 0.08, 0.083)),),
+            mass=2.1232,
+            volume=1.0e-3,
+            position=(0.0, 0.0, -0.0855),
+        ),
+    ),
+    slots={k: _t200_slot(*at) for k, at in enumerate(_BLUEROV2_THRUSTERS, 1)},
+)
+
 # A stiff plate of ABS (1050 kg/m³), 60 × 50 × 2 mm with corners rounded to 10 mm, whose leading
 # edge is where it is mounted, as a tail's. Its box's face stands for its area, 3 % too much.
 # Lift before the stall: 2π A / (2 + √(A² + 4)) per rad (Helmbold 1942) for the aspect ratio
@@ -140,9 +234,9 @@ _LIFT_THRUSTER = ModuleType(
 # square plate across the flow (Hoerner, Fluid-Dynamic Drag, 1965, chapter 3). That friction is left
 # out, and that the centre of pressure stays in the middle, are choices: a tail works at large
 # angles.
-_FIN_STALL = math.pi / 6
+_FIN_STALL = math.radians(TODAY["fin_stall"].value)
 _FIN_LIFT = 2 * math.pi * (50 / 60) / (2 + math.hypot(50 / 60, 2))
-_FIN_DRAG = 0.465
+_FIN_DRAG = TODAY["fin_drag"].value
 _TO_ACROSS = math.pi / 2 - _FIN_STALL  # from the stall to a plate across the flow [rad]
 _FIN = ModuleType(
     name="Fin",
@@ -157,7 +251,7 @@ _FIN = ModuleType(
                 cda=_FIN_DRAG,
                 alpha_stall=_FIN_STALL,
                 cla_stall=-_FIN_LIFT * _FIN_STALL / _TO_ACROSS,
-                cda_stall=(1.17 - _FIN_DRAG * _FIN_STALL) / _TO_ACROSS,
+                cda_stall=(TODAY["plate_drag"].value - _FIN_DRAG * _FIN_STALL) / _TO_ACROSS,
                 forward=(-1.0, 0.0, 0.0),
                 upward=(0.0, 0.0, 1.0),
             ),
@@ -167,9 +261,9 @@ _FIN = ModuleType(
 )
 
 MODULES: dict[str, ModuleType] = _with_aliases(
-    _CORE, _BRICK, _HINGE, _TOUCH_SENSOR, _THRUSTER, _LIFT_THRUSTER, _FIN
+    _CORE, _BRICK, _HINGE, _TOUCH_SENSOR, _THRUSTER, _LIFT_THRUSTER, _FIN, _T200, _BLUEROV2
 )
-"""The catalogue by name and alias: the values of Revolve's code, and our thrusters and fin."""
+"""The catalogue by name and alias: Revolve's values, our thrusters and fin, T200 and BlueROV2."""
 
 # The thesis's Table 1 prints the two hinge masses the other way round. It also gives the touch
 # sensor the brick's box; that is not taken over, since it says nowhere how such a box is attached.
@@ -221,8 +315,8 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
                                                   # of a fin lift_drag
                 added_mass: true                  # default: the world's
                 coefficients: {}                  # default; of laws, by name
-                drag_coefficient: 1.05            # default
-                added_mass_coefficient: 1.0       # default
+                drag_coefficient: 1.05            # default; or three, along the part's axes
+                added_mass_coefficient: 1.0       # default; or three
                 contact: true                     # default
             slots:                   # default: none
               1: +x                  # or {position: [...], direction: [...], up: [0, 0, 1]}
@@ -237,6 +331,15 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
                 mass: 0.005
                 lift_drag:           # makes it a fin; fields of `LiftDrag`
                   {cla: 2.0, cda: 0.3, alpha_stall: 0.5, forward: [0, 1, 0], upward: [0, 0, 1]}
+          Pod:
+            mount: -x
+            parts:
+              - size: [0.06, 0.04, 0.04]
+                mass: 0.05
+                fossen:              # known water, in place of our laws; fields of `Fossen`
+                  added_mass: [0.01, 0.04, 0.04, 0, 2.0e-6, 2.0e-6]     # or six rows of six
+                  linear_damping: [0.05, 0.1, 0.1, 0, 0, 0]             # likewise
+                  quadratic_damping: [0.4, 1.2, 1.2, 0, 1.0e-5, 1.0e-5]
           Jet:
             mount: -x
             parts:

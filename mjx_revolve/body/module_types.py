@@ -35,8 +35,9 @@ from mjx_revolve.inputs.schema import (
     show,
     words,
 )
-from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag
+from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag, PerAxis
 from mjx_revolve.water.plates import CUBE_DRAG
+from mjx_revolve.water.plates import Fossen as Fossen
 from mjx_revolve.water.plates import LiftDrag as LiftDrag
 from mjx_revolve.water.propellers import Thruster as Thruster
 
@@ -82,13 +83,13 @@ class Part:
         center_of_volume: of mesh and electronics, part frame [m].
         position: of the part's frame, module frame [m].
         coefficients: of laws, by name; by default the world's.
-        drag_coefficient: of a face that meets the flow [-].
-        added_mass_coefficient: multiplies the main box's added mass [-].
+        drag_coefficient: of a face that meets the flow, or three, across the part's axes [-].
+        added_mass_coefficient: multiplies the main box's added mass; or three, along its axes [-].
         contact: whether it touches the bed.
         buoyancy: name of a buoyancy law; by default the world's choice. What a world switches off
             stays off, here and below.
-        drag: name of a drag law of parts; by default "lift_drag" for a fin, else the world's
-            choice.
+        drag: name of a drag law of parts; by default "fossen" where that is stated, "lift_drag" for
+            a fin, else the world's choice.
         added_mass: false for none; by default the world's choice.
         entrained_water: share of the room in the main box that mesh, electronics and ballast leave
             free, whose water is carried along, 0 to 1 [-].
@@ -96,6 +97,8 @@ class Part:
         ballast_volume: a point volume that displaces water: a float, or the ballast's own [m³].
         ballast_position: of both, part frame [m].
         lift_drag: parameters of Gazebo's LiftDrag, which make the part a fin.
+        fossen: added mass and damping known from elsewhere, which replace those of our laws, the
+            entrained water among them.
         thruster: makes the part a thruster.
 
     Raises:
@@ -110,8 +113,8 @@ class Part:
     center_of_volume: Annotated[Vector, Unit("m")] = (0.0, 0.0, 0.0)
     position: Annotated[Vector, Unit("m")] = (0.0, 0.0, 0.0)
     coefficients: Coefficients = ()
-    drag_coefficient: Annotated[NonNegative, Unit("-")] = CUBE_DRAG
-    added_mass_coefficient: Annotated[NonNegative, Unit("-")] = 1.0
+    drag_coefficient: Annotated[PerAxis, Unit("-")] = CUBE_DRAG
+    added_mass_coefficient: Annotated[PerAxis, Unit("-")] = 1.0
     contact: Boolean = True
     buoyancy: BuoyancyName | None = None
     drag: PartDrag | None = None
@@ -121,6 +124,7 @@ class Part:
     ballast_volume: Annotated[NonNegative, Unit("m3")] = 0.0
     ballast_position: Annotated[Vector, Unit("m")] = (0.0, 0.0, 0.0)
     lift_drag: LiftDrag | None = None
+    fossen: Fossen | None = None
     thruster: Thruster | None = None
 
     def __post_init__(self) -> None:
@@ -298,6 +302,9 @@ class ModuleType:
             raise ConstraintError("parts", "parts, each name once", show(names))
         if self.mount is not None and 0 in self.slots:
             raise ConstraintError("slots", "numbers >= 1 (0 is where it is attached)", "0")
+        whole = [part.fossen is not None and part.fossen.whole for part in self.parts]
+        if any(whole[1:]) or (whole[0] and self.mount is not None):
+            raise ConstraintError("parts", "fossen.whole in the first part of a core only", "more")
         if self.mount is None and self.mass <= 0.0:
             raise ConstraintError("mass", "a core heavier than 0 kg", f"{self.mass:g}")
         for k, sensor in enumerate(self.sensors):

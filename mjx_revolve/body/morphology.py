@@ -102,13 +102,15 @@ def make_morphology(
     - `ballast` [kg] added to the first part: to its mass, or, with `ballast_position` (three
       numbers, part frame [m]) or `ballast_volume` [m³], as a point there that takes the place of
       the part's own;
-    - `drag_coefficient`, `added_mass_coefficient`, `entrained_water` (share of the box's free
-      volume, 0 to 1) of every part [-];
+    - `drag_coefficient`, `added_mass_coefficient` (a number, or three along the part's axes),
+      `entrained_water` (share of the box's free volume, 0 to 1) of every part [-];
     - `coefficients`: a mapping of coefficients of laws that have no key of their own;
     - `buoyancy`, `drag` (a law's name or `off`) and `added_mass` (true or false): the module's own
       choice where the world's does not suit it;
     - `lift_drag`: a mapping with fields of `LiftDrag`, such as `{cla: 2.0}`; it changes a fin and
       makes a fin of any other module;
+    - `fossen`: a mapping with fields of `Fossen`: added mass and damping known from elsewhere, of a
+      module with one part, in place of those of our laws;
     - `thruster`: a mapping with fields of `Thruster`, such as `{torque_ratio: -0.0035}` for a
       left-handed propeller; `thrust` [N] at its highest command, which scales its curve.
 
@@ -143,6 +145,13 @@ def _make(
     if "body" not in data:
         raise InputError(f"{source}: expected the key body; found {show(list(data))}")
     tree = _read_tree(data["body"], modules, source)
+    hinges = [module.name for module in tree if module.kind.hinge is not None]
+    stated = tree[0].kind.parts[0].fossen
+    if hinges and stated is not None and stated.whole:
+        raise InputError(
+            f"{source}: body: expected no hinges, as the core's fossen.whole states the water of "
+            f"all of a rigid robot; found {hinges[0]}"
+        )
     return Morphology(
         name=_read_id(data.get("id"), f"{source}: id") or name,
         modules=tree,

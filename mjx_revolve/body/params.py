@@ -18,15 +18,17 @@ from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.tree import COLORS
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import Boolean, NonNegative, Number, Share, Text, Triple, read, words
-from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag
-from mjx_revolve.water.plates import LiftDrag
+from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag, PerAxis
+from mjx_revolve.water.plates import Fossen, LiftDrag
 from mjx_revolve.water.propellers import Thruster
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
 def read_number(value: Any) -> Any:
-    """Text such as `0.707;`, as found in files, as a number; everything else as it is."""
+    """Text such as `0.707;`, as found in files, as a number, in lists too; else as it is."""
+    if isinstance(value, list):
+        return [read_number(x) for x in value]
     if isinstance(value, str):
         text = value.strip().rstrip(";,").rstrip()
         return float(text) if _NUMBER.fullmatch(text) else value
@@ -40,8 +42,8 @@ _Place = Annotated[Triple[Annotated[Number, _Loose]], AfterValidator(list), Unit
 _Some = Annotated[dict[Text, Any], MinLen(1), words("a mapping with any of its fields")]
 # What every part takes over as it is.
 _PLAIN: dict[str, Any] = {
-    "drag_coefficient": Annotated[_Amount, Unit("-")],
-    "added_mass_coefficient": Annotated[_Amount, Unit("-")],
+    "drag_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
+    "added_mass_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
     "entrained_water": Annotated[Share, _Loose],
     "coefficients": Coefficients,
     "buoyancy": BuoyancyName,
@@ -59,6 +61,7 @@ _OVERRIDES: dict[str, Any] = _PLAIN | {
     "center_of_volume": _Place,
     "thrust": Annotated[_Amount, Unit("N")],
     "lift_drag": _Some,
+    "fossen": _Some,
     "thruster": _Some,
 }
 # How alike a key and one of ours are that is taken for a slip of the finger: one letter in four. A
@@ -141,6 +144,12 @@ def apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
         for part, change in zip(parts, changes, strict=True):
             if part.lift_drag is not None or not kind.is_fin:
                 change["lift_drag"] = replace(part.lift_drag or LiftDrag(), **params["lift_drag"])
+    if "fossen" in params:
+        if len(parts) > 1:
+            raise InputError(
+                f"fossen: expected a module with one part; found type {kind.name} with {len(parts)}"
+            )
+        changes[0]["fossen"] = read(Fossen, params["fossen"], "fossen")
     if "thruster" in params or "thrust" in params:
         if not kind.is_thruster:
             key = "thruster" if "thruster" in params else "thrust"

@@ -30,7 +30,7 @@ from mjx_revolve.engine.step_constants import (
     read_constants,
     select_bodies,
 )
-from mjx_revolve.engine.thrusters import read_thrusters
+from mjx_revolve.engine.thrusters import curve_points, read_thrusters
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.laws import BodyDragLaw, part_fields
@@ -62,6 +62,7 @@ class Capacity:
     Attributes:
         hinges: most hinges that a robot may have.
         thrusters: most thrusters.
+        curve_points: most points of a thruster's broken line, 0 where all have another curve.
         pairs: most pairs of hinges that share a rigid body.
         rows: most rows, which the root is not one of.
         slots: length of the stack.
@@ -78,6 +79,7 @@ class Capacity:
 
     hinges: int
     thrusters: int
+    curve_points: int
     pairs: int
     rows: int
     slots: int
@@ -307,6 +309,10 @@ def fit_capacity(
     capacity = Capacity(
         hinges=max(largest, hinges),
         thrusters=thrusters,
+        curve_points=max(
+            (curve_points(part.thruster) for kind in types.values() for part in kind.parts),
+            default=0,
+        ),
         pairs=pairs,
         rows=count,
         slots=slots,
@@ -419,7 +425,7 @@ def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool) -> Level
         groups = []
         for parts in blank.parts:
             carried = parts.carried
-            if carried is not None:
+            if carried is not None and not parts.laws.coupled:
                 cross = tuple(tuple(0.0 if i == j else None for j in range(3)) for i in range(3))
                 about = carried.inertia._replace(
                     cross=cross, linear=(None, 0.0, 0.0, None, 0.0, None)
@@ -574,7 +580,7 @@ def pack_bodies(
         PackedBodies(
             root=root,
             rows=level,
-            thrusters=read_thrusters(assembly, capacity.thrusters),
+            thrusters=read_thrusters(assembly, capacity.thrusters, capacity.curve_points),
             plant=replace(
                 _wire(assembly, hanging["row"], capacity),
                 mounts=place_types(assembly, _body_rows(order), capacity.sites, capacity.rows),
@@ -650,10 +656,11 @@ def _check_fit(
     for k, laws in enumerate(columns.laws):
         if laws not in room and not laws.idle:
             part = int(np.argmax(columns.part_laws == k))
-            known = [tuple(x) for x in room]
+            shown = lambda x: tuple(x) if x.coupled else tuple(x)[:3]  # noqa: E731
+            known = [shown(x) for x in room]
             raise InputError(
                 f"robot {names[assembly.layout.body[part]]!r}: expected parts under one of the "
-                f"laws {known} (buoyancy, drag, thruster); found {tuple(laws)}"
+                f"laws {known} (buoyancy, drag, thruster, stated 6×6); found {shown(laws)}"
             )
     slots = np.ones(len(order.length), int)
     np.maximum.at(slots, order.robot, 1 + order.slot)

@@ -20,9 +20,13 @@ from mjx_revolve.body.placement import RestPose
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.water.added_mass import box_added_mass, entrained_water
 from mjx_revolve.water.drag import DRAG_LAWS
+from mjx_revolve.water.face_drag import beside, split_axes
 from mjx_revolve.water.law_names import list_coefficients
 from mjx_revolve.water.laws import Coefficient
+from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
 from mjx_revolve.water.world import World
+
+_NOTHING = ((0.0,) * 6,) * 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +48,16 @@ class FluidTable:
         exposed: share of each pair of faces that the water reaches [-].
         buoyancy: names of the buoyancy laws.
         drag: names of the drag laws.
-        coefficients: `[npart]` each: every coefficient of the laws, by name.
+        coefficients: `[npart]` each, or `[npart, 3]`: every coefficient of the laws, by name.
         parameters: `[npart]` each: the parameters of laws that have a class of them.
-        added_mass: of the envelope's exposed faces, per unit density, part frame [m³].
+        added_mass: of the envelope's exposed faces, or as stated, per unit density, part frame
+            [m³].
         added_inertia: the same about the axes [m⁵].
         carried_mass: what the step carries: added mass where it is switched on, and entrained
             water, per unit density [m³].
         carried_inertia: the same about the axes [m⁵].
+        coupling: what a stated added mass has beside its diagonal: along the axes, then about them,
+            per unit density, part frame [m³, m⁴, m⁵].
     """
 
     __repr__ = short_repr
@@ -67,18 +74,24 @@ class FluidTable:
     exposed: Float[np.ndarray, "npart 3"]
     buoyancy: tuple[str, ...]
     drag: tuple[str, ...]
-    coefficients: Mapping[str, Float[np.ndarray, " npart"]]
+    coefficients: Mapping[str, Float[np.ndarray, "npart ..."]]
     parameters: Mapping[str, tuple[Any, ...]]
     added_mass: Float[np.ndarray, "npart 3"]
     added_inertia: Float[np.ndarray, "npart 3"]
     carried_mass: Float[np.ndarray, "npart 3"]
     carried_inertia: Float[np.ndarray, "npart 3"]
+    coupling: Float[np.ndarray, "npart 6 6"]
 
     @property
     def face_area(self) -> Float[np.ndarray, "npart 3"]:
         """What the water reaches of a face across each axis [m²]."""
         area: np.ndarray = self.exposed * self.silhouette
         return area
+
+    @property
+    def coupled(self) -> np.ndarray:
+        """`[npart]` whether what a part carries is more than a diagonal in its axes."""
+        return np.any(self.coupling, (1, 2))
 
     @property
     def carries(self) -> bool:
@@ -90,12 +103,15 @@ def drag_law(part: Part, world: World) -> str:
     """The name of a part's drag law: its own, that of its fin, or the world's.
 
     A world that switches drag off switches it off for every part, and MuJoCo's laws, which know no
-    fins, hold for fins too.
+    fins, hold for fins and for parts that state their own damping, too.
     """
     if world.drag == "off":
         return "off"
-    fin = part.lift_drag is not None and world.drag == "faces"
-    return part.drag or ("lift_drag" if fin else world.drag)
+    if part.drag is not None or world.drag in (INERTIA_BOX.name, ELLIPSOID.name):
+        return part.drag or world.drag
+    if part.fossen is not None:
+        return "fossen"
+    return "lift_drag" if part.lift_drag is not None else world.drag
 
 
 def make_fluid_table(
@@ -122,20 +138,37 @@ def make_fluid_table(
 
     def given(part: Part, c: Coefficient) -> Any:
         if c.own_field:
-            return getattr(part, c.name)
+            value = getattr(part, c.name)
+            return np.broadcast_to(value, 3) if c.per_axis else value
         return dict(part.coefficients).get(c.name, dict(world.coefficients).get(c.name, c.default))
 
     half = np.array([p.boxes[0].size for p in parts]) / 2
     mass, inertia = box_added_mass(half)
     coefficients = {c.name: np.array([given(p, c) for p in parts]) for _, c in list_coefficients()}
-    scale = coefficients["added_mass_coefficient"][:, None]
+    scale, share = split_axes(coefficients["added_mass_coefficient"])
     free = np.array([p.free_volume for p in parts])
     inside = entrained_water(half, free, coefficients["entrained_water"])
     on = np.array([[world.added_mass and p.added_mass is not False] for p in parts])
+    reached = exposed * share[kind]
+    added_mass = reached * (scale * mass)[kind]
     # Water that turns about an axis is pushed by the four faces beside it.
-    beside = (exposed[:, [1, 2, 0]] + exposed[:, [2, 0, 1]]) / 2
-    added_mass = exposed * (scale * mass)[kind]
-    added_inertia = beside * (scale * inertia)[kind]
+    added_inertia = beside(reached) / 2 * (scale * inertia)[kind]
+    stated = np.array([p.fossen is not None for p in parts])[kind]
+    known = np.array([_NOTHING if p.fossen is None else p.fossen.added_mass for p in parts])[kind]
+    known = known / (world.density or np.inf)
+    diagonal = np.einsum("pii->pi", known)
+    added_mass = np.where(stated[:, None], diagonal[:, :3], added_mass)
+    added_inertia = np.where(stated[:, None], diagonal[:, 3:], added_inertia)
+    # Where the core states the water of all of its robot, other parts have none.
+    whole = np.array([p.fossen is not None and p.fossen.whole for p in parts])[kind]
+    replaced = np.isin(layout.body, layout.body[whole]) & ~whole
+    added_mass, added_inertia = (
+        np.where(replaced[:, None], 0.0, x) for x in (added_mass, added_inertia)
+    )
+    drag = each([drag_law(p, world) for p in parts])
+    if replaced.any():
+        drag = tuple("off" if r else name for r, name in zip(replaced, drag, strict=True))
+    own = (world.added_mass & ~(stated | replaced))[:, None]  # what fills the room is ours
     off = world.buoyancy == "off"
     return FluidTable(
         body=body,
@@ -149,15 +182,18 @@ def make_fluid_table(
         silhouette=np.array([p.face_areas for p in parts])[kind],
         exposed=exposed,
         buoyancy=each(["off" if off else p.buoyancy or world.buoyancy for p in parts]),
-        drag=each([drag_law(p, world) for p in parts]),
+        drag=drag,
         coefficients={name: x[kind] for name, x in coefficients.items()},
         parameters={
-            name: each([getattr(p, name) or getattr(world, name) for p in parts])
+            name: each(
+                [getattr(p, name) or getattr(world, name, None) or law.parameters() for p in parts]
+            )
             for name, law in DRAG_LAWS.items()
             if law.parameters is not None
         },
         added_mass=added_mass,
         added_inertia=added_inertia,
-        carried_mass=on[kind] * added_mass + (world.added_mass * inside[0])[kind],
-        carried_inertia=on[kind] * added_inertia + (world.added_mass * inside[1])[kind],
+        carried_mass=on[kind] * added_mass + own * inside[0][kind],
+        carried_inertia=on[kind] * added_inertia + own * inside[1][kind],
+        coupling=on[kind][:, None] * (known - diagonal[:, None] * np.eye(6)),
     )

@@ -35,6 +35,7 @@ from mjx_revolve.numerics.spatial import (
     matvec,
     mul,
     neg,
+    rotate,
     rotate_sym,
     sub,
     total,
@@ -211,14 +212,18 @@ def _angular_drag(parts: Parts, coefficient: Vec, flow: PartFlow, gather: Sum) -
 
 
 def _damping(
-    parts: Parts, linear: Vec | None, angular: Sym | None, gather: Sum
+    parts: Parts, own: Vec | SpatialInertia | None, angular: Sym | None, gather: Sum
 ) -> SpatialInertia | None:
     """Damping of forces along the parts' axes and of torques, about the bodies' origins."""
-    if linear is None:
+    if own is None:
         return None if angular is None else SpatialInertia(angular, (_ZERO,) * 3, (0.0,) * 6)
-    x, y, z = linear
-    along = rotate_sym(parts.rotation, (x, 0.0, 0.0, y, 0.0, z))
-    one = shift_inertia(along, (0.0,) * 6, parts.position)
+    if isinstance(own, SpatialInertia):
+        about, along = (rotate_sym(parts.rotation, x) for x in (own.angular, own.linear))
+        one = shift_inertia(along, about, parts.position, rotate(parts.rotation, own.cross))
+    else:
+        x, y, z = own
+        along = rotate_sym(parts.rotation, (x, 0.0, 0.0, y, 0.0, z))
+        one = shift_inertia(along, (0.0,) * 6, parts.position)
     turning = tuple(map(gather, one.angular))
     return SpatialInertia(
         turning if angular is None else vadd(turning, angular),
@@ -235,6 +240,17 @@ def _angular_slam(parts: Parts, carried: CarriedWater, w: Vec, rate: Scalar, gat
     # All parts turn alike about their own axes.
     together = tuple(gather(mul(rate, x)) for x in carried.angular)
     return matvec(parts.rotation, slam(1.0, together, w))
+
+
+def _coupled_slam(
+    carried: CarriedWater, stream: _Stream, motion: BodyMotion, rate: Scalar
+) -> tuple[Vec, Vec]:
+    """Torque and force of the slam on parts that carry a whole 6×6, about the bodies' origins."""
+    velocity = motion.velocity
+    if stream.velocity is not None:
+        velocity = vsub(velocity, stream.velocity)
+    torque, force = apply_inertia(carried.inertia, motion.angular_velocity, velocity)
+    return vscale(neg(rate), torque), vscale(neg(rate), force)
 
 
 def _pressure(
@@ -316,7 +332,8 @@ def _water_on_parts(
     rate = None
     if before is not None and parts.carried is not None:
         rate = wetting_rate(submerged, before.submerged, before.dt)
-        force = vadd(force, slam(rate, parts.carried.mass, v))
+        if not parts.laws.coupled:
+            force = vadd(force, slam(rate, parts.carried.mass, v))
     force = matvec(parts.rotation, force)
     torque = vadd(matvec(parts.rotation, torque), cross(parts.position, force))
     if parts.mounts is not None:
@@ -327,7 +344,12 @@ def _water_on_parts(
         righting, lift = _pressure(world, parts, at, gravity, gather)
         torque, force = vadd(torque, righting), vadd(force, lift)
     if rate is not None and parts.carried is not None:
-        torque = vadd(torque, _angular_slam(parts, parts.carried, w, rate, gather))
+        if parts.laws.coupled:
+            blow = _coupled_slam(parts.carried, at.stream, motion, rate)
+            torque = vadd(torque, map(gather, blow[0]))
+            force = vadd(force, map(gather, blow[1]))
+        else:
+            torque = vadd(torque, _angular_slam(parts, parts.carried, w, rate, gather))
     angular = None
     if isinstance(law, PartDragLaw) and law.angular is not None:
         twist, angular = _angular_drag(parts, law.angular(parts.drag), at.flow, gather)

@@ -42,11 +42,13 @@ class PartLaws(NamedTuple):
         buoyancy: name of the buoyancy law.
         drag: name of the drag law.
         pushes: whether they are thrusters.
+        coupled: whether they may carry more water than a diagonal in their axes, as stated.
     """
 
     buoyancy: str
     drag: str
     pushes: bool = False
+    coupled: bool = False
 
     @property
     def idle(self) -> bool:

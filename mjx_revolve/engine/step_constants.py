@@ -17,6 +17,7 @@ import numpy as np
 
 from mjx_revolve.body.placement import counted, turned
 from mjx_revolve.engine.assembly import Assembly
+from mjx_revolve.engine.fluid_table import FluidTable
 from mjx_revolve.engine.level import (
     Hinges,
     InertiaBox,
@@ -139,7 +140,8 @@ def read_constants(assembly: Assembly) -> StepConstants:
         points = (_vec(_end(place, 0.0)), _end(share[touching], 0.0))
     pushing = np.zeros(len(table.volume), bool)
     pushing[assembly.thruster_row] = True
-    each = list(zip(table.buoyancy, table.drag, pushing.tolist(), strict=True))
+    columns = table.buoyancy, table.drag, pushing.tolist(), table.coupled.tolist()
+    each = list(zip(*columns, strict=True))
     laws = sorted(set(each))
     number = {law: k for k, law in enumerate(laws)}
     return StepConstants(
@@ -242,12 +244,8 @@ def _base_inertias(assembly: Assembly) -> np.ndarray:
     center = place + turned(turn, assembly.center)
     found = seen(center, assembly.mass[:, None, None] * unit, inertia)
     if table.carries:
-        axes = layout.rotation
-        along = [
-            (axes * (density * x)[:, None]) @ axes.swapaxes(1, 2)
-            for x in (table.carried_mass, table.carried_inertia)
-        ]
-        np.add.at(found, table.body, seen(layout.position, *along))
+        carried = _carried_about(table, density, layout.rotation, layout.position)
+        np.add.at(found, table.body, np.stack(carried, 1))
     # A subtree is a run of bodies.
     runs = np.stack([np.arange(len(found)), assembly.end], 1).ravel()
     below = np.add.reduceat(np.append(found, found[:1], 0), runs)[::2]
@@ -326,29 +324,53 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
         mounts=_mounts(assembly, turn, position) if len(assembly.thruster_row) else None,
     )
     parts = Parts(PartLaws("", ""), len(table.volume) + 1, **numbers)
-    turns = {"none": None, "vector": swap, "size": np.abs(swap)}
+    turns = {"vector": swap, "size": np.abs(swap)}
 
     def column(field: PartField, x: Any) -> Any:
         """A number along the axes that describe the parts, and that of a part of no effect."""
         blank = field.blank(world) if callable(field.blank) else field.blank
         if not isinstance(x, np.ndarray):  # components already
             return jax.tree.map(lambda component: _end(component, blank), x)
-        turn = turns[field.axes]
-        x = _end(x if turn is None else turned(turn, x), blank)
+        if field.axes == "matrix":
+            x = swap @ x @ swap.swapaxes(1, 2)
+        elif field.axes != "none":
+            x = turned(turns[field.axes], x)
+        x = _end(x, blank)
         return x if x.ndim == 1 else _vec(x) if x.ndim == 2 else _mat(x)
 
     found: Parts = map_fields(column, parts)
     return found
 
 
-def _carried(assembly: Assembly, turn: np.ndarray, position: np.ndarray) -> CarriedWater:
-    table, density = assembly.fluid, assembly.world.density
+def _carried_about(
+    table: FluidTable, density: float, turn: np.ndarray, position: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Carried water about an origin: `[npart, 3, 3]` angular, cross and linear.
+
+    Args:
+        table: of the parts.
+        density: of the water [kg/m³].
+        turn: `[npart, 3, 3]` of the parts.
+        position: `[npart, 3]` of the parts [m].
+    """
     x, across = _skews(position), turn.swapaxes(1, 2)
     linear = density * (turn * table.carried_mass[:, None]) @ across
     angular = density * (turn * table.carried_inertia[:, None]) @ across
-    about = SpatialInertia(_sym(angular - x @ linear @ x), _mat(x @ linear), _sym(linear))
+    if not table.coupled.any():
+        return angular - x @ linear @ x, x @ linear, linear
+    more = density * table.coupling
+    linear = linear + turn @ more[:, :3, :3] @ across
+    angular = angular + turn @ more[:, 3:, 3:] @ across
+    own = turn @ more[:, 3:, :3] @ across
+    once = own @ x
+    return angular - once - once.swapaxes(1, 2) - x @ linear @ x, own + x @ linear, linear
+
+
+def _carried(assembly: Assembly, turn: np.ndarray, position: np.ndarray) -> CarriedWater:
+    table, density = assembly.fluid, assembly.world.density
+    angular, cross, linear = _carried_about(table, density, turn, position)
     own: Any = density * table.carried_mass, density * table.carried_inertia
-    return CarriedWater(about, *own)
+    return CarriedWater(SpatialInertia(_sym(angular), _mat(cross), _sym(linear)), *own)
 
 
 def _mounts(assembly: Assembly, turn: np.ndarray, position: np.ndarray) -> ThrusterMounts:

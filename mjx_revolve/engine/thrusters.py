@@ -28,12 +28,18 @@ from mjx_revolve.water.thrusters import (
 _NONE = Thruster(gain=0.0)
 
 
-def read_thrusters(assembly: Assembly, count: int) -> Thrusters:
+def curve_points(thruster: Thruster | None) -> int:
+    """How many points a thruster's broken line has; 0 for another curve."""
+    return 0 if thruster is None else len(thruster.commands)
+
+
+def read_thrusters(assembly: Assembly, count: int, points: int = 0) -> Thrusters:
     """The thrusters of robots side by side.
 
     Args:
         assembly: of the robots.
         count: how many a robot may have; the others do nothing.
+        points: room for at least so many points of a curve.
 
     Returns:
         Tables `[count, robots]`.
@@ -57,10 +63,9 @@ def read_thrusters(assembly: Assembly, count: int) -> Thrusters:
         )
 
     backward = lambda t: t.gain if t.gain_backward is None else t.gain_backward  # noqa: E731
-    lines = [t for some in padded for t in some if t.curve == "interpolated"]
+    most = max([points, *(curve_points(t) for some in padded for t in some)])
     line = None
-    if lines:
-        most = max(len(t.commands) for t in lines)
+    if most:
         line = (
             tuple(column(lambda t, k=k: _point(t, k)[0]) for k in range(most)),
             tuple(column(lambda t, k=k: _point(t, k)[1]) for k in range(most)),

@@ -45,6 +45,8 @@ _STEP = 0.001
 # Thrust coefficient K_T of a propeller at standstill (Carlton, Marine Propellers and Propulsion,
 # chapter 6); it only makes it spin.
 _THRUST_COEFFICIENT = 0.3
+# Gazebo's names of forces and of velocities, after Fossen.
+_FORCES = "xyzkmn", "UVWPQR"
 # Of a bed, as `robot.py` has it.
 _SAND = (0.76, 0.70, 0.50)
 
@@ -208,12 +210,13 @@ def _link(robot: Robot, links: tuple[Link, ...], link: Link, meshes: str) -> Ite
 
 
 def _carried(robot: Robot, part: PlacedPart) -> Iterator[Element]:
-    """Added mass and entrained water of a part: diagonal, since its link is its box's frame."""
+    """Added mass and entrained water of a part: its link is its box's frame."""
     table = robot.fluid
-    carried = [*table.carried_mass[part.row], *table.carried_inertia[part.row]]
-    if any(carried):
-        tags = ("xx", "yy", "zz", "pp", "qq", "rr")
-        entries = {tag: robot.world.density * x for tag, x in zip(tags, carried, strict=True)}
+    diagonal = [*table.carried_mass[part.row], *table.carried_inertia[part.row]]
+    carried = robot.world.density * (np.diag(diagonal) + table.coupling[part.row])
+    if carried.any():
+        pairs = [(i, j) for i in range(6) for j in range(i, 6) if i == j or carried[i, j]]
+        entries = {"xyzpqr"[i] + "xyzpqr"[j]: carried[i, j] for i, j in pairs}
         yield node("fluid_added_mass", *nodes(**entries))
 
 
@@ -284,17 +287,32 @@ def _forces(robot: Robot, link: Link) -> Iterator[Element]:
 
 
 def _face_drag(robot: Robot, part: PlacedPart) -> Element:
-    """Drag of the faces; Gazebo takes damping as negative, after Fossen."""
+    """Drag of the faces."""
     numbers: FaceNumbers = FACES.numbers(robot.fluid, robot.world)
-    values = [*numbers.linear[part.row], *numbers.angular[part.row]]
-    tags = ("xUabsU", "yVabsV", "zWabsW", "kPabsP", "mQabsQ", "nRabsR")
+    return _damping(robot, part, [*numbers.linear[part.row], *numbers.angular[part.row]])
+
+
+def _stated_drag(robot: Robot, part: PlacedPart) -> Element:
+    """Damping that a module states itself."""
+    stated = robot.fluid.parameters["fossen"][part.row]
+    return _damping(robot, part, stated.quadratic_damping, np.array(stated.linear_damping))
+
+
+def _damping(
+    robot: Robot, part: PlacedPart, quadratic: Iterable[float], linear: np.ndarray | None = None
+) -> Element:
+    """Gazebo's Hydrodynamics; it takes damping as negative, after Fossen."""
+    tags = {f"{row}{axis}abs{axis}": x for row, axis, x in zip(*_FORCES, quadratic, strict=True)}
+    if linear is not None:
+        rows, axes = _FORCES
+        tags |= {rows[i] + axes[j]: linear[i, j] for i, j in np.argwhere(linear)}
     return _plugin(
         "hydrodynamics",
         "Hydrodynamics",
         link_name=part.name,
         water_density=robot.world.density,
         default_current=robot.world.current,
-        **{tag: -x for tag, x in zip(tags, values, strict=True)},
+        **{tag: -float(x) for tag, x in tags.items()},
     )
 
 
@@ -318,7 +336,7 @@ def _lift_drag(robot: Robot, part: PlacedPart) -> Element:
 
 
 # Gazebo's plugins by the law that they have, as `DragLaw.sdf` names it.
-PLUGINS = {"faces": _face_drag, "lift_drag": _lift_drag}
+PLUGINS = {"faces": _face_drag, "lift_drag": _lift_drag, "fossen": _stated_drag}
 
 
 def _thruster(robot: Robot, part: PlacedPart) -> Element:

@@ -147,20 +147,29 @@ def scale_inertia(s: Scalar, a: SpatialInertia) -> SpatialInertia:
     )
 
 
-def shift_inertia(linear: Sym, angular: Sym, position: Vec) -> SpatialInertia:
+def shift_inertia(
+    linear: Sym, angular: Sym, position: Vec, cross: Mat | None = None
+) -> SpatialInertia:
     """What resists motion at a place, seen from the body's origin.
 
     Args:
         linear: 3×3 against the place's velocity, body frame.
         angular: 3×3 against rotation.
         position: of the place, body frame [m].
+        cross: 3×3 of torque per velocity at the place; by default none.
 
     Returns:
-        The 6×6 about the origin: [[angular - [r] L [r], [r] L], [·, L]].
+        The 6×6 about the origin: [[A - C [r] - (C [r])ᵀ - [r] L [r], C + [r] L], [·, L]].
     """
     x = skew(position)
     across = matmul(x, full(linear))
     second = matmul(across, x)
+    if cross is not None:
+        once = matmul(cross, x)
+        second = tuple(
+            vadd(row, vadd(a, b)) for row, a, b in zip(second, once, transpose(once), strict=True)
+        )
+        across = tuple(vadd(a, b) for a, b in zip(cross, across, strict=True))
     return SpatialInertia(
         tuple(sub(angular[k], second[i][j]) for k, (i, j) in enumerate(SYM)), across, linear
     )

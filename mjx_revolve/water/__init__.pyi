@@ -22,6 +22,7 @@ from .laws import PartFlow as PartFlow
 from .laws import PartShapes as PartShapes
 from .laws import law_numbers as law_numbers
 from .laws import part_field as part_field
+from .plates import Fossen as Fossen
 from .plates import LiftDrag as LiftDrag
 from .propellers import Thruster as Thruster
 from .world import World as World

@@ -14,11 +14,17 @@ from scipy.special import elliprd
 
 from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.spatial import Scalar, Vec, mul, neg
+from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.laws import Coefficient, law_numbers, part_field
 
 COEFFICIENTS = (
     Coefficient(
-        "added_mass_coefficient", "-", "multiplies the envelope's added mass", 1.0, own_field=True
+        "added_mass_coefficient",
+        "-",
+        "multiplies the envelope's added mass",
+        1.0,
+        own_field=True,
+        per_axis=True,
     ),
     Coefficient(
         "entrained_water",
@@ -84,8 +90,7 @@ def lamb_coefficients(semi_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def box_added_mass(half_size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Added mass of a box: that of the ellipsoid of equal volume and equal proportions.
 
-    A choice: for a cube it gives 0.50 of the displaced water where experiment gives 0.64 to 0.68
-    (DNV-RP-H103, table A-2); the inscribed ellipsoid would give 0.26.
+    A choice, which `coefficients` explains.
 
     Args:
         half_size: `[..., 3]` half edges [m].
@@ -93,7 +98,8 @@ def box_added_mass(half_size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         As `lamb_coefficients`.
     """
-    return lamb_coefficients((6 / np.pi) ** (1 / 3) * np.asarray(half_size, np.float64))
+    share = TODAY["box_added_mass"].value
+    return lamb_coefficients((6 / np.pi * share) ** (1 / 3) * np.asarray(half_size, np.float64))
 
 
 def entrained_water(

@@ -5,7 +5,9 @@ A new law is a value in a file of its own, and its name in `DRAG_LAWS`.
 
 from __future__ import annotations
 
+from mjx_revolve.water.cross_flow import CROSS_FLOW
 from mjx_revolve.water.face_drag import FACES
+from mjx_revolve.water.fossen import FOSSEN
 from mjx_revolve.water.laws import DragLaw, Export, PartDragLaw, find_law
 from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
@@ -20,7 +22,7 @@ OFF = PartDragLaw(
 )
 
 DRAG_LAWS: dict[str, DragLaw] = {
-    law.name: law for law in (FACES, LIFT_DRAG, INERTIA_BOX, ELLIPSOID, OFF)
+    law.name: law for law in (FACES, LIFT_DRAG, FOSSEN, CROSS_FLOW, INERTIA_BOX, ELLIPSOID, OFF)
 }
 
 

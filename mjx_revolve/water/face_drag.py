@@ -53,12 +53,13 @@ def face_drag_coefficients(
     Along axis i the pressure acts on the face A_i: F = ½ ρ C_d A_i |v| v. Turning about axis i,
     each strip of the two pairs of faces beside it meets the water at ω r; integrating ½ ρ C_d (ω
     r)² r over them gives T = ρ C_d b_i (b_j⁴ + b_k⁴) / 64 |ω| ω (the form of MuJoCo's inertia-box
-    law).
+    law); each pair of faces with its own C_d.
 
     Args:
         size: `[..., 3]` edges of the box [m].
         face_areas: `[..., 3]` area that faces each axis [m²].
-        drag_coefficient: `[...]` C_d of a face that meets the flow [-].
+        drag_coefficient: `[...]` C_d of a face that meets the flow, or `[..., 3]` across each axis
+            [-].
         exposed: `[..., 3]` share of each pair of faces that the water reaches [-]; by default all.
 
     Returns:
@@ -66,12 +67,25 @@ def face_drag_coefficients(
     """
     b = np.asarray(size, np.float64)
     e = np.ones(3) if exposed is None else np.asarray(exposed, np.float64)
-    drag = np.asarray(drag_coefficient, np.float64)[..., None]
+    drag = np.asarray(drag_coefficient, np.float64)
+    drag = np.broadcast_to(drag if drag.ndim == b.ndim else drag[..., None], b.shape)
     linear = 0.5 * drag * e * np.asarray(face_areas, np.float64)
-    j, k = [1, 2, 0], [2, 0, 1]
-    # The faces across k are strips along j, and the other way round.
-    strips = e[..., k] * b[..., j] ** 4 + e[..., j] * b[..., k] ** 4
-    return linear, drag * b * strips / 64
+    most, share = split_axes(drag)
+    strips = beside(share * e, b**4)
+    return linear, most * b * strips / 64
+
+
+def split_axes(coefficient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`[..., 3]` as its largest and the shares of it, which are 1 where all three are the same."""
+    most = coefficient.max(-1, keepdims=True)
+    return most, np.divide(coefficient, most, out=np.ones_like(coefficient), where=most > 0)
+
+
+def beside(faces: np.ndarray, edges: Any = 1.0) -> np.ndarray:
+    """For each axis, the sum over the faces beside it; those across k are strips along j."""
+    j, k, edges = [1, 2, 0], [2, 0, 1], np.broadcast_to(edges, faces.shape)
+    found: np.ndarray = faces[..., k] * edges[..., j] + faces[..., j] * edges[..., k]
+    return found
 
 
 def quadratic_drag(rate: Scalar, coefficient: Scalar, share: Scalar) -> tuple[Scalar, Scalar]:
@@ -113,7 +127,12 @@ FACES = PartDragLaw(
     varied=True,
     coefficients=(
         Coefficient(
-            "drag_coefficient", "-", "C_d of a face that meets the flow", CUBE_DRAG, own_field=True
+            "drag_coefficient",
+            "-",
+            "C_d of a face that meets the flow",
+            CUBE_DRAG,
+            own_field=True,
+            per_axis=True,
         ),
     ),
     numbers=_face_numbers,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import BeforeValidator
 
 from mjx_revolve.inputs.errors import ConstraintError, show
-from mjx_revolve.inputs.schema import LARGEST, Number, Text, words
+from mjx_revolve.inputs.schema import LARGEST, Number, Text, as_tuple, words
 
 if TYPE_CHECKING:
     from mjx_revolve.water.laws import Coefficient
@@ -73,6 +73,22 @@ def _read_coefficients(value: Any) -> Any:
     return tuple(sorted(given.items()))
 
 
+def _read_per_axis(value: Any) -> Any:
+    """A number, or three of them, one for each axis."""
+    value = as_tuple(value)
+    several = value if isinstance(value, tuple) else (value,)
+    plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in several)
+    if len(several) not in (1, 3) or not plain or not all(0 <= x <= LARGEST for x in several):
+        raise ConstraintError("", "a number >= 0, or three, one for each axis", show(value))
+    return tuple(map(float, value)) if isinstance(value, tuple) and len(value) == 3 else value
+
+
+PerAxis = Annotated[
+    float | tuple[float, float, float],
+    BeforeValidator(_read_per_axis),
+    words("a number >= 0, or three, one for each axis"),
+]
+"""A coefficient of all faces of a part, or of those across each of its axes."""
 DragName = Annotated[str, BeforeValidator(lambda value: _check(value, drag_names()))]
 PartDrag = Annotated[str, BeforeValidator(lambda value: _check(value, drag_names(of_parts=True)))]
 BuoyancyName = Annotated[str, BeforeValidator(lambda value: _check(value, buoyancy_names()))]

@@ -23,6 +23,7 @@ import jax
 import numpy as np
 
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.spatial import Scalar, Vec, mul
 
 if TYPE_CHECKING:
@@ -42,15 +43,15 @@ class PartField(NamedTuple):
         blank: its value in the part of no effect that pads tables, or a function of the world that
             gives it.
         axes: how it turns with the axes that describe the part: "vector" (components change their
-            sign), "size" (they change places only) or "none" (a number, or already in the body's
-            frame).
+            sign), "size" (they change places only), "matrix" (rows and columns turn) or "none" (a
+            number, or already in the body's frame).
         varied: factors of `Variation` that multiply it.
         fixed: why no factor does; exactly one of `varied` and `fixed` is given.
     """
 
     unit: str
     blank: Any
-    axes: Literal["vector", "size", "none"]
+    axes: Literal["vector", "size", "matrix", "none"]
     varied: tuple[str, ...]
     fixed: str
 
@@ -59,7 +60,7 @@ def part_field(
     unit: str,
     *,
     blank: Any = 0.0,
-    axes: Literal["vector", "size", "none"] = "none",
+    axes: Literal["vector", "size", "matrix", "none"] = "none",
     varied: tuple[str, ...] = (),
     fixed: str = "",
     **field: Any,
@@ -151,6 +152,7 @@ class Coefficient:
         low: least value.
         high: greatest value.
         own_field: whether modules have a field of this name; others stand under `coefficients`.
+        per_axis: whether it may be three numbers, one for each axis of a part.
     """
 
     name: str
@@ -160,6 +162,7 @@ class Coefficient:
     low: float = 0.0
     high: float = math.inf
     own_field: bool = False
+    per_axis: bool = False
 
     def __post_init__(self) -> None:
         """Checks that it is documented."""
@@ -201,7 +204,7 @@ class PartShapes(Protocol):
 
     @property
     def coefficients(self) -> Mapping[str, np.ndarray]:
-        """`[n]` each: every `Coefficient` of the laws, by name."""
+        """`[n]` each, or `[n, 3]` per axis: every `Coefficient` of the laws, by name."""
 
     @property
     def parameters(self) -> Mapping[str, tuple[Any, ...]]:
@@ -228,13 +231,14 @@ class Drag(NamedTuple):
     Attributes:
         force: [N].
         torque: [N·m].
-        damping: how fast the force along each axis falls with velocity [N·s/m]: a step takes it
-            implicitly. None for a law that a step takes explicitly.
+        damping: how fast the force along each axis falls with velocity [N·s/m], or how force and
+            torque fall with both velocities: a step takes it implicitly. None for a law that a step
+            takes explicitly.
     """
 
     force: Vec
     torque: Vec
-    damping: Vec | None
+    damping: Vec | SpatialInertia | None
 
 
 _ZERO: Vec = (0.0, 0.0, 0.0)
@@ -253,7 +257,8 @@ class DragLaw:
         explicit: whether a step takes it explicitly, which limits the time step.
         varied: whether `task.robust` varies it.
         coefficients: what users may give for it.
-        parameters: checked class of more of them, which worlds and modules have under its name.
+        parameters: checked class of more of them, which modules have under its name, and worlds
+            where they have a field of this name.
         mj_fluidcoef: MuJoCo's `fluidcoef`, if MuJoCo's geoms have this law under that attribute.
     """
 

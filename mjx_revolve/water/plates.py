@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Gt, Le, Unit
+from pydantic import BeforeValidator
 
 from mjx_revolve.inputs.errors import ConstraintError, show
-from mjx_revolve.inputs.schema import Boolean, Direction, NonNegative, Number, Vector, checked
+from mjx_revolve.inputs.schema import (
+    LARGEST,
+    Boolean,
+    Direction,
+    NonNegative,
+    Number,
+    Vector,
+    as_tuple,
+    checked,
+    words,
+)
+from mjx_revolve.water.coefficients import TODAY
 
-# Drag of a cube that faces the flow: Hoerner, Fluid-Dynamic Drag, 1965, chapter 3.
-CUBE_DRAG = 1.05
+CUBE_DRAG = TODAY["cube_drag"].value  # of a cube that faces the flow
 
 
 @checked
@@ -66,3 +77,68 @@ class LiftDrag:
         if abs(np.dot(self.forward, self.upward)) > 1e-6:
             across = f"a vector perpendicular to forward {show(self.forward)}"
             raise ConstraintError("upward", across, show(self.upward))
+
+
+_SIX = "six numbers, or six rows of six"
+
+
+def _read_matrix(value: Any) -> Any:
+    """Six numbers on the diagonal, or six rows of six, as six rows."""
+    rows = as_tuple(value)
+    if isinstance(rows, tuple):
+        rows = tuple(map(as_tuple, rows))
+        if len(rows) == 6 and not any(isinstance(row, tuple) for row in rows):
+            rows = tuple((0,) * i + (x,) + (0,) * (5 - i) for i, x in enumerate(rows))
+    numbers = [x for row in rows if isinstance(row, tuple) for x in row] if rows else []
+    plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
+    if not isinstance(rows, tuple) or len(rows) != 6 or len(numbers) != 36 or not plain:
+        raise ConstraintError("", _SIX, show(value))
+    if any(len(row) != 6 for row in rows) or not all(abs(x) <= LARGEST for x in numbers):
+        raise ConstraintError("", _SIX, show(value))
+    matrix = np.array(rows, float)
+    size = np.abs(matrix).max()
+    if np.abs(matrix - matrix.T).max() > 1e-6 * size:
+        raise ConstraintError("", "a symmetric matrix", show(value))
+    if np.linalg.eigvalsh(matrix)[0] < -1e-6 * size:
+        raise ConstraintError("", "a matrix without negative eigenvalues", show(value))
+    return tuple(tuple(map(float, row)) for row in (matrix + matrix.T) / 2)
+
+
+Matrix = Annotated[
+    tuple[tuple[float, ...], ...], BeforeValidator(_read_matrix), words(_SIX), Unit("SI")
+]
+"""A symmetric 6×6 without negative eigenvalues: along x, y, z, then about them."""
+_NOTHING = ((0.0,) * 6,) * 6
+
+
+@checked
+class Fossen:
+    """What is known of a part's water from a tank or a panel code, in place of our laws.
+
+    M ν̇ + C(ν) ν + (D + diag(d) |ν|) ν in the part's own axes, at its frame's origin, the centre of
+    its main box (Fossen 2011, Handbook of Marine Craft Hydrodynamics, chapters 6 and 7). What is
+    left out is 0. Numbers are positive, where X_u̇, X_u and X_|u|u are negative. Six numbers serve a
+    frame with z down, too; of six rows, entries that couple x or roll with y, z, pitch or yaw
+    change their sign then. They hold wholly submerged; half out, the submerged share of the main
+    box of them acts.
+
+    Attributes:
+        added_mass: M [kg, kg·m, kg·m²].
+        linear_damping: D [N·s/m, N·s, N·m·s].
+        quadratic_damping: d, six numbers >= 0 [N·s²/m², N·m·s²].
+        whole: whether they are those of the whole robot, of which the part is the core: the water
+            then neither drags nor is carried by any other part. For robots without hinges.
+
+    Raises:
+        InputError: a matrix is not symmetric, or could make energy.
+    """
+
+    added_mass: Matrix = _NOTHING
+    linear_damping: Matrix = _NOTHING
+    quadratic_damping: Annotated[
+        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative],
+        BeforeValidator(as_tuple),
+        words("six numbers >= 0"),
+        Unit("SI"),
+    ] = (0.0,) * 6
+    whole: Boolean = False

@@ -35,6 +35,7 @@ from mjx_revolve.inputs.schema import (
 )
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.bed import Bed
+from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.currents import (
     CurrentField,
     Gust,
@@ -66,7 +67,7 @@ class SurfaceTension:
         contact_angle: between water and module, through the water [rad]; below π/2 it wets.
     """
 
-    gamma: Annotated[Number, Ge(1e-6), Unit("N/m")] = 0.0728
+    gamma: Annotated[Number, Ge(1e-6), Unit("N/m")] = TODAY["surface_tension"].value
     contact_angle: Annotated[Number, Ge(0), Le(math.pi), Unit("rad")] = 0.0
 
 

@@ -220,7 +220,7 @@ REFUSED = {
     "core added": (lambda: add_module(SMALL, 0, 2, "Core"), "(a core is always the root)"),
     "core retyped": (
         lambda: replace_module(SMALL, 0, "FixedBrick"),
-        "small: core.type: expected one of Core, CoreComponent (the root is a core); found 'Fix",
+        "small: core.type: expected one of BlueROV2, Core, CoreComponent (the root is a core); ",
     ),
     "angle": (
         lambda: turn_module(SMALL, "hip", 45),

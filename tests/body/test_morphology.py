@@ -823,15 +823,15 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
         ("", "expected a mapping with id, body and brain; found an empty file"),
         ("body: {type: Core}\nbrian: {}", "expected only id, body, sensors, brain; found 'brian'"),
         ("body:", "body: expected a module (a mapping with a type); found nothing"),
-        ("body: {type: Bric}", "body.type: expected one of Core, CoreComponent; found 'Bric'"),
+        ("body: {type: Bric}", "body.type: expected one of BlueROV2, Core, CoreComponent; found"),
         (
             "body: {type: FixedBrick}",
-            "body.type: expected one of Core, CoreComponent (the root is a core); found 'FixedBri",
+            "body.type: expected one of BlueROV2, Core, CoreComponent (the root is a core); found",
         ),
         (
             "body: {type: Core, children: {1: {type: Core}}}",
             "body.children.1.type: expected one of ActiveHinge, Fin, FixedBrick, FixedBrickSensor, "
-            "LiftThruster, Thruster, TouchSensor (a core is always the root); found 'Core'",
+            "LiftThruster, T200, Thruster, TouchSensor (a core is always the root); found",
         ),
         ("body: {type: Core, orientation: 90}", "body.orientation: expected 0 (the core is attac"),
         (
@@ -934,7 +934,10 @@ def test_a_body_shares_nothing_with_its_mapping():
     "mapping, message",
     [
         (None, "morphology: expected a mapping with id, body and brain; found None"),
-        ({"type": "Bric"}, "morphology: body.type: expected one of Core, CoreComponent; found"),
+        (
+            {"type": "Bric"},
+            "morphology: body.type: expected one of BlueROV2, Core, CoreComponent; f",
+        ),
         (yaml.safe_load(RING), "morphology: body: expected modules that do not overlap at rest"),
     ],
 )

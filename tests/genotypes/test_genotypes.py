@@ -273,7 +273,7 @@ def test_spaces_are_made_of_types_that_there_are():
     )
     assert refusal(modules=("Core", "ActiveHinge")).endswith("found 'Core'")
     assert refusal(core="FixedBrick") == (
-        "bodies.core: expected one of Core, CoreComponent; found 'FixedBrick'"
+        "bodies.core: expected one of BlueROV2, Core, CoreComponent; found 'FixedBrick'"
     )
     assert refusal(modules=("TouchSensor", "ActiveHinge", "FixedBrickSensor")) == (
         "bodies.modules.2: expected each type once; found 'TouchSensor' again"
