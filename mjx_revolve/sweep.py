@@ -45,7 +45,9 @@ def _parser() -> argparse.ArgumentParser:
     add("config", type=read_path, metavar="CONFIG",
         help="a YAML file, or a shipped configuration's name, see configs/")  # fmt: skip
     add("--seeds", type=whole(1, MOST_SEEDS), default=5, metavar="N",
-        help="runs of each case, with seeds from 0 on (default: 5)")  # fmt: skip
+        help="runs of each case (default: 5)")  # fmt: skip
+    add("--first-seed", type=whole(0, 2**32 - 1 - MOST_SEEDS), default=0, metavar="K",
+        help="their seeds are K, K + 1, ... (default: 0)")  # fmt: skip
     add("--set", action="append", default=[], metavar="KEY.PATH=VALUE,...", dest="settings",
         help="values of one setting, with commas between them; may be repeated: all combinations "
         "are run")  # fmt: skip
@@ -87,7 +89,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     from mjx_revolve.view.report.sweep import write_report
     from mjx_revolve.view.results import save_pictures
 
-    sweep = Sweep(str(path), arguments.seeds, tuple(arguments.settings))
+    sweep = Sweep(str(path), arguments.seeds, tuple(arguments.settings), arguments.first_seed)
     folder = Path(arguments.out) if arguments.out else _usual_folder(sweep)
     check_folder(folder)
     default_page(folder)  # refuses now what it would refuse after days
@@ -118,7 +120,8 @@ def _usual_folder(sweep: Sweep) -> Path:
     """The same for the same command, so that it goes on; more seeds make it a longer one."""
     from mjx_revolve.evolution.fingerprints import hash_text
 
-    digest = hash_text(sweep.config, *sweep.settings)[:6]
+    first = (f"first seed {sweep.first_seed}",) if sweep.first_seed else ()
+    digest = hash_text(sweep.config, *sweep.settings, *first)[:6]
     return Path("runs") / f"{Path(sweep.config).stem}-sweep-{digest}"
 
 

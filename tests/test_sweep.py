@@ -18,7 +18,7 @@ import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve, report, sweep
 from mjx_revolve.evolution.run_folder import RunFolder
-from mjx_revolve.evolution.sweeps import Sweep
+from mjx_revolve.evolution.sweeps import Sweep, read_sweep, write_sweep
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.view.report.sweep import case_words
 from mjx_revolve.view.statistics import interval
@@ -109,6 +109,13 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     again = (folder / "out" / "report.html").read_text()
     assert "6 of 6</b>runs finished" in again
     assert run_command(report.main, ["out", "alone"]) == 2
+
+
+def test_seeds_may_begin_later(tmp_path):
+    sweep = Sweep("lake_swim", 2, first_seed=7)
+    write_sweep(tmp_path, sweep)
+    assert read_sweep(tmp_path) == sweep
+    assert [plan.seed for plan in sweep.plans(tmp_path)] == [7, 8]
 
 
 def test_cases_have_names_to_read():

@@ -146,13 +146,15 @@ class Sweep:
 
     Attributes:
         config: the configuration that all start from: a file's path.
-        seeds: of each case, from 0 on.
+        seeds: how many of each case.
         settings: what replaces its values, `KEY.PATH=VALUE,VALUE,...` each.
+        first_seed: the first of the seeds, which follow one another.
     """
 
     config: Annotated[Text, MinLen(1)]
     seeds: Annotated[Integer, Ge(1), Le(MOST_SEEDS)]
     settings: TupleOf[Text] = ()
+    first_seed: Annotated[Integer, Ge(0), Le(2**32 - 1 - MOST_SEEDS)] = 0
 
     @property
     def cases(self) -> dict[str, tuple[str, ...]]:
@@ -169,7 +171,9 @@ class Sweep:
 
     def plans(self, folder: Path) -> list[Plan]:
         """Its runs in a folder, all seeds of a case together."""
-        return make_plans(folder, self.config, self.cases, range(self.seeds))
+        return make_plans(
+            folder, self.config, self.cases, range(self.first_seed, self.first_seed + self.seeds)
+        )
 
 
 def read_sweep(folder: str | Path) -> Sweep:
@@ -200,6 +204,7 @@ def check_folder(folder: Path) -> None:
 def write_sweep(folder: Path, sweep: Sweep) -> None:
     """Writes `sweep.yaml`."""
     data = {"config": sweep.config, "seeds": sweep.seeds, "settings": list(sweep.settings)}
+    data |= {"first_seed": sweep.first_seed} if sweep.first_seed else {}
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
     write_atomic(folder / SWEEP, f"# What the runs of this folder are.\n{text}".encode())
 

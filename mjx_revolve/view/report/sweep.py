@@ -168,6 +168,7 @@ def case_words(sweep: Sweep, case: str) -> str:
 
 def _command(sweep: Sweep) -> str:
     words = ["python", "-m", "mjx_revolve.sweep", sweep.config, "--seeds", str(sweep.seeds)]
+    words += ["--first-seed", str(sweep.first_seed)] if sweep.first_seed else []
     for setting in sweep.settings:
         words += ["--set", setting]
     return shlex.join(words)
