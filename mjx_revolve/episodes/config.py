@@ -497,10 +497,11 @@ def _resolve(file: NamedFile, folder: Path, before: str) -> str:
         return file.text
     place = before + file.place
     named = Path(os.path.expanduser(file.path))
+    found = folder / named
     if file.kind == "morphology":
-        named = find_shipped(named, "morphologies", folder, place)
+        found = find_shipped(named, "morphologies", folder, place)
     with reading(place):
-        path = check_path(os.path.abspath(folder / named))
+        path = check_path(os.path.abspath(found))
     if not path.is_file():
         what = "a folder" if path.is_dir() else "none"
         raise InputError(f"{place}: expected a file; found {what} at {short_path(path)}")
