@@ -29,7 +29,7 @@ from mjx_revolve.body.morphology import (
     read_orientation,
     read_slot,
 )
-from mjx_revolve.body.placement import Module, attach, check_overlaps
+from mjx_revolve.body.placement import Module, attach, check_overlaps, check_rigid
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.inputs.errors import InputError, show
 
@@ -405,6 +405,7 @@ def _finish(
     """The edited body, where it is one; what lies as it did was compared before."""
     if len(modules) > MAX_MODULES:
         raise InputError(f"{place}: expected at most {MAX_MODULES} modules; found {len(modules)}")
+    check_rigid(modules, place)
     before = {(id(m.position), id(m.kind)) for m in body.modules}
     moved = [i for i, m in enumerate(modules) if (id(m.position), id(m.kind)) not in before]
     pairs = check_overlaps(modules, allow_overlap, place, moved) if moved else ()

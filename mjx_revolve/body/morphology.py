@@ -19,7 +19,7 @@ from annotated_types import Unit
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, read_number
-from mjx_revolve.body.placement import Module, attach, check_overlaps, frozen
+from mjx_revolve.body.placement import Module, attach, check_overlaps, check_rigid, frozen
 from mjx_revolve.body.sensors import Sensor, SensorRow
 from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
 from mjx_revolve.inputs.errors import InputError, note, show
@@ -145,13 +145,7 @@ def _make(
     if "body" not in data:
         raise InputError(f"{source}: expected the key body; found {show(list(data))}")
     tree = _read_tree(data["body"], modules, source)
-    hinges = [module.name for module in tree if module.kind.hinge is not None]
-    stated = tree[0].kind.parts[0].fossen
-    if hinges and stated is not None and stated.whole:
-        raise InputError(
-            f"{source}: body: expected no hinges, as the core's fossen.whole states the water of "
-            f"all of a rigid robot; found {hinges[0]}"
-        )
+    check_rigid(tree, f"{source}: body")
     return Morphology(
         name=_read_id(data.get("id"), f"{source}: id") or name,
         modules=tree,

@@ -307,6 +307,17 @@ def find_overlaps(
     return tuple(sorted({(int(i), int(j)) for i, j in pairs}))
 
 
+def check_rigid(modules: Sequence[Module], place: str) -> None:
+    """Raises `InputError` for hinges on a core that states the water of a whole rigid robot."""
+    hinges = [module.name for module in modules if module.kind.hinge is not None]
+    stated = modules[0].kind.parts[0].fossen
+    if hinges and stated is not None and stated.whole:
+        raise InputError(
+            f"{place}: expected no hinges, as the core's fossen.whole states the water of all of a "
+            f"rigid robot; found {hinges[0]}"
+        )
+
+
 def check_overlaps(
     modules: Sequence[Module], allow: bool, place: str, moved: Iterable[int] | None = None
 ) -> tuple[tuple[str, str], ...]:

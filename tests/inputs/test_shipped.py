@@ -38,7 +38,7 @@ def test_help_lists_what_comes_with_the_package(capsys):
     for option in ("--help", "--version"):
         assert run_command(__main__._main, [option]) == 0
     out = capsys.readouterr().out
-    assert "\n  lake_colony " in out and "auv, centipede, " in out
+    assert "\n  lake_colony " in out and "auv, " in out
     assert out.endswith(f"mjx_revolve {__version__}\n")
 
 
