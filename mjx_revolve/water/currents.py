@@ -287,13 +287,13 @@ def load_current_field(path: str | Path) -> CurrentField:
         InputError: it cannot be read or is no full grid; the message names file and place.
     """
     path = check_path(path)
+    read = {".npz": _read_arrays, ".csv": _read_table}.get(path.suffix.lower())
+    if read is None:
+        found = path.suffix or "no suffix"
+        raise InputError(f"{path}: expected a file .npz or .csv; found {found}")
     audit(path, "data", read_file(path))
     with reading(path):
-        if path.suffix.lower() == ".npz":
-            return _read_arrays(path)
-        if path.suffix.lower() == ".csv":
-            return _read_table(path)
-        raise InputError(f"expected a file .npz or .csv; found {path.suffix or 'no suffix'}")
+        return read(path)
 
 
 def _read_arrays(path: Path) -> CurrentField:

@@ -197,7 +197,7 @@ def test_bodies_beyond_the_memory_are_refused_beforehand(folder, capsys, monkeyp
     ):
         assert run(*settings) == 2
         err = capsys.readouterr().err
-        assert f"bodies.yaml: {place}: expected at most " in err
+        assert f"--set {place}: expected at most " in err
         assert err.endswith(" GB of memory are free; found 1000000000\n")
         assert not os.path.exists("run")
 
