@@ -136,7 +136,7 @@ class Robot:
                 DeprecationWarning,
                 stacklevel=3,
             )
-            edited = Robot(self.morphology, self.world, self.edited_model).with_model(model)
+            edited = Robot(self.morphology, self.world).with_model(model)  # checked as built
             self.__dict__["_edited_in_place"] = now, edited
         return edited
 

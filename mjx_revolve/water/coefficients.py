@@ -2,9 +2,9 @@
 
 What follows from a theory alone (Lamb's ellipsoid, Airy's waves) is no coefficient and stands with
 its law. Nothing here was chosen by how our water compares with measured swimmers. Where two sources
-disagree, or say nothing, `decided` says which number holds and why. Those of `COMING` were written
-down before any law that reads them was compared with a measurement; they were read second hand, in
-texts and programs that quote them, so that most lack a page.
+disagree, or say nothing, `decided` says which number holds and why. Those of chains and of `COMING`
+were written down before any law that reads them was compared with a measurement; they were read
+second hand, in texts and programs that quote them, so that most lack a page.
 """
 
 from __future__ import annotations
@@ -58,6 +58,18 @@ TODAY: dict[str, Sourced] = {
         "volume and proportions kept: a cube then carries 0.50 of its volume, measured are 0.64 to "
         "0.68; the inscribed ellipsoid would carry 0.26",
     ),
+    "chain_drag": Sourced(
+        1.75, "-", "C_d across a rectangular part inside a chain", _SWIMMERS,
+        "not the 2.0 of a rod from wall to wall (NACA TR-619): a chain has ends",
+    ),
+    "chain_head_drag": Sourced(
+        1.0, "-", "C_d along a chain, on the area of its head (½ ρ w h |v| v)", _SWIMMERS
+    ),
+    "friction": Sourced(
+        0.455, "-", "a in C_f = a / (log10 Re)^b on side faces", "Prandtl and Schlichting",
+        "once, though hydro.c takes it twice: no reason for that is printed",
+    ),
+    "friction_exponent": Sourced(2.58, "-", "b of the same", "Prandtl and Schlichting"),
     "surface_tension": Sourced(0.0728, "N/m", "γ of clean water at 20 °C", "IAPWS R1-76"),
 }  # fmt: skip
 """Of the laws in force. MuJoCo's two laws have MuJoCo's own (`mujoco_drag`)."""
@@ -73,18 +85,6 @@ COMING: dict[str, Sourced] = {
     "end_slenderness": Sourced(
         0.2, "-", "height over length up to which a body counts as slender", _LIGHTHILL
     ),
-    "chain_drag": Sourced(
-        1.75, "-", "C_d across a rectangular part inside a chain", _SWIMMERS,
-        "not the 2.0 of a rod from wall to wall (NACA TR-619): a chain has ends",
-    ),
-    "chain_head_drag": Sourced(
-        1.0, "-", "C_d along a chain, on the area of its head (½ ρ w h |v| v)", _SWIMMERS
-    ),
-    "friction": Sourced(
-        0.455, "-", "a in C_f = a / (log10 Re)^b on side faces", "Prandtl and Schlichting",
-        "once, though hydro.c takes it twice: no reason for that is printed",
-    ),
-    "friction_exponent": Sourced(2.58, "-", "b of the same", "Prandtl and Schlichting"),
     "swing_drag": Sourced(
         22.5, "-", "a in C_d = a / KC + b of a plate that swings", _IKEDA,
         "this fit and not max(10 KC^(-1/3), 1.95) of Luhar and Nepf (2016): it has a limit to "

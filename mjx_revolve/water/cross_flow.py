@@ -20,7 +20,7 @@ import numpy as np
 
 from mjx_revolve.numerics.inertia import SpatialInertia, add_inertia, shift_inertia
 from mjx_revolve.numerics.spatial import Vec, add, cross, mul, vadd
-from mjx_revolve.water.coefficients import COMING, TODAY
+from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.face_drag import FACES, face_drag_coefficients
 from mjx_revolve.water.laws import (
     Drag,
@@ -70,7 +70,7 @@ def _numbers(parts: PartShapes, world: World) -> CrossFlowNumbers:
     share = (along * covered).sum(-1, keepdims=True)
     own = parts.coefficients["drag_coefficient"]
     cube = TODAY["cube_drag"].value
-    across, ahead = COMING["chain_drag"].value / cube, COMING["chain_head_drag"].value / cube
+    across, ahead = TODAY["chain_drag"].value / cube, TODAY["chain_head_drag"].value / cube
     drag = own * (1 + share * (np.where(along, ahead, across) - 1))
     linear, _ = face_drag_coefficients(size, parts.silhouette, drag, exposed)
     # What strips do not have: the ends' own turning, turning about the axis, and the rest of 1.
@@ -116,9 +116,9 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
             mul(jnp.abs(x), mul(numbers.length, world.density / max(world.viscosity, 1e-30))),
             _LEAST_REYNOLDS,
         )
-        slope = jnp.log10(reynolds) ** COMING["friction_exponent"].value
+        slope = jnp.log10(reynolds) ** TODAY["friction_exponent"].value
         rubbed.append(
-            mul(mul(area, COMING["friction"].value / slope), mul(jnp.abs(x), flow.submerged))
+            mul(mul(area, TODAY["friction"].value / slope), mul(jnp.abs(x), flow.submerged))
         )
     force = vadd(force, tuple(-d * x for d, x in zip(rubbed, flow.velocity, strict=True)))
     assert damping is not None
