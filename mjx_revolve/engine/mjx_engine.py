@@ -8,6 +8,7 @@ is the population engine's penalty law or, where the world says so, MJX's contac
 
 from __future__ import annotations
 
+import copy
 import itertools
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -126,8 +127,11 @@ class MjxEngine:
     def _model(self, dtype: Any) -> Any:
         """MJX's model, one for each precision: it keeps the digits of the mode it is made in."""
         if dtype not in self._models:
+            # A user may have set MuJoCo's own fluid, to run MuJoCo beside ours; here it stays off.
+            dry = copy.copy(self.robot.mj_model)
+            dry.opt.density = dry.opt.viscosity = 0.0
             with jax.ensure_compile_time_eval():
-                model = mjx.put_model(self.robot.mj_model)
+                model = mjx.put_model(dry)
             self._models[dtype] = model.replace(opt=_options(model.opt, self.solves))
         return self._models[dtype]
 
