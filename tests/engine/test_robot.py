@@ -16,6 +16,7 @@ from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot, check_timestep, export_mjcf
 from mjx_revolve.engine.single_tree import make_single_tree
+from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height
 from mjx_revolve.water.lift_drag import LIFT_DRAG
@@ -361,3 +362,14 @@ def test_a_model_edited_in_place_counts_from_the_next_engine_on():
     robot.mj_model.body_pos[3] += 0.1
     with pytest.raises(InputError, match="found another body_pos"):
         make_engine(robot)
+
+
+@pytest.mark.slow
+def test_mujocos_own_fluid_acts_in_no_engine():
+    """Set in place, for a run of MuJoCo C beside ours."""
+    ends = []
+    for density in (0.0, 1000.0):
+        robot = build_robot(body("core"), world(drag="faces"))
+        robot.mj_model.opt.density = density
+        ends.append(simulate(robot, None, 0.05, qvel=np.full(6, 0.5), engine="mjx").qvel)
+    assert np.array_equal(*ends)
