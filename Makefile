@@ -18,7 +18,7 @@ $(READY): requirements.lock pyproject.toml
 	@echo "setting up $(VENV) from requirements.lock: one to three minutes, 2 GB"
 	@$(PYTHON) -m venv $(VENV)
 	@echo "downloading and installing packages"
-	@$(VENV)/bin/pip install --quiet --disable-pip-version-check -r requirements.lock
+	@$(VENV)/bin/pip install --disable-pip-version-check -r requirements.lock
 	@echo "installing mjx_revolve itself"
 	@$(VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --editable .
 	@touch $(READY)

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.episodes.config import Config, load_config
+from mjx_revolve.inputs.commands import check_no_sweep
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.files import check_path, read_file
 from mjx_revolve.inputs.schema import LARGEST
@@ -37,6 +38,7 @@ def find_run(path: str | Path) -> Path:
     folder = check_path(path)
     if folder.name == "champion" and not (folder / "config.yaml").is_file():
         folder = folder.parent
+    check_no_sweep(folder)
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{path}: expected a run folder; found no config.yaml in it")
     return folder

@@ -45,6 +45,7 @@ from mjx_revolve.episodes.individual_log import (
 from mjx_revolve.episodes.run_reader import Checkpoint, DamageError, RunReader, generation_of
 from mjx_revolve.episodes.settings import copy_files, locate_files
 from mjx_revolve.evolution.archive import Archive, filled, from_arrays
+from mjx_revolve.inputs.commands import check_no_sweep
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import check_path, resolve_inside, with_path, write_atomic
 
@@ -375,6 +376,7 @@ def open_run_folder(folder: str | Path) -> RunFolder:
     if (folder / ".lock").exists() and is_new_folder(folder):
         found = "one that was not begun; begin it with --out"
         raise InputError(f"{folder}: expected a run folder; found {found}")
+    check_no_sweep(folder)
     for name in ("config.yaml", "run.json"):
         if not (folder / name).is_file():
             raise InputError(f"{folder}: expected a run folder; found no {name} in it")

@@ -172,16 +172,21 @@ def individual_name(number: int | None) -> str:
     return "" if number is None else f"individuals/{number}"
 
 
+def check_no_sweep(path: str | Path) -> None:
+    """Raises `InputError` if a path is the folder of a sweep, where one run is expected."""
+    if (Path(path) / SWEEP).is_file():
+        runs = sorted(Path(path).glob("*/seed_*/config.yaml"))
+        such = f", such as {runs[0].parent}" if runs else ""
+        raise InputError(f"{path}: expected one run; found a sweep of several{such}")
+
+
 def check_episode_path(path: str | Path) -> None:
     """Raises `InputError` if there is no run folder, `genes.yaml` or morphology at a path.
 
     This precedes the imports of JAX and MuJoCo.
     """
     shipped = list_shipped("morphologies")
-    if (Path(path) / SWEEP).is_file():
-        runs = sorted(Path(path).glob("*/seed_*/config.yaml"))
-        such = f", such as {runs[0].parent}" if runs else ""
-        raise InputError(f"{path}: expected one run; found a sweep of several{such}")
+    check_no_sweep(path)
     if not Path(path).exists() and str(path) not in shipped:
         raise InputError(
             f"{path}: expected a run folder, a genes.yaml or a morphology; found none, and no "
