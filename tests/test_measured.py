@@ -78,18 +78,18 @@ def test_a_chain_that_glides_turns_too_far():
 
 
 @pytest.mark.slow
-def test_a_chain_glides_as_far_as_measured_with_drag_across_it():
+def test_a_chain_glides_as_far_as_measured_with_the_law_of_chains():
     found = ratios(measured_cases.amphibot_glide("cross_flow").rows)
-    assert all(abs(x - 1) < 0.05 for name, x in found.items() if "way" in name)
-    assert found["glide, rotation after 4.4 s"] == pytest.approx(2.4, abs=0.02)
+    assert all(abs(x - 1) < 0.04 for name, x in found.items() if "way" in name)
+    assert found["glide, rotation after 4.4 s"] == pytest.approx(2.01, abs=0.02)
 
 
 @pytest.mark.slow
-def test_a_chain_that_swims_reaches_two_thirds_of_the_speed():
-    pool = measured_cases._pool()
-    chain = measured_cases.body("ChainHead", pool, "ChainModule", 6)
+@pytest.mark.parametrize(("law", "ratio"), [("faces", 0.63), ("cross_flow", 0.96)])
+def test_a_chain_that_swims(law, ratio):
+    chain = measured_cases.body("ChainHead", measured_cases._pool(law), "ChainModule", 6)
     [speed], error = measured_cases.swim(chain, [data.AMPHIBOT_SWIM], settle=3.0)
-    assert speed / data.AMPHIBOT_SWIM.speed == pytest.approx(0.63, abs=0.01)
+    assert speed / data.AMPHIBOT_SWIM.speed == pytest.approx(ratio, abs=0.01)
     assert error < 0.02  # the joints do what is prescribed
 
 

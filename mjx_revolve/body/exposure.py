@@ -6,6 +6,8 @@ and a limb would be no harder to move sideways than lengthwise; swimming lives o
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mjx_revolve.body.placement import RestPose, pairs_within, turned
@@ -23,18 +25,34 @@ _BESIDE = ((1, 2), (0, 2), (0, 1))
 _SLACK = 1e-6
 
 
-def exposed_shares(parts: RestPose) -> np.ndarray:
-    """The share of each part's faces that no other part covers, at rest.
+class Exposure(NamedTuple):
+    """What neighbours leave of parts at rest, `[npart, 3]` along each part's x, y and z axes.
 
-    A choice: the pose at rest stands for all poses; a bent hinge opens a little more. Opposite
-    faces are averaged, as drag and added mass are the same in both directions.
+    A row is a straight line of parts, of which each covers some of the next one's end. Parts of all
+    modules stand in order.
+
+    Attributes:
+        shares: of the silhouette that no other part covers [-]. Opposite faces are averaged, as
+            drag and added mass are the same in both directions.
+        joined: of the ends by which a part is in a row, the share that its neighbours cover [-]; 0
+            without neighbours.
+        ends: 1 or -1 where a row ends with this part, in that direction; 0 elsewhere.
+        rows: length of the row [m]; of a lone part its own.
+    """
+
+    shares: np.ndarray
+    joined: np.ndarray
+    ends: np.ndarray
+    rows: np.ndarray
+
+
+def exposure(parts: RestPose) -> Exposure:
+    """What the water reaches of each part's faces, and where rows of parts end.
+
+    A choice: the pose at rest stands for all poses; a bent hinge opens a little more.
 
     Args:
         parts: of one body, `Morphology.layout`, or of several.
-
-    Returns:
-        `[npart, 3]` exposed share of the silhouette along each part's x, y and z axes [-], parts of
-        all modules in order.
     """
     part, box, center, turn = _near(parts)
     # Boxes that stand square to a face cover a rectangle of it: each axis tells on its own.
@@ -49,6 +67,7 @@ def exposed_shares(parts: RestPose) -> np.ndarray:
     before = (np.abs(heights[part] - center[:, None, None]) <= reach[:, None, None]).any(2)
     side, axis, pair = np.nonzero((before & square[:, None, None]).transpose(1, 2, 0))
     covered = np.zeros((len(parts.low), 2, 3, _POINTS), np.uint32)
+    neighbour = np.full((len(parts.low), 2, 3), -1)
     if len(pair):  # those of a part, a side and an axis stand together, as those of a part do
         within = _spans(parts, part, center, reach)
         beside = np.array(_BESIDE)[axis]
@@ -56,6 +75,13 @@ def exposed_shares(parts: RestPose) -> np.ndarray:
         face = (part[pair] * 2 + side) * 3 + axis
         start = np.flatnonzero(np.append(True, np.diff(face)))
         covered.reshape(-1, _POINTS)[face[start]] = np.bitwise_or.reduceat(hits, start)
+        # The last write holds: the box that covers most of a face. Those that only reach past an
+        # edge of it have their centres beside the part, not in front of it.
+        most = np.argsort(np.bitwise_count(hits).sum(1), kind="stable")
+        face_height = np.where(side, parts.high[part[pair], axis], -parts.low[part[pair], axis])
+        ahead = np.where(side, 1, -1) * center[pair, axis] > face_height
+        most = most[(hits.any(1) & ahead)[most]]
+        neighbour.reshape(-1)[face[most]] = parts.box_part[box[pair[most]]]
     for k in np.flatnonzero(~square):
         low, high = parts.low[part[k]], parts.high[part[k]]
         grid = low + ((np.arange(_POINTS) + 0.5) / _POINTS)[:, None] * (high - low)
@@ -68,7 +94,35 @@ def exposed_shares(parts: RestPose) -> np.ndarray:
             covered[part[k], side, axis] |= inside.all(axis=-1).any(axis=0) @ _BITS[:-1]
     hidden = np.bitwise_count(covered & silhouette[:, None]).sum(axis=-1)
     whole = np.maximum(np.bitwise_count(silhouette).sum(axis=-1), 1)
-    return 1 - hidden.sum(axis=1) / (2 * whole)
+    cover = np.bitwise_count(covered & silhouette[:, None]).sum(axis=-1) / whole[:, None]
+    near = neighbour >= 0
+    joined = (near * cover).sum(1) / np.maximum(near.sum(1), 1)
+    shares = 1 - hidden.sum(axis=1) / (2 * whole)
+    ends = np.where(near.any(1), near[:, 0].astype(int) - near[:, 1], 0)
+    return Exposure(shares, joined, ends, _row_lengths(parts, neighbour))
+
+
+def _row_lengths(parts: RestPose, neighbour: np.ndarray) -> np.ndarray:
+    """`[npart, 3]` lengths of rows, from the part that covers most of each face; -1 for none."""
+    size = parts.high - parts.low
+    length = size.copy()
+    part, axis = (x.ravel() for x in np.indices(size.shape))
+    for outward in (-1, 1):
+        at, toward = part, outward * parts.rotation[part, :, axis]
+        going = np.ones(len(at), bool)
+        # A line meets each part once.
+        for _ in range(len(size)):
+            local = np.einsum("ni,nij->nj", toward, parts.rotation[at])
+            along = np.abs(local).argmax(1)
+            ahead = local[np.arange(len(at)), along] > 0
+            further = neighbour[at, ahead.astype(int), along]
+            going &= further >= 0
+            if not going.any():
+                break
+            at = np.where(going, further, at)
+            entered = np.abs(np.einsum("ni,nij->nj", toward, parts.rotation[at])).argmax(1)
+            length[part, axis] += np.where(going, size[at, entered], 0)
+    return length
 
 
 def _near(parts: RestPose) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjx_revolve.body.exposure import exposed_shares
+from mjx_revolve.body.exposure import exposure
 from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.placement import RestPose
 from mjx_revolve.inputs.short_repr import short_repr
@@ -46,6 +46,9 @@ class FluidTable:
         mass: [kg].
         silhouette: area of the part's boxes together, seen along each axis [m²].
         exposed: share of each pair of faces that the water reaches [-].
+        joined: share that neighbours cover of the ends by which the part is in a row of parts [-].
+        ends: 1 or -1 along an axis at whose end a row of parts ends, in that direction; else 0.
+        rows: length of that row [m].
         buoyancy: names of the buoyancy laws.
         drag: names of the drag laws.
         coefficients: `[npart]` each, or `[npart, 3]`: every coefficient of the laws, by name.
@@ -72,6 +75,9 @@ class FluidTable:
     mass: Float[np.ndarray, " npart"]
     silhouette: Float[np.ndarray, "npart 3"]
     exposed: Float[np.ndarray, "npart 3"]
+    joined: Float[np.ndarray, "npart 3"]
+    ends: Float[np.ndarray, "npart 3"]
+    rows: Float[np.ndarray, "npart 3"]
     buoyancy: tuple[str, ...]
     drag: tuple[str, ...]
     coefficients: Mapping[str, Float[np.ndarray, "npart ..."]]
@@ -130,7 +136,8 @@ def make_fluid_table(
         rotation: of each part, body from part.
         world: whose laws hold where a part has none of its own.
     """
-    parts, kind, exposed = layout.parts, layout.kind, exposed_shares(layout)
+    parts, kind = layout.parts, layout.kind
+    exposed, joined, ends, rows = exposure(layout)
 
     def each(values: list[Any]) -> tuple[Any, ...]:
         """By part, from what is read once for parts that are the same."""
@@ -181,6 +188,9 @@ def make_fluid_table(
         mass=np.array([p.total_mass for p in parts])[kind],
         silhouette=np.array([p.face_areas for p in parts])[kind],
         exposed=exposed,
+        joined=joined,
+        ends=ends,
+        rows=rows,
         buoyancy=each(["off" if off else p.buoyancy or world.buoyancy for p in parts]),
         drag=drag,
         coefficients={name: x[kind] for name, x in coefficients.items()},

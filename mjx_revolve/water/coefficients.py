@@ -70,11 +70,6 @@ TODAY: dict[str, Sourced] = {
         "once, though hydro.c takes it twice: no reason for that is printed",
     ),
     "friction_exponent": Sourced(2.58, "-", "b of the same", "Prandtl and Schlichting"),
-    "surface_tension": Sourced(0.0728, "N/m", "γ of clean water at 20 °C", "IAPWS R1-76"),
-}  # fmt: skip
-"""Of the laws in force. MuJoCo's two laws have MuJoCo's own (`mujoco_drag`)."""
-
-COMING: dict[str, Sourced] = {
     "end_added_mass": Sourced(
         0.5, "-", "c_m: momentum shed at a trailing end, per c_m (π/4) ρ h² of its section",
         f"{_POREZ}, and hydro.c: 0.5; {_LIGHTHILL}: 1",
@@ -85,6 +80,11 @@ COMING: dict[str, Sourced] = {
     "end_slenderness": Sourced(
         0.2, "-", "height over length up to which a body counts as slender", _LIGHTHILL
     ),
+    "surface_tension": Sourced(0.0728, "N/m", "γ of clean water at 20 °C", "IAPWS R1-76"),
+}  # fmt: skip
+"""Of the laws in force. MuJoCo's two laws have MuJoCo's own (`mujoco_drag`)."""
+
+COMING: dict[str, Sourced] = {
     "swing_drag": Sourced(
         22.5, "-", "a in C_d = a / KC + b of a plate that swings", _IKEDA,
         "this fit and not max(10 KC^(-1/3), 1.95) of Luhar and Nepf (2016): it has a limit to "

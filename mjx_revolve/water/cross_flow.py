@@ -1,14 +1,22 @@
-"""Drag across a chain of parts, by strips and with the whole transverse velocity, and friction.
+"""Drag across chains of parts by strips, friction along them, and momentum shed at their ends.
 
 The law of EPFL's chains and of FARMS (Taylor 1952 for the form): a strip of a long body that moves
 through the water obliquely is dragged by ½ ρ C_d h |v⊥| v⊥, v⊥ its whole velocity across the body,
 and along it by friction, ½ ρ C_f S |v∥| v∥. A face by itself (`face_drag`) meets the component of
 the velocity across it only, so that a rod at 45° meets half of what it should.
 
-How much of a chain a part is, is the share c of its ends that neighbours cover: 1 inside, ½ at an
-end, 0 for a part by itself, for which this is the law of the faces. In between coefficients are
+At an end that trails, the momentum that the body has given to the water across its way, m w for
+each unit of length, leaves with the wake (Lighthill 1971, Proc. R. Soc. B 179; Porez, Boyer and
+Ijspeert 2014, Int. J. Robotics Research 33): F = ½ m w² t - m w u n, with u > 0 the end's velocity
+along t, into the body, w that along n, across it, and m = c_m (π/4) ρ h². Its work, -½ m w² u, is
+never positive, and for small waves its mean thrust is Lighthill's, ½ m (ẏ² - U² y_x²).
+
+How much of a chain a part is, is a share c: 1 in a row of parts that is five times as long as high,
+falling to 0 where it is 2.5 times as long, times the share of the part's joined ends that its
+neighbours cover. For a part by itself this is the law of the faces. In between coefficients are
 interpolated; the strips then stand at c of the part's half length, and what that leaves of the drag
-against turning, 1 - c³ of it, stays with the faces: no part is dragged twice.
+against turning, 1 - c³ of it, stays with the faces: no part is dragged twice. The ends of a row are
+chain as well, as the C_d of chains, which is below that of an endless rod, is a mean over them.
 """
 
 from __future__ import annotations
@@ -19,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.inertia import SpatialInertia, add_inertia, shift_inertia
-from mjx_revolve.numerics.spatial import Vec, add, cross, mul, vadd
+from mjx_revolve.numerics.spatial import Vec, add, cross, dot, mul, total, vadd, vscale
 from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.face_drag import FACES, face_drag_coefficients
 from mjx_revolve.water.laws import (
@@ -38,6 +46,10 @@ if TYPE_CHECKING:
 # Gauss's four points on -1 to 1, and their shares.
 _PLACES, _SHARES = (x.tolist() for x in np.polynomial.legendre.leggauss(4))
 _VARIED = ("drag", "density")
+_END_VARIED = ("added_mass", "density")
+# Where the way ahead is less than this share of an end's velocity, its wake stays with it, and no
+# momentum is carried away. A choice: it must be small.
+_AHEAD = 0.1
 # Least Reynolds number at which friction is taken; below it, there is next to none.
 _LEAST_REYNOLDS = 1e3
 
@@ -53,6 +65,9 @@ class CrossFlowNumbers:
         reach: c times half of the length along that axis, else 0 [m].
         friction: ρ ½ S of the side faces, at that axis, else 0 [kg/m].
         length: along that axis [m].
+        shed: c_m (π/4) ρ h² across the end of a row, along each axis [kg/m].
+        end: place of that end [m].
+        outward: unit vector from the part to that end.
     """
 
     linear: Any = part_field("kg/m", axes="size", varied=_VARIED)
@@ -61,17 +76,23 @@ class CrossFlowNumbers:
     reach: Any = part_field("m", axes="size", fixed="the robot's shape, which is known")
     friction: Any = part_field("kg/m", axes="size", varied=_VARIED)
     length: Any = part_field("m", blank=1.0, fixed="the robot's shape, which is known")
+    shed: Any = part_field("kg/m", axes="size", varied=_END_VARIED)
+    end: Any = part_field("m", axes="vector", fixed="the robot's shape, which is known")
+    outward: Any = part_field("-", axes="vector", fixed="the robot's shape, which is known")
 
 
 def _numbers(parts: PartShapes, world: World) -> CrossFlowNumbers:
-    size, exposed = 2 * parts.half_size, parts.exposed
-    covered = 1 - exposed
-    along = np.eye(3)[covered.argmax(-1)]
-    share = (along * covered).sum(-1, keepdims=True)
-    own = parts.coefficients["drag_coefficient"]
+    size = 2 * parts.half_size
+    # A row is as high as the larger of the edges across its axis.
+    high = np.stack([np.delete(size, axis, 1).max(1) for axis in range(3)], 1)
+    slender = np.clip(2 - high / parts.rows / TODAY["end_slenderness"].value, 0, 1)
+    chained = slender * parts.joined
+    along = np.eye(3)[chained.argmax(-1)]
+    share = (along * chained).sum(-1, keepdims=True)
+    own, exposed = parts.coefficients["drag_coefficient"], parts.exposed
     cube = TODAY["cube_drag"].value
-    across, ahead = TODAY["chain_drag"].value / cube, TODAY["chain_head_drag"].value / cube
-    drag = own * (1 + share * (np.where(along, ahead, across) - 1))
+    sides, head = TODAY["chain_drag"].value / cube, TODAY["chain_head_drag"].value / cube
+    drag = own * (1 + share * (np.where(along, head, sides) - 1))
     linear, _ = face_drag_coefficients(size, parts.silhouette, drag, exposed)
     # What strips do not have: the ends' own turning, turning about the axis, and the rest of 1.
     turning = [
@@ -80,15 +101,22 @@ def _numbers(parts: PartShapes, world: World) -> CrossFlowNumbers:
     ]
     left = np.where(along, 1.0, 1 - share**3)
     length = (along * size).sum(-1)
+    ends = parts.ends * along
+    # Height across the flow along each axis: the third edge.
+    height = np.where(along, 0.0, (size * (1 - along)).sum(-1, keepdims=True) - size)
+    shed = TODAY["end_added_mass"].value * np.pi / 4 * world.density * height**2
     # Faces across y and z are side faces of a chain along x: their areas, on two sides each.
-    sides = 2 * ((1 - along) * exposed * parts.silhouette).sum(-1, keepdims=True)
+    wet = 2 * ((1 - along) * exposed * parts.silhouette).sum(-1, keepdims=True)
     return CrossFlowNumbers(
         linear=world.density * linear,
         angular=world.density * (turning[0] + left * turning[1]),
         mixing=along * share,
         reach=along * share * size / 2,
-        friction=world.density / 2 * along * share * sides,
+        friction=world.density / 2 * along * share * wet,
         length=length,
+        shed=share * np.abs(ends).sum(-1, keepdims=True) * shed,
+        end=ends * size / 2,
+        outward=ends,
     )
 
 
@@ -122,6 +150,21 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
         )
     force = vadd(force, tuple(-d * x for d, x in zip(rubbed, flow.velocity, strict=True)))
     assert damping is not None
+    # What a trailing end sheds.
+    v = vadd(flow.velocity, cross(flow.angular_velocity, numbers.end))
+    ahead = jnp.maximum(-dot(v, numbers.outward), 0)
+    square = ahead * ahead
+    whole = square + _AHEAD**2 * dot(v, v)
+    share = mul(jnp.where(whole > 0, square / jnp.where(whole > 0, whole, 1), 0), flow.submerged)
+    lost = tuple(mul(mul(m, ahead), share) for m in numbers.shed)
+    push = tuple(-d * x for d, x in zip(lost, v, strict=True))
+    thrust = mul(
+        mul(-0.5, share), total(*[mul(m, x * x) for m, x in zip(numbers.shed, v, strict=True)])
+    )
+    push = vadd(push, vscale(thrust, numbers.outward))
+    force, torque = vadd(force, push), vadd(torque, cross(numbers.end, push))
+    x, y, z = lost
+    damping = add_inertia(damping, shift_inertia((x, 0.0, 0.0, y, 0.0, z), (0.0,) * 6, numbers.end))
     x, y, z = rubbed
     damping = add_inertia(damping, shift_inertia((x, 0.0, 0.0, y, 0.0, z), (0.0,) * 6, (0.0,) * 3))
     return Drag(force, torque, damping)
@@ -129,12 +172,16 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
 
 CROSS_FLOW = PartDragLaw(
     name="cross_flow",
-    summary="drag across chains of parts, by strips, and friction; of a lone part that of faces",
+    summary="drag across chains of parts, friction, wakes of their ends; of a lone part faces'",
     explicit=False,
     varied=True,
     numbers=_numbers,
     force=_force,
     angular=lambda numbers: numbers.angular,
     mjcf=FACES.mjcf,
-    sdf=Export("faces", FACES.sdf.note, missing="cross_flow: oblique flow on chains, and friction"),
+    sdf=Export(
+        "faces",
+        FACES.sdf.note,
+        missing="cross_flow: oblique flow on chains, friction, wakes of ends",
+    ),
 )

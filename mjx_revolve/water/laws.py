@@ -203,6 +203,18 @@ class PartShapes(Protocol):
         """`[n, 3]` share of each pair of faces that the water reaches [-]."""
 
     @property
+    def joined(self) -> np.ndarray:
+        """`[n, 3]` share of the ends by which a part is in a row that its neighbours cover [-]."""
+
+    @property
+    def ends(self) -> np.ndarray:
+        """`[n, 3]` 1 or -1 along an axis at whose end a row of parts ends; else 0."""
+
+    @property
+    def rows(self) -> np.ndarray:
+        """`[n, 3]` length of that row [m]."""
+
+    @property
     def coefficients(self) -> Mapping[str, np.ndarray]:
         """`[n]` each, or `[n, 3]` per axis: every `Coefficient` of the laws, by name."""
 

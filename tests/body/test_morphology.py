@@ -16,7 +16,7 @@ import yaml
 from laboratory import ROOT
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
 from mjx_revolve.body.descriptors import UNITS
-from mjx_revolve.body.exposure import exposed_shares
+from mjx_revolve.body.exposure import exposure
 from mjx_revolve.body.morphology import (
     MAX_MODULES,
     Morphology,
@@ -976,7 +976,7 @@ def test_the_layout_is_that_of_the_modules(path):
     corners = np.array(corners)
     assert robot.layout.core_corners().reshape(-1, 3) == pytest.approx(corners)
     assert robot.bounds[0] == pytest.approx(corners.min(axis=0))
-    exposed = exposed_shares(robot.layout)
+    exposed = exposure(robot.layout).shares
     assert exposed.shape == (len(parts), 3)
     assert (exposed >= 0).all() and (exposed <= 1).all()
 
@@ -985,7 +985,7 @@ def test_exposed_shares_of_a_chain_counted_by_hand(tmp_path):
     text = (
         "body: {type: Core, children: {2: {type: FixedBrick, children: {1: {type: FixedBrick}}}}}"
     )
-    core, first, last = exposed_shares(read(tmp_path, text).layout)
+    core, first, last = exposure(read(tmp_path, text).layout).shares
     # The brick hides as much of the core's front as it is smaller than it.
     size = np.array(MODULES["Core"].parts[0].boxes[0].size)
     brick = np.array(MODULES["FixedBrick"].parts[0].boxes[0].size)
@@ -1015,7 +1015,7 @@ def test_slanted_modules_cover_what_lies_behind_them(tmp_path):
             covered[i, j] |= bool((np.abs(place) <= size / 2 + 1e-6).all())
     assert 0 < covered.mean() < 1
     # The other face, on the core, is hidden.
-    exposed = exposed_shares(robot.layout)
+    exposed = exposure(robot.layout).shares
     assert np.isclose(exposed[1], (1 - covered.mean()) / 2, atol=1e-12).any()
 
 

@@ -1,7 +1,8 @@
-"""Drag across chains: oblique flow, spinning rods, friction; a lone part has its faces' drag."""
+"""Chains: oblique flow, spinning rods, friction, wakes; a lone part has its faces' drag."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -20,17 +21,30 @@ WATER = world(drag="cross_flow")
 SIZE = np.array([0.2, 0.1, 0.06])  # [m]
 
 
-@pytest.fixture(scope="module")
-def inside():
-    """Numbers of a part inside a chain along x, whose ends its neighbours cover."""
+def chain_numbers(end=0.0):
+    """Of a part in a slender row along x, with neighbours at both ends or at all but one."""
     parts = SimpleNamespace(
         half_size=SIZE[None] / 2,
         silhouette=(SIZE.prod() / SIZE)[None],
-        exposed=np.array([[0.0, 1.0, 1.0]]),
+        exposed=np.array([[abs(end) / 2, 1.0, 1.0]]),
+        joined=np.array([[1.0, 0.0, 0.0]]),
+        ends=np.array([[end, 0.0, 0.0]]),
+        rows=np.array([[2.0, 0.1, 0.06]]),
         coefficients={"drag_coefficient": np.full((1, 3), 1.05)},
     )
     numbers = CROSS_FLOW.numbers(parts, WATER)
     return as_components(jax.tree.map(lambda x: x[0], numbers))
+
+
+@pytest.fixture(scope="module")
+def inside():
+    return chain_numbers()
+
+
+@pytest.fixture(scope="module")
+def tail():
+    """It ends towards -x."""
+    return chain_numbers(-1.0)
 
 
 def drag_at(numbers, velocity, turning=(0.0, 0.0, 0.0)):
@@ -70,6 +84,60 @@ def test_a_spinning_rod_is_dragged_by_its_strips(inside):
     expected = -WATER.density * 1.75 * SIZE[1] * SIZE[0] ** 4 / 64 * 25.0
     assert drag.torque == pytest.approx([0, expected, 0], rel=0.01)
     assert drag.force == pytest.approx([0, 0, 0], abs=1e-12)
+
+
+def shed_at(tail, velocity, turning=None):
+    """Force and torque of the wake alone."""
+    turning = np.zeros_like(velocity) if turning is None else turning
+    none = replace(tail, shed=(0.0, 0.0, 0.0))
+    one, other = drag_at(tail, velocity, turning), drag_at(none, velocity, turning)
+    pairs = ((one.force, other.force), (one.torque, other.torque))
+    wide = [[a - b + 0 * velocity[0] for a, b in zip(*pair, strict=True)] for pair in pairs]
+    return np.array(wide[0]), np.array(wide[1])
+
+
+def test_a_waving_plate_has_lighthills_mean_thrust(tail):
+    """½ m (mean ẏ² - U² mean y_x²) for small waves; the fade takes a hundredth of it."""
+    phase = 2 * np.pi * np.arange(64) / 64
+    ahead, heave, slope = 0.5, 0.05 * np.cos(phase), 0.06 * np.sin(phase + 0.5)
+    c, s = np.cos(slope), np.sin(slope)
+    velocity = np.array([c * ahead + s * heave, c * heave - s * ahead, 0 * phase])
+    force, torque = shed_at(tail, velocity)
+    m = 0.5 * np.pi / 4 * WATER.density * SIZE[2] ** 2
+    expected = m / 2 * (np.mean(heave**2) - ahead**2 * np.mean(slope**2))
+    assert np.mean(c * force[0] - s * force[1]) == pytest.approx(expected, rel=0.015)
+    assert torque == pytest.approx(np.cross([-SIZE[0] / 2, 0, 0], force.T).T, abs=1e-12)
+
+
+def test_only_an_end_that_trails_sheds_momentum_and_does_no_work(tail, inside):
+    v = np.random.default_rng(1).normal(size=(3, 100))
+    w = 5 * np.random.default_rng(2).normal(size=(3, 100))
+    force, torque = shed_at(tail, v, w)
+    at = v + np.cross(w.T, [-SIZE[0] / 2, 0, 0]).T
+    assert np.all((np.abs(force).max(0) > 0) == (at[0] > 0))
+    assert np.all(np.sum(force * v, 0) + np.sum(torque * w, 0) <= 1e-9)
+    force, _ = shed_at(inside, v, w)
+    assert np.all(force == 0)
+    slowly, _ = shed_at(tail, np.array([1e-9, 0.5, 0.0]))
+    assert np.abs(slowly).max() < 1e-9  # no jump where it turns from leading to trailing
+
+
+def test_rows_are_found_in_the_body():
+    text = (
+        "body: {type: Core, children: {1: {type: FixedBrick, children: {1: {type: FixedBrick}}}}}"
+    )
+    table = build_robot(read(text), WATER).fluid
+    edges = 2 * table.half_size
+    assert table.ends.tolist() == [[0, -1, 0], [0, 0, 0], [0, 1, 0]]
+    rows = edges.copy()
+    rows[:, 1] = edges[:, 1].sum()
+    assert table.rows == pytest.approx(rows)
+    # The row is twice as long as the core is high, and four times as long as the bricks are.
+    numbers = CROSS_FLOW.numbers(table, WATER)
+    share = 2 - edges[1, 0] / rows[1, 1] / 0.2
+    assert numbers.mixing[:, 1] == pytest.approx([0, share, share])
+    shed = share * 0.5 * np.pi / 4 * WATER.density * edges[2, 0] ** 2
+    assert numbers.shed[:, 2] == pytest.approx([0, 0, shed])
 
 
 def test_its_work_is_never_positive_and_its_damping_is_all_of_it(inside):
