@@ -296,6 +296,7 @@ def test_boxes_meet_without_passing_and_keep_momentum(dt, speed):
     assert np.dot(gap[-1], (v[-1, :3, 1] - v[-1, :3, 0])) > 0
 
 
+@pytest.mark.slow
 def test_without_others_nothing_changes():
     """A meeting of robots out of each other's reach leaves every bit as it is."""
     space, _, capacity, tables, spheres = crowd_tables()

@@ -152,6 +152,7 @@ def course_of(way, robot):
     return moved, np.arctan2(-moved[:, 0], moved[:, 1])
 
 
+@pytest.mark.slow
 def test_a_symmetric_beat_goes_straight_once_it_has_begun():
     """Sideways drift is a straight way at the angle that the first strokes from rest have left."""
     robot = load("fish")

@@ -176,6 +176,7 @@ def test_ribs_is_asked_for_by_name_where_it_is_missing(monkeypatch):
         to_ribs(grid(), [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [grid, lambda: tessellation(2000)], ids=["grid", "cvt"])
 def test_ribs_opens_an_archive_with_the_same_cells(make):
     pytest.importorskip("ribs", reason=NO_RIBS)

@@ -35,6 +35,7 @@ def quick_compiles(monkeypatch):
     monkeypatch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
 
 
+@pytest.mark.slow
 def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
     """Scores are those of each individual alone, to the bit, and the champion can be replayed."""
     monkeypatch.chdir(tmp_path)

@@ -150,6 +150,7 @@ def test_its_work_is_never_positive_and_its_damping_is_all_of_it(inside):
             assert np.abs(np.asarray(x) + np.asarray(y)).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_fins_keep_their_lift_and_gradients_are_finite():
     fish = read("body: {type: Core, children: {1: {type: FixedBrick}, 0: {type: Fin}}}")
     robot = build_robot(fish, WATER)

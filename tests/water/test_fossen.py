@@ -159,6 +159,7 @@ def test_where_they_may_stand():
         read(brick % ("FixedBrick", "whole: true"))
 
 
+@pytest.mark.slow
 def test_different_bodies_side_by_side_and_gradients():
     tank = world(**WATER)
     damped = f"{{added_mass: {ADDED.tolist()}, quadratic_damping: [3, 4, 5, .1, .1, .1]}}"

@@ -187,6 +187,7 @@ def test_a_law_in_the_table_needs_nothing_else(linear):
     assert "drag: linear" in make_mjcf(plain) and "drag: linear" in make_sdf(plain)
 
 
+@pytest.mark.slow
 def test_a_law_in_the_table_steps_different_bodies_side_by_side(linear):
     """One of two parts of another law, so that tables are padded."""
     tank = world(drag="linear")
