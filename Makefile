@@ -7,7 +7,7 @@ TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile 
 READY  := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve test test-quick fuzz check format docs bench lock clean
+.PHONY: help install evolve test test-quick fuzz check format docs bench dist lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -52,6 +52,15 @@ docs: $(READY)  ## the documentation and a reference of all functions, as HTML i
 
 bench: $(READY)  ## throughput beside MuJoCo C and plain MJX, from the same run
 	$(RUN) -m experiments.bench
+
+dist: $(READY)  ## wheel and sdist in dist/, tried in a fresh environment from an empty folder
+	rm -rf dist build/dist
+	$(RUN) -m pip install --quiet --disable-pip-version-check build
+	$(RUN) -m build --outdir dist .
+	$(PYTHON) -m venv build/dist/venv
+	build/dist/venv/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	build/dist/venv/bin/pip check
+	mkdir -p build/dist/empty && cd build/dist/empty && ../venv/bin/mjx-revolve evolve smoke --out run
 
 lock:  ## write requirements.lock anew from pyproject.toml
 	$(PYTHON) -m venv $(VENV)-lock

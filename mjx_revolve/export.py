@@ -26,6 +26,7 @@ from mjx_revolve.inputs.commands import (
 )
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import check_name, short_path
+from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.numerics import runtime
 
 # By option: what its file is called in a folder, what it may end in, and what it is.
@@ -109,10 +110,9 @@ def main(argv: list[str] | None = None) -> int:
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.formats.export import export_robot
-    from mjx_revolve.formats.ros_bag import check_rosbags
 
     if arguments.mcap is not None:
-        check_rosbags()
+        check_package("--mcap", "rosbags")
     episode = load_asked(arguments)
     if not files:
         if episode.folder is not None:
@@ -125,7 +125,7 @@ def main(argv: list[str] | None = None) -> int:
     lacking = None
     if arguments.mcap is None and "mcap" in files:
         try:
-            check_rosbags()
+            check_package("--mcap", "rosbags")
         except InputError as error:  # the other formats do not need it
             lacking = error
             del files["mcap"]

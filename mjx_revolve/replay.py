@@ -31,6 +31,7 @@ from mjx_revolve.inputs.commands import (
 )
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
+from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.view.film.opengl import check_screen, find_opengl
 
 if TYPE_CHECKING:
@@ -180,6 +181,8 @@ def main(argv: list[str] | None = None) -> int:
         paths = _paths_in(folder, name, kinds)
     check_episode_path(path)
     check_colony_arguments(arguments)
+    if ".mp4" in (kinds if paths is None else paths) and not view:
+        check_package("MP4", "av")
     # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
     films = not view and set(kinds if paths is None else paths) != {".html"}
     opengl = find_opengl() if films else ""

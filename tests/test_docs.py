@@ -19,6 +19,7 @@ import pytest
 
 import mjx_revolve
 from laboratory import ROOT
+from mjx_revolve.inputs.packages import REQUIREMENTS
 
 FOUND = [m.name for m in pkgutil.walk_packages(mjx_revolve.__path__, "mjx_revolve.")]
 MODULES = [name for name in FOUND if "._" not in name]
@@ -347,5 +348,6 @@ def test_messages_name_what_can_be_installed():
     known = {name for extra in project["optional-dependencies"].values() for name in extra}
     texts = [p.read_text("utf-8") for p in [*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]]
     texts += [p.read_text("utf-8") for p in (ROOT / "mjx_revolve").rglob("*.py")]
-    named = {x for text in texts for x in re.findall(r"pip install[ \"\n]*'([^']+)'", text)}
-    assert len(named) == 5 and named <= known
+    named = {x for text in texts for x in re.findall(r"pip install[ \"\n]*'([^'{]+)'", text)}
+    named |= {*REQUIREMENTS.values()}
+    assert len(named) == 7 and named <= known

@@ -347,7 +347,7 @@ def test_tensorboard_is_missed_before_anything_begins(stopped, argv, capsys, mon
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     assert run_main(*argv, "--set", "evolution.tensorboard=true") == 2
     err = capsys.readouterr().err
-    assert "evolution.tensorboard: expected the package tensorboardX (pip install" in err
+    assert "evolution.tensorboard: expected the package tensorboardX; found none (pip" in err
     assert err.count("\n") == 1
     assert not (stopped / "new").exists()
 

@@ -21,6 +21,7 @@ from mjx_revolve.engine.edited_model import check_edit, edited_assembly
 from mjx_revolve.engine.fluid_table import FluidTable
 from mjx_revolve.engine.mujoco_model import compile_model
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.world import World
 
@@ -227,7 +228,12 @@ def _bytes_of(model: mujoco.MjModel) -> bytes:
 
 
 def import_mjx() -> Any:
-    """The module `mujoco.mjx`, imported late because it is slow, without its lines about Warp."""
+    """The module `mujoco.mjx`, imported late because it is slow, without its lines about Warp.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    check_package("engine: mjx", "mujoco.mjx")
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
     return mjx

@@ -6,7 +6,6 @@ made. All environments are stepped in one compiled call.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +24,7 @@ from mjx_revolve.episodes.environment import (
 )
 from mjx_revolve.episodes.fitness import Fitness, make_fitness
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.numerics.xla import LANES, jit, on_cpu
 
 AUTORESET_MODES = ("NextStep", "SameStep")
@@ -297,11 +297,7 @@ def make_vector_env(
     Raises:
         InputError: gymnasium is not installed, the configuration is wrong, or it has no one body.
     """
-    if importlib.util.find_spec("gymnasium") is None:
-        raise InputError(
-            "make_vector_env: expected the package gymnasium (pip install 'gymnasium>=1.1'); "
-            "found none"
-        )
+    check_package("make_vector_env", "gymnasium")
     whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
     if not whole or num_envs < 1:
         raise InputError(f"num_envs: expected a whole number >= 1; found {num_envs!r}")

@@ -8,7 +8,6 @@ algorithm", IEEE Trans. Evolutionary Computation 22(4), 2018.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -20,6 +19,7 @@ from scipy.spatial.distance import cdist
 
 from mjx_revolve.episodes.bodies_config import ArchiveConfig
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.packages import check_package
 
 # Samples per cell, and rounds, with which a tessellation is found: from evenly spread points, more
 # rounds no longer make the cells' volumes more equal (12 to 14 % standard deviation).
@@ -255,10 +255,7 @@ def to_ribs(archive: Archive, solutions: Sequence[object]) -> Any:
         InputError: `ribs` is not installed.
         ValueError: there are not as many solutions as individuals.
     """
-    if importlib.util.find_spec("ribs") is None:
-        raise InputError(
-            "archive: expected the package ribs; found none (pip install 'ribs>=0.12,<0.13')"
-        )
+    check_package("archive", "ribs")
     from ribs.archives import CVTArchive, GridArchive
 
     cells = filled(archive)

@@ -37,6 +37,7 @@ from mjx_revolve.evolution.jobs import (
     open_job,
 )
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
@@ -149,12 +150,9 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
         Raises:
             InputError: there is none, or Dask is not installed.
         """
-        try:
-            import distributed
-        except ImportError:
-            raise InputError(
-                "--cluster: expected Dask (pip install 'distributed>=2025.1'); found none"
-            ) from None
+        check_package("--cluster", "distributed")
+        import distributed
+
         is_file = place.endswith(".json") or os.path.isfile(place)
         if is_file and not os.path.isfile(place):  # Dask would wait for it
             raise InputError(f"--cluster: expected a scheduler file; found none at {place}")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjx_revolve.body.catalogue import load_modules
+from mjx_revolve.inputs.packages import installed_version
 from mjx_revolve.inputs.user_code import content_name
 from mjx_revolve.numerics import runtime
 
@@ -135,7 +135,7 @@ def model_hash(fitness: Any) -> str:
 
 def program_versions() -> dict[str, str]:
     """Our source and the engines' versions, the same in all processes of a run."""
-    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    versions = {name: installed_version(name) for name in _PACKAGES}
     return {"mjx_revolve": runtime.source_hash(), **versions}
 
 

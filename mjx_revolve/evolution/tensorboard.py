@@ -7,15 +7,14 @@ used rather than its SummaryWriter, whose thread does not report a full disk.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import with_path
+from mjx_revolve.inputs.packages import check_package
 
 # The group of a column in TensorBoard; measures of the task have their own.
 _GROUPS = {
@@ -28,11 +27,7 @@ _GROUPS = {
 
 def check_tensorboard(source: str) -> None:
     """Raises InputError, naming the configuration's `source`, if tensorboardX is missing."""
-    if importlib.util.find_spec("tensorboardX") is None:
-        raise InputError(
-            f"{source}: evolution.tensorboard: expected the package tensorboardX (pip install "
-            "'tensorboardX>=2.6'); found none"
-        )
+    check_package(f"{source}: evolution.tensorboard", "tensorboardX")
 
 
 class TensorBoardLog:

@@ -7,7 +7,6 @@ REP 103.
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from mjx_revolve.formats.links import BASE, ODOM, WORLD, Link, make_links
 from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.numerics.spatial import quat_mul, quat_to_matrix
 
 # Messages per second, unless the simulation steps more slowly [1/s].
@@ -31,18 +31,6 @@ RATE = 100.0
 
 # Topics whose one message reaches those who listen later.
 _LATCHED = ("/tf_static", "/robot_description")
-
-
-def check_rosbags() -> None:
-    """Whether bags can be written here.
-
-    Raises:
-        InputError: the package that does it is missing.
-    """
-    if importlib.util.find_spec("rosbags") is None:
-        raise InputError(
-            "--mcap: expected the package rosbags; found none (pip install 'rosbags>=0.11')"
-        )
 
 
 def write_bag(robot: Robot, trajectory: Trajectory, path: Path) -> None:
@@ -70,7 +58,7 @@ def write_bag(robot: Robot, trajectory: Trajectory, path: Path) -> None:
         InputError: the package `rosbags` is missing.
         OSError: the file cannot be written.
     """
-    check_rosbags()
+    check_package("--mcap", "rosbags")
 
     def write(place: Path) -> None:
         with tempfile.TemporaryDirectory() as folder:

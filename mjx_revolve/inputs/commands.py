@@ -19,6 +19,7 @@ from typing import NoReturn
 from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import SWEEP, check_path
+from mjx_revolve.inputs.packages import check_mujoco
 from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.inputs.terminal import spell_unencodable
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -254,6 +255,7 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
     early_sigint.running = True
     try:
         with show_notes():
+            check_mujoco()
             return main(argv)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -269,10 +269,8 @@ def describe_process() -> dict[str, Any]:
 
     versions = {"python": platform.python_version()}
     for name in _PACKAGES:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return {
         "versions": versions,
         "git": _git_revision(),

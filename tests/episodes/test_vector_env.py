@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,6 @@ import pytest
 from laboratory import OAR, swimmer
 from mjx_revolve import InputError, make_fitness, make_vector_env, simulate
 from mjx_revolve.engine.plant import actuators_of
-from mjx_revolve.episodes import vector_env
 from mjx_revolve.episodes.scoring import WORST
 
 gymnasium = pytest.importorskip(
@@ -329,7 +330,7 @@ def test_what_is_wrong_gets_one_message(config, monkeypatch):
     bodies = {"bodies": {"seeds": ["spider"]}, "morphology": None, "trim": "none"}
     refuses("expected one, as this is the fitness of one body", config, 1, **bodies)
     refuses("expected a hinge or a thruster", config, 1, morphology="core")
-    monkeypatch.setattr(vector_env.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
     refuses("pip install 'gymnasium>=1.1'", config, 1)
 
 

@@ -12,7 +12,6 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 from PIL import Image
 from tqdm import tqdm
@@ -84,6 +83,8 @@ def write_mp4(
         fps: frames per second.
         title: for the file's metadata.
     """
+    import av  # an extra; only MP4 needs it
+
     # The index goes to the front, so that a browser can play while it loads.
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as file:
         file.metadata["title"] = title

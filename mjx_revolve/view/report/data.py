@@ -6,7 +6,6 @@ can be read, and everything else is named.
 
 from __future__ import annotations
 
-import importlib.metadata
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -23,6 +22,7 @@ from mjx_revolve.episodes.run_reader import RunReader, find_run, generation_of, 
 from mjx_revolve.episodes.settings import find_copies, locate_files
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import check_path, resolve_inside
+from mjx_revolve.inputs.packages import installed_version
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.view.colony_history import read_history
 from mjx_revolve.view.population import read_population
@@ -299,9 +299,7 @@ def _version(package: str) -> str:
     """Of a package here; "" where it is not installed, as a checkout of ours need not be."""
     if package == "mjx_revolve":
         return mjx_revolve.__version__
-    with suppress(importlib.metadata.PackageNotFoundError):
-        return importlib.metadata.version(package)
-    return ""
+    return installed_version(package)
 
 
 def _numbers(version: str) -> list[int]:
