@@ -249,6 +249,10 @@ typedef float brain_real;
 #define BRAIN_RATE {rate} /* calls of brain_step a second [Hz] */
 #define BRAIN_COMMANDS {count}
 
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
 typedef struct {{
 {sensors}
 }} brain_sensors;
@@ -267,6 +271,9 @@ void brain_init(brain_state *state);
 void brain_step(brain_state *state, brain_real time, const brain_sensors *sensors,
                 brain_real commands[BRAIN_COMMANDS]);
 
+#ifdef __cplusplus
+}}
+#endif
 #endif
 """
 

@@ -46,17 +46,21 @@ ELEMENTWISE: dict[str, Form] = {
         "asin", "acos", "atan", "asinh", "acosh", "atanh",
     )},
     "add": _infix("+"), "sub": _infix("-"), "mul": _infix("*"), "div": _infix("/"),
+    "div.int": Form("(({0} - np.fmod({0}, {1})) // {1})", "({0} / {1})"),  # towards 0
     "neg": Form("(-{0})", "(-{0})"),
     "abs": _function("abs", "fabs"),
     "abs.int": Form("np.abs({0})", "({0} < 0 ? -{0} : {0})"),
     "round": _function("rint"),
     "sign": Form("np.sign({0})", "brain_sign({0})"),
+    "sign.int": Form("np.sign({0})", "(({0} > 0) - ({0} < 0))"),
+    "square.int": Form("np.square({0})", "({0} * {0})"),
     "square": Form("np.square({0})", "brain_square({0})"),
     "rsqrt": Form("(1 / np.sqrt({0}))", "(1 / BRAIN_F(sqrt)({0}))"),
     "logistic": Form("(1 / (1 + np.exp(-{0})))", "(1 / (1 + BRAIN_F(exp)(-{0})))"),
     "pow": Form("np.power({0}, {1})", "BRAIN_F(pow)({0}, {1})"),
     "atan2": Form("np.arctan2({0}, {1})", "BRAIN_F(atan2)({0}, {1})"),
     "rem": Form("np.fmod({0}, {1})", "BRAIN_F(fmod)({0}, {1})"),
+    "rem.int": Form("np.fmod({0}, {1})", "({0} % {1})"),
     "max": Form(_LARGER, "brain_max({0}, {1})"),
     "min": Form(_SMALLER, "brain_min({0}, {1})"),
     "max.int": Form(_LARGER, "({0} > {1} ? {0} : {1})"),
@@ -76,8 +80,8 @@ ELEMENTWISE: dict[str, Form] = {
 }  # fmt: skip
 """By JAX's name, with `.int` for a form of whole numbers."""
 
-# Of these only reals: what NumPy and C make of whole numbers differs, or a sign of `~` and `!`.
-_REALS_ONLY = ("div", "rem", "pow", "sign", "square", "clamp")
+# Of these only reals: what NumPy and C make of whole numbers differs.
+_REALS_ONLY = ("pow", "clamp")
 REDUCTIONS = {"reduce_sum": "sum", "reduce_max": "max", "reduce_min": "min"}
 """By JAX's name, NumPy's."""
 
@@ -91,6 +95,7 @@ _CALLS = (
 _MOVES: dict[str, tuple[int, ...] | None] = {
     "reshape": None, "squeeze": None, "expand_dims": None, "slice": None, "transpose": None,
     "broadcast_in_dim": None, "concatenate": None, "rev": None, "pad": None, "split": None,
+    "stack": None, "unstack": None, "tile": None,
     "gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2),
 }  # fmt: skip
 _KINDS = {"f": "real", "i": "int", "b": "bool"}
