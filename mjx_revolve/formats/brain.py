@@ -49,6 +49,15 @@ READINGS: dict[str, tuple[str, str]] = {
 measured: the core, or a module's main box."""
 
 
+# At one module.
+_AT_MODULE = {
+    "angle": "angle of its hinge, 0 in the rest pose",
+    "speed": "angular velocity of its hinge",
+    "load": "torque of its hinge's servo",
+    "touch": "force of the bed on its rigid body",
+}
+
+
 @dataclass(frozen=True)
 class Signal:
     """An input of a brain.
@@ -255,6 +264,7 @@ def _list_readings(
             fields = {f"{field}_{key}": x for key, x in value._asdict().items()}
         for name, x in fields.items():
             unit, words = READINGS[name]
+            words = _AT_MODULE.get(name, words) if place else words
             at = "the core" if not place else place.replace("at ", "module ")
             where = "" if name in ("angle", "speed", "load", "touch") and not place else f", {at}"
             if place.startswith("each "):
@@ -286,6 +296,7 @@ def describe_brain(brain: Brain) -> tuple[str, list[str], list[str]]:
     for sensor in brain.sensors:
         low, high = sensor.limits
         text = f"- {sensor.label}: {sensor.kind.what}, {low:g} to {high:g} {sensor.kind.unit}"
+        text = text.removesuffix(" -")
         text += f", noise {sensor.noise:g}" if sensor.noise else ""
         text += f", {sensor.rate:g} Hz" if sensor.rate is not None else ""
         text += f", {sensor.delay:g} s late" if sensor.delay else ""

@@ -32,7 +32,9 @@ def make_brain_node(brain: Brain, stem: str) -> str:
     topics, setup, readers = [], [], []
     if joints:
         topics.append(f"/joint_states (sensor_msgs/JointState): {', '.join(joints.values())}")
-        setup.append("self.create_subscription(JointState, '/joint_states', self.read_joints, 10)")
+        setup.append(
+            "self.create_subscription(JointState, '/joint_states', self.read_joints, _QOS)"
+        )
         lines = "".join(_JOINT.format(name=name, field=field) for name, field in joints.items())
         readers.append(_READ_JOINTS + lines)
     if inertial:
@@ -40,7 +42,7 @@ def make_brain_node(brain: Brain, stem: str) -> str:
             "/imu (sensor_msgs/Imu), in the core's frame, the orientation that of the core in a "
             "frame whose z is up"
         )
-        setup.append("self.create_subscription(Imu, '/imu', self.read_imu, 10)")
+        setup.append("self.create_subscription(Imu, '/imu', self.read_imu, _QOS)")
         lines = "".join(
             f"        self.sensors[{name!r}] = {text}\n" for name, text in inertial.items()
         )
@@ -48,7 +50,9 @@ def make_brain_node(brain: Brain, stem: str) -> str:
     for name in others:
         topics.append(f"/sensors/{name} (std_msgs/Float64MultiArray)")
         read = f"lambda message: self.sensors.update({name}=list(message.data))"
-        setup.append(f"self.create_subscription(Float64MultiArray, '/sensors/{name}', {read}, 10)")
+        setup.append(
+            f"self.create_subscription(Float64MultiArray, '/sensors/{name}', {read}, _QOS)"
+        )
     out = []
     if hinges:
         setup.append("self.targets = self.create_publisher(JointState, '/joint_targets', 10)")
@@ -88,12 +92,14 @@ Publishes
 
 import rclpy
 from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray
 
 from {stem} import RATE, SENSORS, Brain
 
 HINGES = {hinges}
+_QOS = qos_profile_sensor_data  # hears reliable senders, and others
 
 
 class BrainNode(Node):

@@ -455,7 +455,8 @@ def test_the_node_gives_the_brains_commands(tmp_path, monkeypatch):
     brain = plain_brain()
     (tmp_path / "brain_of_test.py").write_text(make_brain_python(brain))
     for name, fields in {
-        "rclpy": {}, "rclpy.node": {"Node": _Node}, "sensor_msgs": {},
+        "rclpy": {}, "rclpy.node": {"Node": _Node},
+        "rclpy.qos": {"qos_profile_sensor_data": "sensor data"}, "sensor_msgs": {},
         "sensor_msgs.msg": {"Imu": _Message, "JointState": _Message}, "std_msgs": {},
         "std_msgs.msg": {"Float64MultiArray": _Message},
     }.items():  # fmt: skip
