@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_revolve.formats.brain import Brain, describe_brain
 from mjx_revolve.formats.brain_code import Code, array_text, is_bracketed
-from mjx_revolve.formats.brain_program import REDUCTIONS, Value, View, split_runs
+from mjx_revolve.formats.brain_program import Value, View, number_text
 
 _TYPES = {"real": "brain_real", "int": "int32_t", "bool": "bool"}
 
@@ -27,11 +27,8 @@ _HELPERS = {
 class _CCode(Code):
     language = "c"
 
-    def power(self, base: str, exponent: int) -> str:
-        return f"BRAIN_F(pow)({base}, {exponent})"
-
     def literal(self, x: np.generic) -> str:
-        text = number_text(x)
+        text = _number(x)
         return f"((brain_real){text})" if isinstance(x, np.floating) else f"({text})"
 
     def table_name(self, count: int) -> str:
@@ -67,42 +64,9 @@ class _CCode(Code):
         self.lines.append(f"for (i = 0; i < {size}; i++) {name}[{place}] = {text};")
 
     def store(self, number: int, value: Value) -> str:
-        name, names = f"v{number}", [self.name_of(arg) for arg in value.args]
-        if value.op == "take":
-            self._take(name, value, names)
-        elif value.op == "dot":
-            _, m, n, k = value.shape
-            left, right = f"{names[0]}[(i / {n}) * {k} + j]", f"(i / {m * n} * {n} + i % {n})"
-            self._fold(
-                name, value.size, k, "0", f"{name}[i] += {left} * {names[1]}[{right} * {k} + j]"
-            )
-        else:
-            count = self.program.values[value.args[0]].size // value.size
-            item = f"{names[0]}[i * {count} + j]"
-            if REDUCTIONS[value.op] == "sum":
-                self._fold(name, value.size, count, "0", f"{name}[i] += {item}")
-            else:
-                sign = ">" if REDUCTIONS[value.op] == "max" else "<"
-                larger = f"if ({item} {sign} {name}[i]) {name}[i] = {item}"
-                self._fold(name, value.size, count, f"{names[0]}[i * {count}]", larger)
-        return name
-
-    def _fold(self, name: str, size: int, count: int, first: str, step: str) -> None:
-        self.lines.append(
-            f"for (i = 0; i < {size}; i++) {{ {name}[i] = {first}; "
-            f"for (j = 0; j < {count}; j++) {step}; }}"
-        )
-
-    def _take(self, name: str, value: Value, names: list[str]) -> None:
-        sizes = [self.program.values[arg].size for arg in value.args]
-        ends = np.cumsum([0, *sizes]).tolist()
-        for place, start, count in split_runs(value.index):
-            for source, low, high in zip(names, ends[:-1], ends[1:], strict=True):
-                first, last = max(start, low), min(start + count, high)
-                if first < last:
-                    view, size = View(first - low), last - first
-                    text = self.at(source, view, size, high - low)
-                    self._write_loop(name, size, text, place + first - start)
+        for place, source, view, size, whole in self.pieces(value):
+            self._write_loop(f"v{number}", size, self.at(source, view, size, whole), place)
+        return f"v{number}"
 
 
 def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
@@ -153,7 +117,7 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
         start._write_loop(f"state->{value.label}", value.size, text)
     tables = [
         f"static const {_TYPES[{'f': 'real', 'i': 'int', 'b': 'bool'}[data.dtype.kind]]} "
-        f"{name}[{data.size}] = {{{array_text(data, number_text)[1:-1]}}};"
+        f"{name}[{data.size}] = {{{array_text(data, _number)[1:-1]}}};"
         for name, data in code.constants.items()
     ]
     every = "\n".join([*lines, *start.lines])
@@ -175,10 +139,9 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
 
 
 def _function(lines: list[str], arguments: list[str]) -> str:
-    """The body of a function: counters that it needs, and arguments that it does not."""
+    """The body of a function: the counter that it may need, and arguments that it does not."""
     text = "\n".join(lines)
-    counters = [name for name in "ij" if f"({name} = 0" in text]
-    head = [f"int {', '.join(counters)};"] if counters else []
+    head = ["int i;"] if "(i = 0" in text else []
     unused = [f"(void){name};" for name in arguments if not re.search(rf"\b{name}\b", text)]
     stored = [line for line in lines if line.startswith("static ")]
     return "\n".join(f"    {x}" for x in [*stored, *head, *unused, *lines[len(stored) :]])
@@ -220,16 +183,8 @@ def share_buffers(lines: list[str], values: tuple[Value, ...]) -> tuple[list[str
     return renamed, declared
 
 
-def number_text(x: np.generic) -> str:
-    """A number as C reads it, to the same bits."""
-    if isinstance(x, np.bool_):
-        return str(bool(x)).lower()
-    if isinstance(x, np.integer):
-        return str(int(x))
-    value = float(x)
-    if not np.isfinite(value):
-        return "NAN" if value != value else "INFINITY" if value > 0 else "-INFINITY"
-    return repr(value)
+def _number(x: np.generic) -> str:
+    return number_text(x, "NAN", "INFINITY")
 
 
 _HEADER = """/* {comment}

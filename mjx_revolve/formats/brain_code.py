@@ -7,25 +7,24 @@ from a stored array by a simple index is that array with the index.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from mjx_revolve.formats.brain_program import (
     ELEMENTWISE,
-    REDUCTIONS,
     Program,
     Value,
     View,
     find_view,
+    split_runs,
 )
 
 # Longer expressions get a name; a choice.
 _LONGEST = 100
-# Operations that read their arguments as a whole.
-_STORED = ("take", "dot", *REDUCTIONS)
 
 
 class Code(ABC):
@@ -69,7 +68,7 @@ class Code(ABC):
     def _is_whole(self, number: int) -> bool:
         """Whether a value must stand in memory as a whole."""
         users = (self.program.values[user].op for user in self._users.get(number, ()))
-        return number in self._results or any(op in _STORED for op in users)
+        return number in self._results or "take" in users
 
     def _is_inline(self, number: int, value: Value, text: str) -> bool:
         """Whether an expression stands where it is used: there only, and as often."""
@@ -95,8 +94,6 @@ class Code(ABC):
             simple = len(value.args) == 1 and find_view(value.index) is not None
             if self._is_whole(number) or not simple:
                 self._names[number] = self.store(number, value)
-        elif value.op in _STORED:
-            self._names[number] = self.store(number, value)
         else:
             text = self.element(value)
             if self._is_inline(number, value, text):
@@ -107,8 +104,6 @@ class Code(ABC):
     def element(self, value: Value) -> str:
         """An operation on elements, from its arguments."""
         args = [self.operand(arg) for arg in value.args]
-        if value.op == "integer_pow":
-            return self.power(args[0], value.power)
         return getattr(ELEMENTWISE[value.op], self.language).format(*args)
 
     def operand(self, number: int) -> str:
@@ -126,6 +121,17 @@ class Code(ABC):
         [source] = value.args
         return self.at(self.name_of(source), view, value.size, self.program.values[source].size)
 
+    def pieces(self, value: Value) -> Iterator[tuple[int, str, View, int, int]]:
+        """A take as runs: where each goes, its source, the view, its length and the source's."""
+        names = [self.name_of(arg) for arg in value.args]
+        ends = np.cumsum([0, *(self.program.values[arg].size for arg in value.args)]).tolist()
+        for place, start, count in split_runs(value.index):
+            # A run may go on from one source into the next.
+            for name, (low, high) in zip(names, pairwise(ends), strict=True):
+                first, last = max(start, low), min(start + count, high)
+                if first < last:
+                    yield place + first - start, name, View(first - low), last - first, high - low
+
     def name_of(self, number: int) -> str:
         """The name of a stored value, or of a constant's table."""
         if number in self._names:
@@ -137,10 +143,6 @@ class Code(ABC):
             self._tables[key] = self.table_name(len(self._tables))
             self.constants[self._tables[key]] = data
         return self._tables[key]
-
-    @abstractmethod
-    def power(self, base: str, exponent: int) -> str:
-        """A whole power."""
 
     @abstractmethod
     def literal(self, x: np.generic) -> str:
@@ -164,7 +166,7 @@ class Code(ABC):
 
     @abstractmethod
     def store(self, number: int, value: Value) -> str:
-        """Writes what reads arrays as a whole into an array, and returns its name."""
+        """Writes a take into an array, and returns its name."""
 
 
 def array_text(data: np.ndarray, number: Callable[[np.generic], str]) -> str:

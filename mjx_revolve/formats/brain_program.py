@@ -1,9 +1,9 @@
 """A function of JAX as a short list of operations on flat arrays, for files that run without JAX.
 
 The function is traced, its calls are inlined and its constants folded. What moves numbers about
-(slices, reshapes, broadcasts, gathers at constant places) becomes an index, so that what is left is
-arithmetic, element by element, sums and matrix products. The set is closed: `ELEMENTWISE` has
-each operation once, as NumPy and as C99 write it.
+(slices, reshapes, broadcasts, gathers at constant places) becomes an index, sums and products of
+matrices are written out, and what is left is arithmetic, element by element. The set is closed:
+`ELEMENTWISE` has each operation once, as NumPy and as C99 write it.
 """
 
 from __future__ import annotations
@@ -82,8 +82,7 @@ ELEMENTWISE: dict[str, Form] = {
 
 # Of these only reals: what NumPy and C make of whole numbers differs.
 _REALS_ONLY = ("pow", "clamp")
-REDUCTIONS = {"reduce_sum": "sum", "reduce_max": "max", "reduce_min": "min"}
-"""By JAX's name, NumPy's."""
+_REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
 
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1}
 _SAME = ("materialize", "copy", "copy_p", "optimization_barrier", "reduce_precision")
@@ -93,7 +92,7 @@ _CALLS = (
 )  # fmt: skip
 # What moves numbers, and which operands are moved; the others are constant places.
 _MOVES: dict[str, tuple[int, ...] | None] = {
-    "reshape": None, "squeeze": None, "expand_dims": None, "slice": None, "transpose": None,
+    "reshape": None, "squeeze": None, "slice": None, "transpose": None,
     "broadcast_in_dim": None, "concatenate": None, "rev": None, "pad": None, "split": None,
     "stack": None, "unstack": None, "tile": None,
     "gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2),
@@ -108,15 +107,11 @@ class Value:
     Attributes:
         kind: "real", "int" or "bool".
         size: number of elements.
-        op: a name in `ELEMENTWISE`, or "integer_pow"; "input", "constant", "take" (see `index`), a
-            name in `REDUCTIONS` (of equal groups in a row), or "dot" (of rows of `[b, m, k]` with
-            rows of `[b, n, k]`).
+        op: a name in `ELEMENTWISE`, or "input", "constant" or "take" (see `index`).
         args: numbers of the values that it is made of.
         index: `[size]` of a "take": which element of its arguments, one behind the other.
-        shape: of a "dot": (b, m, n, k).
         data: `[size]` of a constant.
         label: of an input: its name.
-        power: of "integer_pow".
     """
 
     kind: str
@@ -124,10 +119,8 @@ class Value:
     op: str
     args: tuple[int, ...] = ()
     index: tuple[int, ...] = ()
-    shape: tuple[int, ...] = ()
     data: np.ndarray | None = field(default=None, compare=False)
     label: str = ""
-    power: int = 0
 
 
 @dataclass(frozen=True)
@@ -188,7 +181,7 @@ class Builder:
         """An input by its name."""
         return self.add(Value(kind, size, "input", label=label))
 
-    def apply(self, name: str, kind: str, *args: int, power: int = 0) -> int:
+    def apply(self, name: str, kind: str, *args: int) -> int:
         """An operation on elements; what adds 0 or multiplies by 1 is left out."""
         size = max(self.values[number].size for number in args)
         for k in (0, 1) if name in _NEUTRAL and kind == "real" else ():
@@ -201,7 +194,7 @@ class Builder:
                 continue
             if (data == _NEUTRAL[name]).all():
                 return other
-        return self.add(Value(kind, size, name, args, power=power))
+        return self.add(Value(kind, size, name, args))
 
     def take(self, args: Sequence[int], index: Any) -> int:
         """Elements of values that stand one behind the other."""
@@ -280,16 +273,22 @@ class Builder:
             return [self.constant(x) for x in (found if isinstance(found, list) else [found])]
         out = equation.outvars[0].aval
         kind, size = kind_of(out.dtype), int(np.prod(out.shape))
-        if name in REDUCTIONS and kind != "bool":
-            return [self._reduce(name, args[0], shapes[0], params["axes"], size)]
+        if name in _REDUCTIONS and kind != "bool":
+            keep = [k for k in range(len(shapes[0])) if k not in params["axes"]]
+            grid = np.arange(self.values[args[0]].size).reshape(shapes[0])
+            grid = grid.transpose(*keep, *params["axes"]).reshape(size, -1)
+            return [self._fold(_REDUCTIONS[name], kind, [self.take(args, row) for row in grid.T])]
         if name == "dot_general":
-            return [self._dot(args, shapes, params["dimension_numbers"])]
-        form = name if name == "integer_pow" else self._form(equation, args)
+            return [self._dot(kind, args, shapes, params["dimension_numbers"])]
+        if name == "integer_pow":
+            power = self.constant(np.full(1, float(params["y"])))
+            return [self.apply("pow", kind, *args, power)]
+        form = self._form(equation, args)
         for k, (number, shape) in enumerate(zip(args, shapes, strict=True)):
             if self.values[number].size not in (1, size):  # axes of size 1 stretch
                 grid = np.arange(self.values[number].size).reshape(shape)
                 args[k] = self.take([number], np.broadcast_to(grid, out.shape))
-        return [self.apply(form, kind, *args, power=int(params.get("y", 0)))]
+        return [self.apply(form, kind, *args)]
 
     def _form(self, equation: Any, args: list[int]) -> str:
         """The name in `ELEMENTWISE` of an operation on elements."""
@@ -333,35 +332,40 @@ class Builder:
                     f"{name!r} at places that its step computes"
                 )
             grids.append(data.reshape(shape))
-        made = _INDEXERS[name](grids, params, outs[0]) if name in _INDEXERS else None
-        if made is None:
+        if name in _INDEXERS:
+            made: Any = _INDEXERS[name](grids, params, outs[0])
+        else:
             made = equation.primitive.bind(*grids, **params)
         found = made if isinstance(made, list | tuple) else [made]
         sources = [args[k] for k in moved]
         return [self.take(sources, np.asarray(x)) for x in found]
 
-    def _reduce(
-        self, op: str, number: int, shape: tuple[int, ...], axes: Sequence[int], size: int
-    ) -> int:
-        """Over axes, which become the last."""
-        keep = [k for k in range(len(shape)) if k not in axes]
-        grid = np.arange(self.values[number].size).reshape(shape).transpose(*keep, *axes)
-        source = self.take([number], grid)
-        return self.add(Value(self.values[number].kind, size, op, (source,)))
+    def _fold(self, op: str, kind: str, terms: list[int]) -> int:
+        """Terms put together one after the other."""
+        op = f"{op}.int" if kind == "int" and f"{op}.int" in ELEMENTWISE else op
+        found = terms[0]
+        for term in terms[1:]:
+            found = self.apply(op, kind, found, term)
+        return found
 
-    def _dot(self, args: list[int], shapes: list[tuple[int, ...]], numbers: Any) -> int:
-        """A product of matrices, both brought into rows along the axes that are summed over."""
+    def _dot(self, kind: str, args: list[int], shapes: list[tuple[int, ...]], numbers: Any) -> int:
+        """A product of matrices, written out along the axes that are summed over."""
         contract, batch = numbers
-        rows, sizes = [], []
+        grids, frees = [], []
         for k in (0, 1):
             free = [n for n in range(len(shapes[k])) if n not in (*contract[k], *batch[k])]
             grid = np.arange(self.values[args[k]].size).reshape(shapes[k])
-            rows.append(self.take([args[k]], grid.transpose(*batch[k], *free, *contract[k])))
-            sizes.append(int(np.prod([shapes[k][n] for n in free])))
-        b = int(np.prod([shapes[0][n] for n in batch[0]]))
-        inner = int(np.prod([shapes[0][n] for n in contract[0]]))
-        shape = (b, *sizes, inner)
-        return self.add(Value("real", b * sizes[0] * sizes[1], "dot", tuple(rows), shape=shape))
+            grids.append(grid.transpose(*contract[k], *batch[k], *free))
+            frees.append([shapes[k][n] for n in free])
+        count = int(np.prod([shapes[0][n] for n in contract[0]]))
+        shape = [shapes[0][n] for n in batch[0]]
+        left = grids[0].reshape(count, *shape, *frees[0], *[1] * len(frees[1]))
+        right = grids[1].reshape(count, *shape, *[1] * len(frees[0]), *frees[1])
+        terms = []
+        for a, b in zip(*np.broadcast_arrays(left, right), strict=True):
+            pair = self.take([args[0]], a), self.take([args[1]], b)
+            terms.append(self.apply("mul", kind, *pair))
+        return self._fold("add", kind, terms)
 
 
 def _broadcast(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray:
@@ -369,10 +373,6 @@ def _broadcast(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray:
     for axis, size in zip(params["broadcast_dimensions"], grids[0].shape, strict=True):
         inner[axis] = size
     return np.broadcast_to(grids[0].reshape(inner), out)
-
-
-def _reshaped(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray | None:
-    return None if params.get("dimensions") and "new_sizes" in params else grids[0].reshape(out)
 
 
 def _sliced(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray:
@@ -386,11 +386,10 @@ def _sliced(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray:
     return found
 
 
-# The frequent ones by NumPy, as JAX would compile each; None: by JAX.
-_INDEXERS: dict[str, Callable[[Any, Any, tuple[int, ...]], np.ndarray | None]] = {
-    "reshape": _reshaped,
+# The frequent ones by NumPy, as JAX would compile each.
+_INDEXERS: dict[str, Callable[[Any, Any, tuple[int, ...]], np.ndarray]] = {
+    "reshape": lambda grids, params, out: grids[0].reshape(out),
     "squeeze": lambda grids, params, out: grids[0].reshape(out),
-    "expand_dims": lambda grids, params, out: grids[0].reshape(out),
     "slice": _sliced,
     "transpose": lambda grids, params, out: grids[0].transpose(params["permutation"]),
     "broadcast_in_dim": _broadcast,
@@ -449,3 +448,12 @@ def split_runs(index: Sequence[int]) -> list[tuple[int, int, int]]:
     places = np.asarray(index)
     cuts = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
     return [(a, int(places[a]), b - a) for a, b in pairwise(cuts)]
+
+
+def number_text(x: np.generic, nan: str, infinity: str) -> str:
+    """A number as C and Python read it, to the same bits; what they call what is not finite."""
+    if not isinstance(x, np.floating):
+        return str(x).lower() if infinity == "INFINITY" else str(x)
+    if not np.isfinite(x):
+        return nan if np.isnan(x) else infinity if x > 0 else f"-{infinity}"
+    return repr(float(x))

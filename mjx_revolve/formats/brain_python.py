@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_revolve.formats.brain import Brain, describe_brain
 from mjx_revolve.formats.brain_code import Code, array_text, is_bracketed
-from mjx_revolve.formats.brain_program import REDUCTIONS, Value, View, split_runs
+from mjx_revolve.formats.brain_program import Value, View, number_text
 
 # Takes of more runs than this are done by a table of places.
 _MOST_RUNS = 8
@@ -42,11 +42,8 @@ SENSORS = {sensors}
 class _PythonCode(Code):
     language = "numpy"
 
-    def power(self, base: str, exponent: int) -> str:
-        return f"({base} ** {exponent})"
-
     def literal(self, x: np.generic) -> str:
-        text = number_text(x)
+        text = _number(x)
         return text if not text.startswith("-") else f"({text})"
 
     def table_name(self, count: int) -> str:
@@ -78,34 +75,13 @@ class _PythonCode(Code):
         return f"v{number}"
 
     def store(self, number: int, value: Value) -> str:
-        names = [self.name_of(arg) for arg in value.args]
-        if value.op == "take":
-            return self.assign(number, value, self._taken(value, names))
-        if value.op == "dot":
-            b, m, n, k = value.shape
-            left, right = f"{names[0]}.reshape({b}, {m}, {k})", f"{names[1]}.reshape({b}, {n}, {k})"
-            return self.assign(
-                number, value, f"np.matmul({left}, {right}.swapaxes(1, 2)).reshape(-1)"
-            )
-        grid = f"{names[0]}.reshape({value.size}, -1)"
-        return self.assign(number, value, f"{grid}.{REDUCTIONS[value.op]}(axis=1)")
-
-    def _taken(self, value: Value, names: list[str]) -> str:
-        runs = split_runs(value.index)
-        sizes = [self.program.values[arg].size for arg in value.args]
-        ends = np.cumsum([0, *sizes]).tolist()
-        if len(runs) > _MOST_RUNS:
+        pieces = [self.at(*run[1:]) for run in self.pieces(value)]
+        text = pieces[0] if len(pieces) == 1 else f"np.concatenate([{', '.join(pieces)}])"
+        if len(pieces) > _MOST_RUNS:
+            names = [self.name_of(arg) for arg in value.args]
             whole = names[0] if len(names) == 1 else f"np.concatenate([{', '.join(names)}])"
-            return f"{whole}[{list(value.index)}]"
-        parts = []
-        for _, start, count in runs:
-            # A run may go on from one source into the next.
-            for name, low, high in zip(names, ends[:-1], ends[1:], strict=True):
-                first, last = max(start, low) - low, min(start + count, high) - low
-                if first < last:
-                    whole = first == 0 and last == high - low
-                    parts.append(name if whole else f"{name}[{first}:{last}]")
-        return parts[0] if len(parts) == 1 else f"np.concatenate([{', '.join(parts)}])"
+            text = f"{whole}[{list(value.index)}]"
+        return self.assign(number, value, text)
 
 
 def make_brain_python(brain: Brain) -> str:
@@ -132,12 +108,12 @@ def make_brain_python(brain: Brain) -> str:
     )
     for name, data in code.constants.items():
         dtype = _DTYPES[{"f": "real", "i": "int", "b": "bool"}[data.dtype.kind]]
-        text += wrapped(f"{name} = np.array({array_text(data, number_text)}, {dtype})") + "\n"
+        text += wrapped(f"{name} = np.array({array_text(data, _number)}, {dtype})") + "\n"
     start, states = [], [program.values[program.state[k]] for k in code.live_states]
     for k, value in zip(code.live_states, states, strict=True):
         data = program.initial[k]
-        filled = f"np.full({value.size}, {number_text(data[0])}, {_DTYPES[value.kind]})"
-        whole = f"np.array({array_text(data, number_text)}, {_DTYPES[value.kind]})"
+        filled = f"np.full({value.size}, {_number(data[0])}, {_DTYPES[value.kind]})"
+        whole = f"np.array({array_text(data, _number)}, {_DTYPES[value.kind]})"
         start.append(filled if (data == data[0]).all() else whole)
     labels = [value.label for value in states]
     inputs = [f"{s.name} = _read(sensors, {s.name!r})" for s in brain.signals]
@@ -150,7 +126,7 @@ def make_brain_python(brain: Brain) -> str:
     if states:
         after = [code.name_of(program.after[k]) for k in code.live_states]
         body.append(f"self.state = ({', '.join(after)},)")
-    body.append(f"return {code.name_of(program.commands)}")
+    body.append(f"return {code.name_of(program.commands)}.copy()")
     lines = "\n".join(wrapped(f"        {line}") for line in body)
     return text + _TAIL.format(start=", ".join([*start, ""]).strip(), body=lines)
 
@@ -159,7 +135,7 @@ _TAIL = '''
 
 def _read(sensors, name):
     """The numbers of a sensor."""
-    found = np.asarray(sensors[name], REAL).reshape(-1)
+    found = np.array(sensors[name], REAL).reshape(-1)
     if len(found) != SENSORS[name]:
         raise ValueError(f"sensors[{{name!r}}]: expected {{SENSORS[name]}}; found {{len(found)}}")
     return found
@@ -181,16 +157,8 @@ class Brain:
 '''
 
 
-def number_text(x: np.generic) -> str:
-    """A number as Python reads it, to the same bits."""
-    if isinstance(x, np.bool_):
-        return str(bool(x))
-    if isinstance(x, np.integer):
-        return str(int(x))
-    value = float(x)
-    if not np.isfinite(value):
-        return "np.nan" if value != value else "np.inf" if value > 0 else "-np.inf"
-    return repr(value)
+def _number(x: np.generic) -> str:
+    return number_text(x, "np.nan", "np.inf")
 
 
 def wrapped(line: str) -> str:

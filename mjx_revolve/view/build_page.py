@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.engine.plant import read_actuators
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.formats.links import Joint, make_links, make_meshes
+from mjx_revolve.formats.links import make_links, make_meshes
 from mjx_revolve.view.palette import ACCENT
 from mjx_revolve.view.pieces import Scene, make_pieces, place_pieces
 from mjx_revolve.view.raster import draw_scene, make_view
@@ -42,27 +41,6 @@ _STEEL = 7900.0
 # Below this distance centres of mass and volume are one [m]: a choice, what a builder can set.
 _ONE_POINT = 5e-4
 _AXES = ("x", "y", "z")
-
-
-@dataclass(frozen=True)
-class PartRow:
-    """A type of module in the list of parts.
-
-    Attributes:
-        name: of the type.
-        count: how many.
-        mass: of one [g].
-        volume: that one displaces [cm³].
-        parts: name of each of its parts, mass [g], volume [cm³], size [mm], and what it is.
-        modules: names of the modules.
-    """
-
-    name: str
-    count: int
-    mass: float
-    volume: float
-    parts: tuple[tuple[str, float, float, str, str], ...]
-    modules: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -107,7 +85,9 @@ def make_build_page(robot: Robot, title: str = "") -> str:
     return templates.get_template("build_page.html").render(
         name=body.name,
         title=title,
-        rows=list_parts(body),
+        kinds=list_parts(body),
+        describe=_describe,
+        degrees=math.degrees,
         balance=balance,
         words=ballast_words(balance),
         centers=[_numbers(x.round(1), 4) for x in (balance.mass_center, balance.lift_center)],
@@ -120,28 +100,16 @@ def make_build_page(robot: Robot, title: str = "") -> str:
     )
 
 
-def list_parts(body: Morphology) -> list[PartRow]:
-    """The types of modules; those with masses or volumes of their own count as types."""
-    kinds: dict[Any, list[Module]] = {}
+def list_parts(body: Morphology) -> list[list[Module]]:
+    """The modules by type; those with masses or volumes of their own count as types."""
+    kinds: dict[tuple[str, float, float], list[Module]] = {}
     for module in body.modules:
-        key = (module.type, round(module.kind.mass, 7), round(module.kind.volume, 10))
+        key = module.type, round(module.kind.mass, 7), round(module.kind.volume, 10)
         kinds.setdefault(key, []).append(module)
-    rows = []
-    for modules in kinds.values():
-        kind = modules[0].kind
-        parts = tuple(
-            (part.name, 1e3 * part.total_mass, 1e6 * part.total_volume,
-             " × ".join(f"{1e3 * x:.4g}" for x in part.boxes[0].size), _describe(kind, k, part))
-            for k, part in enumerate(kind.parts)
-        )  # fmt: skip
-        rows.append(
-            PartRow(kind.name, len(modules), 1e3 * kind.mass, 1e6 * kind.volume, parts,
-                    tuple(module.name for module in modules))
-        )  # fmt: skip
-    return rows
+    return [*kinds.values()]
 
 
-def _describe(kind: ModuleType, number: int, part: Part) -> str:
+def _describe(kind: ModuleType, part: Part) -> str:
     """What a part is, and what is in it besides what is printed."""
     words = []
     if part.thruster is not None:
@@ -149,7 +117,9 @@ def _describe(kind: ModuleType, number: int, part: Part) -> str:
     elif part.lift_drag is not None:
         words.append("fin")
     if kind.hinge is not None:
-        words.append("fixed to the parent" if number == 0 else "moves; the servo, to buy, is in it")
+        words.append(
+            "fixed to the parent" if part is kind.parts[0] else "moves; the servo, to buy, is in it"
+        )
     for volume, what, center in (
         (part.electronics_volume, "sealed volume", np.asarray(part.center_of_volume)),
         (part.ballast_volume, "ballast or float", np.asarray(part.ballast_position)),
@@ -236,53 +206,32 @@ def ballast_words(balance: Balance) -> list[str]:
 
 
 def joint_rows(robot: Robot) -> list[dict[str, Any]]:
-    """The hinges in the order of the controller's commands."""
-    body = robot.morphology
-    by_servo = {link.joint.ctrl: link.joint for link in make_links(robot) if link.joint is not None}
-    return [
-        _joint_row(number, by_servo[servo], body, body.modules[index])
-        for number, (servo, index) in enumerate(zip(robot.servos, body.hinges, strict=True))
-    ]
-
-
-def _joint_row(number: int, joint: Joint, body: Morphology, module: Module) -> dict[str, Any]:
-    hinge = module.kind.hinge
-    assert hinge is not None
-    axis = module.rotation @ np.asarray(hinge.axis)
-    ends = [np.asarray(slot.position) for slot in module.kind.slots.values()]
-    end = ends[0] if ends else np.asarray(module.kind.parts[-1].position)
-    motion = np.cross(axis, module.rotation @ (end - np.asarray(hinge.anchor)))
-    return {
-        "number": number,
-        "name": joint.name,
-        "module": module.name,
-        "parent": body.modules[module.parent].name,
-        "axis": _axis_words(axis),
-        "toward": _axis_words(motion / max(float(np.linalg.norm(motion)), 1e-12)),
-        "low": joint.range[0],
-        "high": joint.range[1],
-        "low_degrees": math.degrees(joint.range[0]),
-        "high_degrees": math.degrees(joint.range[1]),
-        "stiffness": joint.stiffness,
-        "damping": joint.damping,
-        "effort": joint.effort,
-        "speed": joint.speed,
-    }
+    """The hinges in the order of the controller's commands, and how they turn."""
+    body, rows = robot.morphology, []
+    joints = {link.joint.ctrl: link.joint for link in make_links(robot) if link.joint is not None}
+    for servo, index in zip(robot.servos, body.hinges, strict=True):
+        module, hinge = body.modules[index], body.modules[index].kind.hinge
+        assert hinge is not None
+        axis = module.rotation @ np.asarray(hinge.axis)
+        ends = [slot.position for slot in module.kind.slots.values()]
+        ends.append(module.kind.parts[-1].position)
+        motion = np.cross(axis, module.rotation @ np.subtract(ends[0], hinge.anchor))
+        toward = _axis_words(motion / max(float(np.linalg.norm(motion)), 1e-12))
+        parent = body.modules[module.parent].name
+        rows.append(
+            {"joint": joints[servo], "parent": parent, "axis": _axis_words(axis), "toward": toward}
+        )
+    return rows
 
 
 def _thruster_rows(robot: Robot) -> list[dict[str, Any]]:
     """The thrusters, behind the hinges in the order of the controller's commands."""
-    body = robot.morphology
-    low, high, place, axis = read_actuators([body])
-    rows = []
-    for k, (index, _) in enumerate(body.thrusters, robot.num_hinges):
-        name = robot.mj_model.actuator(robot.thrusters[k - robot.num_hinges]).name
-        rows.append(
-            {"number": k, "name": name, "module": body.modules[index].name,
-             "axis": _axis_words(axis[k]), "low": low[k], "high": high[k],
-             "place": _numbers(1e3 * place[k], 4)}
-        )  # fmt: skip
-    return rows
+    low, high, place, axis = (x[robot.num_hinges :] for x in read_actuators([robot.morphology]))
+    return [
+        {"name": robot.mj_model.actuator(jet).name, "axis": _axis_words(axis[k]), "low": low[k],
+         "high": high[k], "place": _numbers(1e3 * place[k], 4)}
+        for k, jet in enumerate(robot.thrusters)
+    ]  # fmt: skip
 
 
 def _steps(body: Morphology) -> list[dict[str, str]]:
@@ -292,9 +241,7 @@ def _steps(body: Morphology) -> list[dict[str, str]]:
     whole = place_pieces(pieces, lambda piece: frames[piece.module])
     owner = np.array([piece.module for piece in pieces])[whole.part]
     marks = np.array([piece.mark for piece in pieces])[whole.part]
-    counts: Counter[str] = Counter()
     for k, module in enumerate(body.modules):
-        counts[module.type] += 1
         there = owner <= k
         new = ((owner == k) & ~marks)[there, None]
         own, old = whole.color[there], (owner < k)[there, None]
