@@ -210,7 +210,7 @@ def _lower(
         num_hinges=plant.num_hinges,
         low=tuple(low.tolist()),
         high=tuple(high.tolist()),
-        rate=1 / plant.timestep,
+        rate=plant.rate or 1 / plant.timestep,
         sensors=sensors,
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_revolve.formats.brain import Brain, describe_brain
 from mjx_revolve.formats.brain_code import Code, array_text, is_bracketed
-from mjx_revolve.formats.brain_program import Value, View, number_text
+from mjx_revolve.formats.brain_program import Value, View, kind_of, number_text
 
 _TYPES = {"real": "brain_real", "int": "int32_t", "bool": "bool"}
 
@@ -52,10 +52,11 @@ class _CCode(Code):
 
     def assign(self, number: int, value: Value, text: str) -> str:
         text = text[1:-1] if is_bracketed(text) else text
-        self._write_loop(f"v{number}", value.size, text)
+        self.write_loop(f"v{number}", value.size, text)
         return f"v{number}"
 
-    def _write_loop(self, name: str, size: int, text: str, first: int = 0) -> None:
+    def write_loop(self, name: str, size: int, text: str, first: int = 0) -> None:
+        """Writes an expression, in which `i` counts, into a part of an array."""
         if size == 1:
             text = re.sub(r"\bi\b", "0", text)
             self.lines.append(f"{name}[{first}] = {text};")
@@ -65,7 +66,7 @@ class _CCode(Code):
 
     def store(self, number: int, value: Value) -> str:
         for place, source, view, size, whole in self.pieces(value):
-            self._write_loop(f"v{number}", size, self.at(source, view, size, whole), place)
+            self.write_loop(f"v{number}", size, self.at(source, view, size, whole), place)
         return f"v{number}"
 
 
@@ -103,9 +104,10 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
             name = f"v{after}"
         copies.append((value, code.at(name, View(0), value.size, value.size)))
     for value, text in copies:
-        code._write_loop(f"state->{value.label}", value.size, text)
-    result = code.at(code.name_of(program.commands), View(0), len(brain.commands), 2)
-    code._write_loop("commands", len(brain.commands), result)
+        code.write_loop(f"state->{value.label}", value.size, text)
+    count = len(brain.commands)
+    result = code.at(code.name_of(program.commands), View(0), count, count)
+    code.write_loop("commands", count, result)
     lines, buffers = share_buffers(code.lines, program.values)
     start = _CCode(program)
     for k, value in zip(code.live_states, states, strict=True):
@@ -114,9 +116,9 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
         if not (data == data[0]).all():
             text = f"s{k}[i]"
             code.constants[f"s{k}"] = data
-        start._write_loop(f"state->{value.label}", value.size, text)
+        start.write_loop(f"state->{value.label}", value.size, text)
     tables = [
-        f"static const {_TYPES[{'f': 'real', 'i': 'int', 'b': 'bool'}[data.dtype.kind]]} "
+        f"static const {_TYPES[kind_of(data.dtype)]} "
         f"{name}[{data.size}] = {{{array_text(data, _number)[1:-1]}}};"
         for name, data in code.constants.items()
     ]

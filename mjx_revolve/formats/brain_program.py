@@ -201,11 +201,9 @@ class Builder:
         parts = []  # of (value, element), what is itself taken looked through
         for number in args:
             value = self.values[number]
-            places = range(value.size)
-            if value.op == "take":
-                parts += [self._find(value, k) for k in value.index]
-            else:
-                parts += [(number, k) for k in places]
+            own = [(number, k) for k in range(value.size)]
+            is_take = value.op == "take"
+            parts += [self._find(value, k) for k in value.index] if is_take else own
         chosen = [parts[k] for k in np.asarray(index).reshape(-1).tolist()]
         sources = tuple(dict.fromkeys(number for number, _ in chosen))
         if len(sources) == 1 and [k for _, k in chosen] == [*range(self.values[sources[0]].size)]:
@@ -258,14 +256,14 @@ class Builder:
             return self.run(inner, args)
         if name in _SAME:
             return args
-        shapes = [atom.aval.shape for atom in equation.invars]
-        if name in _MOVES:
-            return self._move(equation, args, shapes)
         if -1 in args:
             raise InputError(
                 "controller: expected a step without the simulation's sensor noise, as devices "
                 "have their own; found one that reads its seed"
             )
+        shapes = [atom.aval.shape for atom in equation.invars]
+        if name in _MOVES:
+            return self._move(equation, args, shapes)
         known = [self.values[number].data for number in args]
         if all(x is not None for x in known):
             arrays = [np.asarray(x).reshape(shape) for x, shape in zip(known, shapes, strict=True)]
@@ -280,10 +278,12 @@ class Builder:
             return [self._fold(_REDUCTIONS[name], kind, [self.take(args, row) for row in grid.T])]
         if name == "dot_general":
             return [self._dot(kind, args, shapes, params["dimension_numbers"])]
-        if name == "integer_pow":
+        if name == "integer_pow" and kind == "real":
             power = self.constant(np.full(1, float(params["y"])))
             return [self.apply("pow", kind, *args, power)]
         form = self._form(equation, args)
+        if form == f"to {self.values[args[0]].kind}":
+            return args
         for k, (number, shape) in enumerate(zip(args, shapes, strict=True)):
             if self.values[number].size not in (1, size):  # axes of size 1 stretch
                 grid = np.arange(self.values[number].size).reshape(shape)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_revolve.formats.brain import Brain, describe_brain
 from mjx_revolve.formats.brain_code import Code, array_text, is_bracketed
-from mjx_revolve.formats.brain_program import Value, View, number_text
+from mjx_revolve.formats.brain_program import Value, View, kind_of, number_text
 
 # Takes of more runs than this are done by a table of places.
 _MOST_RUNS = 8
@@ -107,7 +107,7 @@ def make_brain_python(brain: Brain) -> str:
         sensors=wrapped(repr({signal.name: signal.size for signal in brain.signals})),
     )
     for name, data in code.constants.items():
-        dtype = _DTYPES[{"f": "real", "i": "int", "b": "bool"}[data.dtype.kind]]
+        dtype = _DTYPES[kind_of(data.dtype)]
         text += wrapped(f"{name} = np.array({array_text(data, _number)}, {dtype})") + "\n"
     start, states = [], [program.values[program.state[k]] for k in code.live_states]
     for k, value in zip(code.live_states, states, strict=True):
@@ -121,7 +121,7 @@ def make_brain_python(brain: Brain) -> str:
         inputs.insert(0, "time = np.asarray(time, REAL).reshape(1)")
     body = [*inputs]
     if states:
-        body.append(f"{', '.join(labels)}, = self.state")
+        body.append(f"({', '.join(labels)},) = self.state")
     body += code.lines
     if states:
         after = [code.name_of(program.after[k]) for k in code.live_states]

@@ -236,12 +236,14 @@ KINDS = [*CONTROLLERS, "mine.py:matrix"]
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_episode_with_sensors_gives_the_same_commands(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    fitness = make_fitness(config(tmp_path, kind, **({"harmonics": 2} if kind == "sine" else {})))
+    # Older runs have no rate: a command at each of the world's steps.
+    more = {"sine": {"harmonics": 2}, "feedback": {"rate": None}}.get(kind, {})
+    fitness = make_fitness(config(tmp_path, kind, **more))
     genes = genes_of(fitness)
     readings, ctrl = record(fitness, genes)
     brain = champion_brain(fitness, genes)
-    assert brain.rate == pytest.approx(20.0)
-    assert [len(brain.commands), len(ctrl)] == [3, 30]
+    assert brain.rate == (20.0 if "rate" not in more else pytest.approx(200.0))
+    assert ctrl.shape == (1.5 * brain.rate, len(brain.commands)) and len(brain.commands) == 3
     assert np.ptp(ctrl, axis=0).max() > 0.05
     given = [as_given(brain, row) for row in readings]
     expected = clipped(brain, ctrl)
@@ -339,6 +341,25 @@ def test_c_agrees_with_python(tmp_path):
     np.testing.assert_allclose(found, run_python(make_brain_python(brain), brain, given), rtol=1e-6)
 
 
+def test_a_state_of_many_arrays(spider):
+    """Lines of Python that are broken are still Python."""
+
+    def step(parameters, state, time, sense):
+        return [*state[1:], sense.angle + state[0]], jnp.tanh(sum(state))
+
+    begin = [jnp.full((8, 1), 1e-4 * k) for k in range(40)]
+    controller = Controller(0, (), lambda genes, plant: (), lambda parameters: begin, step)
+    brain = make_brain(spider, controller, np.zeros(0), 20.0)
+    given, state, expected = [{"angle": np.full(8, 0.1 * k)} for k in range(4)], [*begin], []
+    for row in given:
+        felt = readings_at_rest(plant_of(spider), 1, ())._replace(angle=row["angle"][:, None])
+        state, command = step((), state, 0.0, felt)
+        expected.append(command[:, 0])
+    found = run_python(make_brain_python(brain), brain, given)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert np.ptp(found[:, 0]) > 0.1
+
+
 @needs_cc
 def test_whole_numbers_and_truth_values(tmp_path, spider):
     """A state of all kinds, and shifting from one place of it into the next."""
@@ -389,6 +410,8 @@ def test_names_and_limits_are_those_of_the_robot():
         (lambda p, s, t, x: (s, jnp.sort(x.angle, axis=0)), "found JAX's 'sort' in its step"),
         (lambda p, s, t, x: (s, x.angle[(10 * t).astype(int) % 2] + x.angle), "constant places"),
         (lambda p, s, t, x: (s, x.angle + x.noise.astype(float)), "the simulation's sensor noise"),
+        (lambda p, s, t, x: (s, x.angle + x.noise[0]), "the simulation's sensor noise"),
+        (lambda p, s, t, x: (s, x.angle * x.angle.astype(int) ** 3), "found JAX's 'integer_pow'"),
     ],
 )
 def test_what_a_file_cannot_hold_is_refused(step, message, spider):
