@@ -2,16 +2,18 @@
 
 ``python -m mjx_revolve.export runs/mine``
 
-Writes the robot as MJCF for stock MuJoCo, as URDF for ROS, as an SDF world for Gazebo, and what it
-did as a ROS 2 bag (MCAP).
+Writes the robot as MJCF for stock MuJoCo, as URDF for ROS, as an SDF world for Gazebo, what it
+did as a ROS 2 bag (MCAP), its controller as Python and C, and a page on how to build it.
 """
 
 from __future__ import annotations
 
 import argparse
+import keyword
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mjx_revolve.inputs.commands import (
     Parser,
@@ -25,9 +27,13 @@ from mjx_revolve.inputs.commands import (
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import check_name, short_path
+from mjx_revolve.inputs.files import PAGES, check_name, short_path, write_atomic
 from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.numerics import runtime
+
+if TYPE_CHECKING:
+    from mjx_revolve.episodes.champion import Episode
+    from mjx_revolve.formats.brain import Brain
 
 # By option: what its file is called in a folder, what it may end in, and what it is.
 _FORMATS = {
@@ -35,14 +41,19 @@ _FORMATS = {
     "urdf": ("robot.urdf", (".urdf",), "for ROS"),
     "sdf": ("robot.sdf", (".sdf", ".world"), "a world for Gazebo, with the water"),
     "mcap": ("rollout.mcap", (".mcap",), "the rollout, as a ROS 2 bag"),
-}
+    "controller": (
+        "brain.py", (".py",),
+        "the controller with its genes in Python, in C99 and as a ROS 2 node beside it",
+    ),
+    "build": ("build.html", PAGES, "how to build it: parts, ballast, assembly, joints, STL"),
+}  # fmt: skip
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog=program("export"),
-        description="Write a champion, or a morphology, for MuJoCo, ROS and Gazebo: all formats "
-        "into a folder, or those that are given a file.",
+        description="Write a champion, or a morphology, for MuJoCo, ROS, Gazebo and the bench: all "
+        "formats into a folder, or those that are given a file.",
     )
     add_episode_arguments(parser)
     for name, (_, endings, words) in _FORMATS.items():
@@ -77,6 +88,8 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
         label = f"--{name} {getattr(arguments, name)}"
         files[name] = check_name(getattr(arguments, name), endings, label)
         check_place(files[name], label)
+        if name == "controller":
+            _check_importable(files[name], label)
         if not files[name].parent.is_dir():
             raise InputError(f"{label}: expected the folder {files[name].parent}; found none")
     if arguments.out is None:
@@ -88,6 +101,15 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
         raise InputError(f"--out {folder}: expected a folder; found a file")
     check_place(folder / "any", f"--out {folder}")
     return _all_files(folder)
+
+
+def _check_importable(path: Path, label: str) -> None:
+    """Refuses a file that the node beside it could not import."""
+    if not path.stem.isidentifier() or keyword.iskeyword(path.stem):
+        raise InputError(
+            f"{label}: expected a name that Python can import (letters, digits and _); found "
+            f"{path.stem!r}"
+        )
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -110,6 +132,7 @@ def main(argv: list[str] | None = None) -> int:
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.formats.export import export_robot
+    from mjx_revolve.view.build_page import make_build_page
 
     if arguments.mcap is not None:
         check_package("--mcap", "rosbags")
@@ -122,18 +145,42 @@ def main(argv: list[str] | None = None) -> int:
             folder = Path(f"{Path(episode.robot.morphology.name).name}_export")
             check_absent(folder, "folder")
         files = _all_files(folder)
-    lacking = None
-    if arguments.mcap is None and "mcap" in files:
-        try:
+    brain, lacking = None, []
+    try:
+        brain = _brain_of(episode) if "controller" in files else None
+    except InputError as error:
+        if arguments.controller is not None:
+            raise
+        lacking.append(f"no controller: {error}")
+        del files["controller"]
+    try:
+        if "mcap" in files:
             check_package("--mcap", "rosbags")
-        except InputError as error:  # the other formats do not need it
-            lacking = error
-            del files["mcap"]
-    for path, words in export_robot(episode.robot, files, episode.trajectory, arguments.meshes):
+    except InputError as error:
+        if arguments.mcap is not None:
+            raise
+        lacking.append(f"no bag: {error}")
+        del files["mcap"]
+    done = export_robot(episode.robot, files, episode.trajectory, arguments.meshes, brain)
+    if "build" in files:
+        write_atomic(files["build"], make_build_page(episode.robot, episode.title).encode())
+        done.append((files["build"], "how to build it; for browsers and printers"))
+    for path, words in done:
         print(plain(f"{short_path(path)}: {words}"))
-    if lacking is not None:
-        print(f"no bag: {lacking}", file=sys.stderr)
+    for reason in lacking:  # the other formats do not need it
+        print(reason, file=sys.stderr)
     return 0
+
+
+def _brain_of(episode: Episode) -> Brain:
+    """The brain of an episode."""
+    from mjx_revolve.formats.brain import champion_brain
+
+    if episode.fitness is None or episode.genes is None:
+        raise InputError(
+            "--controller: expected a champion; found a morphology, which has no genes"
+        )
+    return champion_brain(episode.fitness, episode.genes)
 
 
 if __name__ == "__main__":

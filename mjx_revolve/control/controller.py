@@ -52,6 +52,7 @@ class _Controller(NamedTuple):
     genes: tuple[Gene, ...] = ()
     signals: tuple[str, ...] = ()
     observer: Observer | None = None
+    rate: float | None = None
 
 
 class Controller(_Controller):
@@ -69,6 +70,8 @@ class Controller(_Controller):
             from one body to another.
         signals: which of `OPTIONAL_SIGNALS`, and which modules, it reads.
         observer: of the declared sensors; None without.
+        rate: of its commands, which it holds in between (see `rate.hold_commands`) [Hz]; None: a
+            new one at every step.
     """
 
     __slots__ = ()
@@ -174,6 +177,20 @@ def make_controller(
         return f"{gene.what} {names[gene.number + shift]}"
 
     return Controller(len(genes), tuple(map(name, genes)), decode, init, step, tuple(genes))
+
+
+def lag_share(plant: Plant, constant: Any) -> Any:
+    """Share of the way that a lag of first order goes from one command to the next.
+
+    Exact for an input that is held; without a rate, as in runs of older versions, Euler's step.
+
+    Args:
+        plant: that the controller is made for.
+        constant: the lag's time constant [s].
+    """
+    if plant.rate is None:
+        return jnp.minimum(plant.timestep / constant, 1)
+    return -jnp.expm1(-plant.timestep / constant)
 
 
 def fade_in(time: jax.Array) -> jax.Array:

@@ -53,7 +53,7 @@ def describe_gait(plant: Plant, settings: Any, genes: Any) -> dict[str, float]:
     still = dict.fromkeys(UNITS, 0.0)
     if not plant.num_hinges:
         return still
-    controller = find_controller(plant, settings)
+    controller = find_controller(plant, settings.model_copy(update={"rate": None}))
     parameters = controller.decode(jnp.asarray(genes, float)[:, None], plant)
     rate, amplitude, phase = _WAVES[settings.type](parameters, plant.num_hinge_rows)
     moves = (amplitude > 1e-9) & (rate > 1e-9)
@@ -78,7 +78,7 @@ def _sine_waves(parameters: Any, hinges: int) -> _Waves:
 
 def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
     """As `_sine_waves`, of the greatest sine of each oscillator."""
-    w, coupling, reach, _, _ = parameters
+    w, coupling, reach, *_ = parameters
     matrix = np.zeros((2 * hinges, 2 * hinges))
     for j, column in coupling.items():
         matrix[:hinges, j] = np.asarray(column, float)[:, 0]

@@ -21,6 +21,7 @@ from mjx_revolve.control.controller import (
     StepOutput,
     as_plant,
     fade_in,
+    lag_share,
     make_controller,
 )
 from mjx_revolve.control.neighbours import apply_matrix, neighbour_mean
@@ -96,7 +97,6 @@ def make_joint_network(
     names += ["frequency", *(f"phase {x}" for x in _PLACE[1:5])]
     names += [f"{h}>thrust" for h in units] if made_for.num_thrusters else []
     genes = [Gene(name, "robot") for name in names]
-    dt = made_for.timestep
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
         folded, lanes, start = jnp.sin(genes), genes.shape[1:], 0
@@ -116,7 +116,7 @@ def make_joint_network(
             # From the slowest to the fastest in equal ratios, 0.14 s for a gene of 0.
             share = (1 + take(hidden)) / 2
             tau = _SLOWEST * jnp.exp(share * np.log(_FASTEST / _SLOWEST))
-            pace = jnp.minimum(dt / tau, 1)[:, None]
+            pace = lag_share(made_for, tau)[:, None]
         rate = 2 * np.pi * max_frequency * (1 + take(1)) / 2
         phase = np.pi * take(4)
         target = out[:, :1]
@@ -182,7 +182,7 @@ def make_joint_network(
         else:
             h = jnp.tanh(activity)
         command = sum(target[k] * h[k] for k in range(hidden))
-        share = min(dt / _MESSAGE_LAG, 1.0)
+        share = lag_share(made_for, _MESSAGE_LAG)
         fresh = [sum(message[k, m] * h[k][:rows] for k in range(hidden)) for m in range(len(sent))]
         sent = tuple(old + share * (new - old) for old, new in zip(sent, fresh, strict=True))
         return (samples, sent, memory), middle + fade_in(time) * reach * jnp.tanh(command)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.neurons import make_neural_network
+from mjx_revolve.control.rate import hold_commands
 from mjx_revolve.control.readings import (
     OPTIONAL_SIGNALS,
     SensorReadings,
@@ -42,7 +43,8 @@ def find_controller(
         plant: of the actuators.
         settings: a `ControllerConfig`. Its `type` is a name in `CONTROLLERS`, or FILE.py:FUNCTION
             for a user's function, which takes the plant and these settings and returns a
-            `Controller`.
+            `Controller`. With a `rate` its commands are held (`rate.hold_commands`), and the plant
+            that it is made for has the time between them for `timestep`.
         source: the configuration, in messages.
         example: a plant with its tables, to try a user's controller on; by default `plant`.
         body: of the plant, for `type: brain`; None for many bodies.
@@ -50,6 +52,17 @@ def find_controller(
     Raises:
         InputError: the file or the function is missing, or it makes no controller of this plant.
     """
+    if settings.rate is not None:
+        paced = plant.at_rate(settings.rate)
+        shown = None if example is None else example.at_rate(settings.rate)
+        return hold_commands(_find(paced, settings, source, shown, body), paced)
+    return _find(plant, settings, source, example, body)
+
+
+def _find(
+    plant: Plant, settings: Any, source: str, example: Plant | None, body: Morphology | None
+) -> Controller:
+    """The controller, which acts whenever it is called."""
     name = settings.type
     if name == "brain":
         return _make_brain(plant, settings, source, body)

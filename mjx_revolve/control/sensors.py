@@ -35,7 +35,7 @@ _DUE = 0.01
 _LONGEST = 256
 
 
-def count_samples(time: jax.Array, rate: float) -> jax.Array:
+def count_samples(time: Any, rate: float) -> jax.Array:
     """The number of samples after the first that are due, a whole number in the type of `time`.
 
     Args:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from mjx_revolve.control.controller import (
     GeneBlocks,
     StepOutput,
     as_plant,
+    lag_share,
     make_controller,
 )
 from mjx_revolve.control.neighbours import apply_matrix, pair_matrix
@@ -23,10 +25,13 @@ from mjx_revolve.control.sensors import make_observer
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import sincos
+from mjx_revolve.numerics.xla import materialize
 
-# How fast amplitudes and offsets follow [1/s], and how strongly neighbours pull [rad/s]: choices,
-# a fifth of a second, and a phase lag that is found within a stroke.
-_FOLLOW, _PULL = 5.0, 10.0
+# Time in which amplitudes and offsets follow [s], and how strongly neighbours pull [rad/s]:
+# choices, a fifth of a second, and a phase lag that is found within a stroke.
+_FOLLOW, _PULL = 0.2, 10.0
+# The longest step of the phases [s]: a joint with ten neighbours settles without overshoot.
+_PHASE_STEP = 0.0125
 
 
 def make_sensory_cpg(
@@ -74,7 +79,10 @@ def make_sensory_cpg(
         ("frequency", "robot"),
         *((what, "actuator") for what in ("offset", *on_offset)),
     )
-    dt, few = made_for.timestep, len(robot)
+    few = len(robot)
+    # The phases' steps between two commands; one without a rate, as of old.
+    count = 1 if made_for.rate is None else math.ceil(made_for.timestep / _PHASE_STEP - 1e-6)
+    dt = made_for.timestep / count
 
     def decode(genes: jax.Array, plant: Plant) -> Any:
         values = blocks.split(jnp.sin(genes), plant)
@@ -105,7 +113,7 @@ def make_sensory_cpg(
             terms = [w * x for w, x in zip(weights, inputs, strict=True)]
             return gain * sum(terms) if terms else 0.0
 
-        follow = min(_FOLLOW * dt, 1.0)
+        follow = lag_share(made_for, _FOLLOW)
         aim = bias + respond(on_offset, inputs[:few])
         if not oscillators:
             offset = offset + follow * (jnp.clip(aim, -1, 1) - offset)
@@ -114,21 +122,25 @@ def make_sensory_cpg(
         rows = phase.shape[0]
         speed = rate + 2 * np.pi * max_frequency * respond(on_phase, inputs)
         sine, cosine = sincos(phase)
-        # sin(θ_j - φ - θ_i), the difference taken apart, so that each phase has one sine.
         along, across = near
-        up = apply_matrix(along, sine) - apply_matrix(across, cosine)
-        level = apply_matrix(along, cosine) + apply_matrix(across, sine)
-        speed = speed + _PULL * (cosine * up - sine * level)
+        begun = sine
+        for k in range(count):
+            if k:
+                sine, cosine = map(materialize, sincos(phase))
+            # sin(θ_j - φ - θ_i), the difference taken apart, so that each phase has one sine.
+            up = apply_matrix(along, sine) - apply_matrix(across, cosine)
+            level = apply_matrix(along, cosine) + apply_matrix(across, sine)
+            phase = phase + dt * (speed + _PULL * (cosine * up - sine * level))
         if on_bend:
             more = aim[:rows] + respond(on_bend, inputs[few:])
             aim = more if rows == aim.shape[0] else jnp.concatenate([more, aim[rows:]])
         size_aim = jnp.clip(size + respond(on_size, inputs), -1, 1)
         swing = swing + follow * (size_aim - swing)
         offset = offset + follow * (jnp.clip(aim, -1, 1) - offset)
-        wave = offset[:rows] + swing * sine
+        wave = offset[:rows] + swing * begun
         command = wave if rows == offset.shape[0] else jnp.concatenate([wave, offset[rows:]])
         target = middle + reach * jnp.clip(command, -1, 1)
-        return (samples, (phase + dt * speed, swing), offset), target
+        return (samples, (phase, swing), offset), target
 
     found = make_controller(made_for, blocks.genes, decode, init, step)
     return found._replace(signals=observer.signals, observer=observer)

@@ -7,7 +7,7 @@ have the population on the last axis: so a controller or a task is written once 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -106,7 +106,7 @@ def _mean(place: np.ndarray, weight: np.ndarray, owner: np.ndarray, count: int) 
     jax.tree_util.register_dataclass,
     data_fields=["low", "high", "place", "axis", "source", "first", "second", "mounts"],
     meta_fields=[
-        "num_hinges", "num_thrusters", "num_pairs", "names", "pairs", "timestep", "modules",
+        "num_hinges", "num_thrusters", "num_pairs", "names", "pairs", "timestep", "modules", "rate",
     ],
 )  # fmt: skip
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Plant:
         num_pairs: how many pairs of hinges share a rigid body.
         names: `[num_hinges + num_thrusters]` of the actuators, the robot's order.
         pairs: `[num_pairs]` names of the pairs.
-        timestep: of the world [s].
+        timestep: between calls of a controller [s]: the world's, or one over `rate`.
         low: `[n, lanes]` least command of each row: hinges [rad], thrusters [-].
         high: `[n, lanes]` greatest.
         place: `[n, 3, lanes]` of hinges and thrusters at rest, core frame [m].
@@ -133,6 +133,7 @@ class Plant:
         second: `[num_pairs, lanes]` of the later one.
         mounts: places of sensors on types of modules, where some are asked for and robots differ.
         modules: places of all modules of one robot; None where robots differ.
+        rate: of commands, held in between [Hz]; None: one for each of the world's steps.
     """
 
     num_hinges: int
@@ -150,6 +151,15 @@ class Plant:
     second: Any = None
     mounts: Any = field(default_factory=dict)
     modules: ModuleSites | None = None
+    rate: float | None = None
+
+    def at_rate(self, rate: float) -> Plant:
+        """The same for a controller that gives so many commands a second [Hz].
+
+        The world's steps are the most that there are.
+        """
+        rate = min(rate, 1 / self.timestep)
+        return replace(self, rate=rate, timestep=1 / rate)
 
     def site(self, place: str) -> Sites:
         """Where sensors sit.

@@ -113,8 +113,11 @@ class ControllerConfig(Section):
     type: Annotated[str, one_of(CONTROLLERS), File("code")] = "cpg"
     """`cpg`, `sine`, `feedback`, `mlp`, `rnn`, `sensory_cpg`, `splines`, `brain` (what the
     robot's YAML has under `brain`), or FILE.py:FUNCTION, a function of a plant and this section."""
+    rate: Annotated[Positive, Le(1000), Unit("Hz")] | None = 20.0
+    """Commands in a second, held in between, as servos and Revolve have them; null: a new one at
+    each of the world's steps, as in runs of versions that had no rate [Hz]."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
-    """The fastest oscillation [Hz]."""
+    """The fastest oscillation, half of `rate` at most [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0
     """Of each sine at most, as a fraction of the hinge's range, which clips their sum [-]."""
     harmonics: Annotated[Integer, Ge(1), Le(8)] = 1
@@ -532,7 +535,19 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
+        data = with_older_values(data)
     return make_config(data, path.parent, overrides, short_path(path))
+
+
+def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A run folder's settings with the values that older versions had where they lack a setting.
+
+    Their controllers had no rate, and gave a command at every step.
+    """
+    found, controller = dict(data), data.get("controller")
+    if isinstance(controller, Mapping):
+        found["controller"] = {"rate": None} | dict(controller)
+    return found
 
 
 def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:

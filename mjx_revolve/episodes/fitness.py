@@ -31,7 +31,13 @@ from mjx_revolve.engine.batch import Capacity, PackedBodies, fit_capacity, pack_
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import Engine, make_engine
 from mjx_revolve.engine.kinematics import body_poses
-from mjx_revolve.engine.plant import BodyGeometry, Plant, actuators_of, body_geometry
+from mjx_revolve.engine.plant import (
+    BodyGeometry,
+    Plant,
+    actuators_of,
+    body_geometry,
+    plant_of,
+)
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.variation import Variation
@@ -111,6 +117,22 @@ class Fitness(EpisodeSpec):
         found: tuple[jax.Array, dict[str, jax.Array]]
         found = self.program(population, key)((), population, key)
         return found
+
+    def bare_controller(self) -> Controller:
+        """The controller as a device runs it: called at its rate, with exact sensors.
+
+        It acts whenever it is called, and holds nothing; what it is given has the noise, the rate
+        and the delay of real sensors. Its genes are those of `controller`.
+        """
+        rate, plant = self.controller.rate, plant_of(self.robot)
+        body = self.robot.morphology
+        settings = _listening(self.config, read_modules(self.config), body)
+        exact = [replace(s, noise=0.0, rate=None, delay=0.0) for s in settings.sensors or ()]
+        sensors = None if settings.sensors is None else tuple(exact)
+        settings = settings.model_copy(update={"rate": None, "sensors": sensors})
+        if rate is not None:
+            plant = plant.at_rate(rate)
+        return _find_controller(self.config, settings, plant, body)
 
     def replay(self, genes: Any, key: jax.Array, trial: int = 0) -> Trajectory:
         """One episode of one individual, in full.

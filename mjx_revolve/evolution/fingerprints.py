@@ -70,6 +70,8 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     del data["morphology"], data["modules"]
     data["world"]["name"] = Path(data["world"]["name"]).name
     data = map_files(data, by_content, Config)
+    if data["controller"]["rate"] is None:  # as in older runs, which have none
+        del data["controller"]["rate"]
     for section in ("controller", "task"):
         if not data[section]["params"]:  # older runs have none
             del data[section]["params"]

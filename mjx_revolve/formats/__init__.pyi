@@ -1,3 +1,9 @@
+from .brain import Brain as Brain
+from .brain import champion_brain as champion_brain
+from .brain import make_brain as make_brain
+from .brain_c import make_brain_c as make_brain_c
+from .brain_python import make_brain_python as make_brain_python
+from .brain_ros import make_brain_node as make_brain_node
 from .export import export_robot as export_robot
 from .links import Joint as Joint
 from .links import Link as Link

@@ -10,6 +10,10 @@ import numpy as np
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.simulate import Trajectory
+from mjx_revolve.formats.brain import Brain
+from mjx_revolve.formats.brain_c import make_brain_c
+from mjx_revolve.formats.brain_python import make_brain_python
+from mjx_revolve.formats.brain_ros import make_brain_node
 from mjx_revolve.formats.links import make_links, make_meshes
 from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.formats.ros_bag import pick_rows, write_bag
@@ -27,6 +31,7 @@ def export_robot(
     files: dict[str, Path],
     trajectory: Trajectory | None = None,
     meshes: str | None = None,
+    brain: Brain | None = None,
 ) -> list[tuple[Path, str]]:
     """Writes a robot, and what it did, for other programs.
 
@@ -34,17 +39,19 @@ def export_robot(
 
     Args:
         robot: from `build_robot`.
-        files: by format ("mjcf", "urdf", "sdf", "mcap"), where each goes. URDF and SDF have their
-            meshes in a folder `meshes` beside them.
+        files: by format ("mjcf", "urdf", "sdf", "mcap", "controller"), where each goes. URDF and
+            SDF have their meshes in a folder `meshes` beside them, "controller", a Python file,
+            its C and its ROS 2 node.
         trajectory: what it did; MJCF and SDF start where it starts, and "mcap" cannot do without.
         meshes: what URDF and SDF call that folder; by default `meshes/`, as seen from the file.
+        brain: from `champion_brain`; "controller" cannot do without.
 
     Returns:
         The files, and what each is, in words.
 
     Raises:
-        InputError: there is no trajectory for a bag, nothing of it is finite, or the package that
-            writes bags is missing.
+        InputError: there is no trajectory for a bag, nothing of it is finite, the package that
+            writes bags is missing, or there is no brain for a controller.
         OSError: a file cannot be written.
     """
     done: list[tuple[Path, str]] = []
@@ -75,4 +82,24 @@ def export_robot(
         rows, stamps = pick_rows(robot, trajectory)
         words = f"ROS 2 bag: {stamps[-1] / 1e9:.4g} s, {len(rows)} poses"
         done.append((files["mcap"], f"{words} of {len(make_links(robot))} links"))
+    if "controller" in files:
+        if brain is None:
+            raise InputError("controller: expected a brain; found none")
+        done += _write_brain(brain, files["controller"])
     return done
+
+
+def _write_brain(brain: Brain, path: Path) -> list[tuple[Path, str]]:
+    """Writes a brain as Python, as C beside it, and as a ROS 2 node."""
+    header, source = make_brain_c(brain, path.stem)
+    rate = f"{brain.rate:.6g} Hz"
+    made = (
+        (path, make_brain_python(brain), f"the controller in Python; NumPy only; {rate}"),
+        (path.with_suffix(".h"), header, "the controller in C99, its header"),
+        (path.with_suffix(".c"), source, "the controller in C99"),
+        (path.with_name(f"{path.stem}_node.py"), make_brain_node(brain, path.stem),
+         f"ROS 2 node around {path.name}"),
+    )  # fmt: skip
+    for place, text, _ in made:
+        write_atomic(place, text.encode())
+    return [(place, words) for place, _, words in made]

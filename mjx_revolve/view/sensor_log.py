@@ -12,7 +12,7 @@ import numpy as np
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.readings import EpisodeContext, SensorReadings
-from mjx_revolve.control.sensors import Observation, Observer
+from mjx_revolve.control.sensors import Observation, Observer, count_samples
 from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.rollout import Rollout, RolloutState, StepInputs, with_variation
@@ -79,6 +79,10 @@ def trace_sensors(
         fitness.variation(key, trial),
     )
     given, true = jax.tree.map(np.asarray, found)
+    if fitness.controller.rate is not None:  # the brain has what there was at its last command
+        count = count_samples(robot.world.timestep * np.arange(steps), fitness.controller.rate)
+        acted = np.searchsorted(count, count)
+        given = jax.tree.map(lambda x: x[acted], given)
     plant = fitness.engine.plant
     order = np.argsort(np.asarray(plant.source)[: plant.num_hinge_rows, 0])
     hinges = plant.names[: plant.num_hinges]
@@ -143,7 +147,7 @@ def _plain(sensors: Sequence[Sensor], sense: Any) -> tuple[tuple[Any, ...], tupl
 @lru_cache(maxsize=4)
 def _compiled(fitness: Fitness, steps: int) -> Any:
     """Rows of an episode → what the observer gave and what was true, `[T, ...]` each."""
-    observer = fitness.controller.observer
+    observer, rate = fitness.controller.observer, fitness.controller.rate
     assert observer is not None
 
     def run(rows: Any, context: EpisodeContext, variation: Any) -> Any:
@@ -153,6 +157,8 @@ def _compiled(fitness: Fitness, steps: int) -> Any:
         state_at = lambda k: engine.init(qpos[k][:, None], qvel[k][:, None])  # noqa: E731
 
         def policy(state: Any, time: Any, readings: SensorReadings, ctrl: Any) -> Any:
+            if rate is not None:
+                time = count_samples(time, rate) / rate
             seen, observed = observer.observe(state[0], time, readings, number)
             return (seen, observed, Observation(*_plain(observer.sensors, readings))), ctrl
 

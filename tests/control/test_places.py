@@ -507,7 +507,12 @@ def test_a_runs_fingerprint_knows_the_sensors_of_types(tmp_path):
         "morphology": str(tmp_path / "oar.yaml"),
         "modules": str(tmp_path / "modules.yaml"),
         "world": "lake",
-        "controller": {"type": "mlp", "sensors": ["tilt", {"type": "gyro", "range": 5}]},
+        # Those had no rate, which is what null stands for.
+        "controller": {
+            "type": "mlp",
+            "sensors": ["tilt", {"type": "gyro", "range": 5}],
+            "rate": None,
+        },
         "task": {"type": "directed_swim"},
     }
 

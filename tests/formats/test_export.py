@@ -6,14 +6,24 @@ import dataclasses
 import errno
 import importlib.util
 
+import jax.numpy as jnp
 import mujoco
+import numpy as np
 import pytest
 
 from exports import ODD, odd_episode
+from mjx_revolve.control.controller import Controller
 from mjx_revolve.episodes import champion as episodes
 from mjx_revolve.export import main
 from mjx_revolve.formats import export as exporter
+from mjx_revolve.formats.brain import make_brain
 from mjx_revolve.inputs.commands import run_command
+
+# Its commands are constant.
+HELD = Controller(
+    0, (), lambda genes, plant: (), lambda parameters: (),
+    lambda parameters, state, time, sense: (state, jnp.full((3, 1), 0.1)),
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +43,8 @@ def test_command_simulates_a_morphology(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture
 def quick(monkeypatch, episode, tmp_path):
-    """The command without its seconds of compiling, in a folder of its own."""
+    """The command without its seconds of compiling and drawing, in a folder of its own."""
+    monkeypatch.setattr("mjx_revolve.view.build_page._draw", lambda *_: "data:,")
     monkeypatch.setattr(episodes, "load_episode", lambda *_: episode)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "odd.yaml").touch()
@@ -51,10 +62,14 @@ def run(capsys, *arguments):
 def test_command_writes_everything_once(quick, capsys):
     pytest.importorskip("rosbags", reason="the package rosbags writes bags")
     code, out, err = run(capsys, "odd.yaml")
-    assert (code, err) == (0, "")
+    assert code == 0
+    assert err == (
+        "no controller: --controller: expected a champion; found a morphology, which has no genes\n"
+    )
     folder = quick / "odd <one>_export"
     names = {path.name for path in folder.iterdir()}
-    assert names == {"robot.xml", "robot.urdf", "robot.sdf", "rollout.mcap", "meshes"}
+    files = {"robot.xml", "robot.urdf", "robot.sdf", "rollout.mcap", "build.html"}
+    assert names == {*files, "meshes"}
     assert len(out.splitlines()) == len(names)
     mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
     mujoco.MjModel.from_xml_path(str(folder / "robot.urdf"))  # finds its meshes
@@ -78,6 +93,23 @@ def test_command_puts_a_champions_files_into_its_run(quick, capsys, monkeypatch,
     assert (quick / "run" / "export" / "robot.urdf").is_file()
 
 
+def test_command_writes_a_champions_controller(quick, capsys, monkeypatch, episode):
+    brain = make_brain(episode.robot, HELD, np.zeros(0), 20.0)
+    monkeypatch.setattr("mjx_revolve.formats.brain.champion_brain", lambda *_: brain)
+    champion = dataclasses.replace(episode, fitness=object(), genes=np.zeros(0))
+    monkeypatch.setattr(episodes, "load_episode", lambda *_: champion)
+    code, out, err = run(capsys, "odd.yaml", "--controller", "my_brain.py")
+    assert (code, err) == (0, "")
+    names = ["my_brain.c", "my_brain.h", "my_brain.py", "my_brain_node.py"]
+    assert sorted(path.name for path in quick.glob("my_brain*")) == names
+    assert len(out.splitlines()) == len(names) and "20 Hz" in out
+    first = {name: (quick / name).read_bytes() for name in names}
+    assert b"from my_brain import" in first["my_brain_node.py"]
+    assert b'#include "my_brain.h"' in first["my_brain.c"]
+    assert run(capsys, "odd.yaml", "--controller", "my_brain.py")[0] == 0
+    assert first == {name: (quick / name).read_bytes() for name in names}
+
+
 def test_command_without_rosbags(quick, capsys, monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(
@@ -85,7 +117,7 @@ def test_command_without_rosbags(quick, capsys, monkeypatch):
     )
     code, out, err = run(capsys, "odd.yaml", "--out", "here")
     assert code == 0 and "rollout.mcap" not in out
-    assert err.startswith("no bag: --mcap: expected the package rosbags; found none (pip install")
+    assert "\nno bag: --mcap: expected the package rosbags; found none (pip install" in err
     code, _, err = run(capsys, "odd.yaml", "--mcap", "a.mcap")
     assert code == 2 and err.startswith("error: --mcap: expected the package rosbags")
 
@@ -99,6 +131,15 @@ WRONG = [
     (["a.yaml", "--urdf", "a"], "--urdf a: expected a name that ends in .urdf; found ''"),
     (["a.yaml", "--sdf", "a.x"], "--sdf a.x: expected a name that ends in .sdf or .world; found"),
     (["a.yaml", "--mcap", "a.bag"], "--mcap a.bag: expected a name that ends in .mcap; found"),
+    (
+        ["a.yaml", "--controller", "a.c"],
+        "--controller a.c: expected a name that ends in .py; found",
+    ),
+    (
+        ["a.yaml", "--controller", "my-brain.py"],
+        "--controller my-brain.py: expected a name that Python can import (letters, digits and _)",
+    ),
+    (["a.yaml", "--build", "a.pdf"], "--build a.pdf: expected a name that ends in .html or .htm"),
     (["a.yaml", "--mjcf", "dir.xml"], "--mjcf dir.xml: expected a file; found a folder"),
     (["a.yaml", "--out", "file"], "--out file: expected a folder; found a file"),
     (["a.yaml", "--out", "b", "--sdf", "a.sdf"], "--out: expected a folder or single files; found"),

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.scoring import replay_key
@@ -119,7 +120,10 @@ def cpg_phases(fitness: Fitness, genes: np.ndarray, steps: int) -> np.ndarray:
 @lru_cache(maxsize=8)
 def _oscillators(fitness: Fitness, steps: int) -> Any:
     """The states of all oscillators, `[steps, nhinge]` each, from genes."""
-    controller, plant = fitness.controller, plant_of(fitness.robot)
+    plant = plant_of(fitness.robot)
+    # Its oscillators at all times, not only when it commands.
+    settings = fitness.config.controller.model_copy(update={"rate": None})
+    controller = find_controller(plant, settings)
     blind: Any = None  # oscillators sense nothing
 
     def run(genes: jax.Array) -> Any:

@@ -1,0 +1,170 @@
+"""A brain as a Python file that needs NumPy only."""
+
+from __future__ import annotations
+
+import textwrap
+
+import numpy as np
+
+from mjx_revolve.formats.brain import Brain, describe_brain
+from mjx_revolve.formats.brain_code import Code, array_text, is_bracketed
+from mjx_revolve.formats.brain_program import Value, View, kind_of, number_text
+
+# Takes of more runs than this are done by a table of places.
+_MOST_RUNS = 8
+_DTYPES = {"real": "REAL", "int": "np.int32", "bool": "bool"}
+
+_HEAD = '''"""{title}
+
+{words}
+
+    brain = Brain()
+    commands = brain.step(time, sensors)
+
+`time` is in seconds since the start, `sensors` maps each name of SENSORS to its numbers. The brain
+keeps a state from call to call; `init` begins anew.
+"""
+
+import numpy as np
+
+REAL = np.float32  # or np.float64
+RATE = {rate!r}  # calls of `step` a second [Hz]; commands hold until the next call
+
+# {interface}
+COMMANDS = {commands}
+LOW = {low}
+HIGH = {high}
+SENSORS = {sensors}
+
+'''
+
+
+class _PythonCode(Code):
+    language = "numpy"
+
+    def literal(self, x: np.generic) -> str:
+        text = _number(x)
+        return text if not text.startswith("-") else f"({text})"
+
+    def table_name(self, count: int) -> str:
+        return f"_C{count}"
+
+    def input_name(self, value: Value) -> str:
+        return value.label
+
+    def at(self, name: str, view: View, size: int, whole: int) -> str:
+        start, step, run, period = view
+        if size == whole and view == View(0):
+            return name
+        if size == 1 or step == 0:
+            return name if whole == 1 else f"{name}[{start}:{start + 1}]"
+        count = period or -(-size // run)
+        part = f"{name}[{start}:{start + step * (count - 1) + 1}{f':{step}' * (step > 1)}]"
+        if count == whole and step == 1:
+            part = name
+        if period:
+            return f"np.tile({part}, {-(-size // period)})" + f"[:{size}]" * (size % period > 0)
+        if run > 1:
+            return f"np.repeat({part}, {run})" + f"[:{size}]" * (size % run > 0)
+        return part
+
+    def assign(self, number: int, value: Value, text: str) -> str:
+        if is_bracketed(text) and len(text) < 80:  # else it breaks between its brackets
+            text = text[1:-1]
+        self.lines.append(f"v{number} = {text}")
+        return f"v{number}"
+
+    def store(self, number: int, value: Value) -> str:
+        pieces = [self.at(*run[1:]) for run in self.pieces(value)]
+        text = pieces[0] if len(pieces) == 1 else f"np.concatenate([{', '.join(pieces)}])"
+        if len(pieces) > _MOST_RUNS:
+            names = [self.name_of(arg) for arg in value.args]
+            whole = names[0] if len(names) == 1 else f"np.concatenate([{', '.join(names)}])"
+            text = f"{whole}[{list(value.index)}]"
+        return self.assign(number, value, text)
+
+
+def make_brain_python(brain: Brain) -> str:
+    """Writes a brain as Python.
+
+    Args:
+        brain: from `make_brain`.
+
+    Returns:
+        A module with a class `Brain`; it needs NumPy only.
+    """
+    program, code = brain.program, _PythonCode(brain.program)
+    code.write()
+    title, words, interface = describe_brain(brain)
+    text = _HEAD.format(
+        title=title,
+        words="\n".join(words),
+        rate=brain.rate,
+        interface="\n# ".join(interface),
+        commands=wrapped(repr(list(brain.commands))),
+        low=wrapped(f"np.array({list(brain.low)}, REAL)"),
+        high=wrapped(f"np.array({list(brain.high)}, REAL)"),
+        sensors=wrapped(repr({signal.name: signal.size for signal in brain.signals})),
+    )
+    for name, data in code.constants.items():
+        dtype = _DTYPES[kind_of(data.dtype)]
+        text += wrapped(f"{name} = np.array({array_text(data, _number)}, {dtype})") + "\n"
+    start, states = [], [program.values[program.state[k]] for k in code.live_states]
+    for k, value in zip(code.live_states, states, strict=True):
+        data = program.initial[k]
+        filled = f"np.full({value.size}, {_number(data[0])}, {_DTYPES[value.kind]})"
+        whole = f"np.array({array_text(data, _number)}, {_DTYPES[value.kind]})"
+        start.append(filled if (data == data[0]).all() else whole)
+    labels = [value.label for value in states]
+    inputs = [f"{s.name} = _read(sensors, {s.name!r})" for s in brain.signals]
+    if brain.time in program.live:
+        inputs.insert(0, "time = np.asarray(time, REAL).reshape(1)")
+    body = [*inputs]
+    if states:
+        body.append(f"({', '.join(labels)},) = self.state")
+    body += code.lines
+    if states:
+        after = [code.name_of(program.after[k]) for k in code.live_states]
+        body.append(f"self.state = ({', '.join(after)},)")
+    body.append(f"return {code.name_of(program.commands)}.copy()")
+    lines = "\n".join(wrapped(f"        {line}") for line in body)
+    return text + _TAIL.format(start=", ".join([*start, ""]).strip(), body=lines)
+
+
+_TAIL = '''
+
+def _read(sensors, name):
+    """The numbers of a sensor."""
+    found = np.array(sensors[name], REAL).reshape(-1)
+    if len(found) != SENSORS[name]:
+        raise ValueError(f"sensors[{{name!r}}]: expected {{SENSORS[name]}}; found {{len(found)}}")
+    return found
+
+
+class Brain:
+    """Sensors to commands."""
+
+    def __init__(self):
+        self.init()
+
+    def init(self):
+        """Begins anew."""
+        self.state = ({start})
+
+    def step(self, time, sensors):
+        """Commands, in the order of COMMANDS, within LOW and HIGH."""
+{body}
+'''
+
+
+def _number(x: np.generic) -> str:
+    return number_text(x, "np.nan", "np.inf")
+
+
+def wrapped(line: str) -> str:
+    """A line of code, broken at blanks between brackets where it is long."""
+    indent = " " * (len(line) - len(line.lstrip()) + 4)
+    return "\n".join(
+        textwrap.wrap(line, 100, subsequent_indent=indent, break_long_words=False,
+                      break_on_hyphens=False, drop_whitespace=True)
+    )  # fmt: skip
