@@ -135,6 +135,36 @@ def body_motions(tree: Tree, state: State) -> BodyMotion:
     return root if rows is None else jax.tree.map(lambda *x: jnp.concatenate(x), root, rows)
 
 
+def center_of_mass(tree: Tree, state: State) -> Vec:
+    """Centre of mass of robots without the water that they hold or carry, world frame.
+
+    Args:
+        tree: the robots.
+        state: the population.
+
+    Returns:
+        x, y and z, `[lanes]` each [m].
+    """
+    root, below, _ = forward_kinematics(tree, state, True)
+    core = state.position
+
+    def weigh(level: Level, children: Any, moved: tuple[BodyMotion, Any]) -> tuple[Any, Any, Any]:
+        motion = moved[0]
+        wide = lambda x: add(x, jnp.zeros_like(motion.height))  # noqa: E731
+        # From the core: far from the origin, products with a mass would lose digits.
+        place = (*motion.xy, motion.height)
+        moment = tuple(
+            wide(add(mul(level.mass, sub(x, origin)), dot(axis, level.moment)))
+            for x, origin, axis in zip(place, core, motion.axes, strict=True)
+        )
+        return (), (), (wide(level.mass), moment)
+
+    _, _, (mass, moment) = tree.backward_pass(weigh, ((), (0.0, (0.0, 0.0, 0.0))), below)
+    own_mass, own = jax.tree.map(lambda x: x[0], weigh(tree.root, None, (root, None))[2])
+    whole = add(own_mass, mass)
+    return tuple(x + add(m, n) / whole for x, m, n in zip(core, own, moment, strict=True))
+
+
 def body_poses(
     robot: Robot, qpos: Float[Array, "n nq"]
 ) -> tuple[Float[Array, "n nbody 3"], Float[Array, "n nbody 3 3"]]:

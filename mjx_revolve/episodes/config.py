@@ -74,6 +74,8 @@ TASKS: dict[str, tuple[str, ...]] = {
     "follow_bed": ("height",),
     "crawl": (),
 }
+# What runs of versions without these settings had.
+OLDER_TASK = {"point": "core", "length": "rest"}
 # Those that have a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
@@ -183,7 +185,13 @@ class TaskConfig(Section):
     """What is scored: a task, see the table above, or FILE.py:FUNCTION, a function like those."""
     unit: Literal["body_lengths", "m"] = "body_lengths"
     """What ways are measured in by tasks whose scores have body lengths in their unit. Where bodies
-    evolve, a body length at rest is a choice of theirs: `m` compares them by what they swim."""
+    evolve, a body length is a choice of theirs: `m` compares them by what they swim."""
+    point: Literal["center_of_mass", "core"] = "center_of_mass"
+    """Whose way is scored and measured: the robot's centre of mass, without the water that it
+    holds or carries, or the core's centre, which gains by being shaken. Sensors stay the core's."""
+    length: Literal["stretched", "rest"] = "stretched"
+    """What a body length is: of the body stretched out, the longest way through it with its hinges
+    straightened (no fold makes that shorter), or the longest edge of its bounding box at rest."""
     duration: Annotated[Positive, Le(86_400), Unit("s")] = 10.0
     """Length of an episode, a day at most [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
@@ -209,7 +217,7 @@ class TaskConfig(Section):
     sight: Annotated[Positive, Unit("m")] | None = None
     """The distance up to which the target is sensed, by default any; `search` needs it [m]."""
     touch: Annotated[Positive, Unit("m")] = 0.1
-    """How near the target touches the core's centre, for `search` and `escape` [m]."""
+    """How near the target touches the robot's `point`, for `search` and `escape` [m]."""
     course_spread: Annotated[Positive, Le(math.pi), Unit("rad")] | None = None
     """Within which angle of `direction`, seen from above, to both sides, each episode's course is
     drawn; `follow_course` needs it [rad]."""
@@ -225,7 +233,8 @@ class TaskConfig(Section):
     """Depth of the start below the surface; `crawl` starts on the bed instead, and `follow_bed`
     at `height` above it [m]."""
     height: Annotated[Positive, Unit("m")] | None = None
-    """Of the core above the bed; `follow_bed` needs it [m]."""
+    """Of the core at the start, then of the robot's `point`, above the bed; `follow_bed` needs it
+    [m]."""
     depth_tolerance: Annotated[Positive, Unit("m")] = 0.25
     """How far from the start depth, or from `height`, still counts as keeping it [m]."""
     energy_weight: Annotated[NonNegative, Unit("1/J")] = 0.0
@@ -532,6 +541,9 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
+        task = data.get("task")
+        if isinstance(task, dict):  # all settings stand there, but for those that came later
+            data = data | {"task": OLDER_TASK | task}
     return make_config(data, path.parent, overrides, short_path(path))
 
 

@@ -50,12 +50,13 @@ class Track:
     """An episode of many individuals, sampled at equal intervals after the settling time.
 
     Attributes:
-        position: `[S, 3, lanes]` core, world frame [m]; the first row is where counting starts.
-        clearance: `[S, lanes]` height of the core above the bed, infinite without one [m].
+        position: `[S, 3, lanes]` the robot's place, its `task.point` (the centre of mass, or the
+            core), world frame [m]; the first row is where counting starts.
+        clearance: `[S, lanes]` height of that point above the bed, infinite without one [m].
         energy: `[S, lanes]` work of the servos since the row before, summed without sign [J].
         interval: time between rows [s].
-        start_height: height of the core at the episode's start, world frame [m].
-        length: body length, the robot's largest extent at rest [m].
+        start_height: height of that point at the episode's start, world frame [m].
+        length: body length, stretched out or at rest as `task.length` says [m].
         weight: of the robot in air [N].
         surface_height: [m].
         num_hinges: of the robot; a batch of different bodies has rows for more.
@@ -70,7 +71,7 @@ class Track:
             are recorded.
         water_force: `[S, 3, lanes]` of the water on the robot, buoyancy included, the inertia of
             carried water not, world frame [N]; None unless "forces" are recorded.
-        water_velocity: `[S, 3, lanes]` of the water where the core is, as if the robot were not
+        water_velocity: `[S, 3, lanes]` of the water at that place, as if the robot were not
             there, world frame [m/s]; None unless "water" is recorded.
         target: `[S, 3, lanes]` where the target is, world frame [m]; None unless "target" is
             recorded and there is one.
@@ -156,6 +157,7 @@ class Task:
         start: where episodes begin, like `start_at_depth`.
         on_bed: whether episodes begin on the bed, so that there must be one.
         measure: the measure that reports show beside the score.
+        point: what `Track.position` is the place of, as `task.point` says.
     """
 
     score: Callable[[Track, Any], jax.Array]
@@ -164,6 +166,7 @@ class Task:
     start: Callable[[Any, World, BodyGeometry, jax.Array], jax.Array] = start_at_depth
     on_bed: bool = False
     measure: str = "speed_m_s"
+    point: str = "core"
 
     def __post_init__(self) -> None:
         """Checks what a user may have got wrong."""
@@ -185,7 +188,7 @@ def _keeps_depth(track: Track, settings: Any) -> jax.Array:
 
 
 def moved_through_water(track: Track) -> jax.Array:
-    """`[S - 1, 3, lanes]` the core's way from row to row, less that of the water around it [m]."""
+    """`[S - 1, 3, lanes]` the robot's way from row to row, less that of the water around it [m]."""
     assert track.water_velocity is not None
     water = (track.water_velocity[1:] + track.water_velocity[:-1]) / 2
     return jnp.diff(track.position, axis=0) - track.interval * water
@@ -346,7 +349,7 @@ def find_task(settings: Any, source: str = "config") -> Task:
                 f"the {record}; found none"
             )
     records = dict.fromkeys((*task.records, *records_of(settings.measures)))
-    task = replace(task, records=tuple(records))
+    task = replace(task, records=tuple(records), point=settings.point)
     if settings.unit == "m":
         unit = score_unit(name, "m")
         if unit == task.unit:
