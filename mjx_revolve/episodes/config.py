@@ -229,6 +229,9 @@ class TaskConfig(Section):
     course_rate: Annotated[NonNegative, Le(10), Unit("rad/s")] = 0.0
     """How fast at most the course turns all the time; rate and side are drawn for each episode
     [rad/s]."""
+    horizon: Annotated[Positive, Le(3600), Unit("s")] | None = None
+    """Over which time `speed` is foretold, if the robot goes on turning and rising as it does from
+    the first half of the episode to the second; none: what the episode itself shows [s]."""
     depth: Annotated[NonNegative, Unit("m")] = 2.0
     """Depth of the start below the surface; `crawl` starts on the bed instead, and `follow_bed`
     at `height` above it [m]."""
@@ -269,6 +272,9 @@ class TaskConfig(Section):
                 field = type(self).model_fields[name]
                 what = describe(Annotated[(field.annotation, field)]).removesuffix(", or nothing")
                 raise ConstraintError(name, f"{what}, because task.type is {self.type}", "none")
+        if self.horizon is not None and self.type != "speed":
+            what = f"none, as task.type is {self.type}, and only speed has one"
+            raise ConstraintError("horizon", what, f"{self.horizon:g}")
         found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
         if len(found) > 1:
             raise ConstraintError("target", "none, as there is a target_distance", "one")
@@ -311,6 +317,8 @@ class EvolutionConfig(Settings):
     """How many of the newest checkpoints are kept."""
     tensorboard: bool = False
     """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
+    passport: bool = True
+    """Whether the champion's passport is made at the end, in about a quarter of a minute."""
     strategy_params: dict[str, Any] = Field({})
     """Settings of the strategy itself, by evosax's names."""
 
@@ -492,6 +500,12 @@ def make_config(
     return config
 
 
+def complete_older(data: dict[str, Any]) -> dict[str, Any]:
+    """A run's `config.yaml` with what it had of settings that came after its version."""
+    task = data.get("task")
+    return data | {"task": OLDER_TASK | task} if isinstance(task, dict) else data
+
+
 def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
     try:
         make_config(data, folder)
@@ -541,9 +555,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
-        task = data.get("task")
-        if isinstance(task, dict):  # all settings stand there, but for those that came later
-            data = data | {"task": OLDER_TASK | task}
+        data = complete_older(data)
     return make_config(data, path.parent, overrides, short_path(path))
 
 

@@ -32,6 +32,8 @@ from mjx_revolve.water.world import World
 
 # What a task may have recorded beside the core's position and the energy: see `Track`.
 RECORDS = ("core", "joints", "contacts", "forces", "water", "target", "course")
+# At so many moments up to the horizon the depth is foretold. A choice.
+_MOMENTS = 16
 # Settings of which one must be given, so that there is such a record.
 _GIVEN = {"target": ("target", "target_distance"), "course": ("course_spread",)}
 
@@ -206,11 +208,37 @@ def directed_swim(track: Track, settings: Any) -> jax.Array:
 def speed(track: Track, settings: Any) -> jax.Array:
     """Net horizontal speed through the water while the robot keeps its depth [body lengths/s].
 
-    In any direction; drifting with a current counts nothing.
+    In any direction; drifting with a current counts nothing. With a `horizon`, net over that time,
+    if what the robot does went on: see `_sustained_speed`.
     """
     moved = moved_through_water(track)[:, :2]
+    if settings.horizon is not None:
+        return _sustained_speed(track, settings, moved)
     counted = moved * _keeps_depth(track, settings)[:, None]
     return safe_norm(tuple(jnp.sum(counted, 0))) / (track.duration * track.length)
+
+
+def _sustained_speed(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
+    """Net speed over the horizon, foretold from the episode's two halves [body lengths/s].
+
+    From one half to the next a robot turns by ψ and rises by some height. n halves of the way d,
+    each turned by ψ from the one before, have the net way d sin(nψ/2) / sin(ψ/2): in a circle none.
+    """
+    half = moved.shape[0] // 2
+    first, second = (jnp.sum(x, 0) for x in (moved[:half], moved[-half:]))
+    way = (safe_norm(tuple(first)) + safe_norm(tuple(second))) / 2
+    ahead = first[0] * second[0] + first[1] * second[1]
+    aside = first[0] * second[1] - first[1] * second[0]
+    # The tiny term: where nothing moves there is no turn, and no derivative of it.
+    turn = jnp.arctan2(aside, ahead + jnp.where(way > 0, 0.0, 1.0)) / 2
+    count = settings.horizon / (half * track.interval)
+    straight = jnp.abs(jnp.sinc(count * turn / np.pi) / jnp.sinc(turn / np.pi))
+    height = track.position[:, 2] - track.start_height
+    begun, ended = jnp.mean(height[: half + 1], 0), jnp.mean(height[-half - 1 :], 0)
+    share = np.linspace(0, 1, _MOMENTS)[:, None]
+    heights = begun + share * count * (ended - begun)
+    keeps = jnp.mean(_keeping(heights, settings.depth_tolerance), 0)
+    return way * straight * keeps / (half * track.interval * track.length)
 
 
 def reach_target(track: Track, settings: Any) -> jax.Array:

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.episodes.settings import NamedFile
 
-FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard")
+FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard", "passport")
 """Settings of `evolution` that may change when a run is resumed; others make another run."""
 # Settings of a task that older versions lack: with their default values they are left out of
 # fingerprints, so that older runs can go on.
 _LATER_IN_TASK = (
     "measures", "unit", "target_turn", "sight", "touch",
-    "course_spread", "course_changes", "course_turn", "course_rate",
+    "course_spread", "course_changes", "course_turn", "course_rate", "horizon",
 )  # fmt: skip
 # Their versions must be the same in all processes of a run.
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
@@ -88,6 +88,8 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
             del data["task"][name]
     if data["bodies"] is not None and not data["bodies"]["max_of"]:
         del data["bodies"]["max_of"]
+    if data["bodies"] is not None and data["bodies"]["selection"]["passport"] == "made":
+        del data["bodies"]["selection"]["passport"]  # older runs lack it
     for name in ("colony", "bodies"):
         if data[name] is None:
             del data[name]
