@@ -67,9 +67,9 @@ OVERLAP = 3.0
 """Deepest overlap of two modules [mm]: what play and bending of printed parts may take up."""
 REVERSALS = 10.0
 """Most reversals of a joint in a second: a hobby servo follows up to some 5 Hz."""
-TORQUE = 0.5
-"""Largest root mean square of a servo's torque, as a share of its effort: above half of the stall
-torque a hobby servo overheats within minutes."""
+TORQUE = 0.7
+"""Largest root mean square of a servo's torque, as a share of its effort: that of a sine which just
+reaches it; a servo that uses more is at its limit for most of the time."""
 
 
 class Check(NamedTuple):
