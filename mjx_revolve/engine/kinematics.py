@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_revolve.engine.level import Hinges, Level
@@ -198,3 +199,12 @@ def body_poses(
             # From the hinge's frame to MuJoCo's.
             place[body], turn[body] = positions[k], axes[k] @ xp.asarray(frame.T, qpos.dtype)
     return xp.stack(place, 1), xp.stack(turn, 1)
+
+
+def mass_centers(robot: Robot, qpos: Float[np.ndarray, "n nq"]) -> Float[np.ndarray, "n 3"]:
+    """`center_of_mass` of one robot in many configurations, by NumPy, world frame [m]."""
+    poses: Any = body_poses(robot, qpos)  # type: ignore[arg-type]  # of NumPy's arrays
+    (place, turn), mass = poses, robot.assembly.mass
+    centers = place + np.einsum("nbij,bj->nbi", turn, robot.assembly.center)
+    found: np.ndarray = np.einsum("b,nbi->ni", mass, centers) / mass.sum()
+    return found

@@ -65,7 +65,7 @@ def save_pictures(run: Run, champion: Champion) -> None:
         )
         counted = counted_time(config.task, robot.world.timestep)
         water, target = fitness.water(champion.key), target_at_last(config.task, trajectory)
-        figures["swim.png"] = plot_swim(robot, trajectory, counted, water, target)
+        figures["swim.png"] = plot_swim(robot, trajectory, counted, water, target, config.task)
     for name, figure in figures.items():
         folder.write(name, figure_png(figure))
 

@@ -13,7 +13,7 @@ from laboratory import body, random_states, read, world
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.kinematics import body_poses
+from mjx_revolve.engine.kinematics import body_poses, mass_centers
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
@@ -43,6 +43,7 @@ def test_the_centre_of_mass_is_mujocos(engine):
         expected = [mujocos(robot, one) for one in qpos.T]
         np.testing.assert_allclose(found, expected, atol=1e-12)
         assert np.linalg.norm(found - qpos[:3].T, axis=1).min() > 0.01
+        np.testing.assert_allclose(mass_centers(robot, qpos.T), expected, atol=1e-12)
 
 
 def test_the_centres_of_mass_of_many_bodies_are_mujocos():
