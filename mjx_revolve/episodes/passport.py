@@ -374,7 +374,7 @@ def _joints(fitness: Fitness, trajectory: Trajectory) -> Iterator[tuple[str, Che
         np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
     )
     moved, speed = robot.assembly.moved, qvel[:, 6:]
-    depth = 1000 * self_overlap(robot, qpos).depth
+    depth = np.abs(1000 * self_overlap(robot, qpos).depth)  # rather than -0
     yield "overlap", Check("deepest overlap of modules", float(depth.max()), "mm", most=OVERLAP)
     yield "overlap_time", Check("share of time with an overlap", float(np.mean(depth > OVERLAP)))
     rate = count_reversals(speed).max() / (len(qvel) * robot.world.timestep)
