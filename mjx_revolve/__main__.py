@@ -22,6 +22,7 @@ _COMMANDS = {
     "replay": "a film of it: MP4 and GIF",
     "live": "a running world in a browser, to drop robots into",
     "report": "a page about one run, several, or a sweep",
+    "passport": "what a run's champion was tried for, and what it fails",
     "export": "a champion, or a robot, for MuJoCo, ROS and Gazebo",
 }
 _EXAMPLES = (

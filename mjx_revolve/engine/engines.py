@@ -89,6 +89,9 @@ class Engine(Protocol[S]):
         `[1 + rows of hinges, lanes]` each; each body's frame at its hinge.
         """
 
+    def center_of_mass(self, state: S) -> Vec:
+        """Centre of mass of whole robots without their water, world frame [m] (a pass)."""
+
     def contact_force(self, state: S, water: Water) -> Float[Array, "bodies lanes"]:
         """Force of the bed on the core's rigid body, then on what each hinge carries [N] (a pass).
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_revolve.engine.level import Hinges, Level
@@ -135,6 +136,36 @@ def body_motions(tree: Tree, state: State) -> BodyMotion:
     return root if rows is None else jax.tree.map(lambda *x: jnp.concatenate(x), root, rows)
 
 
+def center_of_mass(tree: Tree, state: State) -> Vec:
+    """Centre of mass of robots without the water that they hold or carry, world frame.
+
+    Args:
+        tree: the robots.
+        state: the population.
+
+    Returns:
+        x, y and z, `[lanes]` each [m].
+    """
+    root, below, _ = forward_kinematics(tree, state, True)
+    core = state.position
+
+    def weigh(level: Level, children: Any, moved: tuple[BodyMotion, Any]) -> tuple[Any, Any, Any]:
+        motion = moved[0]
+        wide = lambda x: add(x, jnp.zeros_like(motion.height))  # noqa: E731
+        # From the core: far from the origin, products with a mass would lose digits.
+        place = (*motion.xy, motion.height)
+        moment = tuple(
+            wide(add(mul(level.mass, sub(x, origin)), dot(axis, level.moment)))
+            for x, origin, axis in zip(place, core, motion.axes, strict=True)
+        )
+        return (), (), (wide(level.mass), moment)
+
+    _, _, (mass, moment) = tree.backward_pass(weigh, ((), (0.0, (0.0, 0.0, 0.0))), below)
+    own_mass, own = jax.tree.map(lambda x: x[0], weigh(tree.root, None, (root, None))[2])
+    whole = add(own_mass, mass)
+    return tuple(x + add(m, n) / whole for x, m, n in zip(core, own, moment, strict=True))
+
+
 def body_poses(
     robot: Robot, qpos: Float[Array, "n nq"]
 ) -> tuple[Float[Array, "n nbody 3"], Float[Array, "n nbody 3 3"]]:
@@ -168,3 +199,12 @@ def body_poses(
             # From the hinge's frame to MuJoCo's.
             place[body], turn[body] = positions[k], axes[k] @ xp.asarray(frame.T, qpos.dtype)
     return xp.stack(place, 1), xp.stack(turn, 1)
+
+
+def mass_centers(robot: Robot, qpos: Float[np.ndarray, "n nq"]) -> Float[np.ndarray, "n 3"]:
+    """`center_of_mass` of one robot in many configurations, by NumPy, world frame [m]."""
+    poses: Any = body_poses(robot, qpos)  # type: ignore[arg-type]  # of NumPy's arrays
+    (place, turn), mass = poses, robot.assembly.mass
+    centers = place + np.einsum("nbij,bj->nbi", turn, robot.assembly.center)
+    found: np.ndarray = np.einsum("b,nbi->ni", mass, centers) / mass.sum()
+    return found

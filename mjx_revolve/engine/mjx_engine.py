@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from mjx_revolve.engine import forces, population
 from mjx_revolve.engine.dynamics import inertia_and_momentum, with_bed
 from mjx_revolve.engine.hydrodynamics import PreviousStep, water_forces
-from mjx_revolve.engine.kinematics import body_motions
+from mjx_revolve.engine.kinematics import body_motions, center_of_mass
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
 from mjx_revolve.engine.servos import end_stop, servo
@@ -228,6 +228,10 @@ class MjxEngine:
         """Motion of all rigid bodies; see `kinematics.body_motions`."""
         rows = body_motions(self.tree, self._state(state))
         return jax.tree.map(lambda x: self._own_order(x, state.qpos[0]), rows)
+
+    def center_of_mass(self, state: MjxState) -> Vec:
+        """Centre of mass of whole robots; see `kinematics.center_of_mass`."""
+        return center_of_mass(self.tree, self._state(state))
 
     def contact_force(self, state: MjxState, water: Water) -> Float[Array, "bodies lanes"]:
         """Force of the bed on each rigid body; see `forces.contact_force`."""

@@ -32,6 +32,7 @@ class BodyGeometry(NamedTuple):
 
     Attributes:
         length: largest extent at rest [m].
+        stretched: largest extent that the body can reach; see `stretched_lengths` [m].
         weight: in air [N].
         lowest: how far the rest pose reaches below the core's centre [m].
         radius: how far it reaches from the core's vertical [m].
@@ -40,15 +41,18 @@ class BodyGeometry(NamedTuple):
         up: `[3]` or `[3, lanes]` direction from the centre of mass to that of the displaced volume
             at rest, core frame: what points up once the body hangs still in deep water. (0, 0, 1)
             where the two are one.
+        center: `[3]` or `[3, lanes]` centre of mass at rest, core frame [m].
     """
 
     length: Any
+    stretched: Any
     weight: Any
     lowest: Any
     radius: Any
     sinks: Any
     num_hinges: Any
     up: Any
+    center: Any
 
 
 def body_geometry(robot: Robot) -> BodyGeometry:
@@ -67,19 +71,58 @@ def body_geometries(assembly: Assembly) -> BodyGeometry:
     corners = layout.core_corners()
     across = np.hypot(corners[..., 0], corners[..., 1])
     mass = np.bincount(layout.body, table.mass)
-    lever = _buoyancy_center(assembly) - _mass_center(assembly)
+    heavy = _mass_center(assembly)
+    lever = _buoyancy_center(assembly) - heavy
     arm = np.linalg.norm(lever, axis=1, keepdims=True)
     hangs = arm > _ONE_POINT
     displaced = world.density * np.bincount(layout.body, table.volume)
     return BodyGeometry(
         length=extent.max(1),
+        stretched=np.maximum(extent.max(1), stretched_lengths(assembly)),
         weight=mass * max(world.gravity, 1e-9),
         lowest=-np.minimum.reduceat(corners[..., 2].min(1), first),
         radius=np.maximum.reduceat(across.max(1), first),
         sinks=(displaced < mass / 2) | (world.buoyancy == "off"),
         num_hinges=np.array([float(body.num_hinges) for body in assembly.morphologies]),
         up=np.where(hangs, lever / np.where(hangs, arm, 1.0), (0.0, 0.0, 1.0)).T,
+        center=heavy.T,
     )
+
+
+def stretched_lengths(assembly: Assembly) -> np.ndarray:
+    """Lengths of the longest ways through bodies, as if their hinges could straighten them.
+
+    A way leads from the middle of a box's face to another's, straight through each rigid body from
+    hinge to hinge. No pose is longer, up to the boxes' breadths, and no fold makes it shorter.
+
+    Args:
+        assembly: of the robots.
+
+    Returns:
+        `[robots]` [m].
+    """
+    layout, count = assembly.layout, len(assembly.parent)
+    turn = layout.rotation[layout.box_part].swapaxes(1, 2)
+    aside = turn * layout.box_half[..., None]
+    faces = layout.box_centers()[:, None] + np.concatenate([aside, -aside], 1)
+    owner = assembly.fluid.body[layout.box_part]
+    # Of each body: its boxes' faces, and its children's hinges with the longest way beyond them.
+    ends = [
+        [(place, 0.0) for place in faces[owner == body].reshape(-1, 3)] for body in range(count)
+    ]
+    longest = np.zeros(len(assembly.roots))
+    for body in range(count - 1, 0, -1):  # children come after their parents
+        place = np.array([x for x, _ in ends[body]])
+        beyond = np.array([x for _, x in ends[body]])
+        across = np.linalg.norm(place[:, None] - place, axis=-1) + beyond[:, None] + beyond
+        np.fill_diagonal(across, 0.0)
+        robot = assembly.robot[body]
+        longest[robot] = max(longest[robot], across.max())
+        if assembly.parent[body]:
+            hinge = assembly.position[body]
+            reach = np.linalg.norm(place - hinge, axis=-1) + beyond
+            ends[assembly.parent[body]].append((hinge, reach.max()))
+    return longest
 
 
 def _mass_center(assembly: Assembly) -> np.ndarray:

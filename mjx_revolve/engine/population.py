@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from mjx_revolve.engine import forces
 from mjx_revolve.engine.dynamics import accelerate
 from mjx_revolve.engine.interaction import RobotInteraction
-from mjx_revolve.engine.kinematics import body_motions
+from mjx_revolve.engine.kinematics import body_motions, center_of_mass
 from mjx_revolve.engine.plant import Plant, actuators_of, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep
 from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
@@ -120,6 +120,10 @@ class PopulationEngine:
     def body_motions(self, state: State) -> BodyMotion:
         """Motion of all rigid bodies; see `kinematics.body_motions`."""
         return body_motions(self.tree, state)
+
+    def center_of_mass(self, state: State) -> Vec:
+        """Centre of mass of whole robots; see `kinematics.center_of_mass`."""
+        return center_of_mass(self.tree, state)
 
     def contact_force(self, state: State, water: Water) -> Float[Array, "bodies lanes"]:
         """Force of the bed on each rigid body; see `forces.contact_force`."""

@@ -85,6 +85,9 @@ class SelectionConfig(Settings):
     """Descriptors and measures in whose space `novelty` is the mean distance to neighbours."""
     neighbours: Annotated[Integer, Ge(1)] = 15
     """Number of neighbours."""
+    passport: Literal["required", "made"] = "made"
+    """`required`: of the few best, the first that passes its passport (see `docs/evolution.md`)
+    becomes the champion, or the best where none does; `made`: the best, whatever it does."""
 
 
 class Axis(Settings):

@@ -74,6 +74,8 @@ TASKS: dict[str, tuple[str, ...]] = {
     "follow_bed": ("height",),
     "crawl": (),
 }
+# What runs of versions without these settings had.
+OLDER_TASK = {"point": "core", "length": "rest"}
 # Those that have a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
@@ -186,7 +188,13 @@ class TaskConfig(Section):
     """What is scored: a task, see the table above, or FILE.py:FUNCTION, a function like those."""
     unit: Literal["body_lengths", "m"] = "body_lengths"
     """What ways are measured in by tasks whose scores have body lengths in their unit. Where bodies
-    evolve, a body length at rest is a choice of theirs: `m` compares them by what they swim."""
+    evolve, a body length is a choice of theirs: `m` compares them by what they swim."""
+    point: Literal["center_of_mass", "core"] = "center_of_mass"
+    """Whose way is scored and measured: the robot's centre of mass, without the water that it
+    holds or carries, or the core's centre, which gains by being shaken. Sensors stay the core's."""
+    length: Literal["stretched", "rest"] = "stretched"
+    """What a body length is: of the body stretched out, the longest way through it with its hinges
+    straightened (no fold makes that shorter), or the longest edge of its bounding box at rest."""
     duration: Annotated[Positive, Le(86_400), Unit("s")] = 10.0
     """Length of an episode, a day at most [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
@@ -212,7 +220,7 @@ class TaskConfig(Section):
     sight: Annotated[Positive, Unit("m")] | None = None
     """The distance up to which the target is sensed, by default any; `search` needs it [m]."""
     touch: Annotated[Positive, Unit("m")] = 0.1
-    """How near the target touches the core's centre, for `search` and `escape` [m]."""
+    """How near the target touches the robot's `point`, for `search` and `escape` [m]."""
     course_spread: Annotated[Positive, Le(math.pi), Unit("rad")] | None = None
     """Within which angle of `direction`, seen from above, to both sides, each episode's course is
     drawn; `follow_course` needs it [rad]."""
@@ -224,11 +232,15 @@ class TaskConfig(Section):
     course_rate: Annotated[NonNegative, Le(10), Unit("rad/s")] = 0.0
     """How fast at most the course turns all the time; rate and side are drawn for each episode
     [rad/s]."""
+    horizon: Annotated[Positive, Le(3600), Unit("s")] | None = None
+    """Over which time `speed` is foretold, if the robot goes on turning and rising as it does from
+    the first half of the episode to the second; none: what the episode itself shows [s]."""
     depth: Annotated[NonNegative, Unit("m")] = 2.0
     """Depth of the start below the surface; `crawl` starts on the bed instead, and `follow_bed`
     at `height` above it [m]."""
     height: Annotated[Positive, Unit("m")] | None = None
-    """Of the core above the bed; `follow_bed` needs it [m]."""
+    """Of the core at the start, then of the robot's `point`, above the bed; `follow_bed` needs it
+    [m]."""
     depth_tolerance: Annotated[Positive, Unit("m")] = 0.25
     """How far from the start depth, or from `height`, still counts as keeping it [m]."""
     energy_weight: Annotated[NonNegative, Unit("1/J")] = 0.0
@@ -263,6 +275,9 @@ class TaskConfig(Section):
                 field = type(self).model_fields[name]
                 what = describe(Annotated[(field.annotation, field)]).removesuffix(", or nothing")
                 raise ConstraintError(name, f"{what}, because task.type is {self.type}", "none")
+        if self.horizon is not None and self.type != "speed":
+            what = f"none, as task.type is {self.type}, and only speed has one"
+            raise ConstraintError("horizon", what, f"{self.horizon:g}")
         found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
         if len(found) > 1:
             raise ConstraintError("target", "none, as there is a target_distance", "one")
@@ -305,6 +320,8 @@ class EvolutionConfig(Settings):
     """How many of the newest checkpoints are kept."""
     tensorboard: bool = False
     """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
+    passport: bool = True
+    """Whether the champion's passport is made at the end, in about a quarter of a minute."""
     strategy_params: dict[str, Any] = Field({})
     """Settings of the strategy itself, by evosax's names."""
 
@@ -486,6 +503,16 @@ def make_config(
     return config
 
 
+def complete_older(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's `config.yaml` with what it had of settings that came after its version.
+
+    Its controller had no rate and gave a command at every step.
+    """
+    older = {"task": OLDER_TASK, "controller": {"rate": None}}
+    own = {name: data.get(name) for name in older}
+    return {**data} | {k: older[k] | x for k, x in own.items() if isinstance(x, Mapping)}
+
+
 def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
     try:
         make_config(data, folder)
@@ -535,19 +562,8 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
-        data = with_older_values(data)
+        data = complete_older(data)
     return make_config(data, path.parent, overrides, short_path(path))
-
-
-def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A run folder's settings with the values that older versions had where they lack a setting.
-
-    Their controllers had no rate, and gave a command at every step.
-    """
-    found, controller = dict(data), data.get("controller")
-    if isinstance(controller, Mapping):
-        found["controller"] = {"rate": None} | dict(controller)
-    return found
 
 
 def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:

@@ -214,9 +214,8 @@ class Environment:
         recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
         row = {name: x[None] for name, x in recorder(present, ctrl, water).items()}
         track = extend_track(episodes.track, row, (clock - 1) // fitness.record_every)
-        score, sane = fitness.score_so_far(
-            track, episodes.position, fitness.geometry, rollout.context, clock
-        )
+        place = fitness.start_point(fitness.geometry, starts)
+        score, sane = fitness.score_so_far(track, place, fitness.geometry, rollout.context, clock)
         over = clock >= self.num_steps * self.every
         result = StepResult(score - episodes.score, ~sane, over & sane, score)
         whole = clock % fitness.record_every == 0

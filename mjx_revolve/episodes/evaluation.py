@@ -56,6 +56,7 @@ from mjx_revolve.episodes.starts import (
 from mjx_revolve.episodes.tasks import Task, Track
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.adjoint import differentiate_as
+from mjx_revolve.numerics.spatial import matvec, quat_to_mat
 from mjx_revolve.numerics.xla import is_traced, jit, over_chunks
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.flow import Water, flow
@@ -69,7 +70,7 @@ class Chunk(NamedTuple):
         rollout: steps them.
         state: at their starts.
         inputs: of all steps.
-        position: of the cores at their starts, world frame [m].
+        position: of the robots at their starts, see `EpisodeSpec.start_point`.
         geometry: of the bodies.
     """
 
@@ -163,6 +164,14 @@ class EpisodeSpec(ABC):
     def start_pose(self, geometry: BodyGeometry, starts: Starts) -> Float[Array, "7 lanes"]:
         """Poses of the cores at the start, world frame; see `starts.start_pose`."""
         return start_pose(self.task, self.settings, self.world, geometry, starts)
+
+    def start_point(self, geometry: BodyGeometry, starts: Starts) -> Float[Array, "3 lanes"]:
+        """Places of the robots at the start, by the task's point, world frame [m]."""
+        root = self.start_pose(geometry, starts)
+        if self.task.point == "core":
+            return root[:3]
+        center = tuple(jnp.asarray(x, root.dtype) for x in geometry.center)
+        return root[:3] + jnp.stack(matvec(quat_to_mat(tuple(root[3:7])), center))
 
     def check_population(self, population: Any, ranks: tuple[int, ...] = (2,)) -> jax.Array:
         """A population as an array.
@@ -283,7 +292,7 @@ class EpisodeSpec(ABC):
         state = start_at_rest(rollout.engine, root)
         inputs = StepInputs(gust_rows(self.world, starts, self.num_timesteps))
         now = rollout.init(state, self.controller.init(parameters))
-        return Chunk(rollout, now, inputs, root[:3], geometry)
+        return Chunk(rollout, now, inputs, self.start_point(geometry, starts), geometry)
 
     def score(
         self,
@@ -296,7 +305,7 @@ class EpisodeSpec(ABC):
 
         Args:
             track: from `task_recorder`, sampled as `scoring.sample_rows` has it.
-            position: of the cores at the start, world frame [m].
+            position: of the robots at the start, from `start_point`.
             geometry: of the bodies, `[lanes]` or one.
             context: of the episodes.
 
@@ -321,7 +330,7 @@ class EpisodeSpec(ABC):
 
         Args:
             track: rows to come repeat the present, as `scoring.extend_track` has them.
-            position: of the cores at the start, world frame [m].
+            position: of the robots at the start, from `start_point`.
             geometry: of the bodies.
             context: of the episodes.
             clock: timesteps since the start.
@@ -355,7 +364,7 @@ class EpisodeSpec(ABC):
             clearance=clearance,
             interval=self.record_every * world.timestep,
             start_height=start_height,
-            length=geometry.length,
+            length=geometry.stretched if settings.length == "stretched" else geometry.length,
             weight=geometry.weight,
             surface_height=world.surface_height,
             num_hinges=geometry.num_hinges,
@@ -404,7 +413,10 @@ def task_recorder(engine: Engine, task: Task, world: World) -> Recorder:
 
     def record(now: RolloutState, ctrl: jax.Array, water: Water) -> dict[str, jax.Array]:
         root = engine.root(now.state)
-        row = {"position": jnp.stack(root.position), "energy": now.energy}
+        place = root.position
+        if task.point == "center_of_mass":
+            place = engine.center_of_mass(now.state)
+        row = {"position": jnp.stack(place), "energy": now.energy}
         if "core" in task.records:
             row["quat"] = jnp.stack(root.quat)
             row["velocity"] = jnp.stack(root.velocity)
@@ -419,7 +431,7 @@ def task_recorder(engine: Engine, task: Task, world: World) -> Recorder:
             if "forces" in task.records:
                 row["water_force"] = jnp.stack(wet)
         if "water" in task.records:
-            velocity, _ = flow(world, water, *root.position)
+            velocity, _ = flow(world, water, *place)
             like = now.energy
             row["water_velocity"] = jnp.stack(
                 [jnp.broadcast_to(jnp.asarray(v, like.dtype), like.shape) for v in velocity]

@@ -178,7 +178,7 @@ class Fitness(EpisodeSpec):
             jnp.zeros((0, self.num_records)) if command is None else jnp.asarray(command)[rows].T,
             jnp.asarray(trajectory.power * dt).reshape(-1, every).sum(1)[:, None],
             jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[rows], water),
-            self.starts(key)[0][2, :1],
+            self.start_point(self.geometry, self.draw_starts(key))[2, :1],
             jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.context(key)),
             self.variation(key),
             None if trajectory.target is None else jnp.asarray(trajectory.target)[rows],

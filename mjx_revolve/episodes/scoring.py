@@ -35,6 +35,8 @@ RATES = ("energy", "water_velocity")
 # which no generation uses.
 REPORT_EPISODES = 16
 REPORT_STREAM = 2**32 - 2
+# The same of a champion's passport (`passport`).
+PASSPORT_STREAM = 2**32 - 3
 
 # The track is sampled at least this often [s].
 _INTERVAL = 0.1

@@ -32,6 +32,8 @@ from mjx_revolve.water.world import World
 
 # What a task may have recorded beside the core's position and the energy: see `Track`.
 RECORDS = ("core", "joints", "contacts", "forces", "water", "target", "course")
+# At so many moments up to the horizon the depth is foretold. A choice.
+_MOMENTS = 16
 # Settings of which one must be given, so that there is such a record.
 _GIVEN = {"target": ("target", "target_distance"), "course": ("course_spread",)}
 
@@ -50,12 +52,13 @@ class Track:
     """An episode of many individuals, sampled at equal intervals after the settling time.
 
     Attributes:
-        position: `[S, 3, lanes]` core, world frame [m]; the first row is where counting starts.
-        clearance: `[S, lanes]` height of the core above the bed, infinite without one [m].
+        position: `[S, 3, lanes]` the robot's place, its `task.point` (the centre of mass, or the
+            core), world frame [m]; the first row is where counting starts.
+        clearance: `[S, lanes]` height of that point above the bed, infinite without one [m].
         energy: `[S, lanes]` work of the servos since the row before, summed without sign [J].
         interval: time between rows [s].
-        start_height: height of the core at the episode's start, world frame [m].
-        length: body length, the robot's largest extent at rest [m].
+        start_height: height of that point at the episode's start, world frame [m].
+        length: body length, stretched out or at rest as `task.length` says [m].
         weight: of the robot in air [N].
         surface_height: [m].
         num_hinges: of the robot; a batch of different bodies has rows for more.
@@ -70,7 +73,7 @@ class Track:
             are recorded.
         water_force: `[S, 3, lanes]` of the water on the robot, buoyancy included, the inertia of
             carried water not, world frame [N]; None unless "forces" are recorded.
-        water_velocity: `[S, 3, lanes]` of the water where the core is, as if the robot were not
+        water_velocity: `[S, 3, lanes]` of the water at that place, as if the robot were not
             there, world frame [m/s]; None unless "water" is recorded.
         target: `[S, 3, lanes]` where the target is, world frame [m]; None unless "target" is
             recorded and there is one.
@@ -156,6 +159,7 @@ class Task:
         start: where episodes begin, like `start_at_depth`.
         on_bed: whether episodes begin on the bed, so that there must be one.
         measure: the measure that reports show beside the score.
+        point: what `Track.position` is the place of, as `task.point` says.
     """
 
     score: Callable[[Track, Any], jax.Array]
@@ -164,6 +168,7 @@ class Task:
     start: Callable[[Any, World, BodyGeometry, jax.Array], jax.Array] = start_at_depth
     on_bed: bool = False
     measure: str = "speed_m_s"
+    point: str = "core"
 
     def __post_init__(self) -> None:
         """Checks what a user may have got wrong."""
@@ -185,7 +190,7 @@ def _keeps_depth(track: Track, settings: Any) -> jax.Array:
 
 
 def moved_through_water(track: Track) -> jax.Array:
-    """`[S - 1, 3, lanes]` the core's way from row to row, less that of the water around it [m]."""
+    """`[S - 1, 3, lanes]` the robot's way from row to row, less that of the water around it [m]."""
     assert track.water_velocity is not None
     water = (track.water_velocity[1:] + track.water_velocity[:-1]) / 2
     return jnp.diff(track.position, axis=0) - track.interval * water
@@ -203,11 +208,37 @@ def directed_swim(track: Track, settings: Any) -> jax.Array:
 def speed(track: Track, settings: Any) -> jax.Array:
     """Net horizontal speed through the water while the robot keeps its depth [body lengths/s].
 
-    In any direction; drifting with a current counts nothing.
+    In any direction; drifting with a current counts nothing. With a `horizon`, net over that time,
+    if what the robot does went on: see `_sustained_speed`.
     """
     moved = moved_through_water(track)[:, :2]
+    if settings.horizon is not None:
+        return _sustained_speed(track, settings, moved)
     counted = moved * _keeps_depth(track, settings)[:, None]
     return safe_norm(tuple(jnp.sum(counted, 0))) / (track.duration * track.length)
+
+
+def _sustained_speed(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
+    """Net speed over the horizon, foretold from the episode's two halves [body lengths/s].
+
+    From one half to the next a robot turns by ψ and rises by some height. n halves of the way d,
+    each turned by ψ from the one before, have the net way d sin(nψ/2) / sin(ψ/2): in a circle none.
+    """
+    half = moved.shape[0] // 2
+    first, second = (jnp.sum(x, 0) for x in (moved[:half], moved[-half:]))
+    way = (safe_norm(tuple(first)) + safe_norm(tuple(second))) / 2
+    ahead = first[0] * second[0] + first[1] * second[1]
+    aside = first[0] * second[1] - first[1] * second[0]
+    # The tiny term: where nothing moves there is no turn, and no derivative of it.
+    turn = jnp.arctan2(aside, ahead + jnp.where(way > 0, 0.0, 1.0)) / 2
+    count = settings.horizon / (half * track.interval)
+    straight = jnp.abs(jnp.sinc(count * turn / np.pi) / jnp.sinc(turn / np.pi))
+    height = track.position[:, 2] - track.start_height
+    begun, ended = jnp.mean(height[: half + 1], 0), jnp.mean(height[-half - 1 :], 0)
+    share = np.linspace(0, 1, _MOMENTS)[:, None]
+    heights = begun + share * count * (ended - begun)
+    keeps = jnp.mean(_keeping(heights, settings.depth_tolerance), 0)
+    return way * straight * keeps / (half * track.interval * track.length)
 
 
 def reach_target(track: Track, settings: Any) -> jax.Array:
@@ -346,7 +377,7 @@ def find_task(settings: Any, source: str = "config") -> Task:
                 f"the {record}; found none"
             )
     records = dict.fromkeys((*task.records, *records_of(settings.measures)))
-    task = replace(task, records=tuple(records))
+    task = replace(task, records=tuple(records), point=settings.point)
     if settings.unit == "m":
         unit = score_unit(name, "m")
         if unit == task.unit:

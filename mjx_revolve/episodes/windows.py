@@ -222,13 +222,12 @@ class TruncatedBPTT:
     ) -> tuple[Float[Array, " lanes"], dict[str, jax.Array], dict[str, jax.Array]]:
         """Scores so far, their gradients by the window's rows, and the track so far."""
         fitness, every = self.fitness, self.fitness.record_every
+        place = fitness.start_point(fitness.geometry, episodes.starts)
 
         def run(rows: dict[str, jax.Array]) -> Any:
             track = extend_track(episodes.track, rows, clock // every)
             then = clock + self.records * every
-            score, _ = fitness.score_so_far(
-                track, episodes.position, fitness.geometry, context, then
-            )
+            score, _ = fitness.score_so_far(track, place, fitness.geometry, context, then)
             return score, track
 
         score, pull, track = jax.vjp(run, rows, has_aux=True)

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.episodes.settings import NamedFile
 
-FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard")
+FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard", "passport")
 """Settings of `evolution` that may change when a run is resumed; others make another run."""
 # Settings of a task that older versions lack: with their default values they are left out of
 # fingerprints, so that older runs can go on.
 _LATER_IN_TASK = (
-    "unit", "target_turn", "sight", "touch",
-    "course_spread", "course_changes", "course_turn", "course_rate",
+    "measures", "unit", "target_turn", "sight", "touch",
+    "course_spread", "course_changes", "course_turn", "course_rate", "horizon",
 )  # fmt: skip
 # Their versions must be the same in all processes of a run.
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
@@ -56,7 +56,7 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
         config: of the run.
         by_path: whether current fields and data count by their path, as they did in older runs.
     """
-    from mjx_revolve.episodes.config import Config
+    from mjx_revolve.episodes.config import OLDER_TASK, Config
     from mjx_revolve.episodes.settings import map_files
 
     def by_content(file: NamedFile) -> str:
@@ -84,11 +84,14 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
         brought = {name: [s.to_mapping() for s in own] for name, own in kinds.items() if own}
         if brought:
             data["controller"]["brought"] = brought
-    for name in ("measures", *_LATER_IN_TASK):
-        if data["task"][name] == type(config.task).model_fields[name].default:
+    usual = {name: type(config.task).model_fields[name].default for name in _LATER_IN_TASK}
+    for name, value in (usual | OLDER_TASK).items():
+        if data["task"][name] == value:
             del data["task"][name]
     if data["bodies"] is not None and not data["bodies"]["max_of"]:
         del data["bodies"]["max_of"]
+    if data["bodies"] is not None and data["bodies"]["selection"]["passport"] == "made":
+        del data["bodies"]["selection"]["passport"]  # older runs lack it
     for name in ("colony", "bodies"):
         if data[name] is None:
             del data[name]

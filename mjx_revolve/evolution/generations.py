@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from mjx_revolve.body.tree import Morphology
+from mjx_revolve.episodes.passport import Passport
 from mjx_revolve.episodes.scoring import REPORT_EPISODES, REPORT_STREAM, replay_key
 from mjx_revolve.evolution.strategies import FAILED_SCORE
 
@@ -23,6 +24,8 @@ Scored = tuple[np.ndarray, dict[str, np.ndarray]]
 # Fresh episodes per candidate to choose the champion. The reported score comes from others
 # (`REPORT_EPISODES`), because the best of several means is biased upwards, too.
 CHOOSE_EPISODES = 8
+# How many of the best are tried where a passport is required. A choice: some 20 s each.
+_TRIED = 4
 # A stream of random numbers that no generation uses.
 CHOOSE_STREAM = 2**32 - 1
 
@@ -41,6 +44,7 @@ class Champion:
         key: the first of those keys, to replay; None before.
         body: its body, where bodies have evolved.
         individual: its number, where bodies have evolved.
+        passport: what it was tried for; None: it was not.
     """
 
     genes: np.ndarray
@@ -51,6 +55,7 @@ class Champion:
     key: jax.Array | None = None
     body: Morphology | None = None
     individual: int | None = None
+    passport: Passport | None = None
 
 
 class Generation(NamedTuple):
@@ -165,7 +170,10 @@ def score_statistics(scores: np.ndarray) -> dict[str, float]:
 
 
 def choose_candidate(
-    score: Callable[[Sequence[int], jax.Array], Scored], eligible: np.ndarray, seed: int
+    score: Callable[[Sequence[int], jax.Array], Scored],
+    eligible: np.ndarray,
+    seed: int,
+    judge: Callable[[int], Passport] | None = None,
 ) -> tuple[int, dict[str, Any]]:
     """Chooses among candidates on fresh starts, and evaluates the winner on others.
 
@@ -177,9 +185,11 @@ def choose_candidate(
             measures.
         eligible: `[N]` whether a candidate may win.
         seed: of the run.
+        judge: makes a candidate's passport, where that is required: then the best of the best few
+            that passes wins, or the best of all where none does.
 
     Returns:
-        The winner's index, and `score`, `std`, `measures` and `key` of its `Champion`.
+        The winner's index, and `score`, `std`, `measures`, `key` and `passport` of its `Champion`.
     """
     root = jax.random.key(seed)
 
@@ -192,11 +202,22 @@ def choose_candidate(
         return scores.astype(np.float64), measures
 
     means = fresh(range(len(eligible)), CHOOSE_STREAM, CHOOSE_EPISODES)[0].mean(axis=0)
-    winner = int(np.argmax(np.where(eligible, means, -np.inf)))
+    order = np.argsort(-np.where(eligible, means, -np.inf), kind="stable")
+    winner, passport = int(order[0]), None
+    if judge is not None:
+        first = [int(k) for k in order[:_TRIED] if eligible[k] and means[k] > FAILED_SCORE]
+        tried: dict[int, Passport] = {}
+        for k in first:
+            tried[k] = judge(k)
+            if not tried[k].failed:
+                winner = k
+                break
+        passport = tried.get(winner)
     scores, measures = fresh([winner], REPORT_STREAM, REPORT_EPISODES)
     return winner, {
         "score": float(scores.mean()),
         "std": float(scores.std()),
         "measures": {name: float(values.mean()) for name, values in measures.items()},
         "key": replay_key(seed),
+        "passport": passport,
     }

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.passport import Passport, make_passport
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.generations import Champion, Scored, choose_candidate
@@ -59,7 +60,15 @@ class IndividualEvolution:
             return np.concatenate([scores for scores, _ in found]), measures
 
         seed = self.config.evolution.seed
-        winner, judged = choose_candidate(score, np.ones(len(elites), bool), seed)
+
+        def judge(k: int) -> Passport:
+            one = elites[k]
+            return make_passport(self.fitness.body_fitness(one.body), one.genes, seed)
+
+        required = self.fitness.bodies.selection.passport == "required"
+        winner, judged = choose_candidate(
+            score, np.ones(len(elites), bool), seed, judge if required else None
+        )
         return self._champion(elites[winner], **judged)
 
     def _champion(self, one: Individual, **judged: Any) -> Champion:

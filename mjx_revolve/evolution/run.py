@@ -7,12 +7,13 @@ import datetime
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TextIO
 
 from mjx_revolve.episodes.config import Config, load_config, override_config
 from mjx_revolve.episodes.fitness import Fitness
+from mjx_revolve.episodes.passport import PASSPORT, make_passport
 from mjx_revolve.episodes.settings import NamedFile, map_files
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.executor import Executor
@@ -383,9 +384,26 @@ class Run:
         if champion.individual is not None:
             facts["individual"] = champion.individual
         self.folder.save_champion(champion.genes, champion.body, final=True, **facts)
+        champion = self._judge(champion, say)
         say("drawing pictures")
         draw(self, champion)
         self.folder.update_info(finished=timestamp(), generations=self.generation, champion=facts)
+        return champion
+
+    def _judge(self, champion: Champion, say: Callable[[str], None]) -> Champion:
+        """The champion with its passport, written down."""
+        fitness, config = self.executor.fitness, self.config
+        if isinstance(fitness, BodyFitness):
+            assert champion.body is not None
+            fitness = fitness.body_fitness(champion.body)
+        if champion.passport is None and config.evolution.passport and isinstance(fitness, Fitness):
+            say("making the champion's passport")
+            found = make_passport(fitness, champion.genes, config.evolution.seed)
+            champion = replace(champion, passport=found)
+        if champion.passport is not None:
+            self.folder.write(PASSPORT, champion.passport.to_text().encode())
+        else:  # an older champion's
+            (self.folder.path / PASSPORT).unlink(missing_ok=True)
         return champion
 
     def close(self) -> None:

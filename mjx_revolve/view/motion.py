@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from mjx_revolve.engine.kinematics import mass_centers
+from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.view.surroundings import water_velocity
@@ -41,7 +43,7 @@ class Motion:
 
     Attributes:
         robot: that moved.
-        length: of its body [m].
+        length: of its body, as the task has it [m].
         weight: in air [N].
         time: `[T]` [s].
         qpos: `[T, nq]` as in a trajectory.
@@ -113,6 +115,7 @@ def analyse_motion(
     phases: np.ndarray | None = None,
     water: Water | None = None,
     target: np.ndarray | None = None,
+    task: TaskConfig | None = None,
 ) -> Motion:
     """Makes a motion of a trajectory.
 
@@ -123,6 +126,8 @@ def analyse_motion(
         phases: `[T, nhinge]`, see `Motion`.
         water: surface and current, each a number or `[T]`; None: the world's.
         target: see `Motion`.
+        task: whose point distances and speeds are of, and whose body length; None: the core's
+            centre, and the length at rest.
 
     Returns:
         The motion.
@@ -139,6 +144,8 @@ def analyse_motion(
     columns = (trajectory.time, trajectory.qpos, trajectory.ctrl, trajectory.power)
     time, qpos, ctrl, power = (np.asarray(column, float)[:count] for column in columns)
     length = robot.morphology.length
+    if task is not None and task.length == "stretched":
+        length = body_geometry(robot).stretched
     weight = robot.morphology.mass * max(robot.world.gravity, 1e-9)
     own = getattr(trajectory, "surface_height", None)  # what has none is in the world's water
     surface = np.full(count, robot.world.surface_height) if own is None else np.array(own)[:count]
@@ -150,7 +157,8 @@ def analyse_motion(
     energy = np.cumsum(power) * (float(np.median(np.diff(time))) if count > 1 else 0.0)
 
     first = max(min(int(np.searchsorted(time, counted_from - 1e-6)), count - 2), 0)
-    away = np.linalg.norm(path - path[first], axis=1)
+    scored = path if task is None or task.point == "core" else mass_centers(robot, qpos)
+    away = np.linalg.norm(scored - scored[first], axis=1)
     seconds, distance = float(time[-1] - time[first]), float(away[-1])
     if water is not None:
         water = jax.tree.map(lambda x: np.asarray(x)[:count] if np.ndim(x) else x, water)
@@ -185,7 +193,7 @@ def analyse_motion(
         distance=distance,
         speed=distance / seconds if seconds > 0.0 else 0.0,
         current=current,
-        water_speed=float(np.linalg.norm(path[-1] - path[first] - drift)) / seconds
+        water_speed=float(np.linalg.norm(scored[-1] - scored[first] - drift)) / seconds
         if seconds > 0.0
         else 0.0,
         target=target,

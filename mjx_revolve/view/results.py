@@ -27,7 +27,8 @@ def describe_score(champion: Champion, config: Config) -> str:
     """The result of a run: `0.158 ± 0.0025 body lengths/s, mean ± SD over 16 fresh starts`."""
     unit = score_unit(config.task.type, config.task.unit)
     score = f"{champion.score:.3g} ± {champion.std:.2g} {unit}".rstrip()
-    return f"{score}, mean ± SD over {REPORT_EPISODES} fresh starts"
+    mark = champion.passport.mark if champion.passport is not None else ""
+    return f"{score}, mean ± SD over {REPORT_EPISODES} fresh starts" + (f"; {mark}" if mark else "")
 
 
 def save_pictures(run: Run, champion: Champion) -> None:
@@ -64,7 +65,7 @@ def save_pictures(run: Run, champion: Champion) -> None:
         )
         counted = counted_time(config.task, robot.world.timestep)
         water, target = fitness.water(champion.key), target_at_last(config.task, trajectory)
-        figures["swim.png"] = plot_swim(robot, trajectory, counted, water, target)
+        figures["swim.png"] = plot_swim(robot, trajectory, counted, water, target, config.task)
     for name, figure in figures.items():
         folder.write(name, figure_png(figure))
 

@@ -31,6 +31,7 @@ from mjx_revolve.water.flow import Water
 
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
+    from mjx_revolve.episodes.config import TaskConfig
     from mjx_revolve.episodes.simulate import Trajectory
 
 _INCHES, _DPI = (16.0, 9.0), 100
@@ -67,6 +68,7 @@ def plot_swim(
     counted_from: float = 0.0,
     water: Water | None = None,
     target: np.ndarray | None = None,
+    task: TaskConfig | None = None,
 ) -> Figure:
     """Draws the way a robot swam, see `draw_motion`.
 
@@ -76,6 +78,7 @@ def plot_swim(
         counted_from: when its task begins to count, see `motion.counted_time` [s].
         water: surface and current, each a number or a row for each step; None: the world's.
         target: `[3]` that it was to reach, world frame [m].
+        task: see `motion.analyse_motion`.
 
     Returns:
         The figure.
@@ -83,7 +86,7 @@ def plot_swim(
     Raises:
         InputError: the trajectory is another robot's, or has no finite row.
     """
-    return draw_motion(analyse_motion(robot, trajectory, counted_from, None, water, target))
+    return draw_motion(analyse_motion(robot, trajectory, counted_from, None, water, target, task))
 
 
 @in_style

@@ -179,8 +179,9 @@ def turned(yaws, roll=0.3):
 
 
 SETTINGS = SimpleNamespace(
-    direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, target=(4.0, 0.0, 0.0), height=0.4
-)
+    direction=(2.0, 0.0, 0.0), depth_tolerance=0.1, target=(4.0, 0.0, 0.0), height=0.4,
+    horizon=None,
+)  # fmt: skip
 
 
 @pytest.mark.slow
@@ -206,6 +207,61 @@ SETTINGS = SimpleNamespace(
 )
 def test_tasks_with_known_scores(task, given, score):
     assert float(TASKS[task].score(given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.05, 0.2, -0.6])
+def test_a_horizon_foretells_the_way_of_a_circle(rate):
+    """At 1 m/s and so many rad/s: from 20 s the net way of 120 s, by the chord of the arc."""
+    time = np.arange(21.0)
+    angle = rate * time
+    x, y = (time, 0 * time) if rate == 0 else (np.sin(angle) / rate, (1 - np.cos(angle)) / rate)
+    given = track(x)
+    given = replace(given, position=given.position.at[:, 1, 0].set(y.astype(np.float32)))
+    far = SimpleNamespace(horizon=120.0, depth_tolerance=0.1)
+    expected = 2.0 if rate == 0 else 2 * abs(2 * np.sin(60 * rate) / rate) / 120
+    assert float(TASKS["speed"].score(given, far)[0]) == pytest.approx(expected, rel=1e-3)
+    near = SimpleNamespace(horizon=None, depth_tolerance=0.1)
+    assert float(TASKS["speed"].score(given, near)[0]) >= expected - 1e-5
+    slope = jax.grad(lambda s: TASKS["speed"].score(replace(given, position=s), far)[0])
+    assert jnp.all(jnp.isfinite(slope(given.position)))
+    assert jnp.all(jnp.isfinite(slope(0 * given.position)))
+
+
+def test_a_horizon_foretells_when_depth_is_left():
+    """Rising 2 mm/s leaves the 0.1 m that count after 50 s, and what lies beyond after 100 s."""
+    time = np.arange(21.0)
+    far = SimpleNamespace(horizon=120.0, depth_tolerance=0.1)
+    score = float(TASKS["speed"].score(track(time, z=0.002 * time), far)[0])
+    assert score == pytest.approx(2.0 * 0.6, rel=0.1)
+    assert float(TASKS["speed"].score(track(time, z=0.002 * time), SETTINGS)[0]) == 2.0
+
+
+@pytest.mark.slow
+def test_in_a_void_nothing_gets_anywhere(tmp_path):
+    """What only shakes its core moves that, and its centre of mass not at all."""
+    own = swimmer(tmp_path, ROBOT, TASK | {"start_tilt": 0.0, "duration": 2.0})
+    void = {"name": "empty_underwater", "density": 0.0, "gravity": 0.0, "buoyancy": "off"}
+    void |= {"drag": "off", "added_mass": False}
+    moved = {}
+    for point in ("core", "center_of_mass"):
+        settings = own | {"trim": "none", "world": void}
+        fitness = make_fitness(settings, **{"task.point": point, "task.settle": 0.1})
+        genes = jnp.full((1, fitness.num_genes), 1.0)
+        moved[point] = float(fitness.evaluate(genes, KEY)[1]["path_length_m"][0])
+    # What is left is the first-order error of a step of 5 ms.
+    assert moved["core"] > 0.01 and moved["center_of_mass"] < moved["core"] / 20
+
+
+@pytest.mark.slow
+def test_the_length_is_the_tasks(settings, population):
+    """A body's scores by its two lengths stand in their inverse ratio."""
+    found = {
+        name: make_fitness(settings, **{"task.length": name}) for name in ("rest", "stretched")
+    }
+    rest, stretched = (np.asarray(fitness(population[:4], KEY)) for fitness in found.values())
+    sizes = found["rest"].geometry
+    np.testing.assert_allclose(rest * sizes.length, stretched * sizes.stretched, rtol=1e-5)
+    assert sizes.stretched >= sizes.length
 
 
 def test_scores_in_metres_leave_the_body_length_out():

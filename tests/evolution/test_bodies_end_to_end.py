@@ -26,7 +26,7 @@ CONFIG = {
     "controller": {"type": "sine"},
     "task": {"type": "speed", "duration": 0.5, "settle": 0.1, "trials": 1},
     "bodies": {"max_modules": 5, "max_hinges": 2, "learning": {"population_size": 3}},
-    "evolution": {"population_size": 4, "generations": 2, "checkpoint_every": 1},
+    "evolution": {"population_size": 4, "generations": 2, "checkpoint_every": 1, "passport": False},
 }
 
 

@@ -54,7 +54,13 @@ SETTINGS = {
         "life": {"window": 4.0, "max_age": 40.0, "childhood": 12.0, "full_fitness": 0.2},
         "energy": {"start": 5.0, "capacity": 8.0, "idle": 0.2, "chargers": [[0, 0, -1]]},
     },
-    "evolution": {"population_size": 8, "generations": 12, "checkpoint_every": 5, "seed": 3},
+    "evolution": {
+        "population_size": 8,
+        "generations": 12,
+        "checkpoint_every": 5,
+        "seed": 3,
+        "passport": False,
+    },
 }
 
 

@@ -143,6 +143,22 @@ def test_older_run_folders_open(tmp_path, config):
     assert load_world(run.load_config().world_name).density == 1030.0
 
 
+def test_older_runs_keep_the_core_and_the_length_at_rest(tmp_path, config):
+    """Their config.yaml has no such settings, and their fingerprints lack them."""
+    older = override_config(config, {"task.point": "core", "task.length": "rest"})
+    run, _ = runs.create_run_folder(tmp_path / "run", older)
+    text = (run.path / "config.yaml").read_text()
+    for line in ("point: core", "length: rest", "horizon: null"):
+        assert f"\n  {line}\n" in text
+        text = text.replace(f"  {line}\n", "")
+    (run.path / "config.yaml").write_text(text)
+    run.close()
+    found = run.load_config()
+    assert (found.task.point, found.task.length) == ("core", "rest")
+    assert settings_hash(found) == settings_hash(older) != settings_hash(config)
+    assert config.task.point == "center_of_mass"  # a user's file without them is a new one
+
+
 def test_a_robot_that_nothing_moves_does_not_evolve():
     config = load_config("smoke", {"morphology": "core"})
     with pytest.raises(InputError, match=r"expected a robot with hinges or thrusters.*found none"):

@@ -150,7 +150,13 @@ SETTINGS = {
         "mating": {"distance": 1.0, "likeness": 0.0, "adult": 2.0, "children": 2},
         "life": {"window": 2.0, "max_age": 12.0, "childhood": 4.0, "full_fitness": 0.2},
     },
-    "evolution": {"population_size": 8, "generations": 8, "checkpoint_every": 4, "seed": 3},
+    "evolution": {
+        "population_size": 8,
+        "generations": 8,
+        "checkpoint_every": 4,
+        "seed": 3,
+        "passport": False,
+    },
 }
 
 

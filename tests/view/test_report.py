@@ -3,6 +3,7 @@
 import errno
 import json
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -11,9 +12,10 @@ import pytest
 import mjx_revolve
 from laboratory import _ELBOW as ELBOW
 from laboratory import read
-from mjx_revolve import evolve, report
+from mjx_revolve import evolve, inspect, report
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.fitness import make_fitness
+from mjx_revolve.episodes.passport import Check, Passport
 from mjx_revolve.episodes.run_reader import read_metrics
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution import run_folder as runs
@@ -572,6 +574,36 @@ def test_a_page_about_one_run(copy, quick, capsys):
 
 
 @pytest.mark.slow
+def test_a_champion_that_fails_its_passport_is_marked(copy, quick, capsys):
+    """Beside its number, in a table, and by `inspect`; a damaged passport is named."""
+    checks = {"kept_120_s": Check("share kept over 120 s", 0.3, least=0.8),
+              "overlap": Check("deepest overlap", 1.0, "mm", most=3.0)}  # fmt: skip
+    path = copy / "champion" / "passport.yaml"
+    path.write_text(Passport(checks).to_text())
+    assert run_main(copy) == 0
+    page = (copy / "report.html").read_text()
+    assert "✗ fails its passport: kept_120_s" in page and "Its passport" in page
+    for cell in ("share kept over 120 s", "at least 0.8", "FAILS", "1 mm", "passes"):
+        assert f">{cell}</td>" in page
+    capsys.readouterr()
+    assert run_command(inspect.main, [str(copy / "champion" / "morphology.yaml")]) == 0
+    assert "champion of a run: fails its passport: kept_120_s" in capsys.readouterr().out
+    path.write_text("checks: {a: 3}")
+    record = read_run(copy)
+    assert "expected words and a value; found 3" in record.problems[0].text
+    path.unlink()
+    assert run_main(copy) == 0 and "✗" not in (copy / "report.html").read_text()
+
+
+def test_runs_of_the_core_have_another_task(lab):
+    """Older scores are not compared with those of centres of mass."""
+    record = read_run(lab["folder"] / "s0")
+    older = {"point": "core", "length": "rest"}
+    task = record.config.task.model_copy(update=older)
+    changed = replace(record, config=record.config.model_copy(update={"task": task}))
+    assert changed.task == f"{record.task} (core, rest)"
+
+
 def test_a_page_about_several_runs(lab, copy, quick, capsys):
     runs_of = [lab["folder"] / f"s{seed}" for seed in range(3)]
     assert run_main(*runs_of, "run", "--out", "page.html") == 0

@@ -43,7 +43,7 @@ def config(folder, **changes):
         "controller": {"type": "mlp", "hidden": 2, "messages": 0, "sensors": SENSORS},
         "task": {"type": "directed_swim", "duration": 0.5, "settle": 0.0, "trials": 2,
                  "start_yaw": 1.0},
-        "evolution": {"population_size": 4, "generations": 1},
+        "evolution": {"population_size": 4, "generations": 1, "passport": False},
     }  # fmt: skip
     return data | changes
 

@@ -76,7 +76,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
     begin = counted_time(fitness.config.task, fitness.robot.world.timestep)
     motion = analyse_motion(
         fitness.robot, trajectory, begin, phases, fitness.water(key),
-        target_at_last(fitness.config.task, trajectory),
+        target_at_last(fitness.config.task, trajectory), fitness.config.task,
     )  # fmt: skip
     finite = jax.tree.map(lambda x: x[:count], trajectory)
     return ChampionReplay(motion, score, measures, trace_sensors(fitness, finite, key))

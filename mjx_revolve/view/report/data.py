@@ -16,8 +16,9 @@ import numpy as np
 from pydantic import BaseModel
 
 import mjx_revolve
-from mjx_revolve.episodes.config import Config, make_config, with_older_values
+from mjx_revolve.episodes.config import Config, complete_older, make_config
 from mjx_revolve.episodes.individual_log import EVENTS, GENERATIONS, INDIVIDUALS
+from mjx_revolve.episodes.passport import PASSPORT, load_passport
 from mjx_revolve.episodes.run_reader import RunReader, find_run, generation_of, read_metrics
 from mjx_revolve.episodes.settings import find_copies, locate_files
 from mjx_revolve.inputs.errors import InputError, reading
@@ -153,7 +154,7 @@ def _read_config(record: RunRecord) -> None:
         names = ", ".join(unknown)
         record.note("version", f"config.yaml: this version does not know {names}; read without")
     try:
-        known = with_older_values(locate_files(known, find_copies(record.folder)))
+        known = complete_older(locate_files(known, find_copies(record.folder)))
         record.config = make_config(known, record.folder, source=str(path))
     except InputError as error:
         spare = record.folder / "champion" / "morphology.yaml"
@@ -236,6 +237,9 @@ def _read_champion(record: RunRecord) -> None:
             if not found.genes.size:
                 raise InputError(f"{found.path}: genes: expected finite numbers; found none")
             record.genes, record.champion = found.genes, dict(found.facts)
+    if (path := record.folder / PASSPORT).is_file():
+        with record.noting_damage():
+            record.passport = load_passport(path)
     judged = record.info.get("champion")
     if isinstance(judged, dict):  # the same facts, and there even where genes.yaml is not
         record.champion = record.champion | judged

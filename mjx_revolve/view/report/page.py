@@ -291,7 +291,8 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
     origin = record.stand_in or record.champion.get("origin")
     return sections.champion(
         robot.morphology.title, float(motion.time[-1]), motion.counted_from,
-        origin if isinstance(origin, str) else "", tables.measures_table(record, replay), pictures,
+        origin if isinstance(origin, str) else "", tables.measures_table(record, replay),
+        record.passport.rows if record.passport is not None else [], pictures,
     )  # fmt: skip
 
 

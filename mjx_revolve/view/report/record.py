@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.config import OLDER_TASK, Config
+from mjx_revolve.episodes.passport import Passport
 from mjx_revolve.episodes.tasks import score_unit, shown_measure
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
@@ -61,6 +62,7 @@ class RunRecord:
         population: all individuals, where bodies have evolved; else None.
         history: their births, matings and deaths, in a colony; else None.
         champion: facts about it: score, score_std, origin, final, measures, individual.
+        passport: what it was tried for; None without one.
         stand_in: where the genes are from, if they are not the champion's own.
         problems: what is missing, damaged or otherwise notable.
     """
@@ -75,6 +77,7 @@ class RunRecord:
     population: Population | None = None
     history: ColonyHistory | None = None
     champion: dict[str, Any] = field(default_factory=dict)
+    passport: Passport | None = None
     stand_in: str = ""
     problems: list[Problem] = field(default_factory=list)
 
@@ -113,9 +116,12 @@ class RunRecord:
     def task(self) -> str:
         """The task's type; a user's own by what its file holds; "" where it is not known.
 
-        Scores in metres are those of another task.
+        Scores in metres are those of another task, and so are those of the core or by the length
+        at rest.
         """
-        return content_name(self._task_type) + " in metres" * (self._length_unit == "m")
+        found = content_name(self._task_type) + " in metres" * (self._length_unit == "m")
+        measured = [str(self.setting(f"task.{name}", old)) for name, old in OLDER_TASK.items()]
+        return found + (f" ({', '.join(measured)})" if measured == [*OLDER_TASK.values()] else "")
 
     @property
     def unit(self) -> str:

@@ -20,6 +20,8 @@ from mjx_revolve.view.report.record import RunRecord, number
 from mjx_revolve.view.statistics import difference, interval
 
 _NONE = "–"
+# Stands behind the number of a champion that fails its passport.
+_FAILS = "✗"
 Cell = str | int
 """Of a table."""
 
@@ -40,7 +42,9 @@ def _score(record: RunRecord) -> str:
     score, std = (number(record.champion.get(key)) for key in ("score", "score_std"))
     if score is None or not record.is_finished:
         return _NONE
-    return format_number(score) + ("" if std is None else f" ± {format_number(std, 2)}")
+    failed = record.passport is not None and record.passport.failed
+    spread = "" if std is None else f" ± {format_number(std, 2)}"
+    return format_number(score) + spread + (f" {_FAILS}" if failed else "")
 
 
 def _known_measures(records: Iterable[RunRecord]) -> list[str]:
@@ -86,6 +90,8 @@ def _of_run(record: RunRecord, unit: str) -> list[tuple[str, str]]:
     pairs = []
     if record.is_finished:
         starts = f"mean ± standard deviation over {REPORT_EPISODES} fresh starts"
+        mark = record.passport.mark if record.passport is not None else ""
+        starts += f"; {_FAILS} {mark}" if mark else ""
         pairs.append((_score(record), f"score{unit}, {starts}"))
     elif "champion" in record.metrics:
         own = unit if record.history is None else ", fitness in the colony"

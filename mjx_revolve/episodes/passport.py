@@ -1,0 +1,392 @@
+"""A champion's passport: whether what it does would last, and could be built and confirmed.
+
+Evolution is a search for what a score forgot. So a champion is swum again as it was not selected:
+for longer, in smaller steps, from other starts, in other water, without its brain. All lanes of
+one program swim side by side; only another timestep is another program.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import yaml
+
+from mjx_revolve.control.controller import Controller, StepOutput
+from mjx_revolve.control.readings import SensorReadings
+from mjx_revolve.engine.forces import motor_torques
+from mjx_revolve.engine.plant import Plant
+from mjx_revolve.engine.self_overlap import self_overlap
+from mjx_revolve.engine.variation import Variation
+from mjx_revolve.episodes.evaluation import Chunk, task_recorder
+from mjx_revolve.episodes.fitness import Fitness, fit_body
+from mjx_revolve.episodes.scoring import PASSPORT_STREAM, replay_key
+from mjx_revolve.episodes.simulate import Trajectory
+from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.numerics.xla import jit, over_chunks
+from mjx_revolve.water.bed import bed_height
+from mjx_revolve.water.drag import find_drag_law
+
+PASSPORT = "champion/passport.yaml"
+"""Its place in a run folder."""
+
+# How long it swims [s], and after which other time its score is looked at.
+_LONG, _MIDDLE = 120.0, 30.0
+# Fresh starts; and how many of them the variants are tried from.
+_STARTS, _FEW = 64, 8
+# By which coefficients of water and motors differ: what is not known of them, doubled. Drag of
+# cubes and plates spreads by 30 % (see `RobustConfig`).
+_FACTOR = 1.3
+# A joint that turns more slowly than this rests: 0.3° in a step of a servo's pulses, 20 ms [rad/s].
+_RESTING = 0.25
+
+# The speed of a joint is looked at that it has for all but the fastest hundredth of the time.
+_OFTEN = 0.99
+
+# What is required. All are choices, with these reasons.
+KEPT = 0.8
+"""Least share of the score that is left over 30 and 120 s: who turns or rises loses all of it."""
+STEP = 0.1
+"""Largest relative change of the score at half and a quarter of the step: half of what two
+measurements of one real robot differ by."""
+WORST_TENTH = 0.5
+"""Least share of the score of the worst tenth of fresh starts: no lucky starts."""
+VARIED = 0.5
+"""Least share of the score with a coefficient 30 % off: what goes with its square is left half."""
+BRAINLESS = 0.1
+"""Largest share of the score that a robot with joints at rest has: what only floats or sinks."""
+OVERLAP = 3.0
+"""Deepest overlap of two modules [mm]: what play and bending of printed parts may take up."""
+REVERSALS = 10.0
+"""Most reversals of a joint in a second: a hobby servo follows up to some 5 Hz."""
+TORQUE = 0.7
+"""Largest root mean square of a servo's torque, as a share of its effort: that of a sine which just
+reaches it; a servo that uses more is at its limit for most of the time."""
+
+
+class Check(NamedTuple):
+    """A line of a passport.
+
+    Attributes:
+        words: what was tried.
+        value: what was found.
+        unit: of the value; "" for a share.
+        least: the least value that passes; None for any.
+        most: the largest; None for any.
+    """
+
+    words: str
+    value: float
+    unit: str = ""
+    least: float | None = None
+    most: float | None = None
+
+    @property
+    def judged(self) -> bool:
+        """Whether there is a limit."""
+        return self.least is not None or self.most is not None
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value is within the limits; without any, all values are."""
+        low = self.least is None or self.value >= self.least
+        return bool(low and (self.most is None or self.value <= self.most))
+
+    @property
+    def limit(self) -> str:
+        """The limits in words."""
+        found = [] if self.least is None else [f"at least {self.least:g}"]
+        found += [] if self.most is None else [f"at most {self.most:g}"]
+        return " and ".join(found)
+
+
+@dataclass(frozen=True)
+class Passport:
+    """What a champion was tried for, by name."""
+
+    checks: Mapping[str, Check]
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Names of what fails."""
+        return tuple(name for name, check in self.checks.items() if not check.passed)
+
+    @property
+    def mark(self) -> str:
+        """What stands beside the champion's number: "" where all is passed."""
+        return f"fails its passport: {', '.join(self.failed)}" if self.failed else ""
+
+    @property
+    def rows(self) -> list[tuple[str, str, str, str]]:
+        """What was tried, the value, the limit and the verdict of each line, in words."""
+        return [
+            (c.words, f"{c.value:.3g} {c.unit}".rstrip(), c.limit,
+             ("passes" if c.passed else "FAILS") if c.judged else "")
+            for c in self.checks.values()
+        ]  # fmt: skip
+
+    def to_text(self) -> str:
+        """The text of `champion/passport.yaml`."""
+        checks = {
+            name: {k: v for k, v in check._asdict().items() if v not in (None, "")}
+            | ({"passed": check.passed} if check.judged else {})
+            for name, check in self.checks.items()
+        }
+        data = {"passed": not self.failed, "checks": checks}
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+
+
+def load_passport(path: Path) -> Passport:
+    """Reads a passport's file.
+
+    Raises:
+        InputError: it is missing, or holds something else.
+    """
+    data = load_yaml(path)
+    checks = data.get("checks") if isinstance(data, dict) else None
+    if not isinstance(checks, dict):
+        raise InputError(f"{path}: checks: expected a mapping; found {show(checks)}")
+    return Passport({str(name): _read_check(f"{path}: checks.{name}", row)
+                     for name, row in checks.items()})  # fmt: skip
+
+
+def _read_check(place: str, row: Any) -> Check:
+    if not isinstance(row, dict) or not isinstance(row.get("words"), str):
+        raise InputError(f"{place}: expected words and a value; found {show(row)}")
+
+    def number(name: str) -> float:
+        x = row.get(name)
+        if isinstance(x, bool) or not isinstance(x, int | float):
+            raise InputError(f"{place}.{name}: expected a number; found {show(x)}")
+        return float(x)
+
+    least, most = (number(name) if name in row else None for name in ("least", "most"))
+    return Check(row["words"], number("value"), str(row.get("unit", "")), least, most)
+
+
+# ------------------------------------------------------------------ making one
+
+
+def make_passport(fitness: Fitness, genes: Any, seed: int) -> Passport:
+    """Tries a champion as it was not selected.
+
+    Args:
+        fitness: of its body.
+        genes: `[num_genes]`.
+        seed: of its run.
+
+    Returns:
+        The passport; the same bits for the same arguments.
+    """
+    genes = jnp.asarray(genes, jnp.float32)
+    key = jax.random.fold_in(jax.random.key(seed), PASSPORT_STREAM)
+    trajectory = fitness.replay(genes, replay_key(seed))
+    return Passport(dict([*_swim(fitness, genes, key), *_joints(fitness, trajectory)]))
+
+
+class _Lanes(NamedTuple):
+    """Episodes of one program, `[lanes]` each.
+
+    Attributes:
+        start: which of the fresh starts.
+        brain: 1 with its brain, 0 with joints at rest.
+        variation: factors on coefficients; None where they cannot be varied.
+    """
+
+    start: np.ndarray
+    brain: np.ndarray
+    variation: Variation | None
+
+
+def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[str, Check]]:
+    """Scores under other conditions than those of the selection."""
+    usual, unit = fitness.config.task.duration, fitness.task.unit
+    varied = fitness.config.engine == "population" and find_drag_law(fitness.world.drag).varied
+    tried = _variants() if varied else {}
+    few = _Lanes(np.arange(_FEW), np.ones(_FEW, int), None)
+    # XLA compiles without Python's lock: the three programs side by side.
+    with ThreadPoolExecutor(3) as threads:
+        coarse = threads.submit(_scores, fitness, genes, key, _all_lanes(tried), True)
+        fine = {
+            part: threads.submit(_scores, _with_step(fitness, part), genes, key, few, False)
+            for part in (2, 4)
+        }
+        scores = coarse.result()
+        finer = {part: found.result()[usual].mean() for part, found in fine.items()}
+    own = scores[usual][:_STARTS]
+    # Scores that are no rates are no shares of each other: they are shown, and not judged.
+    limits = unit.endswith("/s")
+
+    def share(found: np.ndarray, of: np.ndarray) -> float:
+        return float(found.mean() / of.mean()) if of.mean() > 0 else math.nan
+
+    def checked(
+        words: str, value: float, least: float | None = None, most: float | None = None
+    ) -> Check:
+        return Check(words, value, least=least, most=most) if limits else Check(words, value)
+
+    yield "score", Check(f"score from {_STARTS} fresh starts", float(own.mean()), unit)
+    yield "score_sd", Check("its standard deviation", float(own.std()), unit)
+    worst = share(np.sort(own)[: _STARTS // 10], own)
+    yield "worst_tenth", checked("share in the worst tenth", worst, least=WORST_TENTH)
+    for seconds, found in scores.items():
+        if seconds != usual:
+            kept = share(found[:_STARTS], own)
+            yield f"kept_{seconds:g}_s", checked(f"share kept over {seconds:g} s", kept, least=KEPT)
+    first = own[:_FEW]
+    for part, mean in finer.items():
+        change = float(abs(mean - first.mean()) / max(abs(first.mean()), 1e-9))
+        yield f"step_over_{part}", Check(f"change at 1/{part} of the step", change, most=STEP)
+    trials = scores[usual][_STARTS:].reshape(-1, _FEW)
+    for (name, (words, _)), found in zip(tried.items(), trials, strict=False):
+        yield name, checked(f"share with {words}", share(found, first), least=VARIED)
+    idle = abs(share(trials[-1], first))
+    yield "brainless", checked("share with joints at rest", idle, most=BRAINLESS)
+
+
+def _variants() -> dict[str, tuple[str, Variation]]:
+    """Coefficients off by `_FACTOR`, one at a time, with their names in words."""
+    return {
+        f"{name}_{word}": (f"{name.replace('_', ' ')} x {factor:.2g}", Variation(**{name: factor}))
+        for name in ("drag", "added_mass", "motor")
+        for word, factor in (("less", 2 - _FACTOR), ("more", _FACTOR))
+    }
+
+
+def _all_lanes(tried: Mapping[str, tuple[str, Variation]]) -> _Lanes:
+    """The fresh starts, then some of them with each variant, then without a brain."""
+    start = np.concatenate([np.arange(_STARTS), *[np.arange(_FEW)] * (len(tried) + 1)])
+    brain = np.where(np.arange(len(start)) < len(start) - _FEW, 1, 0)
+    if not tried:
+        return _Lanes(start, brain, None)
+    rows = [Variation()] * _STARTS
+    rows += [variation for _, variation in tried.values() for _ in range(_FEW)]
+    rows += [Variation()] * _FEW
+    return _Lanes(
+        start, brain, Variation(*(np.array(x, np.float32) for x in zip(*rows, strict=True)))
+    )
+
+
+def _with_step(fitness: Fitness, part: int) -> Fitness:
+    """The same body in a world of so many steps for one."""
+    config = fitness.config
+    world = {"name": config.world_name, **config.world_overrides}
+    world["timestep"] = fitness.world.timestep / part
+    # The robot's own body is trimmed already.
+    config = config.model_copy(update={"world": world, "trim": "none"})
+    return fit_body(config, fitness.robot.morphology)
+
+
+def _scores(
+    fitness: Fitness, genes: jax.Array, key: jax.Array, lanes: _Lanes, long: bool
+) -> dict[float, np.ndarray]:
+    """Scores of lanes after some times.
+
+    Args:
+        fitness: of the body.
+        genes: `[num_genes]`.
+        key: draws the starts.
+        lanes: what is tried.
+        long: whether it swims longer than the task lasts.
+
+    Returns:
+        `[lanes]` by time [s]: the task's duration first, then the longer ones.
+    """
+    usual = fitness.config.task.duration
+    times = [usual, *(t for t in (_MIDDLE, _LONG) if long and t > usual)]
+
+    def spec(seconds: float) -> Fitness:
+        task = fitness.settings.model_copy(
+            update={"duration": seconds, "trials": _STARTS, "robust": None}
+        )
+        return replace(fitness, config=fitness.config.model_copy(update={"task": task}))
+
+    specs = {seconds: spec(seconds) for seconds in times}
+    whole = replace(specs[times[-1]], controller=_silenceable(fitness.controller))
+
+    def run(genes: jax.Array, key: jax.Array) -> Any:
+        starts = whole.precise_starts(genes, key)
+        starts = jax.tree.map(lambda x: x[..., lanes.start], starts)
+        starts = starts._replace(variation=jax.tree.map(jnp.asarray, lanes.variation))
+        population = jnp.stack([jnp.append(genes, active) for active in (0.0, 1.0)])
+
+        def swim(brain: jax.Array, lane: jax.Array) -> dict[float, jax.Array]:
+            chunk = whole.prepare(True, False, (), population, starts, brain, lane)
+            recorder = task_recorder(chunk.rollout.engine, whole.task, whole.world)
+            _, track = chunk.rollout.advance(
+                chunk.state, recorder, whole.num_records, whole.record_every, chunk.inputs
+            )
+            return {
+                seconds: _score(one, chunk, jax.tree.map(lambda x, n=one.num_records: x[:n], track))
+                for seconds, one in specs.items()
+            }
+
+        order = jnp.arange(len(lanes.start), dtype=jnp.int32)
+        return over_chunks(swim)(jnp.asarray(lanes.brain, jnp.int32), order)
+
+    found = jit(run)(genes, key)
+    return {seconds: np.asarray(x, float) for seconds, x in found.items()}
+
+
+def _score(spec: Fitness, chunk: Chunk, track: dict[str, jax.Array]) -> jax.Array:
+    """`[lanes]` scores; NaN below the bed, where an engine without contact has led a robot."""
+    score = spec.score(track, chunk.position, chunk.geometry, chunk.rollout.context).score
+    if spec.world.bed is None:
+        return score
+    x, y, z = (track["position"][:, k] for k in range(3))
+    return jnp.where(jnp.any(z < bed_height(spec.world.bed, x, y), 0), jnp.nan, score)
+
+
+def _silenceable(controller: Controller) -> Controller:
+    """A controller with one more gene: 0 keeps joints and thrusters at rest, 1 changes nothing."""
+
+    def decode(genes: jax.Array, plant: Plant) -> Any:
+        return controller.decode(genes[:-1], plant), genes[-1]
+
+    def step(parameters: Any, state: Any, time: jax.Array, readings: SensorReadings) -> StepOutput:
+        own, active = parameters
+        state, ctrl = controller.step(own, state, time, readings)
+        return state, ctrl * active
+
+    return controller._replace(
+        num_genes=controller.num_genes + 1,
+        decode=decode,
+        init=lambda parameters: controller.init(parameters[0]),
+        step=step,
+    )
+
+
+def _joints(fitness: Fitness, trajectory: Trajectory) -> Iterator[tuple[str, Check]]:
+    """What one episode asks of joints, of the busiest of them, and of the room between modules."""
+    robot = fitness.robot
+    if not robot.num_hinges:
+        return
+    rows = np.asarray(trajectory.time) >= fitness.settings.settle
+    qpos, qvel, ctrl = (
+        np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
+    )
+    moved, speed = robot.assembly.moved, qvel[:, 6:]
+    depth = np.abs(1000 * self_overlap(robot, qpos).depth)  # rather than -0
+    yield "overlap", Check("deepest overlap of modules", float(depth.max()), "mm", most=OVERLAP)
+    yield "overlap_time", Check("share of time with an overlap", float(np.mean(depth > OVERLAP)))
+    rate = count_reversals(speed).max() / (len(qvel) * robot.world.timestep)
+    yield "reversals", Check("reversals of a joint", float(rate), "1/s", most=REVERSALS)
+    torque = motor_torques(robot, qpos, qvel, ctrl) / robot.assembly.effort[moved]
+    used = float(np.sqrt(np.mean(torque**2, 0)).max())
+    yield "torque", Check("share of a servo's torque used, root mean square", used, most=TORQUE)
+    fastest = np.quantile(np.abs(speed) / robot.assembly.speed[moved], _OFTEN, axis=0).max()
+    yield "speed", Check(f"share of a servo's speed used, {_OFTEN:.0%} of the time", float(fastest))
+
+
+def count_reversals(speed: np.ndarray) -> np.ndarray:
+    """How often each joint turns back `[n]`, of speeds `[T, n]` [rad/s]; rests do not count."""
+    moving = [column[np.abs(column) > _RESTING] for column in speed.T]
+    return np.array([np.count_nonzero(np.diff(np.sign(column))) for column in moving])

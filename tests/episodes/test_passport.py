@@ -1,0 +1,137 @@
+"""Passports: what drifts, chatters or overlaps fails where it should; same seed, same bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from laboratory import OAR, QUICK, body, swimmer
+from mjx_revolve import InputError, make_fitness
+from mjx_revolve.episodes import passport
+from mjx_revolve.episodes.fitness import fit_body
+from mjx_revolve.episodes.passport import Check, Passport, count_reversals, load_passport
+from mjx_revolve.episodes.simulate import Trajectory
+from mjx_revolve.evolution.generations import choose_candidate
+
+TASK = {"type": "directed_swim", "duration": 0.6, "settle": 0.2, "trials": 1}
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Passports of seconds, not minutes, compiled in haste."""
+    monkeypatch.setattr(passport, "_MIDDLE", 0.8)
+    monkeypatch.setattr(passport, "_LONG", 1.2)
+    monkeypatch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
+
+
+@pytest.mark.slow
+def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, short):
+    """A robot that a current carries keeps its score in all other trials."""
+    settings = swimmer(tmp_path, OAR, TASK) | {"world": {"name": "lake", "current": [0.2, 0, 0]}}
+    fitness = make_fitness(settings)
+    genes = np.zeros(fitness.num_genes)
+    found = passport.make_passport(fitness, genes, 3)
+    assert found.failed == ("brainless",) and "brainless" in found.mark
+    checks = found.checks
+    assert checks["brainless"].value == pytest.approx(1.0, abs=1e-3)
+    assert checks["kept_0.8_s"].passed and checks["kept_1.2_s"].passed
+    assert {"drag_less", "drag_more", "added_mass_less", "motor_more"} <= set(checks)
+    # In the current a robot takes up its speed the sooner the more drag it has.
+    assert checks["drag_less"].value < 1 < checks["drag_more"].value
+    assert checks["step_over_4"].value < 0.01
+    again = passport.make_passport(make_fitness(settings), genes, 3)
+    assert again == found
+    assert passport.make_passport(fitness, genes, 4).checks["score"] != checks["score"]
+    # The same starts by the fitness's own program, without lanes of other coefficients.
+    lanes = passport._Lanes(np.arange(8), np.ones(8, int), None)
+    key = jax.random.fold_in(jax.random.key(3), passport.PASSPORT_STREAM)
+    varied = passport._all_lanes(passport._variants())
+    own = passport._scores(fitness, genes.astype(np.float32), key, lanes, False)[0.6]
+    wide = passport._scores(fitness, genes.astype(np.float32), key, varied, True)[0.6]
+    np.testing.assert_allclose(wide[:8], own, atol=1e-5)
+    np.testing.assert_allclose(wide[64 + 6 * 8 :], own, atol=1e-5)  # nothing to silence
+
+
+@pytest.mark.parametrize(
+    ("wave", "expected"),
+    [
+        (lambda t: np.sin(2 * np.pi * t), 2.0),  # once a second to and fro
+        (lambda t: 0.5 * (-1.0) ** np.arange(len(t)), 200.0),  # every step
+        (lambda t: 0.1 * (-1.0) ** np.arange(len(t)), 0.0),  # at rest, within the servo's play
+        (lambda t: np.where(np.sin(2 * np.pi * t) > 0.5, 1.0, 0.0), 0.0),  # stop and go
+    ],
+)
+def test_reversals_are_counted(wave, expected):
+    time = 0.005 * np.arange(2000)
+    found = count_reversals(wave(time)[:, None]) / 10.0
+    assert found[0] == pytest.approx(expected, abs=0.2)
+
+
+def test_a_robot_that_folds_into_itself_and_chatters_fails(tmp_path):
+    snake = body("snake")
+    fitness = fit_body(make_fitness(swimmer(tmp_path, OAR, TASK)).config, snake)
+    count, steps = fitness.robot.num_hinges, 100
+
+    def swims(angle, speed):
+        qpos = np.tile(fitness.robot.start_qpos(), (steps, 1))
+        qpos[:, 7:], qvel = angle, np.zeros((steps, 6 + count))
+        qvel[:, 6:] = speed[:, None]
+        time = 0.2 + 0.005 * np.arange(1, steps + 1)
+        return trajectory_of(time, qpos, qvel, qpos[:, 7:])
+
+    good = Passport(dict(passport._joints(fitness, swims(0.0, np.sin(6 * np.arange(steps) / 200)))))
+    assert not good.failed and good.checks["overlap"].value == 0
+    curled = swims(1.5, (-1.0) ** np.arange(steps))
+    bad = Passport(dict(passport._joints(fitness, curled)))
+    assert {"overlap", "reversals"} <= set(bad.failed)
+    assert bad.checks["overlap"].value > 10 and bad.checks["overlap_time"].value == 1
+    assert bad.checks["reversals"].value == pytest.approx(200, rel=0.02)
+
+
+def trajectory_of(time, qpos, qvel, ctrl):
+    none = np.zeros(len(time))
+    return Trajectory(time=time, qpos=qpos, qvel=qvel, xpos=none, ctrl=ctrl, power=none)
+
+
+def made(**values):
+    """A passport of shares, of which at least a half is required."""
+    return Passport({name: Check(name, value, least=0.5) for name, value in values.items()})
+
+
+def test_a_passport_comes_back_from_its_file(tmp_path):
+    path = tmp_path / "passport.yaml"
+    found = made(kept=0.9, drag=0.2)
+    found = replace(found, checks=found.checks | {"score": Check("score", 0.1, "m/s")})
+    path.write_text(found.to_text())
+    assert load_passport(path) == found and found.failed == ("drag",)
+    assert [row[3] for row in found.rows] == ["passes", "FAILS", ""]
+    path.write_text(found.to_text().replace("0.9", "much"))
+    with pytest.raises(InputError, match=r"checks.kept.value: expected a number; found 'much'"):
+        load_passport(path)
+    path.write_text("checks: 3")
+    with pytest.raises(InputError, match="checks: expected a mapping; found 3"):
+        load_passport(path)
+    assert made(kept=float("nan")).failed == ("kept",)  # what could not be computed passes nothing
+
+
+@pytest.mark.parametrize(
+    ("shares", "winner", "tried"),
+    [([0.1, 0.9, 0.9], 1, 2), ([0.1, 0.2, 0.3], 0, 3), ([0.9, 0.9, 0.9], 0, 1)],
+)
+def test_where_a_passport_is_required_the_best_that_passes_wins(shares, winner, tried):
+    judged = []
+
+    def score(indices, key):
+        return np.array([[3.0, 2.0, 1.0][k] for k in indices]), {}
+
+    def judge(k):
+        judged.append(k)
+        return made(kept=shares[k])
+
+    found, facts = choose_candidate(score, np.ones(3, bool), 0, judge)
+    assert found == winner and len(judged) == tried
+    assert facts["passport"] == made(kept=shares[winner])
+    assert choose_candidate(score, np.ones(3, bool), 0)[1]["passport"] is None
