@@ -508,9 +508,9 @@ def complete_older(data: Mapping[str, Any]) -> dict[str, Any]:
 
     Its controller had no rate and gave a command at every step.
     """
-    older = {"task": OLDER_TASK, "controller": {"rate": None}}
+    older: dict[str, dict[str, Any]] = {"task": {**OLDER_TASK}, "controller": {"rate": None}}
     own = {name: data.get(name) for name in older}
-    return {**data} | {k: older[k] | x for k, x in own.items() if isinstance(x, Mapping)}
+    return {**data} | {k: {**older[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
 
 
 def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
