@@ -12,8 +12,8 @@ from mjx_revolve.formats.brain_program import Value, View, kind_of, number_text
 
 _TYPES = {"real": "brain_real", "int": "int32_t", "bool": "bool"}
 
-# Helpers, by name: only those that are used are written.
-_HELPERS = {
+# Functions, by name: only those that are used are written.
+_FUNCTIONS = {
     "brain_max": (
         "brain_real a, brain_real b",
         "(a > b || a != a) ? a : b",
@@ -123,15 +123,15 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
         for name, data in code.constants.items()
     ]
     every = "\n".join([*lines, *start.lines])
-    helpers = [
+    functions = [
         f"static brain_real {name}({args}) {{ return {text}; }}"
-        for name, (args, text) in _HELPERS.items()
+        for name, (args, text) in _FUNCTIONS.items()
         if f"{name}(" in every
     ]
     names = ", ".join(f'"{name}"' for name in brain.commands)
     return header, _SOURCE.format(
         stem=stem,
-        tables="\n".join([*tables, *helpers, ""]),
+        tables="\n".join([*tables, *functions, ""]),
         names=names,
         low=", ".join(map(repr, brain.low)),
         high=", ".join(map(repr, brain.high)),

@@ -304,8 +304,15 @@ def _draw(scene: Scene, whole: Scene, view: np.ndarray) -> str:
     on_white = image[..., :3] * image[..., 3:] + 1.0 - image[..., 3:]
     picture = Image.fromarray(np.round(255 * on_white).astype(np.uint8))
     draw = ImageDraw.Draw(picture)
-    # The core's axes in a corner.
-    corner, length = np.array([34.0, picture.height - 34.0]), 24.0
+    # The core's axes in the emptiest corner.
+    length, room = 24.0, 34
+    corners = [(x, y) for x in (room, picture.width - room) for y in (picture.height - room, room)]
+
+    def covered(at: tuple[int, int]) -> float:
+        x, y = at
+        return float(image[y - room : y + room, x - room : x + room, 3].sum())
+
+    corner = np.array(min(corners, key=covered), float)
     for k, name in enumerate(_AXES):
         way = view[:2, k] * (1, -1)
         tip = corner + length * way

@@ -94,6 +94,8 @@ def test_command_puts_a_champions_files_into_its_run(quick, capsys, monkeypatch,
 
 
 def test_command_writes_a_champions_controller(quick, capsys, monkeypatch, episode):
+    code, _, err = run(capsys, "odd.yaml", "--controller", "a.py")
+    assert code == 2 and err.startswith("error: --controller: expected a champion; found a morph")
     brain = make_brain(episode.robot, HELD, np.zeros(0), 20.0)
     monkeypatch.setattr("mjx_revolve.formats.brain.champion_brain", lambda *_: brain)
     champion = dataclasses.replace(episode, fitness=object(), genes=np.zeros(0))
