@@ -45,8 +45,10 @@ _STARTS, _FEW = 64, 8
 # By which coefficients of water and motors differ: what is not known of them, doubled. Drag of
 # cubes and plates spreads by 30 % (see `RobustConfig`).
 _FACTOR = 1.3
-# A joint that turns more slowly than this rests: 0.3° in a step of a servo's pulses, 20 ms [rad/s].
-_RESTING = 0.25
+# A joint that turns back by less than this does not: a hobby servo's dead band and its gears' play,
+# 1.1°. A joint that is hit at its stop swings by a degree or less; one that is driven to and fro at
+# full speed in each step of 5 ms by 1.5° [rad].
+_PLAY = 0.02
 
 # The speed of a joint is looked at that it has for all but the fastest hundredth of the time.
 _OFTEN = 0.99
@@ -377,7 +379,7 @@ def _joints(fitness: Fitness, trajectory: Trajectory) -> Iterator[tuple[str, Che
     depth = np.abs(1000 * self_overlap(robot, qpos).depth)  # rather than -0
     yield "overlap", Check("deepest overlap of modules", float(depth.max()), "mm", most=OVERLAP)
     yield "overlap_time", Check("share of time with an overlap", float(np.mean(depth > OVERLAP)))
-    rate = count_reversals(speed).max() / (len(qvel) * robot.world.timestep)
+    rate = count_reversals(qpos[:, 7:]).max() / (len(qvel) * robot.world.timestep)
     yield "reversals", Check("reversals of a joint", float(rate), "1/s", most=REVERSALS)
     torque = motor_torques(robot, qpos, qvel, ctrl) / robot.assembly.effort[moved]
     used = float(np.sqrt(np.mean(torque**2, 0)).max())
@@ -386,7 +388,18 @@ def _joints(fitness: Fitness, trajectory: Trajectory) -> Iterator[tuple[str, Che
     yield "speed", Check(f"share of a servo's speed used, {_OFTEN:.0%} of the time", float(fastest))
 
 
-def count_reversals(speed: np.ndarray) -> np.ndarray:
-    """How often each joint turns back `[n]`, of speeds `[T, n]` [rad/s]; rests do not count."""
-    moving = [column[np.abs(column) > _RESTING] for column in speed.T]
-    return np.array([np.count_nonzero(np.diff(np.sign(column))) for column in moving])
+def count_reversals(angle: np.ndarray) -> np.ndarray:
+    """How often each joint turns back `[n]`, of angles `[T, n]` [rad], by more than the play."""
+    return np.array([_turns(column) for column in angle.T.tolist()], int)
+
+
+def _turns(angle: list[float]) -> int:
+    """Extremes between which an angle swings by more than the play, but for the first."""
+    count, way, low, high = 0, 0, angle[0], angle[0]
+    for x in angle:
+        low, high = min(low, x), max(high, x)
+        if way >= 0 and high - x > _PLAY:
+            count, way, low = count + (way > 0), -1, x
+        elif way <= 0 and x - low > _PLAY:
+            count, way, high = count + (way < 0), 1, x
+    return count
