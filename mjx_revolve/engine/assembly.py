@@ -16,6 +16,7 @@ from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import RestPose, rest_pose, turned
 from mjx_revolve.engine.fluid_table import FluidTable, make_fluid_table
+from mjx_revolve.engine.self_pairs import hinge_stops, meeting_pairs
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.water.world import World
 
@@ -84,6 +85,16 @@ class Assembly:
     stiffness: np.ndarray
     fluid: FluidTable
     thruster_row: np.ndarray
+
+    @cached_property
+    def stops(self) -> np.ndarray:
+        """`[nbody, 2]` where hinges end: their range, or where their own neighbours meet [rad]."""
+        return hinge_stops(self) if self.world.self_contact else self.range
+
+    @cached_property
+    def meeting_pairs(self) -> np.ndarray:
+        """`[pairs, 2]` parts of one robot that can meet; see `self_pairs.meeting_pairs`."""
+        return meeting_pairs(self) if self.world.self_contact else np.zeros((0, 2), int)
 
     @property
     def moved(self) -> np.ndarray:

@@ -34,6 +34,7 @@ from mjx_revolve.engine.thrusters import curve_points, read_thrusters
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.laws import BodyDragLaw, part_fields
+from mjx_revolve.water.world import World
 
 # What a row costs in a step beside its parts, in parts [-]; measured, alike under both drag laws.
 _ROW_COST = 5.0
@@ -69,6 +70,9 @@ class Capacity:
         groups: room for the parts of a row and of the root.
         points: most contact points of a row, 0 without a bed within reach.
         root_points: most contact points of the root.
+        shells: most boxes of a row that may meet others of the same robot; 0 where none does.
+        root_shells: most of them of the root.
+        meetings: most pairs of them, 0 where none may meet.
         carries: whether water may be carried along.
         timestep: of the world [s].
         nothing: a part that does nothing, with the numbers of every law.
@@ -86,6 +90,9 @@ class Capacity:
     groups: tuple[PartGroup, ...]
     points: int
     root_points: int
+    shells: int
+    root_shells: int
+    meetings: int
     carries: bool
     timestep: float
     nothing: Any
@@ -119,6 +126,8 @@ class PackedBodies(NamedTuple):
         thrusters: `[thrusters, P]` each.
         plant: of the controllers.
         figure: `[P]` each.
+        first: `[meetings, P]` of pairs of boxes that can meet, see `Meetings`, int32.
+        second: the other box of each pair.
     """
 
     root: Any
@@ -132,6 +141,8 @@ class PackedBodies(NamedTuple):
     thrusters: Thrusters
     plant: Plant
     figure: BodyGeometry
+    first: Any
+    second: Any
 
     @property
     def alike(self) -> bool:
@@ -288,13 +299,18 @@ def fit_capacity(
     types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
     types |= {kind.name: kind for kind in kinds}
     # Nothing acts on what neither floats nor drags nor carries nor pushes.
-    every = [x for x in columns.laws if not x.idle or carries]
+    every = [x for x in columns.laws if not x.idle or carries or world.self_contact]
     near = contact and world.bed is not None
     groups, order = _choose_groups(assembly, columns, sizes, every, bool(modules))
     count = max(1, rows, hinges, int(order.length.max()))
     slots = 1 + int(order.slot.max(initial=0))
     thrusters = int(sizes.thrusters.max())
     points, root_points = _count_points(assembly, order) if near else (0, 0)
+    meeting = _list_pairs(robots)
+    shells, root_shells = _count_shells(assembly, order, meeting)
+    if modules and world.self_contact:
+        shells = sum(group.parts for group in groups)
+        root_shells = sum(group.root_parts for group in groups)
     if modules:
         count = max(count, _most_rows(assembly, columns, groups, modules, hinges))
         thrusters = (modules - 1) * any(kind.is_thruster for kind in types.values())
@@ -319,15 +335,20 @@ def fit_capacity(
         groups=groups,
         points=points,
         root_points=root_points,
+        shells=shells,
+        root_shells=root_shells,
+        meetings=_most_meetings(robots, root_shells + count * shells, bool(modules)),
         carries=carries,
         timestep=world.timestep,
         nothing=jax.tree.map(lambda x: x[-1:], columns.parts),
         sites=tuple(sites),
     )
-    one = _pick_rows(assembly, columns, capacity, order)
+    one = _pick_rows(assembly, columns, capacity, order, meeting)[:2]
     known = list(types.values())
     return replace(
-        capacity, root=_constants(one[0], known, False), row=_constants(one[1], known, True)
+        capacity,
+        root=_constants(one[0], known, False, world),
+        row=_constants(one[1], known, True, world),
     )
 
 
@@ -416,7 +437,37 @@ def _count_points(assembly: Assembly, order: RowOrder) -> tuple[int, int]:
     return most, at_root
 
 
-def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool) -> Level:
+def _most_meetings(robots: Sequence[Robot], shells: int, more: bool) -> int:
+    """Room for pairs of boxes: as many as any of these robots has, or as any other may have."""
+    if more and robots[0].world.self_contact:
+        return shells * (shells - 1) // 2
+    return max(len(robot.assembly.meeting_pairs) for robot in robots)
+
+
+def _list_pairs(robots: Sequence[Robot]) -> np.ndarray:
+    """`[pairs, 2]` parts of the robots that can meet, rows of all their tables together."""
+    counts = [len(robot.fluid.volume) for robot in robots]
+    starts = np.cumsum([0, *counts])
+    pairs = [robot.assembly.meeting_pairs + k for robot, k in zip(robots, starts, strict=False)]
+    return np.concatenate(pairs).astype(int)
+
+
+def _shell_places(order: RowOrder, assembly: Assembly, pairs: np.ndarray) -> Any:
+    """Parts that can meet others: `[n]` which, their bodies, pieces and ranks in their pieces."""
+    part = np.unique(pairs)
+    held, piece = assembly.fluid.body[part], order.piece[part]
+    return part, held, piece, _ranks(held * (1 + int(order.piece.max(initial=0))) + piece)
+
+
+def _count_shells(assembly: Assembly, order: RowOrder, pairs: np.ndarray) -> tuple[int, int]:
+    """The most boxes that can meet others of a row, and of a root."""
+    _, held, piece, rank = _shell_places(order, assembly, pairs)
+    at_root = (assembly.parent[held] == 0) & (piece == 0)
+    most = [int(rank[x].max(initial=-1)) + 1 for x in (~at_root, at_root)]
+    return most[0], most[1]
+
+
+def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool, world: World) -> Level:
     """What is the same in all bodies of some types: those numbers, and None in all other places."""
     blank: Level = jax.tree.map(lambda _: None, level)
     if _is_square(kinds):
@@ -432,7 +483,10 @@ def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool) -> Level
                 )
                 carried = replace(carried, inertia=about)
             groups.append(replace(parts, rotation=unit, carried=carried))
-        blank = replace(blank, parts=tuple(groups))
+        shells = blank.shells and replace(blank.shells, rotation=unit)
+        blank = replace(blank, parts=tuple(groups), shells=shells)
+    # Where neighbours meet, hinges of one type end at different angles.
+    ends = level.hinges is not None and world.self_contact
     found = {_hinge_numbers(kind) for kind in kinds if kind.hinge is not None}
     if hinges and blank.hinges is not None and len(found) == 1:
         effort, reach, damping, motor = found.pop()
@@ -441,7 +495,7 @@ def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool) -> Level
             servo_damping=0.0,
             effort=(-effort, effort),
             target=reach,
-            range=reach,
+            range=(None, None) if ends else reach,
             stop=effort / LIMIT_OVERSHOOT,
             motor=motor,
         )
@@ -480,9 +534,13 @@ def _is_square(kinds: Sequence[ModuleType]) -> bool:
 
 
 def _pick_rows(
-    assembly: Assembly, columns: StepConstants, capacity: Capacity, order: RowOrder
-) -> tuple[Level, Level]:
-    """Roots `[1, R]` and rows `[rows, 1, R]` of R robots, all of their numbers."""
+    assembly: Assembly,
+    columns: StepConstants,
+    capacity: Capacity,
+    order: RowOrder,
+    pairs: np.ndarray,
+) -> tuple[Level, Level, np.ndarray]:
+    """Roots `[1, R]` and rows `[rows, 1, R]` of R robots; `[2, meetings, R]` pairs of shells."""
     count, rows = len(assembly.roots), capacity.rows
     body = np.zeros((rows, count), int)
     body[order.place, order.robot] = np.where(order.overflow, 0, order.body)
@@ -519,11 +577,32 @@ def _pick_rows(
         points, root_points = place(every, held, piece, rank, capacity.points, capacity.root_points)
         points = points if capacity.points else None
         root_points = root_points if capacity.root_points else None
+    shells = root_shells = None
+    met = np.zeros((2, capacity.meetings, count), int)
+    if capacity.shells or capacity.root_shells:
+        part, held, piece, rank = _shell_places(order, assembly, pairs)
+        every = np.ones(len(held), bool)
+        most = capacity.shells, capacity.root_shells
+        in_rows, in_roots = place(every, held, piece, rank, *most)
+        shell, robot = np.nonzero(
+            np.concatenate([in_roots, in_rows.reshape(-1, count)]) < len(part)
+        )
+        table = np.concatenate([in_roots, in_rows.reshape(-1, count)])
+        number = np.zeros(len(part), int)
+        number[table[shell, robot]] = shell
+        ends = np.searchsorted(part, pairs)
+        owner = assembly.robot[held[ends[:, 0]]] if len(pairs) else np.zeros(0, int)
+        met[:, _ranks(owner), owner] = number[ends].T
+        blank = np.append(part, len(assembly.fluid.volume))
+        shells = blank[in_rows] if most[0] else None
+        root_shells = blank[in_roots] if most[1] else None
     alike = _alike(columns, capacity.nothing)
     finish = lambda x: x[..., None, :]  # noqa: E731
-    root = select_bodies(alike, assembly.roots, root_parts, root_points, True, 1, finish)
-    level = select_bodies(alike, body, parts, points, False, 1, finish)
-    return root, level
+    root = select_bodies(
+        alike, assembly.roots, root_parts, root_points, root_shells, True, 1, finish
+    )
+    level = select_bodies(alike, body, parts, points, shells, False, 1, finish)
+    return root, level, met
 
 
 def _alike(columns: StepConstants, nothing: Parts) -> StepConstants:
@@ -562,7 +641,9 @@ def pack_bodies(
     columns = read_constants(assembly)
     order = order_rows(assembly, columns, capacity.groups)
     _check_fit(assembly, columns, order, capacity)
-    root, level = _pick_rows(assembly, columns, capacity, order)
+    pairs = _list_pairs(list(unique.values()))
+    _check_shells(assembly, order, pairs, capacity)
+    root, level, met = _pick_rows(assembly, columns, capacity, order, pairs)
     names = [str(body.name) for body in assembly.morphologies]
     real = np.zeros((capacity.rows, 1, len(names)), bool)
     real[order.place, 0, order.robot] = ~order.overflow
@@ -586,6 +667,8 @@ def pack_bodies(
                 mounts=place_types(assembly, _body_rows(order), capacity.sites, capacity.rows),
             ),
             figure=figures,
+            first=met[0],
+            second=met[1],
             **hanging,
         ),
     )
@@ -681,6 +764,25 @@ def _check_fit(
         raise InputError(
             f"robots: expected at most {capacity.points} contact points in a row and "
             f"{capacity.root_points} at the core; found {points} and {root_points}"
+        )
+
+
+def _check_shells(
+    assembly: Assembly, order: RowOrder, pairs: np.ndarray, capacity: Capacity
+) -> None:
+    """Refuses robots with more boxes that can meet than there is room for."""
+    shells, root_shells = _count_shells(assembly, order, pairs)
+    if shells > capacity.shells or root_shells > capacity.root_shells:
+        raise InputError(
+            f"robots: expected at most {capacity.shells} boxes that can meet others in a row and "
+            f"{capacity.root_shells} at the core; found {shells} and {root_shells}"
+        )
+    robot = assembly.robot[assembly.fluid.body[pairs[:, 0]]]
+    most = int(np.bincount(robot, minlength=1).max())
+    if most > capacity.meetings:
+        raise InputError(
+            f"robots: expected at most {capacity.meetings} pairs of boxes that can meet; found "
+            f"{most}"
         )
 
 

@@ -31,6 +31,7 @@ import numpy as np
 
 from mjx_revolve.engine.batch import Capacity, PackedBodies
 from mjx_revolve.engine.level import Level, Thrusters
+from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.engine.variation import Variation, vary_level
 from mjx_revolve.numerics.spatial import Scalar
 from mjx_revolve.numerics.xla import fuse, materialize
@@ -85,6 +86,7 @@ class BatchedTrees:
         stack_indices: of the rows.
         table: constants of the rows.
         count: number of rows to visit, a number or int32.
+        num_meetings: number of pairs of boxes to look at, a number or int32.
         variation: factors on the constants, or None.
     """
 
@@ -95,6 +97,7 @@ class BatchedTrees:
     stack_indices: StackIndices
     table: PackedConstants
     count: Any
+    num_meetings: Any = 0
     variation: Variation | None = None
 
     def with_variation(self, variation: Variation) -> BatchedTrees:
@@ -119,6 +122,24 @@ class BatchedTrees:
     def carries(self) -> bool:
         """Whether any part has added mass."""
         return self.capacity.carries
+
+    @property
+    def meetings(self) -> Meetings | None:
+        """Which boxes of a robot can meet."""
+        bodies, capacity = self.bodies, self.capacity
+        if not capacity.meetings:
+            return None
+        rows = np.repeat(np.arange(1, capacity.rows + 1), capacity.shells)
+        body = np.append(np.zeros(capacity.root_shells, int), rows)
+        return Meetings(body, bodies.first, bodies.second, self.num_meetings)
+
+    def boxes(self, like: jax.Array) -> Boxes:
+        """The root's shells, then those of all rows."""
+        rows = self._own(_merged(self.capacity.row, self.bodies.rows))
+        count = self.capacity.rows
+        if rows.shells is not None:
+            rows = replace(rows, count=count)
+        return Boxes.of((self.root, rows), like.dtype)
 
     @property
     def touches(self) -> bool:
@@ -382,7 +403,11 @@ def make_batched_trees(
         each = jnp.arange(capacity.slots)[:, None]
         own, parent, to = (number(x[:, None] == each) for x in (own, parent, to))
         stack_indices = StackIndices(own, parent, to, inner, apart)
-    return BatchedTrees(world, capacity, bodies, lanes, stack_indices, table, count)
+    meetings: Any = capacity.meetings
+    if meetings and not steady:
+        real = jnp.any(bodies.first != bodies.second, -1)
+        meetings = jnp.sum(real, dtype=jnp.int32)  # a robot's pairs stand in front
+    return BatchedTrees(world, capacity, bodies, lanes, stack_indices, table, count, meetings)
 
 
 def _merged(constant: Level, varying: Level) -> Level:

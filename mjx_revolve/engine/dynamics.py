@@ -9,17 +9,19 @@ Spatial quantities are (angular, linear), in each body's own frame, about its ow
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_revolve.engine.contact import bed_forces
 from mjx_revolve.engine.hydrodynamics import ExternalForces, PreviousStep, water_forces
-from mjx_revolve.engine.kinematics import forward_kinematics
+from mjx_revolve.engine.kinematics import forward_kinematics, stack_motions
 from mjx_revolve.engine.level import Hinges, Level
+from mjx_revolve.engine.meetings import Meetings
+from mjx_revolve.engine.self_contact import Acceleration, Bodies, contact_acceleration
 from mjx_revolve.engine.servos import end_stop, servo
-from mjx_revolve.engine.state import State, effective_gravity, has_acceleration
+from mjx_revolve.engine.state import State, effective_gravity, has_acceleration, integrate
 from mjx_revolve.engine.tree import Tree
 from mjx_revolve.numerics.articulated import eliminate_joint, solve_root, to_parent, upper
 from mjx_revolve.numerics.inertia import (
@@ -42,6 +44,7 @@ from mjx_revolve.numerics.spatial import (
     dot,
     full,
     matTvec,
+    matvec,
     mul,
     neg,
     skew,
@@ -91,7 +94,9 @@ def accelerate(
         without sign, `[lanes]` [W]; submerged fractions, as `State.submerged`.
     """
     world, symmetric = tree.world, not (tree.carries and dt)
+    meetings = tree.meetings if dt else None
     located = has_acceleration(water) or needs_horizontal_position(world) or tree.touches
+    located = located or meetings is not None
     root, moved, midpoint_speed = forward_kinematics(tree, state, located, dt)
 
     def articulate(level: Level, children: Any, moved: Any, *xs: Any) -> tuple[Any, Any, Scalar]:
@@ -117,6 +122,7 @@ def accelerate(
         motor, motor_inertia = servo(
             level.hinges, angle, speed, target, dt, moved_inertia, moved_load
         )
+        column = tuple(tuple(x[i][2] for i in range(3)) for x in (block.angular, block.back))
         block, bias, joint = eliminate_joint(
             block,
             bias,
@@ -126,7 +132,9 @@ def accelerate(
             symmetric,
         )
         block, bias = to_parent(rotation, level.hinges.position, block, bias, symmetric)
-        saved = joint, tree.unstack_parts(submerged)
+        # What a unit of the hinge's acceleration takes; else that is the row of `joint`.
+        column = column if meetings is not None and not symmetric else ()
+        saved = joint, tree.unstack_parts(submerged), column
         return _flatten(block, bias, symmetric), saved, jnp.abs(motor * speed)
 
     children, saved, power = tree.backward_pass(
@@ -141,7 +149,7 @@ def accelerate(
 
     def accelerate_joint(level: Level, parent: Any, *x: Any) -> tuple[Any, Scalar]:
         """Accelerations of bodies from those of their parents, and of their hinges."""
-        (motion, rotation), midpoint_speed, (joint, _) = x
+        (motion, rotation), midpoint_speed, (joint, *_) = x
         assert level.hinges is not None
         angular, linear = parent
         coriolis = _coriolis(motion.midpoint_velocity, midpoint_speed)
@@ -150,16 +158,122 @@ def accelerate(
         b = vadd(matTvec(rotation, vadd(linear, cross(angular, position))), coriolis[1])
         hinge = sub(sub(joint.rest, dot(joint.row_a, a)), dot(joint.row_l, b))
         hinge = mul(joint.inverse, hinge)
-        return ((a[0], a[1], add(a[2], hinge)), b), hinge
+        own = (a[0], a[1], add(a[2], hinge)), b
+        return own, hinge
 
     hinges = tree.forward_pass(accelerate_joint, (angular, linear), moved, midpoint_speed, saved)
     lanes, dtype = state.position[0].shape, state.position[0].dtype
     lane = lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), (1, *lanes))[0]  # noqa: E731
+    qacc = tuple(map(lane, linear)), tuple(map(lane, angular)), hinges
+    if meetings is not None:
+        factors = _Factors(moved, saved, _unflatten(whole, symmetric)[0], symmetric)
+        qacc = _with_contact(tree, meetings, state, water, root, qacc, factors, dt)
     return (
-        (tuple(map(lane, linear)), tuple(map(lane, angular)), hinges),
+        qacc,
         jnp.broadcast_to(jnp.asarray(power, dtype), lanes),
         (submerged, tree.stack_parts(saved, lambda x: x[1])) if state.submerged else (),
     )
+
+
+class _Factors(NamedTuple):
+    """What the articulated-body algorithm leaves, by which further forces act at once.
+
+    Attributes:
+        moved: motion and rotation of the bodies below the root.
+        saved: by the backward pass.
+        root: articulated inertia of the root.
+        symmetric: whether inertias are.
+    """
+
+    moved: Any
+    saved: Any
+    root: Block
+    symmetric: bool
+
+
+def _respond(
+    tree: Tree, factors: _Factors, wrench: tuple[Scalar, ...], like: jax.Array
+) -> Acceleration:
+    """What further forces on the bodies add to all accelerations.
+
+    Args:
+        tree: the robots.
+        factors: of the step.
+        wrench: torque and force about the bodies' origins, own frames, six of `[nbody, lanes]`.
+        like: `[lanes]`.
+    """
+
+    def collect(level: Level, children: Any, moved: Any, saved: Any, *wrench: Any) -> Any:
+        """Bias forces, as the parents feel them."""
+        bias = tuple(map(neg, wrench))
+        if children is not None:
+            bias = vadd(bias, children)
+        rotation, (joint, _, column) = moved[1], saved
+        assert level.hinges is not None
+        rest = neg(bias[2])
+        pushed = mul(joint.inverse, rest)
+        column = column or (joint.row_a, joint.row_l)
+        torque = vadd(bias[:3], vscale(pushed, column[0]))
+        force = matvec(rotation, vadd(bias[3:], vscale(pushed, column[1])))
+        torque = vadd(matvec(rotation, torque), cross(level.hinges.position, force))
+        return (*torque, *force), rest, ()
+
+    def accelerate_joint(level: Level, parent: Any, moved: Any, saved: Any, rest: Any) -> Any:
+        rotation, joint = moved[1], saved[0]
+        angular, linear = parent
+        assert level.hinges is not None
+        a = matTvec(rotation, angular)
+        b = matTvec(rotation, vadd(linear, cross(angular, level.hinges.position)))
+        hinge = sub(sub(rest, dot(joint.row_a, a)), dot(joint.row_l, b))
+        hinge = mul(joint.inverse, hinge)
+        own = (a[0], a[1], add(a[2], hinge)), b
+        return own, (hinge, own)
+
+    below = [tree.split_rows(x[1:]) for x in wrench]
+    gathered, rests, _ = tree.backward_pass(
+        collect, ((0.0,) * 6, ()), factors.moved, factors.saved, *below
+    )
+    bias = vsub(gathered, tuple(x[:1] for x in wrench))
+    root = solve_root(factors.root, (bias[:3], bias[3:]), factors.symmetric)
+    found = tree.forward_pass(accelerate_joint, root, factors.moved, factors.saved, rests)
+    lane = lambda x: jnp.broadcast_to(jnp.asarray(x, like.dtype), (1, *like.shape))  # noqa: E731
+    angular, linear = (tuple(map(lane, x)) for x in root)
+    hinges, own = tree.stack_saved(found, lambda x: x, like)
+    pairs = zip((*angular, *linear), (*own[0], *own[1]), strict=True)
+    return Acceleration(
+        tuple(jnp.concatenate(pair) for pair in pairs),
+        (tuple(x[0] for x in linear), tuple(x[0] for x in angular), tree.split_rows(hinges)),
+    )
+
+
+def _with_contact(
+    tree: Tree,
+    meetings: Meetings,
+    state: State,
+    water: Water,
+    root: BodyMotion,
+    qacc: tuple[Vec, Vec, Any],
+    factors: _Factors,
+    dt: float,
+) -> tuple[Vec, Vec, Any]:
+    """Accelerations of the root and of the hinges with those of contacts within the robot."""
+    like = state.position[0]
+    still = water._replace(current=(0.0, 0.0, 0.0))
+    ahead = integrate(state, still, qacc, dt, tree.carries)
+    root_ahead, moved_ahead, _ = forward_kinematics(tree, ahead, True)
+    now = stack_motions(tree, root, factors.moved, like)
+    later = stack_motions(tree, root_ahead, moved_ahead, like)
+    push = contact_acceleration(
+        meetings,
+        tree.boxes(like),
+        Bodies(now.axes, (*now.xy, now.height)),
+        Bodies(later.axes, (*later.xy, later.height)),
+        lambda wrench: _respond(tree, factors, wrench, like),
+        jax.tree.map(jnp.zeros_like, qacc),
+        dt,
+    )
+    total: tuple[Vec, Vec, Any] = jax.tree.map(jnp.add, qacc, push)
+    return total
 
 
 def with_bed(

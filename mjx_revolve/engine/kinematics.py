@@ -129,8 +129,12 @@ def body_motions(tree: Tree, state: State) -> BodyMotion:
         `[1 + nhinge, lanes]` each, in the order of `Tree.join_rows`; velocities over ground. Each
         body's frame lies at its hinge and has the hinge's axis for its z (see `level`).
     """
-    like = state.position[0]
     root, below, _ = forward_kinematics(tree, state, True)
+    return stack_motions(tree, root, below, state.position[0])
+
+
+def stack_motions(tree: Tree, root: BodyMotion, below: Any, like: jax.Array) -> BodyMotion:
+    """The motions of `forward_kinematics` as one, `[1 + nhinge, lanes]` each."""
     root = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, *like.shape)), root)
     rows = tree.stack_saved(below, lambda saved: saved[0], like)
     return root if rows is None else jax.tree.map(lambda *x: jnp.concatenate(x), root, rows)

@@ -189,7 +189,29 @@ class Points:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["hinges", "mass", "moment", "inertia", "box", "parts", "points"],
+    data_fields=["position", "rotation", "half_size"],
+    meta_fields=["count"],
+)
+@dataclass(frozen=True)
+class Shells:
+    """Boxes that may meet others of the same robot, `[nshell, nbody, lanes]` or a number each.
+
+    Attributes:
+        count: nshell, how many a body has.
+        position: of their centres, body frame [m].
+        rotation: body from box.
+        half_size: half edges [m].
+    """
+
+    count: int
+    position: Vec
+    rotation: Mat
+    half_size: Vec
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["hinges", "mass", "moment", "inertia", "box", "parts", "points", "shells"],
     meta_fields=["count"],
 )
 @dataclass(frozen=True)
@@ -205,6 +227,7 @@ class Level:
         box: for MuJoCo's inertia-box law, else None.
         parts: what the water acts on, in groups that obey the same laws.
         points: what may touch the bed, or None.
+        shells: what may meet other bodies of the same robot, or None.
     """
 
     count: int
@@ -215,6 +238,7 @@ class Level:
     box: InertiaBox | None
     parts: tuple[Parts, ...]
     points: Points | None
+    shells: Shells | None = None
 
     @property
     def carrying(self) -> tuple[int, ...]:

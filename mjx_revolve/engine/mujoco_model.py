@@ -61,6 +61,7 @@ def compile_model(assembly: Assembly) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     spec.option.viscosity = 0.0
     _add_bed(spec, morphology, world)
     _add_bodies(spec, assembly)
+    _add_pairs(spec, assembly)
     try:
         return spec, spec.compile()
     except ValueError as error:
@@ -155,6 +156,14 @@ def _add_bodies(spec: mujoco.MjSpec, assembly: Assembly) -> None:
             row += 1
 
 
+def _add_pairs(spec: mujoco.MjSpec, assembly: Assembly) -> None:
+    """Pairs of main boxes that meet in MuJoCo's solver, as they do in our step; no friction."""
+    [morphology] = assembly.morphologies
+    names = [f"{m.name}/{part.name}" for m in morphology.modules for part in m.kind.parts]
+    for first, second in assembly.meeting_pairs:
+        spec.add_pair(geomname1=names[first], geomname2=names[second], condim=1)
+
+
 def _add_hinge(spec: mujoco.MjSpec, assembly: Assembly, number: int, body: Any) -> None:
     """The hinge that moves a body, and its servo."""
     name, low_high = assembly.names[number], list(assembly.range[number])
@@ -164,7 +173,7 @@ def _add_hinge(spec: mujoco.MjSpec, assembly: Assembly, number: int, body: Any) 
         type=mujoco.mjtJoint.mjJNT_HINGE,
         axis=list(assembly.axis[number]),
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-        range=low_high,
+        range=list(assembly.stops[number]),
         damping=assembly.damping[number],
         # MuJoCo has no speed limit; ours stands here for readers of the model.
         userdata=[assembly.speed[number]],

@@ -310,7 +310,7 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
         engine: "population" or "mjx".
 
     Raises:
-        InputError: the bed's contact is not the engine's; or the step is too long, and the message
+        InputError: the bed's contact, or self-contact, is not the engine's; or the step is too long, and the message
             names the body and the largest stable step.
     """
     bed = robot.world.bed
@@ -318,6 +318,11 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
         raise InputError(
             f"bed.contact: expected 'penalty' with engine: {engine}; found 'mjx' (choose engine: "
             "mjx, or contact: penalty)"
+        )
+    if robot.world.self_contact and engine == "mjx":
+        raise InputError(
+            "self_contact: expected false with engine: mjx, which has no such contact; found true "
+            "(choose engine: population)"
         )
     table, world, assembly = robot.fluid, robot.world, robot.assembly
     explicit = np.array([find_drag_law(name).explicit for name in table.drag])

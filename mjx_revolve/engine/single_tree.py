@@ -17,6 +17,7 @@ import numpy as np
 
 from mjx_revolve.engine.edited_model import edited_constants
 from mjx_revolve.engine.level import Level, PartLaws, Thrusters
+from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.step_constants import StepConstants, read_constants, select_bodies
 from mjx_revolve.engine.thrusters import read_thrusters
@@ -43,6 +44,7 @@ class SingleTree:
         hinge_order: `[nhinge]` the robot's own numbers of the hinges, level by level.
         thrusters: of the robot.
         carries: whether any part has added mass.
+        meetings: which of its modules can meet; None for none.
         robot: the source.
     """
 
@@ -57,12 +59,17 @@ class SingleTree:
     hinge_order: np.ndarray
     thrusters: Thrusters
     carries: bool
+    meetings: Meetings | None
     robot: Robot
 
     @property
     def all(self) -> tuple[Level, ...]:
         """The root's level and those below."""
         return (self.root, *self.below)
+
+    def boxes(self, like: jax.Array) -> Boxes:
+        """The levels' shells, level after level."""
+        return Boxes.of(self.all, like.dtype)
 
     @property
     def touches(self) -> bool:
@@ -205,31 +212,49 @@ def make_single_tree(robot: Robot, contact: bool = True) -> SingleTree:
     for body in range(2, len(parent)):
         depth[body] = depth[parent[body]] + 1
     ids = [[b for b in depth if depth[b] == d] for d in range(max(depth.values()) + 1)]
-    made = [_make_level(columns, bodies, contact, d == 0) for d, bodies in enumerate(ids)]
+    pairs = assembly.meeting_pairs
+    active = np.unique(pairs)
+    made = [_make_level(columns, bodies, contact, active, d == 0) for d, bodies in enumerate(ids)]
     parents = tuple(
         tuple(above.index(parent[b]) for b in bodies) for above, bodies in itertools.pairwise(ids)
     )
     return SingleTree(
         world=robot.world,
         root=made[0][0],
-        below=tuple(level for level, _, _ in made[1:]),
+        below=tuple(level for level, *_ in made[1:]),
         parents=parents,
         bodies=tuple(map(tuple, ids)),
         frames=tuple(columns.frame[bodies] for bodies in ids),
-        part_rows=tuple(rows for _, rows, _ in made),
-        point_rows=tuple(rows for _, _, rows in made),
+        part_rows=tuple(rows for _, rows, *_ in made),
+        point_rows=tuple(rows for _, _, rows, _ in made),
         # Hinge k carries body k + 2: the root is 1.
         hinge_order=np.array([b - 2 for bodies in ids[1:] for b in bodies], np.int32),
         thrusters=read_thrusters(assembly, robot.num_thrusters),
         carries=columns.parts.carried is not None,
+        meetings=_find_meetings(pairs, [rows for *_, rows in made]),
         robot=robot,
     )
 
 
+def _find_meetings(pairs: np.ndarray, shells: list[np.ndarray]) -> Meetings | None:
+    """Pairs of parts as pairs of the levels' shells, level after level."""
+    if not len(pairs):
+        return None
+    order = np.concatenate([rows.ravel() for rows in shells])
+    starts = np.cumsum([0] + [rows.shape[-1] for rows in shells])
+    body = np.concatenate(
+        [np.tile(start + np.arange(rows.shape[-1]), len(rows)) for start, rows in
+         zip(starts[:-1], shells, strict=True)]
+    )  # fmt: skip
+    place = {int(part): k for k, part in enumerate(order) if part >= 0}
+    first, second = np.array([[place[int(x)] for x in pair] for pair in pairs], np.int32).T
+    return Meetings(body, first[:, None], second[:, None], len(pairs))
+
+
 def _make_level(
-    columns: StepConstants, bodies: list[int], contact: bool, root: bool
-) -> tuple[Level, tuple[np.ndarray, ...], np.ndarray]:
-    """One level, and the rows of the fluid table of each of its groups, and of the points."""
+    columns: StepConstants, bodies: list[int], contact: bool, active: np.ndarray, root: bool
+) -> tuple[Level, tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """One level; rows of the fluid table of its groups, of the points, and of the shells."""
     held: dict[PartLaws, list[list[int]]] = {}
     for k, body in enumerate(bodies):
         for part in np.flatnonzero(columns.part_body == body):
@@ -245,11 +270,15 @@ def _make_level(
     if contact:
         lists = [np.flatnonzero(columns.point_body == b).tolist() for b in bodies]
         points = _stack(lists) if any(lists) else None
+    lists = [active[columns.part_body[active] == b].tolist() for b in bodies]
+    shells = _stack(lists) if any(lists) else None
     finish = lambda x: x[..., None] if x.dtype.kind == "i" else fold(x[..., None])  # noqa: E731
-    level = select_bodies(columns, np.array(bodies), parts, points, root, len(bodies), finish)
+    level = select_bodies(
+        columns, np.array(bodies), parts, points, shells, root, len(bodies), finish
+    )
     none = np.zeros((0, len(bodies)), int)
     rows = tuple(parts[laws] for laws in sorted(parts))
-    return level, rows, none if points is None else points
+    return level, rows, none if points is None else points, none if shells is None else shells
 
 
 def _stack(lists: list[list[int]]) -> np.ndarray:

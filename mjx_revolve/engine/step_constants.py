@@ -25,6 +25,7 @@ from mjx_revolve.engine.level import (
     PartLaws,
     Parts,
     Points,
+    Shells,
     ThrusterMounts,
 )
 from mjx_revolve.numerics.inertia import SpatialInertia
@@ -186,6 +187,7 @@ def _read_hinges(assembly: Assembly, frame: np.ndarray) -> Hinges:
     zero = np.zeros(len(jointed))
     motor = motor_line(assembly.speed, effort, damping)
     limits = column(low, 0.0), column(high, 0.0)
+    low, high = assembly.stops.T
     return Hinges(
         rotation=_mat(column(toward, np.eye(3))),
         offset=(column(offset[:, 0], 1.0), column(offset[:, 1], 0.0)),
@@ -394,6 +396,7 @@ def select_bodies(
     bodies: np.ndarray,
     parts: dict[PartLaws, np.ndarray],
     points: np.ndarray | None,
+    shells: np.ndarray | None,
     root: bool,
     count: int,
     finish: Any,
@@ -406,6 +409,7 @@ def select_bodies(
         parts: of each group, which columns of the parts, `[..., npart, ...]` with the parts on the
             axis before the last.
         points: which columns of the points, laid out alike, or None.
+        shells: which columns of the parts may meet others of the robot, laid out alike, or None.
         root: whether they are roots, which no hinge carries.
         count: how many bodies move together.
         finish: what becomes of each picked array.
@@ -432,6 +436,13 @@ def select_bodies(
     if points is not None and columns.points is not None:
         place, share = jax.tree.map(take(points), columns.points)
         touching = Points(points.shape[-2], place, share)
+    boxes = None
+    if shells is not None:
+        own = columns.parts
+        boxes = Shells(
+            shells.shape[-2],
+            *jax.tree.map(take(shells), (own.position, own.rotation, own.half_size)),
+        )
     return Level(
         count=count,
         hinges=None if root else jax.tree.map(take(bodies), columns.hinges),
@@ -441,4 +452,5 @@ def select_bodies(
         box=box,
         parts=tuple(groups),
         points=touching,
+        shells=boxes,
     )

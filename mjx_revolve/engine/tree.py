@@ -8,6 +8,7 @@ from typing import Any, Protocol, Self
 from jaxtyping import Array, Float
 
 from mjx_revolve.engine.level import Level, Thrusters
+from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.water.world import World
 
@@ -36,6 +37,13 @@ class Tree(Protocol):
     @property
     def carries(self) -> bool:
         """Whether any part has added mass."""
+
+    @property
+    def meetings(self) -> Meetings | None:
+        """Which boxes of one robot can meet; None for none."""
+
+    def boxes(self, like: Array) -> Boxes:
+        """The boxes that `meetings` numbers, `[nshell, lanes]` or `[nshell, 1]`, own frames."""
 
     @property
     def touches(self) -> bool:

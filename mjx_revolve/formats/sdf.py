@@ -82,7 +82,7 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
     model = node(
         "model",
         _pose(start[:3], quat_to_matrix(start[3:7] / np.linalg.norm(start[3:7]))),
-        node("self_collide", False),
+        node("self_collide", robot.world.self_contact),
         *(one for link in links for one in _link(robot, links, link, meshes)),
         *(_hinge(link, links[link.parent]) for link in links[1:]),
         *(one for link in links for one in _forces(robot, link)),

@@ -34,6 +34,9 @@ from mjx_revolve.numerics.spatial import (
 _FACES_FIRST = 1e-5
 # Squared sine below which two edges count as parallel [-].
 _PARALLEL = 1e-6
+# The same where the boxes turn within a step: the axis of two edges swings with them, and flips
+# where they become parallel. A choice: 18 degrees.
+_SWINGING = 0.1
 # Sine of the slope below which an edge lies flat on a face [-]: the contact point then moves from
 # the edge's end to its middle. A choice.
 _FLAT = 0.05
@@ -82,10 +85,11 @@ class BoxAxes(NamedTuple):
         return tuple(x * s - r for x, r, s in every)
 
 
-def box_axes(pair: BoxPair) -> BoxAxes:
+def box_axes(pair: BoxPair, parallel: float = _PARALLEL) -> BoxAxes:
     """Shadows of two boxes on the 15 axes: the first's, the second's, then edge by edge.
 
-    Parallel edges have no axis: there the reach is 1e3 m, so that the gap is never the largest.
+    Edges whose squared sine is below `parallel` have no axis: there the reach is 1e3 m, so that the
+    gap is never the largest.
     """
     xp = namespace(pair.offset[0])
     a, b = pair.first_half, pair.second_half
@@ -101,7 +105,7 @@ def box_axes(pair: BoxPair) -> BoxAxes:
         for j in range(3):
             j1, j2 = (j + 1) % 3, (j + 2) % 3
             square = 1 - turn[i][j] * turn[i][j]
-            crossed = square > _PARALLEL
+            crossed = square > parallel
             inverse = 1 / xp.sqrt(xp.where(crossed, square, 1))
             offset.append((t[i2] * turn[i1][j] - t[i1] * turn[i2][j]) * inverse)
             both = a[i1] * size[i2][j] + a[i2] * size[i1][j]
@@ -134,11 +138,13 @@ class BoxContact(NamedTuple):
 
     Attributes:
         gap: along the normal [m]; negative for an overlap.
+        start: the same now, where `gap` is that a step later [m].
         normal: unit vector from the first box to the second, world frame.
         point: in the middle between them, from the first box's centre, world frame [m].
     """
 
     gap: Scalar
+    start: Scalar
     normal: Vec
     point: Vec
 
@@ -159,7 +165,7 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
         The contact; normal and point are now's.
     """
     xp = namespace(pair.offset[0])
-    axes = box_axes(pair)
+    axes = box_axes(pair, _PARALLEL if ahead is None else _SWINGING)
     now = axes.gaps()
     side = tuple(xp.where(x < 0, -1.0, 1.0).astype(x.dtype) for x in axes.offset)
     score = now
@@ -172,10 +178,11 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
         score = tuple(xp.where(n >= least, x, -1e3) for n, x in zip(now, later, strict=True))
     turn = _relative(pair)
     zero = xp.zeros_like(score[0])
-    best, which, normal = xp.full_like(zero, -np.inf), zero, (zero, zero, zero)
+    best, start, which, normal = xp.full_like(zero, -1e6), zero, zero, (zero, zero, zero)
     for k in range(15):
         better = score[k] > best + (_FACES_FIRST if k > 5 else 0)
         best, which = xp.where(better, score[k], best), xp.where(better, k, which)
+        start = xp.where(better, now[k], start)
         axis = _axis(turn, k)
         normal = tuple(xp.where(better, side[k] * x, n) for x, n in zip(axis, normal, strict=True))
     # The features that look at each other, seen from the first box.
@@ -203,7 +210,7 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     )
     # In the middle between the two along the normal.
     point = vadd(point, vscale(0.5 * dot(normal, away) - dot(normal, point), normal))
-    return BoxContact(best, matvec(pair.first, normal), matvec(pair.first, vadd(one, point)))
+    return BoxContact(best, start, matvec(pair.first, normal), matvec(pair.first, vadd(one, point)))
 
 
 def _axis(turn: Mat, k: int) -> Vec:

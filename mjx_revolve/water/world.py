@@ -134,6 +134,8 @@ class World:
         water_depth: of the level bed that the waves feel, below the still surface [m]; None for
             deep water, where a wave is shorter than twice the depth.
         surface_tension: along the waterline, or None.
+        self_contact: whether modules of one robot push each other apart, and hinges end where
+            their neighbours meet; false: modules pass through each other.
         timestep: of the simulation [s].
     """
 
@@ -161,12 +163,14 @@ class World:
     surface_tension: Annotated[
         OrOff[SurfaceTension], BeforeValidator(lambda value: {} if value is True else value)
     ] = None
+    self_contact: Boolean = False
     timestep: Annotated[Number, Ge(1e-5), Le(0.1), Unit("s")] = 0.005
 
     def __repr__(self) -> str:
-        """Its fields, which tell runs apart; no coefficients read as before there were any."""
+        """Its fields, which tell runs apart; later ones only where they are not as before."""
         values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
-        shown = (f"{k}={v!r}" for k, v in values if (k, v) != ("coefficients", ()))
+        later = {"coefficients": (), "self_contact": False}
+        shown = (f"{k}={v!r}" for k, v in values if k not in later or later[k] != v)
         return f"World({', '.join(shown)})"
 
     def __post_init__(self) -> None:
