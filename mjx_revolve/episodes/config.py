@@ -230,8 +230,9 @@ class TaskConfig(Section):
     """How fast at most the course turns all the time; rate and side are drawn for each episode
     [rad/s]."""
     horizon: Annotated[Positive, Le(3600), Unit("s")] | None = None
-    """Over which time `speed` is foretold, if the robot goes on turning and rising as it does from
-    the first half of the episode to the second; none: what the episode itself shows [s]."""
+    """Over which time `speed` and `directed_swim` are foretold, if the robot goes on turning and
+    rising as it does from the first half of the episode to the second, the way being level; none:
+    what the episode itself shows [s]."""
     depth: Annotated[NonNegative, Unit("m")] = 2.0
     """Depth of the start below the surface; `crawl` starts on the bed instead, and `follow_bed`
     at `height` above it [m]."""
@@ -272,8 +273,8 @@ class TaskConfig(Section):
                 field = type(self).model_fields[name]
                 what = describe(Annotated[(field.annotation, field)]).removesuffix(", or nothing")
                 raise ConstraintError(name, f"{what}, because task.type is {self.type}", "none")
-        if self.horizon is not None and self.type != "speed":
-            what = f"none, as task.type is {self.type}, and only speed has one"
+        if self.horizon is not None and self.type not in ("speed", "directed_swim"):
+            what = f"none, as task.type is {self.type}; speed and directed_swim have one"
             raise ConstraintError("horizon", what, f"{self.horizon:g}")
         found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
         if len(found) > 1:
