@@ -501,10 +501,15 @@ def make_config(
     return config
 
 
-def complete_older(data: dict[str, Any]) -> dict[str, Any]:
-    """A run's `config.yaml` with what it had of settings that came after its version."""
-    task = data.get("task")
-    return data | {"task": OLDER_TASK | task} if isinstance(task, dict) else data
+def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A run folder's settings with the values that older versions had where they lack a setting.
+
+    Their robots' places were their cores', and their lengths those at rest.
+    """
+    found, task = dict(data), data.get("task")
+    if isinstance(task, Mapping):
+        found["task"] = OLDER_TASK | dict(task)
+    return found
 
 
 def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
@@ -556,7 +561,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
-        data = complete_older(data)
+        data = with_older_values(data)
     return make_config(data, path.parent, overrides, short_path(path))
 
 
