@@ -319,7 +319,7 @@ class EvolutionConfig(Settings):
     tensorboard: bool = False
     """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
     passport: bool = True
-    """Whether the champion's passport is made at the end, in about a quarter of a minute."""
+    """Whether the champion's passport is made at the end, in half a minute or a whole one."""
     strategy_params: dict[str, Any] = Field({})
     """Settings of the strategy itself, by evosax's names."""
 
@@ -501,17 +501,6 @@ def make_config(
     return config
 
 
-def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A run folder's settings with the values that older versions had where they lack a setting.
-
-    Their robots' places were their cores', and their lengths those at rest.
-    """
-    found, task = dict(data), data.get("task")
-    if isinstance(task, Mapping):
-        found["task"] = OLDER_TASK | dict(task)
-    return found
-
-
 def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
     try:
         make_config(data, folder)
@@ -563,6 +552,17 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
         data = with_older_values(data)
     return make_config(data, path.parent, overrides, short_path(path))
+
+
+def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A run folder's settings with the values that older versions had where they lack a setting.
+
+    Their robots' places were their cores', and their lengths those at rest.
+    """
+    found, task = dict(data), data.get("task")
+    if isinstance(task, Mapping):
+        found["task"] = OLDER_TASK | dict(task)
+    return found
 
 
 def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:
