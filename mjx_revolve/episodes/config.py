@@ -233,8 +233,9 @@ class TaskConfig(Section):
     """How fast at most the course turns all the time; rate and side are drawn for each episode
     [rad/s]."""
     horizon: Annotated[Positive, Le(3600), Unit("s")] | None = None
-    """Over which time `speed` is foretold, if the robot goes on turning and rising as it does from
-    the first half of the episode to the second; none: what the episode itself shows [s]."""
+    """Over which time `speed` and `directed_swim` are foretold, if the robot goes on turning and
+    rising as it does from the first half of the episode to the second, the way being level; none:
+    what the episode itself shows [s]."""
     depth: Annotated[NonNegative, Unit("m")] = 2.0
     """Depth of the start below the surface; `crawl` starts on the bed instead, and `follow_bed`
     at `height` above it [m]."""
@@ -275,8 +276,8 @@ class TaskConfig(Section):
                 field = type(self).model_fields[name]
                 what = describe(Annotated[(field.annotation, field)]).removesuffix(", or nothing")
                 raise ConstraintError(name, f"{what}, because task.type is {self.type}", "none")
-        if self.horizon is not None and self.type != "speed":
-            what = f"none, as task.type is {self.type}, and only speed has one"
+        if self.horizon is not None and self.type not in ("speed", "directed_swim"):
+            what = f"none, as task.type is {self.type}; speed and directed_swim have one"
             raise ConstraintError("horizon", what, f"{self.horizon:g}")
         found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
         if len(found) > 1:
@@ -321,7 +322,7 @@ class EvolutionConfig(Settings):
     tensorboard: bool = False
     """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
     passport: bool = True
-    """Whether the champion's passport is made at the end, in about a quarter of a minute."""
+    """Whether the champion's passport is made at the end, in half a minute or a whole one."""
     strategy_params: dict[str, Any] = Field({})
     """Settings of the strategy itself, by evosax's names."""
 
@@ -503,16 +504,6 @@ def make_config(
     return config
 
 
-def complete_older(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A run's `config.yaml` with what it had of settings that came after its version.
-
-    Its controller had no rate and gave a command at every step.
-    """
-    older: dict[str, dict[str, Any]] = {"task": {**OLDER_TASK}, "controller": {"rate": None}}
-    own = {name: data.get(name) for name in older}
-    return {**data} | {k: {**older[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
-
-
 def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
     try:
         make_config(data, folder)
@@ -562,8 +553,19 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
-        data = complete_older(data)
+        data = with_older_values(data)
     return make_config(data, path.parent, overrides, short_path(path))
+
+
+def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A run folder's settings with the values that older versions had where they lack a setting.
+
+    Their controllers had no rate and gave a command at every step; their robots' places were their
+    cores', and their lengths those at rest.
+    """
+    older: dict[str, dict[str, Any]] = {"task": {**OLDER_TASK}, "controller": {"rate": None}}
+    own = {name: data.get(name) for name in older}
+    return {**data} | {k: {**older[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
 
 
 def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:

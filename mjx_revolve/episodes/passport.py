@@ -224,34 +224,33 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
         scores = coarse.result()
         finer = {part: found.result()[usual].mean() for part, found in fine.items()}
     own = scores[usual][:_STARTS]
-    # Scores that are no rates are no shares of each other: they are shown, and not judged.
-    limits = unit.endswith("/s")
+    # Scores that are no rates are no shares of each other: they are shown as they are, not judged.
+    rates = unit.endswith("/s")
 
-    def share(found: np.ndarray, of: np.ndarray) -> float:
-        return float(found.mean() / of.mean()) if of.mean() > 0 else math.nan
-
-    def checked(
-        words: str, value: float, least: float | None = None, most: float | None = None
-    ) -> Check:
-        return Check(words, value, least=least, most=most) if limits else Check(words, value)
+    def compare(words: str, found: np.ndarray, of: np.ndarray, least: float | None = None) -> Check:
+        if not rates:
+            return Check(f"score {words}", float(found.mean()), unit)
+        share = float(found.mean() / of.mean()) if of.mean() > 0 else math.nan
+        if least is None:  # of what should have no score at all
+            return Check(f"share {words}", abs(share), most=BRAINLESS)
+        return Check(f"share {words}", share, least=least)
 
     yield "score", Check(f"score from {_STARTS} fresh starts", float(own.mean()), unit)
     yield "score_sd", Check("its standard deviation", float(own.std()), unit)
-    worst = share(np.sort(own)[: _STARTS // 10], own)
-    yield "worst_tenth", checked("share in the worst tenth", worst, least=WORST_TENTH)
+    worst = np.sort(own)[: _STARTS // 10]
+    yield "worst_tenth", compare("in the worst tenth", worst, own, WORST_TENTH)
     for seconds, found in scores.items():
         if seconds != usual:
-            kept = share(found[:_STARTS], own)
-            yield f"kept_{seconds:g}_s", checked(f"share kept over {seconds:g} s", kept, least=KEPT)
+            kept = found[:_STARTS]
+            yield f"kept_{seconds:g}_s", compare(f"kept over {seconds:g} s", kept, own, KEPT)
     first = own[:_FEW]
     for part, mean in finer.items():
         change = float(abs(mean - first.mean()) / max(abs(first.mean()), 1e-9))
         yield f"step_over_{part}", Check(f"change at 1/{part} of the step", change, most=STEP)
     trials = scores[usual][_STARTS:].reshape(-1, _FEW)
     for (name, (words, _)), found in zip(tried.items(), trials, strict=False):
-        yield name, checked(f"share with {words}", share(found, first), least=VARIED)
-    idle = abs(share(trials[-1], first))
-    yield "brainless", checked("share with joints at rest", idle, most=BRAINLESS)
+        yield name, compare(f"with {words}", found, first, VARIED)
+    yield "brainless", compare("with joints at rest", trials[-1], first)
 
 
 def _variants() -> dict[str, tuple[str, Variation]]:

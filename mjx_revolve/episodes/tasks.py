@@ -197,9 +197,15 @@ def moved_through_water(track: Track) -> jax.Array:
 
 
 def directed_swim(track: Track, settings: Any) -> jax.Array:
-    """Progress along a direction, over ground, while the robot keeps its depth [body lengths/s]."""
+    """Progress along a direction, over ground, while the robot keeps its depth [body lengths/s].
+
+    With a `horizon`, over that time, if what the robot does went on: see `_foretold`.
+    """
     direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
     moved = jnp.diff(track.position, axis=0)
+    if settings.horizon is not None:
+        x, y = _foretold(track, settings, moved[:, :2])
+        return float(direction[0]) * x + float(direction[1]) * y
     along = sum(float(direction[i]) * moved[:, i] for i in range(3))
     counted = jnp.sum(along * _keeps_depth(track, settings), 0)
     return counted / (track.duration * track.length)
@@ -209,36 +215,39 @@ def speed(track: Track, settings: Any) -> jax.Array:
     """Net horizontal speed through the water while the robot keeps its depth [body lengths/s].
 
     In any direction; drifting with a current counts nothing. With a `horizon`, net over that time,
-    if what the robot does went on: see `_sustained_speed`.
+    if what the robot does went on: see `_foretold`.
     """
     moved = moved_through_water(track)[:, :2]
     if settings.horizon is not None:
-        return _sustained_speed(track, settings, moved)
+        return safe_norm(tuple(_foretold(track, settings, moved)))
     counted = moved * _keeps_depth(track, settings)[:, None]
     return safe_norm(tuple(jnp.sum(counted, 0))) / (track.duration * track.length)
 
 
-def _sustained_speed(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
-    """Net speed over the horizon, foretold from the episode's two halves [body lengths/s].
+def _foretold(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
+    """`[2, lanes]` horizontal net velocity over the horizon, by the episode's halves, at its depth.
 
     From one half to the next a robot turns by ψ and rises by some height. n halves of the way d,
-    each turned by ψ from the one before, have the net way d sin(nψ/2) / sin(ψ/2): in a circle none.
+    each turned by ψ from the one before, have the net way d sin(nψ/2) / sin(ψ/2), which is turned
+    by (n - 1) ψ/2 from the first: in a circle none [body lengths/s].
     """
     half = moved.shape[0] // 2
     first, second = (jnp.sum(x, 0) for x in (moved[:half], moved[-half:]))
     way = (safe_norm(tuple(first)) + safe_norm(tuple(second))) / 2
     ahead = first[0] * second[0] + first[1] * second[1]
     aside = first[0] * second[1] - first[1] * second[0]
-    # The tiny term: where nothing moves there is no turn, and no derivative of it.
-    turn = jnp.arctan2(aside, ahead + jnp.where(way > 0, 0.0, 1.0)) / 2
+    # Where nothing moves there is no turn, and no derivative of it.
+    rests = jnp.where(way > 0, 0.0, 1.0)
+    turn = jnp.arctan2(aside, ahead + rests) / 2
     count = settings.horizon / (half * track.interval)
-    straight = jnp.abs(jnp.sinc(count * turn / np.pi) / jnp.sinc(turn / np.pi))
+    straight = jnp.sinc(count * turn / np.pi) / jnp.sinc(turn / np.pi)
+    heading = jnp.arctan2(first[1], first[0] + rests) + (count - 1) * turn
     height = track.position[:, 2] - track.start_height
     begun, ended = jnp.mean(height[: half + 1], 0), jnp.mean(height[-half - 1 :], 0)
-    share = np.linspace(0, 1, _MOMENTS)[:, None]
-    heights = begun + share * count * (ended - begun)
+    heights = begun + np.linspace(0, 1, _MOMENTS)[:, None] * count * (ended - begun)
     keeps = jnp.mean(_keeping(heights, settings.depth_tolerance), 0)
-    return way * straight * keeps / (half * track.interval * track.length)
+    size = way * straight * keeps / (half * track.interval * track.length)
+    return size * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 
 
 def reach_target(track: Track, settings: Any) -> jax.Array:

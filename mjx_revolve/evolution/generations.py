@@ -24,7 +24,7 @@ Scored = tuple[np.ndarray, dict[str, np.ndarray]]
 # Fresh episodes per candidate to choose the champion. The reported score comes from others
 # (`REPORT_EPISODES`), because the best of several means is biased upwards, too.
 CHOOSE_EPISODES = 8
-# How many of the best are tried where a passport is required. A choice: some 20 s each.
+# How many of the best are tried where a passport is required. A choice: half a minute each.
 _TRIED = 4
 # A stream of random numbers that no generation uses.
 CHOOSE_STREAM = 2**32 - 1

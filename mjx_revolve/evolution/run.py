@@ -398,8 +398,11 @@ class Run:
             fitness = fitness.body_fitness(champion.body)
         if champion.passport is None and config.evolution.passport and isinstance(fitness, Fitness):
             say("making the champion's passport")
-            found = make_passport(fitness, champion.genes, config.evolution.seed)
-            champion = replace(champion, passport=found)
+            try:
+                found = make_passport(fitness, champion.genes, config.evolution.seed)
+                champion = replace(champion, passport=found)
+            except InputError as error:  # of a user's own task, which other times may not suit
+                _log.warning("the champion has no passport: %s", error)
         if champion.passport is not None:
             self.folder.write(PASSPORT, champion.passport.to_text().encode())
         else:  # an older champion's

@@ -98,6 +98,8 @@ def test_it_is_frozen(folder):
         ("task.target=[1, 2]", "task.target: expected three numbers [m], or nothing; "
          "found [1, 2]"),
         ("task.direction=[0, 0, 0]", "task.direction: expected a vector of some length; found"),
+        ("task={type: crawl, horizon: 60}", "--set task.horizon: expected none, as task.type is "
+         "crawl; speed and directed_swim have one; found 60"),
         ("task.durtion=5", "--set task.durtion: expected one of 32 keys; found an unknown key; "
          "did you mean task.duration?"),
         ("task.duration=0.5", "--set task.duration: task.settle: expected a time below "

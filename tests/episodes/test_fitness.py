@@ -222,6 +222,10 @@ def test_a_horizon_foretells_the_way_of_a_circle(rate):
     assert float(TASKS["speed"].score(given, far)[0]) == pytest.approx(expected, rel=1e-3)
     near = SimpleNamespace(horizon=None, depth_tolerance=0.1)
     assert float(TASKS["speed"].score(given, near)[0]) >= expected - 1e-5
+    # Along a direction, from the heading in which it began: the arc's own way along it.
+    along = 2.0 if rate == 0 else 2 * np.sin(120 * rate) / rate / 120
+    ahead = SimpleNamespace(horizon=120.0, depth_tolerance=0.1, direction=(3.0, 0.0, 0.0))
+    assert float(TASKS["directed_swim"].score(given, ahead)[0]) == pytest.approx(along, abs=2e-3)
     slope = jax.grad(lambda s: TASKS["speed"].score(replace(given, position=s), far)[0])
     assert jnp.all(jnp.isfinite(slope(given.position)))
     assert jnp.all(jnp.isfinite(slope(0 * given.position)))

@@ -12,10 +12,10 @@ import pytest
 import mjx_revolve
 from laboratory import _ELBOW as ELBOW
 from laboratory import read
-from mjx_revolve import evolve, inspect, report
+from mjx_revolve import evolve, inspect, passport, report
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.fitness import make_fitness
-from mjx_revolve.episodes.passport import Check, Passport
+from mjx_revolve.episodes.passport import Check, Passport, load_passport
 from mjx_revolve.episodes.run_reader import read_metrics
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution import run_folder as runs
@@ -593,6 +593,24 @@ def test_a_champion_that_fails_its_passport_is_marked(copy, quick, capsys):
     assert "expected words and a value; found 3" in record.problems[0].text
     path.unlink()
     assert run_main(copy) == 0 and "✗" not in (copy / "report.html").read_text()
+
+
+def test_the_command_prints_and_writes_a_passport(copy, monkeypatch, capsys):
+    """Made anew of the run's champion and seed; the exit code says whether something fails."""
+    given = []
+
+    def make(fitness, genes, seed):
+        given.append((fitness.robot.num_hinges, genes.tolist(), seed))
+        return Passport({"drag": Check("share with drag x 1.3", value, least=0.5)})
+
+    monkeypatch.setattr("mjx_revolve.episodes.passport.make_passport", make)
+    for value, code, said in ((0.4, 1, "FAILS"), (0.9, 0, "passes")):
+        assert run_command(passport.main, [str(copy)]) == code
+        out = capsys.readouterr().out
+        assert f"share with drag x 1.3  {value}  at least 0.5  {said}" in out
+        found = load_passport(copy / "champion" / "passport.yaml")
+        assert found.checks["drag"].value == value
+    assert given[0] == (2, GENES.tolist(), 0)
 
 
 def test_runs_of_the_core_have_another_task(lab):

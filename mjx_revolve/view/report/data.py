@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel
 
 import mjx_revolve
-from mjx_revolve.episodes.config import Config, complete_older, make_config
+from mjx_revolve.episodes.config import Config, make_config, with_older_values
 from mjx_revolve.episodes.individual_log import EVENTS, GENERATIONS, INDIVIDUALS
 from mjx_revolve.episodes.passport import PASSPORT, load_passport
 from mjx_revolve.episodes.run_reader import RunReader, find_run, generation_of, read_metrics
@@ -154,7 +154,7 @@ def _read_config(record: RunRecord) -> None:
         names = ", ".join(unknown)
         record.note("version", f"config.yaml: this version does not know {names}; read without")
     try:
-        known = complete_older(locate_files(known, find_copies(record.folder)))
+        known = with_older_values(locate_files(known, find_copies(record.folder)))
         record.config = make_config(known, record.folder, source=str(path))
     except InputError as error:
         spare = record.folder / "champion" / "morphology.yaml"
