@@ -116,7 +116,9 @@ def test_older_runs_have_no_rate_and_keep_their_fingerprint(tmp_path):
 
 
 def test_a_wave_that_cannot_be_sampled_is_refused():
-    with pytest.raises(InputError, match=r"max_frequency: expected at most half of controller.rate"):
+    with pytest.raises(
+        InputError, match=r"max_frequency: expected at most half of controller.rate"
+    ):
         make_config(
             {"morphology": str(SPIDER), "world": "lake", "task": {"type": "speed"}},
             overrides={"controller.max_frequency": 11.0},
