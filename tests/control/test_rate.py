@@ -30,7 +30,7 @@ def plant():
 
 
 def commands(plant, times, dt=0.005, make=None, **settings):
-    """`[T, n, 3]` ctrl at times `[T]` or `[T, 3]`, in float64, of a controller for that timestep."""
+    """`[T, n, 3]` ctrl at times `[T]` or `[T, 3]`, in float64, at a timestep."""
     plant = replace(plant, timestep=dt)
     if make is None:
         make = lambda plant: find_controller(plant, ControllerConfig(**settings))  # noqa: E731
