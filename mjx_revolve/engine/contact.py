@@ -73,7 +73,10 @@ def bed_contact(
     Normal, with d the depth and ḋ the speed inwards: F_n = k max(0, d + dt ḋ) + c ḋ while the sum
     pushes outwards: a spring at the end of the step, k the bed's stiffness, c critical damping of
     the point's mass. Tangential: Coulomb, F_t = -μ F_n v_t / √(v_t² + v_c²) with v_c = 1 mm/s, so
-    that on a slope the point creeps at v_c tan(slope) / μ and slides where that passes μ.
+    that on a slope the point creeps at v_c tan(slope) / μ and slides where that passes μ. Of the
+    normal force, friction takes what the spring bears already and what stops the point's own mass
+    within the step: F_n itself, foreseen with the velocity before, is many times what a foot that
+    lands is really pushed with, and so much grip would make crawlers a third faster at 5 ms.
 
     Both are linear in the velocity at the end of the step, with the damping that is returned: a
     body of any mass can rest on a bed of any stiffness.
@@ -105,7 +108,9 @@ def bed_contact(
     push = jnp.where(touching, push, 0)
     resistance = jnp.where(touching, add(mul(timestep, stiffness), damping), 0)
     sliding = tuple(v - outward * n for v, n in zip(velocity, normal, strict=True))
-    grip = bed.friction * push / jnp.sqrt(dot(sliding, sliding) + CREEP_SPEED**2)
+    arrest = mul(point_mass / timestep, jnp.maximum(neg(outward), 0))
+    borne = jnp.minimum(push, add(mul(stiffness, jnp.maximum(depth, 0)), arrest))
+    grip = bed.friction * borne / jnp.sqrt(dot(sliding, sliding) + CREEP_SPEED**2)
     force = tuple(push * n - grip * s for n, s in zip(normal, sliding, strict=True))
     return force, resistance, grip
 

@@ -144,6 +144,10 @@ class ControllerConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
         self.refuse_params(self.params)
+        slow = self.rate is not None and self.max_frequency > self.rate / 2
+        if slow and self.type not in ("feedback", "brain") and not self.is_user_code:
+            most = f"at most half of controller.rate ({self.rate:g} Hz), to be sampled by it"
+            raise ConstraintError("max_frequency", most, f"{self.max_frequency:g}")
         for name in dict.fromkeys(x for kind in CONTROLLERS.values() for x in kind.settings):
             kinds = [key for key, kind in CONTROLLERS.items() if name in kind.settings]
             usual, found = type(self).model_fields[name].default, getattr(self, name)

@@ -33,6 +33,8 @@ def robot_of(name):
 
 
 def make(kind, plant, **settings):
+    """Brains that act at every step; those with a rate are in `test_rate`."""
+    settings.setdefault("rate", None)
     if kind in ("mlp", "rnn", "sensory_cpg"):
         settings.setdefault("sensors", SENSORS)
     return find_controller(plant, ControllerConfig(type=kind, **settings))

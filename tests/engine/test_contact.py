@@ -80,6 +80,17 @@ def test_force_on_a_point():
     assert outward.max() > 1.0
 
 
+@pytest.mark.parametrize("dt", [0.02, 0.005, 0.00125])
+def test_a_landing_point_is_gripped_by_what_stops_it_at_any_step(dt):
+    """Friction's impulse is at most μ m v, however far the spring would have been pressed; and a
+    point that lies still has all of μ F_n."""
+    mass, speed = 0.01, 0.3
+    land = bed_contact(FLAT, jnp.zeros(1) - 1e-4, (0.0, 0.0, 1.0), (1.0, 0.0, -speed), mass, dt)
+    assert 0 < -float(land[0][0][0]) * dt <= FLAT.friction * mass * speed * (1 + 1e-5)
+    lie = bed_contact(FLAT, jnp.full(1, 1e-3), (0.0, 0.0, 1.0), (0.1, 0.0, 0.0), mass, dt)
+    assert -float(lie[0][0][0]) == pytest.approx(FLAT.friction * float(lie[0][2][0]), rel=1e-3)
+
+
 def test_force_is_continuous_where_a_point_touches_down():
     depth = jnp.linspace(-1e-5, 1e-5, 2001)
     for speed in (0.0, -0.5):

@@ -1,0 +1,125 @@
+"""Controllers at a rate of their own: what is commanded depends on no timestep of the world."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from laboratory import elbow_robot, world
+from mjx_revolve.control.cpg import make_cpg
+from mjx_revolve.control.kinds import find_controller
+from mjx_revolve.control.readings import SensorReadings
+from mjx_revolve.control.sine import make_sine
+from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.episodes.config import ControllerConfig, dump_config, load_config, make_config
+from mjx_revolve.evolution.fingerprints import settings_hash
+from mjx_revolve.inputs.errors import InputError
+
+BLIND = SensorReadings(np.zeros(3), np.zeros(3), (), ())
+GENES = np.random.default_rng(0).normal(size=(40, 3))
+LENGTH = 3.0
+SPIDER = Path(__file__).parents[2] / "morphologies" / "spider.yaml"
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return plant_of(elbow_robot(world()))
+
+
+def commands(plant, times, dt=0.005, make=None, **settings):
+    """`[T, n, 3]` ctrl at times `[T]` or `[T, 3]`, in float64, at a timestep."""
+    plant = replace(plant, timestep=dt)
+    if make is None:
+        make = lambda plant: find_controller(plant, ControllerConfig(**settings))  # noqa: E731
+    with jax.enable_x64(True):
+        controller = make(plant)
+        parameters = controller.decode(jnp.asarray(GENES[: controller.num_genes]), plant)
+        step = lambda state, t: controller.step(parameters, state, t, BLIND)  # noqa: E731
+        run = jax.jit(lambda x: jax.lax.scan(step, controller.init(parameters), x)[1])
+        return np.asarray(run(jnp.asarray(times)))
+
+
+@pytest.mark.parametrize("kind", ["sine", "cpg", "splines"])
+def test_commands_are_the_same_at_any_step_and_held_between(plant, kind):
+    """Those of instants k / rate, also where no steps fall on them (3 and 12.5 ms)."""
+    instants = np.arange(int(20 * LENGTH)) / 20
+    every = commands(plant, instants, 1 / 20, type=kind)
+    assert np.ptp(every, axis=0).min() > 0.05
+    for dt in (0.0125, 0.003):
+        times = np.arange(0, LENGTH, dt)
+        found = commands(plant, times, dt, type=kind)
+        number = np.floor(times * 20 + 1e-9).astype(int)
+        assert found == pytest.approx(every[number], abs=1e-12)
+        assert len(np.unique(number)) == len(instants)
+
+
+def test_a_sine_is_sampled_at_the_instants(plant):
+    """Those of the brain without a rate, at these times."""
+    instants = np.arange(int(20 * LENGTH)) / 20
+    held = commands(plant, instants, 0.05, type="sine")
+    assert held == pytest.approx(commands(plant, instants, make=make_sine), abs=1e-12)
+
+
+def test_robots_of_different_ages_are_each_commanded_from_their_birth(plant):
+    """Lanes with times of their own, as in a colony, have what lanes with one time have."""
+    times = np.arange(0, LENGTH, 0.0125)
+    born = np.array([0, 2, 5])  # steps after the first time, each at its own time 0
+    apart = commands(plant, np.maximum(times[:, None] - 0.0125 * born, 0), 0.0125, type="sine")
+    together = commands(plant, times, 0.0125, type="sine")
+    for lane, steps in enumerate(born):
+        own = apart[steps:, :, lane]
+        assert own == pytest.approx(together[: len(own), :, lane], abs=1e-12)
+
+
+def test_a_cpgs_frequency_depends_neither_on_the_rate_nor_on_the_step(plant):
+    """x at the instants that rates of 10, 20 and 50 Hz share, against the matrix exponential."""
+    from scipy.linalg import expm
+
+    w, c = 4 * np.pi * np.sin(GENES[:2]), 2 * np.pi * np.sin(GENES[2])
+    for rate in (10.0, 20.0, 50.0):
+        times = np.arange(0, 20, 1 / rate)
+        found = commands(plant, times, 1 / rate, type="cpg", rate=rate)[:: round(rate / 10)]
+        for lane in range(3):
+            a, b = w[:, lane]
+            k = c[lane]
+            matrix = np.array([[0, k, a, 0], [-k, 0, 0, b], [-a, 0, 0, 0], [0, -b, 0, 0]])
+            for number in (1, 77, 199):
+                x = (expm(matrix * number / 10) @ [0, 0, 1, 1])[:2]
+                assert found[number, :, lane] == pytest.approx(np.pi / 4 * np.tanh(x), abs=1e-8)
+
+
+def test_without_a_rate_a_controller_acts_at_every_step(plant):
+    times = np.arange(0, 1, 0.005)
+    found = commands(plant, times, type="cpg", rate=None)
+    assert found == pytest.approx(commands(plant, times, make=make_cpg), abs=0)
+    assert (np.diff(found, axis=0) != 0).all()
+
+
+def test_older_runs_have_no_rate_and_keep_their_fingerprint(tmp_path):
+    config = make_config(
+        {"morphology": str(SPIDER), "world": "lake", "task": {"type": "speed"}},
+        overrides={"controller.rate": None},
+    )
+    text = dump_config(config)
+    assert "rate: null" in text
+    (tmp_path / "run.json").write_text("{}")
+    (tmp_path / "config.yaml").write_text(text.replace("rate: null,", "").replace("rate: null", ""))
+    older = load_config(tmp_path / "config.yaml")
+    assert older.controller.rate is None
+    assert settings_hash(older) == settings_hash(config)
+    assert settings_hash(load_config(tmp_path / "config.yaml", {"controller.rate": 20.0})) != (
+        settings_hash(config)
+    )
+
+
+def test_a_wave_that_cannot_be_sampled_is_refused():
+    with pytest.raises(
+        InputError, match=r"max_frequency: expected at most half of controller.rate"
+    ):
+        make_config(
+            {"morphology": str(SPIDER), "world": "lake", "task": {"type": "speed"}},
+            overrides={"controller.max_frequency": 11.0},
+        )
