@@ -266,8 +266,8 @@ def _with_contact(
     push = contact_acceleration(
         meetings,
         tree.boxes(like),
-        Bodies(now.axes, (*now.xy, now.height)),
-        Bodies(later.axes, (*later.xy, later.height)),
+        Bodies.of(now),
+        Bodies.of(later),
         lambda wrench: _respond(tree, factors, wrench, like),
         jax.tree.map(jnp.zeros_like, qacc),
         dt,

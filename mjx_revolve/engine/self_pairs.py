@@ -20,7 +20,7 @@ REST_OVERLAP = 1e-3
 # stops give way by half a degree.
 _RANGE_MARGIN, _CLEARANCE = 0.02, 1e-3
 # Boxes of angles that are looked at, for one pair and for one robot. A choice: some milliseconds.
-_SHARE, _BUDGET = 400, 6000
+_SHARE, _BUDGET = 512, 8000
 # Angles from rest to the end of a hinge's range at which neighbours are compared, and how often the
 # interval in which they meet is divided so again. Choices: steps of 2 degrees, then 0.003.
 _ANGLES, _PASSES = 24, 3

@@ -250,7 +250,8 @@ def _common(spread: Vec, away: Vec, turn: Mat, other_spread: Vec) -> Vec:
         reach = dot(tuple(xp.abs(x) for x in turn[i]), other_spread)
         low = xp.maximum(-spread[i], away[i] - reach)
         high = xp.minimum(spread[i], away[i] + reach)
-        found.append(0.5 * (low + high))
+        # With nothing in common, the end of the other one: the gap is that at its corner.
+        found.append(xp.clip(0.5 * (low + high), away[i] - reach, away[i] + reach))
     return tuple(found)
 
 
