@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from mjx_revolve.engine.assembly import Assembly
 
 # Parts that overlap by more than this at rest [m] are built that way, and pass through each other
-# later on, too. A choice: less than what contact allows.
-REST_OVERLAP = 1e-3
+# later on, too. A choice: rounding.
+REST_OVERLAP = 1e-5
 # Angles beyond the end stops [rad] and gaps [m] that a pair must keep to be left out. Choices: end
 # stops give way by half a degree.
 _RANGE_MARGIN, _CLEARANCE = 0.02, 1e-3
