@@ -257,22 +257,27 @@ def _with_contact(
     dt: float,
 ) -> tuple[Vec, Vec, Any]:
     """Accelerations of the root and of the hinges with those of contacts within the robot."""
-    like = state.position[0]
+    like, nothing = state.position[0], jax.tree.map(jnp.zeros_like, qacc)
     still = water._replace(current=(0.0, 0.0, 0.0))
-    ahead = integrate(state, still, qacc, dt, tree.carries)
-    root_ahead, moved_ahead, _ = forward_kinematics(tree, ahead, True)
-    now = stack_motions(tree, root, factors.moved, like)
-    later = stack_motions(tree, root_ahead, moved_ahead, like)
-    push = contact_acceleration(
-        meetings,
-        tree.boxes(like),
-        Bodies(now.axes, (*now.xy, now.height)),
-        Bodies(later.axes, (*later.xy, later.height)),
-        lambda wrench: _respond(tree, factors, wrench, like),
-        jax.tree.map(jnp.zeros_like, qacc),
-        dt,
-    )
-    total: tuple[Vec, Vec, Any] = jax.tree.map(jnp.add, qacc, push)
+
+    def push() -> Any:
+        ahead = integrate(state, still, qacc, dt, tree.carries)
+        root_ahead, moved_ahead, _ = forward_kinematics(tree, ahead, True)
+        return contact_acceleration(
+            meetings,
+            tree.boxes(like),
+            Bodies.of(stack_motions(tree, root, factors.moved, like)),
+            Bodies.of(stack_motions(tree, root_ahead, moved_ahead, like)),
+            lambda wrench: _respond(tree, factors, wrench, like),
+            nothing,
+            dt,
+        )
+
+    if isinstance(meetings.count, int):
+        found = push()
+    else:  # a chunk of robots none of which can meet itself pays nothing
+        found = jax.lax.cond(meetings.count > 0, push, lambda: nothing)
+    total: tuple[Vec, Vec, Any] = jax.tree.map(jnp.add, qacc, found)
     return total
 
 

@@ -310,8 +310,8 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
         engine: "population" or "mjx".
 
     Raises:
-        InputError: the bed's contact, or self-contact, is not the engine's; or the step is too long, and the message
-            names the body and the largest stable step.
+        InputError: the bed's contact, or self-contact, is not the engine's; or the step is too
+            long, and the message names the body and the largest stable step.
     """
     bed = robot.world.bed
     if bed is not None and bed.contact == "mjx" and engine != "mjx":

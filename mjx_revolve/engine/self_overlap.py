@@ -34,7 +34,7 @@ def self_overlap(robot: Robot, qpos: Float[np.ndarray, "T nq"]) -> SelfOverlap:
     """How deep modules of a robot overlap, exactly: by the 15 separating axes of their main boxes.
 
     Compared are parts of different rigid bodies, but for those of a rigid body and of the one that
-    carries it by a hinge, and for parts that overlap by more than 1 mm at rest (all joints at 0).
+    carries it by a hinge, and for parts that overlap at rest (all joints at 0).
 
     Args:
         robot: from `build_robot`.

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from mjx_revolve.engine.assembly import Assembly
 
 # Parts that overlap by more than this at rest [m] are built that way, and pass through each other
-# later on, too. A choice: less than what contact allows.
-REST_OVERLAP = 1e-3
+# later on, too. A choice: rounding.
+REST_OVERLAP = 1e-5
 # Angles beyond the end stops [rad] and gaps [m] that a pair must keep to be left out. Choices: end
 # stops give way by half a degree.
 _RANGE_MARGIN, _CLEARANCE = 0.02, 1e-3
 # Boxes of angles that are looked at, for one pair and for one robot. A choice: some milliseconds.
-_SHARE, _BUDGET = 400, 6000
+_SHARE, _BUDGET = 512, 8000
 # Angles from rest to the end of a hinge's range at which neighbours are compared, and how often the
 # interval in which they meet is divided so again. Choices: steps of 2 degrees, then 0.003.
 _ANGLES, _PASSES = 24, 3

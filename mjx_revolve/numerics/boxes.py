@@ -179,17 +179,25 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     turn = _relative(pair)
     zero = xp.zeros_like(score[0])
     best, start, which, normal = xp.full_like(zero, -1e6), zero, zero, (zero, zero, zero)
+    # What touches first is what reaches farthest at the end of the step.
+    turn_ahead = turn if ahead is None else _relative(ahead)
+    toward = normal
     for k in range(15):
         better = score[k] > best + (_FACES_FIRST if k > 5 else 0)
         best, which = xp.where(better, score[k], best), xp.where(better, k, which)
         start = xp.where(better, now[k], start)
-        axis = _axis(turn, k)
-        normal = tuple(xp.where(better, side[k] * x, n) for x, n in zip(axis, normal, strict=True))
+        pick = lambda new, old: tuple(  # noqa: E731
+            xp.where(better, side[k] * x, n)  # noqa: B023
+            for x, n in zip(new, old, strict=True)
+        )
+        normal = pick(_axis(turn, k), normal)
+        toward = normal if ahead is None else pick(_axis(turn_ahead, k), toward)
     # The features that look at each other, seen from the first box.
     t = matTvec(pair.first, pair.offset)
     back = transpose(turn)
-    one, spread = _feature(normal, pair.first_half)
-    other, other_spread = _feature(matvec(back, tuple(-x for x in normal)), pair.second_half)
+    one, spread = _feature(toward, pair.first_half)
+    backward = matTvec(turn_ahead, tuple(-x for x in toward))
+    other, other_spread = _feature(backward, pair.second_half)
     away = vsub(vadd(t, matvec(turn, other)), one)
     on_first = _common(spread, away, turn, other_spread)
     on_second = _common(other_spread, matvec(back, tuple(-x for x in away)), back, spread)
@@ -250,7 +258,8 @@ def _common(spread: Vec, away: Vec, turn: Mat, other_spread: Vec) -> Vec:
         reach = dot(tuple(xp.abs(x) for x in turn[i]), other_spread)
         low = xp.maximum(-spread[i], away[i] - reach)
         high = xp.minimum(spread[i], away[i] + reach)
-        found.append(0.5 * (low + high))
+        # With nothing in common, the end of the other one: the gap is that at its corner.
+        found.append(xp.clip(0.5 * (low + high), away[i] - reach, away[i] + reach))
     return tuple(found)
 
 

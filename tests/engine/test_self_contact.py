@@ -1,0 +1,325 @@
+"""Self-contact: depth, momentum, energy, mirrors, batches, MuJoCo's contacts, random bodies."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from experiments.random_bodies import random_body
+from experiments.water_tank import EMPTY, march
+from laboratory import QUICK, at_rest, body, limp
+from mjx_revolve import load_world
+from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.engine.batch import fit_capacity, pack_bodies
+from mjx_revolve.engine.batched_trees import make_batched_trees
+from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.population import PopulationEngine, make_population_engine
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.self_overlap import self_overlap
+from mjx_revolve.engine.self_pairs import candidate_pairs
+from mjx_revolve.episodes.rollout import Rollout, StepInputs, open_loop
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.flow import water_of
+
+INWARDS = np.array([[0.785], [-0.785]])
+
+
+def water(**fields):
+    return load_world("lake", **{"bed": None, "self_contact": True, **fields})
+
+
+def fork(length, base):
+    """Two parallel arms that look ahead, each with a hinge and so many bricks behind it."""
+
+    def side(slot):
+        tip = {"type": "FixedBrick", "orientation": -90}
+        arm = {"type": "ActiveHinge", "orientation": 90, "children": {1: tip}}
+        for _ in range(length - 1):
+            tip["children"] = {1: {"type": "FixedBrick"}}
+            tip = tip["children"][1]
+        top = {"type": "FixedBrick", "children": {slot: arm}}
+        for _ in range(base):
+            top = {"type": "FixedBrick", "children": {1: top}}
+        return top
+
+    return make_morphology({"type": "Core", "children": {2: side(3), 3: side(2)}}, name="fork")
+
+
+def open_jaw(robot, lanes=1):
+    """Not the same on both sides: tips that meet head on slip to either side, by chance."""
+    qpos, qvel = at_rest(robot, lanes, -2.0)
+    qpos[7] = 0.3
+    return qpos, qvel
+
+
+@lru_cache(maxsize=16)
+def jaw(**fields):
+    """The tips of its arms meet when both swing inwards."""
+    return build_robot(fork(3, 1), water(**fields))
+
+
+def depths(robot, qpos):
+    """`[T, lanes]` of `[T, nq, lanes]` [m]."""
+    lanes = range(qpos.shape[-1])
+    return np.stack([self_overlap(robot, qpos[..., k]).depth for k in lanes], -1)
+
+
+def gaits(robot, lanes, steps, seed=0):
+    """`[steps, nu, lanes]` sines of all amplitudes, as fast as the servos and faster."""
+    draw = np.random.default_rng(seed)
+    size = robot.num_hinges, lanes
+    time = robot.world.timestep * np.arange(steps)[:, None, None]
+    middle, swing = draw.uniform(-0.5, 0.5, size), draw.uniform(0.2, 1.0, size)
+    return middle + swing * np.sin(draw.uniform(2, 8, size) * time + draw.uniform(0, 7, size))
+
+
+def momentum(robot, qpos, qvel):
+    """Linear and angular momentum about the core, and kinetic energy, by MuJoCo."""
+    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    mujoco.mj_energyVel(model, data)
+    linear = model.body_subtreemass[1] * data.subtree_linvel[1]
+    return np.concatenate([linear, data.subtree_angmom[1]]), data.energy[1]
+
+
+@pytest.mark.parametrize("timestep", [0.005, 0.01, 0.02])
+def test_servos_at_full_torque_press_less_than_2_mm(timestep):
+    robot = jaw(timestep=timestep)
+    qpos, qvel = open_jaw(robot)
+    _, qpos, qvel, _ = march(robot, 2.0, qpos, qvel, INWARDS)
+    deep = depths(robot, qpos)
+    assert deep.max() < 2e-3
+    assert np.abs(qpos[-1, 7:] - INWARDS).max() > 0.05  # they do press
+    assert np.abs(qvel[-1, 6:]).max() < 0.02
+
+
+def test_without_self_contact_arms_pass_through_each_other():
+    robot = jaw(self_contact=False)
+    qpos, qvel = open_jaw(robot)
+    assert depths(robot, march(robot, 2.0, qpos, qvel, INWARDS)[1]).max() > 0.01
+
+
+def test_a_hinge_ends_where_its_neighbours_meet():
+    """An arm on the inner side of a brick: its servo holder meets the core's other brick."""
+    robot, free = (build_robot(fork(1, 0), water(self_contact=x)) for x in (True, False))
+    assert len(robot.assembly.meeting_pairs) == 0
+    np.testing.assert_array_equal(free.assembly.stops, free.assembly.range)
+    low, high = robot.assembly.stops[robot.assembly.moved].T
+    reach = robot.assembly.range[-1, 1]
+    np.testing.assert_allclose([low[0], high[1]], [-reach, reach])
+    assert 0.3 < high[0] < 0.7
+    assert low[1] == pytest.approx(-high[0], abs=1e-9)
+    np.testing.assert_allclose(robot.mj_model.jnt_range[1:], np.stack([low, high], 1))
+    # By MuJoCo: just inside of the stop nothing of the neighbours touches, just outside it does.
+    model = free.mj_model
+    model.geom_contype[:] = model.geom_conaffinity[:] = 1
+    model.body_contype[:] = model.body_conaffinity[:] = 1
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    hinge = free.assembly.moved[0]
+    counts = []
+    for angle in (0.0, high[0] - 0.002, high[0] + 0.005):
+        data = mujoco.MjData(model)
+        data.qpos[7] = angle
+        mujoco.mj_forward(model, data)
+        pairs = {frozenset(c.geom.tolist()) for c in data.contact[: data.ncon]}
+        own = [model.geom_bodyid[list(pair)].tolist() for pair in pairs]
+        counts.append(sum(hinge in pair for pair in own))
+    assert counts[0] == counts[1] < counts[2]
+    qpos, qvel = at_rest(robot, height=-2.0)
+    angle = march(robot, 1.0, qpos, qvel, INWARDS)[1][-1, 7:, 0]
+    assert np.all(np.abs(np.abs(angle) - high[0]) < 0.02)
+
+
+def one_step(robot, qpos, qvel, ctrl):
+    return march(robot, robot.world.timestep, qpos, qvel, ctrl)[2][0]
+
+
+def test_contact_keeps_momentum_and_takes_energy():
+    """Of the same state, a step with and one without contact."""
+    robot, free = jaw(**EMPTY), jaw(**EMPTY, self_contact=False)
+    draw = np.random.default_rng(0)
+    lanes = 64
+    qpos, qvel = at_rest(robot, lanes)
+    qpos[7:] = np.sign(INWARDS) * draw.uniform(0.6, 0.66, (2, lanes))
+    qvel[:] = draw.normal(size=qvel.shape)
+    qvel[6:] = 5 * np.sign(INWARDS) * draw.uniform(0, 1, (2, lanes))
+    robot, free = limp(robot), limp(free)
+    after, alone = (
+        one_step(x, qpos, qvel, 0 * INWARDS + np.zeros((2, lanes))) for x in (robot, free)
+    )
+    hit = np.abs(after - alone).max(0) > 1e-6
+    assert 5 < hit.sum() < lanes
+    np.testing.assert_array_equal(after[:, ~hit], alone[:, ~hit])
+    for k in np.flatnonzero(hit):
+        change, energy = momentum(robot, qpos[:, k], after[:, k] - alone[:, k])
+        size = np.sqrt(2 * energy * robot.mj_model.body_mass.sum())
+        assert np.abs(change).max() < 1e-11 * max(size, 1e-3)
+        taken = momentum(robot, qpos[:, k], after[:, k])[1]
+        assert taken < momentum(robot, qpos[:, k], alone[:, k])[1]
+
+
+def test_energy_never_rises_without_motors():
+    robot = limp(jaw(**EMPTY))
+    draw = np.random.default_rng(1)
+    qpos, qvel = at_rest(robot, 16)
+    qvel[6:] = 3 * np.sign(INWARDS) * draw.uniform(0.5, 1, (2, 16))
+    _, qpos, qvel, _ = march(robot, 0.5, qpos, qvel)
+    assert 0 < depths(robot, qpos).max() < 2e-3
+    energy = np.array(
+        [[momentum(robot, q[:, k], v[:, k])[1] for k in range(16)]
+         for q, v in zip(qpos, qvel, strict=True)]
+    )  # fmt: skip
+    # Semi-implicit Euler itself gives and takes some of a turning robot's energy.
+    assert np.diff(energy, axis=0).max() < 2e-3 * energy.max()
+    assert np.all(energy[-1] < 0.9 * energy[0])
+
+
+def test_mirror_images():
+    robot = jaw(timestep=0.01)
+    qpos, qvel = open_jaw(robot, 2)
+    qpos[7:, 1] = -qpos[:6:-1, 0]
+    ctrl = INWARDS + 0.3 * gaits(robot, 1, 150)
+    ctrl = np.concatenate([ctrl, -ctrl[:, ::-1]], -1)
+    _, qpos, _, _ = march(robot, 1.5, qpos, qvel, ctrl)
+    assert depths(robot, qpos).max(0).min() > 0
+    np.testing.assert_allclose(qpos[:, 7, 0], -qpos[:, 8, 1], atol=1e-9)
+    np.testing.assert_allclose(qpos[:, 0, 0], -qpos[:, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(qpos[:, 1:3, 0], qpos[:, 1:3, 1], atol=1e-9)
+
+
+def march_batch(robots, capacity, lanes, ctrl, steps):
+    """`[steps, nq, robots * lanes]` of different bodies side by side, in float64."""
+    world = robots[0].world
+
+    @jax.jit
+    def run(bodies, ctrl):
+        trees = make_batched_trees(world, capacity, bodies, ctrl.shape[-1])
+        engine = PopulationEngine(trees, bodies.plant)
+        rollout = Rollout(engine, open_loop, world, water_of(world))
+        qpos = jnp.zeros((7 + capacity.hinges, ctrl.shape[-1])).at[3].set(1.0).at[2].set(-2.0)
+        start = rollout.init(engine.init(qpos, jnp.zeros_like(qpos[1:])))
+        keep = lambda now, *_: engine.observe(now.state)[0]  # noqa: E731
+        inputs = StepInputs(ctrl=jax.vmap(bodies.plant.arrange)(ctrl))
+        return rollout.advance(start, keep, steps, 1, inputs)[1]
+
+    with jax.enable_x64(True):
+        bodies = pack_bodies([r for r in robots for _ in range(lanes)], capacity, np.float64)
+        run = run.lower(bodies, jnp.asarray(ctrl)).compile(QUICK)
+        return np.asarray(run(bodies, jnp.asarray(ctrl)))
+
+
+@pytest.mark.slow
+def test_a_body_alone_and_in_a_batch_agree():
+    world = water(timestep=0.01)
+    robots = [build_robot(x, world) for x in (fork(3, 1), fork(3, 0), body("spider"))]
+    assert [len(r.assembly.meeting_pairs) for r in robots] == [1, 4, 0]
+    capacity, steps = fit_capacity(robots), 80
+    ctrl = np.zeros((steps, 8, 6))
+    for k, robot in enumerate(robots):
+        own = gaits(robot, 2, steps)
+        ctrl[:, : robot.num_hinges, 2 * k : 2 * k + 2] = own + (INWARDS if k < 2 else 0)
+    found = march_batch(robots, capacity, 2, ctrl, steps)
+    for k, robot in enumerate(robots):
+        here = slice(2 * k, 2 * k + 2)
+        start = at_rest(robot, 2, -2.0)
+        alone = march(robot, 0.8, *start, ctrl[:, : robot.num_hinges, here])[1]
+        np.testing.assert_allclose(found[:, : alone.shape[1], here], alone, atol=1e-9)
+        assert (depths(robot, alone).max() > 0) == (k < 2)
+
+
+def test_contacts_are_mujocos():
+    """Which pairs, when, and how deep: MuJoCo's contacts of the same model."""
+    draw, seen = np.random.default_rng(0), 0
+    for seed in (12, 25, 37, 51):
+        robot = build_robot(random_body(seed, 4 + seed % 13, 6), water())
+        model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+        qpos = np.zeros((60, model.nq))
+        qpos[:, 3] = 1
+        stops = robot.assembly.stops[robot.assembly.moved]
+        qpos[:, 7:] = draw.uniform(*stops.T, (60, len(stops)))
+        found = self_overlap(robot, qpos)
+        modules = [m.name for m in robot.morphology.modules]
+        for q, depth, first, second in zip(qpos, *found, strict=True):
+            data.qpos[:] = q
+            mujoco.mj_forward(model, data)
+            deepest = min(data.contact[: data.ncon], key=lambda c: c.dist, default=None)
+            theirs = 0.0 if deepest is None else max(-deepest.dist, 0.0)
+            if 0 < depth < 0.005:
+                assert depth == pytest.approx(theirs, abs=1e-4)
+                names = {model.geom(int(g)).name.split("/")[0] for g in deepest.geom}
+                assert names == {modules[first], modules[second]}
+                seen += 1
+            assert (depth > 1e-4) == (theirs > 1e-4)
+    assert seen > 5
+
+
+def test_pairs_that_can_never_meet_cost_nothing():
+    """A spider's and a fish's step is, operation by operation, the one without self-contact."""
+    assert len(candidate_pairs(build_robot(body("spider"), water()).assembly)) > 100
+    for name in ("spider", "fish"):
+        programs = []
+        for on in (True, False):
+            robot = build_robot(body(name), water(self_contact=on))
+            engine = make_population_engine(robot)
+            start = engine.init(*map(jnp.asarray, at_rest(robot, 4)))
+            ctrl = jnp.zeros((robot.num_hinges, 4))
+            step = lambda s, c, e=engine, r=robot: e.step(s, c, water_of(r.world))  # noqa: E731
+            programs.append(str(jax.make_jaxpr(step)(start, ctrl)))
+        assert programs[0] == programs[1]
+    snake = build_robot(body("snake"), water()).assembly
+    ends = {snake.names[k] for k in snake.fluid.body[snake.meeting_pairs].ravel()}
+    assert 0 < len(snake.meeting_pairs) < 12  # its ends meet when it curls up
+    assert len(ends) <= 6
+
+
+@pytest.mark.slow
+def test_gradients_through_a_contact_are_finite():
+    robot = jaw(timestep=0.02)
+    engine = make_population_engine(robot)
+    rollout = Rollout(engine, open_loop, robot.world, water_of(robot.world))
+
+    def end(ctrl):
+        start = rollout.init(engine.init(*map(jnp.asarray, at_rest(robot, 2, -2.0))))
+        keep = lambda now, *_: engine.observe(now.state)[0]  # noqa: E731
+        path = rollout.advance(start, keep, 30, 1, StepInputs(ctrl=ctrl), differentiable=True)[1]
+        return jnp.sum(path[-1, :3]), path
+
+    with jax.enable_x64(True):
+        ctrl = jnp.asarray(np.broadcast_to(INWARDS * [1.0, 0.9], (30, 2, 2)))
+        run = jax.jit(jax.grad(end, has_aux=True)).lower(ctrl).compile(QUICK)
+        slope, path = run(ctrl)
+    assert depths(robot, np.asarray(path)).max() > 0
+    assert bool(jnp.all(jnp.isfinite(slope))) and float(jnp.abs(slope).max()) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("timestep", [0.005, 0.02])
+def test_random_bodies_under_random_gaits_do_not_overlap(timestep):
+    world = water(timestep=timestep)
+    robots = [build_robot(random_body(k, 4 + k % 9, 6), world) for k in range(100, 164)]
+    robots = [r for r in robots if len(r.assembly.meeting_pairs)]
+    assert len(robots) > 20
+    capacity, steps = fit_capacity(robots), round(2.0 / timestep)
+    ctrl = np.zeros((steps, capacity.hinges, 4 * len(robots)))
+    for k, robot in enumerate(robots):
+        ctrl[:, : robot.num_hinges, 4 * k : 4 * k + 4] = gaits(robot, 4, steps, k)
+    found = march_batch(robots, capacity, 4, ctrl, steps)
+    assert np.isfinite(found).all()
+    deep = [
+        depths(robot, found[:, : 7 + robot.num_hinges, 4 * k : 4 * k + 4]).max()
+        for k, robot in enumerate(robots)
+    ]
+    assert np.max(deep) < 3e-3
+    assert np.median(deep) < 1e-3
+
+
+def test_mjx_refuses_it():
+    with pytest.raises(InputError, match="self_contact: expected false with engine: mjx"):
+        make_engine(jaw(), "mjx")
