@@ -170,8 +170,8 @@ def stopped(folder):
     ("argv", "message"),
     [
         (["--set", "task.duration=4"], "--resume run: task.duration: expected 10.0 as in the run; "
-         "found 4.0; only evolution.generations, checkpoint_every, keep_checkpoints, tensorboard "
-         "may change"),
+         "found 4.0; only evolution.generations, checkpoint_every, keep_checkpoints, "
+         "tensorboard, passport may change"),
         (["--seed", "9"], "--resume run: evolution.seed: expected 0 as in the run; found 9"),
         (["--set", "world=empty_underwater"], "--resume run: world.name: expected 'lake' as in"),
         (["--set", "morphology=other.yaml"], "--resume run: morphology: expected"),
