@@ -43,7 +43,7 @@ from mjx_revolve.numerics.spatial import (
     vsub,
 )
 
-# Contacts of one robot at a time. A choice: of 10,000 random bodies, few have more.
+# Candidates of one robot at a time. A choice: few robots have more in contact.
 _MOST = 8
 # Overlap that is let be [m], the share of the rest that is parted in a step, and the top speed of
 # that [m/s]. Choices.
@@ -51,9 +51,9 @@ _SLOP, _SHARE, _TOP = 5e-4, 1.0, 1.0
 # Steps towards the forces of several contacts, and the error at which they end [m]. Choices: one
 # step is exact for one contact.
 _STEPS, _ENOUGH = 12, 2e-5
-# Softness of a contact [m/N]: what is wedged between two modules has finite forces. A choice: a
-# servo's full torque at an arm of 6 cm gives a sixth of a millimetre.
-_SOFTNESS = 5e-5
+# Added to the inverse mass of a contact [1/kg], so that what is wedged between two modules has
+# finite forces. A choice: as if 50 kg gave way, where modules have some tens of grams.
+_SOFTNESS = 0.02
 # Score of pairs that are no candidates: squared distance of centres per squared reach [-].
 _FAR = 1e3
 
@@ -331,7 +331,7 @@ class _Contacts:
             way = jnp.where((force > 0) | (way > 0), way, 0)
             way = jnp.where(_sum(way * slope) > 0, way, projected)
             change = respond(self._spread(way))
-            curve = self._gather(change.bodies) + _SOFTNESS / self.dt**2 * way
+            curve = self._gather(change.bodies) + _SOFTNESS * way
             gain, bend = _sum(way * slope), _sum(way * curve)
             longest = jnp.where(way < 0, -force / jnp.where(way < 0, way, -1), 1e30)
             most = longest[0]
