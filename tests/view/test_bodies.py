@@ -264,7 +264,8 @@ def test_the_page_shows_who_lived(run, still):
     # Generations 3, 2 and 1, the best first; then the line 1, 3, (4 above) 5.
     assert order == [5, 3, 4, 3, 4, 1, 1, 0, 2, 1, 3, 4, 5]
     assert page.count('alt="Body of individual') == len(order)
-    assert "evolved bodies: speed (run)" in page
+    # Its configuration names neither point nor length, as those of older versions.
+    assert "evolved bodies: speed (core, rest) (run)" in page
     assert "seed &lt;b&gt;$x$&lt;/b&gt;" in page and "<b>$x$" not in page
     assert "The archive" not in page and "more</p>" not in page
     assert read_run(run).problems == read_run(run).problems
