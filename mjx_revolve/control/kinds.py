@@ -55,7 +55,8 @@ def find_controller(
     if settings.rate is not None:
         paced = plant.at_rate(settings.rate)
         shown = None if example is None else example.at_rate(settings.rate)
-        return hold_commands(_find(paced, settings, source, shown, body), paced)
+        found = _find(paced, settings, source, shown, body)
+        return hold_commands(found, paced, settings.between == "ramp")
     return _find(plant, settings, source, example, body)
 
 

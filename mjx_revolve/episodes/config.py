@@ -118,6 +118,9 @@ class ControllerConfig(Section):
     rate: Annotated[Positive, Le(1000), Unit("Hz")] | None = 20.0
     """Commands in a second, held in between, as servos and Revolve have them; null: a new one at
     each of the world's steps, as in runs of versions that had no rate [Hz]."""
+    between: Literal["hold", "ramp"] = "hold"
+    """What targets do between commands: they are held, or `ramp` from the last command to this one,
+    a period late and without jerks."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """The fastest oscillation, half of `rate` at most [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0

@@ -72,6 +72,8 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     data = map_files(data, by_content, Config)
     if data["controller"]["rate"] is None:  # as in older runs, which have none
         del data["controller"]["rate"]
+    if data["controller"]["between"] == "hold":
+        del data["controller"]["between"]
     for section in ("controller", "task"):
         if not data[section]["params"]:  # older runs have none
             del data[section]["params"]

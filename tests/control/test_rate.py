@@ -56,6 +56,21 @@ def test_commands_are_the_same_at_any_step_and_held_between(plant, kind):
         assert len(np.unique(number)) == len(instants)
 
 
+def test_a_ramp_leads_from_the_last_command_to_this_one(plant):
+    """A period late, without jumps, at any step; the first command stands until the second."""
+    instants = np.arange(int(20 * LENGTH)) / 20
+    held = commands(plant, instants, 0.05, type="sine")
+    for dt in (0.0125, 0.003):
+        times = np.arange(0.05, LENGTH - 0.1, dt)
+        found = commands(plant, np.arange(0, LENGTH - 0.1, dt), dt, type="sine", between="ramp")
+        found = found[-len(times) :]
+        times = np.arange(0, LENGTH - 0.1, dt)[-len(times) :]
+        late = [
+            [np.interp(times - 0.05, instants, x) for x in joint.T] for joint in held.swapaxes(0, 1)
+        ]
+        assert found == pytest.approx(np.moveaxis(np.array(late), -1, 0), abs=1e-9)
+
+
 def test_a_sine_is_sampled_at_the_instants(plant):
     """Those of the brain without a rate, at these times."""
     instants = np.arange(int(20 * LENGTH)) / 20
