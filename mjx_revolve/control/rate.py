@@ -51,7 +51,7 @@ def hold_commands(controller: Controller, plant: Plant, ramp: bool = False) -> C
     Returns:
         The controller; its `step` is called at each of the world's steps.
     """
-    rate, ramp = plant.rate, ramp and plant.num_rows > 0
+    rate = plant.rate
     assert rate is not None
 
     def decode(genes: jax.Array, body: Plant) -> Any:
@@ -85,7 +85,7 @@ def hold_commands(controller: Controller, plant: Plant, ramp: bool = False) -> C
             own, ctrl = jax.lax.cond(due[0], fuse(act, inline=True), lambda x: x, (before, held))
         shown = ctrl if len(ctrl) else jnp.zeros((0, *last.shape), last.dtype)
         number = jnp.broadcast_to(number, last.shape)
-        if ramp:  # the first command stands until the second
+        if ramp and len(ctrl):  # the first command stands until the second
             start = jnp.where(due, jnp.where(last < 0, ctrl, held), start)
             shown = start + jnp.clip(time * rate - number, 0, 1) * (ctrl - start)
         return HeldState(number, own, ctrl, start), shown
