@@ -286,6 +286,9 @@ class TaskConfig(Section):
         if self.horizon is not None and self.type not in ("speed", "directed_swim"):
             what = f"none, as task.type is {self.type}; speed and directed_swim have one"
             raise ConstraintError("horizon", what, f"{self.horizon:g}")
+        if self.horizon is not None and self.horizon < self.duration:
+            least = f"a time >= task.duration ({self.duration:g} s)"
+            raise ConstraintError("horizon", least, f"{self.horizon:g}")
         found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
         if len(found) > 1:
             raise ConstraintError("target", "none, as there is a target_distance", "one")

@@ -98,6 +98,8 @@ def test_it_is_frozen(folder):
         ("task.target=[1, 2]", "task.target: expected three numbers [m], or nothing; "
          "found [1, 2]"),
         ("task.direction=[0, 0, 0]", "task.direction: expected a vector of some length; found"),
+        ("task={type: speed, duration: 6, horizon: 3}", "--set task.horizon: expected a time >= "
+         "task.duration (6 s); found 3"),
         ("task={type: crawl, horizon: 60}", "--set task.horizon: expected none, as task.type is "
          "crawl; speed and directed_swim have one; found 60"),
         ("task.durtion=5", "--set task.durtion: expected one of 32 keys; found an unknown key; "
