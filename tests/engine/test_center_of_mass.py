@@ -46,6 +46,7 @@ def test_the_centre_of_mass_is_mujocos(engine):
         np.testing.assert_allclose(mass_centers(robot, qpos.T), expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_centres_of_mass_of_many_bodies_are_mujocos():
     """Padding and overflow rows weigh nothing."""
     with jax.enable_x64(True):

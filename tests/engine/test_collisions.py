@@ -269,6 +269,7 @@ def duel(dt: float):
     return partial(run, (tables, spheres)), np.array([0.3, 0.6])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.002, 0.01])
 @pytest.mark.parametrize("speed", [0.1, 0.5])
 def test_boxes_meet_without_passing_and_keep_momentum(dt, speed):

@@ -194,6 +194,7 @@ def test_a_short_stack_holds_any_tree():
                 stack[slot] = None if overflow else own
 
 
+@pytest.mark.slow
 def test_room_for_all_bodies_of_so_many_modules():
     """Whatever their shape; and no more than a few rows that none of them needs."""
     tank = world(**WATER, bed=BED)

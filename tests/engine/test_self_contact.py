@@ -89,6 +89,7 @@ def momentum(robot, qpos, qvel):
     return np.concatenate([linear, data.subtree_angmom[1]]), data.energy[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timestep", [0.005, 0.01, 0.02])
 def test_servos_at_full_torque_press_less_than_2_mm(timestep):
     robot = jaw(timestep=timestep)
@@ -141,6 +142,7 @@ def one_step(robot, qpos, qvel, ctrl):
     return march(robot, robot.world.timestep, qpos, qvel, ctrl)[2][0]
 
 
+@pytest.mark.slow
 def test_contact_keeps_momentum_and_takes_energy():
     """Of the same state, a step with and one without contact."""
     robot, free = jaw(**EMPTY), jaw(**EMPTY, self_contact=False)
@@ -165,6 +167,7 @@ def test_contact_keeps_momentum_and_takes_energy():
         assert taken < momentum(robot, qpos[:, k], alone[:, k])[1]
 
 
+@pytest.mark.slow
 def test_energy_never_rises_without_motors():
     robot = limp(jaw(**EMPTY))
     draw = np.random.default_rng(1)
@@ -181,6 +184,7 @@ def test_energy_never_rises_without_motors():
     assert np.all(energy[-1] < 0.9 * energy[0])
 
 
+@pytest.mark.slow
 def test_mirror_images():
     robot = jaw(timestep=0.01)
     qpos, qvel = open_jaw(robot, 2)
@@ -260,6 +264,7 @@ def test_contacts_are_mujocos():
     assert seen > 5
 
 
+@pytest.mark.slow
 def test_pairs_that_can_never_meet_cost_nothing():
     """A spider's and a fish's step is, operation by operation, the one without self-contact."""
     assert len(candidate_pairs(build_robot(body("spider"), water()).assembly)) > 100

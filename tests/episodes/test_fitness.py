@@ -210,6 +210,7 @@ def test_tasks_with_known_scores(task, given, score):
     assert float(TASKS[task].score(given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.0, 0.05, 0.2, -0.6])
 def test_a_horizon_foretells_the_way_of_a_circle(rate):
     """At 1 m/s and so many rad/s: from 20 s the net way of 120 s, by the chord of the arc."""

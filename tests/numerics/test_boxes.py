@@ -106,6 +106,7 @@ def test_a_box_that_would_pass_through_another_within_a_step_is_seen():
     assert box_gap(ahead)[0] == pytest.approx(0.008)
 
 
+@pytest.mark.slow
 def test_runs_under_jit_with_finite_gradients():
     boxes = draw_pairs(200, 0.1)
     pair = pair_of(*boxes)

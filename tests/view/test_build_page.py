@@ -125,6 +125,7 @@ def test_joints_move_as_the_table_says():
         assert moved @ axes[row["toward"]] > 0.9 * np.linalg.norm(moved)
 
 
+@pytest.mark.slow
 def test_same_robot_same_page():
     robot = build_robot(read(OAR), load_world("lake"))
     assert make_build_page(robot) == make_build_page(robot)
