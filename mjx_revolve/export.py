@@ -132,7 +132,6 @@ def main(argv: list[str] | None = None) -> int:
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.formats.export import export_robot
-    from mjx_revolve.view.build_page import make_build_page
 
     if arguments.mcap is not None:
         check_package("--mcap", "rosbags")
@@ -163,6 +162,8 @@ def main(argv: list[str] | None = None) -> int:
         del files["mcap"]
     done = export_robot(episode.robot, files, episode.trajectory, arguments.meshes, brain)
     if "build" in files:
+        from mjx_revolve.view.build_page import make_build_page
+
         write_atomic(files["build"], make_build_page(episode.robot, episode.title).encode())
         done.append((files["build"], "how to build it; for browsers and printers"))
     for path, words in done:

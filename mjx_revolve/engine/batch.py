@@ -584,10 +584,8 @@ def _pick_rows(
         every = np.ones(len(held), bool)
         most = capacity.shells, capacity.root_shells
         in_rows, in_roots = place(every, held, piece, rank, *most)
-        shell, robot = np.nonzero(
-            np.concatenate([in_roots, in_rows.reshape(-1, count)]) < len(part)
-        )
         table = np.concatenate([in_roots, in_rows.reshape(-1, count)])
+        shell, robot = np.nonzero(table < len(part))
         number = np.zeros(len(part), int)
         number[table[shell, robot]] = shell
         ends = np.searchsorted(part, pairs)

@@ -74,8 +74,10 @@ TASKS: dict[str, tuple[str, ...]] = {
     "follow_bed": ("height",),
     "crawl": (),
 }
-# What runs of versions without these settings had.
+# What runs of versions without these settings had: their controllers gave a command at every step,
+# their robots' places were their cores', and their lengths those at rest.
 OLDER_TASK = {"point": "core", "length": "rest"}
+OLDER: dict[str, dict[str, Any]] = {"task": OLDER_TASK, "controller": {"rate": None}}
 # Those that have a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
@@ -568,14 +570,9 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
 
 
 def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A run folder's settings with the values that older versions had where they lack a setting.
-
-    Their controllers had no rate and gave a command at every step; their robots' places were their
-    cores', and their lengths those at rest.
-    """
-    older: dict[str, dict[str, Any]] = {"task": {**OLDER_TASK}, "controller": {"rate": None}}
-    own = {name: data.get(name) for name in older}
-    return {**data} | {k: {**older[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
+    """A run folder's settings with the values that older versions had where they lack a setting."""
+    own = {name: data.get(name) for name in OLDER}
+    return {**data} | {k: {**OLDER[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
 
 
 def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:

@@ -18,12 +18,15 @@ if TYPE_CHECKING:
 
 FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard", "passport")
 """Settings of `evolution` that may change when a run is resumed; others make another run."""
-# Settings of a task that older versions lack: with their default values they are left out of
-# fingerprints, so that older runs can go on.
-_LATER_IN_TASK = (
-    "measures", "unit", "target_turn", "sight", "touch",
-    "course_spread", "course_changes", "course_turn", "course_rate", "horizon",
-)  # fmt: skip
+# Settings that older versions lack, by section: with their default values, or with what those
+# versions had (`config.OLDER`), they are left out of fingerprints, so that older runs can go on.
+_LATER = {
+    "task": (
+        "measures", "unit", "target_turn", "sight", "touch",
+        "course_spread", "course_changes", "course_turn", "course_rate", "horizon",
+    ),
+    "controller": ("between",),
+}  # fmt: skip
 # Their versions must be the same in all processes of a run.
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 
@@ -56,7 +59,7 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
         config: of the run.
         by_path: whether current fields and data count by their path, as they did in older runs.
     """
-    from mjx_revolve.episodes.config import OLDER_TASK, Config
+    from mjx_revolve.episodes.config import OLDER, Config
     from mjx_revolve.episodes.settings import map_files
 
     def by_content(file: NamedFile) -> str:
@@ -70,10 +73,6 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     del data["morphology"], data["modules"]
     data["world"]["name"] = Path(data["world"]["name"]).name
     data = map_files(data, by_content, Config)
-    if data["controller"]["rate"] is None:  # as in older runs, which have none
-        del data["controller"]["rate"]
-    if data["controller"]["between"] == "hold":
-        del data["controller"]["between"]
     for section in ("controller", "task"):
         if not data[section]["params"]:  # older runs have none
             del data[section]["params"]
@@ -86,10 +85,12 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
         brought = {name: [s.to_mapping() for s in own] for name, own in kinds.items() if own}
         if brought:
             data["controller"]["brought"] = brought
-    usual = {name: type(config.task).model_fields[name].default for name in _LATER_IN_TASK}
-    for name, value in (usual | OLDER_TASK).items():
-        if data["task"][name] == value:
-            del data["task"][name]
+    for section, names in _LATER.items():
+        fields = type(getattr(config, section)).model_fields
+        usual = {name: fields[name].default for name in names}
+        for name, value in (usual | OLDER[section]).items():
+            if data[section][name] == value:
+                del data[section][name]
     if data["bodies"] is not None and not data["bodies"]["max_of"]:
         del data["bodies"]["max_of"]
     if data["bodies"] is not None and data["bodies"]["selection"]["passport"] == "made":
