@@ -377,7 +377,8 @@ def _joints(fitness: Fitness, trajectory: Trajectory) -> Iterator[tuple[str, Che
     moved, speed = robot.assembly.moved, qvel[:, 6:]
     depth = np.abs(1000 * self_overlap(robot, qpos).depth)  # rather than -0
     yield "overlap", Check("deepest overlap of modules", float(depth.max()), "mm", most=OVERLAP)
-    yield "overlap_time", Check("share of time with an overlap", float(np.mean(depth > OVERLAP)))
+    deeper = float(np.mean(depth > OVERLAP))
+    yield "overlap_time", Check(f"share of time with more than {OVERLAP:g} mm", deeper)
     rate = count_reversals(qpos[:, 7:]).max() / (len(qvel) * robot.world.timestep)
     yield "reversals", Check("reversals of a joint", float(rate), "1/s", most=REVERSALS)
     torque = motor_torques(robot, qpos, qvel, ctrl) / robot.assembly.effort[moved]
