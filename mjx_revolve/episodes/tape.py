@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from mjx_revolve.control.readings import NO_INTERACTION
 from mjx_revolve.episodes.rollout import Recorder, Rollout, RolloutState, StepInputs
 from mjx_revolve.numerics.adjoint import fused_back
-from mjx_revolve.numerics.xla import in_one_array
+from mjx_revolve.numerics.xla import in_one_array, is_wide
 
 Pull = Callable[[Any], tuple[RolloutState, list[jax.Array]]]
 
@@ -141,4 +141,4 @@ def _fill(tree: Any, values: list[jax.Array]) -> Any:
 
 def wide_leaves(tree: Any) -> list[jax.Array]:
     """The leaves that have gradients."""
-    return [x for x in jax.tree.leaves(tree) if x.ndim > 0]
+    return [x for x in jax.tree.leaves(tree) if is_wide(x)]

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_revolve.numerics.xla import in_fused_calls, in_one_array
+from mjx_revolve.numerics.xla import in_fused_calls, in_one_array, is_wide
 
 
 def differentiate_as(
@@ -41,7 +41,7 @@ def fused_back(
 
     Args:
         step: (carry, row, offset) → carry; element-wise but for sums over what is broadcast. Of the
-            carry's leaves, those `[..., lanes]` have gradients; scalars have none.
+            carry's leaves, the wide ones have gradients (see `xla.is_wide`).
         carry: an example.
         row: an example; it has no gradient.
         offset: an example; added to something within the step, for the gradient by it.
@@ -52,7 +52,7 @@ def fused_back(
         Carries are packed by `xla.in_one_array`, gradients like its first result.
     """
     pack, unpack = in_one_array(carry)
-    wide = [x.ndim > 0 for x in jax.tree.leaves(carry)]
+    wide = [is_wide(x) for x in jax.tree.leaves(carry)]
     none = jnp.zeros_like(offset)
 
     def spread(carry: Any) -> list[jax.Array]:

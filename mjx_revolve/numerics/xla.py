@@ -348,8 +348,8 @@ def fuse_step(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any)
     carry travels as one array, because every array that a loop carries costs as much as a call.
 
     Args:
-        step: (carry, row) → (carry, output); element-wise. The carry's leaves are `[..., lanes]`
-            of one floating-point type, but for scalars.
+        step: (carry, row) → (carry, output); element-wise. The carry's leaves are `[..., lanes]`,
+            floats of one type, or others, which are carried as they are.
         carry: an example.
         row: an example.
 
@@ -368,31 +368,35 @@ def fuse_step(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any)
     return fused, pack, unpack
 
 
+def is_wide(x: jax.Array) -> bool:
+    """Whether a leaf of a loop's carry is an array of floats, of one type in all of them."""
+    return x.ndim > 0 and bool(jnp.issubdtype(x.dtype, jnp.floating))
+
+
 def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
     """Functions that pack what a loop carries.
 
     Args:
-        carry: an example; its leaves are `[..., lanes]` of one floating-point type, but for
-            scalars.
+        carry: an example; its leaves are `[..., lanes]`, floats of one type, or others.
 
     Returns:
-        (pack, unpack): between such a carry and `[rows, lanes]` of its leaves, one below the other,
-        with the list of its scalars.
+        (pack, unpack): between such a carry and `[rows, lanes]` of its wide leaves, one below the
+        other, with the list of the others.
     """
     leaves, tree = jax.tree.flatten(carry)
-    wide = [x.ndim > 0 for x in leaves]
+    wide = [is_wide(x) for x in leaves]
     rows = np.cumsum([0] + [x.size // x.shape[-1] for x, w in zip(leaves, wide, strict=True) if w])
 
     def pack(carry: Any) -> Any:
         leaves = jax.tree.leaves(carry)
-        blocks = [x.reshape(-1, x.shape[-1]) for x in leaves if x.ndim > 0]
-        return jnp.concatenate(blocks), [x for x in leaves if x.ndim == 0]
+        blocks = [x.reshape(-1, x.shape[-1]) for x in leaves if is_wide(x)]
+        return jnp.concatenate(blocks), [x for x in leaves if not is_wide(x)]
 
     def unpack(packed: Any) -> Any:
-        block, scalars = packed[0], iter(packed[1])
+        block, others = packed[0], iter(packed[1])
         slices = (block[a:b] for a, b in itertools.pairwise(rows))
         found = [
-            next(slices).reshape(x.shape) if w else next(scalars)
+            next(slices).reshape(x.shape) if w else next(others)
             for x, w in zip(leaves, wide, strict=True)
         ]
         return jax.tree.unflatten(tree, found)
