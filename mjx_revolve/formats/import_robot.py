@@ -51,7 +51,7 @@ class ImportedRobot:
     missing: tuple[str, ...]
 
     def save(self, folder: str | Path = ".") -> tuple[Path, Path]:
-        """Writes `NAME.yaml` and `NAME_modules.yaml`.
+        """Writes two YAML files named after the robot: morphology and types of modules.
 
         Args:
             folder: to write into.
