@@ -1,8 +1,7 @@
 """The robots of Revolve's and revolve2's standard library, beside revolve2's own objects.
 
 revolve2 needs other versions than this package; it lives in an environment of its own, whose Python
-is named by REVOLVE2_PYTHON: `pip install revolve2-modular-robot==1.2.4` and, for the robots, `pip
-install --no-deps revolve2-ci-group==1.2.1`.
+is named by REVOLVE2_PYTHON: `pip install revolve2-standards==1.2.4`.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import pytest
 from laboratory import body
 
 PYTHON = os.environ.get("REVOLVE2_PYTHON", "")
-# Modules and hinges, counted in revolve2-ci-group 1.2.1.
+# Modules and hinges, counted in revolve2-standards 1.2.4.
 ROBOTS = {
     "ant": (17, 8), "babya": (16, 8), "babyb": (21, 10), "blokky": (15, 5), "garrix": (15, 10),
     "gecko": (13, 6), "insect": (12, 9), "linkin": (15, 12), "longleg": (15, 12), "park": (15, 8),
@@ -31,7 +30,7 @@ TURNED = {"gecko"}
 DUMP = """
 import json
 from pyrr import Quaternion, Vector3
-from revolve2.ci_group import modular_robots_v1 as library
+from revolve2.standards import modular_robots_v1 as library
 axes = [Vector3(row) for row in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])]
 whole = lambda vector: [int(round(x)) for x in vector]
 def walk(module, turn, cell, above):
