@@ -5,7 +5,7 @@ import numpy as np
 
 from mjx_revolve.episodes import register_envs
 
-register_envs()  # an installed package has done so already
+register_envs()
 quick = {"task.duration": 2.0, "task.settle": 0.5}
 
 env = gymnasium.make("mjx_revolve/FishSwim-v0", **quick)

@@ -22,7 +22,7 @@ from mjx_revolve.episodes.fitness import make_fitness
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class State:
+class WaterState:
     """An environment, with the names that brax has.
 
     Attributes:
@@ -41,7 +41,7 @@ class State:
     metrics: dict[str, jax.Array] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
 
-    def replace(self, **changes: Any) -> State:
+    def replace(self, **changes: Any) -> WaterState:
         """The state with some fields changed."""
         return replace(self, **changes)
 
@@ -106,17 +106,17 @@ class FunctionalEnv:
         """Itself, as brax asks for it."""
         return self
 
-    def reset(self, rng: jax.Array) -> State:
+    def reset(self, rng: jax.Array) -> WaterState:
         """An episode's start, which follows from the key alone."""
         state, seen = self._begin(jax.random.bits(rng), jnp.int32(0))
         zero = jnp.zeros((), seen.dtype)
-        return State(state, seen, zero, zero, {"score": zero}, {"truncation": zero})
+        return WaterState(state, seen, zero, zero, {"score": zero}, {"truncation": zero})
 
-    def step(self, state: State, action: jax.Array) -> State:
+    def step(self, state: WaterState, action: jax.Array) -> WaterState:
         """A control period with an action `[action_size]` between -1 and 1."""
         after, seen, result = self._advance(state.pipeline_state, action)
         done = (result.terminated | result.truncated).astype(seen.dtype)
-        return State(
+        return WaterState(
             after, seen, result.reward, done, {**state.metrics, "score": result.score},
             {**state.info, "truncation": result.truncated.astype(seen.dtype)},
         )  # fmt: skip

@@ -1,15 +1,19 @@
 """Gymnasium's ids of the shipped tasks: `gymnasium.make("mjx_revolve/LakeSwim-v0")`.
 
-An installed package registers them when Gymnasium is imported (its entry point `gymnasium.envs`);
-`register_envs` does so anywhere. Nothing heavy is imported before the first environment is made.
+Gymnasium knows no package by itself: `register_envs()` registers them, and so does importing this
+file, which `gymnasium.make("mjx_revolve.episodes.gym_ids:mjx_revolve/LakeSwim-v0")` does. Nothing
+heavy is imported before the first environment is made.
 """
 
 from __future__ import annotations
 
+import importlib.util
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+
+from mjx_revolve.inputs.packages import check_package
 
 CONFIGS = (
     "auv_escape", "auv_follow_bed", "auv_follow_course", "auv_hold_depth", "auv_hold_heading",
@@ -24,7 +28,12 @@ def env_id(config: str) -> str:
 
 
 def register_envs() -> None:
-    """Registers an id for each of `CONFIGS`, for `gymnasium.make` and `gymnasium.make_vec`."""
+    """Registers an id for each of `CONFIGS`, for `gymnasium.make` and `gymnasium.make_vec`.
+
+    Raises:
+        InputError: gymnasium is not installed.
+    """
+    check_package("register_envs", "gymnasium")
     from gymnasium.envs.registration import register, registry
 
     place = __name__.rpartition(".")[0]
@@ -82,3 +91,7 @@ def _make_class() -> type:
             self.env.close()
 
     return WaterEnv
+
+
+if importlib.util.find_spec("gymnasium") is not None:
+    register_envs()
