@@ -7,7 +7,7 @@ TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile 
 READY  := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve test test-quick fuzz check format docs bench dist lock clean
+.PHONY: help install evolve test test-quick fuzz check format docs bench dist environments lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -61,6 +61,9 @@ dist: $(READY)  ## wheel and sdist in dist/, tried in a fresh environment from a
 	build/dist/venv/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	build/dist/venv/bin/pip check
 	mkdir -p build/dist/empty && cd build/dist/empty && ../venv/bin/mjx-revolve evolve smoke --out run
+
+environments: $(READY)  ## lowest and newest versions, and neighbours: installed and tried, minutes and GB each
+	$(RUN) -m experiments.installations --tests
 
 lock:  ## write requirements.lock anew from pyproject.toml
 	$(PYTHON) -m venv $(VENV)-lock

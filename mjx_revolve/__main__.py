@@ -24,6 +24,7 @@ _COMMANDS = {
     "report": "a page about one run, several, or a sweep",
     "passport": "what a run's champion was tried for, and what it fails",
     "export": "a champion, or a robot, for MuJoCo, ROS and Gazebo",
+    "import": "a robot of a URDF or an MJCF file",
 }
 _EXAMPLES = (
     "inspect spider --picture spider.png",
@@ -51,7 +52,8 @@ def _main(argv: list[str] | None) -> int:
         return 0
     if name not in _COMMANDS:
         raise InputError(f"expected one of {', '.join(_COMMANDS)}; found {name!r} (see --help)")
-    return importlib.import_module(f"mjx_revolve.{name}").main(rest)
+    module = "importer" if name == "import" else name  # which no module may be called
+    return importlib.import_module(f"mjx_revolve.{module}").main(rest)
 
 
 def _help() -> str:

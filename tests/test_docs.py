@@ -350,4 +350,4 @@ def test_messages_name_what_can_be_installed():
     texts += [p.read_text("utf-8") for p in (ROOT / "mjx_revolve").rglob("*.py")]
     named = {x for text in texts for x in re.findall(r"pip install[ \"\n]*'([^'{]+)'", text)}
     named |= {*REQUIREMENTS.values()}
-    assert len(named) == 7 and named <= known
+    assert len(named) == 8 and named <= known

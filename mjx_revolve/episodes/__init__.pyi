@@ -17,6 +17,9 @@ from .fitness import Fitness as Fitness
 from .fitness import MixedFitness as MixedFitness
 from .fitness import make_fitness as make_fitness
 from .fitness import make_mixed_fitness as make_mixed_fitness
+from .functional_env import FunctionalEnv as FunctionalEnv
+from .functional_env import make_functional_env as make_functional_env
+from .gym_ids import register_envs as register_envs
 from .individual_log import LoggedIndividual as LoggedIndividual
 from .individual_log import read_events as read_events
 from .measure_table import MEASURES as MEASURES
@@ -28,6 +31,7 @@ from .rollout import RolloutState as RolloutState
 from .rollout import StepInputs as StepInputs
 from .run_reader import ChampionRecord as ChampionRecord
 from .run_reader import RunReader as RunReader
+from .sb3_env import make_sb3_env as make_sb3_env
 from .simulate import Trajectory as Trajectory
 from .tank import Tank as Tank
 from .tank import TankTrajectory as TankTrajectory

@@ -223,6 +223,38 @@ class Environment:
         episodes = episodes._replace(rollout=now, track=track, score=score)
         return state._replace(episodes=episodes, ended=over | ~sane), result
 
+    def begin(
+        self, seed: UInt[Array, " lanes"], episode: Int[Array, " lanes"]
+    ) -> tuple[EnvironmentState, Float[Array, "k lanes"]]:
+        """Episodes at their starts, and what is observed there; see `start`."""
+        return self.observe(self.start(seed, episode))
+
+    def step_and_restart(
+        self, state: EnvironmentState, action: Float[Array, "n lanes"]
+    ) -> tuple[EnvironmentState, Float[Array, "k lanes"], StepResult, Float[Array, "k lanes"]]:
+        """A control period, after which episodes that are over begin anew at once.
+
+        Args:
+            state: of the episodes.
+            action: as in `step`.
+
+        Returns:
+            The state, the observations, the result, and the observations before any began anew.
+        """
+        moved, result = self.step(state, action)
+        moved, last = self.observe(moved)
+        state, seen = jax.lax.cond(
+            jnp.any(moved.ended),
+            lambda: choose(moved.ended, self.begin(moved.seed, moved.episode + 1), (moved, last)),
+            lambda: (moved, last),
+        )
+        return state, seen, result, last
+
+
+def choose(mask: Bool[Array, " lanes"], new: Any, old: Any) -> Any:
+    """Pytrees `[..., lanes]`, the new one where the mask is true."""
+    return jax.tree.map(lambda a, b: jnp.where(mask, a, b), new, old)
+
 
 def make_environment(
     fitness: Fitness, control_rate: float | None = None, sensors: Sequence[Any] | None = None

@@ -7,7 +7,7 @@ made. All environments are stepped in one compiled call.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from mjx_revolve.episodes.environment import (
     Environment,
     EnvironmentState,
     StepResult,
+    choose,
     make_environment,
 )
 from mjx_revolve.episodes.fitness import Fitness, make_fitness
@@ -29,18 +30,6 @@ from mjx_revolve.numerics.xla import LANES, jit, on_cpu
 
 AUTORESET_MODES = ("NextStep", "SameStep")
 """When an episode that is over begins anew, by Gymnasium's names."""
-
-
-def _pick(mask: jax.Array, new: Any, old: Any) -> Any:
-    """Pytrees `[..., lanes]`, the new one where the mask is true."""
-    return jax.tree.map(lambda a, b: jnp.where(mask, a, b), new, old)
-
-
-def _begin(
-    environment: Environment, seed: jax.Array, episode: jax.Array
-) -> tuple[EnvironmentState, jax.Array]:
-    """Episodes at their starts, and what is seen there."""
-    return environment.observe(environment.start(seed, episode))
 
 
 def _next_step(
@@ -56,34 +45,13 @@ def _next_step(
     nothing = jax.tree.map(jnp.zeros_like, outcome)
     state, outcome = jax.lax.cond(
         jnp.any(over),
-        lambda: _pick(
+        lambda: choose(
             over, (environment.start(state.seed, state.episode + 1), nothing), (moved, outcome)
         ),
         lambda: (moved, outcome),
     )
     state, seen = environment.observe(state)
     return state, seen, outcome, seen
-
-
-def _same_step(
-    environment: Environment, state: EnvironmentState, action: jax.Array
-) -> tuple[EnvironmentState, jax.Array, StepResult, jax.Array]:
-    """A control period; what is over after it begins anew at once.
-
-    Returns:
-        The state, `[k, lanes]` observations, what came of it, and the observations before any
-        began anew.
-    """
-    moved, outcome = environment.step(state, action)
-    moved, last = environment.observe(moved)
-    state, seen = jax.lax.cond(
-        jnp.any(moved.ended),
-        lambda: _pick(
-            moved.ended, _begin(environment, moved.seed, moved.episode + 1), (moved, last)
-        ),
-        lambda: (moved, last),
-    )
-    return state, seen, outcome, last
 
 
 @lru_cache(maxsize=1)
@@ -119,22 +87,21 @@ def _make_class() -> type:
             self._chunks = -(-num_envs // self._lanes)
             self._state: EnvironmentState | None = None
             self._seen = np.zeros((num_envs, seen), np.float32)
-            advance = _same_step if mode == "SameStep" else _next_step
+            same = mode == "SameStep"
+            advance = environment.step_and_restart if same else partial(_next_step, environment)
 
             def step(state: EnvironmentState, actions: jax.Array) -> Any:
-                found = jax.lax.map(
-                    lambda given: advance(environment, *given), (state, self._split(actions))
-                )
+                found = jax.lax.map(lambda given: advance(*given), (state, self._split(actions)))
                 state, seen, outcome, last = found
                 return state, self._join(seen), jax.tree.map(self._join, outcome), self._join(last)
 
             def begin(seed: jax.Array, episode: jax.Array) -> Any:
                 given = self._split(seed), self._split(episode)
-                state, seen = jax.lax.map(lambda given: _begin(environment, *given), given)
+                state, seen = jax.lax.map(lambda given: environment.begin(*given), given)
                 return state, self._join(seen)
 
             def resume(mask: jax.Array, new: Any, old: Any) -> Any:
-                pick = jax.vmap(_pick)
+                pick = jax.vmap(choose)
                 return pick(self._split(mask), new, old)
 
             self._step = jit(step, donate_argnums=0)

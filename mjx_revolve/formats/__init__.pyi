@@ -5,6 +5,8 @@ from .brain_c import make_brain_c as make_brain_c
 from .brain_python import make_brain_python as make_brain_python
 from .brain_ros import make_brain_node as make_brain_node
 from .export import export_robot as export_robot
+from .import_robot import ImportedRobot as ImportedRobot
+from .import_robot import import_robot as import_robot
 from .links import Joint as Joint
 from .links import Link as Link
 from .links import make_links as make_links

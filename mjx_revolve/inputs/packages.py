@@ -14,6 +14,7 @@ REQUIREMENTS = {
     "mujoco.mjx": "mujoco-mjx>=3.17,<3.18",
     "ribs": "ribs>=0.12,<0.13",
     "rosbags": "rosbags>=0.11",
+    "stable_baselines3": "stable-baselines3>=2.4",
     "tensorboardX": "tensorboardX>=2.6",
 }
 """What brings a module that no part of the base installation has."""

@@ -1,0 +1,126 @@
+"""Does the package install beside others? Makes environments, and tries it in each.
+
+``python -m experiments.installations [--only lowest,newest,neighbours] [--tests]``
+
+`lowest` has the lowest version of each package that `pyproject.toml` names, `newest` the newest of
+everything, `neighbours` brax, MuJoCo Playground, Stable-Baselines3 and QDax. In each: `pip check`,
+imports, the smoke run from an empty folder, and with `--tests` the quick tests. Each takes minutes
+and up to 8 GB, in `--out`, and is removed afterwards.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.common import ROOT, make_folder, make_parser
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import write_atomic
+
+# What is installed besides this package, and what is imported beside it.
+COLUMNS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "lowest": ((), ()),
+    "newest": ((), ()),
+    "neighbours": (
+        ("brax", "playground", "stable-baselines3", "qdax", "gymnasium>=1.1"),
+        ("brax.envs", "mujoco_playground", "stable_baselines3", "qdax.core.map_elites"),
+    ),
+}
+TOOLS = ("pytest>=8", "pytest-xdist>=3.6", "hypothesis>=6.130", "pandas>=2.2")
+
+
+def lowest_versions() -> list[str]:
+    """A pin for each package that the base installation names."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    found = (re.match(r"([\w-]+)>=([\d.]+)", line) for line in project["dependencies"])
+    return [f"{one[1]}=={one[2]}" for one in found if one]
+
+
+def run(*command: str | Path, folder: Path = ROOT) -> tuple[bool, str]:
+    """Whether a command succeeded, and the last lines of what it said."""
+    words = [str(word) for word in command]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    said = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+    return done.returncode == 0, "\n".join(said[-5:])
+
+
+def measure(python: Path) -> dict[str, Any]:
+    """How many distributions an environment has, pip left out, and how large they are."""
+    script = (
+        "import json; from importlib.metadata import distributions as d; "
+        "print(json.dumps({x.metadata['Name']: x.version for x in d()}))"
+    )
+    done = subprocess.run([python, "-c", script], capture_output=True, text=True, check=True)
+    versions = json.loads(done.stdout)
+    versions = {k: versions[k] for k in sorted(versions) if k not in ("pip", "setuptools")}
+    size = sum(
+        path.stat().st_size
+        for path in python.parent.parent.glob("lib/python*/site-packages/**/*")
+        if path.is_file() and path.parts[-2] != "__pycache__"
+    )
+    return {"distributions": len(versions), "megabytes": round(size / 1e6), "versions": versions}
+
+
+def try_column(name: str, folder: Path, tests: bool) -> dict[str, Any]:
+    """Makes an environment and tries the package in it; a step that fails ends it."""
+    more, imports = COLUMNS[name]
+    pins = lowest_versions() if name == "lowest" else []
+    python, empty = folder / name / "bin" / "python", folder / f"{name}_empty"
+    shutil.rmtree(folder / name, ignore_errors=True)
+    shutil.rmtree(empty, ignore_errors=True)
+    empty.mkdir(parents=True)
+    pip = (python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
+    modules = ("mjx_revolve.episodes.fitness", *imports)
+    steps: dict[str, tuple[str | Path, ...]] = {
+        "venv": (sys.executable, "-m", "venv", folder / name),
+        "install": (*pip, ROOT, *pins, *more),
+        "pip check": (python, "-m", "pip", "check"),
+        "imports": (python, "-c", f"import {', '.join(modules)}"),
+        "smoke run": (python.with_name("mjx-revolve"), "evolve", "smoke", "--out", "run"),
+    }
+    if tests:
+        quick = ("--numprocesses", "2", "--dist", "loadfile", "-m", "not slow")
+        steps["test tools"] = (*pip, *pins, *TOOLS)
+        steps["quick tests"] = (python, "-m", "pytest", *quick)
+    found: dict[str, Any] = {}
+    for step, command in steps.items():
+        here = empty if step in ("imports", "smoke run") else ROOT
+        well, said = run(*command, folder=here)
+        found[step] = "passed" if well else f"failed: {said}"
+        print(f"{name}: {step}: {found[step] if step != 'quick tests' else said}", flush=True)
+        if not well:
+            break
+        if step == "install":
+            found |= measure(python)
+            print(f"{name}: {found['distributions']} distributions, {found['megabytes']} MB")
+    shutil.rmtree(folder / name)
+    return found
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Tries all columns; returns 1 if a step failed."""
+    parser = make_parser("installations", "Tries the package in environments of its own.")
+    parser.add_argument("--only", default=",".join(COLUMNS), help="columns (default: all)")
+    parser.add_argument("--tests", action="store_true", help="the quick tests, too")
+    args = parser.parse_args(argv)
+    names = args.only.split(",")
+    if unknown := [name for name in names if name not in COLUMNS]:
+        raise InputError(f"--only: expected any of {', '.join(COLUMNS)}; found {unknown[0]}")
+    folder = make_folder(args.out, "installations").resolve()
+    found = {name: try_column(name, folder, args.tests) for name in names}
+    path = folder / "installations.json"
+    write_atomic(path, (json.dumps(found, indent=1) + "\n").encode())
+    print(f"Wrote {path}")
+    return int(any("failed" in str(step) for one in found.values() for step in one.values()))
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main))

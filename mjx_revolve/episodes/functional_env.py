@@ -1,0 +1,153 @@
+"""Our water as a pure environment, of one robot: `reset` and `step`, as brax has them.
+
+Both can be jitted, vmapped and scanned. Under `jax.vmap` the batch becomes the lanes that our step
+is made for; its states are those of one environment each, on the first axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.environment import Environment, EnvironmentState, make_environment
+from mjx_revolve.episodes.fitness import make_fitness
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class WaterState:
+    """An environment, with the names that brax has.
+
+    Attributes:
+        pipeline_state: of the episode.
+        obs: `[k]` observation, between -1 and 1.
+        reward: of the last step; 0 after `reset`.
+        done: 1.0 if the last step ended the episode, else 0.0.
+        metrics: `score`: the task's so far, the episode's when it is over.
+        info: `truncation`: 1.0 if its time ended it; what others keep there stays.
+    """
+
+    pipeline_state: EnvironmentState
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict[str, jax.Array] = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
+
+    def replace(self, **changes: Any) -> WaterState:
+        """The state with some fields changed."""
+        return replace(self, **changes)
+
+
+def _to_lanes(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
+
+
+def _from_lanes(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), tree)
+
+
+def _of_one(run: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of lanes as one of a single lane, whose batches become lanes."""
+
+    @custom_vmap
+    def single(*given: Any) -> Any:
+        lane = jax.tree.map(lambda x: x[..., None], given)
+        return jax.tree.map(lambda x: x[..., 0], run(*lane))
+
+    @single.def_vmap
+    def batch(size: int, batched: Any, *given: Any) -> Any:
+        whole = jax.tree.map(
+            lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *x.shape)),
+            given, tuple(batched),
+        )  # fmt: skip
+        found = _from_lanes(run(*_to_lanes(whole)))
+        return found, jax.tree.map(lambda _: True, found)
+
+    return single
+
+
+class FunctionalEnv:
+    """See `make_functional_env`.
+
+    Attributes:
+        environment: that it steps.
+        observation_size: numbers of an observation; `environment.observation_names` has them.
+        action_size: numbers of an action; `environment.action_names` has them.
+        backend: of the physics, as brax asks for it.
+    """
+
+    backend = "mjx_revolve"
+
+    def __init__(self, environment: Environment, auto_reset: bool) -> None:
+        """Keeps what it steps."""
+        self.environment = environment
+        self.observation_size = len(environment.observation_names)
+        self.action_size = len(environment.action_names)
+
+        def advance(state: Any, action: Any) -> Any:
+            if auto_reset:
+                return environment.step_and_restart(state, action)[:3]
+            moved, result = environment.step(state, action)
+            moved, seen = environment.observe(moved)
+            return moved, seen, result
+
+        self._begin, self._advance = _of_one(environment.begin), _of_one(advance)
+
+    @property
+    def unwrapped(self) -> FunctionalEnv:
+        """Itself, as brax asks for it."""
+        return self
+
+    def reset(self, rng: jax.Array) -> WaterState:
+        """An episode's start, which follows from the key alone."""
+        state, seen = self._begin(jax.random.bits(rng), jnp.int32(0))
+        zero = jnp.zeros((), seen.dtype)
+        return WaterState(state, seen, zero, zero, {"score": zero}, {"truncation": zero})
+
+    def step(self, state: WaterState, action: jax.Array) -> WaterState:
+        """A control period with an action `[action_size]` between -1 and 1."""
+        after, seen, result = self._advance(state.pipeline_state, action)
+        done = (result.terminated | result.truncated).astype(seen.dtype)
+        return WaterState(
+            after, seen, result.reward, done, {**state.metrics, "score": result.score},
+            {**state.info, "truncation": result.truncated.astype(seen.dtype)},
+        )  # fmt: skip
+
+
+def make_functional_env(
+    config: Config | str | Path | Mapping[str, Any],
+    *,
+    sensors: Sequence[Any] | None = None,
+    control_rate: float | None = None,
+    auto_reset: bool = False,
+    **overrides: Any,
+) -> FunctionalEnv:
+    """A pure environment of a configuration: `state = env.reset(key)`, `env.step(state, action)`.
+
+    Observations, actions, rewards and episodes are those of `make_vector_env`. In batches, on a
+    CPU, `jax.vmap` over multiples of 64 makes the most of it.
+
+    Args:
+        config: as `make_fitness` takes it.
+        sensors: as in `make_vector_env`.
+        control_rate: as in `make_vector_env` [Hz].
+        auto_reset: an episode that is over begins anew in the same step, as the next one of its
+            key; else it goes on unscored, and whoever steps it resets it.
+        **overrides: as `make_fitness` takes them.
+
+    Returns:
+        The environment.
+
+    Raises:
+        InputError: the configuration is wrong, or has no one body.
+    """
+    fitness = make_fitness(config, **overrides)
+    return FunctionalEnv(make_environment(fitness, control_rate, sensors), auto_reset)

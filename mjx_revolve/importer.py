@@ -1,0 +1,53 @@
+"""Command line: a rigid robot from elsewhere, as a robot of ours.
+
+``python -m mjx_revolve.importer robot.urdf``, or ``mjx-revolve import robot.urdf``
+
+Reads URDF or MuJoCo's MJCF; writes a morphology and its types of modules as YAML.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
+from mjx_revolve.inputs.files import short_path
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Writes a robot of a URDF or an MJCF file as YAML, and prints what was not taken over.
+
+    Args:
+        argv: the arguments; None: those of the process.
+
+    Returns:
+        0.
+
+    Raises:
+        InputError: an argument or the file is wrong.
+        OSError: a file cannot be written.
+    """
+    parser = Parser(
+        prog=program("import"),
+        description="Make a robot of a URDF or an MJCF file: links become modules with boxes, "
+        "volumes and hinges. What cannot be taken over is listed.",
+    )
+    parser.add_argument("file", type=read_path, help="URDF or MJCF")
+    parser.add_argument(
+        "--out", type=read_path, metavar="DIR", default=".", help="folder (default: here)"
+    )
+    arguments = parser.parse_args(argv)
+    # MuJoCo takes a second to import: not for those who ask for help.
+    from mjx_revolve.formats.import_robot import import_robot
+
+    robot = import_robot(arguments.file)
+    body, modules = (short_path(path) for path in robot.save(arguments.out))
+    print(f"{body}, {modules}: {robot.morphology.counts}, {robot.morphology.mass:.4g} kg, "
+          f"{1e6 * robot.morphology.volume:.4g} cm³")  # fmt: skip
+    for line in robot.missing:
+        print(f"  not taken over: {line}")
+    print(f"evolve it with: --set morphology={body} --set modules={modules}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main))
