@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterable
 
 from mjx_revolve.inputs.commands import Parser, program, run_command
 from mjx_revolve.inputs.shipped import list_shipped
@@ -34,7 +35,7 @@ def make_script(shell: str) -> str:
     from mjx_revolve.__main__ import COMMANDS
     from mjx_revolve.schema import KINDS
 
-    names = {
+    names: dict[str, Iterable[str]] = {
         "commands": COMMANDS,
         "configs": list_shipped("configs"),
         "kinds": KINDS,
