@@ -48,6 +48,8 @@ format: $(READY)  ## let ruff mend what it can
 
 docs: $(READY)  ## the documentation and a reference of all functions, as HTML in build/docs
 	$(RUN) docs/settings.py
+	for kind in config modules morphology sweep world; do \
+	  $(RUN) -m mjx_revolve schema $$kind > mjx_revolve/schemas/$$kind.json || exit 1; done
 	$(RUN) docs/reference.py build/docs
 
 bench: $(READY)  ## throughput beside MuJoCo C and plain MJX, from the same run

@@ -17,6 +17,9 @@ class BuildWithData(build_py):
             for name in ("configs", "morphologies"):
                 place = Path(self.build_lib) / "mjx_revolve" / name
                 shutil.copytree(name, place, dirs_exist_ok=True)
+                for path in place.glob("*.yaml"):  # schemas are nearer there
+                    text = path.read_text("utf-8").replace("=../mjx_revolve/schemas", "=../schemas")
+                    path.write_text(text, "utf-8")
 
 
 setup(cmdclass={"build_py": BuildWithData})

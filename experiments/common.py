@@ -1,10 +1,9 @@
-"""What the experiments' command lines share: options, the output folder, tables."""
+"""What the experiments share: options of command lines, output folders, files of results."""
 
 from __future__ import annotations
 
+import datetime
 import json
-import os
-import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,10 @@ from typing import Any
 from mjx_revolve.inputs.commands import Parser
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
-from mjx_revolve.inputs.packages import installed_version
 
 ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "docs" / "results"
+"""What README and the pages take their figures from; see `docs/numbers.py`."""
 
 
 def make_parser(name: str, description: str) -> Parser:
@@ -57,24 +57,34 @@ def make_folder(out: str | None, name: str) -> Path:
     return folder
 
 
-def write_results(name: str, numbers: Mapping[str, Any], seeds: Sequence[int]) -> Path:
-    """Writes `docs/results/NAME.json`, which pages take their figures from.
+def write_results(
+    name: str, numbers: Mapping[str, Any], seeds: Sequence[int], folder: Path | None = None
+) -> Path:
+    """Writes what a study found, with what it depends on, as `NAME.json`.
 
     Args:
         name: of the study.
-        numbers: that it found.
-        seeds: that it used.
+        numbers: numbers, texts, and mappings or lists of these; SI units, or the unit at the end of
+            the key. Numbers of NumPy will do.
+        seeds: that it ran; () where nothing is drawn.
+        folder: where to; None: `docs/results`, from where the pages take them.
 
     Returns:
         The file.
     """
-    packages = ("mjx_revolve", "jax", "jaxlib", "mujoco", "evosax", "numpy")
-    data = {
-        "versions": {package: installed_version(package) for package in packages},
+    from mjx_revolve.numerics.runtime import describe_process, source_hash
+
+    known = describe_process()
+    result = {
+        "study": name,
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "versions": known["versions"] | {"source": source_hash()},
+        "machine": {key: known[key] for key in ("cpu", "cpu_count", "device")},
         "seeds": list(seeds),
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
-        **numbers,
+        "numbers": numbers,
     }
-    path = ROOT / "docs" / "results" / f"{name}.json"
-    write_atomic(path, (json.dumps(data, indent=1) + "\n").encode())
+    path = (folder or RESULTS) / f"{name}.json"
+    plain = lambda value: value.tolist()  # noqa: E731
+    text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False, default=plain)
+    write_atomic(path, f"{text}\n".encode())
     return path

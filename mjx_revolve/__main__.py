@@ -14,7 +14,7 @@ from mjx_revolve.inputs.commands import program, run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import list_shipped
 
-_COMMANDS = {
+COMMANDS = {
     "evolve": "evolve a robot's brain, bodies with their brains, or a colony: a run folder",
     "sweep": "a grid of such runs, several seeds of each, and one report",
     "inspect": "a robot's modules, and what it weighs in air and in water; its picture",
@@ -25,11 +25,14 @@ _COMMANDS = {
     "passport": "what a run's champion was tried for, and what it fails",
     "export": "a champion, or a robot, for MuJoCo, ROS and Gazebo",
     "import": "a robot of a URDF or an MJCF file",
+    "schema": "the JSON Schema of a kind of YAML, by which editors complete and underline",
+    "completion": "a script for bash or zsh that completes commands and names",
 }
 _EXAMPLES = (
     "inspect spider --picture spider.png",
     "evolve lake_swim --set task.duration=8 --out runs/mine",
     "viewer runs/mine",
+    "schema config",
 )
 
 
@@ -50,8 +53,8 @@ def _main(argv: list[str] | None) -> int:
     if name == "--version":
         print(f"mjx_revolve {mjx_revolve.__version__}")
         return 0
-    if name not in _COMMANDS:
-        raise InputError(f"expected one of {', '.join(_COMMANDS)}; found {name!r} (see --help)")
+    if name not in COMMANDS:
+        raise InputError(f"expected one of {', '.join(COMMANDS)}; found {name!r} (see --help)")
     module = "importer" if name == "import" else name  # which no module may be called
     return importlib.import_module(f"mjx_revolve.{module}").main(rest)
 
@@ -66,7 +69,7 @@ def _help() -> str:
         "Evolves modular robots that swim and crawl under water.",
         "",
         "commands, each of which explains itself with --help:",
-        *_columns(_COMMANDS),
+        *_columns(COMMANDS),
         "",
         "examples:",
         *(f"  {program(line)}" for line in _EXAMPLES),

@@ -54,12 +54,11 @@ def test_a_python_without_revolve2_is_refused(tmp_path):
         comparison.run_revolve2(tmp_path / "python", {})
 
 
-def test_results_name_versions_seeds_and_machine(tmp_path, monkeypatch):
-    monkeypatch.setattr("experiments.common.ROOT", tmp_path)
-    path = write_results("study", {"speed": 2.5}, [1, 2])
-    assert path == tmp_path / "docs" / "results" / "study.json"
+def test_results_name_versions_seeds_and_machine(tmp_path):
+    path = write_results("study", {"speed": 2.5}, [1, 2], tmp_path)
+    assert path == tmp_path / "study.json"
     text = path.read_text()
-    assert '"speed": 2.5' in text and '"jax": "' in text and '"cores": ' in text
+    assert '"speed": 2.5' in text and '"jax": "' in text and '"cpu_count": ' in text
 
 
 @pytest.mark.skipif(not PYTHON, reason="REVOLVE2_PYTHON names no Python that has revolve2")

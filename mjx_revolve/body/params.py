@@ -17,7 +17,17 @@ from pydantic import AfterValidator, BeforeValidator
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.tree import COLORS
 from mjx_revolve.inputs.errors import InputError, show
-from mjx_revolve.inputs.schema import Boolean, NonNegative, Number, Share, Text, Triple, read, words
+from mjx_revolve.inputs.schema import (
+    Boolean,
+    NonNegative,
+    Number,
+    Share,
+    Text,
+    Triple,
+    also,
+    read,
+    words,
+)
 from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag, PerAxis
 from mjx_revolve.water.plates import Fossen, LiftDrag
 from mjx_revolve.water.propellers import Thruster
@@ -25,6 +35,7 @@ from mjx_revolve.water.propellers import Thruster
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
+@also({"type": "string", "pattern": "^\\s*[-+]?[.0-9][.0-9eE+-]*[\\s;,]*$"})
 def read_number(value: Any) -> Any:
     """Text such as `0.707;`, as found in files, as a number, in lists too; else as it is."""
     if isinstance(value, list):
@@ -67,7 +78,9 @@ _OVERRIDES: dict[str, Any] = _PLAIN | {
 # How alike a key and one of ours are that is taken for a slip of the finger: one letter in four. A
 # choice; what others write into `params` is kept.
 _ALIKE = 0.8
-_READ = _OVERRIDES | dict.fromkeys(COLORS, Annotated[Share, _Loose, words("a number from 0 to 1")])
+PARAMS: dict[str, Any] = _OVERRIDES | dict.fromkeys(
+    COLORS, Annotated[Share, _Loose, words("a number from 0 to 1")]
+)
 
 
 def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
@@ -84,14 +97,14 @@ def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
         InputError: a value is out of range, or a key seems to be misspelt.
     """
     for key in params:
-        if isinstance(key, str) and key not in _READ:
-            near = difflib.get_close_matches(key.strip().lower(), _READ, n=1, cutoff=_ALIKE)
+        if isinstance(key, str) and key not in PARAMS:
+            near = difflib.get_close_matches(key.strip().lower(), PARAMS, n=1, cutoff=_ALIKE)
             if near:
                 raise InputError(
                     f"{place}: expected {near[0]}, or a key less like it; found {show(key)}"
                 )
     return {
-        key: read(_READ[key], value, f"{place}.{key}") if key in _READ else value
+        key: read(PARAMS[key], value, f"{place}.{key}") if key in PARAMS else value
         for key, value in params.items()
     }
 

@@ -21,6 +21,7 @@ from mjx_revolve.inputs.schema import (
     Positive,
     Text,
     TupleOf,
+    also,
     as_tuple,
     checked,
     show,
@@ -141,12 +142,14 @@ SENSORS: Mapping[str, SensorKind] = {
 """All kinds of sensors by name."""
 
 
+@also({"type": "number"})
 def _read_range(value: Any) -> Any:
     """A number r as -r to r."""
     plain = isinstance(value, int | float) and not isinstance(value, bool)
     return (-value, value) if plain else as_tuple(value)
 
 
+@also({"type": "integer"})
 def _read_id(value: Any) -> Any:
     """Names in YAML may be numbers."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
@@ -282,6 +285,7 @@ class Sensor:
         return found
 
 
+@also({"type": "string"})
 def _read_sensor(value: Any) -> Any:
     """A kind's name alone as a sensor of it."""
     return {"type": value} if isinstance(value, str) else value

@@ -45,6 +45,7 @@ from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import check_path, short_path
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
 from mjx_revolve.inputs.schema import (
+    OFF,
     ConstraintError,
     Integer,
     NonNegative,
@@ -52,6 +53,7 @@ from mjx_revolve.inputs.schema import (
     Positive,
     TupleOf,
     Vector,
+    also,
     is_off,
     show,
     words,
@@ -185,6 +187,7 @@ class RobustConfig(Settings):
     """On the servos' top speed: about what a hobby servo's differs by between 4.8 and 6 V [-]."""
 
 
+@also(OFF, {"const": True})
 def _read_robust(value: Any) -> Any:
     """`true` as all usual ranges."""
     return {} if value is True else None if is_off(value) else value

@@ -21,7 +21,7 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from annotated_types import Ge, Gt, Le, Unit, doc
@@ -46,6 +46,7 @@ from mjx_revolve.inputs.validation_messages import (
 )
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 
 LARGEST = (2.0 - 2.0**-23) * 2.0**127
 """The largest number of float32."""
@@ -109,14 +110,39 @@ Direction = Annotated[Vector, AfterValidator(_unit_vector), Unit("-")]
 """A vector of any length but 0, scaled to 1."""
 
 
+def also(*forms: dict[str, Any]) -> Callable[[F], F]:
+    """States, as JSON Schema, which further forms a function before validation takes."""
+
+    def state(function: F) -> F:
+        function.also = forms  # type: ignore[attr-defined]
+        return function
+
+    return state
+
+
+OFF = {"enum": ["off", False, None]}
+ONE: dict[str, Any] = {}
+"""One of a list's items by itself."""
+
+
 def is_off(value: Any) -> bool:
     """Whether a value means none: YAML 1.1 reads a bare `off` as False."""
     return value is None or value is False or (isinstance(value, str) and value == "off")
 
 
-LawName = Annotated[T, BeforeValidator(lambda value: "off" if value is False else value)]
+@also({"const": False})
+def _law_name(value: Any) -> Any:
+    return "off" if value is False else value
+
+
+@also(OFF)
+def _or_off(value: Any) -> Any:
+    return None if is_off(value) else value
+
+
+LawName = Annotated[T, BeforeValidator(_law_name)]
 """The name of a law, one of them `off`, which YAML reads as False."""
-OrOff = Annotated[T | None, BeforeValidator(lambda value: None if is_off(value) else value)]
+OrOff = Annotated[T | None, BeforeValidator(_or_off)]
 """A value, or `off`."""
 
 

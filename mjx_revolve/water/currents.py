@@ -20,7 +20,7 @@ from pydantic import BeforeValidator
 
 from mjx_revolve.inputs.errors import ConstraintError, InputError, reading
 from mjx_revolve.inputs.files import check_path, read_file, resolve_inside
-from mjx_revolve.inputs.schema import NonNegative, Number, Triple, Vector, checked, words
+from mjx_revolve.inputs.schema import NonNegative, Number, Triple, Vector, also, checked, words
 from mjx_revolve.inputs.trust import audit
 
 # Shortest wave [m]. Far below 0.1 m surface tension drives waves, which these laws do not know.
@@ -32,6 +32,7 @@ _Small = Annotated[Number, Ge(1e-3)]
 _Angle = Annotated[Number, Ge(-2 * math.pi - 1e-6), Le(2 * math.pi + 1e-6), Unit("rad")]
 
 
+@also({"type": "number"})
 def _level(std: Any) -> Any:
     """One number as that of x and y."""
     plain = isinstance(std, int | float | np.number) and not isinstance(std, bool)

@@ -6,13 +6,13 @@ before, so that bodies that name no law are read without JAX.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator
 
 from mjx_revolve.inputs.errors import ConstraintError, show
-from mjx_revolve.inputs.schema import LARGEST, Number, Text, as_tuple, words
+from mjx_revolve.inputs.schema import LARGEST, Number, Text, also, as_tuple, words
 
 if TYPE_CHECKING:
     from mjx_revolve.water.laws import Coefficient
@@ -46,14 +46,23 @@ def list_coefficients() -> list[tuple[str, Coefficient]]:
     return found + [("added_mass", c) for c in COEFFICIENTS]
 
 
-def _check(value: Any, known: str) -> str:
-    name = "off" if value is False else value  # YAML 1.1 reads a bare `off` as False
-    names = known.removeprefix("one of ").partition(" (")[0].split(", ")
-    if not isinstance(name, str) or name not in names:
-        raise ConstraintError("", known, show(value))
-    return name
+def _law(describe: Callable[[], str]) -> BeforeValidator:
+    """A check that a value is a name of a law; its `names` are for JSON Schema."""
+
+    def names() -> list[str]:
+        return describe().removeprefix("one of ").partition(" (")[0].split(", ")
+
+    def check(value: Any) -> str:
+        name = "off" if value is False else value  # YAML 1.1 reads a bare `off` as False
+        if not isinstance(name, str) or name not in names():
+            raise ConstraintError("", describe(), show(value))
+        return name
+
+    check.names = names  # type: ignore[attr-defined]
+    return BeforeValidator(check)
 
 
+@also({"type": "object", "additionalProperties": {"type": "number"}})
 def _read_coefficients(value: Any) -> Any:
     """A mapping from names to numbers as sorted pairs, each within its coefficient's bounds."""
     if not value:
@@ -89,9 +98,9 @@ PerAxis = Annotated[
     words("a number >= 0, or three, one for each axis"),
 ]
 """A coefficient of all faces of a part, or of those across each of its axes."""
-DragName = Annotated[str, BeforeValidator(lambda value: _check(value, drag_names()))]
-PartDrag = Annotated[str, BeforeValidator(lambda value: _check(value, drag_names(of_parts=True)))]
-BuoyancyName = Annotated[str, BeforeValidator(lambda value: _check(value, buoyancy_names()))]
+DragName = Annotated[str, _law(drag_names)]
+PartDrag = Annotated[str, _law(lambda: drag_names(of_parts=True))]
+BuoyancyName = Annotated[str, _law(buoyancy_names)]
 Coefficients = Annotated[
     tuple[tuple[Text, Number], ...],
     BeforeValidator(_read_coefficients),

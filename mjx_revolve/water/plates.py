@@ -17,6 +17,7 @@ from mjx_revolve.inputs.schema import (
     NonNegative,
     Number,
     Vector,
+    also,
     as_tuple,
     checked,
     words,
@@ -82,6 +83,7 @@ class LiftDrag:
 _SIX = "six numbers, or six rows of six"
 
 
+@also({"type": "array", "items": {"type": "number"}, "minItems": 6, "maxItems": 6})
 def _read_matrix(value: Any) -> Any:
     """Six numbers on the diagonal, or six rows of six, as six rows."""
     rows = as_tuple(value)

@@ -20,6 +20,8 @@ from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 from mjx_revolve.inputs.errors import ConstraintError, InputError, note, reading, show
 from mjx_revolve.inputs.files import check_path, read_file
 from mjx_revolve.inputs.schema import (
+    OFF,
+    ONE,
     Boolean,
     NonNegative,
     Number,
@@ -27,6 +29,7 @@ from mjx_revolve.inputs.schema import (
     Text,
     TupleOf,
     Vector,
+    also,
     as_tuple,
     checked,
     is_off,
@@ -71,6 +74,7 @@ class SurfaceTension:
     contact_angle: Annotated[Number, Ge(0), Le(math.pi), Unit("rad")] = 0.0
 
 
+@also({"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3})
 def _read_gravity(value: Any) -> Any:
     """MuJoCo's and Gazebo's vector (0, 0, -g) as the plain number g."""
     value = as_tuple(value)
@@ -83,6 +87,7 @@ def _read_gravity(value: Any) -> Any:
     return -value[2]
 
 
+@also(OFF, {"type": "number"})
 def _read_bed(value: Any) -> Any:
     """A height as a flat bed at it."""
     if is_off(value):
@@ -91,6 +96,7 @@ def _read_bed(value: Any) -> Any:
     return {"height": value} if plain else value
 
 
+@also(OFF, ONE)
 def _read_waves(value: Any) -> Any:
     """One wave as a list of one."""
     if is_off(value):
@@ -98,6 +104,7 @@ def _read_waves(value: Any) -> Any:
     return (value,) if isinstance(value, Wave | Mapping) else value
 
 
+@also(OFF, {"type": "string"})
 def _read_field(value: Any, info: ValidationInfo) -> Any:
     """Reads the file of a path, which, if relative, starts from the context's folder."""
     if is_off(value):
@@ -107,6 +114,12 @@ def _read_field(value: Any, info: ValidationInfo) -> Any:
     if not isinstance(value, str | Path) or not str(value):
         raise ConstraintError("", "the path of a file", show(value))
     return load_current_field(find_field(value, info.context or Path()))
+
+
+@also({"const": True})
+def _read_tension(value: Any) -> Any:
+    """`true` as that of clean water."""
+    return {} if value is True else value
 
 
 @checked
@@ -160,9 +173,7 @@ class World:
     gust: OrOff[Gust] = None
     waves: Annotated[TupleOf[Wave], BeforeValidator(_read_waves)] = ()
     water_depth: Annotated[Number, Ge(1e-2), Unit("m")] | None = None
-    surface_tension: Annotated[
-        OrOff[SurfaceTension], BeforeValidator(lambda value: {} if value is True else value)
-    ] = None
+    surface_tension: Annotated[OrOff[SurfaceTension], BeforeValidator(_read_tension)] = None
     self_contact: Boolean = False
     timestep: Annotated[Number, Ge(1e-5), Le(0.1), Unit("s")] = 0.005
 

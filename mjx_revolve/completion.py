@@ -1,0 +1,70 @@
+"""Command line: a script by which a shell completes commands, and names of what is shipped.
+
+``eval "$(mjx-revolve completion bash)"`` in `~/.bashrc`; for zsh, in `~/.zshrc` behind `compinit`.
+The names are those of the package as it was when the script was printed.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable
+
+from mjx_revolve.inputs.commands import Parser, program, run_command
+from mjx_revolve.inputs.shipped import list_shipped
+
+_SCRIPT = """_mjx_revolve() {
+  local words
+  case "$COMP_CWORD:${COMP_WORDS[1]}" in
+    1:*) words="%(commands)s" ;;
+    *:evolve|*:sweep) words="%(configs)s" ;;
+    *:schema) words="%(kinds)s" ;;
+    *:completion) words="bash zsh" ;;
+    *) words="%(morphologies)s" ;;
+  esac
+  if [ "${COMP_WORDS[COMP_CWORD-1]}" = --world ]; then words="%(worlds)s"; fi
+  COMPREPLY=($(compgen -W "$words" -- "${COMP_WORDS[COMP_CWORD]}"))
+}
+complete -o default -F _mjx_revolve mjx-revolve
+"""
+_ZSH = "autoload -U +X bashcompinit && bashcompinit\n"
+
+
+def make_script(shell: str) -> str:
+    """The script for "bash" or "zsh"."""
+    from mjx_revolve.__main__ import COMMANDS
+    from mjx_revolve.schema import KINDS
+
+    names: dict[str, Iterable[str]] = {
+        "commands": COMMANDS,
+        "configs": list_shipped("configs"),
+        "kinds": KINDS,
+        "morphologies": list_shipped("morphologies"),
+        "worlds": list_worlds(),
+    }
+    plain = {key: [n for n in found if re.fullmatch(r"[\w.-]+", n)] for key, found in names.items()}
+    script = _SCRIPT % {key: " ".join(found) for key, found in plain.items()}
+    return _ZSH + script if shell == "zsh" else script
+
+
+def list_worlds() -> list[str]:
+    """Names of the worlds that come with the package."""
+    from pathlib import Path
+
+    return sorted(path.stem for path in Path(__file__).parent.glob("water/worlds/*.yaml"))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Prints the script."""
+    parser = Parser(
+        prog=program("completion"),
+        description="Print a script by which a shell completes commands and shipped names.",
+        epilog='example: eval "$(mjx-revolve completion bash)" in ~/.bashrc',
+    )
+    parser.add_argument("shell", choices=("bash", "zsh"), help="whose script")
+    print(make_script(parser.parse_args(argv).shell), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main))

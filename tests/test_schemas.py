@@ -1,0 +1,83 @@
+"""JSON Schemas: those of the shipped files are the code's, and tell right files from wrong ones."""
+
+import json
+import re
+
+import jsonschema
+import pytest
+
+from laboratory import ROOT
+from mjx_revolve.completion import make_script
+from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.schema import FOLDER, KINDS, make_schema, show_schema
+
+FILES = [
+    *(ROOT / "configs").glob("*.yaml"),
+    *(ROOT / "morphologies").glob("*.yaml"),
+    *(ROOT / "experiments").glob("*.yaml"),
+    *(ROOT / "mjx_revolve" / "water" / "worlds").glob("*.yaml"),
+]
+
+
+@pytest.fixture(scope="module")
+def schemas():
+    return {kind: make_schema(kind) for kind in KINDS}
+
+
+def problems(schema, data):
+    jsonschema.Draft202012Validator.check_schema(schema)
+    plain = json.loads(json.dumps(data))  # keys are texts
+    return [e.message for e in jsonschema.Draft202012Validator(schema).iter_errors(plain)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_written_schemas_are_the_codes(kind):
+    text = (FOLDER / f"{kind}.json").read_text("utf-8")
+    assert text == show_schema(kind), f"run: python -m mjx_revolve schema {kind}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_shipped_files_name_their_schema_and_fit_it(path, schemas):
+    (named,) = re.findall(r"^# yaml-language-server: \$schema=(\S+)$", path.read_text(), re.M)
+    found = (path.parent / named).resolve()
+    assert found.parent == FOLDER
+    assert problems(schemas[found.stem], load_yaml(path)) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [
+        ("config", {"world": "lake"}),
+        ("config", {"world": "lake", "task": {"type": "fly"}}),
+        ("config", {"world": "lake", "task": {"type": "speed", "duratoin": 3}}),
+        ("world", {"density": "heavy"}),
+        ("world", {"drag": "tubes"}),
+        ("world", {"waves": {"amplitude": "high"}}),
+        ("morphology", {"id": "x"}),
+        ("morphology", {"body": {"type": "Core", "children": {0: {"orientation": 0}}}}),
+        ("morphology", {"body": {"type": "Core", "params": {"mass": -1}}}),
+        ("modules", {"modules": {"A": {"mount": "up", "parts": [{"size": [1, 1, 1], "mass": 1}]}}}),
+        ("modules", {"modules": {"A": {"mount": "-x", "parts": [{"mass": 1}]}}}),
+        ("sweep", {"config": "x.yaml", "seeds": 0}),
+    ],
+)
+def test_wrong_files_do_not_fit(kind, data, schemas):
+    assert problems(schemas[kind], data)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"bed": -2, "waves": {"amplitude": 0.02, "wavelength": 2.0}, "drag": False, "gust": "off"},
+        {"gravity": [0, 0, -9.81], "current_field": "x.npz", "surface_tension": True},
+        {"gust": {"std": 0.1}, "bed": "off"},
+    ],
+)
+def test_short_forms_fit(data, schemas):
+    assert problems(schemas["world"], data) == []
+
+
+def test_completion_has_the_shipped_names():
+    script = make_script("bash")
+    assert "lake_swim" in script and "spider" in script and "schema completion" in script
+    assert make_script("zsh").endswith(script)
