@@ -23,6 +23,7 @@ _COMMANDS = {
     "live": "a running world in a browser, to drop robots into",
     "report": "a page about one run, several, or a sweep",
     "passport": "what a run's champion was tried for, and what it fails",
+    "fit": "the water's coefficients, from recordings of a robot that swam",
     "export": "a champion, or a robot, for MuJoCo, ROS and Gazebo",
 }
 _EXAMPLES = (

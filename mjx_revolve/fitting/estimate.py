@@ -48,16 +48,17 @@ class State:
     Attributes:
         point: where it is.
         noise: standard deviations by kind of channel.
-        damping: Marquardt's.
+        damping: `[K, R]` Marquardt's, of each window's beginning, and
+        common: of all else.
         iteration: steps done.
         cost: at the point, with this noise.
         moved: the last step over what the numbers are uncertain by.
-        heading: `[R]` turns that the search began with [rad].
     """
 
     point: Point
     noise: dict[str, float]
-    damping: float = 0.0
+    damping: np.ndarray
+    common: float = 0.0
     iteration: int = 0
     cost: float = np.inf
     moved: float = np.inf
@@ -88,19 +89,21 @@ def linearize(problem: Problem, point: Point) -> Model:
     return Model(*problem.linearize(point))
 
 
-def cost_of(problem: Problem, point: Point, values: list[np.ndarray], noise: dict[str, float]) -> float:
-    """Half the sum of squares, wild ones less, with the priors."""
-    total = 0.0
-    for channel, left in zip(problem.channels, values, strict=True):
-        z = np.abs(left[channel.fitted] / noise[channel.kind])
-        z = z[np.isfinite(z)]
-        total += float(np.where(z < _HUBER, z**2 / 2, _HUBER * (z - _HUBER / 2)).sum())
-    spread = np.array([p.spread for p in problem.parameters])
-    total += float(((point.free / spread) ** 2).sum()) / 2
-    total += float(((point.local / problem.local_spread) ** 2).sum()) / 2
+def costs_of(
+    problem: Problem, point: Point, values: list[np.ndarray], noise: dict[str, float]
+) -> tuple[np.ndarray, float]:
+    """Half the sums of squares, wild ones less: `[K, R]` of windows, and of the priors."""
     begun = problem.drive.resets[:, None]
-    total += float((np.where(begun, point.starts / problem.start_spread, 0.0) ** 2).sum()) / 2
-    return total
+    cost = (np.where(begun, point.starts / problem.start_spread, 0.0) ** 2).sum(1) / 2
+    for channel, left in zip(problem.channels, values, strict=True):
+        z = np.abs(left / noise[channel.kind])
+        z = np.where(np.isfinite(left), np.minimum(z, 1e9), 0.0)
+        z = np.where(z < _HUBER, z**2 / 2, _HUBER * (z - _HUBER / 2)).sum(1) * channel.fitted
+        where = problem.window_of(channel.recording, channel.time)
+        cost[:, channel.recording] += np.bincount(where, z, len(cost))
+    spread = np.array([p.spread for p in problem.parameters])
+    prior = float(((point.free / spread) ** 2).sum()) / 2
+    return cost, prior + float(((point.local / problem.local_spread) ** 2).sum()) / 2
 
 
 def normal_equations(
@@ -161,15 +164,15 @@ def step(problem: Problem, state: State, system: System) -> tuple[Point, float]:
     matrix[:count, :count] += prior
     slope[:count] -= prior @ point.free
     spread = np.sqrt(np.diag(np.linalg.inv(matrix)))
-    damped = matrix + state.damping * np.diag(np.diag(matrix))
+    damped = matrix + state.common * np.diag(np.diag(matrix))
     move = np.linalg.solve(damped, slope)
     limit = max(1.0, float(np.abs(move[:count]).max(initial=0.0)) / _LARGEST_STEP)
     move = move / limit
     free = np.array([p.bound(x) for p, x in zip(problem.parameters, point.free + move[:count], strict=True)])
     starts = point.starts.copy()
     for k, r, block, coupling, pull in system.starts:
-        own = np.linalg.solve(block + state.damping * np.diag(np.diag(block)), pull - coupling @ move)
-        starts[k, :, r] += own
+        own = block + state.damping[k, r] * np.diag(np.diag(block))
+        starts[k, :, r] += np.linalg.solve(own, pull - coupling @ move)
     local = point.local + move[count:].reshape(point.local.shape)
     return Point(free, local, starts), float(np.abs(move / spread)[:count].max(initial=0.0))
 
@@ -243,8 +246,9 @@ def begin(problem: Problem, seed: int) -> State:
     else:
         wanted = min(room, problem.settings.draws * room)
         points += [replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)]
+    none = np.zeros(problem.drive.resets.shape)
     if len(points) == 1:
-        return State(origin, noise)
+        return State(origin, noise, none)
     costs = _costs(problem, points, noise)
     best = origin
     if problem.free_heading.any():
@@ -255,7 +259,7 @@ def begin(problem: Problem, seed: int) -> State:
         problem.roots[:] = _turned(problem.roots, starts[:, 5])
     else:
         best = points[int(np.argmin(costs.sum(1)))]
-    return State(best, noise)
+    return State(best, noise, none)
 
 
 def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -283,19 +287,25 @@ def advance(problem: Problem, state: State, model: Model) -> tuple[State, Model]
     system = normal_equations(problem, model, state.point, state.noise)
     noise = estimate_noise(problem, model.values, numbers_used(problem, system))
     system = normal_equations(problem, model, state.point, noise)
-    now = cost_of(problem, state.point, model.values, noise)
+    windows, prior = costs_of(problem, state.point, model.values, noise)
+    now = float(windows.sum()) + prior
     state = replace(state, noise=noise, cost=now)
     for _ in range(8):
         point, moved = step(problem, state, system)
         tried = linearize(problem, point)
-        cost = cost_of(problem, point, tried.values, noise)
-        if np.isfinite(cost) and cost <= now + 1e-6 * abs(now):
-            damping = state.damping / 10 if state.damping > 1e-6 else 0.0
-            return replace(state, point=point, damping=damping, iteration=state.iteration + 1,
-                           cost=cost, moved=moved), tried  # fmt: skip
-        state = replace(state, damping=max(10 * state.damping, 1e-2))
+        others, prior = costs_of(problem, point, tried.values, noise)
+        cost = float(others.sum()) + prior
+        better = others <= windows + 1.0
+        eased = np.where(state.damping > 1e-3, state.damping / 10, 0.0)
+        damping = np.where(better, eased, np.maximum(10 * state.damping, 1e-1))
+        if cost <= now + 1e-6 * abs(now):
+            common = state.common / 10 if state.common > 1e-3 else 0.0
+            return replace(state, point=point, damping=damping, common=common, cost=cost,
+                           iteration=state.iteration + 1, moved=moved), tried  # fmt: skip
         if moved < _TOLERANCE:
             break
+        common = 10 * state.common if state.common else 1e-2
+        state = replace(state, damping=damping, common=common)
     return replace(state, iteration=state.iteration + 1, moved=0.0), model
 
 

@@ -140,7 +140,7 @@ def check_marks(
 
 
 def smooth(time: np.ndarray, value: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Smoothing splines by generalised cross-validation (Woltring 1986).
+    """Smoothing splines, as stiff as foretells every other row from the rest best (Woltring 1986).
 
     Args:
         time: `[n]` rising [s].
@@ -158,7 +158,19 @@ def smooth(time: np.ndarray, value: np.ndarray, at: np.ndarray) -> tuple[np.ndar
         lines = [np.polynomial.Polynomial.fit(t, column, order) for column in y.T]
         found = [np.stack([f(at) for f in g], -1) for g in (lines, [f.deriv() for f in lines])]
         return found[0], found[1], float(np.std(np.diff(y, axis=0)) / np.sqrt(2))
-    splines = [make_smoothing_spline(t, column) for column in y.T]
+    # Lengths from a frame to the whole, to the fourth power, as stiffness grows with length.
+    usual = float(np.median(np.diff(t)))
+    lengths = np.geomspace(usual, max(t[-1] - t[0], 4 * usual), 14)
+    stiffness = lengths**4 / usual / (2 * np.pi) ** 4
+    if len(t) < 12:
+        best = stiffness[len(stiffness) // 3]
+    else:
+        errors = []
+        for lam in stiffness:
+            foretold = [make_smoothing_spline(t[::2], c[::2], lam=lam)(t[1:-1:2]) for c in y.T]
+            errors.append(float(np.mean((np.stack(foretold, -1) - y[1:-1:2]) ** 2)))
+        best = 2 * stiffness[int(np.argmin(errors))]  # of twice as many rows
+    splines = [make_smoothing_spline(t, column, lam=best) for column in y.T]
     left = y - np.stack([f(t) for f in splines], -1)
     values = np.stack([f(at) for f in splines], -1)
     rates = np.stack([f.derivative()(at) for f in splines], -1)

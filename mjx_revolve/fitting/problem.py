@@ -74,6 +74,10 @@ class Settings:
     rate: Annotated[Number, Gt(0)] = 30.0
 
 
+LOCAL_UNITS = {"current": "m/s", "clock": "s"}
+"""Of what each recording has of its own."""
+
+
 class Channel(NamedTuple):
     """Measurements of one kind in one recording.
 
@@ -377,7 +381,8 @@ def _prescribed(
     """Hinges whose measured angles are taken as they are."""
     if servos_free:
         for r in recordings:
-            if not any(n.startswith("command.") for n in r.signals):
+            kinds = {n.partition(".")[0] for n in r.signals}
+            if "angle" in kinds and "command" not in kinds:
                 raise InputError(
                     f"{r.name}: expected the servos' commands (command.MODULE), as they are free; "
                     "found none"
