@@ -47,12 +47,14 @@ class State:
 
     Attributes:
         point: where it is.
-        noise: standard deviations by kind of channel.
+        noise: standard deviations by kind of channel, with their correlation.
         damping: `[K, R]` Marquardt's, of each window's beginning, and
         common: of all else.
         iteration: steps done.
         cost: at the point, with this noise.
         moved: the last step over what the numbers are uncertain by.
+        inflated: whether the residuals' correlation counts by now: only near the end is it that of
+            noise and of the model, and not of a wrong point.
     """
 
     point: Point
@@ -62,11 +64,12 @@ class State:
     iteration: int = 0
     cost: float = np.inf
     moved: float = np.inf
+    inflated: bool = False
 
     @property
     def finished(self) -> bool:
         """Whether it has arrived."""
-        return self.moved < _TOLERANCE
+        return self.inflated and self.moved < _TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -107,9 +110,8 @@ def costs_of(
 
 
 def normal_equations(
-    problem: Problem, model: Model, point: Point, noise: dict[str, float],
-    inflation: dict[str, float] | None = None,
-) -> System:  # fmt: skip
+    problem: Problem, model: Model, point: Point, noise: dict[str, float]
+) -> System:
     """Fisher's information of what is fitted, and the gradient."""
     count, own, recordings = len(problem.parameters), len(problem.local), len(problem.recordings)
     total = count + own * recordings
@@ -121,7 +123,6 @@ def normal_equations(
         blocks[int(k), int(r)] = [prior, np.zeros((START, total)), pull]
     for channel, left, slopes in zip(problem.channels, model.values, model.slopes, strict=True):
         r, sigma = channel.recording, noise[channel.kind]
-        sigma *= np.sqrt(1.0 if inflation is None else inflation.get(channel.kind, 1.0))
         columns = [*range(count), *range(count + r * own, count + (r + 1) * own)]
         where = problem.window_of(r, channel.time)
         for k in np.unique(where[channel.fitted]):
@@ -130,7 +131,7 @@ def normal_equations(
             slant = slopes[rows].reshape(len(value), -1)
             known = np.isfinite(value) & np.isfinite(slant).all(1)
             z, j = value[known] / sigma, slant[known] / sigma
-            weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(left[rows].ravel()[known]) / noise[channel.kind], 1e-9))
+            weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(z), 1e-9))
             common, start = j[:, : count + own], j[:, count + own :]
             matrix[np.ix_(columns, columns)] += (weight[:, None] * common).T @ common
             slope[columns] -= (weight * z) @ common
@@ -211,22 +212,42 @@ def numbers_used(problem: Problem, system: System) -> float:
 
 
 def correlation(problem: Problem, values: list[np.ndarray]) -> dict[str, float]:
-    """By how much the residuals' correlation in time inflates variances: (1 + ρ) / (1 - ρ)."""
-    pairs: dict[str, list[tuple[float, float, int]]] = {}
+    """By how much the residuals' correlation inflates variances, by kind.
+
+    In time by (1 + ρ) / (1 - ρ) of neighbouring frames; within a frame, as of marks that a wrong
+    turn moves together, by how many fewer independent numbers it has than noise would.
+    """
+    lagged: dict[str, list[tuple[float, float, float]]] = {}
+    crowded: dict[str, list[tuple[float, int]]] = {}
     for channel, left in zip(problem.channels, values, strict=True):
         where = problem.window_of(channel.recording, channel.time)
+        whole = left[channel.fitted]
+        whole = np.where(np.isfinite(whole), whole, 0.0)
+        whole = whole[:, np.any(whole != 0, 0)]
+        rows, columns = whole.shape
+        if rows > 1 and columns > 1:
+            square = np.linalg.svd(whole, compute_uv=False) ** 2
+            alone = rows * columns / (rows + columns)
+            crowd = alone * float((square**2).sum() / max(square.sum() ** 2, 1e-30))
+            crowded.setdefault(channel.kind, []).append((crowd, rows))
         for k in np.unique(where[channel.fitted]):
             x = left[channel.fitted & (where == k)]
             a, b = x[:-1].ravel(), x[1:].ravel()
             known = np.isfinite(a) & np.isfinite(b)
-            pairs.setdefault(channel.kind, []).append(
-                (float(a[known] @ b[known]), float(x[np.isfinite(x)] @ x[np.isfinite(x)]), len(x))
-            )
+            square_sum = float(x[np.isfinite(x)] @ x[np.isfinite(x)])
+            both = float(a[known] @ b[known]), square_sum, square_sum * len(x)
+            lagged.setdefault(channel.kind, []).append(both)
     found = {}
-    for kind, many in pairs.items():
-        lagged, square = (sum(x[k] for x in many) for k in (0, 1))
-        rho = min(max(lagged / max(square, 1e-30), 0.0), 0.95)
-        found[kind] = (1 + rho) / (1 - rho)
+    for kind, many in lagged.items():
+        product, square_sum, weighted = (sum(x[k] for x in many) for k in range(3))
+        rows = max(weighted / max(square_sum, 1e-30), 4.0)
+        # What is fitted takes some of it away (Marriott and Pope 1954).
+        rho = (product / max(square_sum, 1e-30) + 1 / rows) / (1 - 3 / rows)
+        rho = min(max(rho, 0.0), 0.95)
+        crowd = 1.0
+        if kind in crowded:
+            crowd = sum(c * n for c, n in crowded[kind]) / sum(n for _, n in crowded[kind])
+        found[kind] = (1 + rho) / (1 - rho) * max(crowd, 1.0)
     return found
 
 
@@ -284,8 +305,13 @@ def _costs(problem: Problem, points: list[Point], noise: dict[str, float]) -> np
 
 def advance(problem: Problem, state: State, model: Model) -> tuple[State, Model]:
     """One step of the search; the damping grows until a step lowers the cost."""
+    if not state.inflated and state.moved < _TOLERANCE:
+        state = replace(state, inflated=True, damping=0 * state.damping, common=0.0)
     system = normal_equations(problem, model, state.point, state.noise)
-    noise = estimate_noise(problem, model.values, numbers_used(problem, system))
+    plain = estimate_noise(problem, model.values, numbers_used(problem, system))
+    # What errs together counts once: the prior then holds where the model errs, and not the frames.
+    inflation = correlation(problem, model.values) if state.inflated else {}
+    noise = {kind: sigma * float(np.sqrt(inflation.get(kind, 1.0))) for kind, sigma in plain.items()}
     system = normal_equations(problem, model, state.point, noise)
     windows, prior = costs_of(problem, state.point, model.values, noise)
     now = float(windows.sum()) + prior
@@ -344,7 +370,7 @@ def estimate(problem: Problem, state: State, model: Model) -> Estimate:
     """Values and their covariance at the end of a search."""
     count, own = len(problem.parameters), len(problem.local)
     inflation = correlation(problem, model.values)
-    system = normal_equations(problem, model, state.point, state.noise, inflation)
+    system = normal_equations(problem, model, state.point, state.noise)
     whole = system.matrix.copy()
     whole[:count, :count] += prior_matrix(problem)
     covariance = np.linalg.inv(whole)
@@ -357,14 +383,15 @@ def estimate(problem: Problem, state: State, model: Model) -> Estimate:
         np.isfinite(left[channel.fitted]).sum() / inflation[channel.kind]
         for channel, left in zip(problem.channels, model.values, strict=True)
     )
-    degrees = max(float(rows) - numbers_used(problem, system), 1.0)
+    # Few data say little of their own noise; the priors bound what that can do.
+    degrees = max(float(rows) - numbers_used(problem, system), 4.0)
     return Estimate(
         state.point.free,
         covariance[:count, :count],
         (alone + alone.T) / 2,
         float(student.ppf((1 + LEVEL) / 2, degrees)),
         state.point.local,
-        np.sqrt(np.diag(covariance)[count:]).reshape(-1, own),
-        dict(state.noise),
+        np.sqrt(np.diag(covariance)[count:]).reshape(state.point.local.shape),
+        {kind: sigma / np.sqrt(inflation[kind]) for kind, sigma in state.noise.items()},
         inflation,
     )

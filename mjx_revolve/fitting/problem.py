@@ -41,9 +41,10 @@ _CLOCK_STEP = 1e-3
 START = 12
 """Corrections of a start: position, rotation (body), velocity, angular velocity (body)."""
 # Standard deviations of where a window begins: more than smoothing can be wrong by, [m, rad, m/s,
-# rad/s]; and of what is not recorded at all, from rest. Choices.
+# rad/s]; and of what is not recorded at all, which is left at rest: seen from above, heave, roll and
+# pitch would else explain what they do not cause. Choices.
 _SEEN = np.repeat([0.03, 0.15, 0.15, 0.6], 3)
-_UNSEEN = np.repeat([0.02, 0.05, 0.03, 0.1], 3)
+_UNSEEN = np.repeat([1e-3, 5e-3, 2e-3, 1e-2], 3)
 # Standard deviations of sensors until residuals say better: [m], [rad], [m], [rad], [rad/s],
 # [m/s²], [m], and of the logarithm of speeds.
 NOISE = {"position": 0.005, "attitude": 0.02, "marks": 0.005, "angles": 0.02, "gyro": 0.02,
@@ -86,6 +87,7 @@ class Channel(NamedTuple):
         recording: its number.
         time: `[n]` [s].
         fitted: `[n]` whether they count.
+        seen: `[n, d]` what was measured, where there is a place of it in the world.
         residual: `[V, n, 13 + hinges]` states at the times (of "accelerometer" with rates beside)
             → `[V, n, d]` simulated minus measured, NaN where nothing was.
     """
@@ -94,6 +96,7 @@ class Channel(NamedTuple):
     recording: int
     time: np.ndarray
     fitted: np.ndarray
+    seen: np.ndarray
     residual: Callable[[np.ndarray], np.ndarray]
 
 
@@ -556,12 +559,15 @@ class _View:
         """The measurements of the recording."""
         signals, found = self.recording.signals, []
 
-        def add(kind: str, time: np.ndarray, residual: Callable[[np.ndarray], np.ndarray]) -> None:
-            found.append(Channel(kind, r, time, time <= until + 1e-9, residual))
+        def add(
+            kind: str, time: np.ndarray, residual: Callable[[np.ndarray], np.ndarray],
+            seen: np.ndarray = np.zeros((0, 3)),
+        ) -> None:  # fmt: skip
+            found.append(Channel(kind, r, time, time <= until + 1e-9, seen, residual))
 
         if "x" in signals:
             position = self.position
-            add("position", self.time, lambda s: s[..., :3] - position)
+            add("position", self.time, lambda s: s[..., :3] - position, position)
             if self.quat is not None:
                 level, quat = self.level, self.quat
                 add("attitude", self.time, lambda s: _turn_error(s[..., 3:7], quat, level))
@@ -575,7 +581,7 @@ class _View:
                 left = place.reshape(*s.shape[:2], -1, 3) - seen
                 return left.reshape(*s.shape[:2], -1)
 
-            add("marks", self.mark_time, off)
+            add("marks", self.mark_time, off, seen.reshape(len(seen), -1))
         if servos_free:
             time, values = self.recording.table([f"angle.{h}" for h in self.hinges])
             if len(time):

@@ -274,14 +274,11 @@ def _predict(problem: Problem, state: State) -> tuple[Prediction, ...]:
                         for v in range(2)]  # fmt: skip
                 seen = np.tile([mean, np.nan, np.nan], (len(channel.time), 1))
             else:
-                states = problem.states(tracks[:, r], r, channel.time)
-                wide = off.reshape(*off.shape[:2], -1, 3)
-                with np.errstate(all="ignore"):
-                    known = np.isfinite(wide[0]).any(1)
-                    mean_off = np.nansum(wide, 2) / np.maximum(np.isfinite(wide).sum(2), 1)
-                both = [np.where(known, states[v, :, :3], np.nan) for v in range(2)]
-                seen = both[0] - mean_off[0]
-                both[1] = seen + mean_off[1]
+                # The middle of the marks that are seen.
+                wide = np.stack([channel.seen + x for x in (0 * off[0], *off)])
+                wide = wide.reshape(*wide.shape[:2], -1, 3)
+                count = np.isfinite(wide).sum(2)
+                seen, *both = np.where(count > 0, np.nansum(wide, 2) / np.maximum(count, 1), np.nan)
             found.append(
                 Prediction(recording.name, channel.time, ~channel.fitted, seen, both[0], both[1])
             )

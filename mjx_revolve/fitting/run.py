@@ -208,7 +208,7 @@ class FitRun:
         self.problem.roots[:] = arrays["roots"]
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
         self.state = State(point, meta["noise"], arrays["damping"], meta["common"],
-                           meta["generation"], meta["cost"], meta["moved"])  # fmt: skip
+                           meta["generation"], meta["cost"], meta["moved"], meta["inflated"])  # fmt: skip
 
     def save(self) -> None:
         """A checkpoint of the state."""
@@ -218,7 +218,7 @@ class FitRun:
         arrays = {"free": point.free, "local": point.local, "starts": point.starts,
                   "damping": state.damping, "roots": self.problem.roots}  # fmt: skip
         meta = {"noise": state.noise, "common": state.common, "cost": state.cost,
-                "moved": min(state.moved, 1e30)}  # fmt: skip
+                "moved": min(state.moved, 1e30), "inflated": state.inflated}  # fmt: skip
         self.folder.save_checkpoint(state.iteration, arrays, meta, 2)
 
     def run(self, interrupts: Interrupts) -> Fit | None:
