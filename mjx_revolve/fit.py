@@ -63,8 +63,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=read_path, metavar="DIR", help="the fit's folder (default: runs/fit-TIME)")
     add("--resume", type=read_path, metavar="DIR", help="go on with this folder, bit for bit")
     add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-        help="window, held_out, iterations, duration, motions, rate; world.KEY; trim=neutral; may be "
-        "repeated")  # fmt: skip
+        help="window, held_out, iterations, duration, motions, rate; world.KEY; trim=neutral; may "
+        "be repeated")  # fmt: skip
     add_trust_argument(parser)
     return parser
 
@@ -146,7 +146,9 @@ def _finish(run: FitRun, interrupts: Interrupts) -> int:
     interrupts.be_patient("finishing the step that is under way")
     fit = run.run(interrupts)
     if fit is None:
-        print(f"stopped; all of it is saved\nresume: {program('fit')} --resume {shlex.quote(place)}")
+        print(
+            f"stopped; all of it is saved\nresume: {program('fit')} --resume {shlex.quote(place)}"
+        )
         return interrupts.exit_code
     with interrupts.writing:
         run.write(fit, make_fit_page(fit))

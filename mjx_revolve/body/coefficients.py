@@ -58,8 +58,8 @@ def correct_types(
     for name in entries:
         if name != ALL and name not in modules:
             raise InputError(
-                f"{source}: modules.{name}: expected `all` or a type of module ({', '.join(modules)}"
-                "), or the file named in a morphology, which has modules by name; found neither"
+                f"{source}: modules.{name}: expected `all` or a type ({', '.join(modules)}), or "
+                "the file named in a morphology, which has modules by name; found neither"
             )
 
     def correct(kind: ModuleType) -> ModuleType:
@@ -70,9 +70,7 @@ def correct_types(
     return {name: correct(kind) for name, kind in modules.items()}
 
 
-def correct_modules(
-    tree: tuple[Module, ...], entries: Entries, source: str
-) -> tuple[Module, ...]:
+def correct_modules(tree: tuple[Module, ...], entries: Entries, source: str) -> tuple[Module, ...]:
     """Modules with coefficients, which their `params` keep.
 
     Raises:

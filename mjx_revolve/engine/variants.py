@@ -104,7 +104,7 @@ def _tree(robot: Robot, prescribed: np.ndarray) -> SingleTree:
         free, none = (-NO_LIMIT, NO_LIMIT), 0.0
 
         def put(now: Any, value: Any, driven: np.ndarray = driven) -> Any:
-            return jax.tree.map(lambda a, b: fold(np.where(driven, b, a)), now, value)
+            return jax.tree.map(lambda a, b: fold(np.asarray(np.where(driven, b, a))), now, value)
 
         hinges = level.hinges
         changed = hinges._replace(

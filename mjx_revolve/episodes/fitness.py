@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
+from mjx_revolve.body.coefficients import correct_types, load_coefficients
 from mjx_revolve.body.edits import add_module, replace_module
 from mjx_revolve.body.module_types import ModuleType
-from mjx_revolve.body.coefficients import correct_types, load_coefficients
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
 from mjx_revolve.control.controller import Controller, as_plant, bind_genes, gene_indices
 from mjx_revolve.control.kinds import find_controller

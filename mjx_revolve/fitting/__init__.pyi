@@ -8,4 +8,5 @@ from .result import Fit as Fit
 from .result import Prediction as Prediction
 from .result import Value as Value
 from .result import fit_robot as fit_robot
-from .synthetic import record_motion as record_motion
+from .synthetic import make_noisy as make_noisy
+from .synthetic import simulate_signals as simulate_signals

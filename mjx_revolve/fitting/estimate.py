@@ -23,6 +23,9 @@ LEVEL = 0.95
 _HUBER = 3.0
 # The search ends when a step is below this share of each number's own uncertainty [-].
 _TOLERANCE = 0.02
+# With fewer measurements of a kind, their noise is what is usual: a wrong model would else pass for
+# noise; intervals are widened by what is left (Birge 1932). A choice.
+_FEW = 30
 _LEAST_NOISE = 0.02  # of `NOISE`: no recording is better, and what was simulated has none at all
 _LARGEST_STEP = 1.0  # in a logarithm, or in units of the prior
 
@@ -144,11 +147,11 @@ def normal_equations(
         matrix[rows, rows] += problem.local_spread**-2.0
         slope[rows] -= point.local[r] * problem.local_spread**-2.0
     starts = []
-    for (k, r), (block, coupling, pull) in blocks.items():
-        solved = np.linalg.solve(block, np.column_stack([coupling, pull]))
+    for (k, r), (own_block, coupling, gradient) in blocks.items():
+        solved = np.linalg.solve(own_block, np.column_stack([coupling, gradient]))
         matrix -= coupling.T @ solved[:, :-1]
         slope -= coupling.T @ solved[:, -1]
-        starts.append((k, r, block, coupling, pull))
+        starts.append((k, r, own_block, coupling, gradient))
     return System((matrix + matrix.T) / 2, slope, starts)
 
 
@@ -169,7 +172,9 @@ def step(problem: Problem, state: State, system: System) -> tuple[Point, float]:
     move = np.linalg.solve(damped, slope)
     limit = max(1.0, float(np.abs(move[:count]).max(initial=0.0)) / _LARGEST_STEP)
     move = move / limit
-    free = np.array([p.bound(x) for p, x in zip(problem.parameters, point.free + move[:count], strict=True)])
+    free = np.array(
+        [p.bound(x) for p, x in zip(problem.parameters, point.free + move[:count], strict=True)]
+    )
     starts = point.starts.copy()
     for k, r, block, coupling, pull in system.starts:
         own = block + state.damping[k, r] * np.diag(np.diag(block))
@@ -186,16 +191,32 @@ def estimate_noise(problem: Problem, values: list[np.ndarray], used: float) -> d
     whole = sum(np.isfinite(x).sum() for many in squares.values() for x in many)
     share = max(1 - used / max(whole, 1), 0.1)
     found = {}
-    for kind, many in squares.items():
-        x = np.concatenate(many)
+    for kind, each in squares.items():
+        x = np.concatenate(each)
         x = x[np.isfinite(x)]
         sigma = NOISE[kind]
-        if len(x) >= 3:
+        if len(x) >= _FEW:
             # Clipped where Huber's weights begin, again and again.
             sigma = float(np.sqrt(np.mean(x**2)))
             for _ in range(8):
                 sigma = float(np.sqrt(np.mean(np.minimum(x**2, (_HUBER * sigma) ** 2))))
         found[kind] = max(sigma / np.sqrt(share), _LEAST_NOISE * NOISE[kind])
+    return found
+
+
+def _widened(
+    problem: Problem, values: list[np.ndarray], noise: dict[str, float]
+) -> dict[str, float]:
+    """The noise, of kinds with few measurements at least what is left of them."""
+    found = dict(noise)
+    for kind in noise:
+        pairs = zip(problem.channels, values, strict=True)
+        many = [left[c.fitted].ravel() for c, left in pairs if c.kind == kind]
+        x = np.concatenate(many)
+        x = x[np.isfinite(x)]
+        if 0 < len(x) < _FEW:
+            degrees = max(len(x) - len(problem.parameters), 1)
+            found[kind] = max(noise[kind], float(np.sqrt(np.sum(x**2) / degrees)))
     return found
 
 
@@ -266,7 +287,9 @@ def begin(problem: Problem, seed: int) -> State:
             points.append(replace(origin, starts=starts))
     else:
         wanted = min(room, problem.settings.draws * room)
-        points += [replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)]
+        points += [
+            replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)
+        ]
     none = np.zeros(problem.drive.resets.shape)
     if len(points) == 1:
         return State(origin, noise, none)
@@ -311,7 +334,9 @@ def advance(problem: Problem, state: State, model: Model) -> tuple[State, Model]
     plain = estimate_noise(problem, model.values, numbers_used(problem, system))
     # What errs together counts once: the prior then holds where the model errs, and not the frames.
     inflation = correlation(problem, model.values) if state.inflated else {}
-    noise = {kind: sigma * float(np.sqrt(inflation.get(kind, 1.0))) for kind, sigma in plain.items()}
+    noise = {
+        kind: sigma * float(np.sqrt(inflation.get(kind, 1.0))) for kind, sigma in plain.items()
+    }
     system = normal_equations(problem, model, state.point, noise)
     windows, prior = costs_of(problem, state.point, model.values, noise)
     now = float(windows.sum()) + prior
@@ -368,9 +393,10 @@ class Estimate:
 
 def estimate(problem: Problem, state: State, model: Model) -> Estimate:
     """Values and their covariance at the end of a search."""
-    count, own = len(problem.parameters), len(problem.local)
+    count = len(problem.parameters)
     inflation = correlation(problem, model.values)
-    system = normal_equations(problem, model, state.point, state.noise)
+    noise = _widened(problem, model.values, state.noise)
+    system = normal_equations(problem, model, state.point, noise)
     whole = system.matrix.copy()
     whole[:count, :count] += prior_matrix(problem)
     covariance = np.linalg.inv(whole)

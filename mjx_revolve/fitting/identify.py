@@ -56,7 +56,7 @@ def find_unknown(parameters: Sequence[Parameter], information: np.ndarray) -> li
     found = []
     for k in np.flatnonzero(strength < _KNOWN):
         v = directions[:, k]
-        rows = np.flatnonzero(np.abs(v) > _NAMED * np.abs(v).max())
+        rows = np.flatnonzero(np.abs(v) > _NAMED * np.abs(v).max()).tolist()
         names = tuple(parameters[i].name for i in rows)
         positive = all(parameters[i].positive for i in rows)
         if len(rows) == 1:

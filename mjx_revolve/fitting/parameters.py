@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from mjx_revolve.body.coefficients import ALL, correct_modules
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology
@@ -66,11 +68,11 @@ class Parameter:
         return min(max(offset, -most), most)
 
 
-def with_values(robot: Robot, parameters: Sequence[Parameter], offsets: Sequence[float]) -> Robot:
+def with_values(robot: Robot, parameters: Sequence[Parameter], offsets: np.ndarray) -> Robot:
     """The robot with values of its free numbers."""
     modules = robot.morphology.modules
     for parameter, offset in zip(parameters, offsets, strict=True):
-        modules = correct_modules(modules, parameter.entries(parameter.value(offset)), "fit")
+        modules = correct_modules(modules, parameter.entries(parameter.value(float(offset))), "fit")
     return Robot(replace(robot.morphology, modules=modules), robot.world)
 
 
@@ -173,7 +175,9 @@ def _plain_value(
             if part.thruster is not None and getattr(part.thruster, field) is not None
         }
         if not jets:
-            raise InputError(f"--free {text}: expected a robot with a thruster's {field}; found none")
+            raise InputError(
+                f"--free {text}: expected a robot with a thruster's {field}; found none"
+            )
         if field == "time_constant":
             own = {jet.time_constant for jet in jets.values()}
             start = max(own) or _USUAL_LAG
@@ -181,7 +185,9 @@ def _plain_value(
             return Parameter(text, "s", start, math.log(_THRUSTER[field]), True, lag)
 
         def scaled(value: float) -> dict[str, Any]:
-            return {m: {"thruster": {field: value * getattr(jet, field)}} for m, jet in jets.items()}
+            return {
+                m: {"thruster": {field: value * getattr(jet, field)}} for m, jet in jets.items()
+            }
 
         return Parameter(text, "", 1.0, math.log(_THRUSTER[field]), True, scaled)
     if head not in ("ballast", "ballast_position"):

@@ -1,4 +1,4 @@
-"""Poses of the core from recordings: rigid fits to marks, smoothing, rest where nothing is known."""
+"""Poses of the core from recordings: rigid fits to marks, smoothing, rest."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ class MarkPoints:
         last = [int(np.flatnonzero(table.module == mark.module)[-1]) for mark in marks]
         self.body = table.body[last]
         modules = [robot.morphology.modules[mark.module] for mark in marks]
-        place = [m.position + m.rotation @ mark.place for m, mark in zip(modules, marks, strict=True)]
+        place = [
+            m.position + m.rotation @ mark.place for m, mark in zip(modules, marks, strict=True)
+        ]
         self.offset = np.array(
             [assembly.rotation[b].T @ (p - assembly.position[b])
              for b, p in zip(self.body, place, strict=True)]
@@ -88,7 +90,12 @@ def fit_rigid(
 
 
 def check_marks(
-    model: np.ndarray, seen: np.ndarray, planar: bool, names: Sequence[str], time: np.ndarray, length: float
+    model: np.ndarray,
+    seen: np.ndarray,
+    planar: bool,
+    names: Sequence[str],
+    time: np.ndarray,
+    length: float,
 ) -> None:
     """Refuses marks that are not on this robot as said.
 
@@ -106,8 +113,8 @@ def check_marks(
     if not 0.8 < ratio < 1.25:
         raise InputError(
             f"marks: expected them as far apart as on the robot, {spread[1]:.3g} m; found "
-            f"{spread[0]:.3g}: another scale (--map mark.NAME.x=COLUMN*{1 / ratio:.3g}), or another "
-            "robot?"
+            f"{spread[0]:.3g}: another scale (--map mark.NAME.x=COLUMN*{1 / ratio:.3g}), or "
+            "another robot?"
         )
     if count <= dims and not (planar and count == 2):
         return
@@ -139,7 +146,9 @@ def check_marks(
         )
 
 
-def smooth(time: np.ndarray, value: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def smooth(
+    time: np.ndarray, value: np.ndarray, at: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Smoothing splines, as stiff as foretells every other row from the rest best (Woltring 1986).
 
     Args:

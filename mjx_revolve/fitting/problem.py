@@ -7,7 +7,7 @@ that are free, so that neither drift nor chaos outlives a window.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated, Any, NamedTuple
@@ -33,7 +33,8 @@ from mjx_revolve.fitting.simulation import ROOT, Drive, simulate_windows
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import Integer, Number, checked
 
-# Records lie no further apart [s]: interpolation is then below a millimetre and a tenth of a degree.
+# Records lie no further apart [s]: interpolation is then good to a millimetre and a tenth of a
+# degree.
 _RECORD = 0.01
 # Steps of the differences by which derivatives are found; in float64 they cost four digits of 16.
 _STEP = 1e-4
@@ -41,8 +42,8 @@ _CLOCK_STEP = 1e-3
 START = 12
 """Corrections of a start: position, rotation (body), velocity, angular velocity (body)."""
 # Standard deviations of where a window begins: more than smoothing can be wrong by, [m, rad, m/s,
-# rad/s]; and of what is not recorded at all, which is left at rest: seen from above, heave, roll and
-# pitch would else explain what they do not cause. Choices.
+# rad/s]; and of what is not recorded at all, which is left at rest: seen from above, heave, roll
+# and pitch would else explain what they do not cause. Choices.
 _SEEN = np.repeat([0.03, 0.15, 0.15, 0.6], 3)
 _UNSEEN = np.repeat([1e-3, 5e-3, 2e-3, 1e-2], 3)
 # Standard deviations of sensors until residuals say better: [m], [rad], [m], [rad], [rad/s],
@@ -77,6 +78,9 @@ class Settings:
 
 LOCAL_UNITS = {"current": "m/s", "clock": "s"}
 """Of what each recording has of its own."""
+
+
+_NOWHERE = np.zeros((0, 3))
 
 
 class Channel(NamedTuple):
@@ -243,7 +247,7 @@ class Problem:
         ]
 
     def states(self, track: np.ndarray, recording: int, time: np.ndarray) -> np.ndarray:
-        """`[V, n, 13 + hinges]` states at times, from `[V, K, records, ...]`; cubic for positions."""
+        """`[V, n, 13 + hinges]` states at times, from `[V, K, records, ...]`."""
         windows, count = track.shape[1:3]
         passed = (time - self.begin[recording]) / self.window
         # A frame where a window ends and the next begins is of the one that has run.
@@ -254,9 +258,13 @@ class Problem:
         a, b = track[:, k, i], track[:, k, i + 1]
         found = a + f * (b - a)
         h = self.window / (count - 1)
-        found[..., :3] += f * (1 - f) * (
-            (1 - f) * (h * a[..., 7:10] - (b - a)[..., :3])
-            - f * (h * b[..., 7:10] - (b - a)[..., :3])
+        found[..., :3] += (
+            f
+            * (1 - f)
+            * (
+                (1 - f) * (h * a[..., 7:10] - (b - a)[..., :3])
+                - f * (h * b[..., 7:10] - (b - a)[..., :3])
+            )
         )
         found[..., 3:7] /= np.linalg.norm(found[..., 3:7], axis=-1, keepdims=True)
         # Acceleration, for accelerometers, behind the state.
@@ -396,7 +404,8 @@ def _prescribed(
         if some != found[0]:
             raise InputError(
                 f"{r.name}: expected angles of the same hinges as {recordings[0].name} "
-                f"({', '.join(sorted(found[0])) or 'none'}); found {', '.join(sorted(some)) or 'none'}"
+                f"({', '.join(sorted(found[0])) or 'none'}); found "
+                f"{', '.join(sorted(some)) or 'none'}"
             )
     return found[0]
 
@@ -413,7 +422,7 @@ def _commands(
             signal = recording.signals[f"angle.{name}"]
             course = _course(signal, begin + dt * np.arange(-1, count + 1))
             targets = course_targets(course, dt)
-            columns.append(lambda late, x=targets: x)
+            columns.append(_constant(targets))
         else:
             columns.append(_held(recording, f"command.{name}", edges, dt))
     columns += [_held(recording, f"command.{name}", edges, dt) for name in jets]
@@ -424,6 +433,10 @@ def _commands(
         return np.stack([f(late) for f in columns], -1).reshape(windows, -1, len(columns))
 
     return commands
+
+
+def _constant(values: np.ndarray) -> Callable[[float], np.ndarray]:
+    return lambda late: values
 
 
 def _course(signal: Any, at: np.ndarray) -> np.ndarray:
@@ -513,7 +526,9 @@ class _View:
                 return np.interp(at, *signal)
         return np.zeros(len(at))
 
-    def hinges_at(self, at: float, prescribed: set[str], dt: float) -> tuple[np.ndarray, np.ndarray]:
+    def hinges_at(
+        self, at: float, prescribed: set[str], dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """`[hinges]` angles and speeds [rad, rad/s]; what is commanded begins at rest."""
         angles, speeds = np.zeros(len(self.hinges)), np.zeros(len(self.hinges))
         for k, hinge in enumerate(self.hinges):
@@ -561,7 +576,7 @@ class _View:
 
         def add(
             kind: str, time: np.ndarray, residual: Callable[[np.ndarray], np.ndarray],
-            seen: np.ndarray = np.zeros((0, 3)),
+            seen: np.ndarray = _NOWHERE,
         ) -> None:  # fmt: skip
             found.append(Channel(kind, r, time, time <= until + 1e-9, seen, residual))
 
@@ -618,10 +633,14 @@ class _View:
 
 
 def _turn_error(quat: np.ndarray, seen: np.ndarray, level: bool) -> np.ndarray:
-    """`[V, n, 3]` rotation from what was seen to what is simulated, or `[V, n, 1]` about z [rad]."""
+    """`[V, n, 3]` rotation from seen to simulated, or `[V, n, 1]` about z [rad]."""
     w, v = seen[:, :1], -seen[:, 1:]
     real = w[:, 0] * quat[..., 0] - np.sum(v * quat[..., 1:], -1)
-    imaginary = w * quat[..., 1:] + quat[..., :1] * v + np.cross(np.broadcast_to(v, quat[..., 1:].shape), quat[..., 1:])
+    imaginary = (
+        w * quat[..., 1:]
+        + quat[..., :1] * v
+        + np.cross(np.broadcast_to(v, quat[..., 1:].shape), quat[..., 1:])
+    )
     if level:
         yaw = 2 * np.arctan2(imaginary[..., 2], real)
         return ((yaw + np.pi) % (2 * np.pi) - np.pi)[..., None]

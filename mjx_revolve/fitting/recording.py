@@ -68,7 +68,7 @@ class Recording:
     notes: tuple[str, ...] = ()
 
     def table(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Times `[n]` at which any of the signals is known, and `[n, len(names)]` values, else NaN."""
+        """Times `[n]` at which any of them is known, and `[n, names]` values, else NaN."""
         known = [self.signals[name].time for name in names if name in self.signals]
         time = np.unique(np.concatenate(known)) if known else np.zeros(0)
         values = np.full((len(time), len(names)), np.nan)
@@ -97,7 +97,9 @@ def read_map(options: Sequence[str], label: str = "--map") -> dict[str, str]:
             )
         data = load_yaml(option)
         if not isinstance(data, dict):
-            raise InputError(f"{option}: expected a mapping of names to columns; found {show(data)}")
+            raise InputError(
+                f"{option}: expected a mapping of names to columns; found {show(data)}"
+            )
         found |= {str(key): str(value) for key, value in data.items()}
     return found
 
@@ -119,7 +121,9 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     """
     path = check_path(path)
     if not path.exists():
-        raise InputError(f"{path}: expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none")
+        raise InputError(
+            f"{path}: expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"
+        )
     marks = {
         key.removeprefix("mark."): _read_mark(key, source, robot)
         for key, source in columns.items()
@@ -180,20 +184,21 @@ def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str,
     named = _name_columns(header, columns, robot)
     if "time" not in named:
         raise InputError(
-            f"expected a column time (--map time=COLUMN, or frame*0.0333); found {', '.join(header)}"
+            f"expected a column time (--map time=COLUMN, or frame*0.0333); found "
+            f"{', '.join(header)}"
         )
     column, scale = named.pop("time")
     time = scale * values[:, column]
     if not np.isfinite(time).all():
-        row = int(np.flatnonzero(~np.isfinite(time))[0])
-        raise InputError(f"row {row + 2}, column {header[column]}: expected a time; found none")
+        bad = int(np.flatnonzero(~np.isfinite(time))[0])
+        raise InputError(f"row {bad + 2}, column {header[column]}: expected a time; found none")
     steps = np.diff(time)
     if np.any(steps <= 0):
-        row = int(np.flatnonzero(steps <= 0)[0]) + 1
-        word = "goes back" if steps[row - 1] < 0 else "stands still"
+        late = int(np.flatnonzero(steps <= 0)[0]) + 1
+        word = "goes back" if steps[late - 1] < 0 else "stands still"
         raise InputError(
-            f"row {row + 2}: expected a time later than {time[row - 1]:g} s; found {time[row]:g} s: "
-            f"time {word}"
+            f"row {late + 2}: expected a time later than {time[late - 1]:g} s; found "
+            f"{time[late]:g} s: time {word}"
         )
     found = {}
     for name, (k, scale) in named.items():
@@ -208,7 +213,7 @@ def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str,
 def _name_columns(
     header: Sequence[str], columns: Mapping[str, str], robot: Robot
 ) -> dict[str, tuple[Any, float]]:
-    """Signals by name: column (None: a constant) and factor; from the mapping, or by their names."""
+    """Signals by name: column (None: a constant) and factor; by the mapping, or by name."""
     found: dict[str, tuple[Any, float]] = {}
     for name, source in columns.items():
         match = _SOURCE.match(source)
@@ -222,8 +227,8 @@ def _name_columns(
             found[name] = None, float(source)
         except ValueError:
             raise InputError(
-                f"--map {name}: expected one of the columns {', '.join(header)}, also with *FACTOR, "
-                f"or a number; found {show(source)}"
+                f"--map {name}: expected one of the columns {', '.join(header)}, also with "
+                f"*FACTOR, or a number; found {show(source)}"
             ) from None
         if name == "time":
             raise InputError(f"--map time: expected a column; found the number {source}")
@@ -231,8 +236,7 @@ def _name_columns(
     for k, column in enumerate(header):
         plain, factor = _unit(column)
         plain = {"t": "time"}.get(plain, plain)
-        mark = re.fullmatch(r"([xyz])(\d+)", plain)
-        if mark:
+        if mark := re.fullmatch(r"([xyz])(\d+)", plain):
             plain = f"mark.{mark[2]}.{mark[1]}"
         head, _, rest = plain.partition(".")
         known = plain == "time" or plain in _POSE or plain in _SENSED or head == "mark"
@@ -258,35 +262,31 @@ def _unit(column: str) -> tuple[str, float]:
 
 
 def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, Signal]:
-    """Topics by their types; with several of one type, `odometry=/topic` and so on choose."""
+    """Topics by their types; of several of one type the first, or what `odometry=/topic` names."""
     check_package("a bag", "rosbags")
-    from rosbags.rosbag2.storage_mcap import ReaderMcap  # of a file without its folder
+    from rosbags.rosbag2 import Reader
     from rosbags.typesys import Stores, get_typestore
 
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
-    files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
-    if not files:
-        raise InputError("expected a bag with MCAP files; found none")
     kept: dict[str, list[tuple[float, float]]] = {}
     chosen: dict[str, str] = {}
-    for file in files:
-        try:
-            bag: Any = ReaderMcap([file]) if False else ReaderMcap(file)
-            bag.open()
-        except Exception as error:  # rosbags' own kinds, and struct's
-            raise InputError(f"expected an MCAP file; found: {error}") from None
-        for connection, stamp, raw in bag.messages():
-            kind = connection.msgtype.rpartition("/")[2]
-            use = _TOPICS.get(kind)
-            if use is None:
-                continue
-            signals = use(store.deserialize_cdr(raw, connection.msgtype), connection.topic)
-            role = kind if kind != "JointState" else f"{kind}{'target' in connection.topic}"
-            if chosen.setdefault(role, columns.get(role.lower(), connection.topic)) != connection.topic:
-                continue
-            for name, value in signals:
-                kept.setdefault(name, []).append((1e-9 * stamp, float(value)))
-        bag.close()
+    try:
+        with Reader(path) as bag:
+            for connection, stamp, raw in bag.messages():
+                kind, topic = connection.msgtype.rpartition("/")[2], connection.topic
+                if (use := _TOPICS.get(kind)) is None:
+                    continue
+                role = f"{kind} {topic}" if kind == "JointState" else kind
+                if chosen.setdefault(role, columns.get(kind.lower(), topic)) != topic:
+                    continue
+                message = store.deserialize_cdr(raw, connection.msgtype)
+                for name, value in use(message, topic):
+                    kept.setdefault(name, []).append((1e-9 * stamp, float(value)))
+    except InputError:
+        raise
+    except Exception as error:  # rosbags' own kinds, struct's, zstd's
+        found_instead = str(error).partition("\n")[0]
+        raise InputError(f"expected a ROS 2 bag; found: {found_instead}") from None
     if not kept:
         raise InputError(f"expected topics of the types {', '.join(_TOPICS)}; found none")
     first = min(rows[0][0] for rows in kept.values())
@@ -317,7 +317,10 @@ def _array(message: Any, topic: str) -> Iterable[tuple[str, float]]:
 
 
 def _imu(message: Any, topic: str) -> Iterable[tuple[str, float]]:
-    for kind, vector in (("gyro", message.angular_velocity), ("accel", message.linear_acceleration)):
+    for kind, vector in (
+        ("gyro", message.angular_velocity),
+        ("accel", message.linear_acceleration),
+    ):
         yield from ((f"{kind}.{axis}", getattr(vector, axis)) for axis in "xyz")
 
 
@@ -372,9 +375,7 @@ def _name_marks(
     return signals, marks
 
 
-def _check_signals(
-    signals: dict[str, Signal], robot: Robot
-) -> tuple[dict[str, Signal], list[str]]:
+def _check_signals(signals: dict[str, Signal], robot: Robot) -> tuple[dict[str, Signal], list[str]]:
     """Plain faults, one line each; and notes about gaps."""
     modules = {m.name: m.kind for m in robot.morphology.modules}
     seen = [n for n in signals if n in _POSE or n in _SENSED or n.startswith("mark.")]
@@ -396,20 +397,22 @@ def _check_signals(
         most = float(np.abs(signal.value).max())
         if kind.hinge is not None and most > 2 * math.pi:
             raise InputError(
-                f"{name}: expected radians; found {most:.3g}: degrees? (--map {name}=COLUMN*0.01745,"
-                " or a column that ends in _deg)"
+                f"{name}: expected radians; found {most:.3g}: degrees? (--map "
+                f"{name}=COLUMN*0.01745, or a column that ends in _deg)"
             )
         if kind.hinge is None:
             jet = next(p.thruster for p in kind.parts if p.thruster is not None)
             if most > 3 * max(map(abs, jet.range)):
                 raise InputError(
-                    f"{name}: expected commands within {list(jet.range)}; found {most:.3g}: percent?"
-                    f" (--map {name}=COLUMN*0.01)"
+                    f"{name}: expected commands within {list(jet.range)}; found {most:.3g}: "
+                    f"percent? (--map {name}=COLUMN*0.01)"
                 )
     if all(f"q{axis}" in signals for axis in "wxyz"):
         length = np.sqrt(sum(np.median(signals[f"q{a}"].value ** 2) for a in "wxyz"))
         if not 0.5 < length < 1.5:
-            raise InputError(f"qw, qx, qy, qz: expected unit quaternions; found length {length:.3g}")
+            raise InputError(
+                f"qw, qx, qy, qz: expected unit quaternions; found length {length:.3g}"
+            )
     for name in ("roll", "pitch", "yaw"):
         if name in signals and np.ptp(np.diff(signals[name].value, prepend=0)) > 20 * math.pi:
             raise InputError(f"{name}: expected radians; found steps of more: degrees? (_deg)")
@@ -419,7 +422,7 @@ def _check_signals(
 
 def _check_motion(signals: Mapping[str, Signal], robot: Robot) -> None:
     """Refuses what is too fast for its units, and what does not move at all."""
-    length = robot.morphology.descriptors["absolute_size"] if False else _length(robot)
+    length = _length(robot)
     still = "mean_speed" not in signals
     for name, signal in signals.items():
         if not (name in ("x", "y") or name.startswith("mark.")) or len(signal.time) < 3:
@@ -438,7 +441,9 @@ def _check_motion(signals: Mapping[str, Signal], robot: Robot) -> None:
         if name in signals and np.ptp(signals[name].value) > 0.1:
             still = False
     if still:
-        raise InputError("expected a robot that moves; found nothing that moves more than its noise")
+        raise InputError(
+            "expected a robot that moves; found nothing that moves more than its noise"
+        )
 
 
 def _length(robot: Robot) -> float:

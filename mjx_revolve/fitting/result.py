@@ -1,4 +1,4 @@
-"""What a fit has found: values with intervals, what stays unknown, predictions beside recordings."""
+"""What a fit has found: values with intervals, what is unknown, and predictions."""
 
 from __future__ import annotations
 
@@ -151,7 +151,11 @@ class Fit:
             words = f"{v.low:.4g} to {v.high:.4g} ({LEVEL:.0%})" if v.found else "NOT FOUND"
             lines.append(f"# {v.name} {v.value:.4g} {v.unit}: {words}")
         lines += [f"# {u.words}." for u in self.unknown]
-        return "\n".join(lines) + "\n" + yaml.safe_dump({"modules": self.coefficients}, sort_keys=False)
+        return (
+            "\n".join(lines)
+            + "\n"
+            + yaml.safe_dump({"modules": self.coefficients}, sort_keys=False)
+        )
 
     def to_json(self) -> str:
         """All numbers, for other programs."""
@@ -270,8 +274,8 @@ def _predict(problem: Problem, state: State) -> tuple[Prediction, ...]:
             off = left[k]
             if channel.kind == "speed":
                 mean = float(np.mean(recording.signals["mean_speed"].value))
-                both = [np.stack([mean * np.exp(off[v]), *2 * [np.full_like(off[v], np.nan)]], -1)[:, 0]
-                        for v in range(2)]  # fmt: skip
+                none = np.full_like(off, np.nan)
+                both = list(np.concatenate([mean * np.exp(off), none, none], -1))
                 seen = np.tile([mean, np.nan, np.nan], (len(channel.time), 1))
             else:
                 # The middle of the marks that are seen.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ from mjx_revolve.inputs.schema import read
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.numerics import runtime
-from mjx_revolve.water.world import World, load_world, read_world_files
+from mjx_revolve.water.world import load_world, read_world_files
 
 _FILES = "robot.yaml", "modules.yaml", "recordings.npz"
 
@@ -207,8 +206,9 @@ class FitRun:
         self.folder.rewind(checkpoint)
         self.problem.roots[:] = arrays["roots"]
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
-        self.state = State(point, meta["noise"], arrays["damping"], meta["common"],
-                           meta["generation"], meta["cost"], meta["moved"], meta["inflated"])  # fmt: skip
+        names = ("common", "generation", "cost", "moved", "inflated")
+        rest = (meta[name] for name in names)
+        self.state = State(point, meta["noise"], arrays["damping"], *rest)
 
     def save(self) -> None:
         """A checkpoint of the state."""

@@ -45,9 +45,7 @@ class Drive:
 
 
 @lru_cache(maxsize=8)
-def _program(
-    variants: Variants, lanes: int, windows: int, steps: int, every: int
-) -> Any:
+def _program(variants: Variants, lanes: int, windows: int, steps: int, every: int) -> Any:
     """The jitted simulation of `lanes` variants of each recording."""
     world = variants.tree.world
 
@@ -68,8 +66,9 @@ def _program(
 
         def record(now: RolloutState, ctrl: Any, water: Water) -> Any:
             root = engine.root(now.state)
-            return jnp.stack([*root.position, *root.quat, *root.velocity, *root.angular_velocity,
-                              *engine.tree.tree_to_joints(now.state.angle, root.position[0])])  # fmt: skip
+            angles = engine.tree.tree_to_joints(now.state.angle, root.position[0])
+            pose = (*root.position, *root.quat)
+            return jnp.stack([*pose, *root.velocity, *root.angular_velocity, *angles])
 
         def window(now: RolloutState, given: Any) -> Any:
             root, reset, ctrl = given

@@ -146,9 +146,7 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
             _LEAST_REYNOLDS,
         )
         slope = jnp.log10(reynolds) ** TODAY["friction_exponent"].value
-        rubbed.append(
-            mul(mul(area, 1 / slope), mul(jnp.abs(x), flow.submerged))
-        )
+        rubbed.append(mul(mul(area, 1 / slope), mul(jnp.abs(x), flow.submerged)))
     force = vadd(force, tuple(-d * x for d, x in zip(rubbed, flow.velocity, strict=True)))
     assert damping is not None
     # What a trailing end sheds.

@@ -1,4 +1,4 @@
-"""The page about a fit: predicted beside recorded motion, values with intervals, what is unknown."""
+"""The page about a fit: predicted beside recorded motion, values, intervals."""
 
 from __future__ import annotations
 
