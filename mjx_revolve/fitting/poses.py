@@ -107,8 +107,10 @@ def check_marks(
         return
     dims = 2 if planar else 3
     known = np.isfinite(seen[..., :dims]).all(-1, keepdims=True)
-    spread = [np.nanmedian(np.nanstd(np.where(known, p[..., :dims], np.nan), axis=1))
-              for p in (seen, model)]  # fmt: skip
+    spread = []
+    for points in (seen, model):
+        variance = np.nanvar(np.where(known, points[..., :dims], np.nan), axis=1).sum(-1)
+        spread.append(float(np.sqrt(np.nanmedian(variance))))
     ratio = spread[0] / max(spread[1], 1e-9)
     if not 0.8 < ratio < 1.25:
         raise InputError(

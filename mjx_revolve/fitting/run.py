@@ -64,7 +64,7 @@ def read_settings(texts: Sequence[str]) -> tuple[Settings, dict[str, Any], bool]
     trim = given.get("trim", "none")
     if trim not in ("neutral", "none"):
         raise InputError(f"--set trim: expected neutral or none; found {show(trim)}")
-    return read(Settings, own, "--set"), world, trim == "neutral"
+    return read(Settings, own, "settings"), world, trim == "neutral"
 
 
 def load_robot(
