@@ -25,13 +25,13 @@ DOCS = ROOT / "docs"
 PACKAGE = "mjx_revolve"
 # The order in which a user meets the pages; those not named here follow.
 FIRST = (
-    "tutorial", "settings", "evolution", "viewer", "replay", "live", "report", "sweeps", "measures",
-    "interchange", "physics", "parallel",
+    "tutorial", "fit", "settings", "evolution", "viewer", "replay", "live", "report", "sweeps",
+    "measures", "interchange", "physics", "parallel",
 )  # fmt: skip
 # The package's layers in reading order: each imports only from itself and from those before it.
 LAYERS = (
     "inputs", "numerics", "water", "body", "genotypes", "engine", "control", "episodes",
-    "evolution", "formats", "view",
+    "evolution", "formats", "fitting", "view",
 )  # fmt: skip
 
 _DOT = r'((?:</span><span class="o">)?\.(?:</span><span class="n">)?)'

@@ -1,8 +1,8 @@
 """Massively parallel evolution of modular robots under water, in JAX and MuJoCo MJX.
 
 Public names are those of this package and of its subpackages `body`, `water`, `engine`, `control`,
-`episodes`, `evolution`, `genotypes`, `formats` and `view`, each listed in an `__init__.pyi`. The
-modules inside the subpackages are private and may move between releases.
+`episodes`, `evolution`, `genotypes`, `formats`, `fitting` and `view`, each listed in an
+`__init__.pyi`. The modules inside the subpackages are private and may move between releases.
 
 A name is imported when it is first used, so importing the package, or starting one of its command
 lines, loads neither JAX nor MuJoCo.

@@ -23,6 +23,7 @@ COMMANDS = {
     "live": "a running world in a browser, to drop robots into",
     "report": "a page about one run, several, or a sweep",
     "passport": "what a run's champion was tried for, and what it fails",
+    "fit": "the water's coefficients, from recordings of a robot that swam",
     "export": "a champion, or a robot, for MuJoCo, ROS and Gazebo",
     "import": "a robot of a URDF or an MJCF file",
     "schema": "the JSON Schema of a kind of YAML, by which editors complete and underline",

@@ -73,6 +73,11 @@ def test_what_the_text_refers_to_exists():
 def desk(tmp_path_factory):
     """A folder in which everything was done, and what was printed: (folder, [(block, output)])."""
     folder = tmp_path_factory.mktemp("tutorial")
+    return folder, follow(BLOCKS, folder)
+
+
+def follow(blocks, folder):
+    """Does all that blocks say in a folder; what was printed, [(block, output)]."""
     python = folder / ".venv" / "bin" / "python"
     python.parent.mkdir(parents=True)
     python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
@@ -87,7 +92,7 @@ def desk(tmp_path_factory):
         return done.stdout
 
     output = ""
-    for block in BLOCKS:
+    for block in blocks:
         if block.path:
             path = folder / block.path
             path.parent.mkdir(exist_ok=True)
@@ -98,7 +103,7 @@ def desk(tmp_path_factory):
             printed.append((block, output))
         else:
             output = "".join(run(["/bin/sh", "-c", line]) for line in block.body.splitlines())
-    return folder, printed
+    return printed
 
 
 @pytest.mark.slow

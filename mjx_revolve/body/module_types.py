@@ -35,7 +35,7 @@ from mjx_revolve.inputs.schema import (
     show,
     words,
 )
-from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag, PerAxis
+from mjx_revolve.water.law_names import BuoyancyName, Coefficients, Factors, PartDrag, PerAxis
 from mjx_revolve.water.plates import CUBE_DRAG
 from mjx_revolve.water.plates import Fossen as Fossen
 from mjx_revolve.water.plates import LiftDrag as LiftDrag
@@ -85,6 +85,8 @@ class Part:
         coefficients: of laws, by name; by default the world's.
         drag_coefficient: of a face that meets the flow, or three, across the part's axes [-].
         added_mass_coefficient: multiplies the main box's added mass; or three, along its axes [-].
+        factors: on coefficients of laws, by name, on LAW.FIELD of laws with parameters, and on all
+            that laws vary as `drag` or as `added_mass`; in place of those of robots that swam.
         contact: whether it touches the bed.
         buoyancy: name of a buoyancy law; by default the world's choice. What a world switches off
             stays off, here and below.
@@ -115,6 +117,7 @@ class Part:
     coefficients: Coefficients = ()
     drag_coefficient: Annotated[PerAxis, Unit("-")] = CUBE_DRAG
     added_mass_coefficient: Annotated[PerAxis, Unit("-")] = 1.0
+    factors: Factors = ()
     contact: Boolean = True
     buoyancy: BuoyancyName | None = None
     drag: PartDrag | None = None

@@ -1,7 +1,8 @@
 """Bodies read: from Revolve's YAML, or from a mapping like it, checked and laid out at rest.
 
 A morphology file is Revolve's YAML: `id`, `body` (a tree of modules, each with `id`, `type`,
-`orientation`, `params` and `children` by slot) and `brain`; and `sensors`, which Revolve has not.
+`orientation`, `params` and `children` by slot) and `brain`; and `sensors` and `coefficients` (the
+path of a file of what was fitted, relative to the morphology's), which Revolve has not.
 """
 
 from __future__ import annotations
@@ -14,16 +15,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from annotated_types import Unit
+from annotated_types import MinLen, Unit
 
 from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.coefficients import correct_modules, load_coefficients
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, read_number
 from mjx_revolve.body.placement import Module, attach, check_overlaps, check_rigid, frozen
 from mjx_revolve.body.sensors import Sensor, SensorRow
 from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
 from mjx_revolve.inputs.errors import InputError, note, show
-from mjx_revolve.inputs.schema import Positive, read, words
+from mjx_revolve.inputs.schema import Positive, Text, read, words
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
@@ -42,6 +44,7 @@ MAX_MODULES = 1000
 # Names that the MuJoCo model keeps for itself.
 RESERVED = ("world", "root")
 
+_File = Annotated[Text, MinLen(1), words("the path of a file of coefficients")]
 _Children = Annotated[dict[Any, Any], words("a mapping from slots to modules")]
 _MODULE_KEYS = ("id", "type", "slot", "orientation", "params", "children")
 
@@ -105,6 +108,9 @@ def make_morphology(
     - `drag_coefficient`, `added_mass_coefficient` (a number, or three along the part's axes),
       `entrained_water` (share of the box's free volume, 0 to 1) of every part [-];
     - `coefficients`: a mapping of coefficients of laws that have no key of their own;
+    - `factors`: a mapping of factors on any coefficient of a law, on `drag` or `added_mass` as a
+      whole, and on `mass`, `thrust`, `servo_speed` and `servo_effort`: what was fitted to a robot
+      that swam (`docs/fit.md`);
     - `buoyancy`, `drag` (a law's name or `off`) and `added_mass` (true or false): the module's own
       choice where the world's does not suit it;
     - `lift_drag`: a mapping with fields of `LiftDrag`, such as `{cla: 2.0}`; it changes a fin and
@@ -115,7 +121,8 @@ def make_morphology(
       left-handed propeller; `thrust` [N] at its highest command, which scales its curve.
 
     Args:
-        mapping: `id`, `body`, `sensors` and `brain`, or a body's tree of modules alone; copied.
+        mapping: `id`, `body`, `sensors`, `brain` and `coefficients`, or a body's tree of modules
+            alone; copied.
         modules: the types of modules by name and alias.
         allow_overlap: make a robot whose modules overlap at rest; `overlaps` then names them.
         name: of the robot, where the mapping has no `id`.
@@ -141,10 +148,14 @@ def _make(
         raise InputError(
             f"{source}: expected a mapping with id, body and brain; found {show(data)}"
         )
-    _check_known(data, ("id", "body", "sensors", "brain"), source)
+    _check_known(data, ("id", "body", "sensors", "brain", "coefficients"), source)
     if "body" not in data:
         raise InputError(f"{source}: expected the key body; found {show(list(data))}")
     tree = _read_tree(data["body"], modules, source)
+    if (named := data.get("coefficients")) is not None:
+        named = read(_File, named, f"{source}: coefficients")
+        place = Path(source).parent / named
+        tree = correct_modules(tree, load_coefficients(place), str(place))
     check_rigid(tree, f"{source}: body")
     return Morphology(
         name=_read_id(data.get("id"), f"{source}: id") or name,

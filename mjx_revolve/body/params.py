@@ -14,13 +14,14 @@ from typing import Annotated, Any
 from annotated_types import MinLen, Unit
 from pydantic import AfterValidator, BeforeValidator
 
-from mjx_revolve.body.module_types import ModuleType
+from mjx_revolve.body.module_types import ModuleType, Part
 from mjx_revolve.body.tree import COLORS
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import (
     Boolean,
     NonNegative,
     Number,
+    Positive,
     Share,
     Text,
     Triple,
@@ -28,7 +29,7 @@ from mjx_revolve.inputs.schema import (
     read,
     words,
 )
-from mjx_revolve.water.law_names import BuoyancyName, Coefficients, PartDrag, PerAxis
+from mjx_revolve.water.law_names import BuoyancyName, Coefficients, Factors, PartDrag, PerAxis
 from mjx_revolve.water.plates import Fossen, LiftDrag
 from mjx_revolve.water.propellers import Thruster
 
@@ -51,6 +52,23 @@ _Amount = Annotated[NonNegative, _Loose]
 _Place = Annotated[Triple[Annotated[Number, _Loose]], AfterValidator(list), Unit("m")]
 # Its values are checked where they are applied.
 _Some = Annotated[dict[Text, Any], MinLen(1), words("a mapping with any of its fields")]
+
+MODULE_FACTORS = {"mass": 1.05, "thrust": 1.3, "servo_speed": 1.1, "servo_effort": 1.3}
+"""Factors on what is no water's, with `Coefficient.spread`; a choice, but for the servos' speed
+(`docs/sensitivity.md`)."""
+
+
+def _read_factors(value: Any) -> Any:
+    """Those of modules, as numbers; the others stay for `Factors`."""
+    if not isinstance(value, dict):
+        return read(_Some, value)
+    water = {key: x for key, x in value.items() if key not in MODULE_FACTORS}
+    own = {key: x for key, x in value.items() if key in MODULE_FACTORS}
+    found = {key: read(Positive, read_number(x), key) for key, x in own.items()}
+    water = dict(read(Factors, water))
+    return found | {k: list(x) if isinstance(x, tuple) else x for k, x in water.items()}
+
+
 # What every part takes over as it is.
 _PLAIN: dict[str, Any] = {
     "drag_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
@@ -71,6 +89,7 @@ _OVERRIDES: dict[str, Any] = _PLAIN | {
     "ballast_position": _Place,
     "center_of_volume": _Place,
     "thrust": Annotated[_Amount, Unit("N")],
+    "factors": Annotated[Any, BeforeValidator(_read_factors)],
     "lift_drag": _Some,
     "fossen": _Some,
     "thruster": _Some,
@@ -171,7 +190,37 @@ def apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
             if part.thruster is not None:
                 change["thruster"] = _change_thruster(part.thruster, params)
     changed = [replace(part, **change) for part, change in zip(parts, changes, strict=True)]
-    return replace(kind, parts=tuple(changed))
+    kind = replace(kind, parts=tuple(changed))
+    return _multiply(kind, params["factors"]) if params.get("factors") else kind
+
+
+def _multiply(kind: ModuleType, factors: Mapping[str, Any]) -> ModuleType:
+    """The type with factors on its numbers; those that it has none of do nothing."""
+    water = {name: factor for name, factor in factors.items() if name not in MODULE_FACTORS}
+    mass, thrust, speed, effort = (factors.get(name, 1.0) for name in MODULE_FACTORS)
+
+    def part(one: Part) -> Part:
+        before = dict(one.factors)
+        both = {k: multiply_factors(f, before.get(k, 1.0)) for k, f in water.items()}
+        return replace(
+            one,
+            factors=tuple((before | both).items()),
+            mass=mass * one.mass,
+            ballast_mass=mass * one.ballast_mass,
+            thruster=one.thruster and one.thruster.scaled(thrust),
+        )
+
+    hinge = kind.hinge
+    if hinge is not None:
+        hinge = replace(hinge, speed=speed * hinge.speed, effort=effort * hinge.effort)
+    return replace(kind, parts=tuple(map(part, kind.parts)), hinge=hinge)
+
+
+def multiply_factors(one: Any, other: Any) -> Any:
+    """The product of two factors, each a number or three along axes."""
+    wide = [x if isinstance(x, tuple | list) else [x] * 3 for x in (one, other)]
+    found = [a * b for a, b in zip(*wide, strict=True)]
+    return found if isinstance(one, tuple | list) or isinstance(other, tuple | list) else found[0]
 
 
 def _change_thruster(thruster: Thruster, params: Mapping[str, Any]) -> Thruster:

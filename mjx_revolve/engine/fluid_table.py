@@ -8,7 +8,7 @@ Where a part makes no choice of its own, the world's holds.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,7 @@ class FluidTable:
         drag: names of the drag laws.
         coefficients: `[npart]` each, or `[npart, 3]`: every coefficient of the laws, by name.
         parameters: `[npart]` each: the parameters of laws that have a class of them.
+        factors: `[npart]` each: the parts' own factors on what laws vary, by name.
         added_mass: of the envelope's exposed faces, or as stated, per unit density, part frame
             [m³].
         added_inertia: the same about the axes [m⁵].
@@ -82,6 +83,7 @@ class FluidTable:
     drag: tuple[str, ...]
     coefficients: Mapping[str, Float[np.ndarray, "npart ..."]]
     parameters: Mapping[str, tuple[Any, ...]]
+    factors: Mapping[str, Float[np.ndarray, " npart"]]
     added_mass: Float[np.ndarray, "npart 3"]
     added_inertia: Float[np.ndarray, "npart 3"]
     carried_mass: Float[np.ndarray, "npart 3"]
@@ -120,6 +122,15 @@ def drag_law(part: Part, world: World) -> str:
     return "lift_drag" if part.lift_drag is not None else world.drag
 
 
+def _scaled(parameters: Any, part: Part) -> Any:
+    """Parameters of a law times a part's factors on them, which are called LAW.FIELD."""
+    law = next(name for name, law in DRAG_LAWS.items() if law.parameters is type(parameters))
+    own = {k.partition(".")[2]: f for k, f in part.factors if k.startswith(f"{law}.")}
+    if not own:
+        return parameters
+    return replace(parameters, **{name: getattr(parameters, name) * f for name, f in own.items()})
+
+
 def make_fluid_table(
     layout: RestPose,
     body: Int[np.ndarray, " npart"],
@@ -144,10 +155,14 @@ def make_fluid_table(
         return tuple(values[k] for k in kind.tolist())
 
     def given(part: Part, c: Coefficient) -> Any:
+        factor = dict(part.factors).get(c.name, 1.0)
         if c.own_field:
             value = getattr(part, c.name)
-            return np.broadcast_to(value, 3) if c.per_axis else value
-        return dict(part.coefficients).get(c.name, dict(world.coefficients).get(c.name, c.default))
+        else:
+            usual = dict(world.coefficients).get(c.name, c.default)
+            value = dict(part.coefficients).get(c.name, usual)
+        value = np.minimum(np.multiply(value, factor), c.high)
+        return np.broadcast_to(value, 3) if c.per_axis else value
 
     half = np.array([p.boxes[0].size for p in parts]) / 2
     mass, inertia = box_added_mass(half)
@@ -163,9 +178,16 @@ def make_fluid_table(
     stated = np.array([p.fossen is not None for p in parts])[kind]
     known = np.array([_NOTHING if p.fossen is None else p.fossen.added_mass for p in parts])[kind]
     known = known / (world.density or np.inf)
+    factors = {
+        name: np.array([dict(p.factors).get(name, 1.0) for p in parts])[kind]
+        for name in ("drag", "added_mass")
+        if any(name in dict(p.factors) for p in parts)
+    }
+    more = factors.get("added_mass", np.ones(len(kind)))[:, None]
+    known = known * more[..., None]
     diagonal = np.einsum("pii->pi", known)
-    added_mass = np.where(stated[:, None], diagonal[:, :3], added_mass)
-    added_inertia = np.where(stated[:, None], diagonal[:, 3:], added_inertia)
+    added_mass = np.where(stated[:, None], diagonal[:, :3], more * added_mass)
+    added_inertia = np.where(stated[:, None], diagonal[:, 3:], more * added_inertia)
     # Where the core states the water of all of its robot, other parts have none.
     whole = np.array([p.fossen is not None and p.fossen.whole for p in parts])[kind]
     replaced = np.isin(layout.body, layout.body[whole]) & ~whole
@@ -196,14 +218,18 @@ def make_fluid_table(
         coefficients={name: x[kind] for name, x in coefficients.items()},
         parameters={
             name: each(
-                [getattr(p, name) or getattr(world, name, None) or law.parameters() for p in parts]
+                [
+                    _scaled(getattr(p, name) or getattr(world, name, None) or law.parameters(), p)
+                    for p in parts
+                ]
             )
             for name, law in DRAG_LAWS.items()
             if law.parameters is not None
         },
+        factors=factors,
         added_mass=added_mass,
         added_inertia=added_inertia,
-        carried_mass=on[kind] * added_mass + own * inside[0][kind],
-        carried_inertia=on[kind] * added_inertia + own * inside[1][kind],
+        carried_mass=on[kind] * added_mass + own * more * inside[0][kind],
+        carried_inertia=on[kind] * added_inertia + own * more * inside[1][kind],
         coupling=on[kind][:, None] * (known - diagonal[:, None] * np.eye(6)),
     )

@@ -33,7 +33,13 @@ from mjx_revolve.numerics.spatial import SYM, clean
 from mjx_revolve.water.added_mass import CarriedWater
 from mjx_revolve.water.buoyancy import find_buoyancy_law
 from mjx_revolve.water.drag import find_drag_law
-from mjx_revolve.water.laws import BodyDragLaw, PartDragLaw, PartField, map_fields
+from mjx_revolve.water.laws import (
+    BodyDragLaw,
+    PartDragLaw,
+    PartField,
+    map_fields,
+    part_numbers,
+)
 
 # Stiffness of a joint's end stop, as full effort per this overshoot [rad]. A choice: stiff enough
 # to keep within half a degree of the real range; the step treats it implicitly, so it is stable.
@@ -318,7 +324,7 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
         bulk=8 * table.half_size.prod(-1) if whole else None,
         exposed=table.exposed if world.surface_tension else None,
         drag={
-            name: law.numbers(table, world)
+            name: part_numbers(law, table, world)
             for name, law in laws.items()
             if isinstance(law, PartDragLaw)
         },

@@ -362,6 +362,8 @@ class Config(Settings):
     """The robot: a morphology YAML; none where bodies evolve."""
     modules: Annotated[_Modules | None, File("modules")] = None
     """The user's own module types: a YAML, or None."""
+    coefficients: Annotated[_Modules | None, File("modules")] = None
+    """What was fitted to a robot that swam, by types of modules: a YAML, or None."""
     allow_overlap: bool = False
     """Whether modules may overlap."""
     trim: Literal["neutral", "none"] = "none"

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
+from mjx_revolve.body.coefficients import correct_types, load_coefficients
 from mjx_revolve.body.edits import add_module, replace_module
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
@@ -633,7 +634,10 @@ def _diagonal(kind: ModuleType) -> float:
 
 def read_modules(config: Config) -> Mapping[str, ModuleType]:
     """All types of modules of a configuration, by name and alias."""
-    return MODULES | load_modules(config.modules) if config.modules else MODULES
+    modules = MODULES | load_modules(config.modules) if config.modules else MODULES
+    if config.coefficients is None:
+        return modules
+    return correct_types(modules, load_coefficients(config.coefficients), config.coefficients)
 
 
 def _read(config: Any, overrides: dict[str, Any]) -> Config:

@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mjx_revolve.body.coefficients import read_morphology_files
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import read_file, resolve_inside
 from mjx_revolve.inputs.schema import ConstraintError
@@ -68,6 +69,8 @@ class NamedFile(NamedTuple):
         """
         if self.kind == "world":
             return read_world_files(self.path)
+        if self.kind == "morphology":
+            return read_morphology_files(self.path)
         content = read_file(self.path)
         if self.kind == "data":  # others are audited where they are used
             audit(self.path, "data", content)

@@ -95,7 +95,7 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
         del data["bodies"]["max_of"]
     if data["bodies"] is not None and data["bodies"]["selection"]["passport"] == "made":
         del data["bodies"]["selection"]["passport"]  # older runs lack it
-    for name in ("colony", "bodies"):
+    for name in ("colony", "bodies", "coefficients"):
         if data[name] is None:
             del data[name]
     return hash_text(_dump(data))

@@ -336,6 +336,28 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
         InputError: the folder holds something.
         OSError: it cannot be written.
     """
+    settings, copies = copy_files(config.model_dump(), Config)
+    folder = Path(folder).absolute()
+    places = {name: folder / name for name in copies}
+    config = make_config(locate_files(settings, places), source=config.source)
+    return begin_run_folder(folder, _config_text(config, folder), copies, **info), config
+
+
+def begin_run_folder(
+    folder: str | Path, config: bytes, copies: Mapping[str, bytes], **info: Any
+) -> RunFolder:
+    """Makes a run folder of any kind: `create_run_folder`, and fits of coefficients.
+
+    Args:
+        folder: a new or empty folder.
+        config: the text of `config.yaml`.
+        copies: of the files that it names, by paths relative to the folder.
+        **info: entries for `run.json`.
+
+    Raises:
+        InputError: the folder holds something.
+        OSError: it cannot be written.
+    """
     check_new_folder(folder)
     folder = Path(folder).absolute()
     try:
@@ -345,16 +367,13 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
         (folder / "checkpoints").mkdir(exist_ok=True)
     except OSError as error:
         raise with_path(error, folder) from None
-    settings, copies = copy_files(config.model_dump(), Config)
     for name, content in copies.items():
         write_atomic(folder / name, content)
-    places = {name: folder / name for name in copies}
-    config = make_config(locate_files(settings, places), source=config.source)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in copies.items()}
     write_atomic(folder / "run.json", _info_text(info | {"inputs": hashes}))
     # Last: where it is, the run can be continued.
-    write_atomic(folder / "config.yaml", _config_text(config, folder))
-    return run, config
+    write_atomic(folder / "config.yaml", config)
+    return run
 
 
 def open_run_folder(folder: str | Path) -> RunFolder:

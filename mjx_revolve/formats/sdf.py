@@ -37,6 +37,7 @@ from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.buoyancy import find_buoyancy_law
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.face_drag import FACES, FaceNumbers
+from mjx_revolve.water.laws import part_numbers
 from mjx_revolve.water.lift_drag import LIFT_DRAG, PlateNumbers
 from mjx_revolve.water.thrusters import thrust
 
@@ -288,7 +289,7 @@ def _forces(robot: Robot, link: Link) -> Iterator[Element]:
 
 def _face_drag(robot: Robot, part: PlacedPart) -> Element:
     """Drag of the faces."""
-    numbers: FaceNumbers = FACES.numbers(robot.fluid, robot.world)
+    numbers: FaceNumbers = part_numbers(FACES, robot.fluid, robot.world)
     return _damping(robot, part, [*numbers.linear[part.row], *numbers.angular[part.row]])
 
 
@@ -317,7 +318,7 @@ def _damping(
 
 
 def _lift_drag(robot: Robot, part: PlacedPart) -> Element:
-    numbers: PlateNumbers = LIFT_DRAG.numbers(robot.fluid, robot.world)
+    numbers: PlateNumbers = part_numbers(LIFT_DRAG, robot.fluid, robot.world)
     plate = jax.tree.map(lambda x: x[part.row], numbers)
     names = ("a0", "cla", "cda", "cma", "alpha_stall", "cla_stall", "cda_stall", "cma_stall")
     return _plugin(

@@ -25,6 +25,7 @@ COEFFICIENTS = (
         1.0,
         own_field=True,
         per_axis=True,
+        spread=1.35,
     ),
     Coefficient(
         "entrained_water",

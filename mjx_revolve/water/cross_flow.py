@@ -31,6 +31,7 @@ from mjx_revolve.numerics.spatial import Vec, add, cross, dot, mul, total, vadd,
 from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.face_drag import FACES, face_drag_coefficients
 from mjx_revolve.water.laws import (
+    Coefficient,
     Drag,
     Export,
     PartDragLaw,
@@ -63,7 +64,7 @@ class CrossFlowNumbers:
         angular: what stays with the faces, against turning about each axis [kg·m²].
         mixing: c, at the place of the chain's axis, else 0 [-].
         reach: c times half of the length along that axis, else 0 [m].
-        friction: ρ ½ S of the side faces, at that axis, else 0 [kg/m].
+        friction: ρ ½ a S of the side faces, at that axis, else 0 [kg/m].
         length: along that axis [m].
         shed: c_m (π/4) ρ h² across the end of a row, along each axis [kg/m].
         end: place of that end [m].
@@ -112,7 +113,7 @@ def _numbers(parts: PartShapes, world: World) -> CrossFlowNumbers:
         angular=world.density * (turning[0] + left * turning[1]),
         mixing=along * share,
         reach=along * share * size / 2,
-        friction=world.density / 2 * along * share * wet,
+        friction=world.density / 2 * along * share * wet * parts.coefficients["friction"][:, None],
         length=length,
         shed=share * np.abs(ends).sum(-1, keepdims=True) * shed,
         end=ends * size / 2,
@@ -145,9 +146,7 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
             _LEAST_REYNOLDS,
         )
         slope = jnp.log10(reynolds) ** TODAY["friction_exponent"].value
-        rubbed.append(
-            mul(mul(area, TODAY["friction"].value / slope), mul(jnp.abs(x), flow.submerged))
-        )
+        rubbed.append(mul(mul(area, 1 / slope), mul(jnp.abs(x), flow.submerged)))
     force = vadd(force, tuple(-d * x for d, x in zip(rubbed, flow.velocity, strict=True)))
     assert damping is not None
     # What a trailing end sheds.
@@ -175,6 +174,15 @@ CROSS_FLOW = PartDragLaw(
     summary="drag across chains of parts, friction, wakes of their ends; of a lone part faces'",
     explicit=False,
     varied=True,
+    coefficients=(
+        Coefficient(
+            "friction",
+            "-",
+            "a in C_f = a / (log10 Re)^2.58 along chains",
+            TODAY["friction"].value,
+            spread=2.0,
+        ),
+    ),
     numbers=_numbers,
     force=_force,
     angular=lambda numbers: numbers.angular,

@@ -6,6 +6,7 @@ before, so that bodies that name no law are read without JAX.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -107,3 +108,43 @@ Coefficients = Annotated[
     words("a mapping from coefficients of laws to numbers"),
 ]
 """Coefficients of laws by name; what is not given has the law's default."""
+
+
+def factor_names() -> dict[str, tuple[bool, float]]:
+    """What of a part's water factors may multiply: whether along axes, and `Coefficient.spread`.
+
+    All that laws vary as `drag` or `added_mass`, each coefficient, and LAW.FIELD of parameters.
+    """
+    from mjx_revolve.water.drag import DRAG_LAWS
+
+    found = {"drag": (False, 1.5), "added_mass": (False, 1.35)}
+    found |= {c.name: (c.per_axis, c.spread) for _, c in list_coefficients()}
+    for name, law in DRAG_LAWS.items():
+        for field in dataclasses.fields(law.parameters) if law.parameters is not None else ():
+            if isinstance(field.default, float):
+                found[f"{name}.{field.name}"] = (False, 1.5)
+    return found
+
+
+def _read_factors(value: Any) -> Any:
+    """A mapping from names to factors as sorted pairs."""
+    if not value:
+        return ()
+    if not isinstance(value, Mapping | tuple):
+        raise ConstraintError("", "a mapping from coefficients to factors", show(value))
+    given, known = {**dict(value)}, factor_names()
+    for name, factor in given.items():
+        if name not in known:
+            raise ConstraintError("", f"names of coefficients ({', '.join(known)})", show(name))
+        given[name] = _read_per_axis(factor)
+        if isinstance(given[name], tuple) and not known[name][0]:
+            raise ConstraintError(name, "one number >= 0", show(factor))
+    return tuple(sorted(given.items()))
+
+
+Factors = Annotated[
+    tuple[tuple[Text, Any], ...],
+    BeforeValidator(_read_factors),
+    words("a mapping from coefficients of laws to factors"),
+]
+"""Factors on coefficients of laws by name."""

@@ -153,6 +153,8 @@ class Coefficient:
         high: greatest value.
         own_field: whether modules have a field of this name; others stand under `coefficients`.
         per_axis: whether it may be three numbers, one for each axis of a part.
+        spread: by what factor, either way, it is not known (`docs/sensitivity.md`): the standard
+            deviation of its logarithm, where it is fitted.
     """
 
     name: str
@@ -163,6 +165,7 @@ class Coefficient:
     high: float = math.inf
     own_field: bool = False
     per_axis: bool = False
+    spread: float = 1.5
 
     def __post_init__(self) -> None:
         """Checks that it is documented."""
@@ -221,6 +224,10 @@ class PartShapes(Protocol):
     @property
     def parameters(self) -> Mapping[str, tuple[Any, ...]]:
         """`[n]` each: the parameters of laws that have a class of them, by the law's name."""
+
+    @property
+    def factors(self) -> Mapping[str, np.ndarray]:
+        """`[n]` each: the parts' own factors, by the names that `PartField.varied` has."""
 
 
 class PartFlow(NamedTuple):
@@ -300,6 +307,18 @@ class PartDragLaw(DragLaw):
     numbers: Callable[[PartShapes, World], Any] = lambda parts, world: NoNumbers()
     force: Callable[[PartFlow, Any, World], Drag] = lambda flow, numbers, world: NO_DRAG
     angular: Callable[[Any], Vec] | None = None
+
+
+def part_numbers(law: PartDragLaw, parts: PartShapes, world: World) -> Any:
+    """The numbers of parts under a law, times the parts' own factors."""
+
+    def scale(field: PartField, x: Any) -> Any:
+        for name in field.varied:
+            if name in parts.factors and isinstance(x, np.ndarray):
+                x = x * parts.factors[name].reshape(-1, *[1] * (x.ndim - 1))
+        return x
+
+    return map_fields(scale, law.numbers(parts, world))
 
 
 @dataclass(frozen=True)

@@ -821,7 +821,7 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
     "text, message",
     [
         ("", "expected a mapping with id, body and brain; found an empty file"),
-        ("body: {type: Core}\nbrian: {}", "expected only id, body, sensors, brain; found 'brian'"),
+        ("body: {type: Core}\nbrian: {}", "brain, coefficients; found 'brian'"),
         ("body:", "body: expected a module (a mapping with a type); found nothing"),
         ("body: {type: Bric}", "body.type: expected one of BlueROV2, Core, CoreComponent; found"),
         (
@@ -950,7 +950,7 @@ def test_wrong_mappings_are_refused(mapping, message):
 
 
 def test_a_tree_without_its_file_around_it_is_no_file(tmp_path):
-    with pytest.raises(InputError, match="expected only id, body, sensors, brain; found 'type'"):
+    with pytest.raises(InputError, match="brain, coefficients; found 'type'"):
         read(tmp_path, "type: Core")
 
 

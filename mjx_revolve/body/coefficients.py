@@ -1,0 +1,122 @@
+"""Coefficients of a robot that swam, in a YAML that morphologies and configurations name.
+
+    modules:
+      all: {factors: {drag: 1.31, added_mass: 0.87}}    # of every module
+      Core: {factors: {drag_coefficient: [1, 0.8, 1]}}  # of a type
+      left_hip: {factors: {servo_speed: 0.9}}           # of one module; in morphologies only
+
+Each entry is a module's `params` (`morphology.make_morphology`); factors of several entries
+multiply. `python -m mjx_revolve.fit` writes such files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mjx_revolve.body.module_types import ModuleType
+from mjx_revolve.body.params import apply_overrides, check_overrides, multiply_factors
+from mjx_revolve.body.placement import Module
+from mjx_revolve.inputs.errors import InputError, reading, show
+from mjx_revolve.inputs.files import read_file
+from mjx_revolve.inputs.yaml_reader import load_yaml
+
+ALL = "all"
+Entries = Mapping[str, Mapping[str, Any]]
+
+
+def load_coefficients(path: str | Path) -> dict[str, dict[str, Any]]:
+    """Reads a file of coefficients.
+
+    Returns:
+        Params by type of module, name of a module, or `all`.
+
+    Raises:
+        InputError: the file is wrong; the message says where.
+    """
+    data = load_yaml(path)
+    with reading(path):
+        entries = data.get("modules") if isinstance(data, dict) else None
+        if not isinstance(data, dict) or set(data) != {"modules"} or not isinstance(entries, dict):
+            raise InputError(f"expected a mapping `modules`; found {show(data)}")
+        for name, params in entries.items():
+            if not isinstance(params, dict):
+                raise InputError(f"modules.{name}: expected a mapping; found {show(params)}")
+        return {str(k): check_overrides(v, f"modules.{k}") for k, v in entries.items()}
+
+
+def correct_types(
+    modules: Mapping[str, ModuleType], entries: Entries, source: str
+) -> dict[str, ModuleType]:
+    """The catalogue with coefficients in its types.
+
+    Raises:
+        InputError: an entry is of no type.
+    """
+    for name in entries:
+        if name != ALL and name not in modules:
+            raise InputError(
+                f"{source}: modules.{name}: expected `all` or a type ({', '.join(modules)}), or "
+                "the file named in a morphology, which has modules by name; found neither"
+            )
+
+    def correct(kind: ModuleType) -> ModuleType:
+        for name in (ALL, kind.name, *kind.aliases):
+            kind = apply_overrides(kind, _suited(entries.get(name, {}), kind))
+        return kind
+
+    return {name: correct(kind) for name, kind in modules.items()}
+
+
+def correct_modules(tree: tuple[Module, ...], entries: Entries, source: str) -> tuple[Module, ...]:
+    """Modules with coefficients, which their `params` keep.
+
+    Raises:
+        InputError: an entry is of no module.
+    """
+    known = {ALL, *(m.type for m in tree), *(m.name for m in tree)}
+    for name in entries:
+        if name not in known:
+            raise InputError(
+                f"{source}: modules.{name}: expected `all`, a type or a module of this robot "
+                f"({', '.join(sorted(known - {ALL}))}); found none of this name"
+            )
+    return tuple(_correct(module, entries) for module in tree)
+
+
+def _correct(module: Module, entries: Entries) -> Module:
+    kind, params = module.kind, dict(module.params)
+    for name in (ALL, module.type, module.name):
+        entry = _suited(entries.get(name, {}), kind)
+        if not entry:
+            continue
+        kind = apply_overrides(kind, entry)
+        before, more = params.get("factors", {}), entry.get("factors", {})
+        params |= entry
+        if before or more:
+            both = {k: multiply_factors(x, before.get(k, 1.0)) for k, x in more.items()}
+            params["factors"] = before | both
+    return replace(module, kind=kind, params=params)
+
+
+def _suited(entry: Mapping[str, Any], kind: ModuleType) -> dict[str, Any]:
+    """An entry without what only thrusters have, where there is none."""
+    thruster = kind.is_thruster
+    return {k: v for k, v in entry.items() if thruster or k not in ("thruster", "thrust")}
+
+
+def read_morphology_files(path: str | Path) -> dict[str, bytes]:
+    """A morphology's file, and the coefficients that it names, by paths relative to its folder.
+
+    Raises:
+        InputError: one cannot be read.
+    """
+    path = Path(path)
+    found = {path.name: read_file(path)}
+    data = load_yaml(path)
+    named = data.get("coefficients") if isinstance(data, dict) else None
+    if isinstance(named, str) and not Path(named).is_absolute() and ".." not in Path(named).parts:
+        found[named] = read_file(path.parent / named)
+    return found

@@ -1,0 +1,423 @@
+"""The search for coefficients, and how sure they are: Levenberg-Marquardt, priors, Fisher's matrix.
+
+Residuals are weighted by the noise that is estimated on the way; single wild frames count less
+(Huber 1964). Windows' beginnings are eliminated one by one (Schur complements), so that cost grows
+with the length of a recording and not with its cube. Intervals are those of the linear model at the
+solution, in logarithms, with the noise's own correlation in time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import t as student
+
+from mjx_revolve.fitting.problem import NOISE, START, Point, Problem
+
+LEVEL = 0.95
+"""Of intervals."""
+# Residuals of more than so many standard deviations count less (Huber's 1.345 for pure noise costs
+# 5 % of the information; frames that a tracker lost lie far beyond 3). A choice.
+_HUBER = 3.0
+# The search ends when a step is below this share of each number's own uncertainty [-].
+_TOLERANCE = 0.02
+# With fewer measurements of a kind, their noise is what is usual: a wrong model would else pass for
+# noise; intervals are widened by what is left (Birge 1932). A choice.
+_FEW = 30
+_LEAST_NOISE = 0.02  # of `NOISE`: no recording is better, and what was simulated has none at all
+_LARGEST_STEP = 1.0  # in a logarithm, or in units of the prior
+
+
+class System(NamedTuple):
+    """Normal equations of P free numbers and G = P + R L common ones, windows eliminated.
+
+    Attributes:
+        matrix: `[G, G]` Fisher's information with the priors of all but the P free numbers.
+        slope: `[G]` minus the gradient.
+        starts: (window, recording, matrix `[12, 12]`, coupling `[12, G]`, slope `[12]`) of each.
+    """
+
+    matrix: np.ndarray
+    slope: np.ndarray
+    starts: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class State:
+    """The search between two steps.
+
+    Attributes:
+        point: where it is.
+        noise: standard deviations by kind of channel, with their correlation.
+        damping: `[K, R]` Marquardt's, of each window's beginning, and
+        common: of all else.
+        iteration: steps done.
+        cost: at the point, with this noise.
+        moved: the last step over what the numbers are uncertain by.
+        inflated: whether the residuals' correlation counts by now: only near the end is it that of
+            noise and of the model, and not of a wrong point.
+    """
+
+    point: Point
+    noise: dict[str, float]
+    damping: np.ndarray
+    common: float = 0.0
+    iteration: int = 0
+    cost: float = np.inf
+    moved: float = np.inf
+    inflated: bool = False
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has arrived."""
+        return self.inflated and self.moved < _TOLERANCE
+
+
+@dataclass(frozen=True)
+class Model:
+    """A problem linearised at a point.
+
+    Attributes:
+        values: `[n, d]` residuals of each channel.
+        slopes: `[n, d, P + L + 12]` their derivatives.
+        track: `[R, K, records, 13 + hinges]`.
+    """
+
+    values: list[np.ndarray]
+    slopes: list[np.ndarray] = field(repr=False)
+    track: np.ndarray = field(repr=False)
+
+
+def linearize(problem: Problem, point: Point) -> Model:
+    """The problem near a point."""
+    return Model(*problem.linearize(point))
+
+
+def costs_of(
+    problem: Problem, point: Point, values: list[np.ndarray], noise: dict[str, float]
+) -> tuple[np.ndarray, float]:
+    """Half the sums of squares, wild ones less: `[K, R]` of windows, and of the priors."""
+    begun = problem.drive.resets[:, None]
+    cost = (np.where(begun, point.starts / problem.start_spread, 0.0) ** 2).sum(1) / 2
+    for channel, left in zip(problem.channels, values, strict=True):
+        z = np.abs(left / noise[channel.kind])
+        z = np.where(np.isfinite(left), np.minimum(z, 1e9), 0.0)
+        z = np.where(z < _HUBER, z**2 / 2, _HUBER * (z - _HUBER / 2)).sum(1) * channel.fitted
+        where = problem.window_of(channel.recording, channel.time)
+        cost[:, channel.recording] += np.bincount(where, z, len(cost))
+    spread = np.array([p.spread for p in problem.parameters])
+    prior = float(((point.free / spread) ** 2).sum()) / 2
+    return cost, prior + float(((point.local / problem.local_spread) ** 2).sum()) / 2
+
+
+def normal_equations(
+    problem: Problem, model: Model, point: Point, noise: dict[str, float]
+) -> System:
+    """Fisher's information of what is fitted, and the gradient."""
+    count, own, recordings = len(problem.parameters), len(problem.local), len(problem.recordings)
+    total = count + own * recordings
+    matrix, slope = np.zeros((total, total)), np.zeros(total)
+    blocks: dict[tuple[int, int], list[np.ndarray]] = {}
+    for k, r in zip(*np.nonzero(problem.drive.resets), strict=True):
+        prior = np.diag(problem.start_spread[k, :, r] ** -2.0)
+        pull = -point.starts[k, :, r] * problem.start_spread[k, :, r] ** -2.0
+        blocks[int(k), int(r)] = [prior, np.zeros((START, total)), pull]
+    for channel, left, slopes in zip(problem.channels, model.values, model.slopes, strict=True):
+        r, sigma = channel.recording, noise[channel.kind]
+        columns = [*range(count), *range(count + r * own, count + (r + 1) * own)]
+        where = problem.window_of(r, channel.time)
+        for k in np.unique(where[channel.fitted]):
+            rows = channel.fitted & (where == k)
+            value = left[rows].ravel()
+            slant = slopes[rows].reshape(len(value), -1)
+            known = np.isfinite(value) & np.isfinite(slant).all(1)
+            z, j = value[known] / sigma, slant[known] / sigma
+            weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(z), 1e-9))
+            common, start = j[:, : count + own], j[:, count + own :]
+            matrix[np.ix_(columns, columns)] += (weight[:, None] * common).T @ common
+            slope[columns] -= (weight * z) @ common
+            block = blocks[int(k), r]
+            block[0] = block[0] + (weight[:, None] * start).T @ start
+            block[1][:, columns] += (weight[:, None] * start).T @ common
+            block[2] = block[2] - (weight * z) @ start
+    for r in range(recordings):
+        rows = np.arange(count + r * own, count + (r + 1) * own)
+        matrix[rows, rows] += problem.local_spread**-2.0
+        slope[rows] -= point.local[r] * problem.local_spread**-2.0
+    starts = []
+    for (k, r), (own_block, coupling, gradient) in blocks.items():
+        solved = np.linalg.solve(own_block, np.column_stack([coupling, gradient]))
+        matrix -= coupling.T @ solved[:, :-1]
+        slope -= coupling.T @ solved[:, -1]
+        starts.append((k, r, own_block, coupling, gradient))
+    return System((matrix + matrix.T) / 2, slope, starts)
+
+
+def prior_matrix(problem: Problem) -> np.ndarray:
+    """`[P, P]` information of the priors of the free numbers."""
+    return np.diag([p.spread**-2.0 for p in problem.parameters])
+
+
+def step(problem: Problem, state: State, system: System) -> tuple[Point, float]:
+    """A damped step, and how far it leads over what the numbers are uncertain by."""
+    count, point = len(problem.parameters), state.point
+    matrix, slope = system.matrix.copy(), system.slope.copy()
+    prior = prior_matrix(problem)
+    matrix[:count, :count] += prior
+    slope[:count] -= prior @ point.free
+    spread = np.sqrt(np.diag(np.linalg.inv(matrix)))
+    damped = matrix + state.common * np.diag(np.diag(matrix))
+    move = np.linalg.solve(damped, slope)
+    limit = max(1.0, float(np.abs(move[:count]).max(initial=0.0)) / _LARGEST_STEP)
+    move = move / limit
+    free = np.array(
+        [p.bound(x) for p, x in zip(problem.parameters, point.free + move[:count], strict=True)]
+    )
+    starts = point.starts.copy()
+    for k, r, block, coupling, pull in system.starts:
+        own = block + state.damping[k, r] * np.diag(np.diag(block))
+        starts[k, :, r] += np.linalg.solve(own, pull - coupling @ move)
+    local = point.local + move[count:].reshape(point.local.shape)
+    return Point(free, local, starts), float(np.abs(move / spread)[:count].max(initial=0.0))
+
+
+def estimate_noise(problem: Problem, values: list[np.ndarray], used: float) -> dict[str, float]:
+    """Standard deviations by kind, robust against wild frames; `used`: numbers fitted."""
+    squares: dict[str, list[np.ndarray]] = {}
+    for channel, left in zip(problem.channels, values, strict=True):
+        squares.setdefault(channel.kind, []).append(left[channel.fitted].ravel())
+    whole = sum(np.isfinite(x).sum() for many in squares.values() for x in many)
+    share = max(1 - used / max(whole, 1), 0.1)
+    found = {}
+    for kind, each in squares.items():
+        x = np.concatenate(each)
+        x = x[np.isfinite(x)]
+        sigma = NOISE[kind]
+        if len(x) >= _FEW:
+            # Clipped where Huber's weights begin, again and again.
+            sigma = float(np.sqrt(np.mean(x**2)))
+            for _ in range(8):
+                sigma = float(np.sqrt(np.mean(np.minimum(x**2, (_HUBER * sigma) ** 2))))
+        found[kind] = max(sigma / np.sqrt(share), _LEAST_NOISE * NOISE[kind])
+    return found
+
+
+def _widened(
+    problem: Problem, values: list[np.ndarray], noise: dict[str, float]
+) -> dict[str, float]:
+    """The noise, of kinds with few measurements at least what is left of them."""
+    found = dict(noise)
+    for kind in noise:
+        pairs = zip(problem.channels, values, strict=True)
+        many = [left[c.fitted].ravel() for c, left in pairs if c.kind == kind]
+        x = np.concatenate(many)
+        x = x[np.isfinite(x)]
+        if 0 < len(x) < _FEW:
+            degrees = max(len(x) - len(problem.parameters), 1)
+            found[kind] = max(noise[kind], float(np.sqrt(np.sum(x**2) / degrees)))
+    return found
+
+
+def numbers_used(problem: Problem, system: System) -> float:
+    """How many numbers the data have determined: the trace of information over information."""
+    count = len(problem.parameters)
+    whole = system.matrix.copy()
+    whole[:count, :count] += prior_matrix(problem)
+    used = float(np.trace(np.linalg.solve(whole[:count, :count], system.matrix[:count, :count])))
+    for k, r, block, _, _ in system.starts:
+        spread = problem.start_spread[k, :, r]
+        used += START - float(np.trace(np.linalg.inv(block) @ np.diag(spread**-2.0)))
+    return used
+
+
+def correlation(problem: Problem, values: list[np.ndarray]) -> dict[str, float]:
+    """By how much the residuals' correlation inflates variances, by kind.
+
+    In time by (1 + ρ) / (1 - ρ) of neighbouring frames; within a frame, as of marks that a wrong
+    turn moves together, by how many fewer independent numbers it has than noise would.
+    """
+    lagged: dict[str, list[tuple[float, float, float]]] = {}
+    crowded: dict[str, list[tuple[float, int]]] = {}
+    for channel, left in zip(problem.channels, values, strict=True):
+        where = problem.window_of(channel.recording, channel.time)
+        whole = left[channel.fitted]
+        whole = np.where(np.isfinite(whole), whole, 0.0)
+        whole = whole[:, np.any(whole != 0, 0)]
+        rows, columns = whole.shape
+        if rows > 1 and columns > 1:
+            square = np.linalg.svd(whole, compute_uv=False) ** 2
+            alone = rows * columns / (rows + columns)
+            crowd = alone * float((square**2).sum() / max(square.sum() ** 2, 1e-30))
+            crowded.setdefault(channel.kind, []).append((crowd, rows))
+        for k in np.unique(where[channel.fitted]):
+            x = left[channel.fitted & (where == k)]
+            a, b = x[:-1].ravel(), x[1:].ravel()
+            known = np.isfinite(a) & np.isfinite(b)
+            square_sum = float(x[np.isfinite(x)] @ x[np.isfinite(x)])
+            both = float(a[known] @ b[known]), square_sum, square_sum * len(x)
+            lagged.setdefault(channel.kind, []).append(both)
+    found = {}
+    for kind, many in lagged.items():
+        product, square_sum, weighted = (sum(x[k] for x in many) for k in range(3))
+        rows = max(weighted / max(square_sum, 1e-30), 4.0)
+        # What is fitted takes some of it away (Marriott and Pope 1954).
+        rho = (product / max(square_sum, 1e-30) + 1 / rows) / (1 - 3 / rows)
+        rho = min(max(rho, 0.0), 0.95)
+        crowd = 1.0
+        if kind in crowded:
+            crowd = sum(c * n for c, n in crowded[kind]) / sum(n for _, n in crowded[kind])
+        found[kind] = (1 + rho) / (1 - rho) * max(crowd, 1.0)
+    return found
+
+
+def begin(problem: Problem, seed: int) -> State:
+    """The first state: the best of some draws of the prior and, where unknown, of headings."""
+    origin = problem.origin()
+    noise = {channel.kind: NOISE[channel.kind] for channel in problem.channels}
+    draw = np.random.default_rng(seed)
+    spread = np.array([p.spread for p in problem.parameters])
+    points = [origin]
+    room = problem.lanes - 1
+    if problem.free_heading.any():
+        for k in range(1, room + 1):
+            starts = origin.starts.copy()
+            starts[:, 5, problem.free_heading] = 2 * np.pi * k / (room + 1)
+            points.append(replace(origin, starts=starts))
+    else:
+        wanted = min(room, problem.settings.draws * room)
+        points += [
+            replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)
+        ]
+    none = np.zeros(problem.drive.resets.shape)
+    if len(points) == 1:
+        return State(origin, noise, none)
+    costs = _costs(problem, points, noise)
+    best = origin
+    if problem.free_heading.any():
+        starts = origin.starts.copy()
+        for r in range(len(problem.recordings)):
+            starts[..., r] = points[int(np.argmin(costs[:, r]))].starts[..., r]
+        # It is where the prior of the heading lies from here on.
+        problem.roots[:] = _turned(problem.roots, starts[:, 5])
+    else:
+        best = points[int(np.argmin(costs.sum(1)))]
+    return State(best, noise, none)
+
+
+def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """States with the core turned about z [rad]."""
+    found, (c, s) = roots.copy(), (np.cos(turn / 2), np.sin(turn / 2))
+    w, x, y, z = (roots[:, 3 + k] for k in range(4))
+    found[:, 3:7] = np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], 1)
+    return found
+
+
+def _costs(problem: Problem, points: list[Point], noise: dict[str, float]) -> np.ndarray:
+    """`[points, R]` sums of squares, wild ones less."""
+    tracks = problem.simulate(points)
+    found = np.zeros((len(points), len(problem.recordings)))
+    for channel, left in zip(problem.channels, problem.residuals(tracks), strict=True):
+        z = np.abs(left[:, channel.fitted] / noise[channel.kind])
+        z = np.where(np.isfinite(z), z, 0.0)
+        bent = np.where(z < 30, z**2 / 2, 30 * (z - 15))
+        found[:, channel.recording] += bent.sum((1, 2))
+    return found
+
+
+def advance(problem: Problem, state: State, model: Model) -> tuple[State, Model]:
+    """One step of the search; the damping grows until a step lowers the cost."""
+    if not state.inflated and state.moved < _TOLERANCE:
+        state = replace(state, inflated=True, damping=0 * state.damping, common=0.0)
+    system = normal_equations(problem, model, state.point, state.noise)
+    plain = estimate_noise(problem, model.values, numbers_used(problem, system))
+    # What errs together counts once: the prior then holds where the model errs, and not the frames.
+    inflation = correlation(problem, model.values) if state.inflated else {}
+    noise = {
+        kind: sigma * float(np.sqrt(inflation.get(kind, 1.0))) for kind, sigma in plain.items()
+    }
+    system = normal_equations(problem, model, state.point, noise)
+    windows, prior = costs_of(problem, state.point, model.values, noise)
+    now = float(windows.sum()) + prior
+    state = replace(state, noise=noise, cost=now)
+    for _ in range(8):
+        point, moved = step(problem, state, system)
+        tried = linearize(problem, point)
+        others, prior = costs_of(problem, point, tried.values, noise)
+        cost = float(others.sum()) + prior
+        better = others <= windows + 1.0
+        eased = np.where(state.damping > 1e-3, state.damping / 10, 0.0)
+        damping = np.where(better, eased, np.maximum(10 * state.damping, 1e-1))
+        if cost <= now + 1e-6 * abs(now):
+            common = state.common / 10 if state.common > 1e-3 else 0.0
+            return replace(state, point=point, damping=damping, common=common, cost=cost,
+                           iteration=state.iteration + 1, moved=moved), tried  # fmt: skip
+        if moved < _TOLERANCE:
+            break
+        common = 10 * state.common if state.common else 1e-2
+        state = replace(state, damping=damping, common=common)
+    return replace(state, iteration=state.iteration + 1, moved=0.0), model
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a fit has found.
+
+    Attributes:
+        offsets: `[P]` of the free numbers from the priors' medians.
+        covariance: `[P, P]` of them.
+        information: `[P, P]` what the data alone say, windows' and recordings' own numbers unknown.
+        quantile: standard deviations from an interval's middle to its end.
+        local: `[R, L]`, and
+        local_spread: `[R, L]` their standard deviations.
+        noise: standard deviations by kind.
+        inflation: of variances, by correlation in time, by kind.
+    """
+
+    offsets: np.ndarray
+    covariance: np.ndarray
+    information: np.ndarray
+    quantile: float
+    local: np.ndarray
+    local_spread: np.ndarray
+    noise: dict[str, float]
+    inflation: dict[str, float]
+
+    def interval(self, problem: Problem, k: int) -> tuple[float, float, float]:
+        """Value, lower and upper end of a free number."""
+        parameter, half = problem.parameters[k], self.quantile * np.sqrt(self.covariance[k, k])
+        low, middle, high = (parameter.value(self.offsets[k] + x) for x in (-half, 0.0, half))
+        return middle, low, high
+
+
+def estimate(problem: Problem, state: State, model: Model) -> Estimate:
+    """Values and their covariance at the end of a search."""
+    count = len(problem.parameters)
+    inflation = correlation(problem, model.values)
+    noise = _widened(problem, model.values, state.noise)
+    system = normal_equations(problem, model, state.point, noise)
+    whole = system.matrix.copy()
+    whole[:count, :count] += prior_matrix(problem)
+    covariance = np.linalg.inv(whole)
+    rest = system.matrix[count:, count:]
+    across = system.matrix[:count, count:]
+    alone = system.matrix[:count, :count]
+    if len(rest):
+        alone = alone - across @ np.linalg.solve(rest, across.T)
+    rows = sum(
+        np.isfinite(left[channel.fitted]).sum() / inflation[channel.kind]
+        for channel, left in zip(problem.channels, model.values, strict=True)
+    )
+    # Few data say little of their own noise; the priors bound what that can do.
+    degrees = max(float(rows) - numbers_used(problem, system), 4.0)
+    return Estimate(
+        state.point.free,
+        covariance[:count, :count],
+        (alone + alone.T) / 2,
+        float(student.ppf((1 + LEVEL) / 2, degrees)),
+        state.point.local,
+        np.sqrt(np.diag(covariance)[count:]).reshape(state.point.local.shape),
+        {kind: sigma / np.sqrt(inflation[kind]) for kind, sigma in state.noise.items()},
+        inflation,
+    )

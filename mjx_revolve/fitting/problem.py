@@ -1,0 +1,648 @@
+"""A fit as least squares: recordings cut into windows, what is simulated of them, what is left.
+
+Multiple shooting (Bock 1983): each window begins where smoothing found the core, plus corrections
+that are free, so that neither drift nor chaos outlives a window.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+from scipy.spatial.transform import Rotation
+
+from mjx_revolve.engine.plant import body_geometry
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.variants import Variants, course_targets, make_variants
+from mjx_revolve.fitting.parameters import (
+    LOCAL_SPREAD,
+    RECORDING,
+    Parameter,
+    read_free,
+    split_free,
+    with_values,
+)
+from mjx_revolve.fitting.poses import MarkPoints, check_marks, fit_rigid, rest_height, smooth
+from mjx_revolve.fitting.recording import Recording
+from mjx_revolve.fitting.simulation import ROOT, Drive, simulate_windows
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.schema import Integer, Number, checked
+
+# Records lie no further apart [s]: interpolation is then good to a millimetre and a tenth of a
+# degree.
+_RECORD = 0.01
+# Steps of the differences by which derivatives are found; in float64 they cost four digits of 16.
+_STEP = 1e-4
+_CLOCK_STEP = 1e-3
+START = 12
+"""Corrections of a start: position, rotation (body), velocity, angular velocity (body)."""
+# Standard deviations of where a window begins: more than smoothing can be wrong by, [m, rad, m/s,
+# rad/s]; and of what is not recorded at all, which is left at rest: seen from above, heave, roll
+# and pitch would else explain what they do not cause. Choices.
+_SEEN = np.repeat([0.03, 0.15, 0.15, 0.6], 3)
+_UNSEEN = np.repeat([1e-3, 5e-3, 2e-3, 1e-2], 3)
+# Standard deviations of sensors until residuals say better: [m], [rad], [m], [rad], [rad/s],
+# [m/s²], [m], and of the logarithm of speeds.
+NOISE = {"position": 0.005, "attitude": 0.02, "marks": 0.005, "angles": 0.02, "gyro": 0.02,
+         "accelerometer": 0.2, "depth": 0.01, "speed": 0.1}  # fmt: skip
+
+
+@checked
+class Settings:
+    """How a fit goes about it.
+
+    Attributes:
+        window: length of a window [s].
+        held_out: share of the recordings, or of each one's end where there are fewer than four,
+            that nothing is fitted to.
+        iterations: at most.
+        draws: of the prior, at whose best the search begins.
+        duration: of a planned motion [s].
+        motions: how many are planned.
+        rate: of frames in a planned recording [Hz].
+    """
+
+    window: Annotated[Number, Gt(0)] = 4.0
+    held_out: Annotated[Number, Ge(0), Lt(1)] = 0.25
+    iterations: Annotated[Integer, Ge(1), Le(200)] = 30
+    draws: Annotated[Integer, Ge(0)] = 1
+    duration: Annotated[Number, Gt(0)] = 8.0
+    motions: Annotated[Integer, Ge(1), Le(20)] = 4
+    rate: Annotated[Number, Gt(0)] = 30.0
+
+
+LOCAL_UNITS = {"current": "m/s", "clock": "s"}
+"""Of what each recording has of its own."""
+
+
+_NOWHERE = np.zeros((0, 3))
+
+
+class Channel(NamedTuple):
+    """Measurements of one kind in one recording.
+
+    Attributes:
+        kind: of `NOISE`.
+        recording: its number.
+        time: `[n]` [s].
+        fitted: `[n]` whether they count.
+        seen: `[n, d]` what was measured, where there is a place of it in the world.
+        residual: `[V, n, 13 + hinges]` states at the times (of "accelerometer" with rates beside)
+            → `[V, n, d]` simulated minus measured, NaN where nothing was.
+    """
+
+    kind: str
+    recording: int
+    time: np.ndarray
+    fitted: np.ndarray
+    seen: np.ndarray
+    residual: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of the search: offsets from the priors' medians.
+
+    Attributes:
+        free: `[P]`.
+        local: `[R, L]` what each recording has of its own.
+        starts: `[K, 12, R]` corrections of the windows' beginnings.
+    """
+
+    free: np.ndarray
+    local: np.ndarray
+    starts: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A robot, what is free of it, and recordings.
+
+    Attributes:
+        robot: with the numbers that it has now.
+        parameters: P free numbers.
+        local: L names of what each recording has of its own.
+        recordings: R of them.
+        settings: of the fit.
+        begin: `[R]` times at which they begin [s].
+        end: `[R]` and end.
+        fitted_until: `[R]` up to where they are fitted; nothing of those held out.
+        window: length of a window [s].
+        drive: what is given of them.
+        roots: `[K, 13, R]` where windows begin, by smoothing.
+        start_spread: `[K, 12, R]` of the corrections' priors.
+        segment: `[K, R]` the window in which each one's simulation begins.
+        channels: the measurements.
+        variants: of the robot, one for each free number.
+        free_heading: `[R]` whether nothing says which way the robot heads at first.
+    """
+
+    robot: Robot
+    parameters: tuple[Parameter, ...]
+    local: tuple[str, ...]
+    recordings: tuple[Recording, ...]
+    settings: Settings
+    begin: np.ndarray
+    end: np.ndarray
+    fitted_until: np.ndarray
+    window: float
+    every: int
+    drive: Drive
+    roots: np.ndarray
+    start_spread: np.ndarray
+    segment: np.ndarray
+    channels: tuple[Channel, ...]
+    variants: Variants
+    free_heading: np.ndarray
+    commands: tuple[Callable[[float], np.ndarray], ...]
+
+    @property
+    def lanes(self) -> int:
+        """Variants of each recording: as it is, and one for each derivative."""
+        return 1 + len(self.parameters) + len(self.local) + START
+
+    def origin(self) -> Point:
+        """The priors' medians."""
+        windows, _, count = self.roots.shape
+        return Point(
+            np.zeros(len(self.parameters)),
+            np.zeros((count, len(self.local))),
+            np.zeros((windows, START, count)),
+        )
+
+    @property
+    def local_spread(self) -> np.ndarray:
+        """`[L]` standard deviations of the priors of what each recording has of its own."""
+        return np.array([LOCAL_SPREAD[name.partition("_")[0]] for name in self.local])
+
+    def _simulate(self, robots: Sequence[Robot], shifts: Sequence[Point]) -> np.ndarray:
+        """`[V, R, K, records, 13 + hinges]` of points, one for each robot."""
+        roots = np.stack([_moved(self.roots, p.starts) for p in shifts], 2)
+        current = np.zeros((3, len(shifts), len(self.recordings)))
+        current += np.array(self.robot.world.current)[:, None, None]
+        for k, name in enumerate(self.local):
+            if name.startswith("current"):
+                axis = "xyz".index(name[-1])
+                current[axis] += np.stack([p.local[:, k] for p in shifts])
+        drive = self.drive
+        if "clock" in self.local:
+            k = self.local.index("clock")
+            base = shifts[0].local[:, k]
+            pair = [[f(t + s) for f, t in zip(self.commands, base, strict=True)]
+                    for s in (0.0, _CLOCK_STEP)]  # fmt: skip
+            # [2, R, K, N, nu] to [K, N, nu, 2, R]
+            ctrl = np.moveaxis(np.array(pair), (0, 1), (3, 4))
+            drive = replace(drive, ctrl=ctrl)
+        return simulate_windows(self.variants, robots, drive, roots, current, self.every)
+
+    def simulate(self, points: Sequence[Point]) -> np.ndarray:
+        """`[points, R, K, records, 13 + hinges]`; commands at the first one's clock."""
+        robots = [with_values(self.robot, self.parameters, p.free) for p in points]
+        padded = [*points] + [points[0]] * (self.lanes - len(points))
+        robots += [robots[0]] * (self.lanes - len(points))
+        still = replace(self, drive=replace(self.drive, later=np.zeros(self.lanes, bool)))
+        return still._simulate(robots, padded)[: len(points)]
+
+    def linearize(self, point: Point) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
+        """Residuals and their derivatives.
+
+        Returns:
+            For each channel `[n, d]` residuals, `[n, d, P + L + 12]` derivatives, and the track
+            `[R, K, records, 13 + hinges]`.
+        """
+        points, robots = [point], [with_values(self.robot, self.parameters, point.free)]
+        count, own = len(self.parameters), len(self.local)
+        for k in range(count):
+            points.append(replace(point, free=point.free + _STEP * np.eye(count)[k]))
+            robots.append(with_values(self.robot, self.parameters, points[-1].free))
+        for k in range(own):
+            clock = self.local[k] == "clock"  # its commands are the drive's later ones
+            step = 0.0 if clock else _STEP
+            points.append(replace(point, local=point.local + step * np.eye(own)[k]))
+        for k in range(START):
+            shift = _STEP * np.eye(START)[k][None, :, None] * self.drive.resets[:, None]
+            points.append(replace(point, starts=point.starts + shift))
+        robots += [robots[0]] * (own + START)
+        tracks = self._simulate(robots, points)
+        steps = np.full(self.lanes - 1, _STEP)
+        steps[count : count + own][[n == "clock" for n in self.local]] = _CLOCK_STEP
+        values, slopes = [], []
+        for left in self.residuals(tracks):
+            values.append(left[0])
+            slopes.append(np.moveaxis(left[1:] - left[0], 0, -1) / steps)
+        return values, slopes, tracks[0]
+
+    def residuals(self, tracks: np.ndarray) -> list[np.ndarray]:
+        """`[V, n, d]` of each channel, from `simulate`'s tracks."""
+        return [
+            channel.residual(
+                self.states(tracks[:, channel.recording], channel.recording, channel.time)
+            )
+            for channel in self.channels
+        ]
+
+    def states(self, track: np.ndarray, recording: int, time: np.ndarray) -> np.ndarray:
+        """`[V, n, 13 + hinges]` states at times, from `[V, K, records, ...]`."""
+        windows, count = track.shape[1:3]
+        passed = (time - self.begin[recording]) / self.window
+        # A frame where a window ends and the next begins is of the one that has run.
+        k = np.clip(np.ceil(passed - 1e-9).astype(int) - 1, 0, windows - 1)
+        place = np.clip((passed - k) * (count - 1), 0, count - 1)
+        i = np.minimum(place.astype(int), count - 2)
+        f = (place - i)[:, None]
+        a, b = track[:, k, i], track[:, k, i + 1]
+        found = a + f * (b - a)
+        h = self.window / (count - 1)
+        found[..., :3] += (
+            f
+            * (1 - f)
+            * (
+                (1 - f) * (h * a[..., 7:10] - (b - a)[..., :3])
+                - f * (h * b[..., 7:10] - (b - a)[..., :3])
+            )
+        )
+        found[..., 3:7] /= np.linalg.norm(found[..., 3:7], axis=-1, keepdims=True)
+        # Acceleration, for accelerometers, behind the state.
+        push = (b - a)[..., 7:10] / h
+        return np.concatenate([found, push], -1)
+
+    def window_of(self, recording: int, time: np.ndarray) -> np.ndarray:
+        """`[n]` the windows in which the simulations that times belong to began."""
+        passed = (time - self.begin[recording]) / self.window
+        k = np.clip(np.ceil(passed - 1e-9).astype(int) - 1, 0, len(self.roots) - 1)
+        found: np.ndarray = self.segment[k, recording]
+        return found
+
+
+def _moved(roots: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """`[K, 13, R]` states of the core with `[K, 12, R]` corrections."""
+    found = roots.copy()
+    found[:, :3] += shift[:, :3]
+    found[:, 7:10] += shift[:, 6:9]
+    found[:, 10:] += shift[:, 9:]
+    quats = np.moveaxis(roots[:, 3:7], 1, -1).reshape(-1, 4)
+    turns = np.moveaxis(shift[:, 3:6], 1, -1).reshape(-1, 3)
+    turned = Rotation.from_quat(quats, scalar_first=True) * Rotation.from_rotvec(turns)
+    wide = turned.as_quat(scalar_first=True).reshape(len(roots), -1, 4)
+    found[:, 3:7] = np.moveaxis(wide, -1, 1)
+    return found
+
+
+# --- making one -----------------------------------------------------------------------------------
+
+
+def make_problem(
+    robot: Robot, recordings: Sequence[Recording], free: Sequence[str], settings: Settings
+) -> Problem:
+    """Recordings of a robot as a least-squares problem.
+
+    Args:
+        robot: that swam.
+        recordings: of it.
+        free: names of what is free.
+        settings: of the fit.
+
+    Raises:
+        InputError: a recording or a name does not suit the robot; the message says which.
+    """
+    own, common = split_free(free)
+    parameters = read_free(own, robot)
+    local = tuple(f"{n}_{x}" if x else n for n in common for x in RECORDING[n])
+    if not parameters:
+        raise InputError("--free: expected at least one number of the robot; found none")
+    names = [m.name for m in robot.morphology.modules]
+    hinges = [names[k] for k in robot.morphology.hinges]
+    jets = [names[k] for k, _ in robot.morphology.thrusters]
+    servos_free = any(p.name.startswith("servo") for p in parameters)
+    prescribed = _prescribed(recordings, hinges, servos_free)
+    views = [_View(robot, r, hinges) for r in recordings]
+    begin = np.array([v.begin for v in views])
+    end = np.array([v.end for v in views])
+    held = _held_out(len(recordings), settings.held_out)
+    share = 0.0 if held.any() else settings.held_out
+    until = np.where(held, -np.inf, end - share * (end - begin))
+    usual = np.where(held, end, until) - begin
+    dt = robot.world.timestep
+    window = float(min(settings.window, usual.max()))
+    every = max(1, int(_RECORD / dt + 1e-9))
+    steps = max(1, math.ceil(window / dt / every - 1e-9)) * every
+    window = steps * dt
+    windows = max(1, math.ceil((end - begin).max() / window - 1e-6))
+    resets = np.zeros((windows, len(recordings)), bool)
+    for r, view in enumerate(views):
+        many = 1 if held[r] or view.loose else max(1, int(usual[r] / window + 0.25))
+        resets[:many, r] = True
+    segment = np.maximum.accumulate(np.where(resets, np.arange(windows)[:, None], 0), 0)
+    at = begin + window * np.arange(windows)[:, None]
+    starts = [view.starts(t) for view, t in zip(views, at.T, strict=True)]
+    roots, spread = (np.stack([s[k] for s in starts], -1) for k in range(2))
+    count = windows * steps
+    commands = tuple(
+        _commands(r, b, dt, count, hinges, jets, prescribed, robot, windows)
+        for r, b in zip(recordings, begin, strict=True)
+    )
+    ctrl = np.stack([f(0.0) for f in commands], -1)
+    ctrl = np.stack([ctrl, ctrl], -2)
+    lanes = 1 + len(parameters) + len(local) + START
+    later = np.zeros(lanes, bool)
+    if "clock" in local:
+        later[1 + len(parameters) + local.index("clock")] = True
+    angles, speeds = (
+        np.stack([v.hinges_at(v.begin, prescribed, dt)[k] for v in views], -1) for k in range(2)
+    )
+    drive = Drive(resets, angles, speeds, ctrl, later)
+    channels = [
+        channel
+        for r, view in enumerate(views)
+        for channel in view.channels(r, until[r], servos_free)
+    ]
+    variants = _variants(robot, tuple(own), tuple(h in prescribed for h in hinges))
+    return Problem(
+        robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, window,
+        every, drive, roots, spread, segment, tuple(channels), variants,
+        np.array([v.heading is None for v in views]), commands,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _variants(robot: Robot, names: tuple[str, ...], prescribed: tuple[bool, ...]) -> Variants:
+    """Of a robot whose numbers are free: the same for the same, so that nothing compiles twice."""
+    parameters = read_free(names, robot)
+    tried = [with_values(robot, parameters, np.zeros(len(names)))]
+    tried += [with_values(robot, parameters, 0.1 * x) for x in np.eye(len(names))]
+    return make_variants(tried, prescribed)
+
+
+def _held_out(count: int, share: float) -> np.ndarray:
+    """`[R]` whole recordings that are held out, evenly spread; none where there are few."""
+    if count < 4:
+        return np.zeros(count, bool)
+    done = np.floor(share * np.arange(count + 1) + 1e-9)
+    return np.diff(done) > 0
+
+
+def _prescribed(
+    recordings: Sequence[Recording], hinges: Sequence[str], servos_free: bool
+) -> set[str]:
+    """Hinges whose measured angles are taken as they are."""
+    if servos_free:
+        for r in recordings:
+            kinds = {n.partition(".")[0] for n in r.signals}
+            if "angle" in kinds and "command" not in kinds:
+                raise InputError(
+                    f"{r.name}: expected the servos' commands (command.MODULE), as they are free; "
+                    "found none"
+                )
+        return set()
+    found = [{h for h in hinges if f"angle.{h}" in r.signals} for r in recordings]
+    for r, some in zip(recordings, found, strict=True):
+        if some != found[0]:
+            raise InputError(
+                f"{r.name}: expected angles of the same hinges as {recordings[0].name} "
+                f"({', '.join(sorted(found[0])) or 'none'}); found "
+                f"{', '.join(sorted(some)) or 'none'}"
+            )
+    return found[0]
+
+
+def _commands(
+    recording: Recording, begin: float, dt: float, count: int, hinges: Sequence[str],
+    jets: Sequence[str], prescribed: set[str], robot: Robot, windows: int,
+) -> Callable[[float], np.ndarray]:  # fmt: skip
+    """Commands by how late the recording's clock is [s]: `[K, N, nu]`, the mean over each step."""
+    edges = begin + dt * np.arange(count + 1)
+    columns: list[Callable[[float], np.ndarray]] = []
+    for name in hinges:
+        if name in prescribed:
+            signal = recording.signals[f"angle.{name}"]
+            course = _course(signal, begin + dt * np.arange(-1, count + 1))
+            targets = course_targets(course, dt)
+            columns.append(_constant(targets))
+        else:
+            columns.append(_held(recording, f"command.{name}", edges, dt))
+    columns += [_held(recording, f"command.{name}", edges, dt) for name in jets]
+
+    def commands(late: float) -> np.ndarray:
+        if not columns:
+            return np.zeros((windows, count // windows, 0))
+        return np.stack([f(late) for f in columns], -1).reshape(windows, -1, len(columns))
+
+    return commands
+
+
+def _constant(values: np.ndarray) -> Callable[[float], np.ndarray]:
+    return lambda late: values
+
+
+def _course(signal: Any, at: np.ndarray) -> np.ndarray:
+    """A measured angle, smoothed, at other times [rad]."""
+    if len(signal.time) < 3 or np.ptp(signal.value) < 1e-9:
+        return np.interp(at, signal.time, signal.value)
+    return smooth(signal.time, signal.value[:, None], at)[0][:, 0]
+
+
+def _held(
+    recording: Recording, name: str, edges: np.ndarray, dt: float
+) -> Callable[[float], np.ndarray]:
+    """A command that holds until the next one; before the first one, 0 or a hinge's first."""
+    signal = recording.signals.get(name)
+    if signal is None:
+        return lambda late: np.zeros(len(edges) - 1)
+    time, value = signal
+    area = np.concatenate([[0.0], np.cumsum(np.diff(time) * value[:-1])])
+
+    def mean(late: float) -> np.ndarray:
+        t = edges + late
+        inside = np.interp(t, time, area) + value[-1] * np.maximum(t - time[-1], 0)
+        inside += value[0] * np.minimum(t - time[0], 0)
+        found: np.ndarray = np.diff(inside) / dt
+        return found
+
+    return mean
+
+
+class _View:
+    """A recording as poses of a robot's core."""
+
+    def __init__(self, robot: Robot, recording: Recording, hinges: Sequence[str]) -> None:
+        """Finds the core's poses."""
+        self.robot, self.recording, self.hinges = robot, recording, hinges
+        signals = recording.signals
+        self.names = list(recording.marks)
+        self.points = MarkPoints(robot, list(recording.marks.values()))
+        wanted = [f"mark.{n}.{x}" for n in self.names for x in "xyz"]
+        self.mark_time, seen = recording.table(wanted)
+        self.seen = seen.reshape(len(self.mark_time), len(self.names), 3)
+        self.time, pose = recording.table(["x", "y", "z", "qw", "qx", "qy", "qz"])
+        self.position, quat = pose[:, :3], pose[:, 3:]
+        self.planar = "z" not in signals and "depth" not in signals
+        self.quat: np.ndarray | None = quat if "qw" in signals else None
+        self.level = False
+        if self.quat is None and "yaw" in signals:
+            turns = [np.interp(self.time, *signals[n]) if n in signals else 0 * self.time
+                     for n in ("yaw", "pitch", "roll")]  # fmt: skip
+            self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
+            self.level = "roll" not in signals
+        if self.names:
+            self._fit_marks()
+        times = [signals[n].time for n in signals if not n.startswith(("command.", "angle."))]
+        if "mean_speed" in signals:
+            times += [s.time for n, s in signals.items() if n.startswith(("command.", "angle."))]
+        self.begin = min(float(t[0]) for t in times)
+        self.end = max(float(t[-1]) for t in times)
+        self.heading = self.quat
+        # Without attitude, nothing says how to begin again.
+        self.loose = self.quat is None
+
+    def _fit_marks(self) -> None:
+        """Poses from marks, where the core's own are not recorded."""
+        self.planar = self.planar and not np.isfinite(self.seen[..., 2]).any()
+        dims = 2 if self.planar else 3
+        if "x" in self.recording.signals:
+            return
+        angles = np.stack([self._angle(h, self.mark_time) for h in self.hinges], -1) if (
+            self.hinges) else np.zeros((len(self.mark_time), 0))  # fmt: skip
+        model = self.points.on_core(angles)
+        length = float(body_geometry(self.robot).length)
+        check_marks(model, self.seen, self.planar, self.names, self.mark_time, length)
+        self.time = self.mark_time
+        if len(self.names) >= dims:
+            self.position, self.quat, _ = fit_rigid(model, self.seen, self.planar)
+            self.quat[np.isnan(self.position[:, 0])] = np.nan
+            self.level = self.planar
+        else:
+            self.position = self.seen[:, 0]
+        if self.planar:
+            self.position[:, 2] = np.nan
+
+    def _angle(self, hinge: str, at: np.ndarray) -> np.ndarray:
+        for kind in ("angle", "command"):
+            if (signal := self.recording.signals.get(f"{kind}.{hinge}")) is not None:
+                return np.interp(at, *signal)
+        return np.zeros(len(at))
+
+    def hinges_at(
+        self, at: float, prescribed: set[str], dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`[hinges]` angles and speeds [rad, rad/s]; what is commanded begins at rest."""
+        angles, speeds = np.zeros(len(self.hinges)), np.zeros(len(self.hinges))
+        for k, hinge in enumerate(self.hinges):
+            if hinge in prescribed:
+                signal = self.recording.signals[f"angle.{hinge}"]
+                before, now = _course(signal, at + dt * np.array([-1.0, 0.0]))
+                angles[k], speeds[k] = now, (now - before) / dt
+            else:
+                angles[k] = self._angle(hinge, np.array([at]))[0]
+        return angles, speeds
+
+    def starts(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`[K, 13]` states of the core at times, and `[K, 12]` how uncertain they are."""
+        found = np.zeros((len(at), ROOT))
+        found[:, 2], found[:, 3] = rest_height(self.robot), 1.0
+        spread = np.tile(_UNSEEN, (len(at), 1))
+        axes = [k for k in range(3) if len(self.time) and np.isfinite(self.position[:, k]).any()]
+        for k in axes:
+            value, rate, _ = smooth(self.time, self.position[:, k : k + 1], at)
+            found[:, k], found[:, 7 + k] = value[:, 0], rate[:, 0]
+            spread[:, [k, 6 + k]] = _SEEN[[k, 6 + k]]
+        if (depth := self.recording.signals.get("depth")) is not None and 2 not in axes:
+            value, rate, _ = smooth(depth.time, depth.value[:, None], at)
+            found[:, 2], found[:, 9] = self.robot.world.surface_height - value[:, 0], -rate[:, 0]
+            spread[:, [2, 8]] = _SEEN[[2, 8]]
+        if self.quat is not None:
+            quat, known = self.quat.copy(), np.isfinite(self.quat).all(1)
+            # Of one sign from frame to frame.
+            q = quat[known] / np.linalg.norm(quat[known], axis=1, keepdims=True)
+            turn = np.append(1.0, np.where(np.sum(q[1:] * q[:-1], 1) < 0, -1.0, 1.0))
+            value, rate, _ = smooth(self.time[known], q * np.cumprod(turn)[:, None], at)
+            value /= np.linalg.norm(value, axis=1, keepdims=True)
+            found[:, 3:7] = value
+            w, v, dw, dv = value[:, :1], value[:, 1:], rate[:, :1], rate[:, 1:]
+            found[:, 10:] = 2 * (w * dv - dw * v - np.cross(v, dv))
+            turns = [5, 11] if self.level else [3, 4, 5, 9, 10, 11]
+            spread[:, turns] = _SEEN[turns]
+        elif axes:
+            spread[:, 5] = 1.0
+        return found, spread
+
+    def channels(self, r: int, until: float, servos_free: bool) -> list[Channel]:
+        """The measurements of the recording."""
+        signals, found = self.recording.signals, []
+
+        def add(
+            kind: str, time: np.ndarray, residual: Callable[[np.ndarray], np.ndarray],
+            seen: np.ndarray = _NOWHERE,
+        ) -> None:  # fmt: skip
+            found.append(Channel(kind, r, time, time <= until + 1e-9, seen, residual))
+
+        if "x" in signals:
+            position = self.position
+            add("position", self.time, lambda s: s[..., :3] - position, position)
+            if self.quat is not None:
+                level, quat = self.level, self.quat
+                add("attitude", self.time, lambda s: _turn_error(s[..., 3:7], quat, level))
+        elif self.names:
+            hinges = len(self.hinges)
+            seen, points = self.seen, self.points
+
+            def off(s: np.ndarray) -> np.ndarray:
+                qpos = np.concatenate([s[..., :7], s[..., ROOT : ROOT + hinges]], -1)
+                place = points.at(qpos.reshape(-1, qpos.shape[-1]))
+                left = place.reshape(*s.shape[:2], -1, 3) - seen
+                return left.reshape(*s.shape[:2], -1)
+
+            add("marks", self.mark_time, off, seen.reshape(len(seen), -1))
+        if servos_free:
+            time, values = self.recording.table([f"angle.{h}" for h in self.hinges])
+            if len(time):
+                add("angles", time, lambda s: s[..., ROOT : ROOT + len(self.hinges)] - values)
+        if (depth := signals.get("depth")) is not None:
+            top = self.robot.world.surface_height
+            add("depth", depth.time, lambda s: top - s[..., 2:3] - depth.value[:, None])
+        gravity = np.array([0.0, 0.0, self.robot.world.gravity])
+        for kind, name in (("gyro", "gyro"), ("accelerometer", "accel")):
+            time, sensed = self.recording.table([f"{name}.{x}" for x in "xyz"])
+            if not len(time):
+                continue
+
+            def read(s: np.ndarray, kind: str = kind, sensed: np.ndarray = sensed) -> np.ndarray:
+                if kind == "gyro":
+                    return s[..., 10:13] - sensed
+                turn = Rotation.from_quat(s[..., 3:7].reshape(-1, 4), scalar_first=True)
+                push = (s[..., -3:] + gravity).reshape(-1, 3)
+                return turn.inv().apply(push).reshape(*s.shape[:2], 3) - sensed
+
+            add(kind, time, read)
+        if (speed := signals.get("mean_speed")) is not None:
+            time = speed.time[[0, -1]]
+            mean = max(float(np.mean(speed.value)), 1e-6)
+
+            def slow(s: np.ndarray) -> np.ndarray:
+                way = np.linalg.norm(s[:, 1, :2] - s[:, 0, :2], axis=-1) / (time[1] - time[0])
+                left = np.full((len(s), 2, 1), np.nan)
+                left[:, 1, 0] = np.log(np.maximum(way, 1e-9) / mean)
+                return left
+
+            add("speed", time, slow)
+        return found
+
+
+def _turn_error(quat: np.ndarray, seen: np.ndarray, level: bool) -> np.ndarray:
+    """`[V, n, 3]` rotation from seen to simulated, or `[V, n, 1]` about z [rad]."""
+    w, v = seen[:, :1], -seen[:, 1:]
+    real = w[:, 0] * quat[..., 0] - np.sum(v * quat[..., 1:], -1)
+    imaginary = (
+        w * quat[..., 1:]
+        + quat[..., :1] * v
+        + np.cross(np.broadcast_to(v, quat[..., 1:].shape), quat[..., 1:])
+    )
+    if level:
+        yaw = 2 * np.arctan2(imaginary[..., 2], real)
+        return ((yaw + np.pi) % (2 * np.pi) - np.pi)[..., None]
+    found: np.ndarray = 2 * imaginary * np.sign(real)[..., None]
+    return found

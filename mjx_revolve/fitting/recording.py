@@ -1,0 +1,471 @@
+"""Recordings of a robot that swam: CSV, ROS 2 bags and run folders, read as signals and checked.
+
+A signal has times and values of its own. Their names: `x`, `y`, `z` and `qw`, `qx`, `qy`, `qz`, or
+`roll`, `pitch`, `yaw`, of the core, world frame; `mark.NAME.x` (`.y`, `.z`) of points on the robot;
+`command.MODULE` of hinges [rad] and thrusters [-]; `angle.MODULE`, measured; `gyro.x`, `accel.x`
+(specific force) of the core, its own frame; `depth`, `mean_speed`. SI units and radians.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.inputs.errors import InputError, reading, show
+from mjx_revolve.inputs.files import check_path, read_file
+from mjx_revolve.inputs.packages import check_package
+from mjx_revolve.inputs.yaml_reader import load_yaml
+
+# Units that a column's name may end in, and what they are in SI.
+_UNITS = {"_m": 1.0, "_cm": 1e-2, "_mm": 1e-3, "_s": 1.0, "_ms": 1e-3, "_us": 1e-6, "_ns": 1e-9,
+          "_rad": 1.0, "_deg": math.pi / 180}  # fmt: skip
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz", "roll", "pitch", "yaw", "depth", "mean_speed")
+_SENSED = tuple(f"{kind}.{axis}" for kind in ("gyro", "accel") for axis in "xyz")
+_SOURCE = re.compile(r"^(?P<column>.*?)(?:\*(?P<factor>[-+0-9.eE]+))?$")
+# Faster than any robot of modules swims [body lengths/s]; wrong units are beyond it. A choice.
+_FASTEST = 30.0
+# A gap is longer than so many usual frames; one of two is a dropped frame. A choice.
+_GAP = 2.5
+
+
+class Signal(NamedTuple):
+    """A measured or commanded number; `[n]` times [s], rising, and `[n]` values."""
+
+    time: np.ndarray
+    value: np.ndarray
+
+
+class Mark(NamedTuple):
+    """A point on the robot: index of its module, and where in its frame [m]."""
+
+    module: int
+    place: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A robot that swam.
+
+    Attributes:
+        name: of the file.
+        signals: by name.
+        marks: points on the robot, by name.
+        notes: what a person should know of it, a line each.
+    """
+
+    name: str
+    signals: Mapping[str, Signal]
+    marks: Mapping[str, Mark] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def table(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """Times `[n]` at which any of them is known, and `[n, names]` values, else NaN."""
+        known = [self.signals[name].time for name in names if name in self.signals]
+        time = np.unique(np.concatenate(known)) if known else np.zeros(0)
+        values = np.full((len(time), len(names)), np.nan)
+        for k, name in enumerate(names):
+            if name in self.signals:
+                signal = self.signals[name]
+                values[np.searchsorted(time, signal.time), k] = signal.value
+        return time, values
+
+
+def read_map(options: Sequence[str], label: str = "--map") -> dict[str, str]:
+    """The mapping of names to columns, from `NAME=COLUMN` texts and YAML files of them.
+
+    Raises:
+        InputError: one is neither.
+    """
+    found: dict[str, str] = {}
+    for option in options:
+        name, equals, source = option.partition("=")
+        if equals and name and source:
+            found[name.strip()] = source.strip()
+            continue
+        if not Path(option).is_file():
+            raise InputError(
+                f"{label} {option}: expected NAME=COLUMN, or a YAML file of them; found neither"
+            )
+        data = load_yaml(option)
+        if not isinstance(data, dict):
+            raise InputError(
+                f"{option}: expected a mapping of names to columns; found {show(data)}"
+            )
+        found |= {str(key): str(value) for key, value in data.items()}
+    return found
+
+
+def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -> Recording:
+    """Reads a recording of a robot.
+
+    Args:
+        path: a CSV file, an MCAP file or folder of a ROS 2 bag, or a run folder of ours.
+        robot: that swam.
+        columns: `read_map`: a signal's column or topic, also `COLUMN*FACTOR`, or a number that
+            holds all the time; `time=COLUMN*FACTOR`; `mark.NAME=MODULE` or `MODULE:X,Y,Z` [m].
+
+    Returns:
+        The recording, checked.
+
+    Raises:
+        InputError: it cannot be read, or is not of this robot; one line that says where and why.
+    """
+    path = check_path(path)
+    if not path.exists():
+        raise InputError(
+            f"{path}: expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"
+        )
+    marks = {
+        key.removeprefix("mark."): _read_mark(key, source, robot)
+        for key, source in columns.items()
+        if key.startswith("mark.") and key.count(".") == 1
+    }
+    rest = {k: v for k, v in columns.items() if not (k.startswith("mark.") and k.count(".") == 1)}
+    with reading(path):
+        if path.is_dir() and (path / "run.json").is_file():
+            signals = _read_run(path)
+        elif path.is_dir() or path.suffix == ".mcap":
+            signals = _read_bag(path, rest)
+        else:
+            signals = _read_csv(path, rest, robot)
+        signals, marks = _name_marks(signals, marks, robot)
+        signals, notes = _check_signals(signals, robot)
+    return Recording(path.stem, signals, marks, tuple(notes))
+
+
+def _read_mark(key: str, source: str, robot: Robot) -> Mark:
+    module, _, at = source.partition(":")
+    names = [m.name for m in robot.morphology.modules]
+    try:
+        place = tuple(float(x) for x in at.split(",")) if at else (0.0, 0.0, 0.0)
+    except ValueError:
+        place = ()
+    if module not in names or len(place) != 3:
+        raise InputError(
+            f"--map {key}: expected a module ({', '.join(names)}), or MODULE:X,Y,Z [m]; found "
+            f"{show(source)}"
+        )
+    return Mark(names.index(module), (place[0], place[1], place[2]))
+
+
+# --- CSV ------------------------------------------------------------------------------------------
+
+
+def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str, Signal]:
+    text = read_file(path).decode("utf-8-sig")
+    rows = list(csv.reader(io.StringIO(text)))
+    rows = [row for row in rows if any(cell.strip() for cell in row)]
+    if not rows:
+        raise InputError("expected a line of column names and rows of numbers; found an empty file")
+    header = [cell.strip() for cell in rows[0]]
+    if len(rows) < 3:
+        raise InputError(f"expected rows of numbers below the names; found {len(rows) - 1}")
+    values = np.full((len(rows) - 1, len(header)), np.nan)
+    for k, row in enumerate(rows[1:]):
+        if len(row) != len(header):
+            raise InputError(f"row {k + 2}: expected {len(header)} cells; found {len(row)}")
+        for j, cell in enumerate(row):
+            if cell.strip():
+                try:
+                    values[k, j] = float(cell)
+                except ValueError:
+                    raise InputError(
+                        f"row {k + 2}, column {header[j]}: expected a number; found {show(cell)}"
+                    ) from None
+    named = _name_columns(header, columns, robot)
+    if "time" not in named:
+        raise InputError(
+            f"expected a column time (--map time=COLUMN, or frame*0.0333); found "
+            f"{', '.join(header)}"
+        )
+    column, scale = named.pop("time")
+    time = scale * values[:, column]
+    if not np.isfinite(time).all():
+        bad = int(np.flatnonzero(~np.isfinite(time))[0])
+        raise InputError(f"row {bad + 2}, column {header[column]}: expected a time; found none")
+    steps = np.diff(time)
+    if np.any(steps <= 0):
+        late = int(np.flatnonzero(steps <= 0)[0]) + 1
+        word = "goes back" if steps[late - 1] < 0 else "stands still"
+        raise InputError(
+            f"row {late + 2}: expected a time later than {time[late - 1]:g} s; found "
+            f"{time[late]:g} s: time {word}"
+        )
+    found = {}
+    for name, (k, scale) in named.items():
+        value = scale * values[:, k] if k is not None else np.full(len(time), scale)
+        known = np.isfinite(value)
+        if not known.any():
+            raise InputError(f"column {header[k]}: expected numbers; found none, or NaN only")
+        found[name] = Signal(time[known], value[known])
+    return found
+
+
+def _name_columns(
+    header: Sequence[str], columns: Mapping[str, str], robot: Robot
+) -> dict[str, tuple[Any, float]]:
+    """Signals by name: column (None: a constant) and factor; by the mapping, or by name."""
+    found: dict[str, tuple[Any, float]] = {}
+    for name, source in columns.items():
+        match = _SOURCE.match(source)
+        assert match is not None
+        column, factor = match["column"], match["factor"]
+        if column in header:
+            usual = 1.0 if factor else _unit(column)[1]
+            found[name] = header.index(column), float(factor) if factor else usual
+            continue
+        try:
+            found[name] = None, float(source)
+        except ValueError:
+            raise InputError(
+                f"--map {name}: expected one of the columns {', '.join(header)}, also with "
+                f"*FACTOR, or a number; found {show(source)}"
+            ) from None
+        if name == "time":
+            raise InputError(f"--map time: expected a column; found the number {source}")
+    modules = [m.name for m in robot.morphology.modules]
+    for k, column in enumerate(header):
+        plain, factor = _unit(column)
+        plain = {"t": "time"}.get(plain, plain)
+        if mark := re.fullmatch(r"([xyz])(\d+)", plain):
+            plain = f"mark.{mark[2]}.{mark[1]}"
+        head, _, rest = plain.partition(".")
+        known = plain == "time" or plain in _POSE or plain in _SENSED or head == "mark"
+        if plain not in found and (known or (head in ("command", "angle") and rest in modules)):
+            found[plain] = k, factor
+        elif head in ("command", "angle") and rest not in modules:
+            raise InputError(
+                f"column {column}: expected a module of {robot.morphology.name} "
+                f"({', '.join(modules)}); found {show(rest)}: another robot?"
+            )
+    return found
+
+
+def _unit(column: str) -> tuple[str, float]:
+    """A column's name without its unit, and the unit in SI."""
+    for end, factor in _UNITS.items():
+        if column.endswith(end):
+            return column.removesuffix(end), factor
+    return column, 1.0
+
+
+# --- bags and run folders -------------------------------------------------------------------------
+
+
+def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, Signal]:
+    """Topics by their types; of several of one type the first, or what `odometry=/topic` names."""
+    check_package("a bag", "rosbags")
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    store: Any = get_typestore(Stores.ROS2_HUMBLE)
+    kept: dict[str, list[tuple[float, float]]] = {}
+    chosen: dict[str, str] = {}
+    try:
+        with Reader(path) as bag:
+            for connection, stamp, raw in bag.messages():
+                kind, topic = connection.msgtype.rpartition("/")[2], connection.topic
+                if (use := _TOPICS.get(kind)) is None:
+                    continue
+                role = f"{kind} {topic}" if kind == "JointState" else kind
+                if chosen.setdefault(role, columns.get(kind.lower(), topic)) != topic:
+                    continue
+                message = store.deserialize_cdr(raw, connection.msgtype)
+                for name, value in use(message, topic):
+                    kept.setdefault(name, []).append((1e-9 * stamp, float(value)))
+    except InputError:
+        raise
+    except Exception as error:  # rosbags' own kinds, struct's, zstd's
+        found_instead = str(error).partition("\n")[0]
+        raise InputError(f"expected a ROS 2 bag; found: {found_instead}") from None
+    if not kept:
+        raise InputError(f"expected topics of the types {', '.join(_TOPICS)}; found none")
+    first = min(rows[0][0] for rows in kept.values())
+    found = {}
+    for name, rows in kept.items():
+        time, value = np.array(rows).T
+        order = np.argsort(time, kind="stable")
+        once = np.append(True, np.diff(time[order]) > 0)
+        found[name] = Signal(time[order][once] - first, value[order][once])
+    return found
+
+
+def _pose(pose: Any) -> Iterable[tuple[str, float]]:
+    yield from ((axis, getattr(pose.position, axis)) for axis in "xyz")
+    yield from ((f"q{axis}", getattr(pose.orientation, axis)) for axis in "wxyz")
+
+
+def _joints(message: Any, topic: str) -> Iterable[tuple[str, float]]:
+    kind = "command" if "target" in topic or "command" in topic else "angle"
+    pairs = zip(message.name, message.position, strict=False)
+    yield from ((f"{kind}.{name}", value) for name, value in pairs)
+
+
+def _array(message: Any, topic: str) -> Iterable[tuple[str, float]]:
+    if message.layout.dim:
+        names = message.layout.dim[0].label.split(",")
+        yield from ((f"command.{n}", x) for n, x in zip(names, message.data, strict=False))
+
+
+def _imu(message: Any, topic: str) -> Iterable[tuple[str, float]]:
+    for kind, vector in (
+        ("gyro", message.angular_velocity),
+        ("accel", message.linear_acceleration),
+    ):
+        yield from ((f"{kind}.{axis}", getattr(vector, axis)) for axis in "xyz")
+
+
+_TOPICS: dict[str, Callable[[Any, str], Iterable[tuple[str, float]]]] = {
+    "Odometry": lambda m, _: _pose(m.pose.pose),
+    "PoseStamped": lambda m, _: _pose(m.pose),
+    "JointState": _joints,
+    "Float64MultiArray": _array,
+    "Imu": _imu,
+}
+
+
+def _read_run(path: Path) -> dict[str, Signal]:
+    """What the champion of a run folder does, sampled 50 times a second."""
+    from mjx_revolve.episodes.champion import load_episode
+
+    episode = load_episode(path)
+    trajectory = episode.trajectory
+    robot = episode.robot
+    every = max(1, round(0.02 / robot.world.timestep))
+    time = np.asarray(trajectory.time, float)[every - 1 :: every]
+    qpos = np.asarray(trajectory.qpos, float)[every - 1 :: every]
+    ctrl = np.asarray(trajectory.ctrl, float)
+    names = [robot.mj_model.actuator(k).name for k in range(robot.mj_model.nu)]
+    begun = robot.world.timestep * np.arange(len(ctrl))
+    found = {f"command.{n}": Signal(begun, x) for n, x in zip(names, ctrl.T, strict=True)}
+    pose = zip(_POSE[:7], qpos.T[:7], strict=True)
+    return found | {name: Signal(time, x) for name, x in pose}
+
+
+# --- checks ---------------------------------------------------------------------------------------
+
+
+def _name_marks(
+    signals: dict[str, Signal], marks: dict[str, Mark], robot: Robot
+) -> tuple[dict[str, Signal], dict[str, Mark]]:
+    """Marks as the signals have them; those that nothing says a place of are refused."""
+    seen = {name.split(".")[1] for name in signals if name.startswith("mark.")}
+    for name in sorted(seen):
+        if name in marks:
+            continue
+        modules = [m.name for m in robot.morphology.modules]
+        if name not in modules:
+            raise InputError(
+                f"mark {name}: expected where it is (--map mark.{name}=MODULE:X,Y,Z [m], of the "
+                f"modules {', '.join(modules)}); found nothing"
+            )
+        marks[name] = Mark(modules.index(name), (0.0, 0.0, 0.0))
+    for name in marks:
+        if name not in seen:
+            raise InputError(f"mark {name}: expected columns mark.{name}.x and .y; found none")
+    return signals, marks
+
+
+def _check_signals(signals: dict[str, Signal], robot: Robot) -> tuple[dict[str, Signal], list[str]]:
+    """Plain faults, one line each; and notes about gaps."""
+    modules = {m.name: m.kind for m in robot.morphology.modules}
+    seen = [n for n in signals if n in _POSE or n in _SENSED or n.startswith("mark.")]
+    if not any(n in ("x", "y", "mean_speed") or n.startswith("mark.") for n in signals):
+        raise InputError("expected x and y of the core, marks, or mean_speed; found none of them")
+    for name, signal in signals.items():
+        if not np.isfinite(signal.value).all():
+            raise InputError(f"{name}: expected finite numbers; found NaN or infinity")
+        head, _, module = name.partition(".")
+        if head not in ("command", "angle"):
+            continue
+        kind = modules.get(module)
+        if kind is None or (kind.hinge is None and not (kind.is_thruster and head == "command")):
+            which = [m for m, k in modules.items() if k.hinge is not None or k.is_thruster]
+            raise InputError(
+                f"{name}: expected a hinge or thruster of {robot.morphology.name} "
+                f"({', '.join(which) or 'it has none'}); found {show(module)}: another robot?"
+            )
+        most = float(np.abs(signal.value).max())
+        if kind.hinge is not None and most > 2 * math.pi:
+            raise InputError(
+                f"{name}: expected radians; found {most:.3g}: degrees? (--map "
+                f"{name}=COLUMN*0.01745, or a column that ends in _deg)"
+            )
+        if kind.hinge is None:
+            jet = next(p.thruster for p in kind.parts if p.thruster is not None)
+            if most > 3 * max(map(abs, jet.range)):
+                raise InputError(
+                    f"{name}: expected commands within {list(jet.range)}; found {most:.3g}: "
+                    f"percent? (--map {name}=COLUMN*0.01)"
+                )
+    if all(f"q{axis}" in signals for axis in "wxyz"):
+        length = np.sqrt(sum(np.median(signals[f"q{a}"].value ** 2) for a in "wxyz"))
+        if not 0.5 < length < 1.5:
+            raise InputError(
+                f"qw, qx, qy, qz: expected unit quaternions; found length {length:.3g}"
+            )
+    for name in ("roll", "pitch", "yaw"):
+        if name in signals and np.ptp(np.diff(signals[name].value, prepend=0)) > 20 * math.pi:
+            raise InputError(f"{name}: expected radians; found steps of more: degrees? (_deg)")
+    _check_motion(signals, robot)
+    return signals, _gaps({n: signals[n] for n in seen})
+
+
+def _check_motion(signals: Mapping[str, Signal], robot: Robot) -> None:
+    """Refuses what is too fast for its units, and what does not move at all."""
+    length = _length(robot)
+    still = "mean_speed" not in signals
+    for name, signal in signals.items():
+        if not (name in ("x", "y") or name.startswith("mark.")) or len(signal.time) < 3:
+            continue
+        # Between quantiles: single frames may be wrong.
+        speed = float(np.quantile(np.abs(np.diff(signal.value) / np.diff(signal.time)), 0.75))
+        if speed > _FASTEST * length:
+            raise InputError(
+                f"{name}: expected metres of a robot {length:.2g} m long; found steps of "
+                f"{speed:.3g} a second: millimetres or pixels? (--map {name}=COLUMN*FACTOR, or a "
+                "column that ends in _mm)"
+            )
+        jitter = float(np.median(np.abs(np.diff(signal.value, 2)))) / 2
+        still = still and float(np.ptp(signal.value)) < max(12 * jitter, 2e-3 * length)
+    for name in ("yaw", "qz", "qx"):
+        if name in signals and np.ptp(signals[name].value) > 0.1:
+            still = False
+    if still:
+        raise InputError(
+            "expected a robot that moves; found nothing that moves more than its noise"
+        )
+
+
+def _length(robot: Robot) -> float:
+    from mjx_revolve.engine.plant import body_geometry
+
+    return float(body_geometry(robot).length)
+
+
+def _gaps(signals: Mapping[str, Signal]) -> list[str]:
+    """Frames that are missing, in words; once for signals of the same times."""
+    found: dict[str, None] = {}
+    for name, (time, _) in signals.items():
+        if len(time) < 3:
+            continue
+        steps = np.diff(time)
+        usual = float(np.median(steps))
+        lost = np.round(steps / usual) - 1
+        single, long = int((lost == 1).sum()), steps[steps > _GAP * usual]
+        group = name.partition(".")[0] if name.startswith("mark.") else "frames"
+        if single or len(long):
+            words = f"{group} at {1 / usual:.3g} Hz: {single} dropped"
+            if len(long):
+                words += f", {len(long)} gaps of up to {long.max():.2g} s"
+            found[words] = None
+    return list(found)

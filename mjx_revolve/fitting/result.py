@@ -1,0 +1,289 @@
+"""What a fit has found: values with intervals, what is unknown, and predictions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+
+from mjx_revolve.body.params import multiply_factors
+from mjx_revolve.engine.robot import Robot
+from mjx_revolve.fitting.estimate import (
+    LEVEL,
+    Estimate,
+    Model,
+    State,
+    advance,
+    begin,
+    estimate,
+    linearize,
+)
+from mjx_revolve.fitting.identify import Unknown, find_unknown, is_found, plan_motions
+from mjx_revolve.fitting.parameters import with_values
+from mjx_revolve.fitting.problem import Problem, Settings, make_problem
+from mjx_revolve.fitting.recording import Recording
+
+
+@dataclass(frozen=True)
+class Value:
+    """A free number as found.
+
+    Attributes:
+        name: of it.
+        unit: of it; "" for a factor on what it was.
+        value: most probable one.
+        low: lower end of the interval.
+        high: upper end.
+        found: whether the recordings tell it; else it is no more than the prior.
+    """
+
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    found: bool
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A recording beside what was simulated of it.
+
+    Attributes:
+        name: of the recording.
+        time: `[n]` [s].
+        held: `[n]` whether nothing was fitted to a frame; from the first of them on, what is
+            simulated runs on by itself.
+        recorded: `[n, 3]` position of the core, or the middle of the marks, NaN where unknown [m];
+            of a recording of a mean speed, that [m/s].
+        fitted: `[n, 3]` the same, with the coefficients found.
+        before: `[n, 3]` with those that the robot had.
+    """
+
+    name: str
+    time: np.ndarray
+    held: np.ndarray
+    recorded: np.ndarray
+    fitted: np.ndarray
+    before: np.ndarray
+
+    def error(self, which: np.ndarray, held: bool) -> float:
+        """Root mean square distance of `fitted` or `before` from what was recorded [m]."""
+        rows = self.held if held else ~self.held
+        square = np.nansum((which - self.recorded)[rows] ** 2, 1)
+        return float(np.sqrt(square.mean())) if rows.any() else float("nan")
+
+    @property
+    def way(self) -> float:
+        """Length of the recorded way, in steps of a tenth of it [m]."""
+        rows = np.linspace(0, len(self.time) - 1, 11).astype(int)
+        steps = np.diff(self.recorded[rows], axis=0)
+        return float(np.sqrt(np.nansum(steps**2, 1)).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The end of a fit.
+
+    Attributes:
+        problem: that was solved.
+        state: where the search ended.
+        estimate: of the numbers.
+        values: the numbers.
+        unknown: what the recordings do not tell.
+        local: (recording, name, value, standard deviation) of what each recording has of its own.
+        predictions: of all recordings, those held out first.
+        advice: the motion that would tell most, and the largest of the remaining shares of what
+            was not known before and after it; "" where it was not asked for.
+    """
+
+    problem: Problem
+    state: State
+    estimate: Estimate
+    values: tuple[Value, ...]
+    unknown: tuple[Unknown, ...]
+    local: tuple[tuple[str, str, float, float], ...]
+    predictions: tuple[Prediction, ...]
+    advice: str = ""
+
+    @property
+    def robot(self) -> Robot:
+        """The robot with the numbers found."""
+        return with_values(self.problem.robot, self.problem.parameters, self.state.point.free)
+
+    @property
+    def coefficients(self) -> dict[str, dict[str, Any]]:
+        """Params by type of module, module or `all`, as `body.coefficients` reads them."""
+        found: dict[str, dict[str, Any]] = {}
+        pairs = zip(self.problem.parameters, self.state.point.free, strict=True)
+        for parameter, offset in pairs:
+            for where, params in parameter.entries(parameter.value(float(offset))).items():
+                own = found.setdefault(where, {})
+                for key, value in params.items():
+                    if key == "factors":
+                        before = own.get(key, {})
+                        own[key] = before | {
+                            k: multiply_factors(_plain(x), before.get(k, 1.0))
+                            for k, x in value.items()
+                        }
+                    elif isinstance(value, dict):
+                        own[key] = own.get(key, {}) | {k: _plain(x) for k, x in value.items()}
+                    elif key == "ballast_position" and key in own:
+                        start = self.problem.robot.morphology.modules
+                        [at] = [m.kind.parts[0].ballast_position for m in start if m.name == where]
+                        own[key] = [
+                            _plain(b) if b != c else a
+                            for a, b, c in zip(own[key], value, at, strict=True)
+                        ]
+                    else:
+                        own[key] = _plain(value)
+        return found
+
+    def to_yaml(self) -> str:
+        """The file of coefficients that morphologies and configurations name."""
+        names = ", ".join(r.name for r in self.problem.recordings)
+        lines = [f"# Coefficients of {self.problem.robot.morphology.name}, fitted to {names}."]
+        for v in self.values:
+            words = f"{v.low:.4g} to {v.high:.4g} ({LEVEL:.0%})" if v.found else "NOT FOUND"
+            lines.append(f"# {v.name} {v.value:.4g} {v.unit}: {words}")
+        lines += [f"# {u.words}." for u in self.unknown]
+        return (
+            "\n".join(lines)
+            + "\n"
+            + yaml.safe_dump({"modules": self.coefficients}, sort_keys=False)
+        )
+
+    def to_json(self) -> str:
+        """All numbers, for other programs."""
+        data = {
+            "values": [vars(v) for v in self.values],
+            "unknown": [{"names": u.names, "words": u.words} for u in self.unknown],
+            "recordings": [
+                {"recording": r, "name": n, "value": v, "std": s} for r, n, v, s in self.local
+            ],
+            "noise": self.estimate.noise,
+            "variance_inflation": self.estimate.inflation,
+            "covariance_of_offsets": self.estimate.covariance.tolist(),
+            "predictions": [
+                {
+                    "recording": p.name,
+                    "held_out": bool(p.held.any()),
+                    "error_fitted": p.error(p.fitted, bool(p.held.any())),
+                    "error_before": p.error(p.before, bool(p.held.any())),
+                    "way": p.way,
+                }
+                for p in self.predictions
+            ],
+            "iterations": self.state.iteration,
+            "advice": self.advice,
+        }
+        return json.dumps(data, indent=2) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_plain(x) for x in value]
+    return round(float(value), 9) if isinstance(value, float) else value
+
+
+def fit_robot(
+    robot: Robot,
+    recordings: Sequence[Recording],
+    free: Sequence[str],
+    settings: Settings | None = None,
+    seed: int = 0,
+    advise: bool = False,
+) -> Fit:
+    """Fits numbers of a robot to recordings of it.
+
+    Args:
+        robot: from `build_robot`.
+        recordings: from `load_recording`, or made in code.
+        free: names of what is free, as `drag`, `thrust@port`, `current`.
+        settings: of the fit.
+        seed: of the draws with which the search begins.
+        advise: whether the motion that would tell most is looked for.
+
+    Returns:
+        What was found.
+
+    Raises:
+        InputError: a recording or a name does not suit the robot.
+    """
+    problem = make_problem(robot, recordings, free, settings or Settings())
+    state = begin(problem, seed)
+    model = linearize(problem, state.point)
+    while not is_done(problem, state):
+        state, model = advance(problem, state, model)
+    return conclude(problem, state, model, free, advise)
+
+
+def is_done(problem: Problem, state: State) -> bool:
+    """Whether the search has arrived, or has had all its iterations."""
+    return state.finished or state.iteration >= problem.settings.iterations
+
+
+def conclude(
+    problem: Problem, state: State, model: Model, free: Sequence[str], advise: bool
+) -> Fit:
+    """What a search that has ended has found."""
+    found = estimate(problem, state, model)
+    values = []
+    for k, parameter in enumerate(problem.parameters):
+        value, low, high = found.interval(problem, k)
+        known = is_found(parameter, found.covariance[k, k])
+        values.append(Value(parameter.name, parameter.unit, value, low, high, known))
+    unknown = tuple(find_unknown(problem.parameters, found.information))
+    local = tuple(
+        (recording.name, name, float(found.local[r, k]), float(found.local_spread[r, k]))
+        for r, recording in enumerate(problem.recordings)
+        for k, name in enumerate(problem.local)
+        if np.isfinite(problem.fitted_until[r])
+    )
+    advice = ""
+    if advise:
+        own = [name for name in free if name not in ("current", "clock")]
+        plan = plan_motions(problem.robot, own, problem.settings, found.information, 1)
+        spread = np.array([p.spread for p in problem.parameters])
+        now = np.sqrt(np.diag(found.covariance)) / spread
+        worst = int(np.argmax(now))
+        after = plan.spreads[0][worst] / spread[worst]
+        advice = (
+            f"{plan.motions[0].words}: it would leave {after:.2g} of what is not known of "
+            f"{problem.parameters[worst].name}, now {now[worst]:.2g}"
+        )
+    return Fit(
+        problem, state, found, tuple(values), unknown, local, _predict(problem, state), advice
+    )
+
+
+def _predict(problem: Problem, state: State) -> tuple[Prediction, ...]:
+    before = problem.origin()
+    before = type(before)(before.free, state.point.local, state.point.starts)
+    tracks = problem.simulate([state.point, before])
+    left = dict(zip(range(len(problem.channels)), problem.residuals(tracks), strict=True))
+    found = []
+    for r, recording in enumerate(problem.recordings):
+        for k, channel in enumerate(problem.channels):
+            if channel.recording != r or channel.kind not in ("position", "marks", "speed"):
+                continue
+            off = left[k]
+            if channel.kind == "speed":
+                mean = float(np.mean(recording.signals["mean_speed"].value))
+                none = np.full_like(off, np.nan)
+                both = list(np.concatenate([mean * np.exp(off), none, none], -1))
+                seen = np.tile([mean, np.nan, np.nan], (len(channel.time), 1))
+            else:
+                # The middle of the marks that are seen.
+                wide = np.stack([channel.seen + x for x in (0 * off[0], *off)])
+                wide = wide.reshape(*wide.shape[:2], -1, 3)
+                count = np.isfinite(wide).sum(2)
+                seen, *both = np.where(count > 0, np.nansum(wide, 2) / np.maximum(count, 1), np.nan)
+            found.append(
+                Prediction(recording.name, channel.time, ~channel.fitted, seen, both[0], both[1])
+            )
+    return tuple(sorted(found, key=lambda p: not p.held.all()))

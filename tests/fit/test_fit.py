@@ -1,0 +1,428 @@
+"""Fits of robots whose coefficients are known, what is unknown, and recordings that are wrong."""
+
+import json
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+import yaml
+
+from experiments import measured_data as data
+from experiments.measured_cases import body as chain
+from experiments.water_tank import world as tank
+from laboratory import ROOT
+from mjx_revolve import fit as command
+from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.coefficients import correct_types, load_coefficients
+from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.variants import course_targets
+from mjx_revolve.episodes.config import load_config
+from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.simulate import simulate
+from mjx_revolve.evolution.interrupts import Interrupts
+from mjx_revolve.fitting import Recording, Settings, Signal, fit_robot, load_recording, make_noisy
+from mjx_revolve.fitting.identify import find_unknown, plan_motions
+from mjx_revolve.fitting.parameters import read_free, with_values
+from mjx_revolve.fitting.problem import make_problem
+from mjx_revolve.fitting.recording import read_map
+from mjx_revolve.fitting.run import FitRun, Request, load_robot
+from mjx_revolve.fitting.synthetic import simulate_signals
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.world import load_world
+
+FREE = ["drag", "added_mass", "thrust", "current"]
+TRUE = np.log([1.3, 0.8, 0.9])
+SHARED = ROOT.parent / "shared" / "swimmers" / "amphibot_glide.csv"
+
+
+@pytest.fixture(scope="module")
+def auv():
+    return build_robot(load_morphology("auv"), load_world("lake", bed="off"))
+
+
+def steps(robot, duration=10.0):
+    """Thrusters on and off, at levels that differ."""
+    time = np.arange(0, duration, robot.world.timestep)
+    draw = np.random.default_rng(3)
+    levels = draw.uniform(-0.8, 0.8, (10, robot.mj_model.nu))
+    return levels[(time // 1.5).astype(int)]
+
+
+@pytest.fixture(scope="module")
+def signals(auv):
+    return simulate_signals(auv, FREE[:3], TRUE, steps(auv), (0.02, -0.01, 0))
+
+
+@pytest.fixture(scope="module")
+def fitted(auv, signals):
+    recording = make_noisy(signals, rate=30, lost=0.05, seed=1, name="pool")
+    return fit_robot(auv, [recording], FREE)
+
+
+def test_what_is_simulated_for_a_fit_is_what_simulate_does(auv, signals):
+    """Variants in lanes, windows and records change nothing."""
+    robot = with_values(auv, read_free(FREE[:3], auv), TRUE)
+    with jax.enable_x64(True):
+        from mjx_revolve.water.flow import Water
+
+        alone = simulate(robot, steps(auv), water=Water(0.0, (0.02, -0.01, 0.0)))
+        found = np.asarray(alone.qpos)
+    time, x = signals["x"]
+    at = np.round(time[1:] / auv.world.timestep).astype(int) - 1
+    np.testing.assert_allclose(x[1:], found[at, 0], atol=1e-9)
+
+
+def test_known_coefficients_are_found_within_their_intervals(fitted):
+    for value, truth in zip(fitted.values, np.exp(TRUE), strict=True):
+        assert value.found
+        assert value.value == pytest.approx(truth, rel=0.03)
+        # The intervals, half as wide again: one case of three numbers is no coverage.
+        middle = (value.low + value.high) / 2
+        assert abs(truth - middle) < 1.5 * (value.high - middle)
+        assert value.high / value.low < 1.1
+    current = {n: (x, s) for _, n, x, s in fitted.local}
+    assert current["current_x"][0] == pytest.approx(0.02, abs=4 * current["current_x"][1] + 1e-3)
+    assert fitted.estimate.noise["position"] == pytest.approx(0.005, rel=0.15)
+    assert fitted.estimate.noise["attitude"] == pytest.approx(np.pi / 180, rel=0.15)
+    assert not fitted.unknown
+
+
+def test_what_is_held_out_is_foretold_better_than_before(fitted):
+    [prediction] = fitted.predictions
+    assert 0.2 < prediction.held.mean() < 0.3
+    off = [prediction.error(x, True) for x in (prediction.fitted, prediction.before)]
+    assert off[0] < 0.03 and off[0] < off[1] / 5
+
+
+def test_a_wild_frame_does_no_harm(auv, signals, fitted):
+    recording = make_noisy(signals, rate=30, lost=0.05, seed=1)
+    time, x = recording.signals["x"]
+    bad = x.copy()
+    bad[[40, 90]] += 0.5
+    wild = replace(recording, signals={**recording.signals, "x": Signal(time, bad)})
+    found = fit_robot(auv, [wild], FREE)
+    for a, b in zip(found.values, fitted.values, strict=True):
+        assert a.value == pytest.approx(b.value, rel=0.02)
+
+
+def test_a_common_scale_is_named_and_not_found():
+    """Surge alone: force, drag and carried water may all be twice as large, if mass may."""
+    free = read_free(["drag", "thrust", "added_mass"], build_robot(
+        load_morphology("auv"), load_world("lake")))  # fmt: skip
+    both = np.array([1.0, -1.0, 0.0])
+    information = 1e4 * np.outer(both, both) + 1e4 * np.diag([0, 0, 1.0])
+    [unknown] = find_unknown(free[:2], information[:2, :2])
+    assert unknown.words == "only the ratio of drag and thrust is known"
+    [unknown] = find_unknown(free[:2], 1e4 * np.ones((2, 2)))
+    assert unknown.words == "only the product of drag and thrust is known"
+    three = np.eye(3) - np.ones((3, 3)) / 3
+    spread = np.array([p.spread for p in free])
+    [unknown] = find_unknown(free, 1e4 * three / np.outer(spread, spread))
+    assert "up to a common factor" in unknown.words
+
+
+def test_a_robot_that_only_coasts_does_not_tell_its_thrust(auv):
+    found = simulate_signals(auv, ["drag"], [0.2], velocity=(0, 0.3, 0, 0, 0, 0.5), duration=6.0)
+    fit = fit_robot(auv, [make_noisy(found)], ["drag", "thrust"], Settings(held_out=0.0))
+    drag, thrust = fit.values
+    assert drag.found and drag.value == pytest.approx(np.exp(0.2), rel=0.05)
+    assert not thrust.found
+    assert [u.words for u in fit.unknown] == ["thrust is not known from this"]
+    assert "# thrust 1 : NOT FOUND" in fit.to_yaml().replace("# thrust 1.0", "# thrust 1")
+
+
+def test_a_plan_knows_more_with_each_motion(auv):
+    settings = Settings(duration=3.0, motions=2)
+    plan = plan_motions(auv, ["drag", "thrust"], settings)
+    assert len({m.words for m in plan.motions}) == 2
+    assert (plan.spreads[1] < plan.spreads[0]).all()
+    assert not plan.unknown
+
+
+# --- coefficients in files ------------------------------------------------------------------------
+
+
+def test_morphologies_and_configurations_name_what_was_fitted(fitted, tmp_path):
+    (tmp_path / "water.yaml").write_text(fitted.to_yaml())
+    tree = {"id": "core", "type": "Core", "children": {1: {"id": "leg", "type": "ActiveHinge"}}}
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump({"body": tree, "coefficients": "water.yaml"}))
+    robot = load_morphology(path)
+    factor = dict(robot.modules[1].kind.parts[0].factors)["drag"]
+    assert factor == pytest.approx(fitted.values[0].value, rel=1e-6)
+    (tmp_path / "again").mkdir()
+    save_morphology(robot, tmp_path / "again" / "robot.yaml")
+    again = load_morphology(tmp_path / "again" / "robot.yaml")
+    assert again.modules[1].kind == robot.modules[1].kind
+    config = load_config("lake_swim", overrides={"coefficients": str(tmp_path / "water.yaml")})
+    assert read_modules(config)["Core"].parts[0].factors == robot.modules[0].kind.parts[0].factors
+    water = load_world("lake")
+    plain = build_robot(make_morphology(tree), water).fluid
+    mine = build_robot(robot, water).fluid
+    np.testing.assert_allclose(
+        mine.carried_mass, fitted.values[1].value * plain.carried_mass, rtol=1e-6
+    )
+
+
+def test_factors_of_one_coefficient_and_of_one_module():
+    robot = build_robot(load_morphology("spider"), load_world("lake"))
+    free = read_free(["drag_coefficient.x@Core", "servo_speed@left_hip", "mass"], robot)
+    found = with_values(robot, free, np.log([2.0, 0.5, 1.1])).morphology
+    core, hip = found.modules[0], next(m for m in found.modules if m.name == "left_hip")
+    assert dict(core.kind.parts[0].factors)["drag_coefficient"] == (2.0, 1.0, 1.0)
+    assert hip.kind.hinge.speed == pytest.approx(MODULES["ActiveHinge"].hinge.speed / 2)
+    assert found.mass == pytest.approx(1.1 * robot.morphology.mass)
+    with pytest.raises(InputError, match=r"water.yaml: modules.left_hip: expected `all` or a type"):
+        correct_types(MODULES, {"left_hip": {}}, "water.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("modules: {all: {factors: {dragg: 2}}}", "modules.all.factors: expected names of coeff"),
+        ("drag: 2", "expected a mapping `modules`"),
+        ("modules: {all: 3}", "modules.all: expected a mapping"),
+    ],
+)
+def test_a_wrong_file_of_coefficients_is_one_line(tmp_path, text, words):
+    (tmp_path / "water.yaml").write_text(text)
+    with pytest.raises(InputError, match=words.replace(".", r"\.")):
+        load_coefficients(tmp_path / "water.yaml")
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+
+def write_csv(path, columns):
+    names = list(columns)
+    rows = [",".join(names)]
+    rows += [",".join(map(str, row)) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join(rows) + "\n")
+
+
+def swim(count=60):
+    time = np.arange(count) / 20
+    return {"time": time, "x": 0.2 * time, "y": 0.05 * np.sin(time), "z": 0 * time - 1,
+            "yaw": 0.1 * time, "command.port": 0 * time + 0.4}  # fmt: skip
+
+
+def changed(**more):
+    return {k: v for k, v in (swim() | more).items() if v is not None}
+
+
+def backwards():
+    time = swim()["time"].copy()
+    time[30] = time[28]
+    return time
+
+
+BAD = {
+    "empty": ("", "found an empty file"),
+    "words": ("time,x,y\n0,1,2\n1,oops,2\n", "row 3, column x: expected a number; found 'oops'"),
+    "nothing measured": (changed(x=np.full(60, np.nan)), "column x: expected numbers; found none"),
+    "no time": (changed(time=None), "expected a column time"),
+    "back": (changed(time=backwards()), "row 32: expected a time later than 1.45 s; found 1.4 s"),
+    "millimetres": (changed(x=200 * np.arange(60.0)), "millimetres or pixels"),
+    "other robot": (changed(**{"command.left_hip": np.zeros(60)}), "another robot"),
+    "percent": (changed(**{"command.port": np.full(60, 40.0)}), "percent"),
+    "still": (changed(x=np.ones(60), y=np.ones(60), yaw=np.zeros(60)), "a robot that moves"),
+    "no place": (changed(x=None, y=None), "expected x and y of the core, marks, or mean_speed"),
+    "ragged": ("time,x\n0,1\n1,2,3\n2,3\n", "row 3: expected 2 cells; found 3"),
+    "no quaternion": (changed(qw=np.full(60, 7.0), qx=np.zeros(60), qy=np.zeros(60),
+                              qz=np.zeros(60)), "expected unit quaternions"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_bad_recording_is_one_line(kind, tmp_path, capsys):
+    content, words = BAD[kind]
+    path = tmp_path / "swim.csv"
+    path.write_text(content) if isinstance(content, str) else write_csv(path, content)
+    assert run_command(command.main, ["auv", str(path), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and words in error and "swim.csv" in error
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["auv"], "expected a RECORDING, or --plan"),
+        (["auv", "none.csv"], "expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"),
+        (["--plan", "auv", "--free", "lift"], "--free lift: expected some of drag, added_mass"),
+        (["--plan", "spider", "--free", "thrust"], "expected a robot with a thruster; found none"),
+        (["--plan", "auv", "--free", "drag@leg"], "--free drag@leg: expected @ and one of Core"),
+        (["--plan", "auv", "--set", "windows=3"], "settings.windows: expected one of window"),
+        (["--plan", "auv", "--free", "drag,drag"], "--free drag: expected each name once"),
+    ],
+)
+def test_wrong_arguments_are_one_line(arguments, words, capsys):
+    assert run_command(command.main, arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and words in error
+
+
+MARKS = {"a": (0.0, 0.1, 0.0), "b": (0.0, -0.1, 0.0), "c": (0.05, 0.03, 0.0)}
+
+
+def marks(order="abc", mirror=1.0, scale=1.0):
+    """A robot that swims ahead and turns, as a camera from above sees three points on it."""
+    time = np.arange(60) / 20
+    yaw, found = 0.3 * time, {"time": time}
+    for name, real in zip("abc", order, strict=True):
+        x, y, _ = MARKS[real]
+        found[f"mark.{name}.x"] = scale * (0.2 * time + np.cos(yaw) * x - np.sin(yaw) * y)
+        found[f"mark.{name}.y"] = mirror * scale * (np.sin(yaw) * x + np.cos(yaw) * y)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        (marks("bac"), "marks a and b: expected them as on the robot; found them swapped"),
+        (marks(mirror=-1.0), "found them mirrored"),
+        (marks(scale=2.0), "another scale"),
+    ],
+    ids=["swapped", "mirrored", "scale"],
+)
+def test_marks_that_are_not_on_the_robot_are_refused(auv, tmp_path, columns, words):
+    write_csv(tmp_path / "swim.csv", columns)
+    where = [f"mark.{k}=core:{','.join(map(str, v))}" for k, v in MARKS.items()]
+    recording = load_recording(tmp_path / "swim.csv", auv, read_map(where))
+    with pytest.raises(InputError, match=words):
+        make_problem(auv, [recording], ["drag"], Settings())
+
+
+def test_marks_as_they_should_be_begin_where_the_robot_is(auv, tmp_path):
+    write_csv(tmp_path / "swim.csv", marks())
+    where = [f"mark.{k}=core:{','.join(map(str, v))}" for k, v in MARKS.items()]
+    recording = load_recording(tmp_path / "swim.csv", auv, read_map(where))
+    problem = make_problem(auv, [recording], ["drag"], Settings(window=1.0, held_out=0.0))
+    np.testing.assert_allclose(problem.roots[1, :2, 0], [0.2, 0.0], atol=2e-3)
+    np.testing.assert_allclose(problem.roots[1, 7:9, 0], [0.2, 0.0], atol=5e-3)
+    np.testing.assert_allclose(problem.roots[1, 12, 0], 0.3, atol=5e-3)
+
+
+def test_units_gaps_and_factors_of_columns(auv, tmp_path):
+    columns = swim()
+    columns = {"frame": 20 * columns["time"], "px": 500 * columns["x"], "y_mm": 1e3 * columns["y"],
+               "z": columns["z"], "yaw_deg": np.degrees(columns["yaw"])}  # fmt: skip
+    kept = np.r_[0:20, 30:60]
+    write_csv(tmp_path / "swim.csv", {k: v[kept] for k, v in columns.items()})
+    given = read_map(["time=frame*0.05", "x=px*0.002"])
+    found = load_recording(tmp_path / "swim.csv", auv, given)
+    for name in ("x", "y", "yaw"):
+        np.testing.assert_allclose(found.signals[name].value, swim()[name][kept], atol=1e-9)
+    assert found.notes == ("frames at 20 Hz: 0 dropped, 1 gaps of up to 0.55 s",)
+
+
+def test_a_bag_of_ours_is_read(auv, tmp_path):
+    pytest.importorskip("rosbags", reason="the package rosbags reads bags")
+    from mjx_revolve.formats.ros_bag import write_bag
+
+    trajectory = simulate(auv, [0.5] * 4, 1.0, once=True)
+    write_bag(auv, trajectory, tmp_path / "swim.mcap")
+    found = load_recording(tmp_path / "swim.mcap", auv, {})
+    assert {"x", "qw", "command.port"} <= set(found.signals)
+    rows = np.round((found.signals["x"].time + 0.01) / auv.world.timestep).astype(int) - 1
+    np.testing.assert_allclose(
+        found.signals["y"].value, np.asarray(trajectory.qpos)[rows, 1], atol=1e-6
+    )
+
+
+def test_prescribed_hinges_follow_what_was_measured():
+    robot = build_robot(load_morphology("spider"), load_world("lake", bed="off"))
+    time = np.arange(0, 2, 0.02)
+    hip = 0.5 * np.sin(4 * time)
+    still = {n: Signal(time, 0.1 * time) for n in ("x", "y", "z", "yaw")}
+    recording = Recording("legs", still | {"angle.left_hip": Signal(time, hip)})
+    problem = make_problem(robot, [recording], ["drag"], Settings(held_out=0.0))
+    track = problem.simulate([problem.origin()])[:, 0]
+    names = [robot.morphology.modules[k].name for k in robot.morphology.hinges]
+    angle = problem.states(track, 0, time)[0, :, 13 + names.index("left_hip")]
+    np.testing.assert_allclose(angle, hip, atol=2e-3)
+    course = np.cumsum(np.random.default_rng(0).normal(size=20))
+    assert course_targets(course, 0.01).shape == (18,)
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+class Stop(Interrupts):
+    """A signal that comes after so many looks."""
+
+    def __init__(self, looks):
+        super().__init__()
+        self.looks = looks
+
+    @property
+    def signal(self):
+        self.looks -= 1
+        return 2 if self.looks < 0 else None
+
+    @signal.setter
+    def signal(self, value):
+        pass
+
+
+def test_a_fit_that_was_stopped_goes_on_bit_for_bit(signals, tmp_path):
+    robot, entry, copies = load_robot("auv", None, None, {"bed": "off"}, False)
+    recording = make_noisy(signals, seed=2, name="pool")
+    request = Request(robot, (recording,), tuple(FREE), Settings(), 0, (entry, copies))
+    whole = FitRun.begin(tmp_path / "whole", request)
+    found = whole.run(Stop(10**6))
+    whole.write(found, "page")
+    whole.folder.close()
+    part = FitRun.begin(tmp_path / "part", request)
+    assert part.run(Stop(2)) is None
+    part.folder.close()
+    again = FitRun.resume(tmp_path / "part")
+    assert again.state.iteration == 2
+    rest = again.run(Stop(10**6))
+    again.folder.close()
+    assert rest.to_json() == found.to_json()
+    assert rest.advice
+    names = ("coefficients.yaml", "fit.json", "robot.yaml", "report.html", "metrics.csv")
+    assert all((tmp_path / "whole" / name).is_file() for name in names)
+    assert json.loads((tmp_path / "whole" / "fit.json").read_text())["values"][0]["found"]
+    corrected = load_morphology(tmp_path / "whole" / "robot.yaml")
+    assert dict(corrected.modules[0].kind.parts[0].factors)["drag"] == found.values[0].value
+
+
+def test_the_page_shows_what_was_found(fitted):
+    from mjx_revolve.view.report.fit import make_fit_page
+
+    page = make_fit_page(fitted)
+    for words in ("Predicted beside recorded", "held out", "added_mass", "3 of 3", "<img"):
+        assert words in page
+    assert "http" not in page.replace("http://www.w3.org", "")
+
+
+# --- measured -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED.is_file(), reason=f"EPFL's glide is not there: {SHARED}")
+def test_two_seconds_of_a_glide_foretell_the_rest_of_its_way():
+    """AmphiBot's marks: drag and friction from 2 s of them, the way of the others within 3 %."""
+    pool = tank(gravity=9.81, buoyancy="partial", drag="cross_flow", added_mass=True,
+                timestep=0.001)  # fmt: skip
+    robot, half = chain("ChainHead", pool, "ChainModule", 6), data.CHAIN_MODULE / 2
+    given = {f"angle.link{k}": str(np.radians(a)) for k, a in enumerate(data.AMPHIBOT_GLIDE.angles)}
+    given["mark.0"] = "core"
+    for k in range(6):
+        given |= {f"mark.{2 * k + 1}": f"link{k}", f"mark.{2 * k + 2}": f"link{k}:{half},0,0"}
+    recording = load_recording(SHARED, robot, given)
+    late = {n: s.time > 989.05 for n, s in recording.signals.items()}  # the joints have stopped
+    kept = {n: Signal(s.time[late[n]], s.value[late[n]]) for n, s in recording.signals.items()}
+    settings = Settings(held_out=1 - 2.05 / 4.402)
+    fit = fit_robot(robot, [replace(recording, signals=kept)], ["drag", "friction"], settings)
+    [p] = fit.predictions
+    assert (p.time[~p.held] < 991.1).all() and p.held.sum() == 5
+    way, seen = (
+        np.linalg.norm(x[:, :2] - p.recorded[0, :2], axis=1) for x in (p.fitted, p.recorded)
+    )
+    np.testing.assert_allclose(way[p.held], seen[p.held], rtol=0.03)
