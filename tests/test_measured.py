@@ -31,6 +31,16 @@ def test_steady_drag_is_near_that_of_plates_and_far_from_that_of_long_rods(stead
     np.testing.assert_allclose(ours, by_hand, rtol=1e-9)
 
 
+def test_a_rod_meets_what_a_rod_meets_with_the_law_of_chains(steady):
+    found, before = ratios(measured_cases.steady_drag("cross_flow").rows), ratios(steady.rows)
+    assert found["square rod, face on"] == pytest.approx(1.75 / 2.0, rel=1e-6)
+    assert found["square rod, edge on"] == pytest.approx(1.75 / 2**0.5 / 1.6, rel=1e-6)
+    for name in ("square plate, broadside", "disc, broadside"):
+        assert found[name] == before[name]
+    # Friction on a blunt body, which it is not.
+    assert found["REMUS 100, ahead"] == pytest.approx(1.5 / 0.42, rel=0.01)
+
+
 def test_a_plate_sinks_by_its_drag():
     """Terminal speeds are within 10 % of what the measured C_d gives."""
     row = measured_cases.sinking_plate()

@@ -34,8 +34,8 @@ class Exposure(NamedTuple):
     Attributes:
         shares: of the silhouette that no other part covers [-]. Opposite faces are averaged, as
             drag and added mass are the same in both directions.
-        joined: of the ends by which a part is in a row, the share that its neighbours cover [-]; 0
-            without neighbours.
+        joined: of the ends by which a part is in a row, the share that its neighbours cover [-]; 1
+            of a part that is a row by itself.
         ends: 1 or -1 where a row ends with this part, in that direction; 0 elsewhere.
         rows: length of the row [m]; of a lone part its own.
     """
@@ -96,7 +96,7 @@ def exposure(parts: RestPose) -> Exposure:
     whole = np.maximum(np.bitwise_count(silhouette).sum(axis=-1), 1)
     cover = np.bitwise_count(covered & silhouette[:, None]).sum(axis=-1) / whole[:, None]
     near = neighbour >= 0
-    joined = (near * cover).sum(1) / np.maximum(near.sum(1), 1)
+    joined = np.where(near.any(1), (near * cover).sum(1) / np.maximum(near.sum(1), 1), 1.0)
     shares = 1 - hidden.sum(axis=1) / (2 * whole)
     ends = np.where(near.any(1), near[:, 0].astype(int) - near[:, 1], 0)
     return Exposure(shares, joined, ends, _row_lengths(parts, neighbour))

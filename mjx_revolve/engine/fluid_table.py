@@ -46,7 +46,8 @@ class FluidTable:
         mass: [kg].
         silhouette: area of the part's boxes together, seen along each axis [m²].
         exposed: share of each pair of faces that the water reaches [-].
-        joined: share that neighbours cover of the ends by which the part is in a row of parts [-].
+        joined: share that neighbours cover of the ends by which the part is in a row of parts [-];
+            1 of a part that is a row by itself.
         ends: 1 or -1 along an axis at whose end a row of parts ends, in that direction; else 0.
         rows: length of that row [m].
         buoyancy: names of the buoyancy laws.

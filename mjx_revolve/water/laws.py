@@ -207,7 +207,7 @@ class PartShapes(Protocol):
 
     @property
     def joined(self) -> np.ndarray:
-        """`[n, 3]` share of the ends by which a part is in a row that its neighbours cover [-]."""
+        """`[n, 3]` share of its ends in a row that neighbours cover [-]; 1 of a row by itself."""
 
     @property
     def ends(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Chains: oblique flow, spinning rods, friction, wakes; a lone part has its faces' drag."""
+"""Chains and rods: oblique flow, turning, friction, wakes; what is compact has its faces' drag."""
 
 from __future__ import annotations
 
@@ -53,12 +53,30 @@ def drag_at(numbers, velocity, turning=(0.0, 0.0, 0.0)):
         return jax.tree.map(np.asarray, CROSS_FLOW.force(flow, numbers, WATER))
 
 
-def test_a_lone_part_has_the_drag_of_its_faces():
+def test_a_compact_part_has_the_drag_of_its_faces():
     robots = [box_robot((0.2, 0.1, 0.06), 1.2, world(drag=x)) for x in ("faces", "cross_flow")]
     qpos, qvel = at_rest(robots[0], 1, -5.0)
     qvel[:6, 0] = [0.3, -0.2, 0.1, 0.5, 0.2, -0.4]
     found = [accelerate(robot, qpos, qvel) for robot in robots]
     assert found[1] == pytest.approx(found[0], rel=1e-12)
+
+
+def test_a_lone_rod_is_a_chain_that_sheds_nothing():
+    """In oblique flow, along it, spinning about its middle; in between, some of it."""
+    rod, shorter = (
+        box_robot((length, 0.1, 0.1), 1000 * length * 0.01, WATER) for length in (1.0, 0.1 / 0.3)
+    )
+    numbers = CROSS_FLOW.numbers(rod.fluid, WATER)
+    assert numbers.mixing.tolist() == [[1, 0, 0]]
+    assert not numbers.shed.any()
+    numbers = as_components(jax.tree.map(lambda x: x[0], numbers))
+    across = drag_at(numbers, [0.0, 0.3, 0.4]).force
+    assert across == pytest.approx(
+        -0.5 * WATER.density * 1.75 * 0.1 * 0.5 * np.array([0, 0.3, 0.4])
+    )
+    spun = drag_at(numbers, [0.0, 0, 0], [0, 0, 5.0]).torque
+    assert spun[2] == pytest.approx(-WATER.density * 1.75 * 0.1 / 64 * 25, rel=0.01)
+    assert CROSS_FLOW.numbers(shorter.fluid, WATER).mixing[0, 0] == pytest.approx(0.5)
 
 
 def test_a_chain_in_oblique_flow_meets_all_of_the_velocity_across_it(inside):
