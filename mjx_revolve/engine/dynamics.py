@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from mjx_revolve.engine.contact import bed_forces
 from mjx_revolve.engine.hydrodynamics import ExternalForces, PreviousStep, water_forces
-from mjx_revolve.engine.kinematics import body_motions, forward_kinematics
+from mjx_revolve.engine.kinematics import body_frames, forward_kinematics
 from mjx_revolve.engine.level import Hinges, Level
 from mjx_revolve.engine.self_contact import (
     Acceleration,
@@ -278,10 +278,10 @@ def _with_contact(
         wanted = any_lane(left < 0) & wanted
 
     def push() -> tuple[jax.Array, Any]:
-        motions = [body_motions(tree, x) for x in (state, ahead)]
+        bodies = Bodies(body_frames(tree, state), body_frames(tree, ahead))
         found, clearance = contact_acceleration(
             meetings,
-            Bodies.of(*motions),
+            bodies,
             lambda which: _make_respond(tree, factors, which),
             dt,
         )

@@ -27,9 +27,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_revolve.engine.kinematics import BodyFrames
 from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.numerics.boxes import BoxPair, box_contact
-from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
     Mat,
     Scalar,
@@ -66,29 +66,15 @@ _SOFTNESS = 0.02
 
 
 class Bodies(NamedTuple):
-    """Rigid bodies of robots, `[nbody, lanes]` each, the root first.
+    """Rigid bodies of robots, as `kinematics.body_frames` returns them.
 
     Attributes:
-        rotation: world from body.
-        position: of the origin, world frame [m].
-        rotation_ahead: at the end of the step without contact.
-        position_ahead: likewise.
-        velocity: of the origin then, body frame [m/s].
-        spin: angular velocity then, body frame [rad/s].
+        now: their poses.
+        ahead: at the end of the step without contact.
     """
 
-    rotation: Mat
-    position: Vec
-    rotation_ahead: Mat
-    position_ahead: Vec
-    velocity: Vec
-    spin: Vec
-
-    @staticmethod
-    def of(now: BodyMotion, ahead: BodyMotion) -> Bodies:
-        """From motions now, and at the end of the step."""
-        poses = [(x.axes, (*x.xy, x.height)) for x in (now, ahead)]
-        return Bodies(*poses[0], *poses[1], ahead.velocity, ahead.angular_velocity)
+    now: BodyFrames
+    ahead: BodyFrames
 
 
 class Acceleration(NamedTuple):
@@ -125,32 +111,36 @@ def contact_acceleration(
     Returns:
         As `Acceleration.robot`; and, where robots are alike, `State.clearance`.
     """
-    nbody, lanes = bodies.position[0].shape
-    nothing = jnp.zeros((6 + nbody - 1, lanes), bodies.position[0].dtype)
+    nbody, lanes = bodies.now.position[0].shape
+    nothing = jnp.zeros((6 + nbody - 1, lanes), bodies.now.position[0].dtype)
     look_up, gather = _make_search(meetings, bodies)
     blocks, width = meetings.first.shape
     room = blocks * width if meetings.steady else min(blocks * width, _ROOM)
     start = jnp.zeros(room + max(width, _PAIRS), jnp.int32), jnp.int32(0)
     clear = jnp.full(width, 1e3, nothing.dtype)
-    table = jnp.zeros((_MOST, 15, lanes), nothing.dtype).at[:, 0].set(_NONE)
+    table = ContactTable(
+        jnp.full((_MOST, lanes), _NONE, nothing.dtype),
+        jnp.zeros((_MOST + 1, 14, lanes), nothing.dtype),
+    )
 
-    def measure(listed: Any, table: jax.Array) -> jax.Array:
+    def measure(listed: Any, table: ContactTable) -> ContactTable:
         return _measure_all(listed, look_up, table, dt, meetings.steady)
 
-    def resolve(table: jax.Array) -> jax.Array:
+    def resolve(table: ContactTable) -> jax.Array:
         lane = jnp.arange(lanes, dtype=jnp.int32)
         size = min(_ROBOTS, lanes)
         most = -(-lanes // size)
         start = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
-        touches = table[0, 0] > 0
+        touches = table.need[0] > 0
         for k in range(1, _MOST):
-            touches = touches | (table[k, 0] > 0)
+            touches = touches | (table.need[k] > 0)
         touching, count = _append(touches, lane, start, meetings.steady)
 
         def solve(k: Any, total: jax.Array) -> jax.Array:
             which = jax.lax.dynamic_slice(touching, (k * size,), (size,))
             real = k * size + jnp.arange(size, dtype=jnp.int32) < count
-            contacts = _Contacts(take_lanes(table, which), real, nbody, dt)
+            own: ContactTable = jax.tree.map(lambda x: take_lanes(x, which), table)
+            contacts = _Contacts(own, real, nbody, dt)
             found = contacts.solve(respond_at(which), len(total))
 
             def write(j: Any, total: jax.Array) -> jax.Array:
@@ -251,11 +241,11 @@ def _make_search(meetings: Meetings, bodies: Bodies) -> tuple[Any, Any]:
         A function: numbers of pairs → their two boxes. And one that looks at the next block:
         (block, (numbers of such pairs, how many there are), the spheres' clearance `[width]`).
     """
-    lanes, dtype = bodies.position[0].shape[-1], bodies.position[0].dtype
+    lanes, dtype = bodies.now.position[0].shape[-1], bodies.now.position[0].dtype
     body = jnp.asarray(meetings.body, jnp.int32)
     boxes = meetings.boxes
-    place: Bodies = jax.tree.map(meetings.at_bodies, bodies)
-    center = vadd(place.position_ahead, matvec(place.rotation_ahead, boxes.position))
+    place: BodyFrames = jax.tree.map(meetings.at_bodies, bodies.ahead)
+    center = vadd(place.position, matvec(place.rotation, boxes.position))
     center = tuple(x.reshape(-1) for x in center)
     radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size)).reshape(-1)
     frames, shells = jax.tree.map(lambda x: x.reshape(-1), (bodies, boxes))
@@ -297,24 +287,35 @@ def _make_search(meetings: Meetings, bodies: Bodies) -> tuple[Any, Any]:
     return look_up, gather
 
 
-def _measure_all(listed: Any, look_up: Any, table: jax.Array, dt: float, steady: bool) -> jax.Array:
-    """Contacts of each robot, those that need the most, `[_MOST, 15, lanes]`.
-
-    Of each: the acceleration along the normal that it needs [m/s²], not positive where boxes stay
-    apart unless other contacts push them together; the numbers of both bodies; torque and force of
-    a unit force on each, own frames.
-    """
+def _measure_all(
+    listed: Any, look_up: Any, table: ContactTable, dt: float, steady: bool
+) -> ContactTable:
+    """The contacts of listed pairs join those of each robot; the weakest give way."""
     numbers, count = listed
 
-    def examine(k: Any, table: jax.Array) -> jax.Array:
+    def examine(k: Any, table: ContactTable) -> ContactTable:
         pair = jax.lax.dynamic_slice(numbers, (k * _PAIRS,), (_PAIRS,))
         given = look_up(pair)
         need, *rest = _measure(given, dt)
         need = jnp.where(k * _PAIRS + jnp.arange(_PAIRS, dtype=jnp.int32) < count, need, _NONE)
-        return _insert(table, jnp.stack([need, *rest]), given[0].lane)
+        return _insert(table, need, jnp.stack(rest), given[0].lane)
 
     most = -(-(len(numbers) - 1) // _PAIRS)
     return _repeat(-(-count // _PAIRS), most, examine, table, steady)
+
+
+class ContactTable(NamedTuple):
+    """Contacts of robots.
+
+    Attributes:
+        need: `[_MOST, lanes]` the acceleration along the normal that each needs [m/s²]; not
+            positive where boxes stay apart unless other contacts push them together.
+        rest: `[_MOST + 1, 14, lanes]` the numbers of both bodies, and torque and force of a unit
+            force on each, own frames; the last contact is none.
+    """
+
+    need: jax.Array
+    rest: jax.Array
 
 
 class _Given(NamedTuple):
@@ -334,20 +335,16 @@ class _Given(NamedTuple):
 
 
 def _measure(given: tuple[_Given, ...], dt: float) -> list[jax.Array]:
-    """The 15 numbers of pairs, see `_measure_all`."""
+    """What pairs need, and the 14 other numbers of them; see `ContactTable`."""
 
-    def poses(body: Bodies, box: Boxes) -> tuple[tuple[Vec, Mat], tuple[Vec, Mat]]:
-        """Centres and rotations of boxes now, and at the end of the step without contact."""
-        now = vadd(body.position, matvec(body.rotation, box.position))
-        later = vadd(body.position_ahead, matvec(body.rotation_ahead, box.position))
-        return (now, matmul(body.rotation, box.rotation)), (
-            later,
-            matmul(body.rotation_ahead, box.rotation),
-        )
+    def pose(frame: BodyFrames, box: Boxes) -> tuple[Vec, Mat]:
+        """Centres and rotations of boxes."""
+        center = vadd(frame.position, matvec(frame.rotation, box.position))
+        return center, matmul(frame.rotation, box.rotation)
 
     def compute(given: Any) -> Any:
         (one, box), (other, second) = given
-        sides = poses(one, box), poses(other, second)
+        sides = [tuple(pose(x, shape) for x in body) for body, shape in given]
         half = box.half_size, second.half_size
         pair, later = (
             BoxPair(vsub(y[0], x[0]), x[1], y[1], *half) for x, y in zip(*sides, strict=True)
@@ -358,17 +355,18 @@ def _measure(given: tuple[_Given, ...], dt: float) -> list[jax.Array]:
         target = jnp.minimum(contact.start, 0) + jnp.minimum(parted, closing)
         need = (target - contact.gap) / dt**2
         point = vadd(sides[0][0][0], contact.point)
-        arms = [matTvec(x.rotation, vsub(point, x.position)) for x in (one, other)]
-        speeds = [
-            matvec(x.rotation_ahead, vadd(x.velocity, cross(x.spin, arm)))
+        arms = [matTvec(x.now.rotation, vsub(point, x.now.position)) for x in (one, other)]
+        # Where the point ends that is fixed to each body.
+        ends = [
+            vadd(x.ahead.position, matvec(x.ahead.rotation, arm))
             for x, arm in zip((one, other), arms, strict=True)
         ]
-        speed = dot(contact.normal, vsub(speeds[1], speeds[0]))
+        speed = dot(contact.normal, vsub(ends[1], ends[0])) / dt
         # Normals turn within the step; so that no work is done, boxes part no faster than they met.
         need = jnp.minimum(need, 2 * jnp.maximum(-speed, 0) / dt)
         units = []
         for x, arm, sign in zip((one, other), arms, (-1.0, 1.0), strict=True):
-            push = vscale(sign, matTvec(x.rotation, contact.normal))
+            push = vscale(sign, matTvec(x.now.rotation, contact.normal))
             units += [*cross(arm, push), *push]
         return need, *units
 
@@ -376,21 +374,25 @@ def _measure(given: tuple[_Given, ...], dt: float) -> list[jax.Array]:
     return [need, *(x.number for x in given), *units]
 
 
-def _insert(table: jax.Array, found: jax.Array, lane: jax.Array) -> jax.Array:
-    """Contacts `[15, n]` of such lanes, each in place of its robot's weakest one so far."""
+def _insert(table: ContactTable, need: jax.Array, rest: jax.Array, lane: jax.Array) -> ContactTable:
+    """Contacts of such lanes, each in place of its robot's weakest one so far."""
 
-    def one(j: Any, table: jax.Array) -> jax.Array:
+    def one(j: Any, table: ContactTable) -> ContactTable:
         zero, own = jnp.int32(0), lane[j]
-        needs = jax.lax.dynamic_slice(table, (zero, zero, own), (_MOST, 1, 1))[:, 0, 0]
+        needs = jax.lax.dynamic_slice(table.need, (zero, own), (_MOST, 1))[:, 0]
         slot, least = zero, needs[0]
         for k in range(1, _MOST):
             weaker = needs[k] < least
             slot, least = jnp.where(weaker, k, slot), jnp.where(weaker, needs[k], least)
-        place = slot.astype(jnp.int32), zero, own
-        old = jax.lax.dynamic_slice(table, place, (1, 15, 1))
-        new = jax.lax.dynamic_slice(found, (zero, j), (15, 1))[None]
-        better = found[0, j] > least
-        return jax.lax.dynamic_update_slice(table, jnp.where(better, new, old), place)
+        slot = slot.astype(jnp.int32)
+        most = jnp.maximum(need[j], least).reshape(1, 1)
+        new = jax.lax.dynamic_slice(rest, (zero, j), (14, 1))[None]
+        # What is not read is written where it stands; what is too weak, behind the others.
+        place = jnp.where(need[j] > least, slot, _MOST), zero, own
+        return ContactTable(
+            jax.lax.dynamic_update_slice(table.need, most, (slot, own)),
+            jax.lax.dynamic_update_slice(table.rest, new, place),
+        )
 
     return _loop(len(lane), one, table)
 
@@ -407,12 +409,12 @@ class _Contacts:
         unit: torque and force of a unit force on each.
     """
 
-    def __init__(self, table: jax.Array, real: jax.Array, count: int, dt: float) -> None:
-        rows = [table[:, k] for k in range(15)]
+    def __init__(self, table: ContactTable, real: jax.Array, count: int, dt: float) -> None:
+        rows = [table.rest[:_MOST, k] for k in range(14)]
         self.count, self.dt = count, dt
-        self.need = jnp.where(real, rows[0], _NONE)
-        self.bodies = tuple(x.astype(jnp.int32) for x in rows[1:3])
-        self.unit = rows[3:9], rows[9:15]
+        self.need = jnp.where(real, table.need, _NONE)
+        self.bodies = tuple(x.astype(jnp.int32) for x in rows[:2])
+        self.unit = rows[2:8], rows[8:14]
 
     def _spread(self, force: jax.Array) -> tuple[jax.Array, ...]:
         """Torque and force on all bodies of forces along the normals, six of `[nbody, lanes]`."""
