@@ -488,6 +488,8 @@ def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool, world: W
     # Where neighbours meet, hinges of one type end at different angles.
     ends = level.hinges is not None and world.self_contact
     found = {_hinge_numbers(kind) for kind in kinds if kind.hinge is not None}
+    if blank.hinges is not None and not ends:
+        blank = replace(blank, hinges=blank.hinges._replace(lever=0.0))
     if hinges and blank.hinges is not None and len(found) == 1:
         effort, reach, damping, motor = found.pop()
         same = blank.hinges._replace(

@@ -33,8 +33,8 @@ from mjx_revolve.engine.batch import Capacity, PackedBodies
 from mjx_revolve.engine.level import Level, Thrusters
 from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.engine.variation import Variation, vary_level
-from mjx_revolve.numerics.spatial import Scalar
-from mjx_revolve.numerics.xla import fuse, materialize
+from mjx_revolve.numerics.spatial import Scalar, Vec
+from mjx_revolve.numerics.xla import fuse, materialize, take_lanes
 from mjx_revolve.water.world import World
 
 
@@ -86,7 +86,7 @@ class BatchedTrees:
         stack_indices: of the rows.
         table: constants of the rows.
         count: number of rows to visit, a number or int32.
-        num_meetings: number of pairs of boxes to look at, a number or int32.
+        met: which boxes of robots that differ can meet.
         variation: factors on the constants, or None.
     """
 
@@ -97,7 +97,7 @@ class BatchedTrees:
     stack_indices: StackIndices
     table: PackedConstants
     count: Any
-    num_meetings: Any = 0
+    met: Meetings | None = None
     variation: Variation | None = None
 
     def with_variation(self, variation: Variation) -> BatchedTrees:
@@ -124,22 +124,19 @@ class BatchedTrees:
         return self.capacity.carries
 
     @property
-    def meetings(self) -> Meetings | None:
-        """Which boxes of a robot can meet."""
-        bodies, capacity = self.bodies, self.capacity
-        if not capacity.meetings:
-            return None
-        rows = np.repeat(np.arange(1, capacity.rows + 1), capacity.shells)
-        body = np.append(np.zeros(capacity.root_shells, int), rows)
-        return Meetings(body, bodies.first, bodies.second, self.num_meetings)
+    def alike(self) -> bool:
+        """Whether the tables hold one robot."""
+        return self.bodies.alike
 
-    def boxes(self, like: jax.Array) -> Boxes:
-        """The root's shells, then those of all rows."""
-        rows = self._own(_merged(self.capacity.row, self.bodies.rows))
-        count = self.capacity.rows
-        if rows.shells is not None:
-            rows = replace(rows, count=count)
-        return Boxes.of((self.root, rows), like.dtype)
+    @property
+    def meets(self) -> bool:
+        """Whether any boxes of a robot can meet."""
+        return self.met is not None
+
+    def meetings(self, like: jax.Array) -> Meetings:
+        """Which boxes of the robots can meet."""
+        assert self.met is not None
+        return self.met
 
     @property
     def touches(self) -> bool:
@@ -171,6 +168,33 @@ class BatchedTrees:
         """`[rows, lanes]` of what `select` takes."""
         columns = saved.data.reshape(-1, saved.tree.num_leaves, self.lanes)
         return select(jax.tree.unflatten(saved.tree, list(jnp.moveaxis(columns, 1, 0))))
+
+    def at_lanes(self, which: jax.Array) -> BatchedTrees:
+        """Some of the robots; their constants are not theirs."""
+        indices = self.stack_indices
+        if not self.bodies.alike:
+            indices = jax.tree.map(lambda x: take_lanes(x, which), indices)
+        return replace(self, lanes=len(which), stack_indices=indices, variation=None)
+
+    def saved_at_lanes(
+        self, saved: PackedRow, select: Callable[[Any], Any], which: jax.Array
+    ) -> PackedRow:
+        """Columns of what `select` takes."""
+        count = saved.tree.num_leaves
+        leaves, tree = jax.tree.flatten(select(jax.tree.unflatten(saved.tree, range(count))))
+        columns = saved.data.reshape(-1, count, self.lanes)
+        found = [take_lanes(columns[:, k], which) for k in leaves]
+        return PackedRow(jnp.concatenate(found, 1), tree)
+
+    def hinge_positions(self, which: jax.Array) -> Vec:
+        """Of each lane, or one for all."""
+        hinges = _merged(self.capacity.row, self.bodies.rows).hinges
+        assert hinges is not None
+        shape = self.capacity.rows, 1, 1 if self.bodies.alike else self.lanes
+        wide = lambda x: jnp.broadcast_to(jnp.asarray(x, self.table.data.dtype), shape)  # noqa: E731
+        return tuple(
+            wide(x) if self.bodies.alike else take_lanes(wide(x), which) for x in hinges.position
+        )
 
     # Values of parts, group by group.
 
@@ -403,11 +427,23 @@ def make_batched_trees(
         each = jnp.arange(capacity.slots)[:, None]
         own, parent, to = (number(x[:, None] == each) for x in (own, parent, to))
         stack_indices = StackIndices(own, parent, to, inner, apart)
-    meetings: Any = capacity.meetings
-    if meetings and not steady:
-        real = jnp.any(bodies.first != bodies.second, -1)
-        meetings = jnp.sum(real, dtype=jnp.int32)  # a robot's pairs stand in front
-    return BatchedTrees(world, capacity, bodies, lanes, stack_indices, table, count, meetings)
+    met = None
+    if capacity.meetings:
+        rows = _merged(capacity.row, bodies.rows)
+        rows = rows if rows.shells is None else replace(rows, count=capacity.rows)
+        boxes = Boxes.of((_merged(capacity.root, bodies.root), rows), table.data.dtype)
+        body = np.append(
+            np.zeros(capacity.root_shells, int),
+            np.repeat(np.arange(1, capacity.rows + 1), capacity.shells),
+        )
+        first, second = bodies.first, bodies.second
+        if not bodies.alike:
+            met = Meetings.different(boxes, body, first, second, steady)
+        else:
+            real = jnp.sum(first != second, dtype=jnp.int32)  # its pairs stand in front
+            found = len(first) if steady else real
+            met = Meetings.alike(boxes, body, first, second, found, lanes)
+    return BatchedTrees(world, capacity, bodies, lanes, stack_indices, table, count, met)
 
 
 def _merged(constant: Level, varying: Level) -> Level:

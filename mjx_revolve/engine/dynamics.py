@@ -16,10 +16,15 @@ import jax.numpy as jnp
 
 from mjx_revolve.engine.contact import bed_forces
 from mjx_revolve.engine.hydrodynamics import ExternalForces, PreviousStep, water_forces
-from mjx_revolve.engine.kinematics import forward_kinematics, stack_motions
+from mjx_revolve.engine.kinematics import body_frames, forward_kinematics
 from mjx_revolve.engine.level import Hinges, Level
-from mjx_revolve.engine.meetings import Meetings
-from mjx_revolve.engine.self_contact import Acceleration, Bodies, contact_acceleration
+from mjx_revolve.engine.self_contact import (
+    Acceleration,
+    Bodies,
+    Respond,
+    any_lane,
+    contact_acceleration,
+)
 from mjx_revolve.engine.servos import end_stop, servo
 from mjx_revolve.engine.state import State, effective_gravity, has_acceleration, integrate
 from mjx_revolve.engine.tree import Tree
@@ -49,11 +54,13 @@ from mjx_revolve.numerics.spatial import (
     neg,
     skew,
     sub,
+    total,
     transpose,
     vadd,
     vscale,
     vsub,
 )
+from mjx_revolve.numerics.xla import fuse, take_lanes
 from mjx_revolve.water.flow import Water, needs_horizontal_position
 from mjx_revolve.water.world import World
 
@@ -70,7 +77,7 @@ def accelerate(
     thrusts: Any,
     dt: float,
     wrench: Any = (),
-) -> tuple[tuple[Vec, Vec, Any], Scalar, Any]:
+) -> tuple[tuple[Vec, Vec, Any], Scalar, Any, Any]:
     """Accelerations, by the articulated-body algorithm.
 
     With added mass, the momentum h of each body with its water turns as K(h) ν, and the step takes
@@ -91,12 +98,11 @@ def accelerate(
     Returns:
         (linear and angular acceleration of the root, body frame, as rates of the body-frame
         components [m/s², rad/s²]; of the hinges [rad/s²]); servo power, summed over the hinges
-        without sign, `[lanes]` [W]; submerged fractions, as `State.submerged`.
+        without sign, `[lanes]` [W]; submerged fractions and clearance, as in `State`.
     """
     world, symmetric = tree.world, not (tree.carries and dt)
-    meetings = tree.meetings if dt else None
+    meets = tree.meets and dt > 0
     located = has_acceleration(water) or needs_horizontal_position(world) or tree.touches
-    located = located or meetings is not None
     root, moved, midpoint_speed = forward_kinematics(tree, state, located, dt)
 
     def articulate(level: Level, children: Any, moved: Any, *xs: Any) -> tuple[Any, Any, Scalar]:
@@ -133,7 +139,7 @@ def accelerate(
         )
         block, bias = to_parent(rotation, level.hinges.position, block, bias, symmetric)
         # What a unit of the hinge's acceleration takes; else that is the row of `joint`.
-        column = column if meetings is not None and not symmetric else ()
+        column = column if meets and not symmetric else ()
         saved = joint, tree.unstack_parts(submerged), column
         return _flatten(block, bias, symmetric), saved, jnp.abs(motor * speed)
 
@@ -165,13 +171,15 @@ def accelerate(
     lanes, dtype = state.position[0].shape, state.position[0].dtype
     lane = lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), (1, *lanes))[0]  # noqa: E731
     qacc = tuple(map(lane, linear)), tuple(map(lane, angular)), hinges
-    if meetings is not None:
+    clearance: Any = ()
+    if meets:
         factors = _Factors(moved, saved, _unflatten(whole, symmetric)[0], symmetric)
-        qacc = _with_contact(tree, meetings, state, water, root, qacc, factors, dt)
+        qacc, clearance = _with_contact(tree, state, water, qacc, factors, dt)
     return (
         qacc,
         jnp.broadcast_to(jnp.asarray(power, dtype), lanes),
         (submerged, tree.stack_parts(saved, lambda x: x[1])) if state.submerged else (),
+        clearance,
     )
 
 
@@ -179,7 +187,7 @@ class _Factors(NamedTuple):
     """What the articulated-body algorithm leaves, by which further forces act at once.
 
     Attributes:
-        moved: motion and rotation of the bodies below the root.
+        moved: motion and rotation of the bodies below the root, parent from child.
         saved: by the backward pass.
         root: articulated inertia of the root.
         symmetric: whether inertias are.
@@ -191,94 +199,104 @@ class _Factors(NamedTuple):
     symmetric: bool
 
 
-def _respond(
-    tree: Tree, factors: _Factors, wrench: tuple[Scalar, ...], like: jax.Array
-) -> Acceleration:
-    """What further forces on the bodies add to all accelerations.
+def _make_respond(tree: Tree, factors: _Factors, which: jax.Array) -> Respond:
+    """For some of the robots, what further forces on their bodies add to all accelerations."""
+    lanes, symmetric = len(which), factors.symmetric
+    own = lambda x: take_lanes(x, which) if jnp.shape(x)[-1:] not in ((), (1,)) else x  # noqa: E731
+    block: Block = jax.tree.map(own, factors.root)
+    turns = tree.saved_at_lanes(factors.moved, lambda moved: moved[1], which)
+    saved = tree.saved_at_lanes(factors.saved, lambda saved: (saved[0][:3], saved[2]), which)
+    places = tree.hinge_positions(which)
+    few = tree.at_lanes(which)
 
-    Args:
-        tree: the robots.
-        factors: of the step.
-        wrench: torque and force about the bodies' origins, own frames, six of `[nbody, lanes]`.
-        like: `[lanes]`.
-    """
-
-    def collect(level: Level, children: Any, moved: Any, saved: Any, *wrench: Any) -> Any:
+    def collect(_: Level, children: Any, turn: Any, place: Any, saved: Any, *wrench: Any) -> Any:
         """Bias forces, as the parents feel them."""
         bias = tuple(map(neg, wrench))
         if children is not None:
             bias = vadd(bias, children)
-        rotation, (joint, _, column) = moved[1], saved
-        assert level.hinges is not None
+        (row_a, row_l, inverse), column = saved
         rest = neg(bias[2])
-        pushed = mul(joint.inverse, rest)
-        column = column or (joint.row_a, joint.row_l)
+        pushed = mul(inverse, rest)
+        column = column or (row_a, row_l)
         torque = vadd(bias[:3], vscale(pushed, column[0]))
-        force = matvec(rotation, vadd(bias[3:], vscale(pushed, column[1])))
-        torque = vadd(matvec(rotation, torque), cross(level.hinges.position, force))
+        force = matvec(turn, vadd(bias[3:], vscale(pushed, column[1])))
+        torque = vadd(matvec(turn, torque), cross(place, force))
         return (*torque, *force), rest, ()
 
-    def accelerate_joint(level: Level, parent: Any, moved: Any, saved: Any, rest: Any) -> Any:
-        rotation, joint = moved[1], saved[0]
+    def accelerate_joint(
+        _: Level, parent: Any, turn: Any, place: Any, saved: Any, rest: Any
+    ) -> Any:
         angular, linear = parent
-        assert level.hinges is not None
-        a = matTvec(rotation, angular)
-        b = matTvec(rotation, vadd(linear, cross(angular, level.hinges.position)))
-        hinge = sub(sub(rest, dot(joint.row_a, a)), dot(joint.row_l, b))
-        hinge = mul(joint.inverse, hinge)
+        a = matTvec(turn, angular)
+        b = matTvec(turn, vadd(linear, cross(angular, place)))
+        (row_a, row_l, inverse), _ = saved
+        hinge = mul(inverse, sub(sub(rest, dot(row_a, a)), dot(row_l, b)))
         own = (a[0], a[1], add(a[2], hinge)), b
         return own, (hinge, own)
 
-    below = [tree.split_rows(x[1:]) for x in wrench]
-    gathered, rests, _ = tree.backward_pass(
-        collect, ((0.0,) * 6, ()), factors.moved, factors.saved, *below
-    )
-    bias = vsub(gathered, tuple(x[:1] for x in wrench))
-    root = solve_root(factors.root, (bias[:3], bias[3:]), factors.symmetric)
-    found = tree.forward_pass(accelerate_joint, root, factors.moved, factors.saved, rests)
-    lane = lambda x: jnp.broadcast_to(jnp.asarray(x, like.dtype), (1, *like.shape))  # noqa: E731
-    angular, linear = (tuple(map(lane, x)) for x in root)
-    hinges, own = tree.stack_saved(found, lambda x: x, like)
-    pairs = zip((*angular, *linear), (*own[0], *own[1]), strict=True)
-    return Acceleration(
-        tuple(jnp.concatenate(pair) for pair in pairs),
-        (tuple(x[0] for x in linear), tuple(x[0] for x in angular), tree.split_rows(hinges)),
-    )
+    def respond(wrench: tuple[jax.Array, ...]) -> Acceleration:
+        like = wrench[0][0]
+        below = [few.split_rows(x[1:]) for x in wrench]
+        gathered, rests, _ = few.backward_pass(
+            collect, ((0.0,) * 6, ()), turns, places, saved, *below
+        )
+        bias = vsub(gathered, tuple(x[:1] for x in wrench))
+        root = solve_root(block, (bias[:3], bias[3:]), symmetric)
+        found = few.forward_pass(accelerate_joint, root, turns, places, saved, rests)
+        lane = lambda x: jnp.broadcast_to(jnp.asarray(x, like.dtype), (1, lanes))  # noqa: E731
+        angular, linear = (tuple(map(lane, x)) for x in root)
+        hinges, own = few.stack_saved(found, lambda x: x, like)
+        pairs = zip((*angular, *linear), (*own[0], *own[1]), strict=True)
+        bodies = tuple(jnp.concatenate(pair) for pair in pairs)
+        return Acceleration(bodies, jnp.concatenate([*linear, *angular, hinges]))
+
+    return respond
 
 
 def _with_contact(
     tree: Tree,
-    meetings: Meetings,
     state: State,
     water: Water,
-    root: BodyMotion,
     qacc: tuple[Vec, Vec, Any],
     factors: _Factors,
     dt: float,
-) -> tuple[Vec, Vec, Any]:
-    """Accelerations of the root and of the hinges with those of contacts within the robot."""
-    like, nothing = state.position[0], jax.tree.map(jnp.zeros_like, qacc)
-    still = water._replace(current=(0.0, 0.0, 0.0))
+) -> tuple[tuple[Vec, Vec, Any], Any]:
+    """Accelerations with those of contacts within the robot, and the clearance; see `State`.
 
-    def push() -> Any:
-        ahead = integrate(state, still, qacc, dt, tree.carries)
-        root_ahead, moved_ahead, _ = forward_kinematics(tree, ahead, True)
-        return contact_acceleration(
+    Where robots are alike, nothing is looked at while none can have moved as far as its clearance.
+    """
+    like = state.position[0]
+    meetings = tree.meetings(like)
+    nothing = jnp.zeros((6 + len(tree.join_rows(state.angle, like)), len(like)), like.dtype)
+    still = water._replace(current=(0.0, 0.0, 0.0))
+    ahead = integrate(state, still, qacc, dt, tree.carries)
+    wanted = meetings.count > 0  # a chunk of robots none of which can meet itself pays nothing
+    left = state.clearance
+    if tree.alike:
+        ways = tree.join_rows(tree.map(_sweep, ahead.speed), like)
+        left = left - dt * total(*[ways[k] for k in range(len(ways))])
+        wanted = any_lane(left < 0) & wanted
+
+    def push() -> tuple[jax.Array, Any]:
+        bodies = Bodies(body_frames(tree, state), body_frames(tree, ahead))
+        found, clearance = contact_acceleration(
             meetings,
-            tree.boxes(like),
-            Bodies.of(stack_motions(tree, root, factors.moved, like)),
-            Bodies.of(stack_motions(tree, root_ahead, moved_ahead, like)),
-            lambda wrench: _respond(tree, factors, wrench, like),
-            nothing,
+            bodies,
+            lambda which: _make_respond(tree, factors, which),
             dt,
         )
+        return found, clearance if tree.alike else ()
 
-    if isinstance(meetings.count, int):
-        found = push()
-    else:  # a chunk of robots none of which can meet itself pays nothing
-        found = jax.lax.cond(meetings.count > 0, push, lambda: nothing)
-    total: tuple[Vec, Vec, Any] = jax.tree.map(jnp.add, qacc, found)
-    return total
+    found, clearance = jax.lax.cond(wanted, fuse(push), lambda: (nothing, left))
+    robot = tuple(found[:3]), tuple(found[3:6]), tree.split_rows(found[6:])
+    sums: tuple[Vec, Vec, Any] = jax.tree.map(jnp.add, qacc, robot)
+    return sums, clearance
+
+
+def _sweep(level: Level, speed: Scalar) -> Scalar:
+    """At what speed boxes may near each other by each hinge's turning [m/s]."""
+    assert level.hinges is not None
+    return mul(level.hinges.lever, jnp.abs(speed))
 
 
 def with_bed(

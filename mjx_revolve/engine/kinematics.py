@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,9 @@ from mjx_revolve.numerics.spatial import (
     add,
     cross,
     dot,
+    matmul,
     matTvec,
+    matvec,
     mul,
     namespace,
     quat_to_mat,
@@ -120,6 +122,35 @@ def _child_velocity(
     own = matTvec(rotation, angular)
     linear = matTvec(rotation, vadd(linear, cross(angular, position)))
     return (own[0], own[1], add(own[2], speed)), linear
+
+
+class BodyFrames(NamedTuple):
+    """Poses of rigid bodies, `[1 + nhinge, lanes]` each, in the order of `Tree.join_rows`.
+
+    Attributes:
+        rotation: world from body.
+        position: of the origins, world frame [m].
+    """
+
+    rotation: Mat
+    position: Vec
+
+
+def body_frames(tree: Tree, state: State) -> BodyFrames:
+    """Poses of the core's rigid body, then of what each hinge carries; frames as in `level`."""
+    root = tuple(map(_row, quat_to_mat(state.quat))), _row(state.position)
+
+    def move(level: Level, parent: Any, angle: Scalar) -> Any:
+        assert level.hinges is not None
+        rotation, position = parent
+        position = vadd(position, matvec(rotation, level.hinges.position))
+        own = matmul(rotation, hinge_rotation(level.hinges, angle)), position
+        return own, own
+
+    like = state.position[0]
+    below = tree.forward_pass(move, root, state.angle)
+    rows = tree.stack_saved(below, lambda saved: saved, like)
+    return BodyFrames(*jax.tree.map(lambda *x: jnp.concatenate(x), root, rows))
 
 
 def body_motions(tree: Tree, state: State) -> BodyMotion:

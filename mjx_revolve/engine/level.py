@@ -78,6 +78,8 @@ class Hinges(NamedTuple):
             a servo has none: torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s].
         base_inertia: of all that is on the parent's side of the hinge, about its axis, at rest
             [kg·m²].
+        lever: how far boxes of the robot can move for each radian, one seen from another [m]; 0
+            where modules do not meet.
     """
 
     rotation: Mat
@@ -94,6 +96,7 @@ class Hinges(NamedTuple):
     stop: Scalar
     motor: tuple[Scalar, Scalar, Scalar]
     base_inertia: Scalar
+    lever: Scalar
 
 
 class InertiaBox(NamedTuple):

@@ -80,9 +80,12 @@ class PopulationEngine:
         targets, command, thrusts, pumped = _actuate(self.tree, state, ctrl)
         # The whole step is seen from the uniform current: there, no current is left.
         relative = state._replace(velocity=vsub(state.velocity, water.current))
-        qacc, power, submerged = accelerate(tree, relative, targets, water, thrusts, dt, wrench)
+        qacc, power, submerged, clearance = accelerate(
+            tree, relative, targets, water, thrusts, dt, wrench
+        )
         new = integrate(state, water, qacc, dt, tree.carries)
-        return new._replace(command=command, submerged=submerged), add(power, pumped)
+        new = new._replace(command=command, submerged=submerged, clearance=clearance)
+        return new, add(power, pumped)
 
     def observe(self, state: State) -> tuple[Float[Array, "nq lanes"], Float[Array, "nv lanes"]]:
         """Qpos and qvel in MuJoCo's order."""
@@ -184,6 +187,7 @@ def init(tree: Tree, qpos: jax.Array, qvel: jax.Array) -> State:
         command=jnp.zeros((count, *lanes), qpos.dtype) if count else (),
         # No slam before the first step, which finds the parts as submerged as they are.
         submerged=tree.fully_submerged(lanes, qpos.dtype) if tree.carries else (),
+        clearance=jnp.full(lanes, -1, qpos.dtype) if tree.meets and tree.alike else (),
     )
 
 

@@ -27,9 +27,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_revolve.engine.kinematics import BodyFrames
 from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.numerics.boxes import BoxPair, box_contact
-from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
     Mat,
     Scalar,
@@ -40,11 +40,20 @@ from mjx_revolve.numerics.spatial import (
     matTvec,
     matvec,
     vadd,
+    vscale,
     vsub,
 )
+from mjx_revolve.numerics.xla import fuse, take_lanes
 
-# Candidates of one robot at a time. A choice: few robots have more in contact.
+# Contacts of one robot at a time. A choice: few robots have more.
 _MOST = 8
+# Pairs that are looked at exactly at a time, and robots whose contacts are solved together: enough
+# for vector registers. Few robots of a chunk have contacts at a time. Choices.
+_PAIRS, _ROBOTS = 32, 8
+# Pairs that are near which are listed at a time, where robots differ. A choice.
+_ROOM = 2048
+# What no contact needs [m/s²].
+_NONE = -1e9
 # Overlap that is let be [m], the share of the rest that is parted in a step, and the top speed of
 # that [m/s]. Choices.
 _SLOP, _SHARE, _TOP = 5e-4, 1.0, 1.0
@@ -54,31 +63,18 @@ _STEPS, _ENOUGH = 12, 2e-5
 # Added to the inverse mass of a contact [1/kg], so that what is wedged between two modules has
 # finite forces. A choice: as if 50 kg gave way, where modules have some tens of grams.
 _SOFTNESS = 0.02
-# Score of pairs that are no candidates: squared distance of centres per squared reach [-].
-_FAR = 1e3
 
 
 class Bodies(NamedTuple):
-    """Rigid bodies of robots, `[nbody, lanes]` each, the root first; world frame.
+    """Rigid bodies of robots, as `kinematics.body_frames` returns them.
 
     Attributes:
-        rotation: world from body.
-        position: of the origin [m].
-        velocity: of the origin [m/s].
-        angular_velocity: [rad/s].
+        now: their poses.
+        ahead: at the end of the step without contact.
     """
 
-    rotation: Mat
-    position: Vec
-    velocity: Vec
-    angular_velocity: Vec
-
-    @staticmethod
-    def of(motion: BodyMotion) -> Bodies:
-        """The bodies of `kinematics.stack_motions`."""
-        turn = motion.axes
-        velocity, spin = matvec(turn, motion.velocity), matvec(turn, motion.angular_velocity)
-        return Bodies(turn, (*motion.xy, motion.height), velocity, spin)
+    now: BodyFrames
+    ahead: BodyFrames
 
 
 class Acceleration(NamedTuple):
@@ -86,212 +82,339 @@ class Acceleration(NamedTuple):
 
     Attributes:
         bodies: angular and linear acceleration of all bodies, own frames, six of `[nbody, lanes]`.
-        robot: what the step needs: of the root and the hinges, as `accelerate` returns it.
+        robot: `[6 + nhinge, lanes]` of the root, linear and angular, and of the hinges.
     """
 
     bodies: tuple[Scalar, ...]
-    robot: Any
+    robot: jax.Array
 
 
-Respond = Callable[[tuple[Scalar, ...]], Acceleration]
+# Torques [N·m] and forces [N] about the bodies' origins, own frames, six of `[nbody, lanes]` →
+# accelerations.
+Respond = Callable[[tuple[jax.Array, ...]], Acceleration]
 
 
 def contact_acceleration(
     meetings: Meetings,
-    boxes: Boxes,
-    now: Bodies,
-    ahead: Bodies,
-    respond: Respond,
-    nothing: Any,
+    bodies: Bodies,
+    respond_at: Callable[[jax.Array], Respond],
     dt: float,
-) -> Any:
+) -> tuple[jax.Array, jax.Array]:
     """Accelerations of robots by contacts of their own modules.
 
     Args:
         meetings: which boxes can meet.
-        boxes: of the robots.
-        now: the bodies.
-        ahead: the bodies at the end of the step, without contact.
-        respond: torques [N·m] and forces [N] about the bodies' origins, own frames, six of
-            `[nbody, lanes]` → accelerations.
-        nothing: zeros, as `Acceleration.robot`.
+        bodies: of the robots.
+        respond_at: which lanes, int32 → their responses to forces.
         dt: of the step [s].
 
     Returns:
-        As `Acceleration.robot`.
+        As `Acceleration.robot`; and, where robots are alike, `State.clearance`.
     """
-    near, first, second = _find_candidates(meetings, boxes, ahead)
+    nbody, lanes = bodies.now.position[0].shape
+    nothing = jnp.zeros((6 + nbody - 1, lanes), bodies.now.position[0].dtype)
+    look_up, gather = _make_search(meetings, bodies)
+    blocks, width = meetings.first.shape
+    room = blocks * width if meetings.steady else min(blocks * width, _ROOM)
+    start = jnp.zeros(room + max(width, _PAIRS), jnp.int32), jnp.int32(0)
+    clear = jnp.full(width, 1e3, nothing.dtype)
+    table = ContactTable(
+        jnp.full((_MOST, lanes), _NONE, nothing.dtype),
+        jnp.zeros((_MOST + 1, 14, lanes), nothing.dtype),
+    )
 
-    def resolve() -> Any:
-        contacts = _Contacts(meetings, boxes, now, ahead, near, first, second, dt)
-        return jax.lax.cond(
-            _any(contacts.need > 0), lambda: contacts.solve(respond, nothing), lambda: nothing
+    def measure(listed: Any, table: ContactTable) -> ContactTable:
+        return _measure_all(listed, look_up, table, dt, meetings.steady)
+
+    def resolve(table: ContactTable) -> jax.Array:
+        lane = jnp.arange(lanes, dtype=jnp.int32)
+        size = min(_ROBOTS, lanes)
+        most = -(-lanes // size)
+        start = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
+        touches = table.need[0] > 0
+        for k in range(1, _MOST):
+            touches = touches | (table.need[k] > 0)
+        touching, count = _append(touches, lane, start, meetings.steady)
+
+        def solve(k: Any, total: jax.Array) -> jax.Array:
+            which = jax.lax.dynamic_slice(touching, (k * size,), (size,))
+            real = k * size + jnp.arange(size, dtype=jnp.int32) < count
+            own: ContactTable = jax.tree.map(lambda x: take_lanes(x, which), table)
+            contacts = _Contacts(own, real, nbody, dt)
+            found = contacts.solve(respond_at(which), len(total))
+
+            def write(j: Any, total: jax.Array) -> jax.Array:
+                place = jnp.int32(0), which[j]
+                old = jax.lax.dynamic_slice(total, place, (len(total), 1))
+                new = jax.lax.dynamic_slice(found, (jnp.int32(0), j), (len(total), 1))
+                return jax.lax.dynamic_update_slice(total, jnp.where(real[j], new, old), place)
+
+            return _loop(size, write, total)
+
+        return _repeat(-(-count // size), most, solve, nothing, meetings.steady)
+
+    if meetings.steady:
+        _, listed, clear = _loop(
+            meetings.count, lambda _, x: gather(x), (jnp.int32(0), start, clear)
         )
+        found = jax.lax.cond(
+            listed[1] > 0, lambda: resolve(measure(listed, table)), lambda: nothing
+        )
+        return found, clear
 
-    return jax.lax.cond(_any(near), resolve, lambda: nothing)
+    def more(carry: Any) -> Any:
+        """The next blocks, until the list is full."""
+        block, clear, table = carry
+        wanted = lambda x: (x[0] < meetings.count) & (x[1][1] + width <= room)  # noqa: E731
+        block, listed, clear = jax.lax.while_loop(wanted, gather, (block, start, clear))
+        return block, clear, measure(listed, table)
+
+    _, clear, table = jax.lax.while_loop(
+        lambda x: x[0] < meetings.count, more, (jnp.int32(0), clear, table)
+    )
+    return resolve(table), clear
 
 
-# ------------------------------------------------------------------ candidates
+def _loop(count: Any, body: Callable[[jax.Array, Any], Any], carry: Any) -> Any:
+    """`fori_loop` from 0 whose number has 32 bits in either mode."""
+    return jax.lax.fori_loop(0, count, lambda k, x: body(jnp.asarray(k, jnp.int32), x), carry)
 
 
-def _find_candidates(
-    meetings: Meetings, boxes: Boxes, ahead: Bodies
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Pairs of boxes whose bounding spheres will overlap, the nearest of each robot.
+def _repeat(count: Any, most: int, body: Any, carry: Any, steady: bool) -> Any:
+    """A loop of `count` rounds; of known length, so that it has derivatives, where it must be."""
+    if not steady:
+        return _loop(count, body, carry)
+
+    def step(k: Any, carry: Any) -> Any:
+        return jax.lax.cond(k < count, lambda x: body(k, x), lambda x: x, carry)
+
+    return _loop(most, step, carry)
+
+
+def _append(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> Any:
+    """A list with room for one more, and its length, with the values `[n]` where flags are set."""
+    number, end = jnp.arange(len(flags), dtype=jnp.int32), jnp.int32(len(flags))
+
+    def write(k: Any, found: Any) -> Any:
+        new = jax.lax.dynamic_slice(values, (k,), (1,))
+        return jax.lax.dynamic_update_slice(found[0], new, (found[1],))
+
+    if steady:
+        every = lambda k, x: (write(k, x), x[1] + flags[k].astype(jnp.int32))  # noqa: E731
+        return jax.lax.cond(any_lane(flags), lambda: _loop(len(flags), every, found), lambda: found)
+
+    def after(k: Any) -> jax.Array:
+        return _least(jnp.where(flags & (number > k), number, end))
+
+    def step(carry: Any) -> Any:
+        k, *found = carry
+        return after(k), write(k, found), found[1] + 1
+
+    return jax.lax.while_loop(lambda x: x[0] < end, step, (after(-1), *found))[1:]
+
+
+def _least(x: jax.Array) -> jax.Array:
+    """The least of `[n]`, by halves, as a fused step has no reductions."""
+    while x.shape[0] > 1:
+        middle = x.shape[0] // 2
+        tail = x[2 * middle :]
+        x = jnp.concatenate([jnp.minimum(x[:middle], x[middle : 2 * middle]), tail])
+    return x[0]
+
+
+def any_lane(found: jax.Array) -> jax.Array:
+    """Whether any of `[n]` is set; by halves, as a fused step has no reductions."""
+    while found.shape[0] > 1:
+        middle = found.shape[0] // 2
+        tail = found[2 * middle :]
+        found = jnp.concatenate([found[:middle] | found[middle : 2 * middle], tail])
+    return found[0]
+
+
+# ------------------------------------------------------------------ pairs in contact
+
+
+def _make_search(meetings: Meetings, bodies: Bodies) -> tuple[Any, Any]:
+    """Pairs whose bounding spheres overlap at the end of the step.
 
     Returns:
-        `[k, lanes]` whether they will; and the boxes' numbers, int32.
+        A function: numbers of pairs → their two boxes. And one that looks at the next block:
+        (block, (numbers of such pairs, how many there are), the spheres' clearance `[width]`).
     """
-    place: Bodies = jax.tree.map(lambda x: x[meetings.body], ahead)
+    lanes, dtype = bodies.now.position[0].shape[-1], bodies.now.position[0].dtype
+    body = jnp.asarray(meetings.body, jnp.int32)
+    boxes = meetings.boxes
+    place: BodyFrames = jax.tree.map(meetings.at_bodies, bodies.ahead)
     center = vadd(place.position, matvec(place.rotation, boxes.position))
-    radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size))
-    spheres = (*center, jnp.broadcast_to(radius, center[0].shape))
-    lanes, dtype = center[0].shape[-1], center[0].dtype
+    center = tuple(x.reshape(-1) for x in center)
+    radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size)).reshape(-1)
+    frames, shells = jax.tree.map(lambda x: x.reshape(-1), (bodies, boxes))
+    pick = lambda xs, k: jax.tree.map(lambda x: take_lanes(x, k), xs)  # noqa: E731
+    alike = boxes.half_size[0].shape[-1] == 1
+    shape_of = (lambda k: k // lanes) if alike else (lambda k: k)
+    width = meetings.first.shape[1]
+    blocks = tuple(map(jnp.asarray, (meetings.first, meetings.second)))
+    every = tuple(x.reshape(-1) for x in blocks)
 
-    def insert(k: Any, best: list[tuple[jax.Array, ...]]) -> list[tuple[jax.Array, ...]]:
-        """The nearest pairs so far, with pair k."""
-        pair = [
-            jnp.broadcast_to(jax.lax.dynamic_slice_in_dim(x, k, 1), (1, lanes))
-            for x in (meetings.first, meetings.second)
-        ]
-        one, other = (tuple(_pick(x, which)[0] for x in spheres) for which in pair)
-        apart, reach = vsub(one[:3], other[:3]), one[3] + other[3]
-        score = dot(apart, apart) / (reach * reach)
-        first, second = pair[0][0], pair[1][0]
-        new: tuple[jax.Array, ...] = (jnp.where(first == second, _FAR, score), first, second)
-        kept = []
-        for old in best:
-            better = new[0] < old[0]
-            kept.append(tuple(jnp.where(better, x, y) for x, y in zip(new, old, strict=True)))
-            new = tuple(jnp.where(better, y, x) for x, y in zip(new, old, strict=True))
-        return kept
-
-    number = jnp.zeros(lanes, jnp.int32)
-    start = [(jnp.full(lanes, _FAR, dtype), number, number)]
-    start = start * min(_MOST, meetings.first.shape[0])
-    found = jax.lax.fori_loop(0, meetings.count, insert, start)
-    scores, first, second = (jnp.stack(x) for x in zip(*found, strict=True))
-    return scores < 1, first, second
-
-
-def _any(found: jax.Array) -> jax.Array:
-    """Whether any of `[k, lanes]` is set; by halves, as a fused step has no reductions."""
-    lane = found[0]
-    for k in range(1, found.shape[0]):
-        lane = lane | found[k]
-    while lane.shape[0] > 1:
-        middle = lane.shape[0] // 2
-        tail = lane[2 * middle :]
-        lane = jnp.concatenate([lane[:middle] | lane[middle : 2 * middle], tail])
-    return lane[0]
-
-
-# ------------------------------------------------------------------ contacts
-
-
-def _pick(x: jax.Array, which: jax.Array) -> jax.Array:
-    """Of `[n, lanes]` or `[n, 1]` numbers, `[k, lanes]` of each lane."""
-    wide = jnp.broadcast_to(x, (x.shape[0], which.shape[-1]))
-    return jnp.take_along_axis(wide, which, 0, mode="promise_in_bounds")
-
-
-class _Side(NamedTuple):
-    """One box of each candidate, `[k, lanes]` each: its body's number and motion, and its pose.
-
-    Attributes:
-        body: number of the body.
-        origin: of the body [m].
-        frame: world from body.
-        center: of the box, now [m].
-        rotation: world from box, now.
-        center_ahead: at the end of the step, without contact [m].
-        rotation_ahead: at the end of the step.
-        half_size: [m].
-        velocity: of the body's origin at the end of the step, without contact [m/s].
-        spin: of the body, likewise [rad/s].
-    """
-
-    body: Any
-    origin: Vec
-    frame: Mat
-    center: Vec
-    rotation: Mat
-    center_ahead: Vec
-    rotation_ahead: Mat
-    half_size: Vec
-    velocity: Vec
-    spin: Vec
-
-
-class _Contacts:
-    """Contacts among the candidates, `[k, lanes]` each.
-
-    Attributes:
-        need: acceleration along the normal that each needs [m/s²]; not positive: no contact.
-    """
-
-    def __init__(
-        self,
-        meetings: Meetings,
-        boxes: Boxes,
-        now: Bodies,
-        ahead: Bodies,
-        near: jax.Array,
-        first: jax.Array,
-        second: jax.Array,
-        dt: float,
-    ) -> None:
-        self.count = len(now.position[0])
-        self.dt = dt
-
-        def side(which: jax.Array) -> _Side:
-            body = jnp.asarray(meetings.body, jnp.int32)[which]
-            own, later = jax.tree.map(lambda x: _pick(x, body), (now, ahead))
-            box: Boxes = jax.tree.map(lambda x: _pick(x, which), boxes)
-            return _Side(
-                body=body,
-                origin=own.position,
-                frame=own.rotation,
-                center=vadd(own.position, matvec(own.rotation, box.position)),
-                rotation=matmul(own.rotation, box.rotation),
-                center_ahead=vadd(later.position, matvec(later.rotation, box.position)),
-                rotation_ahead=matmul(later.rotation, box.rotation),
-                half_size=box.half_size,
-                velocity=later.velocity,
-                spin=later.angular_velocity,
+    def look_up(pair: jax.Array) -> tuple[_Given, ...]:
+        found = []
+        for number in every:
+            which = take_lanes(number, pair)
+            own = take_lanes(body, which // lanes)
+            frame = own * lanes + which % lanes
+            found.append(
+                _Given(
+                    own.astype(dtype),
+                    pick(frames, frame),
+                    pick(shells, shape_of(which)),
+                    which % lanes,
+                )
             )
+        return tuple(found)
 
-        one, other = side(first), side(second)
-        half = one.half_size, other.half_size
-        pair = BoxPair(vsub(other.center, one.center), one.rotation, other.rotation, *half)
-        later = BoxPair(
-            vsub(other.center_ahead, one.center_ahead),
-            one.rotation_ahead,
-            other.rotation_ahead,
-            *half,
+    def gather(carry: Any) -> Any:
+        block, listed, clear = carry
+        pair = tuple(jax.lax.dynamic_index_in_dim(x, block, 0, False) for x in blocks)
+        away = tuple(take_lanes(x, pair[1]) - take_lanes(x, pair[0]) for x in center)
+        reach = sum(take_lanes(radius, shape_of(x)) for x in pair)
+        real, square = pair[0] != pair[1], dot(away, away)
+        near = real & (square < reach * reach)
+        number = block * width + jnp.arange(width, dtype=jnp.int32)
+        if alike:
+            clear = jnp.where(real, jnp.minimum(clear, jnp.sqrt(square) - reach), clear)
+        return block + 1, _append(near, number, listed, meetings.steady), clear
+
+    return look_up, gather
+
+
+def _measure_all(
+    listed: Any, look_up: Any, table: ContactTable, dt: float, steady: bool
+) -> ContactTable:
+    """The contacts of listed pairs join those of each robot; the weakest give way."""
+    numbers, count = listed
+
+    def examine(k: Any, table: ContactTable) -> ContactTable:
+        pair = jax.lax.dynamic_slice(numbers, (k * _PAIRS,), (_PAIRS,))
+        given = look_up(pair)
+        need, *rest = _measure(given, dt)
+        need = jnp.where(k * _PAIRS + jnp.arange(_PAIRS, dtype=jnp.int32) < count, need, _NONE)
+        return _insert(table, need, jnp.stack(rest), given[0].lane)
+
+    most = -(-(len(numbers) - 1) // _PAIRS)
+    return _repeat(-(-count // _PAIRS), most, examine, table, steady)
+
+
+class ContactTable(NamedTuple):
+    """Contacts of robots.
+
+    Attributes:
+        need: `[_MOST, lanes]` the acceleration along the normal that each needs [m/s²]; not
+            positive where boxes stay apart unless other contacts push them together.
+        rest: `[_MOST + 1, 14, lanes]` the numbers of both bodies, and torque and force of a unit
+            force on each, own frames; the last contact is none.
+    """
+
+    need: jax.Array
+    rest: jax.Array
+
+
+class _Given(NamedTuple):
+    """One box of each pair, `[n]` each.
+
+    Attributes:
+        number: of its body.
+        body: that body.
+        box: on it.
+        lane: its robot.
+    """
+
+    number: jax.Array
+    body: Bodies
+    box: Boxes
+    lane: jax.Array
+
+
+def _measure(given: tuple[_Given, ...], dt: float) -> list[jax.Array]:
+    """What pairs need, and the 14 other numbers of them; see `ContactTable`."""
+
+    def pose(frame: BodyFrames, box: Boxes) -> tuple[Vec, Mat]:
+        """Centres and rotations of boxes."""
+        center = vadd(frame.position, matvec(frame.rotation, box.position))
+        return center, matmul(frame.rotation, box.rotation)
+
+    def compute(given: Any) -> Any:
+        (one, box), (other, second) = given
+        sides = [tuple(pose(x, shape) for x in body) for body, shape in given]
+        half = box.half_size, second.half_size
+        pair, later = (
+            BoxPair(vsub(y[0], x[0]), x[1], y[1], *half) for x, y in zip(*sides, strict=True)
         )
         contact = box_contact(pair, later)
         closing = jnp.maximum(contact.start - contact.gap, 0)
         parted = jnp.clip(-_SHARE * (contact.start + _SLOP), 0, dt * _TOP)
         target = jnp.minimum(contact.start, 0) + jnp.minimum(parted, closing)
-        need = jnp.where(near, target - contact.gap, -1) / dt**2
-        point = vadd(one.center, contact.point)
-        speeds = [
-            vadd(side.velocity, cross(side.spin, vsub(point, side.origin))) for side in (one, other)
+        need = (target - contact.gap) / dt**2
+        point = vadd(sides[0][0][0], contact.point)
+        arms = [matTvec(x.now.rotation, vsub(point, x.now.position)) for x in (one, other)]
+        # Where the point ends that is fixed to each body.
+        ends = [
+            vadd(x.ahead.position, matvec(x.ahead.rotation, arm))
+            for x, arm in zip((one, other), arms, strict=True)
         ]
-        speed = dot(contact.normal, vsub(speeds[1], speeds[0]))
+        speed = dot(contact.normal, vsub(ends[1], ends[0])) / dt
         # Normals turn within the step; so that no work is done, boxes part no faster than they met.
-        self.need = jnp.minimum(need, 2 * jnp.maximum(-speed, 0) / dt)
-        pushed = tuple(-x for x in contact.normal), contact.normal
-        self.bodies = one.body, other.body
-        # Torque and force of a unit force on each side.
-        self.unit = tuple(
-            (
-                *matTvec(side.frame, cross(vsub(point, side.origin), push)),
-                *matTvec(side.frame, push),
-            )
-            for side, push in zip((one, other), pushed, strict=True)
+        need = jnp.minimum(need, 2 * jnp.maximum(-speed, 0) / dt)
+        units = []
+        for x, arm, sign in zip((one, other), arms, (-1.0, 1.0), strict=True):
+            push = vscale(sign, matTvec(x.now.rotation, contact.normal))
+            units += [*cross(arm, push), *push]
+        return need, *units
+
+    need, *units = fuse(compute)(tuple(x[1:3] for x in given))
+    return [need, *(x.number for x in given), *units]
+
+
+def _insert(table: ContactTable, need: jax.Array, rest: jax.Array, lane: jax.Array) -> ContactTable:
+    """Contacts of such lanes, each in place of its robot's weakest one so far."""
+
+    def one(j: Any, table: ContactTable) -> ContactTable:
+        zero, own = jnp.int32(0), lane[j]
+        needs = jax.lax.dynamic_slice(table.need, (zero, own), (_MOST, 1))[:, 0]
+        slot, least = zero, needs[0]
+        for k in range(1, _MOST):
+            weaker = needs[k] < least
+            slot, least = jnp.where(weaker, k, slot), jnp.where(weaker, needs[k], least)
+        slot = slot.astype(jnp.int32)
+        most = jnp.maximum(need[j], least).reshape(1, 1)
+        new = jax.lax.dynamic_slice(rest, (zero, j), (14, 1))[None]
+        # What is not read is written where it stands; what is too weak, behind the others.
+        place = jnp.where(need[j] > least, slot, _MOST), zero, own
+        return ContactTable(
+            jax.lax.dynamic_update_slice(table.need, most, (slot, own)),
+            jax.lax.dynamic_update_slice(table.rest, new, place),
         )
+
+    return _loop(len(lane), one, table)
+
+
+# ------------------------------------------------------------------ forces
+
+
+class _Contacts:
+    """Contacts of some robots, `[k, lanes]` each.
+
+    Attributes:
+        need: acceleration along the normal that each needs [m/s²]; not positive: no contact.
+        bodies: numbers of the two bodies.
+        unit: torque and force of a unit force on each.
+    """
+
+    def __init__(self, table: ContactTable, real: jax.Array, count: int, dt: float) -> None:
+        rows = [table.rest[:_MOST, k] for k in range(14)]
+        self.count, self.dt = count, dt
+        self.need = jnp.where(real, table.need, _NONE)
+        self.bodies = tuple(x.astype(jnp.int32) for x in rows[:2])
+        self.unit = rows[2:8], rows[8:14]
 
     def _spread(self, force: jax.Array) -> tuple[jax.Array, ...]:
         """Torque and force on all bodies of forces along the normals, six of `[nbody, lanes]`."""
@@ -308,11 +431,11 @@ class _Contacts:
         total = jnp.zeros_like(self.need)
         for body, unit in zip(self.bodies, self.unit, strict=True):
             for x, y in zip(acceleration, unit, strict=True):
-                total = total + _pick(x, body) * y
+                total = total + jnp.take_along_axis(x, body, 0, mode="promise_in_bounds") * y
         return total
 
-    def solve(self, respond: Respond, nothing: Any) -> Any:
-        """The accelerations by all contacts.
+    def solve(self, respond: Respond, rows: int) -> jax.Array:
+        """The accelerations by all contacts, `Acceleration.robot` of so many rows.
 
         Conjugate gradients within the bounds λ ≥ 0 (cf. Dostál 2009, Optimal Quadratic Programming
         Algorithms, chapter 5): one step is exact for one contact, and each of several lessens
@@ -343,17 +466,20 @@ class _Contacts:
             length = jnp.where(self._is_open(force, found), jnp.minimum(length, most), 0)
             force = jnp.maximum(force + length * way, 0)
             force = jnp.where(stopped & (longest <= most), 0, force)
-            total = jax.tree.map(lambda x, y: x + length * y, total, change.robot)
+            total = total + length * change.robot
             way = jnp.where(stopped, 0, way)
             return force, found + length * curve, way, curve, total
 
         def step(_: Any, now: Any) -> Any:
             return jax.lax.cond(
-                _any(self._is_open(now[0], now[1])[None]), improve, lambda x: x, now
+                any_lane(self._is_open(now[0], now[1])),
+                fuse(improve, inline=True),
+                lambda x: x,
+                now,
             )
 
-        start = zero, zero, zero, zero, nothing
-        return jax.lax.fori_loop(0, _STEPS, step, start)[-1]
+        start = zero, zero, zero, zero, jnp.zeros((rows, zero.shape[-1]), zero.dtype)
+        return _loop(_STEPS, step, start)[-1]
 
     def _is_open(self, force: jax.Array, found: jax.Array) -> jax.Array:
         """`[lanes]` whether forces are not good enough yet."""

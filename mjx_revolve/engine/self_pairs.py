@@ -232,3 +232,43 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
             width = np.where(met, width / _ANGLES, 0)
         nearest.at(stops[:, side], hinge, free)
     return stops
+
+
+def hinge_levers(assembly: Assembly) -> Float[np.ndarray, " nbody"]:
+    """How far boxes of a robot can move, one seen from another, for each radian of a hinge.
+
+    The farthest that any box reaches from the hinge on the side of it where they reach less far, as
+    if all hinges on the way could stretch: an upper bound, in every pose.
+
+    Args:
+        assembly: of a robot, or of several.
+
+    Returns:
+        Of each body's hinge [m]; 0 of roots.
+    """
+    table, parent, place = assembly.fluid, assembly.parent, assembly.position
+    center = place[table.body] + turned(assembly.rotation[table.body], table.position)
+    radius = np.linalg.norm(table.half_size, axis=1)
+    order = np.argsort(table.body, kind="stable")
+    down, up = np.zeros(len(parent)), np.zeros(len(parent))
+
+    def reach(at: np.ndarray, part: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(center[part] - place[at], axis=1) + radius[part]
+
+    np.maximum.at(down, table.body[order], reach(table.body[order], order))
+    link = np.linalg.norm(place - place[parent], axis=1)
+    hinged = np.flatnonzero(parent)
+    for body in hinged[::-1]:  # children come after their parents
+        down[parent[body]] = max(down[parent[body]], link[body] + down[body])
+    # On the other side: the carrying body's own boxes, its other children, and what carries it.
+    which, part = pairs_within(parent[hinged], table.body[order])
+    np.maximum.at(up, hinged[which], reach(hinged[which], order[part]))
+    family = hinged[np.argsort(parent[hinged], kind="stable")]
+    which, other = pairs_within(parent[hinged], parent[family])
+    which, other = hinged[which], family[other]
+    beyond = np.linalg.norm(place[other] - place[which], axis=1) + down[other]
+    np.maximum.at(up, which, np.where(which == other, 0, beyond))
+    for body in hinged:
+        if parent[parent[body]]:
+            up[body] = max(up[body], link[body] + up[parent[body]])
+    return np.where(parent > 0, np.minimum(down, up), 0.0)

@@ -22,7 +22,8 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.step_constants import StepConstants, read_constants, select_bodies
 from mjx_revolve.engine.thrusters import read_thrusters
 from mjx_revolve.engine.variation import Variation, vary_level
-from mjx_revolve.numerics.spatial import add, fold, namespace, total
+from mjx_revolve.numerics.spatial import Vec, add, fold, namespace, total
+from mjx_revolve.numerics.xla import take_lanes
 from mjx_revolve.water.world import World
 
 
@@ -44,7 +45,8 @@ class SingleTree:
         hinge_order: `[nhinge]` the robot's own numbers of the hinges, level by level.
         thrusters: of the robot.
         carries: whether any part has added mass.
-        meetings: which of its modules can meet; None for none.
+        shells: the body of each box that can meet others, level after level, as `Meetings.body`.
+        pairs: `[npair, 2]` boxes that can meet, int32.
         robot: the source.
     """
 
@@ -59,7 +61,8 @@ class SingleTree:
     hinge_order: np.ndarray
     thrusters: Thrusters
     carries: bool
-    meetings: Meetings | None
+    shells: np.ndarray
+    pairs: np.ndarray
     robot: Robot
 
     @property
@@ -67,9 +70,18 @@ class SingleTree:
         """The root's level and those below."""
         return (self.root, *self.below)
 
-    def boxes(self, like: jax.Array) -> Boxes:
-        """The levels' shells, level after level."""
-        return Boxes.of(self.all, like.dtype)
+    alike = True
+
+    @property
+    def meets(self) -> bool:
+        """Whether any of its modules can meet."""
+        return len(self.pairs) > 0
+
+    def meetings(self, like: jax.Array) -> Meetings:
+        """Which boxes can meet, level after level."""
+        first, second = self.pairs.T[..., None]
+        boxes = Boxes.of(self.all, like.dtype)
+        return Meetings.alike(boxes, self.shells, first, second, len(first), like.shape[0])
 
     @property
     def touches(self) -> bool:
@@ -113,6 +125,21 @@ class SingleTree:
             return jnp.concatenate(wide)
 
         return jax.tree.map(join, *map(select, saved))
+
+    def at_lanes(self, which: jax.Array) -> SingleTree:
+        """Itself: all lanes are this robot."""
+        return self
+
+    def saved_at_lanes(
+        self, saved: Any, select: Callable[[Any], Any], which: jax.Array
+    ) -> tuple[Any, ...]:
+        """Columns of what `select` takes; what is the same in all lanes as it is."""
+        pick = lambda x: take_lanes(x, which) if np.shape(x)[-1:] not in ((), (1,)) else x  # noqa: E731
+        return tuple(jax.tree.map(pick, select(level)) for level in saved)
+
+    def hinge_positions(self, which: jax.Array) -> tuple[Vec, ...]:
+        """The levels' own."""
+        return tuple(level.hinges.position for level in self.below if level.hinges is not None)
 
     # Values of parts, group by group.
 
@@ -231,24 +258,22 @@ def make_single_tree(robot: Robot, contact: bool = True) -> SingleTree:
         hinge_order=np.array([b - 2 for bodies in ids[1:] for b in bodies], np.int32),
         thrusters=read_thrusters(assembly, robot.num_thrusters),
         carries=columns.parts.carried is not None,
-        meetings=_find_meetings(pairs, [rows for *_, rows in made]),
+        **_find_meetings(pairs, [rows for *_, rows in made]),
         robot=robot,
     )
 
 
-def _find_meetings(pairs: np.ndarray, shells: list[np.ndarray]) -> Meetings | None:
-    """Pairs of parts as pairs of the levels' shells, level after level."""
-    if not len(pairs):
-        return None
+def _find_meetings(pairs: np.ndarray, shells: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """Pairs of parts as pairs of the levels' shells, level after level, and the shells' bodies."""
     order = np.concatenate([rows.ravel() for rows in shells])
     starts = np.cumsum([0] + [rows.shape[-1] for rows in shells])
-    body = np.concatenate(
-        [np.tile(start + np.arange(rows.shape[-1]), len(rows)) for start, rows in
-         zip(starts[:-1], shells, strict=True)]
-    )  # fmt: skip
-    place = {int(part): k for k, part in enumerate(order) if part >= 0}
-    first, second = np.array([[place[int(x)] for x in pair] for pair in pairs], np.int32).T
-    return Meetings(body, first[:, None], second[:, None], len(pairs))
+    body = [
+        np.tile(start + np.arange(rows.shape[-1]), len(rows))
+        for start, rows in zip(starts, shells, strict=False)
+    ]
+    place = np.zeros(1 + max(order.max(initial=0), pairs.max(initial=0)), np.int32)
+    place[order[order >= 0]] = np.flatnonzero(order >= 0)
+    return {"shells": np.concatenate(body), "pairs": place[pairs]}
 
 
 def _make_level(

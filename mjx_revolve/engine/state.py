@@ -46,6 +46,8 @@ class State(NamedTuple):
         submerged: submerged fractions of the parts with added mass at the step before, by groups:
             (the root's `[npart, 1, lanes]`, those of the bodies below it: `[npart, nbody, lanes]`
             for each level, or `[rows, npart, 1, lanes]`) [-]; empty without added mass.
+        clearance: least distance by which boxes of a robot that can meet stay apart, `[lanes]` [m];
+            not positive: unknown. Empty where robots differ or have no such boxes.
     """
 
     position: Lanes
@@ -57,6 +59,7 @@ class State(NamedTuple):
     qacc_prev: Any = ()
     command: Any = ()
     submerged: Any = ()
+    clearance: Any = ()
 
 
 class RootState(NamedTuple):

@@ -28,6 +28,7 @@ from mjx_revolve.engine.level import (
     Shells,
     ThrusterMounts,
 )
+from mjx_revolve.engine.self_pairs import hinge_levers
 from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.spatial import SYM, clean
 from mjx_revolve.water.added_mass import CarriedWater
@@ -209,6 +210,7 @@ def _read_hinges(assembly: Assembly, frame: np.ndarray) -> Hinges:
         stop=column(effort / LIMIT_OVERSHOOT, 0.0),
         motor=(column(motor[0], NO_LIMIT), column(motor[1], 0.0), column(motor[2], 1.0)),
         base_inertia=column(_base_inertias(assembly), 1.0),
+        lever=hinge_levers(assembly) if assembly.world.self_contact else zero,
     )
 
 

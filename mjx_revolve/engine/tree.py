@@ -8,7 +8,7 @@ from typing import Any, Protocol, Self
 from jaxtyping import Array, Float
 
 from mjx_revolve.engine.level import Level, Thrusters
-from mjx_revolve.engine.meetings import Boxes, Meetings
+from mjx_revolve.engine.meetings import Meetings
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.water.world import World
 
@@ -39,11 +39,15 @@ class Tree(Protocol):
         """Whether any part has added mass."""
 
     @property
-    def meetings(self) -> Meetings | None:
-        """Which boxes of one robot can meet; None for none."""
+    def alike(self) -> bool:
+        """Whether all lanes are the same robot."""
 
-    def boxes(self, like: Array) -> Boxes:
-        """The boxes that `meetings` numbers, `[nshell, lanes]` or `[nshell, 1]`, own frames."""
+    @property
+    def meets(self) -> bool:
+        """Whether boxes of one robot can meet."""
+
+    def meetings(self, like: Array) -> Meetings:
+        """Which boxes of the robots can meet; `like` `[lanes]`."""
 
     @property
     def touches(self) -> bool:
@@ -69,6 +73,15 @@ class Tree(Protocol):
 
         None without hinges.
         """
+
+    def at_lanes(self, which: Array) -> Self:
+        """Some of the robots, for passes that read no constants of theirs."""
+
+    def saved_at_lanes(self, saved: Any, select: Callable[[Any], Any], which: Array) -> Any:
+        """For some of the robots, what `select` takes of what a pass saved, as if saved so."""
+
+    def hinge_positions(self, which: Array) -> Any:
+        """Of some of the robots: joint values of the hinges' places in their parents' frames."""
 
     def unstack_parts(self, groups: tuple[Array, ...]) -> tuple[Any, ...]:
         """`[npart, nbody, lanes]` of each group of parts, as a pass saves them."""

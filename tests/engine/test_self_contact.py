@@ -323,8 +323,8 @@ def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):
             for k, robot in enumerate(robots)
         ]
     )
-    # Measured: 0.7 % beyond 3 mm and 4.3 mm at most; at 20 ms, 4.2 % and 5.7 mm.
-    share, most = (0.99, 5e-3) if timestep < 0.01 else (0.95, 1e-2)
+    # Measured, 144 gaits: 1.8 mm at most; at 20 ms, 4.2 % beyond 3 mm and 5.7 mm at most.
+    share, most = (0.99, 3e-3) if timestep < 0.01 else (0.95, 1e-2)
     assert np.mean(deep < 3e-3) >= share
     assert deep.max() < most
     assert np.median(deep) < 1e-3
