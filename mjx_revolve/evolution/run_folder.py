@@ -338,20 +338,20 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
     """
     settings, copies = copy_files(config.model_dump(), Config)
     folder = Path(folder).absolute()
+    run = begin_run_folder(folder, copies, **info)
     places = {name: folder / name for name in copies}
     config = make_config(locate_files(settings, places), source=config.source)
-    return begin_run_folder(folder, _config_text(config, folder), copies, **info), config
+    # Last: where it is, the run can be continued.
+    write_atomic(folder / "config.yaml", _config_text(config, folder))
+    return run, config
 
 
-def begin_run_folder(
-    folder: str | Path, config: bytes, copies: Mapping[str, bytes], **info: Any
-) -> RunFolder:
-    """Makes a run folder of any kind: `create_run_folder`, and fits of coefficients.
+def begin_run_folder(folder: str | Path, copies: Mapping[str, bytes], **info: Any) -> RunFolder:
+    """Makes a run folder of any kind, all but its `config.yaml`, which a run writes last.
 
     Args:
         folder: a new or empty folder.
-        config: the text of `config.yaml`.
-        copies: of the files that it names, by paths relative to the folder.
+        copies: of the files that its configuration names, by paths relative to the folder.
         **info: entries for `run.json`.
 
     Raises:
@@ -371,8 +371,6 @@ def begin_run_folder(
         write_atomic(folder / name, content)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in copies.items()}
     write_atomic(folder / "run.json", _info_text(info | {"inputs": hashes}))
-    # Last: where it is, the run can be continued.
-    write_atomic(folder / "config.yaml", config)
     return run
 
 

@@ -24,7 +24,7 @@ from mjx_revolve.fitting.problem import Point, Problem, Settings, make_problem
 from mjx_revolve.fitting.recording import Mark, Recording, Signal
 from mjx_revolve.fitting.result import Fit, conclude, is_done
 from mjx_revolve.inputs.errors import InputError, show
-from mjx_revolve.inputs.files import read_file
+from mjx_revolve.inputs.files import read_file, write_atomic
 from mjx_revolve.inputs.overrides import read_overrides
 from mjx_revolve.inputs.schema import read
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
@@ -162,10 +162,12 @@ class FitRun:
         files = {f"inputs/{name}": content for name, content in copies.items()}
         files["inputs/recordings.npz"] = _pack(request.recordings)
         folder = begin_run_folder(
-            out, (text + yaml.safe_dump(config, sort_keys=False)).encode(), files,
+            out, files,
             kind="fit", started=timestamp(), seed=request.seed, **runtime.describe_process(),
         )  # fmt: skip
         save_morphology(request.robot.morphology, folder.path / "inputs" / "robot.yaml")
+        text += yaml.safe_dump(config, sort_keys=False)
+        write_atomic(folder.path / "config.yaml", text.encode())
         return cls(folder, request, problem)
 
     @classmethod
