@@ -21,8 +21,8 @@ A table has its heading by hand and a row for each element of a list (or mapping
     <!--/-->
 
 A field is STUDY.KEY.KEY..., in `rows` the row's KEY; an element of a list goes by its place or its
-`name`. `*FACTOR` multiplies, the rest is Python's format. A mapping of `mean`, `low`, `high` reads
-`mean [low, high]`, null reads –. Renderers drop comments outside code blocks, so that no figure
+`name`. `*FACTOR` multiplies, the rest is Python's format. An interval reads as its `text`, a list
+as its lines, null as –. Renderers drop comments outside code blocks, so that no figure
 that is measured can stand in a code block.
 
 Outside these places no figure is allowed: a number with a unit of what is measured (%, times, s,
@@ -99,8 +99,9 @@ class _Template(string.Formatter):
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if isinstance(value, Mapping):
-            ends = (self.format_field(value[key], format_spec) for key in ("mean", "low", "high"))
-            return "{} [{}, {}]".format(*ends)
+            return str(value["text"])
+        if isinstance(value, list):
+            return "\n\n" + "\n".join(map(str, value)) + "\n\n"
         return "–" if value is None else format(value, format_spec)
 
 

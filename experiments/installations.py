@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common import ROOT, make_folder, make_parser
+from experiments.common import ROOT, make_folder, make_parser, write_results
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
@@ -119,6 +119,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     path = folder / "installations.json"
     write_atomic(path, (json.dumps(found, indent=1) + "\n").encode())
     print(f"Wrote {path}")
+    if args.results:
+        write_results("installations", found, ())
     return int(any("failed" in str(step) for one in found.values() for step in one.values()))
 
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.common import make_folder, make_parser
+from experiments.common import make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import short_path, write_atomic
@@ -269,11 +270,20 @@ def main(argv: list[str] | None = None) -> int:
         figures["measured_section"] = draw_section(floats)
     lines = table(rows)
     print("\n".join(align([lines[0], ("",) * len(HEADINGS), *lines[1:]], left=(0, 1))))
+    steady_by_law = {}
     for law in cases.LAWS[1:]:
-        numbers = ", ".join(f"{r.ours:.2f} {r.what}" for r in cases.steady_drag(law).rows)
+        steady_by_law[law] = {r.what: r.ours for r in cases.steady_drag(law).rows}
+        numbers = ", ".join(f"{ours:.2f} {what}" for what, ours in steady_by_law[law].items())
         print(f"steady C_d by drag: {law}: {numbers}")
     bias, scatter = cases.log_scatter([r for r in swum.rows if r.case == "lamprey robot"][:-1])
     print(f"lamprey robot, nine gaits: bias {bias:.2f}, scatter {scatter:.2f}")
+    if options.results:
+        by_case: dict[str, list[dict[str, Any]]] = {}
+        for r in rows:
+            entry = asdict(r) | {"name": r.what, "ratio": r.ratio}
+            by_case.setdefault(r.case, []).append(entry)
+        found = {"cases": by_case, "steady_by_law": steady_by_law}
+        write_results("measured", found | {"lamprey": {"bias": bias, "scatter": scatter}}, ())
     text = io.StringIO()
     csv.writer(text).writerows(lines)
     write_atomic(folder / "measured.csv", text.getvalue().encode())
