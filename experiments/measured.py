@@ -22,7 +22,7 @@ from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.view.plots import WIDE, in_style, new_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from experiments.measured_cases import Found, Row
 
@@ -37,6 +37,18 @@ def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
         for r in rows
     ]
     return [HEADINGS, *cells]
+
+
+def group(
+    rows: Sequence[Row], by_law: Mapping[str, Mapping[str, float]]
+) -> dict[str, list[dict[str, Any]]]:
+    """Rows by case as the results file has them, with what other laws give of the same."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        others = {law: ours.get(row.what) for law, ours in by_law.items()}
+        entry = asdict(row) | others | {"name": row.what, "ratio": row.ratio}
+        found.setdefault(row.case, []).append(entry)
+    return found
 
 
 def _pair() -> tuple[Any, Any, Any]:
@@ -278,12 +290,17 @@ def main(argv: list[str] | None = None) -> int:
     bias, scatter = cases.log_scatter([r for r in swum.rows if r.case == "lamprey robot"][:-1])
     print(f"lamprey robot, nine gaits: bias {bias:.2f}, scatter {scatter:.2f}")
     if options.results:
-        by_case: dict[str, list[dict[str, Any]]] = {}
-        for r in rows:
-            entry = asdict(r) | {"name": r.what, "ratio": r.ratio}
-            by_case.setdefault(r.case, []).append(entry)
-        found = {"cases": by_case, "steady_by_law": steady_by_law}
-        write_results("measured", found | {"lamprey": {"bias": bias, "scatter": scatter}}, ())
+        crossed = [*cases.amphibot_glide("cross_flow").rows, *cases.swimmers("cross_flow").rows]
+        few = [r for r in crossed if r.case == "lamprey robot"][:-1]
+        numbers: dict[str, Any] = {
+            "lamprey": {"bias": bias, "scatter": scatter},
+            "cases": group(rows, steady_by_law),
+            "cross_flow": {
+                "lamprey": dict(zip(("bias", "scatter"), cases.log_scatter(few), strict=True)),
+                "cases": group(crossed, {}),
+            },
+        }
+        write_results("measured", numbers, ())
     text = io.StringIO()
     csv.writer(text).writerows(lines)
     write_atomic(folder / "measured.csv", text.getvalue().encode())

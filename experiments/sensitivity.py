@@ -396,17 +396,15 @@ def results_of(
 ) -> dict[str, Any]:
     """What the tables and the text of `docs/sensitivity.md` show; speeds in cm/s."""
     usual = laws["ours, all laws"].speed.mean() if laws else float("nan")
-    spread = {name: dict(zip(("median", "low", "high"), interval_of(100 * s.speed), strict=True))
-              for name, s in found.draws.items()}  # fmt: skip
+    words = ("", "robust_")
     rows = []
-    for name, entry in spread.items():
-        others = [interval_of(100 * its.draws[name].speed) for its in beside.values()]
-        robust = (
-            dict(zip(("robust_median", "robust_low", "robust_high"), others[0], strict=True))
-            if others
-            else {}
-        )
-        rows.append({"name": name} | entry | robust)
+    for name in found.draws:
+        row: dict[str, Any] = {"name": name}
+        for prefix, its in zip(words, (found, *beside.values()), strict=False):
+            middle, low, high = interval_of(100 * its.draws[name].speed)
+            row |= {f"{prefix}median": middle, f"{prefix}low": low, f"{prefix}high": high}
+            row[f"{prefix}kept"] = low / (100 * its.usual)
+        rows.append(row)
     return {
         "laws": [
             {"name": name, "speed": 100 * s.speed.mean(), "spread": 100 * s.speed.std(ddof=1),
