@@ -48,6 +48,7 @@ format: $(READY)  ## let ruff mend what it can
 
 docs: $(READY)  ## the documentation and a reference of all functions, as HTML in build/docs
 	$(RUN) docs/settings.py
+	$(RUN) docs/numbers.py
 	for kind in config modules morphology sweep world; do \
 	  $(RUN) -m mjx_revolve schema $$kind > mjx_revolve/schemas/$$kind.json || exit 1; done
 	$(RUN) docs/reference.py build/docs

@@ -83,7 +83,7 @@ class _Template(string.Formatter):
         for key in name.split("."):
             try:
                 if isinstance(value, list):
-                    names = {x["name"]: k for k, x in enumerate(value) if "name" in x}
+                    names = {x.get("name"): k for k, x in enumerate(value) if isinstance(x, dict)}
                     value = value[names[key] if key in names else int(key)]
                 else:
                     value = value[key]

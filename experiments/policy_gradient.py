@@ -345,7 +345,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     data = {
         "scores": {k: {"mean": x.mean(), "std": x.std()} for k, x in scores.items()},
         "unit": unit, "seconds": args.seconds, "env_steps_per_second": speed,
-        "timesteps_per_env_step": every, "engine_timesteps_per_second": bare,
+        "timesteps_per_env_step": every, "share_of_engine": speed * every / bare,
+        "engine_timesteps_per_second": bare,
     }  # fmt: skip
     path = folder / "policy_gradient.json"
     write_atomic(path, (json.dumps({"log": log}, indent=1) + "\n").encode())

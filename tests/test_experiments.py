@@ -15,6 +15,7 @@ from experiments import (
     optimisers,
     policy_gradient,
     sensitivity,
+    shipped,
     validation,
     validation_cases,
 )
@@ -167,6 +168,7 @@ def test_falling_spider_writes_its_table_and_its_plot(experiment):
         (optimisers.main, ["--evaluations", "-3"], "expected a whole number >= 1; found '-3'"),
         (optimisers.main, ["--out"], "--out: expected one argument"),
         (validation.main, ["--out", "/dev/null/x"], "--out: expected a folder to write into"),
+        (shipped.main, ["--only", "moon"], "--only: expected any of auv_escape, "),
     ],
 )
 def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
