@@ -1,7 +1,6 @@
 """Fills the figures of README.md and docs/*.md from docs/results/*.json.
 
-    python docs/numbers.py            # `make numbers`
-    python docs/numbers.py --check    # changes nothing; lists what is wrong, exit code 1
+    python docs/numbers.py    # `make numbers`; exit code 1 where something is wrong, one line each
 
 A study writes `docs/results/STUDY.json` by `experiments.common.write_results`; its `numbers`, and
 its `date`, `versions`, `machine` and `seeds`, are what pages can show. Within a line, or a table's
@@ -33,7 +32,6 @@ included, or as the first line of a table or listing, for all of it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import string
@@ -50,7 +48,7 @@ _LEFT_OUT = ("settings.md", "performance.md")
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PAGES = [page for page in PAGES if page.name not in _LEFT_OUT]
 
-_MARK = re.compile(r"(<!--(n|rows)\s+(.*?)-->)(.*?)<!--/-->", re.S)
+_MARK = re.compile(r"(<!--(n|rows)\s+(?P<template>.*?)-->)(.*?)<!--/-->", re.S)
 _CODE = re.compile(r"^```(\w*)\n(.*?)^```$|`(?:[^`\n]|\n(?!\n))+`", re.M | re.S)
 _NUMBER = r"(?<![\w./-])[±+−-]?(?:\d[\d,]*(?:\.\d+)?|\.\d+)(?:e[-−+]?\d+)?"
 _UNIT = (
@@ -121,7 +119,13 @@ def find_figures(text: str, fragments: list[str]) -> Iterator[tuple[int, str]]:
         yield text.count("\n", 0, match.start()) + 1, "a line begins with a marked place"
     # What is taken out leaves its line breaks.
     blank = lambda match: re.sub(r"[^\n]", " ", match[0])  # noqa: E731
-    text = _MARK.sub(blank, text)
+
+    def own_words(mark: re.Match[str]) -> str:
+        """What a template says beside its fields, which is no result."""
+        words = re.sub(r"\{[^}]*\}", " ", mark["template"])
+        return words + "\n" * (mark[0].count("\n") - words.count("\n"))
+
+    text = _MARK.sub(own_words, text)
     for fragment in fragments:
         words = r"\s+".join(map(re.escape, fragment.split()))
         words += r"(?:\n\|.*)*" if re.fullmatch(r"\|.*\|", fragment) else ""
@@ -154,18 +158,13 @@ def check_page(page: Path, results: Mapping[str, Any]) -> tuple[str, list[str]]:
         return text, [*wrong, f"{name}: {error.args[0]}"]
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Fills the pages, or with `--check` only says what is wrong."""
-    parser = argparse.ArgumentParser(description="Fills the pages' figures from docs/results.")
-    parser.add_argument("--check", action="store_true", help="change nothing, list what is wrong")
-    check, results, wrong = parser.parse_args(argv).check, read_results(), []
+def main() -> int:
+    """Fills all pages, and prints what is wrong with them."""
+    results, wrong = read_results(), []
     for page in PAGES:
         filled, lines = check_page(page, results)
         wrong += lines
-        if check and filled != page.read_text(encoding="utf-8"):
-            wrong.append(f"{page.relative_to(ROOT)}: other than docs/results: run make numbers")
-        elif not check:
-            page.write_text(filled, encoding="utf-8")
+        page.write_text(filled, encoding="utf-8")
     print("\n".join(wrong))
     return 1 if wrong else 0
 
