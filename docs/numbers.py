@@ -11,11 +11,11 @@ cell, a template stands in a comment, and what it gives stands between that and 
 A table has its heading by hand and a row for each element of a list, with blank lines around it, as
 a comment next to a row would end the table:
 
-    <!--rows bench.spider | {name} | {ours*1e-6:.1f} | {ratio:.0f} |-->
+    <!--rows bench.cases | {name} | {rows.0.median*1e-6:.1f} | {ratio:.0f} |-->
 
     | case | ours, million steps/s | ratio |
     |---|---|---|
-    | default water | 5.8 | 26 |
+    | spider, default water | 5.8 | 26 |
 
     <!--/-->
 

@@ -552,8 +552,7 @@ def main(argv: list[str] | None = None) -> int:
         except OSError as error:
             raise InputError(f"--json: expected a file to write; found {error.strerror}") from None
     if options.results:
-        cases = {case["name"]: case for case in report["cases"]}
-        numbers = {"load_average": before, "threads": options.threads, "cases": cases}
+        numbers = {key: report[key] for key in ("settings", "load_average", "cases")}
         write_results("bench_parts" if options.parts else "bench", numbers, ())
     wanted = min(options.threads, machine["cores"])
     if served and statistics.median(served) < 0.8 * wanted:
