@@ -48,13 +48,13 @@ format: $(READY)  ## let ruff mend what it can
 
 docs: $(READY)  ## the documentation and a reference of all functions, as HTML in build/docs
 	$(RUN) docs/settings.py
-	$(RUN) docs/numbers.py
+	$(RUN) docs/figures.py
 	for kind in config modules morphology sweep world; do \
 	  $(RUN) -m mjx_revolve schema $$kind > mjx_revolve/schemas/$$kind.json || exit 1; done
 	$(RUN) docs/reference.py build/docs
 
 numbers: $(READY)  ## the figures of README and docs from docs/results
-	$(RUN) docs/numbers.py
+	$(RUN) docs/figures.py
 
 bench: $(READY)  ## throughput beside MuJoCo C and plain MJX, from the same run
 	$(RUN) -m experiments.bench

@@ -17,7 +17,7 @@ from mjx_revolve.view.statistics import Interval
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "results"
-"""What README and the pages take their figures from; see `docs/numbers.py`."""
+"""What README and the pages take their figures from; see `docs/figures.py`."""
 
 
 def make_parser(name: str, description: str) -> Parser:

@@ -1,6 +1,6 @@
 """Fills the figures of README.md and docs/*.md from docs/results/*.json.
 
-    python docs/numbers.py    # `make numbers`; exit code 1 where something is wrong, one line each
+    python docs/figures.py    # `make numbers`; exit code 1 where something is wrong, one line each
 
 A study writes `docs/results/STUDY.json` by `experiments.common.write_results`; its `numbers`, and
 its `date`, `versions`, `machine` and `seeds`, are what pages can show. Within a line, or a table's
