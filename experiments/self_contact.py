@@ -94,7 +94,7 @@ def study(bodies: int, seconds: float, timestep: float, seed: int = 0) -> dict[s
         "not_finite": int(len(depth) - len(finite)),
         "touch": int(np.sum(finite > 0)),
         "beyond_3_mm": int(np.sum(finite > _DEEP)),
-        "deepest_mm": round(1000 * float(finite.max(initial=0)), 2),
+        "deepest_mm": round(1000 * abs(float(finite.max(initial=0))), 2),
     }
 
 
