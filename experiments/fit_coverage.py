@@ -20,8 +20,8 @@ from experiments.common import make_parser, write_results
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.fitting.parameters import read_free, split_free
-from mjx_revolve.fitting.problem import Settings
-from mjx_revolve.fitting.recording import Recording
+from mjx_revolve.fitting.problem import FitSettings
+from mjx_revolve.fitting.recording import RobotRecording
 from mjx_revolve.fitting.result import Fit, fit_robot
 from mjx_revolve.fitting.synthetic import make_noisy, simulate_signals
 from mjx_revolve.inputs.commands import run_command, whole
@@ -52,7 +52,7 @@ def commands(robot: Robot, draw: np.random.Generator, duration: float) -> np.nda
     return found
 
 
-def make_case(robot: Robot, free: tuple[str, ...], seed: int) -> tuple[list[float], Recording]:
+def make_case(robot: Robot, free: tuple[str, ...], seed: int) -> tuple[list[float], RobotRecording]:
     """The coefficients of a case, and what a camera would have seen of it."""
     draw = np.random.default_rng(seed)
     own, _ = split_free(free)
@@ -72,7 +72,7 @@ def run_case(name: str, seed: int) -> tuple[list[float], Fit, float]:
     robot = _robot(name)
     truth, recording = make_case(robot, FREE[name], seed)
     before = time.process_time()
-    fit = fit_robot(robot, [recording], FREE[name], Settings(held_out=0.0), seed)
+    fit = fit_robot(robot, [recording], FREE[name], FitSettings(held_out=0.0), seed)
     return truth, fit, time.process_time() - before
 
 
