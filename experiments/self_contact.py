@@ -105,7 +105,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--seconds", type=read_seconds, default=2.0, help="of each gait (default: 2)"
     )
-    parser.add_argument("--results", action="store_true", help="write docs/results too")
     options = parser.parse_args(argv)
     folder, numbers = make_folder(options.out, "self_contact"), []
     for timestep in (0.005, 0.02):

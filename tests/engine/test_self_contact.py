@@ -215,6 +215,10 @@ def test_a_body_alone_and_in_a_batch_agree():
         alone = march(robot, 0.8, *start, ctrl[:, : robot.num_hinges, here])[1]
         np.testing.assert_allclose(found[:, : alone.shape[1], here], alone, atol=1e-9)
         assert (depths(robot, alone).max() > 0) == (k < 2)
+    # The same bits beside other neighbours.
+    order = [0, 1, 4, 5, 2, 3]
+    other = march_batch([robots[k] for k in (0, 2, 1)], capacity, 2, ctrl[..., order], steps)
+    np.testing.assert_array_equal(other[..., :2], found[..., :2])
 
 
 def test_contacts_are_mujocos():
