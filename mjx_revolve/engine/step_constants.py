@@ -380,7 +380,8 @@ def _carried(assembly: Assembly, turn: np.ndarray, position: np.ndarray) -> Carr
     table, density = assembly.fluid, assembly.world.density
     angular, cross, linear = _carried_about(table, density, turn, position)
     own: Any = density * table.carried_mass, density * table.carried_inertia
-    return CarriedWater(SpatialInertia(_sym(angular), _mat(cross), _sym(linear)), *own)
+    entrained = table.entrained if assembly.world.near_surface else None
+    return CarriedWater(SpatialInertia(_sym(angular), _mat(cross), _sym(linear)), *own, entrained)
 
 
 def _mounts(assembly: Assembly, turn: np.ndarray, position: np.ndarray) -> ThrusterMounts:
