@@ -153,7 +153,6 @@ class SingleTree:
 
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
         """Ones, `[npart, nbody, lanes]` of each group and level."""
-
         axes = 3 if self.world.near_surface else 1
 
         def ones(level: Level) -> tuple[jax.Array, ...]:

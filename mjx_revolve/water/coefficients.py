@@ -81,7 +81,7 @@ TODAY: dict[str, Sourced] = {
         0.2, "-", "height over length up to which a body counts as slender", _LIGHTHILL
     ),
     "wave_share": Sourced(
-        0.5, "-", "share of a floating section's added mass at high frequency that waves take of it "
+        0.5, "-", "share of a floating section's added mass at high frequency that waves take "
         "at the frequency at which it heaves by itself; near_surface",
         "Kramers and Kronig's relation of the damping of Jensen, Mansour and Olsen, 2004",
         "computed: 0.52 to 0.47 for breadths of 4 to 0.5 draughts",

@@ -1,4 +1,4 @@
-"""Added mass of parts at the surface, and the waves that they radiate: strip theory, without memory.
+"""Added mass of parts at the surface, and the waves that they radiate: strip theory, no memory.
 
 Where a body moves faster than its waves can follow, the surface is one of constant pressure (φ =
 0). A section of breadth B and draught T then carries
@@ -27,7 +27,7 @@ nothing that goes in and out, turns or dives gains energy.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -62,15 +62,9 @@ def turning_share(share: Vec, mass: Vec, half_size: Vec) -> Vec:
         a = mul(mass[j], half_size[k] * half_size[k])
         b = mul(mass[k], half_size[j] * half_size[j])
         whole = a + b
-        part = np.where(whole > 0, a / np.where(whole > 0, whole, 1), 0.5) if _plain(whole) else (
-            jnp.where(whole > 0, a / jnp.where(whole > 0, whole, 1), 0.5)
-        )  # fmt: skip
+        part = jnp.where(whole > 0, a / jnp.where(whole > 0, whole, 1), 0.5)
         found.append(mul(part, share[j]) + mul(1 - part, share[k]))
     return tuple(found)
-
-
-def _plain(x: Any) -> bool:
-    return isinstance(x, float | int | np.ndarray | np.generic)
 
 
 def near_surface(
@@ -86,26 +80,25 @@ def near_surface(
         carried: the water that they carry deep down; entrained water stays with its fraction.
         gravity: [m/s²].
     """
-    xp = jnp
     square = tuple(x * x for x in up)
     size = tuple(mul(2, x) for x in half_size)
-    reach = total(*[mul(xp.abs(x), h) for x, h in zip(up, half_size, strict=True)])
-    seen = total(*[mul(xp.abs(up[i]), size[j] * size[k]) for i, j, k in _TURNS])
+    reach = total(*[mul(jnp.abs(x), h) for x, h in zip(up, half_size, strict=True)])
+    seen = total(*[mul(jnp.abs(up[i]), size[j] * size[k]) for i, j, k in _TURNS])
     draught = mul(submerged, size[0] * size[1] * size[2]) / seen
-    narrow = tuple(xp.minimum(size[j], size[k]) for _, j, k in _TURNS)
+    narrow = tuple(jnp.minimum(size[j], size[k]) for _, j, k in _TURNS)
     breadth = total(*[mul(x, b) for x, b in zip(square, narrow, strict=True)])
-    under = xp.maximum(depth - reach, 0)
+    under = jnp.maximum(depth - reach, 0)
     image = (reach / (reach + under)) ** 2
     length = draught + 0.5 * breadth  # 1 / k
-    fading = xp.exp(-2 * under / length) * (gravity > 0)
+    fading = jnp.exp(-2 * under / length) * (gravity > 0)
     onset = 1 - (1 - submerged) ** _ONSET
     heave = onset * (1 - 0.5 * image - 0.5 * TODAY["wave_share"].value * fading)
     sway = submerged * submerged * (1 - (1 - 8 / np.pi**2) * image)
     assert carried.entrained is not None
+    along = (sway + x * (heave - sway) for x in square)
     share = tuple(
-        sway + square[i] * (heave - sway) + mul(inside, submerged - sway - square[i] * (heave - sway))
-        for i, inside in enumerate(carried.entrained)
-    )  # fmt: skip
+        x + mul(inside, submerged - x) for x, inside in zip(along, carried.entrained, strict=True)
+    )
     # Waves: b / m, with m the deep added mass, ρ B² to the length.
     deep = total(
         *[
@@ -114,10 +107,10 @@ def near_surface(
         ]
     )
     beta = 0.5 * breadth / length
-    sine, fall = xp.sin(beta), xp.exp(beta - 1)  # k T = 1 - β
+    sine, fall = jnp.sin(beta), jnp.exp(beta - 1)  # k T = 1 - β
     rate = 4 * sine * sine * fall * fall * length**1.5 / (breadth * breadth)
     strength = float(np.sqrt(gravity)) * rate * fading * onset * deep
-    bottom = (sine - beta * xp.cos(beta)) * fall
+    bottom = (sine - beta * jnp.cos(beta)) * fall
     sides = sine * (1 - (2 - beta) * fall)
     roll = (length * (bottom - sides) / (sine * fall)) ** 2
     about = []
@@ -127,10 +120,8 @@ def near_surface(
             if i != j:
                 k = 3 - i - j
                 long = mul(size[k] * size[k], 1 / 12)
-                lever = lever + square[i] * xp.where(size[k] > size[j], long, roll)
+                lever = lever + square[i] * jnp.where(size[k] > size[j], long, roll)
         about.append(strength * lever)
     x, y, z = about
     linear = tuple(strength * up[i] * up[j] for i, j in SYM)
-    return NearSurface(
-        share, SpatialInertia((x, 0.0, 0.0, y, 0.0, z), ((0.0,) * 3,) * 3, linear)
-    )
+    return NearSurface(share, SpatialInertia((x, 0.0, 0.0, y, 0.0, z), ((0.0,) * 3,) * 3, linear))
