@@ -301,6 +301,8 @@ def main(argv: list[str] | None = None) -> int:
             },
         }
         write_results("measured", numbers, ())
+        close = cases.section((0.55, 0.6, 1.0, 1.25), near_surface=True)
+        write_results("near_surface", group(close.rows, {}), ())
     text = io.StringIO()
     csv.writer(text).writerows(lines)
     write_atomic(folder / "measured.csv", text.getvalue().encode())
