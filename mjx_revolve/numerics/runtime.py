@@ -7,6 +7,7 @@ imports them at the top.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import importlib.metadata
 import logging
@@ -36,6 +37,15 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _WORKER_MIN_COMPILE_TIME = 0.5
 _PACKAGE = Path(__file__).resolve().parents[1]
 _log = logging.getLogger(__name__)
+# Cores that XLA's threads are made for, where those are not all.
+_xla_cores: int | None = None
+_programs: Path | None = None
+
+
+def fix_threads() -> None:
+    """Fixes the thread settings that NumPy reads when it is imported."""
+    for name in _THREAD_SETTINGS:
+        os.environ.setdefault(name, "1")
 
 
 def prepare_process() -> Path | None:
@@ -48,8 +58,7 @@ def prepare_process() -> Path | None:
     Returns:
         The cache folder in use, or None.
     """
-    for name in _THREAD_SETTINGS:
-        os.environ.setdefault(name, "1")
+    fix_threads()
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if "jax" in sys.modules and (known := sys.modules["jax"].config.jax_compilation_cache_dir):
         chosen = known
@@ -71,6 +80,13 @@ def _use_cache(folder: Path | None, min_compile_time: float) -> None:
 
     jax.config.update("jax_compilation_cache_dir", str(folder) if folder else None)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time)
+    global _programs
+    _programs = folder / "programs" if folder else None
+
+
+def program_folder() -> Path | None:
+    """Where whole programs are kept (see `executables`); None: nowhere, as outside of commands."""
+    return _programs
 
 
 def prepare_worker(core: int | None, cache: str | None) -> None:
@@ -83,13 +99,14 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
         cache: the compilation cache's folder, as the process that started the worker uses it. That
             one has removed broken entries; doing so again could hit one that is being written.
     """
-    for name in _THREAD_SETTINGS:
-        os.environ.setdefault(name, "1")
+    fix_threads()
     os.environ["JAX_PLATFORMS"] = "cpu"
     _use_cache(Path(cache) if cache else None, _WORKER_MIN_COMPILE_TIME)
     if core is not None:
         import jax
 
+        global _xla_cores
+        _xla_cores = 1
         cores = list_cores()
         pin_process([core])
         jax.devices()
@@ -257,6 +274,13 @@ def source_hash() -> str:
     for name, path in sorted((path.relative_to(_PACKAGE).as_posix(), path) for path in paths):
         digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:12]
+
+
+@functools.cache
+def host_key() -> tuple[str, ...]:
+    """What a compiled program depends on besides what it computes: source, packages, CPU, cores."""
+    versions = (importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy"))
+    return source_hash(), platform.python_version(), *versions, _cpu_hash(), str(_xla_cores)
 
 
 def describe_process() -> dict[str, Any]:
