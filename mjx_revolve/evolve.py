@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     try:
         # From the first heavy import on: some of them swallow a KeyboardInterrupt, or die of it.
         with Interrupts() as interrupts, contextlib.ExitStack() as executors:
-            runtime.prepare_process()
+            runtime.fix_threads()
             return _lead(arguments, make_fitness, executors, interrupts)
     except WorkerError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -120,6 +120,8 @@ def _lead(
     if path is not None:
         find_shipped(path, "configs")  # a name that there is not is known at once
     print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
+    _check(arguments)
+    runtime.prepare_process()
     from mjx_revolve.evolution.run import Run
 
     if folder is None:
@@ -142,6 +144,21 @@ def _lead(
         return 1
     finally:
         run.close()
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Refuses a wrong configuration before JAX is imported."""
+    path, folder = arguments.config, arguments.resume
+    if folder is not None:
+        from mjx_revolve.episodes.run_reader import RunReader, find_run
+
+        with opening(folder, *([path] if path else []), trust=arguments.trust):
+            RunReader(find_run(folder)).load_config()
+    elif path is not None:
+        from mjx_revolve.episodes.config import load_config
+
+        with opening_config(path, arguments.trust):
+            load_config(path, arguments.settings)
 
 
 def _evolve(run: Run, interrupts: Interrupts) -> int:

@@ -183,11 +183,15 @@ def main(argv: list[str] | None = None) -> int:
     check_colony_arguments(arguments)
     if ".mp4" in (kinds if paths is None else paths) and not view:
         check_package("MP4", "av")
+    from mjx_revolve.numerics.runtime import fix_threads, prepare_process
+
+    fix_threads()
+    from mjx_revolve.episodes.early_checks import check_episode_files
+
+    check_episode_files(arguments)
     # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
     films = not view and set(kinds if paths is None else paths) != {".html"}
     opengl = find_opengl() if films else ""
-
-    from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
     from mjx_revolve.episodes.champion import load_asked
