@@ -52,7 +52,8 @@ docs: $(READY)  ## the documentation and a reference of all functions, as HTML i
 	  $(RUN) -m mjx_revolve schema $$kind > mjx_revolve/schemas/$$kind.json || exit 1; done
 	$(RUN) docs/reference.py build/docs
 
-bench: $(READY)  ## throughput beside MuJoCo C and plain MJX, from the same run
+bench: $(READY)  ## work and precision, then throughput, beside MuJoCo C and plain MJX
+	$(RUN) -m experiments.precision
 	$(RUN) -m experiments.bench
 
 dist: $(READY)  ## wheel and sdist in dist/, tried in a fresh environment from an empty folder
