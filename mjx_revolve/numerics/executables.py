@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.experimental import serialize_executable
 
 from mjx_revolve.numerics import runtime
@@ -64,16 +65,27 @@ class StoredProgram:
             if (found := _load(path, jax.tree.structure((args, {})))) is not None:
                 return found  # another process has compiled it meanwhile
             made = self._jitted.lower(*args).compile()
+            # XLA:CPU (jaxlib 0.10.2) writes executables that it has itself read from JAX's cache
+            # without some of their functions: what does not run when it is read back is not kept.
+            beside = path.with_name(f"{path.name}.{os.getpid()}")
             try:
                 payload, _, out_tree = serialize_executable.serialize(made)
                 content = pickle.dumps((payload, out_tree))
                 path.parent.mkdir(exist_ok=True)
-                beside = path.with_name(f"{path.name}.{os.getpid()}")
                 beside.write_bytes(hashlib.sha256(content).digest() + content)
-                beside.replace(path)
+                again = _load(beside, jax.tree.structure((args, {})))
+                if again is not None and _same(again(*args), made(*args)):
+                    beside.replace(path)
             except (OSError, ValueError, RuntimeError) as error:  # slower starts, the same results
                 _log.debug("a program is not kept: %s", error)
+            finally:
+                beside.unlink(missing_ok=True)
         return made
+
+
+def _same(found: Any, expected: Any) -> bool:
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
+    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
 
 
 def _load(path: Path, tree: Any) -> Any:
