@@ -42,6 +42,7 @@ from mjx_revolve.numerics import runtime
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.evolution.executor import Executor
+    from mjx_revolve.evolution.processes import LocalWorker
     from mjx_revolve.evolution.run import Run
 
 
@@ -104,12 +105,14 @@ def _lead(
     interrupts: Interrupts,
 ) -> int:
     """A whole run; `executors` ends its workers."""
+    started: list[LocalWorker] = []
 
     def make(config: Config) -> Executor:
         from mjx_revolve.evolution.executor import make_executor
 
         workers, cluster = arguments.workers, arguments.cluster
-        return executors.enter_context(make_executor(config, workers, make_fitness, cluster))
+        made = make_executor(config, workers, make_fitness, cluster, started)
+        return executors.enter_context(made)
 
     path, folder, settings = arguments.config, arguments.resume, arguments.settings
     if path is None and folder is None:
@@ -121,6 +124,14 @@ def _lead(
         find_shipped(path, "configs")  # a name that there is not is known at once
     print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
     _check(arguments)
+    count = arguments.workers or runtime.usable_cores()
+    if count > 1 and not arguments.cluster and make_fitness is None and runtime.expects_cpu():
+        # They import JAX and the rest while this process does; those not needed are ended.
+        from mjx_revolve.evolution.processes import start_workers
+
+        started += start_workers(count, runtime.find_cache())
+        for worker in started:
+            executors.callback(worker.end)
     runtime.prepare_process()
     from mjx_revolve.evolution.run import Run
 

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import hashlib
 import importlib.metadata
+import importlib.util
 import logging
 import os
 import platform
@@ -58,6 +59,13 @@ def prepare_process() -> Path | None:
     Returns:
         The cache folder in use, or None.
     """
+    folder = find_cache()
+    _use_cache(folder, 0.0)
+    return folder
+
+
+def find_cache() -> Path | None:
+    """Fixes the thread settings and finds the cache folder of `prepare_process`, without JAX."""
     fix_threads()
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if "jax" in sys.modules and (known := sys.modules["jax"].config.jax_compilation_cache_dir):
@@ -70,9 +78,14 @@ def prepare_process() -> Path | None:
         except OSError as error:  # a read-only home: slower starts, the same results
             _log.warning("no compilation cache: %s: %s", error.strerror, folder)
             folder = None
-
-    _use_cache(folder, 0.0)
     return folder
+
+
+def expects_cpu() -> bool:
+    """Whether JAX will find nothing but CPUs, as far as can be told before it is imported."""
+    if os.environ.get("JAX_PLATFORMS", "cpu") not in ("", "cpu"):
+        return False
+    return all(importlib.util.find_spec(name) is None for name in ("jax_plugins", "libtpu"))
 
 
 def _use_cache(folder: Path | None, min_compile_time: float) -> None:
