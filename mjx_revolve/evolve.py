@@ -55,6 +55,11 @@ def _parser() -> argparse.ArgumentParser:
         epilog=f"Configurations that come with the package: {', '.join(list_shipped('configs'))}. "
         "lake_coevolve, bed_coevolve and lake_map_elites evolve bodies, lake_colony is a colony. "
         "docs/settings.md lists all settings.",
+        examples=(
+            "evolve lake_swim --set task.duration=8 --out runs/mine",
+            "evolve --resume runs/mine",
+            "evolve lake_coevolve --seed 1",
+        ),
     )
     add = parser.add_argument
     add("config", nargs="?", type=read_path, metavar="CONFIG",

@@ -43,6 +43,10 @@ def _parser() -> argparse.ArgumentParser:
         prog=program("fit"),
         description="Fits coefficients of the water, and of a robot, to recordings of it; or plans "
         "which recordings to make.",
+        examples=(
+            "fit --plan auv --free drag,added_mass,thrust",
+            "fit auv swim.csv --free drag,added_mass,thrust,current --out runs/fitted",
+        ),
     )
     add = parser.add_argument
     add("robot", type=read_path, nargs="?", metavar="ROBOT",

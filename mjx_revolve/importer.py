@@ -30,6 +30,7 @@ def main(argv: list[str] | None = None) -> int:
         prog=program("import"),
         description="Make a robot of a URDF or an MJCF file: links become modules with boxes, "
         "volumes and hinges. What cannot be taken over is listed.",
+        examples=("import robot.urdf --out robots",),
     )
     parser.add_argument("file", type=read_path, help="URDF or MJCF")
     parser.add_argument(

@@ -52,6 +52,10 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(
         prog=program("inspect"),
         description="Show the modules, weights and descriptors of a morphology.",
+        examples=(
+            "inspect spider --picture spider.png",
+            "inspect mine.yaml --modules my_modules.yaml",
+        ),
     )
     parser.add_argument("file", type=read_path, help="morphology YAML")
     parser.add_argument("--picture", type=read_path, metavar="OUT.png", help="draw it as well")

@@ -39,6 +39,10 @@ def main(argv: list[str] | None = None) -> int:
         prog=program("live"),
         description="Run a world in real time and show it in a browser: drop robots, change the "
         "current, watch. Only this machine can open the page.",
+        examples=(
+            "live runs/mine",
+            "live spider gecko --world lake --robots 4",
+        ),
     )
     parser.add_argument(
         "paths", nargs="*", type=read_path, metavar="RUN|CONFIG|MORPHOLOGY",

@@ -30,6 +30,7 @@ def main(argv: list[str] | None = None) -> int:
         prog=program("passport"),
         description="Tries a run's champion as it was not selected: from other starts, for longer, "
         "in smaller steps, in other water, without its brain. The exit code is 1 where it fails.",
+        examples=("passport runs/mine",),
     )
     parser.add_argument("run", type=read_path, metavar="RUN", help="a run folder")
     add_trust_argument(parser)

@@ -51,6 +51,11 @@ def _parser() -> Parser:
         prog=program("replay"),
         description="Film a champion, or a morphology in the water: MP4, GIF and viewer.html; or a "
         "whole colony: colony.mp4.",
+        examples=(
+            "replay runs/mine",
+            "replay runs/bodies --ancestors 5",
+            "replay spider --out spider.gif",
+        ),
     )
     add_episode_arguments(parser)
     parser.add_argument(

@@ -24,6 +24,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog=program("report"),
         description="Writes a page about runs: one HTML file that needs nothing else.",
+        examples=(
+            "report runs/mine",
+            "report runs/a runs/b --out both.html",
+        ),
     )
     parser.add_argument("runs", nargs="+", type=read_path, metavar="RUN",
                         help="a run folder; or the folder of one sweep")  # fmt: skip

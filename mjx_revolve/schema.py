@@ -167,7 +167,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(
         prog=program("schema"),
         description="Print the JSON Schema of a kind of YAML, by which editors complete it.",
-        epilog=f"example: {program('schema')} config > config.json",
+        examples=("schema config > config.json",),
     )
     parser.add_argument("kind", choices=KINDS, help="of file")
     print(show_schema(parser.parse_args(argv).kind), end="")

@@ -40,6 +40,9 @@ def _parser() -> argparse.ArgumentParser:
         prog=program("sweep"),
         description="Runs a grid of evolutions, several seeds of each, and reports on all of them. "
         "Started again, it skips what is finished and goes on with the rest.",
+        examples=(
+            "sweep lake_swim --seeds 10 --set morphology=spider,gecko --out runs/bodies_by_hand",
+        ),
     )
     add = parser.add_argument
     add("config", type=read_path, metavar="CONFIG",

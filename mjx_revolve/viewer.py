@@ -46,6 +46,11 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(
         prog=program("viewer"),
         description="Write one HTML file that replays an episode in any browser, offline.",
+        examples=(
+            "viewer runs/mine",
+            "viewer spider --world lake --out spider.html",
+            "viewer runs/colony --colony",
+        ),
     )
     add_episode_arguments(parser)
     parser.add_argument(

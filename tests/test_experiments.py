@@ -17,6 +17,7 @@ from experiments import (
     policy_gradient,
     precision,
     sensitivity,
+    shipped,
     validation,
     validation_cases,
 )
@@ -171,6 +172,7 @@ def test_falling_spider_writes_its_table_and_its_plot(experiment):
         (optimisers.main, ["--evaluations", "-3"], "expected a whole number >= 1; found '-3'"),
         (optimisers.main, ["--out"], "--out: expected one argument"),
         (validation.main, ["--out", "/dev/null/x"], "--out: expected a folder to write into"),
+        (shipped.main, ["--only", "moon"], "--only: expected any of auv_escape, "),
     ],
 )
 def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
@@ -387,6 +389,12 @@ def test_the_tables_and_the_picture_of_sensitivity():
     found = sensitivity.Sensitivity(0.06, curves, {"start": swim, "drag": swim})
     assert sensitivity.intervals(found, 0.25)[1][-1] == "50%"
     assert len(sensitivity.draw(found, {"other": found}).axes) == 2
+    numbers = sensitivity.results_of({"ours, all laws": swim}, found, {"other": found})
+    assert numbers["laws"][0]["speed"] == pytest.approx(6) and numbers["laws"][0]["change"] == 0
+    assert [row["name"] for row in numbers["draws"]] == ["start", "drag"]
+    for prefix in ("", "robust_"):
+        assert numbers["draws"][1][f"{prefix}median"] == pytest.approx(6)
+        assert numbers["draws"][1][f"{prefix}kept"] == pytest.approx(0.051 / 0.06)
 
 
 def test_only_gaits_that_sense_nothing_can_be_played_to_mujoco(tmp_path):

@@ -12,9 +12,9 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
@@ -40,11 +40,26 @@ def program(name: str, python: str = "python") -> str:
     if own.name == "mjx-revolve":
         return f"{own.name} {name}"
     whole = (own.parent.name, own.name) == ("mjx_revolve", "__main__.py")
+    whole |= name.partition(" ")[0] == "import"  # which no module may be called
     return f"{python} -m mjx_revolve{' ' if whole else '.'}{name}"
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser with errors of one line, like those about files."""
+    """Argument parser with errors of one line, like those about files.
+
+    Args:
+        examples: what to type, from the command's name on; `--help` ends with them.
+        settings: as `argparse.ArgumentParser` has them.
+    """
+
+    def __init__(self, *, examples: Sequence[str] = (), **settings: Any) -> None:
+        super().__init__(**settings)
+        self._examples = examples
+
+    def format_help(self) -> str:
+        """The help, and the examples as they are."""
+        lines = [f"  {program(line)}\n" for line in self._examples]
+        return super().format_help() + "\nexamples:\n" * bool(lines) + "".join(lines)
 
     def error(self, message: str) -> NoReturn:
         """Raises `InputError` instead of printing the usage and ending the process."""

@@ -3,12 +3,15 @@
 import argparse
 import errno
 import logging
+import re
 import subprocess
 import sys
 
 import pytest
 
 from laboratory import ROOT
+from mjx_revolve import __main__
+from mjx_revolve.__main__ import COMMANDS
 from mjx_revolve.inputs.commands import (
     Parser,
     check_place,
@@ -49,17 +52,29 @@ def test_help_loads_nothing_heavy(name, words):
     assert words in done.stdout
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_has_examples_of_its_own_options(name, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["mjx-revolve"])
+    with pytest.raises(SystemExit):
+        __main__._main([name, "--help"])
+    usage, _, examples = capsys.readouterr().out.partition("\nexample")
+    assert f"mjx-revolve {name}" in examples
+    for word in re.findall(r"--\S+", examples):
+        assert word in usage
+
+
 @pytest.mark.parametrize(
     ("called", "words"),
     [
         ("/venv/bin/mjx-revolve", "mjx-revolve viewer"),
         ("/lib/mjx_revolve/__main__.py", "python -m mjx_revolve viewer"),
         ("/lib/mjx_revolve/viewer.py", "python -m mjx_revolve.viewer"),
+        ("/lib/mjx_revolve/importer.py", "python -m mjx_revolve import"),
     ],
 )
 def test_commands_name_themselves_as_they_were_called(called, words, monkeypatch):
     monkeypatch.setattr(sys, "argv", [called])
-    assert program("viewer") == words
+    assert program(words.split("revolve")[-1].strip(" .")) == words
 
 
 @pytest.mark.parametrize(
