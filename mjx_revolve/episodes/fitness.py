@@ -90,7 +90,9 @@ class Fitness(EpisodeSpec):
 
     @property
     def _bodies_key(self) -> Any:
-        return self.robot.morphology
+        body = self.robot.morphology
+        listening = _listening(self.config, read_modules(self.config), body)
+        return body, listening.model_dump_json()
 
     def __call__(self, population: Any, key: jax.Array) -> jax.Array:
         """Scores a population.

@@ -8,21 +8,27 @@ arguments' shapes.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
 import pickle
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
+from jax import monitoring
 from jax.experimental import serialize_executable
 
 from mjx_revolve.numerics import runtime
 from mjx_revolve.numerics.xla import fuses, jit, on_cpu
 
+# JAX tells of a program that it finds in its cache by this name.
+_HIT = "/jax/compilation_cache/cache_hits"
+# Programs that nobody has read for so long are removed [s].
+_LIFE = 30 * 86_400
 _log = logging.getLogger(__name__)
 
 
@@ -61,31 +67,41 @@ class StoredProgram:
         return hashlib.sha256(pickle.dumps((self._made_of, signature, host))).hexdigest()[:32]
 
     def _compile(self, path: Path, args: Any) -> Any:
-        with runtime.compile_lock(path.name):
+        with runtime.compile_lock("program", path.name):
             if (found := _load(path, jax.tree.structure((args, {})))) is not None:
                 return found  # another process has compiled it meanwhile
-            made = self._jitted.lower(*args).compile()
-            # XLA:CPU (jaxlib 0.10.2) writes executables that it has itself read from JAX's cache
-            # without some of their functions: what does not run when it is read back is not kept.
-            beside = path.with_name(f"{path.name}.{os.getpid()}")
+            lowered = self._jitted.lower(*args)
+            hits: list[str] = []
+            listen = lambda event, **_: hits.append(event) if event == _HIT else None  # noqa: E731
+            monitoring.register_event_listener(listen)
             try:
-                payload, _, out_tree = serialize_executable.serialize(made)
-                content = pickle.dumps((payload, out_tree))
-                path.parent.mkdir(exist_ok=True)
-                beside.write_bytes(hashlib.sha256(content).digest() + content)
-                again = _load(beside, jax.tree.structure((args, {})))
-                if again is not None and _same(again(*args), made(*args)):
-                    beside.replace(path)
-            except (OSError, ValueError, RuntimeError) as error:  # slower starts, the same results
-                _log.debug("a program is not kept: %s", error)
+                made = lowered.compile()
             finally:
-                beside.unlink(missing_ok=True)
+                monitoring.unregister_event_listener(listen)
+            # XLA:CPU (jaxlib 0.10.2) writes programs that it has itself read from JAX's cache
+            # without some of their functions: those are left to that cache.
+            if not hits:
+                _keep(path, made)
         return made
 
 
-def _same(found: Any, expected: Any) -> bool:
-    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
+def _keep(path: Path, made: Any) -> None:
+    """Writes a program; where that fails, starts are slower and results the same."""
+    beside = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        payload, _, out_tree = serialize_executable.serialize(made)
+        content = pickle.dumps((payload, out_tree))
+        path.parent.mkdir(exist_ok=True)
+        beside.write_bytes(hashlib.sha256(content).digest() + content)
+        beside.replace(path)
+        for old in path.parent.iterdir():
+            if time.time() - old.stat().st_mtime > _LIFE:
+                old.unlink()
+    except (OSError, ValueError, RuntimeError) as error:
+        _log.debug("a program is not kept: %s", error)
+    finally:
+        with contextlib.suppress(OSError):
+            beside.unlink(missing_ok=True)
 
 
 def _load(path: Path, tree: Any) -> Any:
@@ -99,6 +115,8 @@ def _load(path: Path, tree: Any) -> Any:
         return None
     try:
         payload, out_tree = pickle.loads(content)
+        with contextlib.suppress(OSError):  # a folder of somebody else
+            os.utime(path)
         return serialize_executable.deserialize_and_load(payload, tree, out_tree)
     except Exception as error:  # of another machine or version, however that shows
         _log.debug("a kept program is not used: %s", error)

@@ -127,14 +127,15 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
 
 
 @contextlib.contextmanager
-def compile_lock(program: str) -> Iterator[None]:
+def compile_lock(kind: str, fingerprint: str) -> Iterator[None]:
     """Lets one process of a host in first, and those that come meanwhile when that one is done.
 
     The others then read from the compilation cache what it compiled; doing it at the same time
     would take all of them longer. Without a cache there is no lock.
 
     Args:
-        program: a fingerprint of what is compiled.
+        kind: `job`, or `program` within that; so no two processes wait for each other.
+        fingerprint: of what is compiled.
     """
     import jax
 
@@ -144,7 +145,7 @@ def compile_lock(program: str) -> Iterator[None]:
         yield
         return
     # Few names, so that they do not pile up; two programs of one name wait for each other.
-    with open(Path(folder) / f".compiling-{program[:2]}", "ab") as lock:
+    with open(Path(folder) / f".compiling-{kind}-{fingerprint[:2]}", "ab") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -292,8 +293,17 @@ def source_hash() -> str:
 @functools.cache
 def host_key() -> tuple[str, ...]:
     """What a compiled program depends on besides what it computes: source, packages, CPU, cores."""
-    versions = (importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy"))
-    return source_hash(), platform.python_version(), *versions, _cpu_hash(), str(_xla_cores)
+    cores = str(_xla_cores or usable_cores())
+    return source_hash(), str(_versions()), _cpu_hash(), cores
+
+
+def _versions() -> dict[str, str]:
+    """Of Python, and of the packages that bits depend on."""
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions
 
 
 def describe_process() -> dict[str, Any]:
@@ -304,12 +314,8 @@ def describe_process() -> dict[str, Any]:
     """
     import jax
 
-    versions = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
     return {
-        "versions": versions,
+        "versions": _versions(),
         "git": _git_revision(),
         "argv": sys.argv,
         "platform": platform.platform(),
