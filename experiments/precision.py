@@ -1,46 +1,55 @@
 """Work and precision: how far off an episode's end is, over how many robot seconds a core computes.
 
-``python -m experiments.precision [--quick] [--only TEXT] [--rounds N]``
+``python -m experiments.precision [--quick] [--only TEXT] [--rounds N] [--results]``
 
-Error: the distance between an episode's end and the same engine's end with converged steps (the
-reference), median over individuals, over the median way swum. Work: robot seconds per second of
-process CPU time, all engines in one process and measured in turn, so that other programs on the
-machine do not count. Engines in one water are given the same commands, those that our controller
-gave; each is held against a reference of its own, as joint limits differ. Everything goes to
-docs/results/bench.json and docs/precision.png, from where docs/performance.md takes it.
+Error: the distance between an episode's end and its end with converged steps (the reference),
+median over individuals, over the median way swum. Work: robot seconds per second of process CPU
+time, all engines in one process and measured in turn, so that other programs on the machine do not
+count. Engines in one water are given the same commands, those of our controller. Ours is held
+against a reference of its own, with a quarter of the shortest step; MuJoCo C's integrators against
+its RK4 with half of it: joint limits are springs there and constraints here. `--only` measures some
+cases; with `--results` theirs replace those in docs/results/precision.json, from where
+docs/precision.png and docs/performance.md have them.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
+import json
 import math
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from experiments.bench_cases import DEPTH, PHYSICS
-from experiments.common import ROOT, make_parser, write_results
+from experiments.common import RESULTS, ROOT, make_folder, make_parser, write_results
 from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.inputs.errors import InputError
 
 _PERCENT = 1.0  # the error at which engines are compared [% of the way]
-# Individuals whose ends are compared: of ours a chunk, of C what takes no longer.
-_OURS, _FEW = 64, 8
+_OURS, _FEW = 64, 16  # individuals whose ends are compared: ours alone, and beside C
 _DRAWN = 512  # random gaits, of which the best are swum; as many are timed
+_BODIES = 256  # different bodies
 _TIMED = 256  # individuals of MJX that are timed
 _USUAL = 0.005  # the timestep that is timed [s]; a step takes as long whatever its length
+_RATE = 20  # of commands [Hz]; all steps divide its period
 _KEY = 1
+# Strokes of one sine. Commands ramp: with held ones the servos' jerks, not the water, decide how
+# far off a step is, and a gait that was found with 5 ms may swim twice as far as it should.
+_GAIT = {
+    "type": "sine", "harmonics": 1, "max_frequency": 1.0, "amplitude": 0.5, "between": "ramp",
+}  # fmt: skip
 # Sensors at a rate, read late: what robots have.
 _RATED = {"rate": 20.0, "delay": 0.1}
 _SENSES = {
-    "type": "mlp", "harmonics": 1, "hidden": 8,
+    "type": "sensory_cpg", "gain": 0.3, "max_frequency": 1.0, "amplitude": 0.5, "between": "ramp",
     "sensors": [{"type": name} | _RATED for name in ("tilt", "gyro", "angle", "speed")],
 }  # fmt: skip
 _GUST = {"std": [0.02, 0.02, 0.02], "time": 5.0}
@@ -57,9 +66,8 @@ class Case:
         config: a shipped configuration.
         beside: whether MuJoCo C swims in the same water.
         mjx: whether plain MJX is shown, in the inertia box, the only law that it has.
+        steps: timesteps [s], the longest first; explicit laws refuse long ones.
         spread: standard deviation of the genes.
-        steps: timesteps [s], where not those of `Sizes`: MuJoCo's law is explicit and refuses long
-            ones, and different bodies take long to compile.
     """
 
     name: str
@@ -68,17 +76,17 @@ class Case:
     config: str = "lake_swim"
     beside: bool = False
     mjx: bool = False
+    steps: tuple[float, ...] = (0.025, 0.01, 0.005, 0.0025)
     spread: float = 0.5
-    steps: tuple[float, ...] = ()
 
 
 _WEIGHTLESS = {"world": PHYSICS["ellipsoid"], "trim": "none"}
-_SHORT = (0.01, 0.005, 0.0025, 0.000625)
+_SHORT = (0.01, 0.005, 0.0025, 0.00125)
 _LAKE = {"name": "lake", "gust": _GUST}
 CASES = (
     Case("spider, ellipsoid law", "spider", _WEIGHTLESS, beside=True, mjx=True, steps=_SHORT),
     Case("snake, ellipsoid law", "snake", _WEIGHTLESS, beside=True, steps=_SHORT),
-    Case("16 different bodies, ellipsoid law", "", _WEIGHTLESS, beside=True, steps=_SHORT),
+    Case(f"{_BODIES} bodies, ellipsoid law", "", _WEIGHTLESS, beside=True, steps=_SHORT),
     Case(
         "spider, default water, gusts, sensors at 20 Hz", "spider",
         {"world": _LAKE, "controller": _SENSES},
@@ -86,12 +94,11 @@ CASES = (
     Case("snake, default water, gusts", "snake", {"world": _LAKE}),
     Case(
         "AUV, default water, gusts, thrusters with lag", "auv",
-        {"world.gust": {"std": [0.05] * 3, "time": 5.0}, "task.trials": 1}, "auv_hold_depth",
-        spread=0.1,
+        {"world.gust": {"std": [0.05] * 3, "time": 5.0}, "task.trials": 1,
+         "controller": {"type": "feedback", "gain": 0.5, "between": "ramp"}},
+        "auv_hold_depth", spread=0.05,
     ),
-    Case("16 different bodies, default water, gusts", "", {"world": _LAKE, "trim": "none"},
-        steps=_SHORT,
-    ),
+    Case(f"{_BODIES} bodies, default water, gusts", "", {"world": _LAKE, "trim": "none"}),
     Case(
         "spider crawling on the bed, default water", "spider",
         {"world": {"name": "lake"}, "task.type": "crawl", "trim": "none"},
@@ -104,123 +111,169 @@ class Sizes:
     """How much is computed.
 
     Attributes:
-        steps: timesteps [s], the longest first; the last is the reference's.
         duration: of episodes [s].
         rounds: of timings.
+        shown: how many of a case's steps, the longest left out.
     """
 
-    steps: tuple[float, ...] = (0.02, 0.01, 0.005, 0.0025, 0.000625)
     duration: float = 10.0
     rounds: int = 3
+    shown: int = 4
 
 
-QUICK = Sizes((0.01, 0.005, 0.00125), 4.0, 2)
+QUICK = Sizes(2.0, 1, 2)
+_ALL = sorted({step for case in CASES for step in case.steps}, reverse=True)
 
 
-@dataclass
-class Engine:
-    """One engine in one case.
+Ends = tuple[np.ndarray, np.ndarray]
+"""`[n, 3]` starts and ends of episodes [m]."""
 
-    Attributes:
-        name: of the engine.
-        ends: timestep → `[n, 3]` starts and ends of episodes [m].
-        timed: makes what is timed, and the robot seconds that a call of it computes.
-        seconds: CPU seconds of its calls.
-    """
+
+class Engine(Protocol):
+    """One engine in one case; `name` tells which."""
 
     name: str
-    ends: Callable[[float], tuple[np.ndarray, np.ndarray]]
-    timed: Callable[[], tuple[Callable[[], Any], float]]
-    seconds: list[float] = field(default_factory=list)
+
+    def ends(self, step: float) -> Ends:
+        """Of episodes with a timestep [s]."""
+        ...
+
+    def reference(self) -> Ends:
+        """With converged steps."""
+        ...
+
+    def timed(self) -> tuple[Callable[[], Any], float]:
+        """What is timed, and the robot seconds that a call of it computes."""
+        ...
 
 
 # ------------------------------------------------------------------ ours
 
 
 class Ours:
-    """Our engine in a case, one compiled program for each timestep."""
+    """Our engine in a case, one compiled program for each timestep.
+
+    Attributes:
+        case: the case.
+        duration: of episodes [s].
+        finest: the reference's timestep [s].
+    """
+
+    name = "ours"
 
     def __init__(self, case: Case, sizes: Sizes) -> None:
         """Compiles nothing yet."""
-        self.case, self.sizes = case, sizes
-        self._commands = np.zeros(0)
-        self.bodies: list[Any] = []
+        self.case, self.duration = case, sizes.duration
+        self.finest = case.steps[-1] / 4
+
+    @functools.cached_property
+    def bodies(self) -> list[Any]:
+        """The morphologies."""
+        from experiments.random_bodies import random_body
+        from mjx_revolve import load_morphology
+
+        if self.case.robot:
+            return [load_morphology(str(ROOT / "morphologies" / f"{self.case.robot}.yaml"))]
+        return [random_body(k, 4 + k % 13, 6) for k in range(_BODIES)]
 
     def fitness(self, step: float) -> Any:
         """The fitness of a timestep, and its bodies' tables."""
-        from experiments.random_bodies import random_body
         from mjx_revolve import load_config, make_fitness, make_mixed_fitness
 
         case = self.case
-        settings = {"task.type": "speed"} | case.settings
-        if "controller" not in settings:
-            settings["controller.harmonics"] = 1
-        world = dict(settings.pop("world", {}))
-        settings |= {f"world.{key}": value for key, value in world.items()}
-        overrides = settings | {
+        settings = {"task.type": "speed", "controller": _GAIT} | case.settings
+        for section in ("world", "controller"):
+            values = dict(settings.pop(section, {}))
+            settings |= {f"{section}.{key}": value for key, value in values.items()}
+        overrides = {"controller.harmonics": 1} | settings | {
             "morphology": str(ROOT / "morphologies" / f"{case.robot or 'spider'}.yaml"),
-            "task.duration": self.sizes.duration, "task.settle": 0.0, "task.start_tilt": 0.0,
-            "world.timestep": step,
+            "controller.rate": float(_RATE), "task.duration": self.duration, "task.settle": 0.0,
+            "task.start_tilt": 0.0, "world.timestep": step,
         }  # fmt: skip
         config = load_config(str(ROOT / "configs" / f"{case.config}.yaml"), overrides=overrides)
         if case.robot:
             return make_fitness(config), ()
-        self.bodies = [random_body(k, 4 + k % 13, 6) for k in range(16)]
         mixed = make_mixed_fitness(config, self.bodies, hinges=16)
-        lanes = [self.bodies[k % 16] for k in range(_OURS)]
-        robots = {id(body): mixed.build(body) for body in self.bodies}
-        return mixed, mixed.pack([robots[id(body)] for body in lanes])
+        return mixed, mixed.pack([mixed.build(body) for body in self.bodies])
 
     @functools.cached_property
     def genes(self) -> Any:
-        """Gaits that get somewhere: the best of random ones, the same for all timesteps."""
+        """Gaits that get somewhere, the same for all timesteps.
+
+        Of one body the best after some rounds of the cross-entropy method (Rubinstein 1999), of
+        different bodies the best of each body's random ones.
+        """
         import jax
 
-        fitness, _ = self.fitness(_USUAL)
-        count = _DRAWN if self.case.robot else _OURS
-        draw = jax.random.normal(jax.random.key(0), (count, fitness.num_genes))
-        genes, key = self.case.spread * draw, jax.random.key(_KEY)
+        fitness, bodies = self.fitness(_USUAL)
+        rounds, keys = (15, jax.random.split(jax.random.key(0), 15))
+        key, count = jax.random.key(_KEY), fitness.num_genes
         if not self.case.robot:
-            return genes
-        return genes[jax.numpy.argsort(-fitness(genes, key))[:_OURS]]
+            shape = (rounds, _BODIES, count)
+            draws = self.case.spread * jax.random.normal(keys[0], shape)
+            scores = np.stack([np.asarray(fitness(bodies, genes, key)) for genes in draws])
+            return draws[np.argmax(scores, 0), np.arange(_BODIES)]
+        mean, spread = np.zeros(count, np.float32), np.full(count, self.case.spread, np.float32)
+        for drawn in keys:
+            genes = mean + spread * jax.random.normal(drawn, (_DRAWN, count))
+            best = genes[np.argsort(-np.asarray(fitness(genes, key)))[:_OURS]]
+            mean, spread = np.asarray(best.mean(0)), np.asarray(best.std(0))
+        return best
 
-    def ends(self, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """Starts and ends of a chunk of episodes; the reference's commands are kept."""
+    @functools.cached_property
+    def compared(self) -> np.ndarray:
+        """Numbers of the individuals whose ends are compared; of different bodies, all sizes."""
+        count = _FEW if self.case.beside else _OURS
+        return np.arange(count) * (len(self.genes) // count)
+
+    def _run(self, step: float) -> tuple[Ends, np.ndarray]:
+        """Starts and ends, and for other engines the commands `[T, n, lanes]`."""
         import jax
         import jax.numpy as jnp
 
         from mjx_revolve.numerics.xla import jit
 
         fitness, bodies = self.fitness(step)
-        stride = round(step / self.sizes.steps[-1])
-        beside = self.case.beside and stride == 1
-        alike = bool(self.case.robot)
+        alike, beside = bool(self.case.robot), self.case.beside
+        beside = beside and step == self.finest
+        rows = fitness.num_timesteps if beside else 1
+        every = fitness.num_timesteps // rows
+        lanes = jnp.asarray(np.resize(self.compared, _OURS), jnp.int32)
 
         def run(population: Any, key: Any, gusts: Any) -> Any:
             starts = fitness.precise_starts(population, key)._replace(gusts=gusts)
-            lanes = jnp.arange(_OURS, dtype=jnp.int32)
             chunk = fitness.prepare(
                 alike, False, bodies, population, starts, lanes, jnp.zeros_like(lanes)
             )
+            rollout = chunk.rollout
             record = lambda now, ctrl, water: ctrl if beside else ()  # noqa: E731
-            rollout, rows = chunk.rollout, fitness.num_timesteps if beside else 1
-            every = fitness.num_timesteps // rows
             last, ctrl = rollout.advance(chunk.state, record, rows, every, chunk.inputs)
             root = rollout.engine.root
             return root(chunk.state.state).position, root(last.state).position, ctrl
 
-        first, last, ctrl = jit(run, fast=True)(
-            self.genes, jax.random.key(_KEY), self.gusts(fitness, stride)
-        )
-        if beside:
-            self._commands = np.asarray(ctrl, float)
-        return np.stack(first, -1).astype(float), np.stack(last, -1).astype(float)
+        key = jax.random.key(_KEY)
+        first, last, ctrl = jit(run, fast=True)(self.genes, key, self.gusts(fitness, step))
+        count = len(self.compared)
+        ends = np.stack(first, -1)[:count].astype(float), np.stack(last, -1)[:count].astype(float)
+        return ends, np.asarray(ctrl, float)[..., :count] if beside else np.zeros(0)
 
-    def commands(self, step: float) -> np.ndarray:
-        """`[T, n, lanes]` commands of a timestep's steps, in our order of actuators."""
-        return self._commands[:: round(step / self.sizes.steps[-1])]
+    def ends(self, step: float) -> Ends:
+        """See `Engine`."""
+        return self._run(step)[0]
 
-    def gusts(self, fitness: Any, stride: int) -> Any:
+    @functools.cached_property
+    def _converged(self) -> tuple[Ends, np.ndarray]:
+        return self._run(self.finest)
+
+    def reference(self) -> Ends:
+        """See `Engine`: a quarter of the shortest step shown."""
+        return self._converged[0]
+
+    def commands(self, step: float, few: int = _FEW) -> np.ndarray:
+        """`[T, n, few]` commands of a timestep's steps, in our order of actuators."""
+        return self._converged[1][:: round(step / self.finest), :, :few]
+
+    def gusts(self, fitness: Any, step: float) -> Any:
         """One path of gusts for all timesteps, drawn at the reference's; None without."""
         import jax
 
@@ -228,7 +281,7 @@ class Ours:
 
         if fitness.world.gust is None:
             return None
-        world = replace(fitness.world, timestep=self.sizes.steps[-1])
+        world, stride = replace(fitness.world, timestep=self.finest), round(step / self.finest)
         steps = stride * fitness.num_timesteps
         return draw_gusts(world, jax.random.key(_KEY), steps, 1)[::stride]
 
@@ -237,12 +290,12 @@ class Ours:
         import jax
 
         fitness, bodies = self.fitness(_USUAL)
-        key, genes, count = jax.random.key(_KEY), self.genes, _OURS
+        key, genes = jax.random.key(_KEY), self.genes
         if self.case.robot:
-            genes, count = jax.numpy.tile(genes, (_DRAWN // _OURS, 1)), _DRAWN
+            genes = jax.numpy.tile(genes, (_DRAWN // _OURS, 1))
         given = (genes, key) if self.case.robot else (bodies, genes, key)
         run = lambda: jax.block_until_ready(fitness.evaluate(*given))  # noqa: E731
-        return run, count * fitness.num_timesteps * _USUAL
+        return run, len(genes) * fitness.num_timesteps * _USUAL
 
 
 # ------------------------------------------------------------------ MuJoCo
@@ -266,61 +319,61 @@ def c_model(physics: str, body: Any) -> tuple[Any, Any]:
 class C:
     """MuJoCo C with one integrator, one thread of `mujoco.rollout`."""
 
-    def __init__(self, ours: Ours, integrator: str, sizes: Sizes, physics: str = "ellipsoid"):
-        """Builds the models."""
-        import mujoco
+    def __init__(self, ours: Ours, integrator: str, physics: str = "ellipsoid"):
+        """Builds the models of the individuals that are compared."""
+        self.name = f"MuJoCo C, {integrator}"
+        self.ours, self.integrator = ours, integrator
+        bodies = [ours.bodies[k % len(ours.bodies)] for k in ours.compared]
+        made = {id(body): c_model(physics, body) for body in bodies}
+        self.models = [made[id(body)] for body in bodies]
 
-        from mjx_revolve import load_morphology
-
-        path = ROOT / "morphologies" / f"{ours.case.robot}.yaml"
-        bodies = [load_morphology(str(path))] if ours.case.robot else ours.bodies
-        self.ours, self.sizes = ours, sizes
-        self.models = [c_model(physics, body) for body in bodies]
-        for model, _ in self.models:
-            model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
-
-    def _run(self, step: float, lanes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    def _run(self, step: float, integrator: str) -> Ends:
         import mujoco
         from mujoco import rollout
 
+        commands = self.ours.commands(step)
         starts, ends = [], []
-        for k in lanes:
-            model, rows = self.models[k % len(self.models)]
+        for k, (model, rows) in enumerate(self.models):
             model.opt.timestep = step
+            model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
             data = mujoco.MjData(model)
             full = mujoco.mjtState.mjSTATE_FULLPHYSICS
             state = np.zeros(mujoco.mj_stateSize(model, full))
             mujoco.mj_getState(model, data, state, full)
-            ctrl = self.ours.commands(step)[:, :, k][:, rows]
+            ctrl = np.ascontiguousarray(commands[:, rows, k])
             found, _ = rollout.rollout(model, data, state[None], ctrl[None])
             starts.append(model.qpos0[:3].copy())
             ends.append(found[0, -1, 1:4])
         return np.array(starts), np.array(ends)
 
-    def ends(self, step: float) -> tuple[np.ndarray, np.ndarray]:
+    def ends(self, step: float) -> Ends:
         """See `Engine`."""
-        return self._run(step, range(_FEW if self.ours.case.robot else 2 * _FEW))
+        return self._run(step, self.integrator)
+
+    def reference(self) -> Ends:
+        """See `Engine`: of fourth order, half of the shortest step shown."""
+        return self._run(self.ours.case.steps[-1] / 2, "RK4")
 
     def timed(self) -> tuple[Callable[[], Any], float]:
-        """See `Engine`; of different bodies a quarter, small and large ones."""
-        lanes = range(0, 16, 4) if not self.ours.case.robot else range(4)
-        return lambda: self._run(_USUAL, lanes), len(lanes) * self.sizes.duration
+        """See `Engine`; with a step at which nothing blows up, which would take longer."""
+        step = self.ours.case.steps[-1]
+        seconds = len(self.models) * self.ours.duration * _USUAL / step
+        return lambda: self._run(step, self.integrator), seconds
 
 
 class Mjx:
     """Plain `jit(vmap(mjx.step))` in a scan, in the inertia box: the only law that it has."""
 
-    def __init__(self, ours: Ours, sizes: Sizes):
+    name = "plain MJX, inertia box"
+
+    def __init__(self, ours: Ours):
         """Compiles nothing yet."""
         import jax
         import jax.numpy as jnp
         from mujoco import mjx
 
-        from mjx_revolve import load_morphology
-
-        path = ROOT / "morphologies" / f"{ours.case.robot}.yaml"
-        model, self.rows = c_model("inertia_box", load_morphology(str(path)))
-        self.ours, self.sizes, self.start = ours, sizes, model.qpos0.copy()
+        model, self.rows = c_model("inertia_box", ours.bodies[0])
+        self.ours, self.start = ours, model.qpos0.copy()
         self.model = mjx.put_model(model)
 
         def run(step: Any, commands: Any) -> Any:
@@ -339,20 +392,24 @@ class Mjx:
     def _commands(self, step: float) -> Any:
         import jax.numpy as jnp
 
-        rows = self.ours.commands(step)[:, self.rows][..., :_FEW]
+        rows = self.ours.commands(step)[:, self.rows]
         return jnp.asarray(np.moveaxis(rows, 2, 1), jnp.float32)
 
-    def ends(self, step: float) -> tuple[np.ndarray, np.ndarray]:
+    def ends(self, step: float) -> Ends:
         """See `Engine`."""
         found = np.asarray(self.run(np.float32(step), self._commands(step)), float)
-        return np.tile(self.start[:3], (_FEW, 1)), found[:, :3]
+        return np.tile(self.start[:3], (len(found), 1)), found[:, :3]
+
+    def reference(self) -> Ends:
+        """See `Engine`: half of the shortest step shown."""
+        return self.ends(self.ours.case.steps[-1] / 2)
 
     def timed(self) -> tuple[Callable[[], Any], float]:
         """See `Engine`; wider, as MJX gains by it."""
         import jax
         import jax.numpy as jnp
 
-        wide = jnp.tile(self._commands(_USUAL)[:200], (1, _TIMED // _FEW, 1))
+        wide = jnp.tile(self._commands(_USUAL)[:100], (1, _TIMED // _FEW, 1))
         run = lambda: jax.block_until_ready(self.run(np.float32(_USUAL), wide))  # noqa: E731
         return run, _TIMED * len(wide) * _USUAL
 
@@ -363,24 +420,11 @@ class Mjx:
 def make_engines(case: Case, sizes: Sizes) -> list[Engine]:
     """The engines of a case, ours first: the others take its commands."""
     ours = Ours(case, sizes)
-    engines = [Engine("ours", ours.ends, ours.timed)]
-
-    def later(make: Callable[[], Any], name: str) -> Engine:
-        made: list[Any] = []
-
-        def get() -> Any:
-            if not made:
-                made.append(make())
-            return made[0]
-
-        return Engine(name, lambda step: get().ends(step), lambda: get().timed())
-
+    engines: list[Engine] = [ours]
     if case.beside:
-        for name in ("EULER", "IMPLICITFAST", "RK4"):
-            words = name if name == "RK4" else name.lower() if name != "EULER" else "Euler"
-            engines.append(later(lambda n=name: C(ours, n, sizes), f"MuJoCo C, {words}"))
+        engines += [C(ours, name) for name in ("Euler", "implicitfast", "RK4")]
     if case.mjx:
-        engines.append(later(lambda: Mjx(ours, sizes), "plain MJX, inertia box"))
+        engines.append(Mjx(ours))
     return engines
 
 
@@ -414,29 +458,34 @@ def work_at(points: Sequence[dict[str, Any]], percent: float) -> float | None:
 def run_case(case: Case, sizes: Sizes) -> list[dict[str, Any]]:
     """A row for each engine: its points, and its work at the error of comparison."""
     engines = make_engines(case, sizes)
-    errors: dict[str, dict[float, float | None]] = {}
+    errors: list[dict[float, float | None]] = []
+    converged: Ends | None = None
     for engine in engines:
-        start, last = engine.ends(sizes.steps[-1])
-        errors[engine.name] = {}
-        for step in sizes.steps[:-1]:
+        if not isinstance(engine, C) or converged is None:  # one for all of C's integrators
+            converged = engine.reference()
+        start, last = converged
+        found: dict[float, float | None] = {}
+        for step in case.steps[-sizes.shown :]:
             try:
-                found = engine.ends(step)[1]
+                found[step] = error_percent(engine.ends(step)[1], start, last)
             except InputError:  # an explicit law refuses it
-                found = np.full_like(last, np.nan)
-            errors[engine.name][step] = error_percent(found, start, last)
+                found[step] = None
+        errors.append(found)
+        if isinstance(engine, Ours):
+            converged = None
     calls = [engine.timed() for engine in engines]
     for call, _ in calls:
         call()  # compiles
+    spent: list[list[float]] = [[] for _ in engines]
     for number in range(sizes.rounds):  # every other round backwards
-        order = list(zip(engines, calls, strict=True))
-        for engine, (call, _) in order if number % 2 == 0 else reversed(order):
+        order = list(zip(calls, spent, strict=True))
+        for (call, _), times in order if number % 2 == 0 else reversed(order):
             began = time.process_time()
             call()
-            engine.seconds.append(time.process_time() - began)
+            times.append(time.process_time() - began)
     rows = []
-    for engine, (_, seconds) in zip(engines, calls, strict=True):
-        rate = seconds / statistics.median(engine.seconds) / _USUAL  # steps per core second
-        known = errors[engine.name]
+    for engine, (_, seconds), times, known in zip(engines, calls, spent, errors, strict=True):
+        rate = seconds / statistics.median(times) / _USUAL  # steps per core second
         points = [
             {
                 "step_ms": 1000 * step,
@@ -452,14 +501,29 @@ def run_case(case: Case, sizes: Sizes) -> list[dict[str, Any]]:
                 "engine": engine.name,
                 "steps_per_core_second": rate,
                 "points": points,
+                "order": find_order(points),
                 "work": work_at(points, _PERCENT),
-                "error": {f"{1e6 * step:.0f}us": known.get(step) for step in Sizes().steps[:-1]},
+                "error": {f"{1e6 * step:.0f}us": known.get(step) for step in _ALL},
             }
         )
     best = max((row["work"] or 0.0 for row in rows if "MuJoCo C" in row["engine"]), default=0.0)
     for row in rows:
         row["ratio"] = row["work"] / best if best and row["work"] else None
     return rows
+
+
+def find_order(points: Sequence[dict[str, Any]]) -> float | None:
+    """By what power of the step the error shrinks between the two shortest; None if it does not.
+
+    1 for a method of first order shows that its reference is converged.
+    """
+    if len(points) < 2:
+        return None
+    far, near = points[-2:]
+    if not far["error_percent"] or not near["error_percent"]:
+        return None
+    gain = math.log(far["error_percent"] / near["error_percent"])
+    return gain / math.log(far["step_ms"] / near["step_ms"])
 
 
 def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
@@ -491,11 +555,9 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Measures, draws, and writes the results."""
+    """Measures, prints, and with `--results` draws and writes."""
     parser = make_parser("precision", "Errors of episodes' ends over robot seconds per core second")
-    parser.add_argument(
-        "--quick", action="store_true", help="one case with short episodes; nothing in docs/"
-    )
+    parser.add_argument("--quick", action="store_true", help="two cases with short episodes")
     parser.add_argument("--only", metavar="TEXT", help="cases whose name contains this")
     parser.add_argument("--rounds", type=whole(1), metavar="N", help="of timings (default: 3)")
     options = parser.parse_args(argv)
@@ -513,12 +575,11 @@ def main(argv: list[str] | None = None) -> int:
         names = "; ".join(case.name for case in CASES)
         raise InputError(f"--only: expected part of one of: {names}; found {options.only!r}")
     if options.quick:
-        cases = [replace(case, mjx=False, steps=()) for case in cases[:1]]
-    rows: list[dict[str, Any]] = []
+        cases = [replace(case, mjx=False) for case in cases if case.robot == "spider"][:2]
+    place = RESULTS if options.results else make_folder(options.out, "precision")
     for case in cases:
         began = time.monotonic()
-        found = run_case(case, replace(sizes, steps=case.steps or sizes.steps))
-        rows += found
+        found = run_case(case, sizes)
         print(f"\n{case.name} ({time.monotonic() - began:.0f} s)")
         for row in found:
             errors = ", ".join(
@@ -530,15 +591,22 @@ def main(argv: list[str] | None = None) -> int:
             ratio = "" if row["ratio"] is None else f", {row['ratio']:.3g} times the best of C"
             print(f"  {row['engine']}: {row['steps_per_core_second'] / 1e6:.3f} Msteps/s; {errors}")
             print(f"    at {_PERCENT:g} %: {work} robot seconds per core second{ratio}", flush=True)
-        if not options.quick and not options.only:  # after each case: nothing measured is lost
-            save(rows)
+        save(found, place)  # after each case: nothing measured is lost
     return 0
 
 
-def save(rows: list[dict[str, Any]]) -> None:
-    """Writes the results and the diagram."""
-    draw(rows, ROOT / "docs" / "precision.png")
-    write_results("bench", {"percent": _PERCENT, "rows": rows}, (0, _KEY))
+def save(rows: list[dict[str, Any]], folder: Path) -> None:
+    """Adds a case to the results in a folder, and draws all of them."""
+    path = folder / "precision.json"
+    older = json.loads(path.read_text("utf-8"))["numbers"]["rows"] if path.exists() else []
+    known: dict[str, list[dict[str, Any]]] = {}
+    for row in older:
+        known.setdefault(row["case"], []).append(row)
+    known[rows[0]["case"]] = rows
+    rows = [row for case in CASES for row in known.get(case.name, [])]
+    picture = ROOT / "docs" / "precision.png" if folder == RESULTS else folder / "precision.png"
+    draw(rows, picture)
+    write_results("precision", {"percent": _PERCENT, "rows": rows}, (0, _KEY), folder)
 
 
 if __name__ == "__main__":

@@ -166,10 +166,11 @@ def _check(arguments: argparse.Namespace) -> None:
     """Refuses a wrong configuration before JAX is imported."""
     path, folder = arguments.config, arguments.resume
     if folder is not None:
-        from mjx_revolve.episodes.run_reader import RunReader, find_run
+        from mjx_revolve.episodes.run_reader import RunReader
 
         with opening(folder, *([path] if path else []), trust=arguments.trust):
-            RunReader(find_run(folder)).load_config()
+            if (Path(folder) / "config.yaml").is_file():  # the rest is checked when it is locked
+                RunReader(Path(folder)).load_config()
     elif path is not None:
         from mjx_revolve.episodes.config import load_config
 

@@ -27,7 +27,7 @@ from mjx_revolve.inputs.commands import (
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import read_file, short_path
+from mjx_revolve.inputs.files import check_path, short_path
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics import runtime
 
@@ -95,7 +95,10 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.resume is None and not arguments.plan and not arguments.recordings:
         raise InputError("expected a RECORDING, or --plan; found neither")
     for name in arguments.recordings:  # before JAX is imported
-        read_file(name, 1)
+        if not check_path(name).exists():
+            raise InputError(
+                f"{name}: expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"
+            )
     with Interrupts() as interrupts:
         runtime.prepare_process()
         named = [arguments.resume or arguments.robot, *arguments.recordings]

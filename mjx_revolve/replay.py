@@ -240,7 +240,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _ancestor_films(arguments: argparse.Namespace, folder: Path | None) -> list[Film]:
     """Films of an individual and its ancestors, the oldest first."""
-    from mjx_revolve.episodes.champion import champion_number, load_individuals, refuse_world
+    from mjx_revolve.episodes.champion import champion_number, load_individuals
+    from mjx_revolve.episodes.early_checks import refuse_world
     from mjx_revolve.view.film.film import make_film
     from mjx_revolve.view.population import pick_ancestors, read_population
     from mjx_revolve.view.poses import cut_episode
