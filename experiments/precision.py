@@ -37,7 +37,7 @@ _PERCENT = 1.0  # the error at which engines are compared [% of the way]
 _OURS, _FEW = 64, 16  # individuals whose ends are compared: ours alone, and beside C
 _DRAWN = 512  # random gaits, of which the best are swum; as many are timed
 _BODIES = 256  # different bodies
-_TIMED = 256  # individuals of MJX that are timed
+_TIMED, _CALL = 256, 100  # individuals of MJX that are timed, and steps of a call
 _USUAL = 0.005  # the timestep that is timed [s]; a step takes as long whatever its length
 _RATE = 20  # of commands [Hz]; all steps divide its period
 _KEY = 1
@@ -369,36 +369,40 @@ class Mjx:
     def __init__(self, ours: Ours):
         """Compiles nothing yet."""
         import jax
-        import jax.numpy as jnp
         from mujoco import mjx
 
         model, self.rows = c_model("inertia_box", ours.bodies[0])
         self.ours, self.start = ours, model.qpos0.copy()
         self.model = mjx.put_model(model)
 
-        def run(step: Any, commands: Any) -> Any:
+        def begin(qpos: Any) -> Any:
+            return jax.vmap(lambda q: mjx.make_data(self.model).replace(qpos=q))(qpos)
+
+        def run(step: Any, data: Any, commands: Any) -> Any:
             known = self.model.tree_replace({"opt.timestep": step})
-            data = jax.vmap(lambda _: mjx.make_data(known))(jnp.arange(commands.shape[1]))
 
             def advance(data: Any, ctrl: Any) -> tuple[Any, None]:
                 move = jax.vmap(mjx.step, in_axes=(None, 0))
                 return move(known, data.replace(ctrl=ctrl)), None
 
-            qpos = jnp.tile(jnp.asarray(self.start, jnp.float32), (commands.shape[1], 1))
-            return jax.lax.scan(advance, data.replace(qpos=qpos), commands)[0].qpos
+            return jax.lax.scan(advance, data, commands)[0]
 
-        self.run = jax.jit(run)
+        self._begin, self._run = jax.jit(begin), jax.jit(run)
 
-    def _commands(self, step: float) -> Any:
+    def _ends(self, step: float, commands: np.ndarray) -> Ends:
+        """Of commands `[T, n, lanes]`, in calls of one length, which are compiled once."""
         import jax.numpy as jnp
 
-        rows = self.ours.commands(step)[:, self.rows]
-        return jnp.asarray(np.moveaxis(rows, 2, 1), jnp.float32)
+        rows = jnp.asarray(np.moveaxis(commands[:, self.rows], 2, 1), jnp.float32)
+        start = np.tile(self.start, (rows.shape[1], 1))
+        data = self._begin(jnp.asarray(start, jnp.float32))
+        for k in range(0, len(rows), _CALL):
+            data = self._run(np.float32(step), data, rows[k : k + _CALL])
+        return start[:, :3], np.asarray(data.qpos[:, :3], float)
 
     def ends(self, step: float) -> Ends:
         """See `Engine`."""
-        found = np.asarray(self.run(np.float32(step), self._commands(step)), float)
-        return np.tile(self.start[:3], (len(found), 1)), found[:, :3]
+        return self._ends(step, self.ours.commands(step))
 
     def reference(self) -> Ends:
         """See `Engine`: half of the shortest step shown."""
@@ -406,12 +410,8 @@ class Mjx:
 
     def timed(self) -> tuple[Callable[[], Any], float]:
         """See `Engine`; wider, as MJX gains by it."""
-        import jax
-        import jax.numpy as jnp
-
-        wide = jnp.tile(self._commands(_USUAL)[:100], (1, _TIMED // _FEW, 1))
-        run = lambda: jax.block_until_ready(self.run(np.float32(_USUAL), wide))  # noqa: E731
-        return run, _TIMED * len(wide) * _USUAL
+        wide = np.tile(self.ours.commands(_USUAL)[:_CALL], (1, 1, _TIMED // _FEW))
+        return lambda: self._ends(_USUAL, wide), _TIMED * _CALL * _USUAL
 
 
 # ------------------------------------------------------------------ a case

@@ -128,13 +128,15 @@ def _lead(
     if path is not None:
         find_shipped(path, "configs")  # a name that there is not is known at once
     print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
-    _check(arguments)
-    count = arguments.workers or runtime.usable_cores()
-    if count > 1 and not arguments.cluster and make_fitness is None and runtime.expects_cpu():
-        # They import JAX and the rest while this process does; those not needed are ended.
+    config = _check(arguments)
+    if make_fitness is None and not arguments.cluster and runtime.expects_cpu():
+        # They import JAX and the rest while this process does.
+        from mjx_revolve.evolution.executor import choose_workers
         from mjx_revolve.evolution.processes import start_workers
 
-        started += start_workers(count, runtime.find_cache())
+        count = arguments.workers or (choose_workers(config) if config else 1)
+        if count > 1:
+            started += start_workers(count, runtime.find_cache())
         for worker in started:
             executors.callback(worker.end)
     runtime.prepare_process()
@@ -162,20 +164,19 @@ def _lead(
         run.close()
 
 
-def _check(arguments: argparse.Namespace) -> None:
-    """Refuses a wrong configuration before JAX is imported."""
+def _check(arguments: argparse.Namespace) -> Config | None:
+    """The configuration, a wrong one refused before JAX is imported; None: no run folder."""
     path, folder = arguments.config, arguments.resume
-    if folder is not None:
-        from mjx_revolve.episodes.run_reader import RunReader
+    from mjx_revolve.episodes.config import load_config
 
-        with opening(folder, *([path] if path else []), trust=arguments.trust):
-            if (Path(folder) / "config.yaml").is_file():  # the rest is checked when it is locked
-                RunReader(Path(folder)).load_config()
-    elif path is not None:
-        from mjx_revolve.episodes.config import load_config
-
+    if folder is None:
         with opening_config(path, arguments.trust):
-            load_config(path, arguments.settings)
+            return load_config(path, arguments.settings)
+    found = Path(folder) / "config.yaml"
+    if not found.is_file():  # its folder is checked when it is locked
+        return None
+    with opening(folder, *([path] if path else []), trust=arguments.trust):
+        return load_config(found)
 
 
 def _evolve(run: Run, interrupts: Interrupts) -> int:

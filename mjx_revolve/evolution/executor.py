@@ -23,12 +23,13 @@ if TYPE_CHECKING:
 
 
 def choose_workers(config: Config) -> int:
-    """How many workers a run gets: one for each core, but none without a block of its own."""
-    from mjx_revolve.evolution.blocks import block_size
+    """How many workers a run gets on CPUs: one for each core, but none without a block of its own.
 
-    block = block_size(config.task.trials)
-    if block is None or config.colony is not None:  # a world is stepped as a whole
+    It needs no JAX.
+    """
+    if config.colony is not None:  # a world is stepped as a whole
         return 1
+    block = max(1, runtime.LANES // config.task.trials)
     blocks = -(-config.evolution.population_size // block)
     if config.bodies is not None:
         count = config.bodies.selection.offspring or config.evolution.population_size
@@ -65,11 +66,12 @@ def make_executor(
     """
     cache = runtime.prepare_process()
     from mjx_revolve.episodes.config import load_config
+    from mjx_revolve.numerics.xla import on_cpu
 
     if isinstance(config, str | Path):
         config = load_config(config)
     if workers is None:
-        workers = 1 if make_fitness else choose_workers(config)
+        workers = 1 if make_fitness or not on_cpu() else choose_workers(config)
     if started and (len(started) != workers or cluster):
         for worker in started:
             worker.end()

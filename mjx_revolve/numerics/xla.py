@@ -34,9 +34,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
 
-# Individuals stepped together on a CPU: enough to fill vector registers, few enough that the loop's
-# live values stay in the first-level cache (measured: 64 to 256 alike, 16 to 32 slower).
-LANES = 64
+from mjx_revolve.numerics.runtime import LANES as LANES
 
 # Least cost, in plain operations, at which storing and loading a value beats computing it twice.
 _WORTH = 4
