@@ -42,6 +42,7 @@ from mjx_revolve.numerics import runtime
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.evolution.executor import Executor
+    from mjx_revolve.evolution.generations import Champion
     from mjx_revolve.evolution.processes import LocalWorker
     from mjx_revolve.evolution.run import Run
 
@@ -181,8 +182,6 @@ def _check(arguments: argparse.Namespace) -> Config | None:
 
 def _evolve(run: Run, interrupts: Interrupts) -> int:
     """Evolves a run whose arguments are right."""
-    from mjx_revolve.view.results import describe_score, save_pictures
-
     config, place = run.config, short_path(run.folder.path)
     if run.is_finished:
         print(
@@ -194,17 +193,26 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     if run.resumed:
         print(f"resuming {run.resumption}", flush=True)
     interrupts.be_patient("finishing what is under way")
-    champion = run.evolve(interrupts, save_pictures)
+    champion = run.evolve(interrupts, _save_pictures)
     if champion is None:
         saved = f"stopped after {run.unit} {run.generation}; all of it is saved"
         print(f"{saved}\n{_resume_hint(run)}", flush=True)
         return interrupts.exit_code
+    from mjx_revolve.view.results import describe_score
+
     print(f"champion: {describe_score(champion, config)} ({champion.origin})")
     if champion.measures:
         figures = (f"{name} {value:.3g}" for name, value in champion.measures.items())
         print(f"measures: {', '.join(figures)}")
     print(f"run folder: {place}")
     return 0
+
+
+def _save_pictures(run: Run, champion: Champion) -> None:
+    """What draws takes seconds to import: not before the first generation."""
+    from mjx_revolve.view.results import save_pictures
+
+    save_pictures(run, champion)
 
 
 def _describe(run: Run) -> str:
