@@ -7,7 +7,7 @@ median over individuals, over the median way swum. Work: robot seconds per secon
 time, all engines in one process and measured in turn, so that other programs on the machine do not
 count. Engines in one water are given the same commands, those of our controller. Ours is held
 against a reference of its own, with a quarter of the shortest step; MuJoCo C's integrators against
-its RK4 with half of it: joint limits are springs there and constraints here. `--only` measures some
+its RK4 with the same: joint limits are springs there and constraints here. `--only` measures some
 cases; with `--results` theirs replace those in docs/results/precision.json, from where
 docs/precision.png and docs/performance.md have them.
 """
@@ -324,11 +324,15 @@ class C:
 
     def __init__(self, ours: Ours, integrator: str, physics: str = "ellipsoid"):
         """Builds the models of the individuals that are compared."""
+        import mujoco
+
         self.name = f"MuJoCo C, {integrator}"
         self.ours, self.integrator = ours, integrator
         bodies = [ours.bodies[k % len(ours.bodies)] for k in ours.compared]
         made = {id(body): c_model(physics, body) for body in bodies}
         self.models = [made[id(body)] for body in bodies]
+        for model, _ in self.models:  # what blows up is not to begin anew
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
 
     def _run(self, step: float, integrator: str, every: int = 1) -> Ends:
         import mujoco
@@ -355,8 +359,8 @@ class C:
         return self._run(step, self.integrator)
 
     def reference(self) -> Ends:
-        """See `Engine`: of fourth order, half of the shortest step shown."""
-        return self._run(self.ours.case.steps[-1] / 2, "RK4")
+        """See `Engine`: of fourth order, with our reference's step."""
+        return self._run(self.ours.finest, "RK4")
 
     def timed(self) -> tuple[Callable[[], Any], float]:
         """See `Engine`; a quarter, with a step at which nothing blows up: that takes longer."""
@@ -437,7 +441,7 @@ def error_percent(found: np.ndarray, start: np.ndarray, end: np.ndarray) -> floa
     way = float(np.median(np.linalg.norm(end - start, axis=1)))
     off = np.linalg.norm(found - end, axis=1)
     middle = float(np.median(np.where(np.isfinite(off), off, np.inf)))
-    return 100 * middle / way if math.isfinite(middle) else None
+    return 100 * middle / way if math.isfinite(middle) and way > 0 else None
 
 
 def work_at(points: Sequence[dict[str, Any]], percent: float) -> float | None:
