@@ -42,6 +42,7 @@ _MJX, _TIMED, _CALL = 4, 64, 100
 _USUAL = 0.005  # the timestep that is timed [s]; a step takes as long whatever its length
 _RATE = 20  # of commands [Hz]; all steps divide its period
 _KEY = 1
+_LOST = 10.0  # what ends so many ways off has blown up
 # Strokes of one sine. Commands ramp: with held ones the servos' jerks, not the water, decide how
 # far off a step is, and a gait that was found with 5 ms may swim twice as far as it should.
 _GAIT = {
@@ -442,7 +443,7 @@ def error_percent(found: np.ndarray, start: np.ndarray, end: np.ndarray) -> floa
     way = float(np.median(np.linalg.norm(end - start, axis=1)))
     off = np.linalg.norm(found - end, axis=1)
     middle = float(np.median(np.where(np.isfinite(off), off, np.inf)))
-    return 100 * middle / way if math.isfinite(middle) and way > 0 else None
+    return 100 * middle / way if middle < _LOST * way else None
 
 
 def work_at(points: Sequence[dict[str, Any]], percent: float) -> float | None:
