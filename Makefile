@@ -56,7 +56,8 @@ docs: $(READY)  ## the documentation and a reference of all functions, as HTML i
 numbers: $(READY)  ## the figures of README and docs from docs/results
 	$(RUN) docs/figures.py
 
-bench: $(READY)  ## throughput beside MuJoCo C and plain MJX, from the same run
+bench: $(READY)  ## work and precision, then throughput, beside MuJoCo C and plain MJX
+	$(RUN) -m experiments.precision
 	$(RUN) -m experiments.bench
 
 dist: $(READY)  ## wheel and sdist in dist/, tried in a fresh environment from an empty folder
