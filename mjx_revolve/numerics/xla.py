@@ -218,22 +218,37 @@ class Graph:
 
         def run(*args: Any) -> Any:
             values: dict[int, Any] = {}
+            leaves, tree = jax.tree.flatten(args)
             for number, (operations, inputs) in enumerate(cuts):
                 last = number == count - 1
                 outputs = [v for v in own[number] if v in read]
+                wanted = {v for op in operations for v in op.inputs if isinstance(v, int)}
+                wanted |= set(ends if last else ())
+                used = _used_inputs(
+                    lambda *leaves: jax.tree.leaves(unpack(*jax.tree.unflatten(tree, leaves))),
+                    leaves,
+                    [v in wanted for v in self._arguments],
+                )
 
                 def compute(
-                    given: Any, *xs: Any, cut: Any = (operations, inputs, outputs, last)
+                    given: Any, *xs: Any, cut: Any = (operations, inputs, outputs, last, used)
                 ) -> Any:
-                    operations, inputs, outputs, last = cut
+                    operations, inputs, outputs, last, used = cut
                     local = self._constants | dict(zip(inputs, xs, strict=True))
-                    local |= zip(self._arguments, jax.tree.leaves(unpack(*given)), strict=True)
+                    some = iter(given)
+                    whole = [
+                        next(some) if u else np.zeros(x.shape, x.dtype)
+                        for x, u in zip(leaves, used, strict=True)
+                    ]
+                    whole = jax.tree.leaves(unpack(*jax.tree.unflatten(tree, whole)))
+                    local |= zip(self._arguments, whole, strict=True)
                     self._compute(operations, local)
                     if last:
                         return pack(self._finish(local))
                     return [local[v] for v in outputs]
 
-                found = fuse_call(compute)(args, *(values[v] for v in inputs))
+                given = [x for x, u in zip(leaves, used, strict=True) if u]
+                found = fuse_call(compute)(given, *(values[v] for v in inputs))
                 if last:
                     return found
                 values.update(zip(outputs, found, strict=True))
@@ -331,6 +346,19 @@ class Graph:
 
     def _finish(self, values: dict[int, Any]) -> Any:
         return jax.tree.unflatten(self._structure, [_value(values, v) for v in self._results])
+
+
+def _used_inputs(fun: Callable[..., Any], args: list[Any], wanted: list[bool]) -> list[bool]:
+    """Which arguments of a function the wanted ones of its results depend on."""
+    jaxpr = jax.make_jaxpr(fun)(*args).jaxpr
+    ends = (v for v, w in zip(jaxpr.outvars, wanted, strict=True) if w)
+    needed = {v for v in ends if not isinstance(v, core.Literal)}
+    for eqn in reversed(jaxpr.eqns):
+        if needed.intersection(eqn.outvars):
+            needed.update(v for v in eqn.invars if not isinstance(v, core.Literal))
+    # Keys, which have no zero to stand for them, stay.
+    key = lambda v: jnp.issubdtype(v.aval.dtype, jax.dtypes.extended)  # noqa: E731
+    return [v in needed or key(v) for v in jaxpr.invars]
 
 
 def _value(values: dict[int, Any], v: Any) -> Any:
