@@ -79,7 +79,10 @@ TASKS: dict[str, tuple[str, ...]] = {
 # What runs of versions without these settings had: their controllers gave a command at every step,
 # their robots' places were their cores', and their lengths those at rest.
 OLDER_TASK = {"point": "core", "length": "rest"}
-OLDER: dict[str, dict[str, Any]] = {"task": OLDER_TASK, "controller": {"rate": None}}
+OLDER: dict[str, dict[str, Any]] = {
+    "task": OLDER_TASK,
+    "controller": {"rate": None, "between": "hold"},
+}
 # Those that have a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
@@ -120,11 +123,12 @@ class ControllerConfig(Section):
     """`cpg`, `sine`, `feedback`, `mlp`, `rnn`, `sensory_cpg`, `splines`, `brain` (what the
     robot's YAML has under `brain`), or FILE.py:FUNCTION, a function of a plant and this section."""
     rate: Annotated[Positive, Le(1000), Unit("Hz")] | None = 20.0
-    """Commands in a second, held in between, as servos and Revolve have them; null: a new one at
-    each of the world's steps, as in runs of versions that had no rate [Hz]."""
-    between: Literal["hold", "ramp"] = "hold"
-    """What targets do between commands: they are held, or `ramp` from the last command to this one,
-    a period late and without jerks."""
+    """Commands in a second, as servos and Revolve have them; null: a new one at each of the world's
+    steps, as in runs of versions that had no rate [Hz]."""
+    between: Literal["hold", "ramp"] = "ramp"
+    """What targets do between commands: they `ramp` from the last command to this one, a period
+    late and without jerks, as boards that interpolate do it, or they are held (`hold`). Held ones
+    jerk the servos, and steps of 5 ms are too long for what the jerks are worth."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """The fastest oscillation, half of `rate` at most [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0

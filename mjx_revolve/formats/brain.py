@@ -284,8 +284,8 @@ def describe_brain(brain: Brain) -> tuple[str, list[str], list[str]]:
     """
     words = [
         f"Call `step` {brain.rate:.6g} times a second, at times k / {brain.rate:.6g} s from 0, and",
-        "hold the commands in between; or, where the run says `controller.between: ramp`, let the",
-        "targets go evenly from the last command to this one until the next. In single precision,",
+        "let the targets go evenly from the last command to this one until the next; where the run",
+        "says `controller.between: hold`, hold them. In single precision,",
         "a sine of 2 Hz that has run for an hour errs by 0.003 rad.",
         "Frames: x, y, z of the core, or of the module where a sensor sits; z is up at rest.",
         "Feed it what your sensors say, in these units. It clips and scales as in the simulation;",
