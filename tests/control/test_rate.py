@@ -30,7 +30,8 @@ def plant():
 
 
 def commands(plant, times, dt=0.005, make=None, **settings):
-    """`[T, n, 3]` ctrl at times `[T]` or `[T, 3]`, in float64, at a timestep."""
+    """`[T, n, 3]` ctrl at times `[T]` or `[T, 3]`, in float64, at a timestep; held, unless told."""
+    settings = {"between": "hold"} | settings
     plant = replace(plant, timestep=dt)
     if make is None:
         make = lambda plant: find_controller(plant, ControllerConfig(**settings))  # noqa: E731
@@ -116,14 +117,17 @@ def test_without_a_rate_a_controller_acts_at_every_step(plant):
 def test_older_runs_have_no_rate_and_keep_their_fingerprint(tmp_path):
     config = make_config(
         {"morphology": str(SPIDER), "world": "lake", "task": {"type": "speed"}},
-        overrides={"controller.rate": None},
+        overrides={"controller.rate": None, "controller.between": "hold"},
     )
-    text = dump_config(config)
-    assert "rate: null" in text
+    text, lines = dump_config(config), 0
+    for line in ("rate: null", "between: hold"):
+        lines += text.count(line)
+        text = text.replace(f"{line},", "").replace(line, "")
+    assert lines == 2
     (tmp_path / "run.json").write_text("{}")
-    (tmp_path / "config.yaml").write_text(text.replace("rate: null,", "").replace("rate: null", ""))
+    (tmp_path / "config.yaml").write_text(text)
     older = load_config(tmp_path / "config.yaml")
-    assert older.controller.rate is None
+    assert (older.controller.rate, older.controller.between) == (None, "hold")
     assert settings_hash(older) == settings_hash(config)
     assert settings_hash(load_config(tmp_path / "config.yaml", {"controller.rate": 20.0})) != (
         settings_hash(config)
