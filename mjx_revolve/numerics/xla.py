@@ -43,6 +43,9 @@ _WORTH = 4
 # Measured (spider, default water, 482 values): in four pieces two cores are done in half of the
 # time that one piece takes, and a step takes as long; in six it takes a sixth longer.
 _PIECE = 120
+# Of one robot, where little is won by that, and where loops of unknown length are common: more
+# pieces leave more parameters that nothing uses once MLIR has folded what leads to them.
+_PIECE_OF_ONE = 350
 
 # Operations that cost more than a plain one; views cost nothing.
 _COST = {"sqrt": 8, "rsqrt": 8, "div": 8, "tanh": 20, "exp": 15, "atan2": 40, "sin": 20, "cos": 20}
@@ -398,11 +401,16 @@ def fuse_step(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any)
         return step, lambda x: x, lambda x: x
     pack, unpack = in_one_array(carry)
     fused = Graph(step, (carry, row)).in_pieces(
-        _PIECE,
+        _piece_size(carry),
         lambda result: (pack(result[0]), result[1]),
         lambda packed, row: (unpack(packed), row),
     )
     return fused, pack, unpack
+
+
+def _piece_size(examples: Any) -> int:
+    lanes = max((x.shape[-1] for x in jax.tree.leaves(examples) if jnp.ndim(x)), default=1)
+    return _PIECE if lanes > 1 else _PIECE_OF_ONE
 
 
 def is_wide(x: jax.Array) -> bool:
@@ -457,7 +465,7 @@ def in_fused_calls(
     """
     if not fuses():
         return lambda *args: pack(fun(*unpack(*args)))
-    found: Callable[..., Any] = Graph(fun, examples).in_pieces(_PIECE, pack, unpack)
+    found: Callable[..., Any] = Graph(fun, examples).in_pieces(_piece_size(examples), pack, unpack)
     return found
 
 
