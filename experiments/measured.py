@@ -65,7 +65,7 @@ def _finish(*all_axes: Any, legends: bool = True) -> None:
 
 
 @in_style
-def draw_drag(steady: Found, oscillating: Found) -> Any:
+def draw_drag(steady: Found, oscillating: Found, remembered: Found) -> Any:
     """C_d of bodies in a steady flow, and of a plate in an oscillating one."""
     from experiments.measured_data import plate_drag, plate_drag_at_bilge
     from mjx_revolve.view.plots import COLORS
@@ -83,6 +83,8 @@ def draw_drag(steady: Found, oscillating: Found) -> Any:
     bilge = [plate_drag_at_bilge(x) for x in fine]
     right.plot(fine, bilge, color=_GREY, linestyle=":", label="measured (bilge keels)")
     right.plot(number, ours, "o-", color=COLORS[0], label="ours", markersize=4)
+    right.plot(*remembered.lines["cross_flow"], "s-", color=COLORS[1], markersize=4,
+               label="ours, cross_flow")  # fmt: skip
     right.axvspan(5, 15, color=COLORS[4], alpha=0.12, linewidth=0)
     right.text(8.6, 0.15, "limbs", fontsize=8, ha="center", color="#8a6000")
     right.set_xscale("log")
@@ -256,11 +258,12 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.view.plots import figure_png
 
     steady, swung = cases.steady_drag(), cases.oscillating()
+    remembered = cases.oscillating(drag="cross_flow")
     plates, falls, vehicle = cases.polars(), cases.coins(), cases.rov()
     glide, swum = cases.amphibot_glide(), cases.swimmers()
     figures = {
         "measured_swimmers": draw_swimmers(glide, swum),
-        "measured_drag": draw_drag(steady, swung),
+        "measured_drag": draw_drag(steady, swung, remembered),
         "measured_plates": draw_polars(plates),
         "measured_coins": draw_coins(falls),
         "measured_rov": draw_rov(vehicle),
@@ -290,7 +293,9 @@ def main(argv: list[str] | None = None) -> int:
     bias, scatter = cases.log_scatter([r for r in swum.rows if r.case == "lamprey robot"][:-1])
     print(f"lamprey robot, nine gaits: bias {bias:.2f}, scatter {scatter:.2f}")
     if options.results:
-        crossed = [*cases.amphibot_glide("cross_flow").rows, *cases.swimmers("cross_flow").rows]
+        law = "cross_flow"
+        crossed = [*cases.amphibot_glide(law).rows, *cases.swimmers(law).rows, *cases.foil(law)]
+        crossed += [*remembered.rows, *cases.steady_drag(law).rows]
         few = [r for r in crossed if r.case == "lamprey robot"][:-1]
         numbers: dict[str, Any] = {
             "lamprey": {"bias": bias, "scatter": scatter},
