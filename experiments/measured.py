@@ -75,7 +75,7 @@ def draw_drag(steady: Found, oscillating: Found, remembered: Found) -> Any:
     left.barh(place + 0.2, [r.measured for r in steady.rows], 0.36, color=_GREY, label="measured")
     left.barh(place - 0.2, [r.ours for r in steady.rows], 0.36, color=COLORS[0], label="ours")
     left.set_yticks(place, [r.what for r in steady.rows], fontsize=8)
-    left.set_xlabel("$C_d$ on the frontal area", fontsize=9)
+    left.set_xlabel("C_d on the frontal area", fontsize=9)
     left.set_title("steady drag")
     number, ours = oscillating.lines["faces"]
     fine = np.geomspace(number[0], number[-1], 100)
@@ -91,8 +91,8 @@ def draw_drag(steady: Found, oscillating: Found, remembered: Found) -> Any:
     right.set_xticks([3, 5, 10, 30, 100], ["3", "5", "10", "30", "100"])
     right.minorticks_off()
     right.set_ylim(0, None)
-    right.set_xlabel("Keulegan-Carpenter number $U T / b$", fontsize=9)
-    right.set_ylabel("$C_d$", fontsize=9)
+    right.set_xlabel("Keulegan-Carpenter number U T / b", fontsize=9)
+    right.set_ylabel("C_d", fontsize=9)
     right.set_title("a plate across an oscillating flow")
     _finish(left, right)
     left.grid(visible=False, axis="y")
@@ -145,7 +145,7 @@ def draw_polars(found: Found) -> Any:
             axes.plot(polar.angle, getattr(polar, what), mark, color=color, markersize=4.5,
                       label=f"measured, {name}")  # fmt: skip
         axes.set_xlabel("angle of attack (deg)", fontsize=9)
-        axes.set_ylabel(f"$C_{what[0]}$", fontsize=9)
+        axes.set_ylabel(f"C_{what[0]}", fontsize=9)
         axes.set_title(f"{what} of flat plates")
     _finish(left, right)
     if len(right.get_lines()) == 4:
@@ -237,7 +237,7 @@ def draw_section(found: Found) -> Any:
             at, value = np.array(some).T
             axes.plot(at, value / scale(at), mark, color="#3b3b3b", markerfacecolor=fill,
                       markersize=5, label=label)  # fmt: skip
-        axes.set_xlabel("$\\xi = \\omega^2 B / 2 g$", fontsize=9)
+        axes.set_xlabel("ξ = ω² B / 2 g", fontsize=9)
         axes.set_ylabel(words[what], fontsize=9)
         axes.set_title(f"a ship's section in waves: {what}")
     _finish(left, right)
@@ -295,7 +295,8 @@ def main(argv: list[str] | None = None) -> int:
     if options.results:
         law = "cross_flow"
         crossed = [*cases.amphibot_glide(law).rows, *cases.swimmers(law).rows, *cases.foil(law)]
-        crossed += [*remembered.rows, *cases.steady_drag(law).rows]
+        crossed += [*remembered.rows, *cases.steady_drag(law).rows, cases.sinking_plate(law)]
+        crossed += [*cases.polars(drag=law).rows, *cases.coins(law).rows]
         few = [r for r in crossed if r.case == "lamprey robot"][:-1]
         numbers: dict[str, Any] = {
             "lamprey": {"bias": bias, "scatter": scatter},

@@ -204,9 +204,9 @@ def steady_drag(law: str = "faces", speed: float = 0.3) -> Found:
     return Found(rows, lines)
 
 
-def sinking_plate() -> Row:
+def sinking_plate(drag: str = "faces") -> Row:
     """Terminal speed of a square plate that sinks broadside, 1 kg on 0.1 m, by the steps."""
-    world = tank(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
+    world = tank(gravity=G, buoyancy="partial", drag=drag, added_mass=True)
     robot = body("SquarePlate", world)
     edge = sizes(robot)
     qpos, qvel = at_rest(robot, 1, -5.0)
@@ -220,9 +220,9 @@ def sinking_plate() -> Row:
 # ------------------------------------------------------------------------- plates at an angle
 
 
-def polars(speed: float = 0.5) -> Found:
+def polars(speed: float = 0.5, drag: str = "lift_drag") -> Found:
     """Lift and drag coefficients of flat plates over their angle of attack."""
-    world, rows, lines = tank(drag="lift_drag"), [], {}
+    world, rows, lines = tank(drag=drag), [], {}
     for polar in data.POLARS:
         robot = body(polar.module, world)
         edge = sizes(robot)
@@ -247,18 +247,19 @@ DROPS = 64
 TILT = 5.0  # by which they may be off the level when let go, standard deviation [deg]; a choice
 
 
-def fall(coin: data.Coin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fall(coin: data.Coin, drag: str = "faces") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drops of a coin in 38 cm of water.
 
     Args:
         coin: which.
+        drag: the law.
 
     Returns:
         `[T]` time [s], `[T]` depth of the mean track [m], `[DROPS]` how far from where they were
         let go they land [m].
     """
     world = tank(
-        gravity=G, buoyancy="partial", drag="faces", added_mass=True, density=998.0,
+        gravity=G, buoyancy="partial", drag=drag, added_mass=True, density=998.0,
         timestep=0.001,
     )  # fmt: skip
     robot, draw = body(coin.module, world), np.random.default_rng(0)
@@ -271,11 +272,11 @@ def fall(coin: data.Coin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return time, depth.mean(1), np.array(landed)
 
 
-def coins() -> Found:
+def coins(drag: str = "faces") -> Found:
     """How fast coins fall, and how far from the plumb line they land."""
     rows = []
     for coin in data.COINS:
-        time, depth, landed = fall(coin)
+        time, depth, landed = fall(coin, drag)
         first, last = np.interp((0.1, 0.3), depth, time)
         name = coin.module.removeprefix("Coin")
         rows.append(Row(_COIN, f"speed, {name} Kč", coin.speed, 0.2 / (last - first), "m/s"))
@@ -481,6 +482,8 @@ def foil(drag: str = "faces", phases: int = 512, periods: int = 6) -> list[Row]:
                   ).mean()  # fmt: skip
         rows.append(Row(_FOIL, f"C_T, {case.who}", case.thrust, thrust / scale, "-"))
         rows.append(Row(_FOIL, f"η, {case.who}", case.efficiency, thrust * speed / power, "-"))
+        theirs, ours = case.thrust / case.efficiency, power / speed / scale
+        rows.append(Row(_FOIL, f"C_P, {case.who}", theirs, ours, "-"))
     return rows
 
 

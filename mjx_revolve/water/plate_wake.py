@@ -1,7 +1,7 @@
 """Drag of thin plates with a memory of their wake.
 
 A plate that swings meets the vortices that it has shed a moment ago, and is dragged by several
-times its steady drag: C_d = a / KC + b across a flow that oscillates, KC = U T / b the
+times its steady drag: C_d = A / KC + B across a flow that oscillates, KC = U T / b the
 Keulegan-Carpenter number (Ikeda's fit, ITTC). A step knows neither amplitude nor period, so each
 plate keeps four numbers of how its middle moved along its normal, v its velocity there through the
 water and τ a time (the filters are a choice; no simulator that was read has such a memory):
@@ -11,12 +11,13 @@ water and τ a time (the filters are a choice; no simulator that was read has su
     E' = (ξ² - E) / τ          the mean square of that
     G' = ((v - v̄)² - G) / τ   the mean square of the velocity off the mean
 
-with KC = 2 π √(2 E) / width, σ = G / (G + v̄²) the share of what oscillates, and the steady drag
-times 1 + σ (R - 1), R = min(a / KC + b, most) / C_d of a long plate: what carries over to plates of
-other aspect ratios is the ratio. Steady flow has σ = 0, and the steady law. The factor is never
-below 1 and even in v, so that drag opposes every motion; all four know velocities through the water
-only, so that a current changes nothing. They are stepped exactly for a velocity that holds for the
-step. Out of the water a plate forgets: v counts with its submerged share.
+with KC = 2 π a / width, a the larger of √(2 E) and |ξ|, which is there as soon as a motion begins,
+σ = G / (G + v̄²) the share of what oscillates, and the steady drag times 1 + σ (R - 1), where R is
+min(A / KC + B, most) / C_d of a long plate: what plates of other aspect ratios share is the ratio.
+Steady flow has σ = 0, and the steady law. The factor is never below 1 and even in v, so that drag
+opposes every motion; all four know velocities through the water only, so that a current changes
+nothing. They are stepped exactly for a velocity that holds for the step. Out of the water a plate
+forgets: v counts with its submerged share.
 
 Beside that a thin part is one of a chain, a rod or a compact one (`cross_flow`), but for its steady
 drag, which rises with its aspect ratio. The factor holds for the force across it, by strips where
@@ -87,8 +88,9 @@ def _numbers(parts: PartShapes, world: World) -> PlateWakeNumbers:
 
 def _factor(flow: PartFlow, numbers: PlateWakeNumbers) -> Scalar:
     """What the wake multiplies the steady drag by."""
-    mean, _, square, changing = flow.memory
-    number = 2 * np.pi * jnp.sqrt(2 * jnp.maximum(square, 1e-30)) / numbers.width
+    mean, way, square, changing = flow.memory
+    reach = jnp.sqrt(jnp.maximum(jnp.maximum(2 * square, way * way), 1e-30))
+    number = 2 * np.pi * reach / numbers.width
     swinging = jnp.minimum(_A / jnp.maximum(number, 1e-6) + _B, _MOST) / _LONG
     whole = changing + mean * mean
     share = changing / jnp.where(whole > 0, whole, 1)
