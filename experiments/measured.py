@@ -176,6 +176,7 @@ def draw_coins(found: Found) -> Any:
     right.bar(place + 0.2, [r.ours for r in rows["cm"]], 0.36, color=COLORS[0], label="ours")
     right.set_yscale("log")
     right.set_ylim(0.05, 90)
+    right.set_yticks([0.1, 1, 10], ["0.1", "1", "10"])
     right.set_ylabel("distance from the plumb line (cm)", fontsize=9)
     right.set_title("where they land")
     for axes in (left, right):
