@@ -65,7 +65,7 @@ def _finish(*all_axes: Any, legends: bool = True) -> None:
 
 
 @in_style
-def draw_drag(steady: Found, oscillating: Found) -> Any:
+def draw_drag(steady: Found, oscillating: Found, remembered: Found) -> Any:
     """C_d of bodies in a steady flow, and of a plate in an oscillating one."""
     from experiments.measured_data import plate_drag, plate_drag_at_bilge
     from mjx_revolve.view.plots import COLORS
@@ -75,7 +75,7 @@ def draw_drag(steady: Found, oscillating: Found) -> Any:
     left.barh(place + 0.2, [r.measured for r in steady.rows], 0.36, color=_GREY, label="measured")
     left.barh(place - 0.2, [r.ours for r in steady.rows], 0.36, color=COLORS[0], label="ours")
     left.set_yticks(place, [r.what for r in steady.rows], fontsize=8)
-    left.set_xlabel("$C_d$ on the frontal area", fontsize=9)
+    left.set_xlabel("C_d on the frontal area", fontsize=9)
     left.set_title("steady drag")
     number, ours = oscillating.lines["faces"]
     fine = np.geomspace(number[0], number[-1], 100)
@@ -83,14 +83,16 @@ def draw_drag(steady: Found, oscillating: Found) -> Any:
     bilge = [plate_drag_at_bilge(x) for x in fine]
     right.plot(fine, bilge, color=_GREY, linestyle=":", label="measured (bilge keels)")
     right.plot(number, ours, "o-", color=COLORS[0], label="ours", markersize=4)
+    right.plot(*remembered.lines["cross_flow"], "s-", color=COLORS[1], markersize=4,
+               label="ours, cross_flow")  # fmt: skip
     right.axvspan(5, 15, color=COLORS[4], alpha=0.12, linewidth=0)
     right.text(8.6, 0.15, "limbs", fontsize=8, ha="center", color="#8a6000")
     right.set_xscale("log")
     right.set_xticks([3, 5, 10, 30, 100], ["3", "5", "10", "30", "100"])
     right.minorticks_off()
     right.set_ylim(0, None)
-    right.set_xlabel("Keulegan-Carpenter number $U T / b$", fontsize=9)
-    right.set_ylabel("$C_d$", fontsize=9)
+    right.set_xlabel("Keulegan-Carpenter number U T / b", fontsize=9)
+    right.set_ylabel("C_d", fontsize=9)
     right.set_title("a plate across an oscillating flow")
     _finish(left, right)
     left.grid(visible=False, axis="y")
@@ -143,7 +145,7 @@ def draw_polars(found: Found) -> Any:
             axes.plot(polar.angle, getattr(polar, what), mark, color=color, markersize=4.5,
                       label=f"measured, {name}")  # fmt: skip
         axes.set_xlabel("angle of attack (deg)", fontsize=9)
-        axes.set_ylabel(f"$C_{what[0]}$", fontsize=9)
+        axes.set_ylabel(f"C_{what[0]}", fontsize=9)
         axes.set_title(f"{what} of flat plates")
     _finish(left, right)
     if len(right.get_lines()) == 4:
@@ -174,6 +176,7 @@ def draw_coins(found: Found) -> Any:
     right.bar(place + 0.2, [r.ours for r in rows["cm"]], 0.36, color=COLORS[0], label="ours")
     right.set_yscale("log")
     right.set_ylim(0.05, 90)
+    right.set_yticks([0.1, 1, 10], ["0.1", "1", "10"])
     right.set_ylabel("distance from the plumb line (cm)", fontsize=9)
     right.set_title("where they land")
     for axes in (left, right):
@@ -235,7 +238,7 @@ def draw_section(found: Found) -> Any:
             at, value = np.array(some).T
             axes.plot(at, value / scale(at), mark, color="#3b3b3b", markerfacecolor=fill,
                       markersize=5, label=label)  # fmt: skip
-        axes.set_xlabel("$\\xi = \\omega^2 B / 2 g$", fontsize=9)
+        axes.set_xlabel("ξ = ω² B / 2 g", fontsize=9)
         axes.set_ylabel(words[what], fontsize=9)
         axes.set_title(f"a ship's section in waves: {what}")
     _finish(left, right)
@@ -256,11 +259,12 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.view.plots import figure_png
 
     steady, swung = cases.steady_drag(), cases.oscillating()
+    remembered = cases.oscillating(drag="cross_flow")
     plates, falls, vehicle = cases.polars(), cases.coins(), cases.rov()
     glide, swum = cases.amphibot_glide(), cases.swimmers()
     figures = {
         "measured_swimmers": draw_swimmers(glide, swum),
-        "measured_drag": draw_drag(steady, swung),
+        "measured_drag": draw_drag(steady, swung, remembered),
         "measured_plates": draw_polars(plates),
         "measured_coins": draw_coins(falls),
         "measured_rov": draw_rov(vehicle),
@@ -290,7 +294,10 @@ def main(argv: list[str] | None = None) -> int:
     bias, scatter = cases.log_scatter([r for r in swum.rows if r.case == "lamprey robot"][:-1])
     print(f"lamprey robot, nine gaits: bias {bias:.2f}, scatter {scatter:.2f}")
     if options.results:
-        crossed = [*cases.amphibot_glide("cross_flow").rows, *cases.swimmers("cross_flow").rows]
+        law = "cross_flow"
+        crossed = [*cases.amphibot_glide(law).rows, *cases.swimmers(law).rows, *cases.foil(law)]
+        crossed += [*remembered.rows, *cases.steady_drag(law).rows, cases.sinking_plate(law)]
+        crossed += [*cases.polars(drag=law).rows, *cases.coins(law).rows]
         few = [r for r in crossed if r.case == "lamprey robot"][:-1]
         numbers: dict[str, Any] = {
             "lamprey": {"bias": bias, "scatter": scatter},

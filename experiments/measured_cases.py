@@ -22,8 +22,10 @@ from experiments.water_tank import at_rest, march, quick_options
 from experiments.water_tank import world as tank
 from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.population import robot_acceleration
 from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.numerics.spatial import vsub
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
 
@@ -139,6 +141,48 @@ def loads(
         return np.array(weights)[:, None] * np.asarray(found)[[0, 1, 2, 4]]
 
 
+def driven(
+    robot: Robot, velocity: np.ndarray, degrees: Any = 0.0, turning: Any = 0.0
+) -> np.ndarray:
+    """Forces and torques on a body that is moved, step by step, so that laws remember its way.
+
+    Args:
+        robot: a single box without carried water, so heavy that the water does not move it.
+        velocity: `[T, 3, lanes]` of its centre at the beginning of each step, world frame [m/s].
+        degrees: `[T, lanes]` or a number: turn about y then [deg].
+        turning: likewise: how fast it turns about y [rad/s].
+
+    Returns:
+        `[T, 4, lanes]` as `loads`.
+    """
+    steps, _, lanes = velocity.shape
+    model, dt = robot.mj_model, robot.world.timestep
+    engine, water = make_engine(robot), Water(0.0, (0.0, 0.0, 0.0))
+    weights = np.array([float(model.body_mass.sum())] * 3 + [float(model.body_inertia[1, 1])])
+
+    def push(state: Any, given: Any) -> Any:
+        velocity, quat, rate = given
+        still = jnp.zeros_like(rate)
+        state = state._replace(
+            position=(still, still, still - 5),
+            quat=tuple(quat),
+            velocity=tuple(velocity),
+            angular_velocity=(still, rate, still),
+        )
+        new, _ = engine.step(state, jnp.zeros((0, lanes)), water)
+        change = [*vsub(new.velocity, state.velocity), new.angular_velocity[1] - rate]
+        return new, jnp.stack(change) / dt
+
+    with jax.enable_x64(True):
+        wide = lambda x: np.broadcast_to(np.asarray(x, float), (steps, lanes))  # noqa: E731
+        quats = np.moveaxis(tilt(wide(degrees).ravel()).reshape(4, steps, lanes), 0, 1)
+        start = engine.init(*map(jnp.asarray, at_rest(robot, lanes, -5.0)))
+        given = tuple(map(jnp.asarray, (velocity, quats, wide(turning))))
+        run = jax.jit(lambda start, given: jax.lax.scan(push, start, given)[1],
+                      compiler_options=quick_options())  # fmt: skip
+        return weights[:, None] * np.asarray(run(start, given))
+
+
 # ------------------------------------------------------------------------- steady drag
 
 
@@ -160,9 +204,9 @@ def steady_drag(law: str = "faces", speed: float = 0.3) -> Found:
     return Found(rows, lines)
 
 
-def sinking_plate() -> Row:
+def sinking_plate(drag: str = "faces") -> Row:
     """Terminal speed of a square plate that sinks broadside, 1 kg on 0.1 m, by the steps."""
-    world = tank(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
+    world = tank(gravity=G, buoyancy="partial", drag=drag, added_mass=True)
     robot = body("SquarePlate", world)
     edge = sizes(robot)
     qpos, qvel = at_rest(robot, 1, -5.0)
@@ -176,9 +220,9 @@ def sinking_plate() -> Row:
 # ------------------------------------------------------------------------- plates at an angle
 
 
-def polars(speed: float = 0.5) -> Found:
+def polars(speed: float = 0.5, drag: str = "lift_drag") -> Found:
     """Lift and drag coefficients of flat plates over their angle of attack."""
-    world, rows, lines = tank(drag="lift_drag"), [], {}
+    world, rows, lines = tank(drag=drag), [], {}
     for polar in data.POLARS:
         robot = body(polar.module, world)
         edge = sizes(robot)
@@ -203,18 +247,19 @@ DROPS = 64
 TILT = 5.0  # by which they may be off the level when let go, standard deviation [deg]; a choice
 
 
-def fall(coin: data.Coin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fall(coin: data.Coin, drag: str = "faces") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drops of a coin in 38 cm of water.
 
     Args:
         coin: which.
+        drag: the law.
 
     Returns:
         `[T]` time [s], `[T]` depth of the mean track [m], `[DROPS]` how far from where they were
         let go they land [m].
     """
     world = tank(
-        gravity=G, buoyancy="partial", drag="faces", added_mass=True, density=998.0,
+        gravity=G, buoyancy="partial", drag=drag, added_mass=True, density=998.0,
         timestep=0.001,
     )  # fmt: skip
     robot, draw = body(coin.module, world), np.random.default_rng(0)
@@ -227,11 +272,11 @@ def fall(coin: data.Coin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return time, depth.mean(1), np.array(landed)
 
 
-def coins() -> Found:
+def coins(drag: str = "faces") -> Found:
     """How fast coins fall, and how far from the plumb line they land."""
     rows = []
     for coin in data.COINS:
-        time, depth, landed = fall(coin)
+        time, depth, landed = fall(coin, drag)
         first, last = np.interp((0.1, 0.3), depth, time)
         name = coin.module.removeprefix("Coin")
         rows.append(Row(_COIN, f"speed, {name} Kč", coin.speed, 0.2 / (last - first), "m/s"))
@@ -246,28 +291,42 @@ _COIN = "coins that fall"
 # ------------------------------------------------------------------------- oscillating plates
 
 
-def oscillating(numbers: Sequence[float] = (3, 5, 8, 15, 30, 60, 120), phases: int = 256) -> Found:
-    """C_d of a plate across an oscillating flow, by its Keulegan-Carpenter number U T / b."""
-    world = tank(gravity=G, buoyancy="partial", drag="faces", added_mass=True)
+def oscillating(
+    numbers: Sequence[float] = (3, 5, 8, 15, 30, 60, 120),
+    drag: str = "faces",
+    speed: float = 0.5,
+    settle: float = 12.0,
+) -> Found:
+    """C_d of a plate that swings across still water, by its Keulegan-Carpenter number U T / b.
+
+    Args:
+        numbers: Keulegan-Carpenter numbers.
+        drag: the law.
+        speed: the plate's largest [m/s].
+        settle: before the periods that are looked at [s].
+    """
+    world = tank(drag=drag)
     robot = body("OscillatedPlate", world)
-    edge, speed = sizes(robot), 0.5
+    edge, dt = sizes(robot), world.timestep
     scale = 0.5 * world.density * edge[1] * edge[2]
     rows, found = [], []
-    phase = 2 * np.pi * (np.arange(phases) + 0.5) / phases
-    for number in numbers:
-        omega = 2 * np.pi * speed / (number * edge[2])
-        flow, change = speed * np.sin(phase), speed * omega * np.cos(phase)
-        water = Water(0.0, (flow, 0.0, 0.0), (change, 0.0, 0.0))
-        push = forces(robot, np.zeros((3, phases)), flow=water)[0]
+    omega = 2 * np.pi * speed / (np.asarray(numbers, float) * edge[2])
+    steps = round((settle + 4 * np.pi / omega.min()) / dt)
+    time = dt * np.arange(steps)
+    moves = speed * np.sin(np.outer(time, omega))
+    pushes = driven(robot, np.stack([moves, 0 * moves, 0 * moves], 1))[:, 0]
+    for k, number in enumerate(numbers):
+        last = time > time[-1] - 4 * np.pi / omega[k]  # two periods
+        move, change = moves[last, k], speed * omega[k] * np.cos(omega[k] * time[last])
         # As Keulegan and Carpenter: a term in phase with |U| U and one with the acceleration.
-        terms = np.stack([scale * np.abs(flow) * flow, change], -1)
-        ours = np.linalg.lstsq(terms, push, rcond=None)[0][0]
+        terms = np.stack([scale * np.abs(move) * move, change], -1)
+        ours = -np.linalg.lstsq(terms, pushes[last, k], rcond=None)[0][0]
         found.append(ours)
         if number in (3, 5, 8, 15, 30, 60):
             name, bilge = f"C_d of a plate, U T / b = {number:g}", data.plate_drag_at_bilge(number)
             rows.append(Row("oscillating plate", name, data.plate_drag(number), ours, "-"))
             rows.append(Row("oscillating plate", f"{name}, bilge keels", bilge, ours, "-"))
-    return Found(rows, {"faces": (np.asarray(numbers, float), np.array(found))})
+    return Found(rows, {drag: (np.asarray(numbers, float), np.array(found))})
 
 
 # ------------------------------------------------------------------------- swimming chains
@@ -391,31 +450,40 @@ def log_scatter(rows: Sequence[Row]) -> tuple[float, float]:
 # ------------------------------------------------------------------------- a flapping foil
 
 
-def foil(phases: int = 512) -> list[Row]:
-    """Thrust and efficiency of a foil that heaves and pitches while it is towed.
+def foil(drag: str = "faces", phases: int = 512, periods: int = 6) -> list[Row]:
+    """Thrust and efficiency of a towed foil that heaves and pitches, in its last period.
 
     Its added mass is left out: in a motion that repeats, its mean force and power are 0.
     """
-    robot, rows = body("FlappingFoil", tank(drag="faces")), []
-    chord, span, _ = sizes(robot)
-    speed, heave, behind = data.FOIL_SPEED, data.FOIL_HEAVE, (0.5 - data.FOIL_PIVOT) * chord
-    scale = 0.5 * robot.world.density * speed**2 * chord * span
-    phase = 2 * np.pi * (np.arange(phases) + 0.5) / phases
+    rows = []
+    speed, heave = data.FOIL_SPEED, data.FOIL_HEAVE
+    phase = 2 * np.pi * (np.arange(periods * phases) + 0.5) / phases
     for case in data.FLAPPING:
         omega = np.pi * case.strouhal * speed / heave
+        world = tank(drag=drag, timestep=2 * np.pi / omega / phases)
+        robot = body("FlappingFoil", world)
+        chord, span, _ = sizes(robot)
+        behind, scale = (0.5 - data.FOIL_PIVOT) * chord, 0.5 * world.density * speed**2
+        scale *= chord * span
         most = np.arctan(np.pi * case.strouhal) - np.radians(case.angle)
         rising = omega * heave * np.cos(phase)
         pitch, rate = most * np.cos(phase), -most * omega * np.sin(phase)  # nose up
         # The centre lies behind the pivot; turns about y are nose down.
         velocity = np.stack([speed + 0 * phase, 0 * phase, rising])
         velocity += behind * rate * np.stack([np.sin(pitch), 0 * pitch, -np.cos(pitch)])
-        push = loads(robot, velocity, -np.degrees(pitch), -rate)
+        whole = driven(robot, velocity.T[..., None], -np.degrees(pitch)[:, None], -rate[:, None])
+        push, (pitch, rate, rising) = (
+            whole[-phases:, :, 0].T,
+            (x[-phases:] for x in (pitch, rate, rising)),
+        )
         thrust = push[0].mean()
         power = -(push[2] * rising).mean()
         power += (rate * (push[3] - behind * (push[0] * np.sin(pitch) - push[2] * np.cos(pitch)))
                   ).mean()  # fmt: skip
         rows.append(Row(_FOIL, f"C_T, {case.who}", case.thrust, thrust / scale, "-"))
         rows.append(Row(_FOIL, f"η, {case.who}", case.efficiency, thrust * speed / power, "-"))
+        theirs, ours = case.thrust / case.efficiency, power / speed / scale
+        rows.append(Row(_FOIL, f"C_P, {case.who}", theirs, ours, "-"))
     return rows
 
 

@@ -36,7 +36,7 @@ def test_a_rod_meets_what_a_rod_meets_with_the_law_of_chains(steady):
     assert found["square rod, face on"] == pytest.approx(1.75 / 2.0, rel=1e-6)
     assert found["square rod, edge on"] == pytest.approx(1.75 / 2**0.5 / 1.6, rel=1e-6)
     for name in ("square plate, broadside", "disc, broadside"):
-        assert found[name] == before[name]
+        assert found[name] == pytest.approx(before[name] * 1.17 / 1.05)
     # Friction on a blunt body, which it is not.
     assert found["REMUS 100, ahead"] == pytest.approx(1.5 / 0.42, rel=0.01)
 
@@ -108,20 +108,27 @@ def test_bias_and_scatter_of_ratios():
     assert measured_cases.log_scatter(rows) == pytest.approx((1.0, np.log(4) / np.sqrt(2)))
 
 
-def test_a_flapping_foil_thrusts_too_much():
+def test_a_flapping_foil_thrusts_too_much_unless_its_lift_lags():
     found = ratios(measured_cases.foil())
     assert 1.5 < found["C_T, Schouveiler"] < 1.75
     assert 1.65 < found["C_T, Read"] < 1.85
     # Drag has no thrust, and none is without power.
     assert 0.0 < found["η, Read"] * 0.43 < 1.0
+    found = ratios(measured_cases.foil("cross_flow", phases=256))
+    assert all(abs(found[f"C_T, {who}"] - 1) < 0.2 for who in ("Schouveiler", "Read"))
 
 
-def test_an_oscillating_plate_drags_several_times_too_little():
-    found = measured_cases.oscillating((8, 30, 120))
+def test_an_oscillating_plate_drags_several_times_too_little_unless_it_remembers():
+    found = measured_cases.oscillating((8, 30))
     # Whatever the number: ours knows no vortices that stay with the plate.
     np.testing.assert_allclose(found.lines["faces"][1], 1.05, rtol=1e-3)
     assert 0.2 < ratios(found.rows)["C_d of a plate, U T / b = 8"] < 0.22
     assert data.plate_drag(1000.0) == 1.95  # a steady two-dimensional plate
+    few = (3, 5, 8, 15, 30, 60)
+    found = ratios(measured_cases.oscillating(few, "cross_flow").rows)
+    for number in few:
+        name = f"C_d of a plate, U T / b = {number}"
+        assert min(abs(found[x] - 1) for x in (name, f"{name}, bilge keels")) < 0.1
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +145,9 @@ def test_a_vehicles_outer_box_says_its_drag_and_added_mass_within_a_factor_of_fo
 
 
 def test_pictures_and_the_table(steady, polars, vehicle):
-    swung = measured_cases.Found([], {"faces": (np.array([3.0, 120.0]), np.ones(2))})
+    swung = measured_cases.Found(
+        [], {law: (np.array([3.0, 120.0]), np.ones(2)) for law in ("faces", "cross_flow")}
+    )
     line = np.array([0.5, 1.0]), np.ones(2)
     glide = measured_cases.Found([], {"way": line, "rotation": line})
     coins = [
@@ -147,7 +156,7 @@ def test_pictures_and_the_table(steady, polars, vehicle):
     section = measured_cases.Found([], {"heave": line, "roll": line})
     for figure in (
         measured.draw_swimmers(glide, measured_cases.Found([])),
-        measured.draw_drag(steady, swung),
+        measured.draw_drag(steady, swung, swung),
         measured.draw_polars(polars),
         measured.draw_coins(measured_cases.Found(coins)),
         measured.draw_rov(vehicle),

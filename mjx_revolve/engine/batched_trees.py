@@ -210,11 +210,12 @@ class BatchedTrees:
         return tuple(columns[:, own[0] : own[-1] + 1] for own in groups)
 
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
-        """Ones, `[npart, 1, lanes]` of the root and `[rows, npart, 1, lanes]` of the rows."""
+        """`[npart, 1, lanes]` of the root and `[rows, npart, 1, lanes]` of the rows."""
         row, count = _merged(self.capacity.row, self.bodies.rows), self.capacity.rows
         axes = 3 if self.world.near_surface else 1
-        root = tuple(jnp.ones((n, 1, *lanes), dtype) for n in self.root.carrying(axes))
-        return root, tuple(jnp.ones((count, n, 1, *lanes), dtype) for n in row.carrying(axes))
+        below = row.at_first(axes, (1, *lanes), dtype)
+        every = tuple(jnp.broadcast_to(x, (count, *x.shape)) for x in below)
+        return self.root.at_first(axes, (1, *lanes), dtype), every
 
     # The passes.
 

@@ -19,11 +19,15 @@ from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.placement import RestPose
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.water.added_mass import box_added_mass, entrained_water
+from mjx_revolve.water.cross_flow import CROSS_FLOW
 from mjx_revolve.water.drag import DRAG_LAWS
 from mjx_revolve.water.face_drag import beside, split_axes
+from mjx_revolve.water.fin_wake import FIN_WAKE
 from mjx_revolve.water.law_names import list_coefficients
 from mjx_revolve.water.laws import Coefficient
+from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
+from mjx_revolve.water.plate_wake import PLATE_WAKE, thinness
 from mjx_revolve.water.world import World
 
 _NOTHING = ((0.0,) * 6,) * 6
@@ -114,7 +118,8 @@ def drag_law(part: Part, world: World) -> str:
     """The name of a part's drag law: its own, that of its fin, or the world's.
 
     A world that switches drag off switches it off for every part, and MuJoCo's laws, which know no
-    fins, hold for fins and for parts that state their own damping, too.
+    fins, hold for fins and for parts that state their own damping, too. Where drag flows across
+    chains, thin parts and fins have laws that remember their wakes.
     """
     if world.drag == "off":
         return "off"
@@ -122,7 +127,11 @@ def drag_law(part: Part, world: World) -> str:
         return part.drag or world.drag
     if part.fossen is not None:
         return "fossen"
-    return "lift_drag" if part.lift_drag is not None else world.drag
+    crossed = world.drag == CROSS_FLOW.name
+    if part.lift_drag is not None:
+        lags = crossed and not part.lift_drag.radial_symmetry
+        return FIN_WAKE.name if lags else LIFT_DRAG.name
+    return PLATE_WAKE.name if crossed and thinness(part.boxes[0].size) > 0 else world.drag
 
 
 def _scaled(parameters: Any, part: Part) -> Any:

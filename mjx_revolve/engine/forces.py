@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_revolve.engine.contact import bed_forces, bed_normal_force
-from mjx_revolve.engine.hydrodynamics import forces_on_parts, water_forces
+from mjx_revolve.engine.hydrodynamics import PreviousStep, forces_on_parts, water_forces
 from mjx_revolve.engine.kinematics import forward_kinematics
 from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.robot import Robot
@@ -92,10 +92,13 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
     root, moved = _in_current(tree, state, water)
     world = tree.world
 
-    def forces(level: Level, children: Any, moved: tuple[BodyMotion, Any]) -> tuple[Any, Any, Any]:
+    def forces(
+        level: Level, children: Any, moved: tuple[BodyMotion, Any], *submerged: Any
+    ) -> tuple[Any, Any, Any]:
         motion = moved[0]
         gravity = effective_gravity(world, water, motion)
-        external = water_forces(world, level, motion, gravity, water, thrusts)
+        before = PreviousStep(submerged[0], 0.0) if submerged else None
+        external = water_forces(world, level, motion, gravity, water, thrusts, before)
         bed: Vec = _ZERO
         if level.points is not None:
             bed = bed_forces(world, level, motion, level.points, water)[1]
@@ -105,8 +108,9 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
         )
         return (), (), turned
 
-    _, _, below = tree.backward_pass(forces, ((), (_ZERO, _ZERO)), moved)
-    own = jax.tree.map(lambda x: x[0], forces(tree.root, None, (root, None))[2])
+    below = tree.backward_pass(forces, ((), (_ZERO, _ZERO)), moved, *state.submerged[1:])[2]
+    whole = forces(tree.root, None, (root, None), *state.submerged[:1])[2]
+    own = jax.tree.map(lambda x: x[0], whole)
     bed, wet = jax.tree.map(add, own, below)
     return bed, wet
 

@@ -70,7 +70,7 @@ class ExternalForces(NamedTuple):
             by which it turns with the body.
         damping: how force and torque fall with the bodies' velocity, as a 6×6 [N·s/m ...], for
             the implicit part of a step; or None.
-        submerged: submerged fractions of each group of parts that carries water, `[npart, nbody,
+        submerged: submerged fractions of each group of parts that saves something, `[npart, nbody,
             lanes]` each [-]; near the surface as in `State`.
     """
 
@@ -83,11 +83,11 @@ class ExternalForces(NamedTuple):
 
 
 class PreviousStep(NamedTuple):
-    """What a step needs of the one before it, for the slam.
+    """What a step needs of the one before it, for the slam and for what laws remember.
 
     Attributes:
         submerged: submerged fractions then, as in `ExternalForces`, or those of one group.
-        dt: of the step [s].
+        dt: of the step [s]; 0 for forces by themselves, without a slam.
     """
 
     submerged: Any
@@ -260,6 +260,29 @@ def _near_surface(world: World, parts: Parts, at: _Immersion, wide: Sum) -> Near
     )
 
 
+def _by_group(level: Level, before: PreviousStep | None) -> list[PreviousStep | None]:
+    """The step before, of each group of a level's parts."""
+    if before is None:
+        return [None] * len(level.parts)
+    rows = iter(before.submerged)
+    return [before._replace(submerged=next(rows)) if p.saves else None for p in level.parts]
+
+
+def _past(
+    world: World, parts: Parts, before: PreviousStep | None
+) -> tuple[PreviousStep | None, tuple[Scalar, ...]]:
+    """Of one group: what the slam needs, and what the drag law remembers."""
+    if before is None:
+        return None, ()
+    k = parts.count
+    wet = (3 if world.near_surface else 1) * k * parts.carries
+    ends = range(wet, wet + k * parts.laws.memory, k)
+    memory = tuple(before.submerged[end : end + k] for end in ends)
+    if memory:
+        before = before._replace(submerged=before.submerged[:wet])
+    return before if parts.carries and before.dt else None, memory
+
+
 def _near_surface_slam(
     parts: Parts, carried: CarriedWater, flow: PartFlow, share: Vec, before: PreviousStep
 ) -> tuple[Vec, Vec]:
@@ -362,10 +385,15 @@ def _water_on_parts(
         return sum_parts(wide(x) if _is_array(x) else x, k)
 
     at = _immerse(world, parts, motion, water, wide)
-    v, w, submerged = at.flow
+    v, w, submerged, _ = at.flow
+    dt = 0.0 if before is None else before.dt
+    before, memory = _past(world, parts, before)
     law, drag = find_drag_law(parts.laws.drag), NO_DRAG
     if isinstance(law, PartDragLaw):
-        drag = law.force(at.flow, parts.drag, world)
+        passing = at.flow._replace(memory=memory)
+        drag = law.force(passing, parts.drag, world)
+        if memory and dt:
+            memory = law.remember(passing, parts.drag, world, dt)
     force, torque, damping = drag
     pull, turn = _surface_tension(world, parts, at, wide)
     force, torque = vadd(force, pull), vadd(torque, turn)
@@ -376,6 +404,9 @@ def _water_on_parts(
         saved = jnp.concatenate(list(map(wide, shares)))
         if before is not None and close is None:
             before = before._replace(submerged=before.submerged[:k])
+    if memory:
+        kept = [saved] if parts.carries else []
+        saved = jnp.concatenate([*kept, *map(wide, memory)])
     if close is not None and parts.carried is not None:
         if before is not None:
             blow = _near_surface_slam(parts, parts.carried, at.flow, close.share, before)
@@ -459,7 +490,7 @@ def forces_on_parts(
 
     Returns:
         For each group of the level's parts. The force of a drag law of whole bodies is shared out
-        among a body's parts by what of their boxes is submerged.
+        among a body's parts by what of their boxes is submerged. Laws with a memory have none here.
     """
     found, fractions = [], []
     for parts in level.parts:
@@ -558,7 +589,8 @@ def water_forces(
         gravity: upwards, body frames, with the uniform current's acceleration [m/s²].
         water: surface, current, time.
         thrusts: of the thrusters, `[nthruster, lanes]` [N].
-        before: the step before, for the slam (`added_mass.slam`); None for none.
+        before: the step before, for the slam (`added_mass.slam`) and for what laws remember; None
+            for none.
 
     Returns:
         Forces, torques and inertias.
@@ -566,14 +598,11 @@ def water_forces(
     torque, force = _ZERO, _ZERO
     carried, damping, fractions = None, None, []
     submerged: list[Scalar] = []
-    for parts in level.parts:
-        earlier = None
-        if before is not None and parts.carries:
-            earlier = before._replace(submerged=before.submerged[len(submerged)])
+    for parts, earlier in zip(level.parts, _by_group(level, before), strict=True):
         on_torque, on_force, more_carried, more_damping, fraction, saved = _water_on_parts(
             world, parts, level.count, motion, gravity, water, thrusts, earlier
         )
-        if parts.carries:
+        if parts.saves:
             submerged.append(saved)
         torque, force = vadd(torque, on_torque), vadd(force, on_force)
         carried, damping = _plus(carried, more_carried), _plus(damping, more_damping)
@@ -582,7 +611,7 @@ def water_forces(
     if on_bodies is not None:
         torque, force = vadd(torque, on_bodies[0]), vadd(force, on_bodies[1])
     if carried is None:
-        return ExternalForces(torque, force, None, None, damping)
+        return ExternalForces(torque, force, None, None, damping, tuple(submerged))
     angular, velocity = motion.midpoint_velocity
     stream = _stream(world, water, motion, _ZERO)
     if stream.velocity is None:

@@ -16,13 +16,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.spatial import Mat, Scalar, Sym, Vec
 from mjx_revolve.water.added_mass import CarriedWater
 from mjx_revolve.water.buoyancy import find_buoyancy_law
 from mjx_revolve.water.drag import OFF, find_drag_law
-from mjx_revolve.water.laws import law_numbers, part_field
+from mjx_revolve.water.laws import PartDragLaw, law_numbers, part_field
 
 # Why no factor of `Variation` multiplies a number.
 _SHAPE = "the robot's shape, which is known"
@@ -55,6 +56,12 @@ class PartLaws(NamedTuple):
         """Whether nothing acts on such parts, unless they carry water along."""
         lifts = find_buoyancy_law(self.buoyancy).lifts
         return not (lifts or self.pushes) and find_drag_law(self.drag) is OFF
+
+    @property
+    def memory(self) -> int:
+        """How many numbers their drag law keeps of the past for each part."""
+        law = find_drag_law(self.drag)
+        return law.memory if isinstance(law, PartDragLaw) else 0
 
 
 class Hinges(NamedTuple):
@@ -173,6 +180,11 @@ class Parts:
             map(is_present, jax.tree.leaves(self.carried.inertia))
         )
 
+    @property
+    def saves(self) -> bool:
+        """Whether a step leaves something of them to the next one."""
+        return self.carries or self.laws.memory > 0
+
 
 @partial(jax.tree_util.register_dataclass, data_fields=["position", "mass"], meta_fields=["count"])
 @dataclass(frozen=True)
@@ -243,9 +255,21 @@ class Level:
     points: Points | None
     shells: Shells | None = None
 
-    def carrying(self, axes: int) -> tuple[int, ...]:
-        """How many shares each group has that may carry water along: of parts, times axes."""
-        return tuple(axes * parts.count for parts in self.parts if parts.carries)
+    def at_first(self, axes: int, shape: tuple[int, ...], dtype: Any) -> tuple[jax.Array, ...]:
+        """`State.submerged` of groups wholly under water, without a past; `[n, *shape]` each.
+
+        Args:
+            axes: how many shares a part has that carries water along.
+            shape: behind the parts.
+            dtype: of the numbers.
+        """
+        found = []
+        for parts in self.parts:
+            wet, past = axes * parts.count * parts.carries, parts.count * parts.laws.memory
+            first = [jnp.ones((wet, *shape), dtype)] if wet else []
+            first += [jnp.zeros((past, *shape), dtype)] if past else []
+            found += [jnp.concatenate(first) if past and wet else first[0]] if first else []
+        return tuple(found)
 
 
 @partial(

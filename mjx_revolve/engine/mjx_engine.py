@@ -208,7 +208,10 @@ class MjxEngine:
     # By the population engine's functions, whose rows of hinges are those of the levels.
 
     def _state(self, state: MjxState) -> State:
-        return population.init(self.tree, state.qpos, state.qvel)
+        found = population.init(self.tree, state.qpos, state.qvel)
+        return found._replace(
+            submerged=found.submerged and (state.submerged[0], state.submerged[1:])
+        )
 
     def _own_order(self, rows: jax.Array, like: jax.Array) -> jax.Array:
         """Rows of hinges in the robot's order, behind that of the core where there is one."""

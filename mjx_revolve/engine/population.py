@@ -176,6 +176,8 @@ def init(tree: Tree, qpos: jax.Array, qvel: jax.Array) -> State:
     velocity, angular_velocity = tuple(qvel[:3]), tuple(qvel[3:6])
     speed, count, lanes = tree.joints_to_tree(qvel[6:]), tree.thrusters.count, qpos.shape[1:]
     rates = velocity, angular_velocity, speed
+    # No slam before the first step, which finds the parts as submerged as they are.
+    submerged = tree.fully_submerged(lanes, qpos.dtype)
     return State(
         position=tuple(qpos[:3]),
         quat=tuple(qpos[3:7] / length),
@@ -185,8 +187,7 @@ def init(tree: Tree, qpos: jax.Array, qvel: jax.Array) -> State:
         speed=speed,
         qacc_prev=jax.tree.map(jnp.zeros_like, rates) if tree.carries else (),
         command=jnp.zeros((count, *lanes), qpos.dtype) if count else (),
-        # No slam before the first step, which finds the parts as submerged as they are.
-        submerged=tree.fully_submerged(lanes, qpos.dtype) if tree.carries else (),
+        submerged=submerged if tree.carries or jax.tree.leaves(submerged) else (),
         clearance=jnp.full(lanes, -1, qpos.dtype) if tree.meets and tree.alike else (),
     )
 

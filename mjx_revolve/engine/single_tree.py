@@ -152,13 +152,13 @@ class SingleTree:
         return tuple(map(select, saved))
 
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
-        """Ones, `[npart, nbody, lanes]` of each group and level."""
+        """`[npart, nbody, lanes]` of each group and level."""
         axes = 3 if self.world.near_surface else 1
 
-        def ones(level: Level) -> tuple[jax.Array, ...]:
-            return tuple(jnp.ones((n, level.count, *lanes), dtype) for n in level.carrying(axes))
+        def first(level: Level) -> tuple[jax.Array, ...]:
+            return level.at_first(axes, (level.count, *lanes), dtype)
 
-        return ones(self.root), tuple(map(ones, self.below))
+        return first(self.root), tuple(map(first, self.below))
 
     # The passes.
 

@@ -90,7 +90,7 @@ class Tree(Protocol):
         """The inverse of `unstack_parts`, of what `select` takes of values that a pass saved."""
 
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
-        """`State.submerged` of parts that are wholly under water."""
+        """`State.submerged` of parts that are wholly under water and have no past."""
 
     def map(self, fun: Callable[..., Any], *xs: Any) -> Any:
         """`fun` (level, a value of each of `xs`) for the bodies below the root, element-wise."""

@@ -2,9 +2,9 @@
 
 What follows from a theory alone (Lamb's ellipsoid, Airy's waves) is no coefficient and stands with
 its law. Nothing here was chosen by how our water compares with measured swimmers. Where two sources
-disagree, or say nothing, `decided` says which number holds and why. Those of chains and of `COMING`
-were written down before any law that reads them was compared with a measurement; they were read
-second hand, in texts and programs that quote them, so that most lack a page.
+disagree, or say nothing, `decided` says which number holds and why. Those of chains, plates that
+swing and fins were written down before any law that reads them was compared with a measurement;
+they were read second hand, in texts and programs that quote them, so that most lack a page.
 """
 
 from __future__ import annotations
@@ -86,17 +86,29 @@ TODAY: dict[str, Sourced] = {
         "Kramers and Kronig's relation of the damping of Jensen, Mansour and Olsen, 2004",
         "computed: 0.52 to 0.47 for breadths of 4 to 0.5 draughts",
     ),
-    "surface_tension": Sourced(0.0728, "N/m", "γ of clean water at 20 °C", "IAPWS R1-76"),
-}  # fmt: skip
-"""Of the laws in force. MuJoCo's two laws have MuJoCo's own (`mujoco_drag`)."""
-
-COMING: dict[str, Sourced] = {
+    "plate_drag_slope": Sourced(
+        0.02, "-", "growth of a plate's C_d with its aspect ratio, from 1.17 of a square one",
+        f"{_HOERNER}: 1.10 + 0.02 (A + 1/A)", "the same slope from the 1.17 in use",
+    ),
+    "long_plate_drag": Sourced(
+        1.98, "-", "C_d of a long plate across the flow", f"{_HOERNER}; Matthews, Aeronautical "
+        "Engineer's Data Book, p. 95",
+    ),
+    "plate_thinness": Sourced(
+        0.1, "-", "thickness over width up to which a part's edges are sharp",
+        "none; Graham (1980) has the two ends: thin edges KC^(-1/3), square corners KC^0",
+        "a tenth, and none at two tenths: bilge keels are thinner, a limb's box is thicker",
+    ),
     "swing_drag": Sourced(
         22.5, "-", "a in C_d = a / KC + b of a plate that swings", _IKEDA,
-        "this fit and not max(10 KC^(-1/3), 1.95) of Luhar and Nepf (2016): it has a limit to "
-        "which a steady drag relates; both agree within 5 % from KC 8 to 20",
+        "this fit and not max(10 KC^(-1/3), 1.95) of Luhar and Nepf (2016), chosen when no law "
+        "read it; both agree within 5 % from KC 8 to 20",
     ),
-    "swing_steady_drag": Sourced(2.4, "-", "b of the same", _IKEDA),
+    "swing_large_drag": Sourced(
+        2.4, "-", "b of the same", _IKEDA,
+        "where the fit ends, for flow that still turns round, and no plate's steady drag: what "
+        "the fit is divided by is `long_plate_drag`, that of the same two-dimensional plate",
+    ),
     "swing_most": Sourced(
         9.0, "-", "most of a / KC + b", "none", "its value near KC 3, below which few measured"
     ),
@@ -117,5 +129,6 @@ COMING: dict[str, Sourced] = {
     "wagner_slow_rate": Sourced(0.0455, "-", "its rate, per half chord travelled", _WAGNER),
     "wagner_fast": Sourced(0.335, "-", "share of the lift that comes fast", _WAGNER),
     "wagner_fast_rate": Sourced(0.3, "-", "its rate, per half chord travelled", _WAGNER),
+    "surface_tension": Sourced(0.0728, "N/m", "γ of clean water at 20 °C", "IAPWS R1-76"),
 }  # fmt: skip
-"""Of laws that are not there yet, as the literature on measured swimmers gives them."""
+"""Of the laws in force. MuJoCo's two laws have MuJoCo's own (`mujoco_drag`)."""

@@ -29,7 +29,7 @@ import numpy as np
 
 from mjx_revolve.numerics.inertia import SpatialInertia, add_inertia, shift_inertia
 from mjx_revolve.numerics.lazy import jnp
-from mjx_revolve.numerics.spatial import Vec, add, cross, dot, mul, total, vadd, vscale
+from mjx_revolve.numerics.spatial import Scalar, Vec, add, cross, dot, mul, total, vadd, vscale
 from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.face_drag import FACES, face_drag_coefficients
 from mjx_revolve.water.laws import (
@@ -123,6 +123,14 @@ def _numbers(parts: PartShapes, world: World) -> CrossFlowNumbers:
     )
 
 
+def friction_share(speed: Scalar, length: Scalar, world: World) -> Scalar:
+    """1 / (log10 Re)^b of side faces of some length [m]: C_f over a."""
+    scale = mul(length, world.density / max(world.viscosity, 1e-30))
+    reynolds = jnp.maximum(mul(speed, scale), _LEAST_REYNOLDS)
+    share: Scalar = 1 / jnp.log10(reynolds) ** TODAY["friction_exponent"].value
+    return share
+
+
 def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
     mixing, force, torque = numbers.mixing, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     damping: SpatialInertia | None = None
@@ -143,12 +151,8 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
         damping = own if damping is None else add_inertia(damping, own)
     rubbed = []
     for x, area in zip(flow.velocity, numbers.friction, strict=True):
-        reynolds = jnp.maximum(
-            mul(jnp.abs(x), mul(numbers.length, world.density / max(world.viscosity, 1e-30))),
-            _LEAST_REYNOLDS,
-        )
-        slope = jnp.log10(reynolds) ** TODAY["friction_exponent"].value
-        rubbed.append(mul(mul(area, 1 / slope), mul(jnp.abs(x), flow.submerged)))
+        share = friction_share(jnp.abs(x), numbers.length, world)
+        rubbed.append(mul(mul(area, share), mul(jnp.abs(x), flow.submerged)))
     force = vadd(force, tuple(-d * x for d, x in zip(rubbed, flow.velocity, strict=True)))
     assert damping is not None
     # What a trailing end sheds.

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from mjx_revolve.water.cross_flow import CROSS_FLOW
 from mjx_revolve.water.face_drag import FACES
+from mjx_revolve.water.fin_wake import FIN_WAKE
 from mjx_revolve.water.fossen import FOSSEN
 from mjx_revolve.water.laws import DragLaw, Export, PartDragLaw, find_law
 from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
+from mjx_revolve.water.plate_wake import PLATE_WAKE
 
 OFF = PartDragLaw(
     name="off",
@@ -22,7 +24,18 @@ OFF = PartDragLaw(
 )
 
 DRAG_LAWS: dict[str, DragLaw] = {
-    law.name: law for law in (FACES, LIFT_DRAG, FOSSEN, CROSS_FLOW, INERTIA_BOX, ELLIPSOID, OFF)
+    law.name: law
+    for law in (
+        FACES,
+        LIFT_DRAG,
+        FOSSEN,
+        CROSS_FLOW,
+        PLATE_WAKE,
+        FIN_WAKE,
+        INERTIA_BOX,
+        ELLIPSOID,
+        OFF,
+    )
 }
 
 

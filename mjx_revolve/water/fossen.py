@@ -68,7 +68,7 @@ def _damping(matrix: Any, square: Vec, velocity: Vec) -> tuple[Any, ...]:
 
 
 def _force(flow: PartFlow, numbers: FossenNumbers, world: World) -> Drag:
-    v, w, submerged = flow
+    v, w, submerged, _ = flow
     damping = scale_inertia(
         submerged,
         SpatialInertia(

@@ -249,11 +249,13 @@ class PartFlow(NamedTuple):
         velocity: of the box's centre relative to the water (Fossen's ν_r) [m/s].
         angular_velocity: of the part [rad/s].
         submerged: submerged fraction [-].
+        memory: what the law keeps of the steps before, `PartDragLaw.memory` numbers; () for none.
     """
 
     velocity: Vec
     angular_velocity: Vec
     submerged: Scalar
+    memory: tuple[Scalar, ...] = ()
 
 
 class Drag(NamedTuple):
@@ -314,11 +316,15 @@ class PartDragLaw(DragLaw):
             broadcast against the flow, vectors as tuples of three.
         angular: numbers → coefficients c of drag against turning, -c |ω| ω about each axis
             [kg·m²], which a step takes implicitly; None for none.
+        memory: how many numbers it keeps of the past for each part; they begin at 0.
+        remember: (flow, numbers, world, dt) → `PartFlow.memory` a step later.
     """
 
     numbers: Callable[[PartShapes, World], Any] = lambda parts, world: NoNumbers()
     force: Callable[[PartFlow, Any, World], Drag] = lambda flow, numbers, world: NO_DRAG
     angular: Callable[[Any], Vec] | None = None
+    memory: int = 0
+    remember: Callable[[PartFlow, Any, World, float], tuple[Scalar, ...]] = lambda *_: ()
 
 
 def part_numbers(law: PartDragLaw, parts: PartShapes, world: World) -> Any:

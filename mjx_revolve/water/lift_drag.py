@@ -24,7 +24,7 @@ sign in a jump where α wraps at ±90°, unless `cla_stall` brings it to zero th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,7 +58,7 @@ from mjx_revolve.water.plates import LiftDrag
 if TYPE_CHECKING:
     from mjx_revolve.water.world import World
 
-# What `_numbers` casts: the coefficients of a plate.
+# What `slopes` casts: the coefficients of a plate.
 _NAMES = ("a0", "cla", "cda", "alpha_stall", "cla_stall", "cda_stall", "cma", "cma_stall")
 _BY_AREA = "lift, drag and moment are varied together, by `area`"
 _SHAPE = "a direction or a place"
@@ -135,15 +135,39 @@ def plate_numbers(
     )
 
 
-def _numbers(p: LiftDrag | PlateNumbers, dtype: Any) -> Any:
+def slopes(p: LiftDrag | PlateNumbers, dtype: Any) -> Any:
     """The coefficients in the dtype of what they meet."""
     found = ((name, getattr(p, name)) for name in _NAMES)
     return {name: x if isinstance(x, jax.Array) else np.asarray(x, dtype) for name, x in found}
 
 
+def wrapped(angle: Scalar) -> Scalar:
+    """An angle of attack within ±90°: a plate works backwards, too."""
+    found: Scalar = angle - np.pi * jnp.round(angle / np.pi)
+    return found
+
+
 def _may_be(x: Any) -> bool:
     """Whether a number is not plainly zero everywhere; what is traced counts."""
     return isinstance(x, jax.Array) or bool(np.any(x))
+
+
+def coefficients(
+    alpha: Scalar, k: Mapping[str, Any], cos2_sweep: Scalar
+) -> tuple[Scalar, Scalar, Scalar]:
+    """c_l, c_d and c_m at an angle of attack, as `lift_drag_wrench` has them."""
+    before = jnp.minimum(jnp.abs(alpha), k["alpha_stall"])
+    beyond = jnp.abs(alpha) - before
+    stalled = jnp.maximum(k["cla"] * before + k["cla_stall"] * beyond, 0)
+    lifting = jnp.where(beyond > 0, stalled, k["cla"] * before)
+    side = jnp.sign(alpha)
+    c_lift = side * lifting * cos2_sweep
+    c_drag = jnp.abs((k["cda"] * before + k["cda_stall"] * beyond) * cos2_sweep)
+    # Past the stall neither lift nor moment changes sign.
+    turning = k["cma"] * before + k["cma_stall"] * beyond
+    turning = jnp.where(k["cma"] > 0, jnp.maximum(turning, 0), turning)
+    turning = jnp.where(k["cma"] < 0, jnp.minimum(turning, 0), turning)
+    return c_lift, c_drag, side * turning * cos2_sweep
 
 
 def lift_drag_wrench(
@@ -187,26 +211,14 @@ def lift_drag_wrench(
     plane = tuple(sub(x, mul(spanwise, y)) for x, y in zip(v, n, strict=True))
     speed = safe_norm(v)
     speed_in_plane = safe_norm(plane)
-    k = _numbers(p, speed.dtype)
+    k = slopes(p, speed.dtype)
     moving = speed_in_plane > 1e-9
     safe_speed = jnp.where(moving, speed_in_plane, 1.0)
     cos2_sweep = 1 - jnp.where(moving, spanwise / jnp.where(speed > 0, speed, 1.0), 0.0) ** 2
     x = jnp.where(moving, dot(plane, forward), 1.0)
     y = jnp.where(moving, neg(dot(plane, upward)), 0.0)
-    alpha = k["a0"] + jnp.arctan2(y, x)
-    alpha = alpha - np.pi * jnp.round(alpha / np.pi)
-    before = jnp.minimum(jnp.abs(alpha), k["alpha_stall"])
-    beyond = jnp.abs(alpha) - before
-    stalled = jnp.maximum(k["cla"] * before + k["cla_stall"] * beyond, 0)
-    lifting = jnp.where(beyond > 0, stalled, k["cla"] * before)
-    side = jnp.sign(alpha)
-    c_lift = side * lifting * cos2_sweep
-    c_drag = jnp.abs((k["cda"] * before + k["cda_stall"] * beyond) * cos2_sweep)
-    # Past the stall neither lift nor moment changes sign.
-    turning = k["cma"] * before + k["cma_stall"] * beyond
-    turning = jnp.where(k["cma"] > 0, jnp.maximum(turning, 0), turning)
-    turning = jnp.where(k["cma"] < 0, jnp.minimum(turning, 0), turning)
-    c_moment = side * turning * cos2_sweep
+    alpha = wrapped(k["a0"] + jnp.arctan2(y, x))
+    c_lift, c_drag, c_moment = coefficients(alpha, k, cos2_sweep)
     pressure = mul(0.5 * density, mul(area, speed_in_plane)) / safe_speed
     lift_direction = cross(n, plane)  # |n × plane| = |plane|
     force = tuple(
@@ -247,7 +259,7 @@ def lift_drag_damping(
     density = density if p.density is None else p.density
     speed = safe_norm(v)
     xp = jnp if isinstance(p.cla, jax.Array) else np
-    k = {name: xp.abs(x) for name, x in _numbers(p, speed.dtype).items()}
+    k = {name: xp.abs(x) for name, x in slopes(p, speed.dtype).items()}
     steepest = xp.maximum(k["cla"], k["cla_stall"])
     most = k["cda"] * k["alpha_stall"] + k["cda_stall"] * (np.pi / 2 - k["alpha_stall"])
     gradient = steepest + xp.maximum(xp.maximum(k["cda"], k["cda_stall"]), 2 * most)
@@ -261,7 +273,7 @@ def _plates_of(parts: PartShapes, world: World) -> PlateNumbers:
 
 
 def _plate_drag(flow: PartFlow, plate: PlateNumbers, world: World) -> Drag:
-    v, w, submerged = flow
+    v, w, submerged, _ = flow
     at = vadd(v, cross(w, plate.center))
     given = (plate.forward, plate.upward, plate.area, world.density, plate)
     force, torque = lift_drag_wrench(at, *given)

@@ -160,7 +160,7 @@ def _numbers_of_ellipsoids(parts: PartShapes, world: World) -> EllipsoidNumbers:
 
 
 def _ellipsoid_drag(flow: PartFlow, numbers: EllipsoidNumbers, world: World) -> Drag:
-    v, w, submerged = flow
+    v, w, submerged, _ = flow
     # Where our own added mass acts, MuJoCo's virtual mass would be a second one.
     force, torque = ellipsoid(v, w, numbers, not world.added_mass)
     return Drag(vscale(submerged, force), vscale(submerged, torque), None)

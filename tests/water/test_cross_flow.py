@@ -169,10 +169,10 @@ def test_its_work_is_never_positive_and_its_damping_is_all_of_it(inside):
 
 
 @pytest.mark.slow
-def test_fins_keep_their_lift_and_gradients_are_finite():
+def test_fins_have_their_own_law_and_gradients_are_finite():
     fish = read("body: {type: Core, children: {1: {type: FixedBrick}, 0: {type: Fin}}}")
     robot = build_robot(fish, WATER)
-    assert robot.fluid.drag == ("cross_flow", "cross_flow", "lift_drag")
+    assert robot.fluid.drag == ("cross_flow", "cross_flow", "fin_wake")
     numbers = as_components(jax.tree.map(lambda x: x[1], CROSS_FLOW.numbers(robot.fluid, WATER)))
 
     def total(v):
