@@ -7,7 +7,7 @@ TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile 
 READY  := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve test test-quick fuzz check format docs bench dist environments lock clean
+.PHONY: help install evolve test test-quick fuzz check format docs bench dist environments numbers lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -48,11 +48,16 @@ format: $(READY)  ## let ruff mend what it can
 
 docs: $(READY)  ## the documentation and a reference of all functions, as HTML in build/docs
 	$(RUN) docs/settings.py
+	$(RUN) docs/figures.py
 	for kind in config modules morphology sweep world; do \
 	  $(RUN) -m mjx_revolve schema $$kind > mjx_revolve/schemas/$$kind.json || exit 1; done
 	$(RUN) docs/reference.py build/docs
 
-bench: $(READY)  ## throughput beside MuJoCo C and plain MJX, from the same run
+numbers: $(READY)  ## the figures of README and docs from docs/results
+	$(RUN) docs/figures.py
+
+bench: $(READY)  ## work and precision, then throughput, beside MuJoCo C and plain MJX
+	$(RUN) -m experiments.precision
 	$(RUN) -m experiments.bench
 
 dist: $(READY)  ## wheel and sdist in dist/, tried in a fresh environment from an empty folder

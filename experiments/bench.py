@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from experiments.common import ROOT, make_folder, make_parser
+from experiments.common import ROOT, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.inputs.errors import InputError
@@ -551,6 +551,9 @@ def main(argv: list[str] | None = None) -> int:
             target.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         except OSError as error:
             raise InputError(f"--json: expected a file to write; found {error.strerror}") from None
+    if options.results:
+        numbers = {key: report[key] for key in ("settings", "load_average", "cases")}
+        write_results("bench_parts" if options.parts else "bench", numbers, ())
     wanted = min(options.threads, machine["cores"])
     if served and statistics.median(served) < 0.8 * wanted:
         print(

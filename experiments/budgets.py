@@ -10,16 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from experiments.common import ROOT
+from experiments.common import ROOT, as_numbers
 from experiments.studies import (
     BASE,
     Case,
     describe_runs,
     draw_outcomes,
-    fill,
     study_main,
 )
 from mjx_revolve.episodes.config import Config, load_config
@@ -29,7 +27,7 @@ from mjx_revolve.view.body_pictures import plot_bodies
 from mjx_revolve.view.convergence import draw_scores
 from mjx_revolve.view.outcomes import Outcome, by_case, write_csv
 from mjx_revolve.view.plots import WIDE, figure_png, in_style, new_figure
-from mjx_revolve.view.statistics import COVERAGE, difference, holm, rank_test
+from mjx_revolve.view.statistics import difference, holm, rank_test
 
 ROBOTS = ("spider", "gecko", "snake", "centipede", "fish")
 BRAINS = 64  # CMA-ES's population for one body: as many lanes as the step takes at a time, a choice
@@ -79,77 +77,25 @@ def make_cases(settings: Sequence[str] = ()) -> dict[str, Case]:
 
 # --- the report -----------------------------------------------------------------------------------
 
-_INTRODUCTION = """# Co-evolution beside random search and hand-made bodies
-
-All swim in the lake and get equally many trials, in which the score is the net horizontal speed
-[body lengths/s]. Made by `python -m experiments.budgets`, which repeats it;
-`experiments/studies.yaml` has what all runs share. Champions are judged on sixteen fresh starts.
-"""
-
-
-_NOTES = f"""{COVERAGE} p is Mann's and Whitney's test, by permutations and with Holm's correction
-over the table. Who picks the best of the hand-made bodies picks it by the scores that it is then
-judged by, which is in its favour. The fish has a fin, which co-evolution has not."""
-
-
-def describe_difference(name: str, values: Sequence[float], others: Sequence[float]) -> str:
-    """Co-evolution beside another case.
-
-    Args:
-        name: of the other case.
-        values: scores of co-evolution's champions.
-        others: of the other case's.
-
-    Returns:
-        A row of a table in Markdown, but for its last cell.
-    """
-    found = difference(values, others)
-    zero = "no" if found.low > 0 or found.high < 0 else "yes"
-    return f"| `coevolution` − `{name}` | {found} | {zero if np.isfinite(found.low) else '–'} |"
-
 
 @in_style
-def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
-    """Writes `budgets.md`, its pictures and `budgets.csv`.
+def write_report(folder: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Writes `budgets.csv` and the pictures of `docs/budgets.md`.
 
     Args:
         folder: where.
         outcomes: of the finished runs.
 
     Returns:
-        What was found, in lines.
+        The numbers of the results file.
     """
     known = make_cases()
     cases = by_case(outcomes, known)
     scores = {name: [o.champion["score"] for o in found] for name, found in cases.items()}
-    lines = []
-    if ours := scores.get("coevolution"):
-        others = [name for name in cases if name != "coevolution"]
-        p = holm([rank_test(ours, scores[name]) for name in others])
-        lines = ["| | difference of means | holds 0 | p |", "|---|---|---|---|"]
-        lines += [
-            f"{describe_difference(name, ours, scores[name])} {value:.2g} |"
-            for name, value in zip(others, p, strict=True)
-        ]
+    ours = scores.get("coevolution", [])
+    others = [name for name in cases if ours and name != "coevolution"]
+    p = holm([rank_test(ours, scores[name]) for name in others])
     fastest = max(outcomes, key=lambda o: o.champion["score"])
-    text = [
-        _INTRODUCTION,
-        *describe_runs(cases, known),
-        "",
-        *lines,
-        "",
-        f"The fastest of all: {fastest.champion['score']:.3g} body lengths/s, "
-        f"`{fastest.plan.case}`, seed {fastest.plan.seed}.",
-        "",
-        fill(_NOTES),
-        "",
-        "![scores over trials, and champions'](budgets.png)",
-        "",
-        "Left: the best score so far, on the starts that it was found on, which flatters. Right:",
-        "champions on fresh starts.",
-        "",
-        "![champions' bodies](budgets_bodies.png)",
-    ]
     figure = new_figure(WIDE + 3, 4.4)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     draw_outcomes(left, cases, "best score so far (body lengths/s)")
@@ -160,8 +106,16 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
     write_atomic(folder / "budgets_bodies.png", figure_png(bodies))
     rows = [{"case": o.plan.case, "seed": o.plan.seed, **o.champion} for o in outcomes]
     write_csv(folder / "budgets.csv", rows)
-    write_atomic(folder / "budgets.md", ("\n".join(text) + "\n").encode())
-    return lines
+    return {
+        "runs": describe_runs(cases, known),
+        "differences": [
+            {"name": name, "difference": as_numbers(difference(ours, scores[name])), "p": value}
+            for name, value in zip(others, p, strict=True)
+        ],
+        "fastest": {
+            "score": fastest.champion["score"], "name": fastest.plan.case, "seed": fastest.plan.seed
+        },
+    }  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -8,29 +8,34 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mjx_revolve.inputs.commands import Parser
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.view.statistics import Interval
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "results"
-"""What README and the pages take their figures from; see `docs/numbers.py`."""
+"""What README and the pages take their figures from; see `docs/figures.py`."""
 
 
 def make_parser(name: str, description: str) -> Parser:
-    """A parser with the option that all experiments share.
+    """A parser with the options that all experiments share.
 
     Args:
         name: of the experiment's module.
         description: what it does, in a sentence.
 
     Returns:
-        The parser, with `--out`.
+        The parser, with `--out` and `--results`.
     """
     parser = Parser(
         prog=f"python -m experiments.{name}", description=description, allow_abbrev=False
     )
-    parser.add_argument("--out", metavar="DIR", help=f"folder to write into (default: runs/{name})")
+    add = parser.add_argument
+    add("--out", metavar="DIR", help=f"folder to write into (default: runs/{name})")
+    add("--results", action="store_true", help="write docs/results as well, which pages show")
     return parser
 
 
@@ -55,6 +60,12 @@ def make_folder(out: str | None, name: str) -> Path:
             f"--out: expected a folder to write into; found {error.strerror}: {out}"
         ) from None
     return folder
+
+
+def as_numbers(found: Interval) -> dict[str, Any]:
+    """An interval as results files have it: null where it is not known, and as pages show it."""
+    finite = [x if np.isfinite(x) else None for x in (found.mean, found.half)]
+    return {"mean": finite[0], "half": finite[1], "size": found.size, "text": str(found)}
 
 
 def write_results(

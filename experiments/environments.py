@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 from scipy import stats
 
+from experiments.common import as_numbers
 from experiments.studies import (
     Case,
     describe_runs,
     draw_outcomes,
-    fill,
     study_main,
 )
 from mjx_revolve.body.descriptors import UNITS
@@ -32,7 +32,6 @@ from mjx_revolve.view.outcomes import Figures, Outcome, by_case, write_csv
 from mjx_revolve.view.plots import WIDE, figure_png, in_style, new_figure, panels
 from mjx_revolve.view.statistics import (
     ALPHA,
-    COVERAGE,
     Comparison,
     compare,
     interval,
@@ -173,97 +172,33 @@ def describe_differences(figures: Sequence[Compared], whose: str) -> list[str]:
     return lines or [f"- No figure of {whose} tells two environments apart."]
 
 
-def tabulate(figures: Sequence[Compared]) -> list[str]:
-    """A table in Markdown: figures by environment, and whether these differ at all."""
-    names = list(figures[0].values)
-    lines = [
-        f"| | {' | '.join(f'`{name}`' for name in names)} | p |",
-        f"|---|{'---|' * len(names)}---|",
-    ]
+def tabulate(figures: Sequence[Compared]) -> list[dict[str, Any]]:
+    """Figures by environment, and p of whether these differ at all, bold where they do."""
+    rows = []
     for figure in figures:
-        cells = [str(interval(figure.values[name])) for name in names]
         p = "< .001" if figure.p < 1e-3 else f"{figure.p:.3f}".removeprefix("0")
-        mark = f"**{p}**" if figure.p < ALPHA else p
-        lines.append(f"| {FIGURES[figure.name]} | {' | '.join(cells)} | {mark} |")
-    return lines
+        rows.append({
+            "name": FIGURES[figure.name], "p": f"**{p}**" if figure.p < ALPHA else p,
+            **{name: as_numbers(interval(values)) for name, values in figure.values.items()},
+        })  # fmt: skip
+    return rows
 
 
-_INTRODUCTION = """# Bodies evolved in four environments
-
-What becomes of bodies and gaits where the water is deep, shallow, or moves, and on the ground? Made
-by `python -m experiments.environments`, which repeats it; `experiments/studies.yaml` has what all
-runs have in common. The runs are small (the last plot shows whether they were still improving), and
-all of it is simulated: larger budgets or other laws of the water may give other bodies.
-"""
-_NOTES = """Speeds and gaits of champions are means over sixteen fresh starts; those of populations
-are as their last lives went, each with the best of its trials, so they flatter. The water speed is
-that through the water: the score, which counts what the environment's task asks for, and what the
-current takes. The current takes all bodies along alike, of which longer ones lose fewer of their
-own lengths: that alone favours them there. `docs/measures.md` has the formulas, `environments.csv`
-all other figures."""
-
-
-_TESTS = f"""{COVERAGE} p in the tables is Kruskal's and Wallis's test over all environments; over
-the figures of a table it is corrected after Benjamini and Hochberg, so that one in twenty of those
-below {{alpha:.2g}} is expected to be there by chance. Pairs are tested by Mann's and Whitney's
-test, by permutations, with Holm's correction over the pairs of a figure; with so few seeds its p is
-{{least:.2g}} at the least. A difference is said in words only where both are below {{alpha:.2g}};
-that nothing is said of a figure does not mean that it is the same. Runs of one seed begin with the
-same bodies in all environments, of which the tests make no use."""
-
-
-def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
-    """Writes `environments.md`, its pictures and `environments.csv`.
+def write_report(folder: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Writes `environments.csv` and the pictures of `docs/environments.md`.
 
     Args:
         folder: where.
         outcomes: of the finished runs.
 
     Returns:
-        What was found, in lines.
+        The numbers of the results file.
     """
     cases = by_case(outcomes, ENVIRONMENTS)
     compared = {whose: compare_figures(cases, whose) for whose in _WHOSE}
-    words = [
-        line
-        for whose, figures in compared.items()
-        for line in describe_differences(figures, _WHOSE[whose])
-    ]
     counts = sorted(map(len, cases.values()))
     pairs = len(cases) * (len(cases) - 1) // 2
     least = smallest_p(counts[0], counts[min(1, len(counts) - 1)], max(1, pairs))
-    text = [
-        _INTRODUCTION,
-        *describe_runs(cases, ENVIRONMENTS),
-        "",
-        "## What differs",
-        "",
-        *words,
-        "",
-        fill(_TESTS.format(least=least, alpha=ALPHA)),
-        "",
-        "![champions' bodies](environments_bodies.png)",
-        "",
-        "## Champions",
-        "",
-        *tabulate(compared["champion"]),
-        "",
-        fill(_NOTES),
-        "",
-        "![figures of champions](environments_figures.png)",
-        "",
-        "## Final populations",
-        "",
-        "Each seed counts with the mean over its last population.",
-        "",
-        *tabulate(compared["population"]),
-        "",
-        "## How they got there",
-        "",
-        "The best score so far, on the starts that it was found on, which flatters.",
-        "",
-        "![learning curves](environments_curves.png)",
-    ]
     shown = {FIGURES[figure.name]: figure.values for figure in compared["champion"]}
     pictures = {
         "bodies": plot_bodies(cases), "figures": plot_scores(shown), "curves": plot_curves(cases)
@@ -276,8 +211,16 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> list[str]:
         for whose in _WHOSE
     ]
     write_csv(folder / "environments.csv", rows)
-    write_atomic(folder / "environments.md", ("\n".join(text) + "\n").encode())
-    return words
+    return {
+        "runs": describe_runs(cases, ENVIRONMENTS),
+        "least_p": least,
+        **{whose: tabulate(figures) for whose, figures in compared.items()},
+        "differences": [
+            line
+            for whose, figures in compared.items()
+            for line in describe_differences(figures, _WHOSE[whose])
+        ],
+    }
 
 
 @in_style

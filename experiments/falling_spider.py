@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.common import ROOT, make_folder, make_parser
+from experiments.common import ROOT, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
@@ -522,6 +522,10 @@ def main(argv: list[str] | None = None) -> int:
         print("\n".join(textwrap.wrap(line, 98, initial_indent="- ", subsequent_indent="  ")))
     (folder / "falls.png").write_bytes(figure_png(draw(falls, data, readings, still.share)))
     write_csv(folder / "falls.csv", falls)
+    if options.results:
+        dry = {name: acceleration(falls[name]) for name in ("air", "mask", "partial")}
+        last = {"speed_m_s": -float(falls["default"].speed[-1]), "terminal_m_s": still.terminal}
+        write_results("falling_spider", {"accelerations": dry, "default": last}, ())
     print(f"\nwritten: falls.png and falls.csv in {short_path(folder)}")
     return 0
 

@@ -12,17 +12,19 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from typing import Any
 
 import numpy as np
 
+from experiments.common import make_parser, write_results
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.fitting.parameters import read_free, split_free
-from mjx_revolve.fitting.problem import Settings
-from mjx_revolve.fitting.recording import Recording
+from mjx_revolve.fitting.problem import FitSettings
+from mjx_revolve.fitting.recording import RobotRecording
 from mjx_revolve.fitting.result import Fit, fit_robot
 from mjx_revolve.fitting.synthetic import make_noisy, simulate_signals
-from mjx_revolve.inputs.commands import Parser, run_command, whole
+from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world
 
@@ -50,7 +52,7 @@ def commands(robot: Robot, draw: np.random.Generator, duration: float) -> np.nda
     return found
 
 
-def make_case(robot: Robot, free: tuple[str, ...], seed: int) -> tuple[list[float], Recording]:
+def make_case(robot: Robot, free: tuple[str, ...], seed: int) -> tuple[list[float], RobotRecording]:
     """The coefficients of a case, and what a camera would have seen of it."""
     draw = np.random.default_rng(seed)
     own, _ = split_free(free)
@@ -70,7 +72,7 @@ def run_case(name: str, seed: int) -> tuple[list[float], Fit, float]:
     robot = _robot(name)
     truth, recording = make_case(robot, FREE[name], seed)
     before = time.process_time()
-    fit = fit_robot(robot, [recording], FREE[name], Settings(held_out=0.0), seed)
+    fit = fit_robot(robot, [recording], FREE[name], FitSettings(held_out=0.0), seed)
     return truth, fit, time.process_time() - before
 
 
@@ -83,14 +85,19 @@ def _robot(name: str) -> Robot:
     return _ROBOTS[name]
 
 
+def _finite(x: float) -> float | None:
+    return float(x) if np.isfinite(x) else None
+
+
 def main(argv: list[str] | None = None) -> int:
     """Prints the table."""
-    parser = Parser(prog="python -m experiments.fit_coverage", description=__doc__)
+    parser = make_parser("fit_coverage", "Fits beside coefficients that are known.")
     parser.add_argument("--cases", type=whole(1), default=100)
     parser.add_argument("--first", type=whole(0), default=0, help="seed of the first case")
     parser.add_argument("--robots", default=",".join(FREE))
     arguments: argparse.Namespace = parser.parse_args(argv)
     runtime.prepare_process()
+    results: dict[str, Any] = {}
     for name in arguments.robots.split(","):
         inside, errors, seconds, found = [], [], [], []
         for seed in range(arguments.first, arguments.first + arguments.cases):
@@ -106,12 +113,20 @@ def main(argv: list[str] | None = None) -> int:
             )
         print(f"{name}: {len(seconds)} cases; CPU time a fit: median {np.median(seconds):.0f} s, "
               f"most {max(seconds):.0f} s")  # fmt: skip
+        results[name] = {"cases": len(seconds), "cpu_s": np.median(seconds), "coefficients": []}
         for k, v in enumerate(fit.values):
             known = np.array(found)[:, k]
             share = np.mean(np.array(inside)[known, k]) if known.any() else np.nan
             middle = np.median(np.array(errors)[known, k]) if known.any() else np.nan
             print(f"  {v.name}: found in {known.mean():.0%}, within its interval in {share:.0%} of "
                   f"those, median error {middle:.2%}", flush=True)  # fmt: skip
+            results[name]["coefficients"].append({
+                "name": v.name, "found": known.mean(), "error": _finite(middle),
+                "within": _finite(share), "fits": int(known.sum()),
+            })  # fmt: skip
+    if arguments.results:
+        first = arguments.first
+        write_results("fit_coverage", results, range(first, first + arguments.cases))
     return 0
 
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments.common import ROOT, make_folder, make_parser
+from experiments.common import ROOT, make_folder, make_parser, write_results
 from mjx_revolve.episodes.config import EvolutionConfig, load_config
 from mjx_revolve.episodes.fitness import Fitness, make_fitness
 from mjx_revolve.episodes.scoring import REPORT_STREAM
@@ -178,6 +178,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     other = float(judge(fitness, evolve(few, args.seconds, args.seed, say), args.seed)[0])
     unit = fitness.task.unit
     say(f"On {FRESH * EPISODES} fresh starts: gradients {score:.3f}, CMA-ES {other:.3f} {unit}")
+    if args.results:
+        numbers = {
+            "gradients": score, "evolution": other, "seconds": args.seconds,
+            "compile_s": compiling, "starts": FRESH * EPISODES,
+        }  # fmt: skip
+        write_results(f"gradient_learning_{args.seed}", numbers, [args.seed])
     say(f"written: {short_path(run.path)}")
     return 0
 

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common import ROOT, make_folder, make_parser
+from experiments.common import ROOT, make_folder, make_parser, write_results
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
@@ -34,6 +34,7 @@ COLUMNS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("brax.envs", "mujoco_playground", "stable_baselines3", "qdax.core.map_elites"),
     ),
 }
+STEPS = ("pip check", "imports", "smoke run", "quick tests")
 TOOLS = ("pytest>=8", "pytest-xdist>=3.6", "hypothesis>=6.130", "pandas>=2.2")
 
 
@@ -119,6 +120,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     path = folder / "installations.json"
     write_atomic(path, (json.dumps(found, indent=1) + "\n").encode())
     print(f"Wrote {path}")
+    if args.results:
+        columns = [
+            {"name": name, "distributions": one.get("distributions"),
+             "megabytes": one.get("megabytes"), "steps": one,
+             "found": "; ".join(f"{step} {said}" for step, said in one.items() if step in STEPS)}
+            for name, one in found.items()
+        ]  # fmt: skip
+        write_results("installations", {"columns": columns}, ())
     return int(any("failed" in str(step) for one in found.values() for step in one.values()))
 
 

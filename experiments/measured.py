@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.common import make_folder, make_parser
+from experiments.common import make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.view.plots import WIDE, in_style, new_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from experiments.measured_cases import Found, Row
 
@@ -36,6 +37,18 @@ def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
         for r in rows
     ]
     return [HEADINGS, *cells]
+
+
+def group(
+    rows: Sequence[Row], by_law: Mapping[str, Mapping[str, float]]
+) -> dict[str, list[dict[str, Any]]]:
+    """Rows by case as the results file has them, with what other laws give of the same."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        others = {law: ours.get(row.what) for law, ours in by_law.items()}
+        entry = asdict(row) | others | {"name": row.what, "ratio": row.ratio}
+        found.setdefault(row.case, []).append(entry)
+    return found
 
 
 def _pair() -> tuple[Any, Any, Any]:
@@ -269,11 +282,27 @@ def main(argv: list[str] | None = None) -> int:
         figures["measured_section"] = draw_section(floats)
     lines = table(rows)
     print("\n".join(align([lines[0], ("",) * len(HEADINGS), *lines[1:]], left=(0, 1))))
+    steady_by_law = {}
     for law in cases.LAWS[1:]:
-        numbers = ", ".join(f"{r.ours:.2f} {r.what}" for r in cases.steady_drag(law).rows)
+        steady_by_law[law] = {r.what: r.ours for r in cases.steady_drag(law).rows}
+        numbers = ", ".join(f"{ours:.2f} {what}" for what, ours in steady_by_law[law].items())
         print(f"steady C_d by drag: {law}: {numbers}")
     bias, scatter = cases.log_scatter([r for r in swum.rows if r.case == "lamprey robot"][:-1])
     print(f"lamprey robot, nine gaits: bias {bias:.2f}, scatter {scatter:.2f}")
+    if options.results:
+        crossed = [*cases.amphibot_glide("cross_flow").rows, *cases.swimmers("cross_flow").rows]
+        few = [r for r in crossed if r.case == "lamprey robot"][:-1]
+        numbers: dict[str, Any] = {
+            "lamprey": {"bias": bias, "scatter": scatter},
+            "cases": group(rows, steady_by_law),
+            "cross_flow": {
+                "lamprey": dict(zip(("bias", "scatter"), cases.log_scatter(few), strict=True)),
+                "cases": group(crossed, {}),
+            },
+        }
+        write_results("measured", numbers, ())
+        close = cases.section((0.55, 0.6, 1.0, 1.25), near_surface=True)
+        write_results("near_surface", group(close.rows, {}), ())
     text = io.StringIO()
     csv.writer(text).writerows(lines)
     write_atomic(folder / "measured.csv", text.getvalue().encode())

@@ -476,24 +476,35 @@ _SHIP = "ship's section"
 _SUNK = 0.2 - 0.256 / 2
 
 
-def section_periods() -> list[Row]:
+def section_periods(near_surface: bool = False) -> list[Row]:
     """Natural periods in heave and roll, from decays."""
-    robot = body("ShipSection", _flume())
+    robot = body("ShipSection", _flume(near_surface=near_surface))
     rows = []
     for name, height, turn in (("heave", 0.02, 0.0), ("roll", 0.0, 8.0)):
         qpos, qvel = at_rest(robot, 1, height - _SUNK)
         qpos[3:7] = tilt(turn)
         time, q, *_ = march(robot, 12.0, qpos, qvel)
         way = q[:, 2, 0] if name == "heave" else _pitch(q)
-        ours = 2 * np.pi / frequency(time, way)
+        if near_surface:  # it dies down soon, so that what is left at the end is its rest
+            way = way - way[-1]
+            k = np.flatnonzero(np.diff(np.sign(way)))[:4]
+            crossings = time[k] - way[k] * (time[k + 1] - time[k]) / (way[k + 1] - way[k])
+            ours = float(2 * np.mean(np.diff(crossings)))
+        else:
+            ours = 2 * np.pi / frequency(time, way)
         rows.append(Row(_SHIP, f"period in {name}", data.SECTION_PERIODS[name], ours, "s"))
     return rows
 
 
-def section_in_waves(xi: float, duration: float = 90.0) -> tuple[float, float]:
+def section_in_waves(
+    xi: float, duration: float = 90.0, near_surface: bool = False
+) -> tuple[float, float]:
     """Amplitudes of the section in heave [mm] and roll [deg], over the last ten periods."""
     waves = [{"amplitude": data.WAVE_AMPLITUDE, "wavelength": wavelength(xi)}]
-    robot = body("ShipSection", _flume(waves=waves, water_depth=data.FLUME_DEPTH))
+    robot = body(
+        "ShipSection",
+        _flume(waves=waves, water_depth=data.FLUME_DEPTH, near_surface=near_surface),
+    )
     omega = np.sqrt(2 * xi * G / data.SECTION_BREADTH)
     time, q, *_ = march(robot, duration, *at_rest(robot, 1, -_SUNK), every=4)
     last = time > duration - 10 * 2 * np.pi / omega
@@ -511,13 +522,13 @@ def section_in_waves(xi: float, duration: float = 90.0) -> tuple[float, float]:
     return best[1], best[2]
 
 
-def section(steps: Sequence[float] | None = None) -> Found:
+def section(steps: Sequence[float] | None = None, near_surface: bool = False) -> Found:
     """Natural periods, and amplitudes in regular waves, of a ship's section in a flume."""
     if steps is None:
         steps = (0.2, 0.25, 0.3, 0.34, 0.37, 0.4, 0.42, 0.44, 0.46, 0.48, 0.5, 0.525, 0.55, 0.6,
                  0.7, 0.85, 1.0, 1.25, 1.5, 1.75)  # fmt: skip
-    rows = section_periods()
-    found = {xi: section_in_waves(xi) for xi in steps}
+    rows = section_periods(near_surface)
+    found = {xi: section_in_waves(xi, near_surface=near_surface) for xi in steps}
     for motion in data.SECTION_FREE:
         if motion.xi in found and motion.roll is not None:
             heave, roll = found[motion.xi]

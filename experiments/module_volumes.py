@@ -21,9 +21,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from experiments.common import make_parser, write_results
 from experiments.meshes import Mesh, check_mesh, mesh_center_of_volume, mesh_volume
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.solids import part_mesh
+from mjx_revolve.inputs.commands import run_command
 
 # Table 1 of the thesis as Revolve's code has it (the thesis prints the two hinge masses the other
 # way round): mesh volume [m³], mass [kg].
@@ -83,8 +85,11 @@ def rows() -> list[dict[str, float | str]]:
     return found
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """Prints both tables."""
+    options = make_parser("module_volumes", "The thesis's Table 1 from our meshes.").parse_args(
+        argv
+    )
     table = rows()
     print("Module volumes (thesis, Table 1) from our meshes\n")
     print(
@@ -116,8 +121,12 @@ def main() -> int:
             f"{row['part']:<20}{row['computed']:>12.3e}{row['moved']:>12.3e}"
             f"{row['printed']:>12.3e}{row['printed_moved']:>12.3e}"
         )
+    if options.results:
+        parts = [{"name": x["part"], "tabulated": x["tabulated"], "computed": x["computed"]}
+                 for x in table]  # fmt: skip
+        write_results("module_volumes", {"parts": parts}, ())
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_command(main))

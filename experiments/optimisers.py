@@ -14,13 +14,13 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common import ROOT, make_folder, make_parser
+from experiments.common import ROOT, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.inputs.files import short_path
@@ -314,10 +314,18 @@ def main(argv: list[str] | None = None) -> int:
         f"\nKeeping still scores {abs(still):.3f}. Fresh starts: the mean over {FRESH}. Speeds "
         "include compiling the optimiser's own functions, not the fitness."
     )
+    numbers: dict[str, Any] = {
+        "still": still,
+        "optimisers": [
+            {"name": o.name, "score": o.score, "fresh": o.fresh, "evaluations": o.evaluations}
+            for o in outcomes
+        ],
+    }
     if not options.no_gradient:
         best = max(outcomes, key=lambda o: o.score)
         tell("compiling the gradient, most of a minute where it is not in the cache yet")
         up = climb(best.genes)
+        numbers["climb"] = asdict(up)
         found = f"no step along it raises the score of {up.before:.4f}"
         if up.step:
             scores = f"from {up.before:.4f} to {up.after:.4f}"
@@ -327,6 +335,8 @@ def main(argv: list[str] | None = None) -> int:
             f"gene; {found} (compiled in {up.seconds:.0f} s)."
         )
     write_csv(folder / "optimisers.csv", outcomes)
+    if options.results:
+        write_results("optimisers", numbers, [SEED])
     print(f"written: {short_path(folder / 'optimisers.csv')}")
     return 0
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments.common import make_folder, make_parser
+from experiments.common import make_folder, make_parser, write_results
 from mjx_revolve.episodes.rollout import Rollout, held
 from mjx_revolve.episodes.vector_env import make_vector_env
 from mjx_revolve.inputs.commands import run_command
@@ -343,13 +343,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"the bare engine {bare:,.0f} ({speed * every / bare:.0%})"
     )
     data = {
-        "scores": {name: found.tolist() for name, found in scores.items()},
-        "unit": unit, "log": log, "env_steps_per_second": speed,
-        "timesteps_per_env_step": every, "engine_timesteps_per_second": bare,
+        "scores": {k: {"mean": x.mean(), "std": x.std()} for k, x in scores.items()},
+        "unit": unit, "seconds": args.seconds, "env_steps_per_second": speed,
+        "timesteps_per_env_step": every, "share_of_engine": speed * every / bare,
+        "engine_timesteps_per_second": bare,
     }  # fmt: skip
     path = folder / "policy_gradient.json"
-    write_atomic(path, (json.dumps(data, indent=1) + "\n").encode())
+    write_atomic(path, (json.dumps({"log": log}, indent=1) + "\n").encode())
     say(f"Wrote {path}")
+    if args.results:
+        write_results("policy_gradient", data, [args.seed])
     return 0
 
 

@@ -168,7 +168,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=3, help="of each (default: 3)")
     parser.add_argument("--cores", type=int, default=2, help="that revolve2 uses (default: 2)")
     parser.add_argument("--seed", type=int, default=0, help="of the brains (default: 0)")
-    parser.add_argument("--results", action="store_true", help="write docs/results, too")
     args = parser.parse_args(argv)
     folder, python = make_folder(args.out, "revolve2_comparison"), check_path(args.python)
     if min(args.theirs, args.rounds, args.cores) < 1:

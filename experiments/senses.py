@@ -18,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common import make_folder
-from experiments.studies import Case, fill, given_settings, run_study, study_parser
+from experiments.common import as_numbers, make_folder, write_results
+from experiments.studies import Case, given_settings, run_study, study_parser
 from mjx_revolve.episodes.config import ControllerConfig, load_config
 from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.evolution.sweeps import Plan, make_plans
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.inputs.files import short_path
 from mjx_revolve.numerics.runtime import prepare_process
 from mjx_revolve.view.outcomes import write_csv
-from mjx_revolve.view.statistics import COVERAGE, Interval, difference, interval
+from mjx_revolve.view.statistics import Interval, difference, interval
 
 CONFIGS: Mapping[str, Case] = {
     "lake_target": Case("reach a target that moves", ("bearing",)),
@@ -125,61 +125,38 @@ def compare(scores: Mapping[str, Sequence[float]]) -> Interval:
     return difference(ours, list(others) * (len(ours) if best == STILL else 1))
 
 
-def describe(name: str, plans: Sequence[Plan], scores: Mapping[str, Sequence[float]]) -> str:
-    """A row of the report's table."""
+def describe(
+    name: str, plans: Sequence[Plan], scores: Mapping[str, Sequence[float]]
+) -> dict[str, Any]:
+    """A row of the table in `docs/senses.md`."""
     from mjx_revolve.episodes.tasks import score_unit
 
-    config, best, gained = plans[0].config, best_open(scores), compare(scores)
+    config, best = plans[0].config, best_open(scores)
     evolution = config.evolution
-    budget = f"{evolution.generations} × {evolution.population_size} × {config.task.trials}"
-    verdict = "–"
-    if np.isfinite(gained.low):
-        verdict = "yes" if gained.low > 0 else "no"
-    cells = (
-        f"`{name}` [{score_unit(config.task.type)}]",
-        budget,
-        len(scores.get(CLOSED, ())),
-        interval(scores.get(CLOSED, ())),
-        interval(scores[WITHOUT]) if WITHOUT in scores else "",
-        f"{interval(scores[best])} (`{best}`)" if best else "–",
-        gained,
-        verdict,
-    )
-    return f"| {' | '.join(map(str, cells))} |"
+    return {
+        "name": name,
+        "unit": score_unit(config.task.type),
+        "budget": f"{evolution.generations} × {evolution.population_size} × {config.task.trials}",
+        "closed": as_numbers(interval(scores.get(CLOSED, ()))),
+        "without": as_numbers(interval(scores[WITHOUT]))["text"] if WITHOUT in scores else "",
+        "open": as_numbers(interval(scores.get(best, ()))),
+        "best_open": best,
+        "difference": as_numbers(compare(scores)),
+    }
 
 
-_HEAD = (
-    "| task | generations × population × episodes | seeds | closed loop | without the sense "
-    "| best open loop | closed − open | better |",
-    f"|{'---|' * 8}",
-)
-_NOTES = f"""Means over seeds with their 95 % intervals, of champions scored on the same {_KEYS}
-fresh keys, each of as many starts as an individual's evaluation has. "Without the sense" is the
-same controller that has all sensors but those that the task is about: {{taken}}. The best open loop
-is the one with the largest mean of `cpg`, `sine` and the robot at rest (`still`), by the scores
-that are then compared, which is in its favour; it has the same generations, population and
-episodes. "Better": the interval of the difference is above 0. {COVERAGE}"""
-
-
-def write_report(folder: Path, found: Mapping[str, tuple[Sequence[Plan], Any]]) -> list[str]:
-    """Writes `senses.md` and `senses.csv`.
+def write_report(
+    folder: Path, found: Mapping[str, tuple[Sequence[Plan], Any]]
+) -> list[dict[str, Any]]:
+    """Writes `senses.csv`.
 
     Args:
         folder: where.
         found: plans and scores of each configuration.
 
     Returns:
-        The table, in lines.
+        The rows of the table.
     """
-    lines = [*_HEAD, *(describe(name, *both) for name, both in found.items())]
-    taken = "; ".join(
-        f"{' and '.join(f'`{sense}`' for sense in CONFIGS[name].settings)} for `{name}`"
-        for name, (_, scores) in found.items()
-        if WITHOUT in scores
-    )
-    text = ["# Closed loops beside open ones", "", *lines, ""]
-    text.append(fill(_NOTES.format(taken=taken or "none")))
-    write_atomic(folder / "senses.md", ("\n".join(text) + "\n").encode())
     rows = [
         {"configuration": name, "case": case, "champion": k, "score": score}
         for name, (_, scores) in found.items()
@@ -187,7 +164,7 @@ def write_report(folder: Path, found: Mapping[str, tuple[Sequence[Plan], Any]]) 
         for k, score in enumerate(values)
     ]
     write_csv(folder / "senses.csv", rows)
-    return lines
+    return [describe(name, *both) for name, both in found.items()]
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -209,8 +186,13 @@ def main(argv: list[str] | None = None) -> int:
             found[name] = some, scores
     if not found:
         raise InputError("--report: expected runs that are finished; found none")
-    print("\n".join(write_report(folder, found)))
-    print(f"written: senses.md and senses.csv in {short_path(folder)}")
+    rows = write_report(folder, found)
+    for row in rows:
+        gained = f"{row['difference']['text']} more than `{row['best_open']}`"
+        print(f"{row['name']}: {row['closed']['text']} {row['unit']}, {gained}")
+    if options.results:
+        write_results("senses", {"tasks": rows, "keys": _KEYS}, range(options.seeds))
+    print(f"written: senses.csv in {short_path(folder)}")
     return 0
 
 

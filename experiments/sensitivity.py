@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.common import make_folder, make_parser
+from experiments.common import make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.episodes.config import RobustConfig
 from mjx_revolve.inputs.commands import run_command
@@ -391,6 +391,33 @@ def intervals(found: Sensitivity, tolerance: float) -> list[list[str]]:
     return rows
 
 
+def results_of(
+    laws: Mapping[str, Swim], found: Sensitivity, beside: Mapping[str, Sensitivity]
+) -> dict[str, Any]:
+    """What the tables and the text of `docs/sensitivity.md` show; speeds in cm/s."""
+    usual = laws["ours, all laws"].speed.mean() if laws else float("nan")
+    words = ("", "robust_")
+    rows = []
+    for name in found.draws:
+        row: dict[str, Any] = {"name": name}
+        for prefix, its in zip(words, (found, *beside.values()), strict=False):
+            middle, low, high = interval_of(100 * its.draws[name].speed)
+            row |= {f"{prefix}median": middle, f"{prefix}low": low, f"{prefix}high": high}
+            row[f"{prefix}kept"] = low / (100 * its.usual)
+        rows.append(row)
+    return {
+        "laws": [
+            {"name": name, "speed": 100 * s.speed.mean(), "spread": 100 * s.speed.std(ddof=1),
+             "change": s.speed.mean() / usual - 1, "rise_m": s.rise.mean()}
+            for name, s in laws.items()
+        ],
+        "usual": 100 * found.usual,
+        "curves": {name: {"factor": factor, "share": swim.speed / found.usual}
+                   for name, (factor, swim) in found.curves.items()},
+        "draws": rows,
+    }  # fmt: skip
+
+
 def main(argv: list[str] | None = None) -> int:
     """Swims all cases, prints the tables, writes `sensitivity.png`."""
     parser = make_parser("sensitivity", "What each law is worth, and what is uncertain.")
@@ -415,8 +442,12 @@ def main(argv: list[str] | None = None) -> int:
     for name, its in {"the champion": found, **beside}.items():
         print(f"{name}: {100 * its.usual:.2f} cm/s from a level start, nothing varied")
         print("\n".join(align(intervals(its, champion.config.task.depth_tolerance))) + "\n")
-    if not options.no_laws:
-        print("\n".join(align(table(compare_laws(champion)))))
+    laws = {} if options.no_laws else compare_laws(champion)
+    if laws:
+        print("\n".join(align(table(laws))))
+    if options.results:
+        seeds = [run.config.evolution.seed for run in (champion, *rivals.values())]
+        write_results("sensitivity", results_of(laws, found, beside), seeds)
     print(f"\nwritten: sensitivity.png in {short_path(folder)}")
     return 0
 

@@ -9,15 +9,14 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from experiments.common import make_folder, make_parser
+from experiments.common import as_numbers, make_folder, make_parser, write_results
 from mjx_revolve.evolution.executor import make_executor
 from mjx_revolve.evolution.generations import Champion
 from mjx_revolve.evolution.run import Run
@@ -84,7 +83,7 @@ def study_main(
     name: str,
     description: str,
     make_cases: Callable[[Sequence[str]], Mapping[str, Case]],
-    write_report: Callable[[Path, Sequence[Outcome]], Sequence[str]],
+    write_report: Callable[[Path, Sequence[Outcome]], dict[str, Any]],
     argv: list[str] | None = None,
     add: Callable[[str, Figures], Figures] = lambda case, figures: {},
 ) -> int:
@@ -94,8 +93,8 @@ def study_main(
         name: of the experiment's module.
         description: what it does, in a sentence.
         make_cases: what is compared, from what replaces values of the configuration.
-        write_report: writes `NAME.md` and more into a folder, from the outcomes; returns what was
-            found, in lines.
+        write_report: writes tables and pictures into a folder, from the outcomes; returns the
+            numbers for a results file, `runs` among them.
         argv: the arguments; by default the command line's.
         add: as in `read_outcomes`.
 
@@ -108,8 +107,12 @@ def study_main(
     if not options.report and (code := run_study(plans, name, argv)):
         return code
     outcomes = score_still(read_outcomes(plans, add))
-    print("\n".join(write_report(folder, outcomes)))
-    print(f"{len(outcomes)} of {len(plans)} runs; written: {name}.md in {short_path(folder)}")
+    numbers = write_report(folder, outcomes)
+    for run in numbers["runs"]:
+        print(f"{run['name']}: {run['score']['text']} body lengths/s, {run['seeds']} seeds")
+    print(f"{len(outcomes)} of {len(plans)} runs; written: {name}.csv in {short_path(folder)}")
+    if options.results:
+        write_results(name, numbers, range(options.seeds))
     return 0
 
 
@@ -243,33 +246,32 @@ def _still_scores(outcomes: Sequence[Outcome]) -> np.ndarray:
     return np.mean([[s[0] for s, _ in score_brains(executor, who, genes, key)] for key in keys], 0)
 
 
-def describe_runs(cases: Mapping[str, Sequence[Outcome]], known: Mapping[str, Case]) -> list[str]:
-    """Markdown: what was run, how often, for how long, and the champions' scores.
+def describe_runs(
+    cases: Mapping[str, Sequence[Outcome]], known: Mapping[str, Case]
+) -> list[dict[str, Any]]:
+    """What was run, how often, for how long, and the champions' scores, for a results file.
 
     Args:
         cases: outcomes by case.
         known: the cases by name.
 
     Returns:
-        Lines of a table, and what is to be known of it.
+        An entry for each case.
     """
-    lines = ["| | what | seeds | trials each | s each | champions' score | with joints at rest |"]
-    lines.append(f"|{'---|' * 7}")
-    for name, outcomes in cases.items():
-        tried = sorted({f"{int(o.metrics['evaluations'][-1]):,}" for o in outcomes})
-        seconds = np.mean([o.metrics["seconds"][-1] for o in outcomes])
-        scores = (
-            interval([o.champion.get(figure, np.nan) for o in outcomes])
-            for figure in ("score", "still_score")
-        )
-        cells = (known[name].words, len(outcomes), " or ".join(tried), f"{seconds:.0f}", *scores)
-        lines.append(f"| `{name}` | {' | '.join(map(str, cells))} |")
-    return [*lines, "", fill(_STILL)]
-
-
-_STILL = """Scores are in body lengths/s, of each run's champion on fresh starts. A body that does
-not start in the attitude in which it hangs in the water turns, and its core moves without any work
-of a joint: only what a champion scores beyond its score with all joints at rest is its doing."""
+    return [
+        {
+            "name": name,
+            "what": known[name].words,
+            "seeds": len(outcomes),
+            "trials": int(np.mean([o.metrics["evaluations"][-1] for o in outcomes])),
+            "seconds": float(np.mean([o.metrics["seconds"][-1] for o in outcomes])),
+            **{
+                figure: as_numbers(interval([o.champion.get(figure, np.nan) for o in outcomes]))
+                for figure in ("score", "still_score")
+            },
+        }
+        for name, outcomes in cases.items()
+    ]
 
 
 def draw_outcomes(
@@ -283,8 +285,3 @@ def draw_outcomes(
     draw_curves(axes, curves)
     axes.set(xlabel="evaluated individuals", ylabel=label)
     axes.legend(loc="best")
-
-
-def fill(text: str) -> str:
-    """A paragraph of Markdown in lines of the width of our pages."""
-    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)

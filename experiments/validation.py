@@ -8,12 +8,14 @@ Exit code 1 if anything is outside its tolerance. The cases are in `validation_c
 from __future__ import annotations
 
 import csv
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.common import make_folder, make_parser
+from experiments.common import make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import short_path
@@ -61,11 +63,13 @@ def main(argv: list[str] | None = None) -> int:
     from experiments.validation_cases import CASES, QUICK_CASES
 
     table, curves, failed = [HEADINGS, ("",) * len(HEADINGS)], [], 0
+    results: dict[str, list[dict[str, Any]]] = {}
     for name, case in CASES.items():
         if options.quick and name not in QUICK_CASES:
             continue
         result = case()
         curves += result.curves
+        results[name] = [asdict(row) for row in result.rows]
         for row in result.rows:
             failed += not row.passed
             numbers = (row.expected, row.found, abs(row.found - row.expected), row.tolerance)
@@ -78,8 +82,11 @@ def main(argv: list[str] | None = None) -> int:
     if curves:
         (folder / "validation.png").write_bytes(figure_png(draw(curves)))
         written += " and validation.png"
+    count = len(table) - 2
+    if options.results:
+        write_results("validation", {"comparisons": count, "failed": failed, "cases": results}, ())
     verdict = f"{failed} outside their tolerances" if failed else "all within their tolerances"
-    print(f"\n{len(table) - 2} comparisons, {verdict}\nwritten: {written} in {short_path(folder)}")
+    print(f"\n{count} comparisons, {verdict}\nwritten: {written} in {short_path(folder)}")
     return 1 if failed else 0
 
 

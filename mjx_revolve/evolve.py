@@ -42,6 +42,8 @@ from mjx_revolve.numerics import runtime
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.evolution.executor import Executor
+    from mjx_revolve.evolution.generations import Champion
+    from mjx_revolve.evolution.processes import LocalWorker
     from mjx_revolve.evolution.run import Run
 
 
@@ -95,7 +97,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     try:
         # From the first heavy import on: some of them swallow a KeyboardInterrupt, or die of it.
         with Interrupts() as interrupts, contextlib.ExitStack() as executors:
-            runtime.prepare_process()
+            runtime.fix_threads()
             return _lead(arguments, make_fitness, executors, interrupts)
     except WorkerError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -109,12 +111,14 @@ def _lead(
     interrupts: Interrupts,
 ) -> int:
     """A whole run; `executors` ends its workers."""
+    started: list[LocalWorker] = []
 
     def make(config: Config) -> Executor:
         from mjx_revolve.evolution.executor import make_executor
 
         workers, cluster = arguments.workers, arguments.cluster
-        return executors.enter_context(make_executor(config, workers, make_fitness, cluster))
+        made = make_executor(config, workers, make_fitness, cluster, started)
+        return executors.enter_context(made)
 
     path, folder, settings = arguments.config, arguments.resume, arguments.settings
     if path is None and folder is None:
@@ -125,6 +129,18 @@ def _lead(
     if path is not None:
         find_shipped(path, "configs")  # a name that there is not is known at once
     print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
+    config = _check(arguments)
+    if make_fitness is None and not arguments.cluster and runtime.expects_cpu():
+        # They import JAX and the rest while this process does.
+        from mjx_revolve.evolution.executor import choose_workers
+        from mjx_revolve.evolution.processes import start_workers
+
+        count = arguments.workers or (choose_workers(config) if config else 1)
+        if count > 1:
+            started += start_workers(count, runtime.find_cache())
+        for worker in started:
+            executors.callback(worker.end)
+    runtime.prepare_process()
     from mjx_revolve.evolution.run import Run
 
     if folder is None:
@@ -149,10 +165,23 @@ def _lead(
         run.close()
 
 
+def _check(arguments: argparse.Namespace) -> Config | None:
+    """The configuration, a wrong one refused before JAX is imported; None: no run folder."""
+    path, folder = arguments.config, arguments.resume
+    from mjx_revolve.episodes.config import load_config
+
+    if folder is None:
+        with opening_config(path, arguments.trust):
+            return load_config(path, arguments.settings)
+    found = Path(folder) / "config.yaml"
+    if not found.is_file():  # its folder is checked when it is locked
+        return None
+    with opening(folder, *([path] if path else []), trust=arguments.trust):
+        return load_config(found)
+
+
 def _evolve(run: Run, interrupts: Interrupts) -> int:
     """Evolves a run whose arguments are right."""
-    from mjx_revolve.view.results import describe_score, save_pictures
-
     config, place = run.config, short_path(run.folder.path)
     if run.is_finished:
         print(
@@ -164,17 +193,26 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     if run.resumed:
         print(f"resuming {run.resumption}", flush=True)
     interrupts.be_patient("finishing what is under way")
-    champion = run.evolve(interrupts, save_pictures)
+    champion = run.evolve(interrupts, _save_pictures)
     if champion is None:
         saved = f"stopped after {run.unit} {run.generation}; all of it is saved"
         print(f"{saved}\n{_resume_hint(run)}", flush=True)
         return interrupts.exit_code
+    from mjx_revolve.view.results import describe_score
+
     print(f"champion: {describe_score(champion, config)} ({champion.origin})")
     if champion.measures:
         figures = (f"{name} {value:.3g}" for name, value in champion.measures.items())
         print(f"measures: {', '.join(figures)}")
     print(f"run folder: {place}")
     return 0
+
+
+def _save_pictures(run: Run, champion: Champion) -> None:
+    """What draws takes seconds to import: not before the first generation."""
+    from mjx_revolve.view.results import save_pictures
+
+    save_pictures(run, champion)
 
 
 def _describe(run: Run) -> str:

@@ -132,6 +132,10 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     files = _named_files(arguments)
     check_episode_path(arguments.path)
+    runtime.fix_threads()
+    from mjx_revolve.episodes.early_checks import check_episode_files
+
+    check_episode_files(arguments)
     runtime.prepare_process()
     # JAX takes seconds to import: not for those who ask for help.
     from mjx_revolve.episodes.champion import load_asked

@@ -27,7 +27,7 @@ from mjx_revolve.inputs.commands import (
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import short_path
+from mjx_revolve.inputs.files import check_path, short_path
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics import runtime
 
@@ -92,6 +92,13 @@ def main(argv: list[str] | None = None) -> int:
         raise InputError("--resume: expected neither ROBOT nor --out beside it; found one")
     if arguments.plan and arguments.recordings:
         raise InputError("--plan: expected a ROBOT and no recordings; found some")
+    if arguments.resume is None and not arguments.plan and not arguments.recordings:
+        raise InputError("expected a RECORDING, or --plan; found neither")
+    for name in arguments.recordings:  # before JAX is imported
+        if not check_path(name).exists():
+            raise InputError(
+                f"{name}: expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"
+            )
     with Interrupts() as interrupts:
         runtime.prepare_process()
         named = [arguments.resume or arguments.robot, *arguments.recordings]
@@ -114,8 +121,6 @@ def _fit(arguments: argparse.Namespace, interrupts: Interrupts) -> int:
         done = run.state.iteration if run.state else 0
         print(f"resuming after iteration {done}", flush=True)
     else:
-        if not arguments.recordings:
-            raise InputError("expected a RECORDING, or --plan; found neither")
         settings, fields, trim = read_settings(arguments.settings)
         robot, entry, copies = load_robot(
             arguments.robot, arguments.world, arguments.modules, fields, trim

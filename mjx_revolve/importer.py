@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 
 from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
-from mjx_revolve.inputs.files import short_path
+from mjx_revolve.inputs.files import read_file, short_path
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -37,6 +37,7 @@ def main(argv: list[str] | None = None) -> int:
         "--out", type=read_path, metavar="DIR", default=".", help="folder (default: here)"
     )
     arguments = parser.parse_args(argv)
+    read_file(arguments.file, 1)  # it is there
     # MuJoCo takes a second to import: not for those who ask for help.
     from mjx_revolve.formats.import_robot import import_robot
 

@@ -35,8 +35,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("run", type=read_path, metavar="RUN", help="a run folder")
     add_trust_argument(parser)
     arguments = parser.parse_args(argv)
-    runtime.prepare_process()
+    runtime.fix_threads()
+    from mjx_revolve.episodes.run_reader import RunReader, find_run
+
     with opening(arguments.run, trust=arguments.trust):
+        champion = RunReader(find_run(arguments.run)).load_champion()
+        champion.load_config()  # before JAX is imported
+        runtime.prepare_process()
         return _judge(arguments)
 
 

@@ -188,11 +188,15 @@ def main(argv: list[str] | None = None) -> int:
     check_colony_arguments(arguments)
     if ".mp4" in (kinds if paths is None else paths) and not view:
         check_package("MP4", "av")
+    from mjx_revolve.numerics.runtime import fix_threads, prepare_process
+
+    fix_threads()
+    from mjx_revolve.episodes.early_checks import check_episode_files
+
+    check_episode_files(arguments)
     # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
     films = not view and set(kinds if paths is None else paths) != {".html"}
     opengl = find_opengl() if films else ""
-
-    from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
     from mjx_revolve.episodes.champion import load_asked
@@ -236,7 +240,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _ancestor_films(arguments: argparse.Namespace, folder: Path | None) -> list[Film]:
     """Films of an individual and its ancestors, the oldest first."""
-    from mjx_revolve.episodes.champion import champion_number, load_individuals, refuse_world
+    from mjx_revolve.episodes.champion import champion_number, load_individuals
+    from mjx_revolve.episodes.early_checks import refuse_world
     from mjx_revolve.view.film.film import make_film
     from mjx_revolve.view.population import pick_ancestors, read_population
     from mjx_revolve.view.poses import cut_episode

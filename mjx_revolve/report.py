@@ -107,6 +107,10 @@ def main(argv: list[str] | None = None) -> int:
         OSError: the page cannot be written.
     """
     arguments = _parser().parse_args(argv)
+    runtime.fix_threads()
+    from mjx_revolve.episodes.run_reader import check_runs
+
+    check_runs(arguments.runs)
     runtime.prepare_process()
     with opening(*arguments.runs, trust=arguments.trust):
         return _report(arguments)

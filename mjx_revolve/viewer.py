@@ -69,9 +69,14 @@ def main(argv: list[str] | None = None) -> int:
     check_colony_arguments(arguments)
     if arguments.colony:
         return _write_colony(arguments)
-    # JAX takes seconds to import: not for `--help`.
+    # JAX takes seconds to import: not for `--help`, nor for wrong files.
+    from mjx_revolve.numerics.runtime import fix_threads, prepare_process
+
+    fix_threads()
+    from mjx_revolve.episodes.early_checks import check_episode_files
+
+    check_episode_files(arguments)
     from mjx_revolve.episodes.champion import load_asked
-    from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
     episode = load_asked(arguments)

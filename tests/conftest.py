@@ -25,6 +25,7 @@ import pytest
 
 from laboratory import WATER, arm_robot, body, compiled_quickly, elbow_robot, world
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world
 
 # A trace makes millions of small objects of which few are garbage: a tenth of its time.
@@ -66,6 +67,12 @@ def quick_compiles():
     """Leaves out the compiler's optimisations: they cost more than short runs save."""
     with compiled_quickly():
         yield
+
+
+@pytest.fixture(autouse=True)
+def no_kept_programs(monkeypatch):
+    """Tests change what programs are made of; processes that they start keep theirs."""
+    monkeypatch.setattr(runtime, "program_folder", lambda: None)
 
 
 @pytest.fixture(scope="module", autouse=True)

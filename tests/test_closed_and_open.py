@@ -58,15 +58,13 @@ def test_the_report_says_which_is_better(tmp_path):
             ("auv_search", {"closed": [0.5, 0.1, 0.3], "sine": [0.3, 0.2, 0.4], "still": [0.0]}),
         )
     }
-    lines = senses.write_report(tmp_path, found)
-    assert lines[2].startswith(
-        "| `auv_escape` [of the first distance] | 60 × 64 × 8 | 3 | 0.87 ± 0.14 "
-    )
-    assert lines[2].endswith("| 0.5 (`cpg`) | 0.37 ± 0.14 | yes |")
-    assert lines[3].endswith(" | no |") and "(`sine`)" in lines[3]
-    text = (tmp_path / "senses.md").read_text()
-    assert all(line in text for line in lines)
-    assert "`bearing` and `distance` for `auv_escape`." in " ".join(text.split())
+    first, second = senses.write_report(tmp_path, found)
+    assert (first["name"], first["unit"], first["budget"]) == (
+        "auv_escape", "of the first distance", "60 × 64 × 8",
+    )  # fmt: skip
+    assert (first["closed"]["text"], first["best_open"]) == ("0.87 ± 0.14", "cpg")
+    assert (first["open"]["text"], first["difference"]["text"]) == ("0.5", "0.37 ± 0.14")
+    assert second["best_open"] == "sine"
     with (tmp_path / "senses.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 9 + 7 and rows[0]["case"] == "closed" and rows[1]["score"] == "0.8"

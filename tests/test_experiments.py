@@ -11,10 +11,13 @@ import pytest
 from experiments import (
     bench,
     falling_spider,
+    gpu,
     gradient_learning,
     optimisers,
     policy_gradient,
+    precision,
     sensitivity,
+    shipped,
     validation,
     validation_cases,
 )
@@ -163,10 +166,13 @@ def test_falling_spider_writes_its_table_and_its_plot(experiment):
         (bench.main, ["--threads", "0"], "expected a whole number >= 1; found '0'"),
         (bench.main, ["--rounds", "two"], "expected a whole number >= 1; found 'two'"),
         (bench.main, ["--only", "tiger"], "--only: expected part of one of: spider, ellipsoid law"),
+        (precision.main, ["--only", "tiger"], "--only: expected part of one of: spider, ellipsoid"),
+        (gpu.main, ["--robot", "tiger"], "--robot: expected a shipped morphology; found 'tiger'"),
         (bench.main, ["spider"], "unrecognized arguments: spider"),
         (optimisers.main, ["--evaluations", "-3"], "expected a whole number >= 1; found '-3'"),
         (optimisers.main, ["--out"], "--out: expected one argument"),
         (validation.main, ["--out", "/dev/null/x"], "--out: expected a folder to write into"),
+        (shipped.main, ["--only", "moon"], "--only: expected any of auv_escape, "),
     ],
 )
 def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
@@ -205,6 +211,36 @@ def test_a_case_is_held_against_the_best_of_its_opponents():
 def test_memory_of_an_individual():
     sizes = [_result("a", [1.0], 16384, 5e8), _result("b", [1.0], 384, 4.84e8)]
     assert bench.memory_per_individual(sizes) == pytest.approx(1000)
+
+
+def test_work_at_an_error_lies_between_the_steps():
+    points = [
+        {"step_ms": 10.0, "error_percent": 4.0, "robot_seconds_per_core_second": 400.0},
+        {"step_ms": 5.0, "error_percent": 1.0, "robot_seconds_per_core_second": 200.0},
+        {"step_ms": 2.5, "error_percent": 0.25, "robot_seconds_per_core_second": 100.0},
+    ]
+    assert precision.work_at(points, 1.0) == pytest.approx(200)
+    assert precision.work_at(points, 2.0) == pytest.approx(200 * 2**0.5)
+    assert precision.work_at(points, 5.0) == 400  # no step is so bad
+    assert precision.work_at(points, 0.1) is None
+    assert precision.work_at([{**points[0], "error_percent": None}, *points[1:]], 2.0) == 200
+
+
+def test_the_error_is_relative_to_the_way_and_blown_up_episodes_count():
+    start, end = np.zeros((3, 3)), np.array([[2.0, 0, 0]] * 3)
+    found = end + np.array([[0.0, 0, 0], [0, 0.02, 0], [np.nan, 0, 0]])
+    assert precision.error_percent(found, start, end) == pytest.approx(1.0)
+    assert precision.error_percent(np.full((3, 3), np.nan), start, end) is None
+
+
+def test_a_population_is_stepped_as_one_program_and_what_is_missing_is_named():
+    found = gpu.measure(gpu.make_ours, ("core", 8, 5), 1)
+    assert found["robot_seconds_per_second"] == pytest.approx(0.005 * found["steps_per_second"])
+
+    def lacking(*_):
+        raise ImportError("no such module", name="mujoco_warp")
+
+    assert gpu.measure(lacking, ("core", 8, 5), 1) == {"error": "not installed (mujoco_warp)"}
 
 
 def test_every_row_of_the_benchmark_can_be_made():
@@ -353,6 +389,12 @@ def test_the_tables_and_the_picture_of_sensitivity():
     found = sensitivity.Sensitivity(0.06, curves, {"start": swim, "drag": swim})
     assert sensitivity.intervals(found, 0.25)[1][-1] == "50%"
     assert len(sensitivity.draw(found, {"other": found}).axes) == 2
+    numbers = sensitivity.results_of({"ours, all laws": swim}, found, {"other": found})
+    assert numbers["laws"][0]["speed"] == pytest.approx(6) and numbers["laws"][0]["change"] == 0
+    assert [row["name"] for row in numbers["draws"]] == ["start", "drag"]
+    for prefix in ("", "robust_"):
+        assert numbers["draws"][1][f"{prefix}median"] == pytest.approx(6)
+        assert numbers["draws"][1][f"{prefix}kept"] == pytest.approx(0.051 / 0.06)
 
 
 def test_only_gaits_that_sense_nothing_can_be_played_to_mujoco(tmp_path):

@@ -21,7 +21,7 @@ from mjx_revolve.body.params import apply_overrides, check_overrides, multiply_f
 from mjx_revolve.body.placement import Module
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import read_file
-from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.inputs.yaml_reader import load_yaml, parse_yaml
 
 ALL = "all"
 Entries = Mapping[str, Mapping[str, Any]]
@@ -115,7 +115,7 @@ def read_morphology_files(path: str | Path) -> dict[str, bytes]:
     """
     path = Path(path)
     found = {path.name: read_file(path)}
-    data = load_yaml(path)
+    data = parse_yaml(found[path.name], path)
     named = data.get("coefficients") if isinstance(data, dict) else None
     if isinstance(named, str) and not Path(named).is_absolute() and ".." not in Path(named).parts:
         found[named] = read_file(path.parent / named)

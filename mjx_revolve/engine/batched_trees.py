@@ -212,8 +212,9 @@ class BatchedTrees:
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
         """Ones, `[npart, 1, lanes]` of the root and `[rows, npart, 1, lanes]` of the rows."""
         row, count = _merged(self.capacity.row, self.bodies.rows), self.capacity.rows
-        root = tuple(jnp.ones((n, 1, *lanes), dtype) for n in self.root.carrying)
-        return root, tuple(jnp.ones((count, n, 1, *lanes), dtype) for n in row.carrying)
+        axes = 3 if self.world.near_surface else 1
+        root = tuple(jnp.ones((n, 1, *lanes), dtype) for n in self.root.carrying(axes))
+        return root, tuple(jnp.ones((count, n, 1, *lanes), dtype) for n in row.carrying(axes))
 
     # The passes.
 

@@ -278,7 +278,7 @@ def _with_contact(
         wanted = any_lane(left < 0) & wanted
 
     def push() -> tuple[jax.Array, Any]:
-        bodies = Bodies(body_frames(tree, state), body_frames(tree, ahead))
+        bodies = Bodies(*body_frames(tree, state, ahead))
         found, clearance = contact_acceleration(
             meetings,
             bodies,

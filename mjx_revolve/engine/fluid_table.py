@@ -61,6 +61,7 @@ class FluidTable:
         carried_mass: what the step carries: added mass where it is switched on, and entrained
             water, per unit density [m³].
         carried_inertia: the same about the axes [m⁵].
+        entrained: share of `carried_mass` that is entrained water [-].
         coupling: what a stated added mass has beside its diagonal: along the axes, then about them,
             per unit density, part frame [m³, m⁴, m⁵].
     """
@@ -89,6 +90,7 @@ class FluidTable:
     added_inertia: Float[np.ndarray, "npart 3"]
     carried_mass: Float[np.ndarray, "npart 3"]
     carried_inertia: Float[np.ndarray, "npart 3"]
+    entrained: Float[np.ndarray, "npart 3"]
     coupling: Float[np.ndarray, "npart 6 6"]
 
     @property
@@ -200,6 +202,8 @@ def make_fluid_table(
         drag = tuple("off" if r else name for r, name in zip(replaced, drag, strict=True))
     own = (world.added_mass & ~(stated | replaced))[:, None]  # what fills the room is ours
     off = world.buoyancy == "off"
+    flooded = own * more * inside[0][kind]
+    carried_mass = on[kind] * added_mass + flooded
     return FluidTable(
         body=body,
         module=layout.module,
@@ -230,7 +234,8 @@ def make_fluid_table(
         factors=factors,
         added_mass=added_mass,
         added_inertia=added_inertia,
-        carried_mass=on[kind] * added_mass + own * more * inside[0][kind],
+        carried_mass=carried_mass,
         carried_inertia=on[kind] * added_inertia + own * more * inside[1][kind],
+        entrained=flooded / np.where(carried_mass > 0, carried_mass, 1),
         coupling=on[kind][:, None] * (known - diagonal[:, None] * np.eye(6)),
     )

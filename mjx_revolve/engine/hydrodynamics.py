@@ -38,6 +38,7 @@ from mjx_revolve.numerics.spatial import (
     rotate,
     rotate_sym,
     sub,
+    symvec,
     total,
     vadd,
     vscale,
@@ -48,7 +49,9 @@ from mjx_revolve.water.buoyancy import displaced_water, find_buoyancy_law, surfa
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.face_drag import quadratic_drag
 from mjx_revolve.water.flow import Water, flow, is_uniform, surface, wave_convection
+from mjx_revolve.water.fossen import FOSSEN
 from mjx_revolve.water.laws import NO_DRAG, BodyDragLaw, PartDragLaw, PartFlow
+from mjx_revolve.water.near_surface import NearSurface, near_surface, turning_share
 from mjx_revolve.water.world import World
 
 _ZERO = (0.0, 0.0, 0.0)
@@ -68,7 +71,7 @@ class ExternalForces(NamedTuple):
         damping: how force and torque fall with the bodies' velocity, as a 6×6 [N·s/m ...], for
             the implicit part of a step; or None.
         submerged: submerged fractions of each group of parts that carries water, `[npart, nbody,
-            lanes]` each [-].
+            lanes]` each [-]; near the surface as in `State`.
     """
 
     torque: Vec
@@ -242,6 +245,40 @@ def _angular_slam(parts: Parts, carried: CarriedWater, w: Vec, rate: Scalar, gat
     return matvec(parts.rotation, slam(1.0, together, w))
 
 
+def _near_surface(world: World, parts: Parts, at: _Immersion, wide: Sum) -> NearSurface | None:
+    """What the surface makes of parts; None where they carry their submerged fraction.
+
+    That is so of stated water, and where there is no surface that presses.
+    """
+    law = find_buoyancy_law(parts.laws.buoyancy)
+    stated = parts.laws.coupled or parts.laws.drag == FOSSEN.name
+    if not world.near_surface or parts.carried is None or stated or not law.lifts:
+        return None
+    up = tuple(map(wide, at.up))
+    return near_surface(
+        up, at.depth, at.flow.submerged, parts.half_size, parts.carried, world.gravity
+    )
+
+
+def _near_surface_slam(
+    parts: Parts, carried: CarriedWater, flow: PartFlow, share: Vec, before: PreviousStep
+) -> tuple[Vec, Vec]:
+    """Force and torque of the slam on parts along whose axes shares grow, part's axes."""
+    k = parts.count
+    then = tuple(before.submerged[i * k : (i + 1) * k] for i in range(3))
+    turning = (turning_share(x, carried.mass, parts.half_size) for x in (share, then))
+    rates = (
+        [wetting_rate(a, b, before.dt) for a, b in zip(*x, strict=True)]
+        for x in ((share, then), turning)
+    )
+    given = (carried.mass, flow.velocity), (carried.angular, flow.angular_velocity)
+    force, torque = (
+        tuple(slam(r, (m,), (x,))[0] for r, m, x in zip(rate, *what, strict=True))
+        for rate, what in zip(rates, given, strict=True)
+    )
+    return force, torque
+
+
 def _coupled_slam(
     carried: CarriedWater, stream: _Stream, motion: BodyMotion, rate: Scalar
 ) -> tuple[Vec, Vec]:
@@ -314,8 +351,11 @@ def _water_on_parts(
     water: Water,
     thrusts: Any,
     before: PreviousStep | None,
-) -> tuple[Vec, Vec, SpatialInertia | None, SpatialInertia | None, Scalar]:
-    """Torque, force, carried water, damping and submerged fraction of one group of parts."""
+) -> tuple[Vec, Vec, SpatialInertia | None, SpatialInertia | None, Scalar, Scalar]:
+    """Of one group of parts: torque, force, carried water, damping, submerged fraction.
+
+    And what the next step's slam needs of it: that fraction, or shares near the surface.
+    """
     k, wide = parts.count, _widener(parts, n, motion)
 
     def gather(x: Scalar) -> Scalar:
@@ -329,8 +369,22 @@ def _water_on_parts(
     force, torque, damping = drag
     pull, turn = _surface_tension(world, parts, at, wide)
     force, torque = vadd(force, pull), vadd(torque, turn)
-    rate = None
-    if before is not None and parts.carried is not None:
+    rate, saved = None, submerged
+    close = _near_surface(world, parts, at, wide)
+    if world.near_surface and parts.carried is not None:
+        shares = (submerged,) * 3 if close is None else close.share
+        saved = jnp.concatenate(list(map(wide, shares)))
+        if before is not None and close is None:
+            before = before._replace(submerged=before.submerged[:k])
+    if close is not None and parts.carried is not None:
+        if before is not None:
+            blow = _near_surface_slam(parts, parts.carried, at.flow, close.share, before)
+            force, torque = vadd(force, blow[0]), vadd(torque, blow[1])
+        waves = close.damping
+        x, y, z = waves.angular[0], waves.angular[3], waves.angular[5]
+        force = vsub(force, symvec(waves.linear, v))
+        torque = vsub(torque, tuple(c * t for c, t in zip((x, y, z), w, strict=True)))
+    elif before is not None and parts.carried is not None:
         rate = wetting_rate(submerged, before.submerged, before.dt)
         if not parts.laws.coupled:
             force = vadd(force, slam(rate, parts.carried.mass, v))
@@ -355,13 +409,24 @@ def _water_on_parts(
         twist, angular = _angular_drag(parts, law.angular(parts.drag), at.flow, gather)
         torque = vadd(torque, twist)
     carried = None
+    if close is not None and parts.carried is not None:
+        own = parts.carried
+        spins = turning_share(close.share, own.mass, parts.half_size)
+        x, y, z = (mul(m, s) for m, s in zip(own.mass, close.share, strict=True))
+        a, b, c = (mul(m, s) for m, s in zip(own.angular, spins, strict=True))
+        here = SpatialInertia((a, 0.0, 0.0, b, 0.0, c), (_ZERO,) * 3, (x, 0.0, 0.0, y, 0.0, z))
+        carried = _damping(parts, here, None, gather)
+        found = _plus(
+            _damping(parts, damping, angular, gather), _damping(parts, close.damping, None, gather)
+        )
+        return torque, force, carried, found, submerged, saved
     if parts.carries and parts.carried is not None:
 
         def weigh(x: Scalar) -> Scalar:
             return sum_parts(mul(x, submerged), k) if is_present(x) else 0.0
 
         carried = jax.tree.map(weigh, parts.carried.inertia)
-    return torque, force, carried, _damping(parts, damping, angular, gather), submerged
+    return torque, force, carried, _damping(parts, damping, angular, gather), submerged, saved
 
 
 class PartForces(NamedTuple):
@@ -505,11 +570,11 @@ def water_forces(
         earlier = None
         if before is not None and parts.carries:
             earlier = before._replace(submerged=before.submerged[len(submerged)])
-        on_torque, on_force, more_carried, more_damping, fraction = _water_on_parts(
+        on_torque, on_force, more_carried, more_damping, fraction, saved = _water_on_parts(
             world, parts, level.count, motion, gravity, water, thrusts, earlier
         )
         if parts.carries:
-            submerged.append(fraction)
+            submerged.append(saved)
         torque, force = vadd(torque, on_torque), vadd(force, on_force)
         carried, damping = _plus(carried, more_carried), _plus(damping, more_damping)
         fractions.append(fraction)

@@ -136,21 +136,26 @@ class BodyFrames(NamedTuple):
     position: Vec
 
 
-def body_frames(tree: Tree, state: State) -> BodyFrames:
-    """Poses of the core's rigid body, then of what each hinge carries; frames as in `level`."""
-    root = tuple(map(_row, quat_to_mat(state.quat))), _row(state.position)
+def body_frames(tree: Tree, *states: State) -> tuple[BodyFrames, ...]:
+    """Poses of the core's rigid body, then of what each hinge carries; frames as in `level`.
 
-    def move(level: Level, parent: Any, angle: Scalar) -> Any:
+    Of each of some states, all in one pass.
+    """
+    root = tuple((tuple(map(_row, quat_to_mat(x.quat))), _row(x.position)) for x in states)
+
+    def move(level: Level, parents: Any, *angles: Scalar) -> Any:
         assert level.hinges is not None
-        rotation, position = parent
-        position = vadd(position, matvec(rotation, level.hinges.position))
-        own = matmul(rotation, hinge_rotation(level.hinges, angle)), position
-        return own, own
+        found = []
+        for (rotation, position), angle in zip(parents, angles, strict=True):
+            place = vadd(position, matvec(rotation, level.hinges.position))
+            found.append((matmul(rotation, hinge_rotation(level.hinges, angle)), place))
+        return tuple(found), tuple(found)
 
-    like = state.position[0]
-    below = tree.forward_pass(move, root, state.angle)
+    like = states[0].position[0]
+    below = tree.forward_pass(move, root, *(x.angle for x in states))
     rows = tree.stack_saved(below, lambda saved: saved, like)
-    return BodyFrames(*jax.tree.map(lambda *x: jnp.concatenate(x), root, rows))
+    frames = jax.tree.map(lambda *x: jnp.concatenate(x), root, rows)
+    return tuple(BodyFrames(*x) for x in frames)
 
 
 def body_motions(tree: Tree, state: State) -> BodyMotion:

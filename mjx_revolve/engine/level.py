@@ -243,10 +243,9 @@ class Level:
     points: Points | None
     shells: Shells | None = None
 
-    @property
-    def carrying(self) -> tuple[int, ...]:
-        """How many parts of a body each group has that may carry water along."""
-        return tuple(parts.count for parts in self.parts if parts.carries)
+    def carrying(self, axes: int) -> tuple[int, ...]:
+        """How many shares each group has that may carry water along: of parts, times axes."""
+        return tuple(axes * parts.count for parts in self.parts if parts.carries)
 
 
 @partial(

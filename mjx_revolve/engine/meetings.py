@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.level import Level
-from mjx_revolve.numerics.spatial import Mat, Vec
+from mjx_revolve.numerics.spatial import Mat, Vec, matvec, vadd
+from mjx_revolve.numerics.xla import materialize
 
 # Pairs of robots that differ which are looked at together. A choice.
 _WIDTH = 256
@@ -22,27 +23,38 @@ class Boxes(NamedTuple):
 
     Attributes:
         position: of their centres [m].
-        rotation: body from box.
+        rotation: body from box; None where all boxes stand square on their bodies.
         half_size: half edges [m].
     """
 
     position: Vec
-    rotation: Mat
+    rotation: Mat | None
     half_size: Vec
 
     @staticmethod
     def of(levels: Sequence[Level], dtype: Any) -> Boxes:
         """The shells of levels, one behind the other."""
         found = []
+        every = [level.shells.rotation for level in levels if level.shells is not None]
+        square = all(_is_identity(x) for x in every)
         for level in levels:
             if level.shells is not None:
                 own = level.shells
-                numbers = Boxes(own.position, own.rotation, own.half_size)
+                numbers = Boxes(own.position, None if square else own.rotation, own.half_size)
                 found.append(jax.tree.map(partial(_flat, level, own.count, dtype), numbers))
         lanes = max(x.shape[-1] for x in jax.tree.leaves(found))
         wide = lambda x: jnp.broadcast_to(x, (len(x), lanes))  # noqa: E731
         joined: Boxes = jax.tree.map(lambda *x: jnp.concatenate(list(map(wide, x))), *found)
         return joined
+
+
+def _is_identity(rotation: Mat) -> bool:
+    """Whether a rotation is known to be none while it is traced."""
+    return all(
+        isinstance(x, float) and x == (i == j)
+        for i, row in enumerate(rotation)
+        for j, x in enumerate(row)
+    )
 
 
 def _flat(level: Level, count: int, dtype: Any, x: Any) -> jax.Array:
@@ -78,18 +90,27 @@ class Meetings(NamedTuple):
         """Whether loops are to have a known length, so that they have derivatives."""
         return isinstance(self.count, int)
 
-    def at_bodies(self, x: jax.Array) -> jax.Array:
-        """`[nshell, lanes]` of each box's body, of `[nbody, lanes]`."""
-        counts = np.bincount(self.body, minlength=len(x))
+    def centers(self, position: Vec, rotation: Mat) -> Vec:
+        """`[nshell, lanes]` centres of the boxes [m], of `[nbody, lanes]` poses of the bodies."""
+        lanes, own = position[0].shape[1], self.boxes.position
+        counts = np.bincount(self.body, minlength=len(position[0]))
         if np.any(np.diff(self.body) < 0) or len(set(counts[1:].tolist())) > 1:
-            return x[self.body]
-        # As XLA:CPU has vectors for it.
-        lanes, each = x.shape[1], [counts[0], *counts[1:2]]
-        parts = [
-            jnp.broadcast_to(rows[:, None], (len(rows), n, lanes)).reshape(-1, lanes)
-            for rows, n in zip((x[:1], x[1:]), each, strict=False)
-        ]
-        return jnp.concatenate(parts)
+            position, rotation = jax.tree.map(lambda x: x[self.body], (position, rotation))
+            return vadd(position, matvec(rotation, own))
+        # Root and rows by themselves, box after box, as XLA:CPU has vectors for it.
+        parts = []
+        root, row = int(counts[0]), int(counts[-1])
+        for bodies, start, n in (slice(0, 1), 0, root), (slice(1, None), root, row):
+            if not n:
+                continue
+            at, turn = jax.tree.map(lambda x: x[bodies], (position, rotation))  # noqa: B023
+            place = [x[start:][: n * len(at[0])].reshape(-1, n, x.shape[-1]) for x in own]
+            each = [vadd(at, matvec(turn, tuple(x[:, k] for x in place))) for k in range(n)]
+            parts.append([jnp.stack([materialize(x[i]) for x in each], 1) for i in range(3)])
+        return tuple(
+            materialize(jnp.concatenate([x.reshape(-1, lanes) for x in component]))
+            for component in zip(*parts, strict=True)
+        )
 
     @staticmethod
     def alike(

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 
 from mjx_revolve.engine.kinematics import BodyFrames
 from mjx_revolve.engine.meetings import Boxes, Meetings
-from mjx_revolve.numerics.boxes import BoxPair, box_contact
+from mjx_revolve.numerics.boxes import BoxPair, box_contact, last_of, weight
 from mjx_revolve.numerics.spatial import (
     Mat,
     Scalar,
@@ -43,7 +43,7 @@ from mjx_revolve.numerics.spatial import (
     vscale,
     vsub,
 )
-from mjx_revolve.numerics.xla import fuse, take_lanes
+from mjx_revolve.numerics.xla import fuse, materialize, take_lanes
 
 # Contacts of one robot at a time. A choice: few robots have more.
 _MOST = 8
@@ -52,14 +52,16 @@ _MOST = 8
 _PAIRS, _ROBOTS = 32, 8
 # Pairs that are near which are listed at a time, where robots differ. A choice.
 _ROOM = 2048
+# Flags in a word.
+_WORD = 32
 # What no contact needs [m/s²].
 _NONE = -1e9
 # Overlap that is let be [m], the share of the rest that is parted in a step, and the top speed of
 # that [m/s]. Choices.
 _SLOP, _SHARE, _TOP = 5e-4, 1.0, 1.0
-# Steps towards the forces of several contacts, and the error at which they end [m]. Choices: one
-# step is exact for one contact.
-_STEPS, _ENOUGH = 12, 2e-5
+# Sweeps over the forces of several contacts, and the error at which they end [m]. Choices: one
+# sweep is exact for one contact.
+_SWEEPS, _ENOUGH = 30, 2e-5
 # Added to the inverse mass of a contact [1/kg], so that what is wedged between two modules has
 # finite forces. A choice: as if 50 kg gave way, where modules have some tens of grams.
 _SOFTNESS = 0.02
@@ -193,7 +195,6 @@ def _repeat(count: Any, most: int, body: Any, carry: Any, steady: bool) -> Any:
 
 def _append(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> Any:
     """A list with room for one more, and its length, with the values `[n]` where flags are set."""
-    number, end = jnp.arange(len(flags), dtype=jnp.int32), jnp.int32(len(flags))
 
     def write(k: Any, found: Any) -> Any:
         new = jax.lax.dynamic_slice(values, (k,), (1,))
@@ -203,23 +204,31 @@ def _append(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> An
         every = lambda k, x: (write(k, x), x[1] + flags[k].astype(jnp.int32))  # noqa: E731
         return jax.lax.cond(any_lane(flags), lambda: _loop(len(flags), every, found), lambda: found)
 
-    def after(k: Any) -> jax.Array:
-        return _least(jnp.where(flags & (number > k), number, end))
+    words = _pack_bits(flags)
+    count = len(words)
 
     def step(carry: Any) -> Any:
-        k, *found = carry
-        return after(k), write(k, found), found[1] + 1
+        """To the next word, or the next set bit of this one."""
+        k, word, *found = carry
+        done = word == 0
+        bit = jax.lax.population_count((word & -word) - 1)
+        place = jnp.where(done, 0, _WORD * k + bit)
+        found = write(place, found), found[1] + (1 - done.astype(jnp.int32))
+        after = jax.lax.dynamic_slice(words, (jnp.minimum(k + 1, count - 1),), (1,))[0]
+        return jnp.where(done, k + 1, k), jnp.where(done, after, word & (word - 1)), *found
 
-    return jax.lax.while_loop(lambda x: x[0] < end, step, (after(-1), *found))[1:]
+    return jax.lax.while_loop(lambda x: x[0] < count, step, (jnp.int32(0), words[0], *found))[2:]
 
 
-def _least(x: jax.Array) -> jax.Array:
-    """The least of `[n]`, by halves, as a fused step has no reductions."""
-    while x.shape[0] > 1:
-        middle = x.shape[0] // 2
-        tail = x[2 * middle :]
-        x = jnp.concatenate([jnp.minimum(x[:middle], x[middle : 2 * middle]), tail])
-    return x[0]
+def _pack_bits(flags: jax.Array) -> jax.Array:
+    """`[n / 32]` int32 of `[n]`: bit j of word k is flag 32 k + j."""
+    count = -(-len(flags) // _WORD)
+    bits = jnp.pad(flags.astype(jnp.int32), (0, count * _WORD - len(flags)))
+    bits = bits.reshape(count, _WORD)
+    words = bits[:, 0]
+    for j in range(1, _WORD):
+        words = words | (bits[:, j] << j)
+    return words
 
 
 def any_lane(found: jax.Array) -> jax.Array:
@@ -244,8 +253,8 @@ def _make_search(meetings: Meetings, bodies: Bodies) -> tuple[Any, Any]:
     lanes, dtype = bodies.now.position[0].shape[-1], bodies.now.position[0].dtype
     body = jnp.asarray(meetings.body, jnp.int32)
     boxes = meetings.boxes
-    place: BodyFrames = jax.tree.map(meetings.at_bodies, bodies.ahead)
-    center = vadd(place.position, matvec(place.rotation, boxes.position))
+    bodies = jax.tree.map(materialize, bodies)
+    center = meetings.centers(bodies.ahead.position, bodies.ahead.rotation)
     center = tuple(x.reshape(-1) for x in center)
     radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size)).reshape(-1)
     frames, shells = jax.tree.map(lambda x: x.reshape(-1), (bodies, boxes))
@@ -340,6 +349,8 @@ def _measure(given: tuple[_Given, ...], dt: float) -> list[jax.Array]:
     def pose(frame: BodyFrames, box: Boxes) -> tuple[Vec, Mat]:
         """Centres and rotations of boxes."""
         center = vadd(frame.position, matvec(frame.rotation, box.position))
+        if box.rotation is None:
+            return center, frame.rotation
         return center, matmul(frame.rotation, box.rotation)
 
     def compute(given: Any) -> Any:
@@ -422,7 +433,7 @@ class _Contacts:
         found = [jnp.zeros((self.count, force.shape[-1]), force.dtype)] * 6
         for body, unit in zip(self.bodies, self.unit, strict=True):
             for k in range(len(force)):
-                own = jnp.where(number == body[k], force[k], 0)
+                own = weight(number == body[k], force) * force[k]
                 found = [x + own * y[k] for x, y in zip(found, unit, strict=True)]
         return tuple(found)
 
@@ -437,63 +448,75 @@ class _Contacts:
     def solve(self, respond: Respond, rows: int) -> jax.Array:
         """The accelerations by all contacts, `Acceleration.robot` of so many rows.
 
-        Conjugate gradients within the bounds λ ≥ 0 (cf. Dostál 2009, Optimal Quadratic Programming
-        Algorithms, chapter 5): one step is exact for one contact, and each of several lessens
-        ½ λᵀ W λ - λᵀ need, and with it the energy.
+        Contacts take part one after the other, the one that misses most first: a column of W is
+        the response to its unit force. Those that take part are solved by projected Gauss-Seidel
+        (cf. Cottle, Pang and Stone 1992, The Linear Complementarity Problem, chapter 5), which is
+        exact for one contact, and whose steps each lessen ½ λᵀ W λ - λᵀ need, and with it the
+        energy. A robot that is done stays as it is, whatever its neighbours in the batch need.
         """
-        zero = jnp.zeros_like(self.need)
+        lanes = self.need.shape[-1]
 
-        def improve(now: Any) -> Any:
-            force, found, way, curve, total = now
-            slope = self.need - found
-            projected = jnp.where((force > 0) | (slope > 0), slope, 0)
-            # Conjugate to the last way, but where that led to a bound.
-            bend = _sum(way * curve)
-            share = _sum(projected * curve) / jnp.where(bend > 0, bend, 1)
-            way = projected - jnp.where(bend > 0, share, 0) * way
-            way = jnp.where((force > 0) | (way > 0), way, 0)
-            way = jnp.where(_sum(way * slope) > 0, way, projected)
-            change = respond(self._spread(way))
-            curve = self._gather(change.bodies) + _SOFTNESS * way
-            gain, bend = _sum(way * slope), _sum(way * curve)
-            longest = jnp.where(way < 0, -force / jnp.where(way < 0, way, -1), 1e30)
-            most = longest[0]
-            for k in range(1, len(longest)):
-                most = jnp.minimum(most, longest[k])
-            length = jnp.where(bend > 0, gain / jnp.where(bend > 0, bend, 1), 0)
-            stopped = length > most
-            # A robot that is done stays as it is, whatever its neighbours in the batch need.
-            length = jnp.where(self._is_open(force, found), jnp.minimum(length, most), 0)
-            force = jnp.maximum(force + length * way, 0)
-            force = jnp.where(stopped & (longest <= most), 0, force)
-            total = total + length * change.robot
-            way = jnp.where(stopped, 0, way)
-            return force, found + length * curve, way, curve, total
+        def sweep(columns: jax.Array, inverse: jax.Array, now: Any) -> Any:
+            old, moving = now
+            force, most = [old[k] for k in range(_MOST)], jnp.zeros(lanes, old.dtype)
+            for k in range(_MOST):
+                missing = self.need[k] - _sum([columns[j, k] * x for j, x in enumerate(force)])
+                new = jnp.maximum(force[k] + missing * inverse[k], 0)
+                force[k] = force[k] + moving * (new - force[k])
+                most = jnp.maximum(most, jnp.abs(force[k] - old[k]) * columns[k, k])
+            return jnp.stack(force), moving * weight(most * self.dt**2 > _ENOUGH, most)
+
+        def settle(force: jax.Array, columns: jax.Array, moving: jax.Array) -> jax.Array:
+            diagonal = jnp.stack([columns[k, k] for k in range(_MOST)])
+            taken = weight(diagonal > 0, diagonal)
+            inverse = taken / (diagonal + 1 - taken)
+            step = fuse(lambda now: sweep(columns, inverse, now), inline=True)
+
+            def end(_: Any, now: Any) -> Any:
+                return jax.lax.cond(any_lane(now[1] > 0), step, lambda x: x, now)
+
+            found: jax.Array = _loop(_SWEEPS, end, (force, moving))[0]
+            return found
+
+        def join(now: Any) -> Any:
+            """One contact more of each robot that misses any."""
+            force, columns, moved, missing, wanting = now
+            worst, better = missing[0], []
+            for k in range(1, _MOST):
+                better.append(weight(missing[k] > worst, worst))
+                worst = jnp.maximum(worst, missing[k])
+            chosen = jnp.stack(last_of(better)) * wanting
+            change = respond(self._spread(chosen))
+            own = self._gather(change.bodies) + _SOFTNESS * chosen
+            columns = (1 - chosen[:, None]) * columns + chosen[:, None] * own
+            moved = (1 - chosen[:, None]) * moved + chosen[:, None] * change.robot
+            force = settle(force, columns, wanting)
+            return force, columns, moved, *self._missing(force, columns)
 
         def step(_: Any, now: Any) -> Any:
-            return jax.lax.cond(
-                any_lane(self._is_open(now[0], now[1])),
-                fuse(improve, inline=True),
-                lambda x: x,
-                now,
-            )
+            return jax.lax.cond(any_lane(now[-1] > 0), fuse(join, inline=True), lambda x: x, now)
 
-        start = zero, zero, zero, zero, jnp.zeros((rows, zero.shape[-1]), zero.dtype)
-        return _loop(_STEPS, step, start)[-1]
+        force = jnp.zeros_like(self.need)
+        columns = jnp.zeros((_MOST, *force.shape), force.dtype)
+        moved = jnp.zeros((_MOST, rows, lanes), force.dtype)
+        start = force, columns, moved, *self._missing(force, columns)
+        force, _, moved, *_ = _loop(_MOST, step, start)
+        return _sum([force[k] * moved[k] for k in range(_MOST)])
 
-    def _is_open(self, force: jax.Array, found: jax.Array) -> jax.Array:
-        """`[lanes]` whether forces are not good enough yet."""
-        missing = self.need - found
-        wrong = jnp.where(force > 0, jnp.abs(missing), missing) * self.dt**2 > _ENOUGH
-        lane = wrong[0]
-        for k in range(1, len(wrong)):
-            lane = lane | wrong[k]
-        return lane
+    def _missing(self, force: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """What contacts miss that do not take part [m/s²]; `[lanes]` 1 where any misses much."""
+        missing, worst = [], jnp.full_like(force[0], _NONE)
+        for k in range(_MOST):
+            own = self.need[k] - _sum([columns[j, k] * force[j] for j in range(_MOST)])
+            taken = weight(columns[k, k] > 0, own)
+            missing.append((1 - taken) * own + taken * _NONE)
+            worst = jnp.maximum(worst, missing[k])
+        return jnp.stack(missing), weight(worst * self.dt**2 > _ENOUGH, worst)
 
 
-def _sum(x: jax.Array) -> jax.Array:
-    """Over the contacts; written out, as a fused step has no reductions."""
-    total = x[0]
-    for k in range(1, len(x)):
-        total = total + x[k]
+def _sum(xs: list[jax.Array]) -> jax.Array:
+    """Written out, as a fused step has no reductions."""
+    total = xs[0]
+    for x in xs[1:]:
+        total = total + x
     return total

@@ -153,9 +153,10 @@ class SingleTree:
 
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
         """Ones, `[npart, nbody, lanes]` of each group and level."""
+        axes = 3 if self.world.near_surface else 1
 
         def ones(level: Level) -> tuple[jax.Array, ...]:
-            return tuple(jnp.ones((n, level.count, *lanes), dtype) for n in level.carrying)
+            return tuple(jnp.ones((n, level.count, *lanes), dtype) for n in level.carrying(axes))
 
         return ones(self.root), tuple(map(ones, self.below))
 

@@ -45,7 +45,8 @@ class State(NamedTuple):
         command: of the thrusters, behind their lag, `[nthruster, lanes]` [-]; empty without.
         submerged: submerged fractions of the parts with added mass at the step before, by groups:
             (the root's `[npart, 1, lanes]`, those of the bodies below it: `[npart, nbody, lanes]`
-            for each level, or `[rows, npart, 1, lanes]`) [-]; empty without added mass.
+            for each level, or `[rows, npart, 1, lanes]`) [-]; empty without added mass. Near the
+            surface (`World.near_surface`) shares of what they carry along x, then y, then z.
         clearance: least distance by which boxes of a robot that can meet stay apart, `[lanes]` [m];
             not positive: unknown. Empty where robots differ or have no such boxes.
     """

@@ -380,7 +380,9 @@ def _carried(assembly: Assembly, turn: np.ndarray, position: np.ndarray) -> Carr
     table, density = assembly.fluid, assembly.world.density
     angular, cross, linear = _carried_about(table, density, turn, position)
     own: Any = density * table.carried_mass, density * table.carried_inertia
-    return CarriedWater(SpatialInertia(_sym(angular), _mat(cross), _sym(linear)), *own)
+    entrained = table.entrained if assembly.world.near_surface else None
+    inertia = SpatialInertia(_sym(angular), _mat(cross), _sym(linear))
+    return CarriedWater(inertia, own[0], own[1], entrained)
 
 
 def _mounts(assembly: Assembly, turn: np.ndarray, position: np.ndarray) -> ThrusterMounts:

@@ -21,6 +21,7 @@ from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology, trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.early_checks import refuse_world
 from mjx_revolve.episodes.fitness import (
     Fitness,
     fit_body,
@@ -198,22 +199,6 @@ def champion_number(folder: Path) -> int:
         InputError: there is no champion, or bodies did not evolve.
     """
     return RunReader(folder).load_champion().individual
-
-
-def refuse_world(world: str | None, modules: str | Path | None = None) -> None:
-    """Refuses a world, or modules, for a run, which names its own.
-
-    Raises:
-        InputError: there is one.
-    """
-    if world is not None:
-        raise InputError(
-            f"world: expected none: a champion swims in the world it evolved in; found {world!r}"
-        )
-    if modules is not None:
-        raise InputError(
-            f"modules: expected none: a run's configuration names its own; found {str(modules)!r}"
-        )
 
 
 def _key(config: Config, seed: int | None) -> jax.Array:

@@ -56,8 +56,9 @@ from mjx_revolve.episodes.starts import (
 from mjx_revolve.episodes.tasks import Task, Track
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.adjoint import differentiate_as
+from mjx_revolve.numerics.executables import StoredProgram
 from mjx_revolve.numerics.spatial import matvec, quat_to_mat
-from mjx_revolve.numerics.xla import is_traced, jit, over_chunks
+from mjx_revolve.numerics.xla import is_traced, over_chunks
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.flow import Water, flow
 from mjx_revolve.water.world import World
@@ -228,7 +229,27 @@ class EpisodeSpec(ABC):
 
     @cached_property
     def _jitted(self) -> Any:
-        return jit(self._score)
+        return self.keep(self._score, "score")
+
+    def keep(self, fun: Callable[..., Any], name: str, *more: Any) -> StoredProgram:
+        """A compiled function of this specification, kept on disk unless a user's code is in it.
+
+        Args:
+            fun: the function.
+            name: tells it from others of this specification.
+            *more: what it depends on besides.
+        """
+        config = self.config
+        if config.task.is_user_code or config.controller.is_user_code:
+            return StoredProgram(fun, None)
+        settings = config.task.model_dump_json(), config.controller.model_dump_json()
+        made_of = name, settings, config.engine, self.world, self._bodies_key, more
+        return StoredProgram(fun, made_of)
+
+    @property
+    @abstractmethod
+    def _bodies_key(self) -> Any:
+        """What programs depend on of the bodies."""
 
     def _score(self, bodies: Any, population: jax.Array, key: jax.Array) -> Any:
         """Scores and measures `[P]` of a population of one body."""

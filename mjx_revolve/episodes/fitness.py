@@ -54,7 +54,7 @@ from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import Starts, episode_context, pick_water
 from mjx_revolve.episodes.tasks import Task, find_task
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import jit, over_chunks
+from mjx_revolve.numerics.xla import over_chunks
 from mjx_revolve.water.drag import DRAG_LAWS, find_drag_law
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World, load_world
@@ -87,6 +87,12 @@ class Fitness(EpisodeSpec):
 
     def _geometry(self, bodies: Any) -> BodyGeometry:
         return self.geometry
+
+    @property
+    def _bodies_key(self) -> Any:
+        body = self.robot.morphology
+        listening = _listening(self.config, read_modules(self.config), body)
+        return body, listening.model_dump_json()
 
     def __call__(self, population: Any, key: jax.Array) -> jax.Array:
         """Scores a population.
@@ -264,6 +270,10 @@ class MixedFitness(EpisodeSpec):
     def _geometry(self, bodies: PackedBodies) -> BodyGeometry:
         return bodies.figure
 
+    @property
+    def _bodies_key(self) -> Any:
+        return self.capacity, self.touches, self.controller_settings.model_dump_json()
+
     def build(self, morphology: Morphology) -> Robot:
         """Compiles a body for this world, trimmed as the configuration says."""
         return _build(self.config, self.world, morphology)
@@ -436,7 +446,7 @@ class MixedFitness(EpisodeSpec):
 
             return over_chunks(trace)(jnp.arange(len(population), dtype=jnp.int32), trial)
 
-        return jit(run)
+        return self.keep(run, "trace")
 
     def water(self, key: jax.Array, trial: int = 0) -> Water | None:
         """The water of one of a key's episodes at a replay's rows; see `Fitness.water`."""

@@ -12,7 +12,7 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ import numpy as np
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import check_no_sweep
 from mjx_revolve.inputs.errors import InputError, show
-from mjx_revolve.inputs.files import check_path, read_file
+from mjx_revolve.inputs.files import SWEEP, check_path, read_file
 from mjx_revolve.inputs.schema import LARGEST
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
@@ -42,6 +42,22 @@ def find_run(path: str | Path) -> Path:
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{path}: expected a run folder; found no config.yaml in it")
     return folder
+
+
+def check_runs(names: Sequence[str | Path]) -> None:
+    """Refuses names of which nothing can be read as runs, or as sweeps.
+
+    Raises:
+        InputError: a folder is missing, or there is nothing of a run in any.
+    """
+    for name in names:
+        if not check_path(name).is_dir():
+            found = "a file" if Path(name).exists() else "none"
+            raise InputError(f"{name}: expected a run folder; found {found}")
+    files = ("config.yaml", "run.json", "metrics.csv", "champion", SWEEP)
+    folders = [f for f in map(Path, names) for f in (f, f.parent)]
+    if not any((folder / file).exists() for folder in folders for file in files):
+        raise InputError(f"{names[0]}: expected a run folder; found nothing of a run")
 
 
 @dataclass

@@ -14,8 +14,6 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.spatial.distance import cdist
 
 from mjx_revolve.episodes.bodies_config import ArchiveConfig
 from mjx_revolve.inputs.errors import InputError
@@ -82,6 +80,8 @@ def _tessellate(cells: int, axes: int, rng: np.random.Generator) -> np.ndarray:
     It begins with points that are spread evenly: those of Roberts, "The unreasonable effectiveness
     of quasirandom sequences", 2018, shifted by chance.
     """
+    from scipy.spatial import KDTree
+
     samples = rng.random((_SAMPLES * cells, axes))
     ratio = 1.0
     for _ in range(64):  # the root of x^(axes + 1) = x + 1, to the last bit
@@ -127,6 +127,8 @@ def cell_of(archive: Archive, points: np.ndarray) -> np.ndarray:
         indices = np.minimum(steps.astype(int), np.array(archive.shape) - 1)
         found[known] = np.ravel_multi_index(tuple(indices.T), archive.shape)
     elif known.any():
+        from scipy.spatial.distance import cdist
+
         centers = scale_points(archive, archive.centers)
         found[known] = cdist(scale_points(archive, points[known]), centers).argmin(1)
     return found

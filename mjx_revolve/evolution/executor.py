@@ -19,15 +19,17 @@ from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
+    from mjx_revolve.evolution.processes import LocalWorker
 
 
 def choose_workers(config: Config) -> int:
-    """How many workers a run gets: one for each core, but none without a block of its own."""
-    from mjx_revolve.evolution.blocks import block_size
+    """How many workers a run gets on CPUs: one for each core, but none without a block of its own.
 
-    block = block_size(config.task.trials)
-    if block is None or config.colony is not None:  # a world is stepped as a whole
+    It needs no JAX.
+    """
+    if config.colony is not None:  # a world is stepped as a whole
         return 1
+    block = max(1, runtime.LANES // config.task.trials)
     blocks = -(-config.evolution.population_size // block)
     if config.bodies is not None:
         count = config.bodies.selection.offspring or config.evolution.population_size
@@ -41,6 +43,7 @@ def make_executor(
     workers: int | None = None,
     make_fitness: MakeFitness | None = None,
     cluster: str | None = None,
+    started: list[LocalWorker] | None = None,
 ) -> Executor:
     """Builds a fitness and starts the workers that share its work, or finds them.
 
@@ -52,6 +55,7 @@ def make_executor(
             its name, see `jobs.MakeFitness`. None: the package's own. By default another one has no
             workers.
         cluster: a Dask scheduler's address, or the path of its scheduler file: its workers score.
+        started: from `processes.start_workers`, which are taken if they are as many as asked for.
 
     Returns:
         The executor; to be closed, or used in a `with`.
@@ -62,11 +66,16 @@ def make_executor(
     """
     cache = runtime.prepare_process()
     from mjx_revolve.episodes.config import load_config
+    from mjx_revolve.numerics.xla import on_cpu
 
     if isinstance(config, str | Path):
         config = load_config(config)
     if workers is None:
-        workers = 1 if make_fitness else choose_workers(config)
+        workers = 1 if make_fitness or not on_cpu() else choose_workers(config)
+    if started and (len(started) != workers or cluster):
+        for worker in started:
+            worker.end()
+        started = None
     if workers == 1 and cluster is None:
         from mjx_revolve.evolution.blocks import choose_block
 
@@ -77,9 +86,9 @@ def make_executor(
         from mjx_revolve.evolution.cluster import ClusterExecutor
 
         return ClusterExecutor(config, make_fitness, cluster)
-    from mjx_revolve.evolution.processes import ProcessExecutor
+    from mjx_revolve.evolution.processes import ProcessExecutor, start_workers
 
-    return ProcessExecutor(config, make_fitness, workers, cache)
+    return ProcessExecutor(config, make_fitness, started or start_workers(workers, cache), cache)
 
 
 def _expect_cpu(option: str) -> None:

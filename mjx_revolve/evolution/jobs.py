@@ -143,7 +143,7 @@ def compile_job(job: Job, fitness: Any) -> None:
     from mjx_revolve.evolution.fingerprints import hash_text
 
     example = example_block(fitness, json.loads(job.config)["evolution"]["population_size"])
-    with runtime.compile_lock(hash_text(function_name(job.make_fitness), job.config)):
+    with runtime.compile_lock("job", hash_text(function_name(job.make_fitness), job.config)):
         evaluate_block(fitness, example, jax.random.key(0))
 
 

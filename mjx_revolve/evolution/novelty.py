@@ -7,7 +7,6 @@ Evolutionary Computation 19(2), 2011.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 
 def novelty(
@@ -25,6 +24,8 @@ def novelty(
     Returns:
         `[N]` Euclidean distances; 0 where there is no neighbour.
     """
+    from scipy.spatial.distance import cdist
+
     found = np.zeros(len(points))
     placed = np.isfinite(points).all(1)
     own = points[placed] / scale

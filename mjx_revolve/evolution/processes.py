@@ -173,6 +173,36 @@ class LocalWorker:
         self._log.close()
 
 
+def start_workers(count: int, cache: Path | None) -> list[LocalWorker]:
+    """Starts workers, which import what they need and wait for a job.
+
+    Args:
+        count: how many. When they are at least as many as there are cores, each is pinned to a
+            core; fewer are left to the system, so that several such runs on one host do not crowd
+            on the same cores.
+        cache: the compilation cache's folder.
+
+    Raises:
+        WorkerError: the system refuses to start so many.
+    """
+    cores = runtime.list_cores()
+    pinned = bool(cores) and count >= len(cores)
+    workers: list[LocalWorker] = []
+    try:
+        for index in range(count):
+            workers.append(LocalWorker(cores[index % len(cores)] if pinned else None, cache))
+    except BaseException as error:
+        for worker in workers:
+            worker.end()
+        if not isinstance(error, OSError):
+            raise
+        raise WorkerError(
+            f"expected to start {count} workers; found after {len(workers)}: "
+            f"{error.strerror or error}"
+        ) from None
+    return workers
+
+
 class ProcessExecutor(WorkerExecutor[LocalWorker]):
     """Scores with worker processes on this machine.
 
@@ -181,45 +211,34 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
     """
 
     def __init__(
-        self, config: Config, make_fitness: MakeFitness | None, count: int, cache: Path | None
+        self,
+        config: Config,
+        make_fitness: MakeFitness | None,
+        workers: list[LocalWorker],
+        cache: Path | None,
     ) -> None:
-        """Starts the workers.
+        """Gives the workers their job.
 
         Args:
             config: of the run.
             make_fitness: see `executor.make_executor`.
-            count: how many workers. When they are at least as many as there are cores, each is
-                pinned to a core; fewer are left to the system, so that several such runs on one
-                host do not crowd on the same cores.
+            workers: from `start_workers`; they end with this.
             cache: the compilation cache's folder.
-
-        Raises:
-            WorkerError: the system refuses to start so many.
         """
-        self.workers: list[LocalWorker] = []
+        self.workers = workers
         # Theirs, kept here, as they are killed.
         self._scratch = tempfile.TemporaryDirectory(prefix=SCRATCH)
         self._cache = cache
         self._times: deque[float] = deque(maxlen=101)
         self._false_starts = 0
-        cores = runtime.list_cores()
-        pinned = bool(cores) and count >= len(cores)
         try:
-            for index in range(count):
-                core = cores[index % len(cores)] if pinned else None
-                self.workers.append(LocalWorker(core, cache))
             job = make_job(config, make_fitness)
             for worker in self.workers:
                 worker.send((job, self._scratch.name))
             super().__init__(config, job)
-        except BaseException as error:
-            begun = len(self.workers)
+        except BaseException:
             self.close()
-            if not isinstance(error, OSError) or begun == count:
-                raise
-            raise WorkerError(
-                f"expected to start {count} workers; found after {begun}: {error.strerror or error}"
-            ) from None
+            raise
 
     @property
     def num_workers(self) -> int:

@@ -11,14 +11,12 @@ import difflib
 import inspect
 import json
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from evosax.algorithms import algorithms, distribution_based_algorithms
 
 from mjx_revolve.episodes.bodies_config import LearningConfig
 from mjx_revolve.episodes.config import EvolutionConfig
@@ -26,9 +24,6 @@ from mjx_revolve.inputs.errors import InputError
 
 # SV_CMA_ES and SV_Open_ES evolve several populations side by side, which is another loop.
 _NOT_OFFERED = ("SV_CMA_ES", "SV_Open_ES")
-STRATEGIES: dict[str, type] = {
-    name: kind for name, kind in algorithms.items() if name not in _NOT_OFFERED
-}
 # Names that people use, beside evosax's. Case, `-` and `_` do not matter anyway.
 _OTHER_NAMES = {
     "de": "DifferentialEvolution",
@@ -45,6 +40,21 @@ FAILED_SCORE = -1e6
 STD_FLOOR = 1e-3
 # Smallest difference between scores that XLA does not flush to zero, with room to spare.
 _SMALLEST_GAP = 1e-30
+
+
+@cache
+def _strategies() -> dict[str, type]:
+    """Evosax's classes by name: imported, in half a second, while workers start."""
+    from evosax.algorithms import algorithms
+
+    return {name: kind for name, kind in algorithms.items() if name not in _NOT_OFFERED}
+
+
+def __getattr__(name: str) -> dict[str, type]:
+    """`STRATEGIES`, evosax's classes by name."""
+    if name == "STRATEGIES":
+        return _strategies()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def losses_from_scores(scores: np.ndarray, penalty: float | None = None) -> np.ndarray:
@@ -200,13 +210,13 @@ def find_strategy(name: str) -> str:
     Raises:
         InputError: there is no such strategy.
     """
-    known = {_plain(known): known for known in STRATEGIES} | _OTHER_NAMES
+    known = {_plain(known): known for known in _strategies()} | _OTHER_NAMES
     if _plain(name) in known:
         return known[_plain(name)]
     near = difflib.get_close_matches(_plain(name), known, n=1, cutoff=0.5)
     hint = f"; did you mean {known[near[0]]}?" if near else ""
     raise InputError(
-        f"evolution.strategy: expected one of {', '.join(STRATEGIES)}; found {name!r}{hint}"
+        f"evolution.strategy: expected one of {', '.join(_strategies())}; found {name!r}{hint}"
     )
 
 
@@ -218,7 +228,9 @@ def _constructor_settings(
     evosax's defaults assume a step size of 1; ours follow `std_init`, so that every strategy moves
     at all within the some ten generations that a robot can afford.
     """
-    takes = inspect.signature(STRATEGIES[name]).parameters
+    import optax
+
+    takes = inspect.signature(_strategies()[name]).parameters
     keywords: dict[str, Any] = {}
     used: dict[str, float] = {}
     if "std_schedule" in takes:
@@ -269,6 +281,8 @@ def make_strategy(config: EvolutionConfig | LearningConfig, num_genes: int) -> S
 def _make_strategy(
     name: str, size: int, std_init: float, params_json: str, num_genes: int
 ) -> Strategy:
+    from evosax.algorithms import distribution_based_algorithms
+
     settings: dict[str, Any] = json.loads(params_json)
     for key in ("learning_rate", "std_decay"):
         value = settings.get(key, 1.0)
@@ -283,7 +297,7 @@ def _make_strategy(
             f"found {size}"
         )
     try:
-        algorithm = STRATEGIES[name](
+        algorithm = _strategies()[name](
             population_size=size, solution=jnp.zeros(num_genes), **keywords
         )
     except AssertionError as error:  # how evosax refuses a population size

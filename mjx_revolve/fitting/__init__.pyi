@@ -1,12 +1,12 @@
-from .identify import Plan as Plan
+from .identify import MotionPlan as MotionPlan
 from .identify import plan_motions as plan_motions
-from .problem import Settings as Settings
-from .recording import Recording as Recording
-from .recording import Signal as Signal
+from .problem import FitSettings as FitSettings
+from .recording import RobotRecording as RobotRecording
+from .recording import TimeSeries as TimeSeries
 from .recording import load_recording as load_recording
 from .result import Fit as Fit
+from .result import FittedValue as FittedValue
 from .result import Prediction as Prediction
-from .result import Value as Value
 from .result import fit_robot as fit_robot
 from .synthetic import make_noisy as make_noisy
 from .synthetic import simulate_signals as simulate_signals

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import t as student
 
-from mjx_revolve.fitting.problem import NOISE, START, Point, Problem
+from mjx_revolve.fitting.problem import NOISE, START, FitProblem, Point
 
 LEVEL = 0.95
 """Of intervals."""
@@ -45,7 +45,7 @@ class System(NamedTuple):
 
 
 @dataclass(frozen=True)
-class State:
+class FitState:
     """The search between two steps.
 
     Attributes:
@@ -90,13 +90,13 @@ class Model:
     track: np.ndarray = field(repr=False)
 
 
-def linearize(problem: Problem, point: Point) -> Model:
+def linearize(problem: FitProblem, point: Point) -> Model:
     """The problem near a point."""
     return Model(*problem.linearize(point))
 
 
 def costs_of(
-    problem: Problem, point: Point, values: list[np.ndarray], noise: dict[str, float]
+    problem: FitProblem, point: Point, values: list[np.ndarray], noise: dict[str, float]
 ) -> tuple[np.ndarray, float]:
     """Half the sums of squares, wild ones less: `[K, R]` of windows, and of the priors."""
     begun = problem.drive.resets[:, None]
@@ -113,7 +113,7 @@ def costs_of(
 
 
 def normal_equations(
-    problem: Problem, model: Model, point: Point, noise: dict[str, float]
+    problem: FitProblem, model: Model, point: Point, noise: dict[str, float]
 ) -> System:
     """Fisher's information of what is fitted, and the gradient."""
     count, own, recordings = len(problem.parameters), len(problem.local), len(problem.recordings)
@@ -155,12 +155,12 @@ def normal_equations(
     return System((matrix + matrix.T) / 2, slope, starts)
 
 
-def prior_matrix(problem: Problem) -> np.ndarray:
+def prior_matrix(problem: FitProblem) -> np.ndarray:
     """`[P, P]` information of the priors of the free numbers."""
     return np.diag([p.spread**-2.0 for p in problem.parameters])
 
 
-def step(problem: Problem, state: State, system: System) -> tuple[Point, float]:
+def step(problem: FitProblem, state: FitState, system: System) -> tuple[Point, float]:
     """A damped step, and how far it leads over what the numbers are uncertain by."""
     count, point = len(problem.parameters), state.point
     matrix, slope = system.matrix.copy(), system.slope.copy()
@@ -183,7 +183,7 @@ def step(problem: Problem, state: State, system: System) -> tuple[Point, float]:
     return Point(free, local, starts), float(np.abs(move / spread)[:count].max(initial=0.0))
 
 
-def estimate_noise(problem: Problem, values: list[np.ndarray], used: float) -> dict[str, float]:
+def estimate_noise(problem: FitProblem, values: list[np.ndarray], used: float) -> dict[str, float]:
     """Standard deviations by kind, robust against wild frames; `used`: numbers fitted."""
     squares: dict[str, list[np.ndarray]] = {}
     for channel, left in zip(problem.channels, values, strict=True):
@@ -205,7 +205,7 @@ def estimate_noise(problem: Problem, values: list[np.ndarray], used: float) -> d
 
 
 def _widened(
-    problem: Problem, values: list[np.ndarray], noise: dict[str, float]
+    problem: FitProblem, values: list[np.ndarray], noise: dict[str, float]
 ) -> dict[str, float]:
     """The noise, of kinds with few measurements at least what is left of them."""
     found = dict(noise)
@@ -220,7 +220,7 @@ def _widened(
     return found
 
 
-def numbers_used(problem: Problem, system: System) -> float:
+def numbers_used(problem: FitProblem, system: System) -> float:
     """How many numbers the data have determined: the trace of information over information."""
     count = len(problem.parameters)
     whole = system.matrix.copy()
@@ -232,7 +232,7 @@ def numbers_used(problem: Problem, system: System) -> float:
     return used
 
 
-def correlation(problem: Problem, values: list[np.ndarray]) -> dict[str, float]:
+def correlation(problem: FitProblem, values: list[np.ndarray]) -> dict[str, float]:
     """By how much the residuals' correlation inflates variances, by kind.
 
     In time by (1 + ρ) / (1 - ρ) of neighbouring frames; within a frame, as of marks that a wrong
@@ -272,7 +272,7 @@ def correlation(problem: Problem, values: list[np.ndarray]) -> dict[str, float]:
     return found
 
 
-def begin(problem: Problem, seed: int) -> State:
+def begin(problem: FitProblem, seed: int) -> FitState:
     """The first state: the best of some draws of the prior and, where unknown, of headings."""
     origin = problem.origin()
     noise = {channel.kind: NOISE[channel.kind] for channel in problem.channels}
@@ -292,7 +292,7 @@ def begin(problem: Problem, seed: int) -> State:
         ]
     none = np.zeros(problem.drive.resets.shape)
     if len(points) == 1:
-        return State(origin, noise, none)
+        return FitState(origin, noise, none)
     costs = _costs(problem, points, noise)
     best = origin
     if problem.free_heading.any():
@@ -303,7 +303,7 @@ def begin(problem: Problem, seed: int) -> State:
         problem.roots[:] = _turned(problem.roots, starts[:, 5])
     else:
         best = points[int(np.argmin(costs.sum(1)))]
-    return State(best, noise, none)
+    return FitState(best, noise, none)
 
 
 def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -314,7 +314,7 @@ def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return found
 
 
-def _costs(problem: Problem, points: list[Point], noise: dict[str, float]) -> np.ndarray:
+def _costs(problem: FitProblem, points: list[Point], noise: dict[str, float]) -> np.ndarray:
     """`[points, R]` sums of squares, wild ones less."""
     tracks = problem.simulate(points)
     found = np.zeros((len(points), len(problem.recordings)))
@@ -326,7 +326,7 @@ def _costs(problem: Problem, points: list[Point], noise: dict[str, float]) -> np
     return found
 
 
-def advance(problem: Problem, state: State, model: Model) -> tuple[State, Model]:
+def advance(problem: FitProblem, state: FitState, model: Model) -> tuple[FitState, Model]:
     """One step of the search; the damping grows until a step lowers the cost."""
     if not state.inflated and state.moved < _TOLERANCE:
         state = replace(state, inflated=True, damping=0 * state.damping, common=0.0)
@@ -384,14 +384,14 @@ class Estimate:
     noise: dict[str, float]
     inflation: dict[str, float]
 
-    def interval(self, problem: Problem, k: int) -> tuple[float, float, float]:
+    def interval(self, problem: FitProblem, k: int) -> tuple[float, float, float]:
         """Value, lower and upper end of a free number."""
         parameter, half = problem.parameters[k], self.quantile * np.sqrt(self.covariance[k, k])
         low, middle, high = (parameter.value(self.offsets[k] + x) for x in (-half, 0.0, half))
         return middle, low, high
 
 
-def estimate(problem: Problem, state: State, model: Model) -> Estimate:
+def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
     """Values and their covariance at the end of a search."""
     count = len(problem.parameters)
     inflation = correlation(problem, model.values)

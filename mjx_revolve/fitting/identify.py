@@ -12,8 +12,8 @@ from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.fitting.estimate import Model, linearize, normal_equations
 from mjx_revolve.fitting.parameters import Parameter
-from mjx_revolve.fitting.problem import NOISE, Problem, Settings, make_problem
-from mjx_revolve.fitting.recording import Recording, Signal
+from mjx_revolve.fitting.problem import NOISE, FitProblem, FitSettings, make_problem
+from mjx_revolve.fitting.recording import RobotRecording, TimeSeries
 from mjx_revolve.inputs.errors import InputError
 
 # A number is found where the data leave less than this share of what was not known of it, and a
@@ -86,7 +86,7 @@ def is_found(parameter: Parameter, variance: float) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class PlannedMotion:
     """Something to have a robot do.
 
     Attributes:
@@ -97,12 +97,12 @@ class Motion:
     """
 
     words: str
-    recording: Recording
+    recording: RobotRecording
     velocity: np.ndarray
     turn: np.ndarray
 
 
-def list_motions(robot: Robot, settings: Settings) -> list[Motion]:
+def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
     """A catalogue: coast-downs, releases, steps of thrusters, sines of hinges.
 
     Args:
@@ -115,14 +115,16 @@ def list_motions(robot: Robot, settings: Settings) -> list[Motion]:
     hinges = [modules[k].name for k in robot.morphology.hinges]
     parts = {modules[k].name: modules[k].kind.parts[i] for k, i in robot.morphology.thrusters}
     jets = {n: part.thruster for n, part in parts.items() if part.thruster is not None}
-    still = {n: Signal(time, 0 * time) for n in ("x", "y", "z", "yaw", "roll", "pitch")}
-    found: list[Motion] = []
+    still = {n: TimeSeries(time, 0 * time) for n in ("x", "y", "z", "yaw", "roll", "pitch")}
+    found: list[PlannedMotion] = []
 
     def add(words: str, commands: dict[str, np.ndarray], velocity: Sequence[float] = (0,) * 6,
             turn: Sequence[float] = (0, 0, 0)) -> None:  # fmt: skip
-        signals = still | {f"command.{n}": Signal(time, x) for n, x in commands.items()}
-        recording = Recording(f"motion {len(found) + 1}", signals)
-        found.append(Motion(words, recording, np.array(velocity, float), np.array(turn, float)))
+        signals = still | {f"command.{n}": TimeSeries(time, x) for n, x in commands.items()}
+        recording = RobotRecording(f"motion {len(found) + 1}", signals)
+        found.append(
+            PlannedMotion(words, recording, np.array(velocity, float), np.array(turn, float))
+        )
 
     for axis, way in enumerate(("along x", "along y", "along z")):
         push = np.eye(6)[axis] * length
@@ -151,8 +153,8 @@ def list_motions(robot: Robot, settings: Settings) -> list[Motion]:
 
 
 def motion_problem(
-    robot: Robot, motions: Sequence[Motion], free: Sequence[str], settings: Settings
-) -> Problem:
+    robot: Robot, motions: Sequence[PlannedMotion], free: Sequence[str], settings: FitSettings
+) -> FitProblem:
     """Motions as recordings without measurements: what they would tell, not what they told."""
     whole = replace(settings, held_out=0.0, window=settings.duration)
     problem = make_problem(robot, [m.recording for m in motions], free, whole)
@@ -164,7 +166,7 @@ def motion_problem(
     return problem
 
 
-def information_of(problem: Problem) -> np.ndarray:
+def information_of(problem: FitProblem) -> np.ndarray:
     """`[R, P, P]` what each recording of a problem would tell by itself, with usual noise."""
     model = linearize(problem, problem.origin())
     count, own = len(problem.parameters), len(problem.local)
@@ -181,7 +183,7 @@ def information_of(problem: Problem) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Plan:
+class MotionPlan:
     """A programme of motions, the most telling first.
 
     Attributes:
@@ -191,7 +193,7 @@ class Plan:
         unknown: what stays unknown after all.
     """
 
-    motions: tuple[Motion, ...]
+    motions: tuple[PlannedMotion, ...]
     spreads: np.ndarray
     parameters: tuple[Parameter, ...]
     unknown: tuple[Unknown, ...]
@@ -200,10 +202,10 @@ class Plan:
 def plan_motions(
     robot: Robot,
     free: Sequence[str],
-    settings: Settings,
+    settings: FitSettings,
     known: np.ndarray | None = None,
     count: int | None = None,
-) -> Plan:
+) -> MotionPlan:
     """A short programme of motions that tells free numbers apart: D-optimal, one by one.
 
     Args:
@@ -224,7 +226,7 @@ def plan_motions(
     parameters = problem.parameters
     total = np.zeros((len(parameters),) * 2) if known is None else known.copy()
     prior = np.diag([p.spread**-2.0 for p in parameters])
-    chosen: list[Motion] = []
+    chosen: list[PlannedMotion] = []
     spreads = []
     wanted = settings.motions if count is None else count
     for _ in range(min(wanted, len(motions))):
@@ -235,4 +237,4 @@ def plan_motions(
         chosen.append(motions[best])
         spreads.append(np.sqrt(np.diag(np.linalg.inv(total + prior))))
     unknown = tuple(find_unknown(parameters, total))
-    return Plan(tuple(chosen), np.array(spreads), parameters, unknown)
+    return MotionPlan(tuple(chosen), np.array(spreads), parameters, unknown)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_revolve.engine.kinematics import body_poses
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.fitting.recording import Mark
+from mjx_revolve.fitting.recording import MarkedPoint
 from mjx_revolve.inputs.errors import InputError
 
 # Marks fit a robot if they are so far off at most, in lengths of the robot, and are swapped or
@@ -22,7 +22,7 @@ _MISFIT, _BETTER = 0.1, 3.0
 class MarkPoints:
     """Where marks are on a robot, for given angles of its hinges."""
 
-    def __init__(self, robot: Robot, marks: Sequence[Mark]) -> None:
+    def __init__(self, robot: Robot, marks: Sequence[MarkedPoint]) -> None:
         """Finds the bodies that carry them: of a module with a hinge, the part that moves."""
         self.robot, table, assembly = robot, robot.fluid, robot.assembly
         last = [int(np.flatnonzero(table.module == mark.module)[-1]) for mark in marks]

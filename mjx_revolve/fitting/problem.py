@@ -28,7 +28,7 @@ from mjx_revolve.fitting.parameters import (
     with_values,
 )
 from mjx_revolve.fitting.poses import MarkPoints, check_marks, fit_rigid, rest_height, smooth
-from mjx_revolve.fitting.recording import Recording
+from mjx_revolve.fitting.recording import RobotRecording
 from mjx_revolve.fitting.simulation import ROOT, Drive, simulate_windows
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import Integer, Number, checked
@@ -53,7 +53,7 @@ NOISE = {"position": 0.005, "attitude": 0.02, "marks": 0.005, "angles": 0.02, "g
 
 
 @checked
-class Settings:
+class FitSettings:
     """How a fit goes about it.
 
     Attributes:
@@ -120,7 +120,7 @@ class Point:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class FitProblem:
     """A robot, what is free of it, and recordings.
 
     Attributes:
@@ -145,8 +145,8 @@ class Problem:
     robot: Robot
     parameters: tuple[Parameter, ...]
     local: tuple[str, ...]
-    recordings: tuple[Recording, ...]
-    settings: Settings
+    recordings: tuple[RobotRecording, ...]
+    settings: FitSettings
     begin: np.ndarray
     end: np.ndarray
     fitted_until: np.ndarray
@@ -297,8 +297,8 @@ def _moved(roots: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 
 def make_problem(
-    robot: Robot, recordings: Sequence[Recording], free: Sequence[str], settings: Settings
-) -> Problem:
+    robot: Robot, recordings: Sequence[RobotRecording], free: Sequence[str], settings: FitSettings
+) -> FitProblem:
     """Recordings of a robot as a least-squares problem.
 
     Args:
@@ -362,7 +362,7 @@ def make_problem(
         for channel in view.channels(r, until[r], servos_free)
     ]
     variants = _variants(robot, tuple(own), tuple(h in prescribed for h in hinges))
-    return Problem(
+    return FitProblem(
         robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, window,
         every, drive, roots, spread, segment, tuple(channels), variants,
         np.array([v.heading is None for v in views]), commands,
@@ -387,7 +387,7 @@ def _held_out(count: int, share: float) -> np.ndarray:
 
 
 def _prescribed(
-    recordings: Sequence[Recording], hinges: Sequence[str], servos_free: bool
+    recordings: Sequence[RobotRecording], hinges: Sequence[str], servos_free: bool
 ) -> set[str]:
     """Hinges whose measured angles are taken as they are."""
     if servos_free:
@@ -411,7 +411,7 @@ def _prescribed(
 
 
 def _commands(
-    recording: Recording, begin: float, dt: float, count: int, hinges: Sequence[str],
+    recording: RobotRecording, begin: float, dt: float, count: int, hinges: Sequence[str],
     jets: Sequence[str], prescribed: set[str], robot: Robot, windows: int,
 ) -> Callable[[float], np.ndarray]:  # fmt: skip
     """Commands by how late the recording's clock is [s]: `[K, N, nu]`, the mean over each step."""
@@ -447,7 +447,7 @@ def _course(signal: Any, at: np.ndarray) -> np.ndarray:
 
 
 def _held(
-    recording: Recording, name: str, edges: np.ndarray, dt: float
+    recording: RobotRecording, name: str, edges: np.ndarray, dt: float
 ) -> Callable[[float], np.ndarray]:
     """A command that holds until the next one; before the first one, 0 or a hinge's first."""
     signal = recording.signals.get(name)
@@ -469,7 +469,7 @@ def _held(
 class _View:
     """A recording as poses of a robot's core."""
 
-    def __init__(self, robot: Robot, recording: Recording, hinges: Sequence[str]) -> None:
+    def __init__(self, robot: Robot, recording: RobotRecording, hinges: Sequence[str]) -> None:
         """Finds the core's poses."""
         self.robot, self.recording, self.hinges = robot, recording, hinges
         signals = recording.signals

@@ -37,14 +37,14 @@ _FASTEST = 30.0
 _GAP = 2.5
 
 
-class Signal(NamedTuple):
+class TimeSeries(NamedTuple):
     """A measured or commanded number; `[n]` times [s], rising, and `[n]` values."""
 
     time: np.ndarray
     value: np.ndarray
 
 
-class Mark(NamedTuple):
+class MarkedPoint(NamedTuple):
     """A point on the robot: index of its module, and where in its frame [m]."""
 
     module: int
@@ -52,7 +52,7 @@ class Mark(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Recording:
+class RobotRecording:
     """A robot that swam.
 
     Attributes:
@@ -63,8 +63,8 @@ class Recording:
     """
 
     name: str
-    signals: Mapping[str, Signal]
-    marks: Mapping[str, Mark] = field(default_factory=dict)
+    signals: Mapping[str, TimeSeries]
+    marks: Mapping[str, MarkedPoint] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def table(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -104,7 +104,7 @@ def read_map(options: Sequence[str], label: str = "--map") -> dict[str, str]:
     return found
 
 
-def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -> Recording:
+def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -> RobotRecording:
     """Reads a recording of a robot.
 
     Args:
@@ -139,10 +139,10 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
             signals = _read_csv(path, rest, robot)
         signals, marks = _name_marks(signals, marks, robot)
         signals, notes = _check_signals(signals, robot)
-    return Recording(path.stem, signals, marks, tuple(notes))
+    return RobotRecording(path.stem, signals, marks, tuple(notes))
 
 
-def _read_mark(key: str, source: str, robot: Robot) -> Mark:
+def _read_mark(key: str, source: str, robot: Robot) -> MarkedPoint:
     module, _, at = source.partition(":")
     names = [m.name for m in robot.morphology.modules]
     try:
@@ -154,13 +154,13 @@ def _read_mark(key: str, source: str, robot: Robot) -> Mark:
             f"--map {key}: expected a module ({', '.join(names)}), or MODULE:X,Y,Z [m]; found "
             f"{show(source)}"
         )
-    return Mark(names.index(module), (place[0], place[1], place[2]))
+    return MarkedPoint(names.index(module), (place[0], place[1], place[2]))
 
 
 # --- CSV ------------------------------------------------------------------------------------------
 
 
-def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str, Signal]:
+def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str, TimeSeries]:
     text = read_file(path).decode("utf-8-sig")
     rows = list(csv.reader(io.StringIO(text)))
     rows = [row for row in rows if any(cell.strip() for cell in row)]
@@ -206,7 +206,7 @@ def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str,
         known = np.isfinite(value)
         if not known.any():
             raise InputError(f"column {header[k]}: expected numbers; found none, or NaN only")
-        found[name] = Signal(time[known], value[known])
+        found[name] = TimeSeries(time[known], value[known])
     return found
 
 
@@ -261,7 +261,7 @@ def _unit(column: str) -> tuple[str, float]:
 # --- bags and run folders -------------------------------------------------------------------------
 
 
-def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, Signal]:
+def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
     """Topics by their types; of several of one type the first, or what `odometry=/topic` names."""
     check_package("a bag", "rosbags")
     from rosbags.rosbag2 import Reader
@@ -295,7 +295,7 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, Signal]:
         time, value = np.array(rows).T
         order = np.argsort(time, kind="stable")
         once = np.append(True, np.diff(time[order]) > 0)
-        found[name] = Signal(time[order][once] - first, value[order][once])
+        found[name] = TimeSeries(time[order][once] - first, value[order][once])
     return found
 
 
@@ -333,7 +333,7 @@ _TOPICS: dict[str, Callable[[Any, str], Iterable[tuple[str, float]]]] = {
 }
 
 
-def _read_run(path: Path) -> dict[str, Signal]:
+def _read_run(path: Path) -> dict[str, TimeSeries]:
     """What the champion of a run folder does, sampled 50 times a second."""
     from mjx_revolve.episodes.champion import load_episode
 
@@ -346,17 +346,17 @@ def _read_run(path: Path) -> dict[str, Signal]:
     ctrl = np.asarray(trajectory.ctrl, float)
     names = [robot.mj_model.actuator(k).name for k in range(robot.mj_model.nu)]
     begun = robot.world.timestep * np.arange(len(ctrl))
-    found = {f"command.{n}": Signal(begun, x) for n, x in zip(names, ctrl.T, strict=True)}
+    found = {f"command.{n}": TimeSeries(begun, x) for n, x in zip(names, ctrl.T, strict=True)}
     pose = zip(_POSE[:7], qpos.T[:7], strict=True)
-    return found | {name: Signal(time, x) for name, x in pose}
+    return found | {name: TimeSeries(time, x) for name, x in pose}
 
 
 # --- checks ---------------------------------------------------------------------------------------
 
 
 def _name_marks(
-    signals: dict[str, Signal], marks: dict[str, Mark], robot: Robot
-) -> tuple[dict[str, Signal], dict[str, Mark]]:
+    signals: dict[str, TimeSeries], marks: dict[str, MarkedPoint], robot: Robot
+) -> tuple[dict[str, TimeSeries], dict[str, MarkedPoint]]:
     """Marks as the signals have them; those that nothing says a place of are refused."""
     seen = {name.split(".")[1] for name in signals if name.startswith("mark.")}
     for name in sorted(seen):
@@ -368,14 +368,16 @@ def _name_marks(
                 f"mark {name}: expected where it is (--map mark.{name}=MODULE:X,Y,Z [m], of the "
                 f"modules {', '.join(modules)}); found nothing"
             )
-        marks[name] = Mark(modules.index(name), (0.0, 0.0, 0.0))
+        marks[name] = MarkedPoint(modules.index(name), (0.0, 0.0, 0.0))
     for name in marks:
         if name not in seen:
             raise InputError(f"mark {name}: expected columns mark.{name}.x and .y; found none")
     return signals, marks
 
 
-def _check_signals(signals: dict[str, Signal], robot: Robot) -> tuple[dict[str, Signal], list[str]]:
+def _check_signals(
+    signals: dict[str, TimeSeries], robot: Robot
+) -> tuple[dict[str, TimeSeries], list[str]]:
     """Plain faults, one line each; and notes about gaps."""
     modules = {m.name: m.kind for m in robot.morphology.modules}
     seen = [n for n in signals if n in _POSE or n in _SENSED or n.startswith("mark.")]
@@ -420,7 +422,7 @@ def _check_signals(signals: dict[str, Signal], robot: Robot) -> tuple[dict[str, 
     return signals, _gaps({n: signals[n] for n in seen})
 
 
-def _check_motion(signals: Mapping[str, Signal], robot: Robot) -> None:
+def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
     """Refuses what is too fast for its units, and what does not move at all."""
     length = _length(robot)
     still = "mean_speed" not in signals
@@ -452,7 +454,7 @@ def _length(robot: Robot) -> float:
     return float(body_geometry(robot).length)
 
 
-def _gaps(signals: Mapping[str, Signal]) -> list[str]:
+def _gaps(signals: Mapping[str, TimeSeries]) -> list[str]:
     """Frames that are missing, in words; once for signals of the same times."""
     found: dict[str, None] = {}
     for name, (time, _) in signals.items():

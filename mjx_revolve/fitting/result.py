@@ -15,8 +15,8 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.fitting.estimate import (
     LEVEL,
     Estimate,
+    FitState,
     Model,
-    State,
     advance,
     begin,
     estimate,
@@ -24,12 +24,12 @@ from mjx_revolve.fitting.estimate import (
 )
 from mjx_revolve.fitting.identify import Unknown, find_unknown, is_found, plan_motions
 from mjx_revolve.fitting.parameters import with_values
-from mjx_revolve.fitting.problem import Problem, Settings, make_problem
-from mjx_revolve.fitting.recording import Recording
+from mjx_revolve.fitting.problem import FitProblem, FitSettings, make_problem
+from mjx_revolve.fitting.recording import RobotRecording
 
 
 @dataclass(frozen=True)
-class Value:
+class FittedValue:
     """A free number as found.
 
     Attributes:
@@ -101,10 +101,10 @@ class Fit:
             was not known before and after it; "" where it was not asked for.
     """
 
-    problem: Problem
-    state: State
+    problem: FitProblem
+    state: FitState
     estimate: Estimate
-    values: tuple[Value, ...]
+    values: tuple[FittedValue, ...]
     unknown: tuple[Unknown, ...]
     local: tuple[tuple[str, str, float, float], ...]
     predictions: tuple[Prediction, ...]
@@ -192,9 +192,9 @@ def _plain(value: Any) -> Any:
 
 def fit_robot(
     robot: Robot,
-    recordings: Sequence[Recording],
+    recordings: Sequence[RobotRecording],
     free: Sequence[str],
-    settings: Settings | None = None,
+    settings: FitSettings | None = None,
     seed: int = 0,
     advise: bool = False,
 ) -> Fit:
@@ -214,7 +214,7 @@ def fit_robot(
     Raises:
         InputError: a recording or a name does not suit the robot.
     """
-    problem = make_problem(robot, recordings, free, settings or Settings())
+    problem = make_problem(robot, recordings, free, settings or FitSettings())
     state = begin(problem, seed)
     model = linearize(problem, state.point)
     while not is_done(problem, state):
@@ -222,13 +222,13 @@ def fit_robot(
     return conclude(problem, state, model, free, advise)
 
 
-def is_done(problem: Problem, state: State) -> bool:
+def is_done(problem: FitProblem, state: FitState) -> bool:
     """Whether the search has arrived, or has had all its iterations."""
     return state.finished or state.iteration >= problem.settings.iterations
 
 
 def conclude(
-    problem: Problem, state: State, model: Model, free: Sequence[str], advise: bool
+    problem: FitProblem, state: FitState, model: Model, free: Sequence[str], advise: bool
 ) -> Fit:
     """What a search that has ended has found."""
     found = estimate(problem, state, model)
@@ -236,7 +236,7 @@ def conclude(
     for k, parameter in enumerate(problem.parameters):
         value, low, high = found.interval(problem, k)
         known = is_found(parameter, found.covariance[k, k])
-        values.append(Value(parameter.name, parameter.unit, value, low, high, known))
+        values.append(FittedValue(parameter.name, parameter.unit, value, low, high, known))
     unknown = tuple(find_unknown(problem.parameters, found.information))
     local = tuple(
         (recording.name, name, float(found.local[r, k]), float(found.local_spread[r, k]))
@@ -261,7 +261,7 @@ def conclude(
     )
 
 
-def _predict(problem: Problem, state: State) -> tuple[Prediction, ...]:
+def _predict(problem: FitProblem, state: FitState) -> tuple[Prediction, ...]:
     before = problem.origin()
     before = type(before)(before.free, state.point.local, state.point.starts)
     tracks = problem.simulate([state.point, before])

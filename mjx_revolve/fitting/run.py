@@ -19,9 +19,9 @@ from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.evolution.progress import Progress
 from mjx_revolve.evolution.run import timestamp
 from mjx_revolve.evolution.run_folder import RunFolder, begin_run_folder, open_run_folder
-from mjx_revolve.fitting.estimate import Model, State, advance, begin, linearize
-from mjx_revolve.fitting.problem import Point, Problem, Settings, make_problem
-from mjx_revolve.fitting.recording import Mark, Recording, Signal
+from mjx_revolve.fitting.estimate import FitState, Model, advance, begin, linearize
+from mjx_revolve.fitting.problem import FitProblem, FitSettings, Point, make_problem
+from mjx_revolve.fitting.recording import MarkedPoint, RobotRecording, TimeSeries
 from mjx_revolve.fitting.result import Fit, conclude, is_done
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.files import read_file, write_atomic
@@ -49,14 +49,14 @@ class Request:
     """
 
     robot: Robot
-    recordings: tuple[Recording, ...]
+    recordings: tuple[RobotRecording, ...]
     free: tuple[str, ...]
-    settings: Settings
+    settings: FitSettings
     seed: int
     files: tuple[Mapping[str, Any], Mapping[str, bytes]]
 
 
-def read_settings(texts: Sequence[str]) -> tuple[Settings, dict[str, Any], bool]:
+def read_settings(texts: Sequence[str]) -> tuple[FitSettings, dict[str, Any], bool]:
     """Settings of a fit, fields of the world, and whether the robot is trimmed, from `--set`."""
     given, _ = read_overrides(list(texts))
     world = {k.removeprefix("world."): v for k, v in given.items() if k.startswith("world.")}
@@ -64,7 +64,7 @@ def read_settings(texts: Sequence[str]) -> tuple[Settings, dict[str, Any], bool]
     trim = given.get("trim", "none")
     if trim not in ("neutral", "none"):
         raise InputError(f"--set trim: expected neutral or none; found {show(trim)}")
-    return read(Settings, own, "settings"), world, trim == "neutral"
+    return read(FitSettings, own, "settings"), world, trim == "neutral"
 
 
 def load_robot(
@@ -141,8 +141,8 @@ class FitRun:
 
     folder: RunFolder
     request: Request
-    problem: Problem
-    state: State | None = None
+    problem: FitProblem
+    state: FitState | None = None
     model: Model | None = None
 
     @classmethod
@@ -191,7 +191,7 @@ class FitRun:
             water = load_world(inside if inside.is_file() else world, **data["world_fields"])
             request = Request(
                 build_robot(body, water), _unpack(folder.path / data["recordings"]),
-                tuple(data["free"]), read(Settings, data["settings"], str(path)), data["seed"],
+                tuple(data["free"]), read(FitSettings, data["settings"], str(path)), data["seed"],
                 (data, {}),
             )  # fmt: skip
             run = cls(folder, request, _make(request))
@@ -210,7 +210,7 @@ class FitRun:
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
         names = ("common", "generation", "cost", "moved", "inflated")
         rest = (meta[name] for name in names)
-        self.state = State(point, meta["noise"], arrays["damping"], *rest)
+        self.state = FitState(point, meta["noise"], arrays["damping"], *rest)
 
     def save(self) -> None:
         """A checkpoint of the state."""
@@ -266,11 +266,11 @@ class _Progress(Progress):
         return [f"cost {row['best']:.6g}", f"last step {row['mean']:.2g} of the uncertainty"]
 
 
-def _make(request: Request) -> Problem:
+def _make(request: Request) -> FitProblem:
     return make_problem(request.robot, request.recordings, request.free, request.settings)
 
 
-def _pack(recordings: Sequence[Recording]) -> bytes:
+def _pack(recordings: Sequence[RobotRecording]) -> bytes:
     """Recordings as an NPZ file."""
     arrays: dict[str, np.ndarray] = {}
     about = []
@@ -285,21 +285,22 @@ def _pack(recordings: Sequence[Recording]) -> bytes:
     return buffer.getvalue()
 
 
-def _unpack(path: Path) -> tuple[Recording, ...]:
+def _unpack(path: Path) -> tuple[RobotRecording, ...]:
     try:
         with np.load(io.BytesIO(read_file(path)), allow_pickle=False) as data:
             about = yaml.safe_load(data["about"].tobytes())
             found = []
             for r, one in enumerate(about):
                 signals = {
-                    key.partition("/")[2]: Signal(*data[key])
+                    key.partition("/")[2]: TimeSeries(*data[key])
                     for key in data.files
                     if key.startswith(f"{r}/")
                 }
                 marks = {
-                    name: Mark(int(k), (x, y, z)) for name, (k, x, y, z) in one["marks"].items()
+                    name: MarkedPoint(int(k), (x, y, z))
+                    for name, (k, x, y, z) in one["marks"].items()
                 }
-                found.append(Recording(one["name"], signals, marks, tuple(one["notes"])))
+                found.append(RobotRecording(one["name"], signals, marks, tuple(one["notes"])))
     except InputError:
         raise
     except Exception as error:  # a damaged zip has many kinds

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.fitting.problem import Settings, make_problem
-from mjx_revolve.fitting.recording import Recording, Signal
+from mjx_revolve.fitting.problem import FitSettings, make_problem
+from mjx_revolve.fitting.recording import RobotRecording, TimeSeries
 
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
@@ -22,7 +22,7 @@ def simulate_signals(
     current: Sequence[float] = (0.0, 0.0, 0.0),
     velocity: Sequence[float] = (0.0,) * 6,
     duration: float = 5.0,
-) -> dict[str, Signal]:
+) -> dict[str, TimeSeries]:
     """What a robot does from its rest pose, 1 m deep, by the program that fits use.
 
     Args:
@@ -41,15 +41,16 @@ def simulate_signals(
     count = round(duration / dt) if ctrl is None else len(ctrl)
     time = dt * np.arange(count + 1)
     signals = {
-        name: Signal(time[[0, -1]], np.zeros(2)) for name in ("x", "y", "z", "yaw", "roll", "pitch")
+        name: TimeSeries(time[[0, -1]], np.zeros(2))
+        for name in ("x", "y", "z", "yaw", "roll", "pitch")
     }
     commands = {}
     if ctrl is not None:
         for k in range(robot.mj_model.nu):
             name = robot.mj_model.actuator(k).name
-            commands[f"command.{name}"] = Signal(time[:-1], np.asarray(ctrl, float)[:, k])
-    settings = Settings(window=float(time[-1]), held_out=0.0)
-    whole = Recording("simulated", signals | commands)
+            commands[f"command.{name}"] = TimeSeries(time[:-1], np.asarray(ctrl, float)[:, k])
+    settings = FitSettings(window=float(time[-1]), held_out=0.0)
+    whole = RobotRecording("simulated", signals | commands)
     problem = make_problem(robot, [whole], [*free, "current"], settings)
     problem.roots[0, 2] = robot.world.surface_height - 1.0
     problem.roots[0, 7:, 0] = velocity
@@ -58,18 +59,18 @@ def simulate_signals(
     point.local[0] = current[:2]
     track = problem.simulate([point])[0, 0, 0]
     at = problem.every * dt * np.arange(len(track))
-    return commands | {n: Signal(at, x) for n, x in zip(_POSE, track.T[:7], strict=True)}
+    return commands | {n: TimeSeries(at, x) for n, x in zip(_POSE, track.T[:7], strict=True)}
 
 
 def make_noisy(
-    signals: Mapping[str, Signal],
+    signals: Mapping[str, TimeSeries],
     rate: float = 30.0,
     position: float = 0.005,
     attitude: float = np.pi / 180,
     lost: float = 0.0,
     seed: int = 0,
     name: str = "synthetic",
-) -> Recording:
+) -> RobotRecording:
     """A recording as a camera would have made it.
 
     Args:
@@ -90,5 +91,5 @@ def make_noisy(
     turn = Rotation.from_quat(flat[:, 3:], scalar_first=True)
     turn *= Rotation.from_rotvec(attitude * draw.normal(size=(len(time), 3)))
     flat[:, 3:] = turn.as_quat(scalar_first=True)
-    seen = {n: Signal(time, x) for n, x in zip(_POSE, flat.T, strict=True)}
-    return Recording(name, {**signals, **seen})
+    seen = {n: TimeSeries(time, x) for n, x in zip(_POSE, flat.T, strict=True)}
+    return RobotRecording(name, {**signals, **seen})

@@ -139,6 +139,11 @@ def load_yaml(path: str | Path) -> Any:
     if len(content) > _MAX_BYTES:
         raise InputError(f"{path}: expected at most {_MAX_BYTES // 10**6} MB of YAML; found more")
     audit(path, "data", content)
+    return parse_yaml(content, path)
+
+
+def parse_yaml(content: bytes, path: str | Path) -> Any:
+    """The plain values of a YAML document read from `path`, which `load_yaml` audits first."""
     with reading(path):
         text = content.decode("utf-8")
         try:

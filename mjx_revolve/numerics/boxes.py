@@ -5,12 +5,15 @@ three face normals of each, and the nine cross products of their edges (Gottscha
 1996, OBBTree, SIGGRAPH). The largest gap over these axes is, where it is negative, minus the
 penetration depth: the least translation that parts the boxes.
 
-Functions take NumPy's arrays or JAX's, and return the same; see `spatial` for vectors.
+Functions take NumPy's arrays or JAX's, and return the same; see `spatial` for vectors. Choices are
+sums with weights of 0 and 1: XLA:CPU makes a branch of a choice between numbers in memory, and no
+vectors.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +21,6 @@ from mjx_revolve.numerics.spatial import (
     Mat,
     Scalar,
     Vec,
-    cross,
     dot,
     matTvec,
     matvec,
@@ -105,13 +107,19 @@ def box_axes(pair: BoxPair, parallel: float = _PARALLEL) -> BoxAxes:
         for j in range(3):
             j1, j2 = (j + 1) % 3, (j + 2) % 3
             square = 1 - turn[i][j] * turn[i][j]
-            crossed = square > parallel
-            inverse = 1 / xp.sqrt(xp.where(crossed, square, 1))
+            crossed = weight(square > parallel, square)
+            inverse = crossed / xp.sqrt(xp.maximum(square, parallel))
             offset.append((t[i2] * turn[i1][j] - t[i1] * turn[i2][j]) * inverse)
             both = a[i1] * size[i2][j] + a[i2] * size[i1][j]
             both = both + b[j1] * size[i][j2] + b[j2] * size[i][j1]
-            reach.append(xp.where(crossed, both * inverse, 1e3))
+            reach.append(both * inverse + 1e3 * (1 - crossed))
     return BoxAxes(tuple(offset), tuple(reach))
+
+
+def weight(condition: Any, like: Scalar) -> Scalar:
+    """1 where a condition holds, else 0, of the type of another number."""
+    xp = namespace(like)
+    return xp.where(condition, 1.0, 0.0).astype(like.dtype)
 
 
 def _relative(pair: BoxPair) -> Mat:
@@ -167,31 +175,29 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     xp = namespace(pair.offset[0])
     axes = box_axes(pair, _PARALLEL if ahead is None else _SWINGING)
     now = axes.gaps()
-    side = tuple(xp.where(x < 0, -1.0, 1.0).astype(x.dtype) for x in axes.offset)
+    side = tuple(1 - 2 * weight(x < 0, x) for x in axes.offset)
     score = now
     if ahead is not None:
         parts = now[0]
         for gap in now[1:]:
             parts = xp.maximum(parts, gap)
         least = xp.minimum(parts, 0) - _FACES_FIRST
+        parting = [weight(n >= least, n) for n in now]
         later = box_axes(ahead).gaps(side)
-        score = tuple(xp.where(n >= least, x, -1e3) for n, x in zip(now, later, strict=True))
+        score = tuple(w * x - 1e3 * (1 - w) for w, x in zip(parting, later, strict=True))
     turn = _relative(pair)
-    zero = xp.zeros_like(score[0])
-    best, start, which, normal = xp.full_like(zero, -1e6), zero, zero, (zero, zero, zero)
+    best, taken = score[0], []
+    for k in range(1, 15):
+        better = weight(score[k] > best + (_FACES_FIRST if k > 5 else 0), best)
+        best = better * score[k] + (1 - better) * best
+        taken.append(better)
+    share = last_of(taken)
+    start = _sum(share, now)
+    signed = [x * y for x, y in zip(share, side, strict=True)]
+    normal = _axis(turn, signed)
     # What touches first is what reaches farthest at the end of the step.
     turn_ahead = turn if ahead is None else _relative(ahead)
-    toward = normal
-    for k in range(15):
-        better = score[k] > best + (_FACES_FIRST if k > 5 else 0)
-        best, which = xp.where(better, score[k], best), xp.where(better, k, which)
-        start = xp.where(better, now[k], start)
-        pick = lambda new, old: tuple(  # noqa: E731
-            xp.where(better, side[k] * x, n)  # noqa: B023
-            for x, n in zip(new, old, strict=True)
-        )
-        normal = pick(_axis(turn, k), normal)
-        toward = normal if ahead is None else pick(_axis(turn_ahead, k), toward)
+    toward = normal if ahead is None else _axis(turn_ahead, signed)
     # The features that look at each other, seen from the first box.
     t = matTvec(pair.first, pair.offset)
     back = transpose(turn)
@@ -203,36 +209,58 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     on_second = _common(other_spread, matvec(back, tuple(-x for x in away)), back, spread)
     on_second = vadd(away, matvec(turn, on_second))
     # Of two edges, the point of the first that is nearest to the second.
-    rows = [(which > 5.5 + 3 * i) & (which < 8.5 + 3 * i) for i in range(3)]
-    columns = [sum(which == 6 + 3 * i + j for i in range(3)) > 0 for j in range(3)]
-    edge = tuple(xp.where(x, 1.0, zero) for x in rows)
-    other_edge = matvec(turn, tuple(xp.where(x, 1.0, zero) for x in columns))
+    edge = tuple(sum(share[6 + 3 * i : 9 + 3 * i]) for i in range(3))
+    other_edge = matvec(turn, tuple(sum(share[6 + j :: 3]) for j in range(3)))
+    kinds = sum(share[:3]), sum(share[3:6]), sum(edge)
     cosine = dot(edge, other_edge)
     way = dot(edge, away) - cosine * dot(other_edge, away)
-    way = way / xp.where(which > 5.5, 1 - cosine * cosine, 1)
+    way = way / (1 - kinds[2] * cosine * cosine)
     reach = dot(edge, spread)
     crossing = vscale(xp.clip(way, -reach, reach), edge)
-    point = tuple(
-        xp.where(which < 2.5, p, xp.where(which < 5.5, q, m))
-        for p, q, m in zip(on_first, on_second, crossing, strict=True)
-    )
+    point = tuple(_sum(kinds, x) for x in zip(on_first, on_second, crossing, strict=True))
     # In the middle between the two along the normal.
     point = vadd(point, vscale(0.5 * dot(normal, away) - dot(normal, point), normal))
     return BoxContact(best, start, matvec(pair.first, normal), matvec(pair.first, vadd(one, point)))
 
 
-def _axis(turn: Mat, k: int) -> Vec:
-    """The k-th of the 15 axes, a unit vector in the first box's frame."""
+def last_of(better: Sequence[Scalar]) -> list[Scalar]:
+    """1 for the last of some things that was better than those before it, 0 for the others.
+
+    Args:
+        better: 1 or 0 for each thing but the first.
+
+    Returns:
+        For each thing, the first among them.
+    """
+    xp = namespace(better[0])
+    share, left = [], xp.ones_like(better[0])
+    for x in reversed(better):
+        share.append(left * x)
+        left = left * (1 - x)
+    return [left, *reversed(share)]
+
+
+def _sum(weights: Sequence[Scalar], values: Sequence[Scalar]) -> Scalar:
+    """Sum of products."""
+    return sum(w * x for w, x in zip(weights, values, strict=True))
+
+
+def _axis(turn: Mat, share: Sequence[Scalar]) -> Vec:
+    """The sum of the 15 axes, unit vectors in the first box's frame, by such shares."""
     xp = namespace(turn[0][0])
-    zero, one = xp.zeros_like(turn[0][0]), xp.ones_like(turn[0][0])
-    unit = tuple(tuple(one if i == j else zero for j in range(3)) for i in range(3))
-    columns = transpose(turn)
-    if k < 6:
-        return unit[k] if k < 3 else columns[k - 3]
-    i, j = divmod(k - 6, 3)
-    square = 1 - turn[i][j] * turn[i][j]
-    inverse = 1 / xp.sqrt(xp.where(square > _PARALLEL, square, 1))
-    return vscale(inverse, cross(unit[i], columns[j]))
+    found = vadd(tuple(share[:3]), matvec(turn, tuple(share[3:6])))
+    for i in range(3):
+        scaled = []
+        for j in range(3):
+            square = 1 - turn[i][j] * turn[i][j]
+            scaled.append(share[6 + 3 * i + j] / xp.sqrt(xp.maximum(square, _PARALLEL)))
+        # e_i × Σ of the second box's axes.
+        x = matvec(turn, tuple(scaled))
+        i1, i2 = (i + 1) % 3, (i + 2) % 3
+        parts = list(found)
+        parts[i1], parts[i2] = parts[i1] - x[i2], parts[i2] + x[i1]
+        found = tuple(parts)
+    return found
 
 
 def _feature(normal: Vec, half: Vec) -> tuple[Vec, Vec]:

@@ -7,8 +7,10 @@ imports them at the top.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import importlib.metadata
+import importlib.util
 import logging
 import os
 import platform
@@ -34,8 +36,21 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 # What a worker compiles faster than this is not worth a file [s]. The leader keeps everything: a
 # start runs a hundred small programs, 2 s to compile and .3 s to read back.
 _WORKER_MIN_COMPILE_TIME = 0.5
+# Individuals stepped together on a CPU: enough to fill vector registers, few enough that the loop's
+# live values stay in the first-level cache (measured: 64 to 256 alike, 16 to 32 slower). It stands
+# here because workers are counted before JAX is imported.
+LANES = 64
 _PACKAGE = Path(__file__).resolve().parents[1]
 _log = logging.getLogger(__name__)
+# Cores that XLA's threads are made for, where those are not all.
+_xla_cores: int | None = None
+_programs: Path | None = None
+
+
+def fix_threads() -> None:
+    """Fixes the thread settings that NumPy reads when it is imported."""
+    for name in _THREAD_SETTINGS:
+        os.environ.setdefault(name, "1")
 
 
 def prepare_process() -> Path | None:
@@ -48,8 +63,14 @@ def prepare_process() -> Path | None:
     Returns:
         The cache folder in use, or None.
     """
-    for name in _THREAD_SETTINGS:
-        os.environ.setdefault(name, "1")
+    folder = find_cache()
+    _use_cache(folder, 0.0)
+    return folder
+
+
+def find_cache() -> Path | None:
+    """Fixes the thread settings and finds the cache folder of `prepare_process`, without JAX."""
+    fix_threads()
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if "jax" in sys.modules and (known := sys.modules["jax"].config.jax_compilation_cache_dir):
         chosen = known
@@ -61,9 +82,14 @@ def prepare_process() -> Path | None:
         except OSError as error:  # a read-only home: slower starts, the same results
             _log.warning("no compilation cache: %s: %s", error.strerror, folder)
             folder = None
-
-    _use_cache(folder, 0.0)
     return folder
+
+
+def expects_cpu() -> bool:
+    """Whether JAX will find nothing but CPUs, as far as can be told before it is imported."""
+    if os.environ.get("JAX_PLATFORMS", "cpu") not in ("", "cpu"):
+        return False
+    return all(importlib.util.find_spec(name) is None for name in ("jax_plugins", "libtpu"))
 
 
 def _use_cache(folder: Path | None, min_compile_time: float) -> None:
@@ -71,6 +97,13 @@ def _use_cache(folder: Path | None, min_compile_time: float) -> None:
 
     jax.config.update("jax_compilation_cache_dir", str(folder) if folder else None)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time)
+    global _programs
+    _programs = folder / "programs" if folder else None
+
+
+def program_folder() -> Path | None:
+    """Where whole programs are kept (see `executables`); None: nowhere, as outside of commands."""
+    return _programs
 
 
 def prepare_worker(core: int | None, cache: str | None) -> None:
@@ -83,13 +116,14 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
         cache: the compilation cache's folder, as the process that started the worker uses it. That
             one has removed broken entries; doing so again could hit one that is being written.
     """
-    for name in _THREAD_SETTINGS:
-        os.environ.setdefault(name, "1")
+    fix_threads()
     os.environ["JAX_PLATFORMS"] = "cpu"
     _use_cache(Path(cache) if cache else None, _WORKER_MIN_COMPILE_TIME)
     if core is not None:
         import jax
 
+        global _xla_cores
+        _xla_cores = 1
         cores = list_cores()
         pin_process([core])
         jax.devices()
@@ -97,14 +131,15 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
 
 
 @contextlib.contextmanager
-def compile_lock(program: str) -> Iterator[None]:
+def compile_lock(kind: str, fingerprint: str) -> Iterator[None]:
     """Lets one process of a host in first, and those that come meanwhile when that one is done.
 
     The others then read from the compilation cache what it compiled; doing it at the same time
     would take all of them longer. Without a cache there is no lock.
 
     Args:
-        program: a fingerprint of what is compiled.
+        kind: `job`, or `program` within that; so no two processes wait for each other.
+        fingerprint: of what is compiled.
     """
     import jax
 
@@ -114,7 +149,7 @@ def compile_lock(program: str) -> Iterator[None]:
         yield
         return
     # Few names, so that they do not pile up; two programs of one name wait for each other.
-    with open(Path(folder) / f".compiling-{program[:2]}", "ab") as lock:
+    with open(Path(folder) / f".compiling-{kind}-{fingerprint[:2]}", "ab") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -259,6 +294,22 @@ def source_hash() -> str:
     return digest.hexdigest()[:12]
 
 
+@functools.cache
+def host_key() -> tuple[str, ...]:
+    """What a compiled program depends on besides what it computes: source, packages, CPU, cores."""
+    cores = str(_xla_cores or usable_cores())
+    return source_hash(), str(_versions()), _cpu_hash(), cores
+
+
+def _versions() -> dict[str, str]:
+    """Of Python, and of the packages that bits depend on."""
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions
+
+
 def describe_process() -> dict[str, Any]:
     """What the bits of a run depend on, and its command: for `run.json`. Imports JAX.
 
@@ -267,12 +318,8 @@ def describe_process() -> dict[str, Any]:
     """
     import jax
 
-    versions = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
     return {
-        "versions": versions,
+        "versions": _versions(),
         "git": _git_revision(),
         "argv": sys.argv,
         "platform": platform.platform(),

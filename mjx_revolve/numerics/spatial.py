@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+
+from mjx_revolve.numerics.lazy import jax, jnp
 
 Scalar = Any  # float, NumPy array or jax.Array that broadcast against each other
 Vec = tuple[Scalar, ...]  # 3

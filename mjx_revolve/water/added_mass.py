@@ -46,11 +46,13 @@ class CarriedWater:
         inertia: about the body's origin, body frame.
         mass: along the part's axes [kg].
         angular: about them, about the box's centre [kg·m²].
+        entrained: share of `mass` that is entrained water [-], for `near_surface`, else None.
     """
 
     inertia: SpatialInertia = part_field("kg m2", varied=("added_mass", "density"))
     mass: Vec = part_field("kg", axes="size", varied=("added_mass", "density"))
     angular: Vec = part_field("kg m2", axes="size", varied=("added_mass", "density"))
+    entrained: Any = part_field("-", axes="size", fixed="a share", default=None)
 
 
 def lamb_coefficients(semi_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,12 +10,12 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Annotated, Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 from annotated_types import Unit
 
 from mjx_revolve.inputs.errors import ConstraintError
 from mjx_revolve.inputs.schema import NonNegative, Number, Positive, checked
+from mjx_revolve.numerics.lazy import jnp
 from mjx_revolve.numerics.spatial import namespace, sincos
 
 # The thesis's lake: bed about 998 m x 998 m, z from -112.8 m to +36.7 m.

@@ -17,9 +17,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.numerics.lazy import jnp
 from mjx_revolve.numerics.spatial import Scalar, Vec, cross, mul, total, vadd, vscale
 from mjx_revolve.water.laws import BuoyancyLaw, Export, find_law
 

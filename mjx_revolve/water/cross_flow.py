@@ -25,10 +25,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.inertia import SpatialInertia, add_inertia, shift_inertia
+from mjx_revolve.numerics.lazy import jnp
 from mjx_revolve.numerics.spatial import Vec, add, cross, dot, mul, total, vadd, vscale
 from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.face_drag import FACES, face_drag_coefficients

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mjx_revolve.numerics.lazy import jnp
 from mjx_revolve.numerics.spatial import Scalar, mul
 from mjx_revolve.water.laws import (
     Coefficient,

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.inertia import SpatialInertia, apply_inertia, scale_inertia
+from mjx_revolve.numerics.lazy import jnp
 from mjx_revolve.numerics.spatial import SYM, Vec, add, mul, neg
 from mjx_revolve.water.laws import (
     Drag,

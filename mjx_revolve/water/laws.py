@@ -19,11 +19,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, dataclass_transform
 
-import jax
 import numpy as np
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.inertia import SpatialInertia
+from mjx_revolve.numerics.lazy import jax
 from mjx_revolve.numerics.spatial import Scalar, Vec, mul
 
 if TYPE_CHECKING:
@@ -78,11 +78,23 @@ def part_field(
 
 @dataclass_transform(frozen_default=True, field_specifiers=(part_field, dataclasses.field))
 def law_numbers(kind: type[T]) -> type[T]:
-    """Makes a class a frozen dataclass and a pytree; fields that are no `part_field` are static."""
+    """Makes a class a frozen dataclass and a pytree; fields that are no `part_field` are static.
+
+    JAX is told of the class with its first value: laws are named in files that are read without it.
+    """
     made = dataclass(frozen=True)(kind)
     data = list(part_fields(made))
     static = [field.name for field in dataclasses.fields(made) if field.name not in data]  # type: ignore[arg-type]
-    jax.tree_util.register_dataclass(made, data_fields=data, meta_fields=static)
+
+    @functools.cache
+    def register() -> None:
+        jax.tree_util.register_dataclass(made, data_fields=data, meta_fields=static)
+
+    def new(cls: type, *_: Any, **__: Any) -> Any:
+        register()
+        return object.__new__(cls)
+
+    made.__new__ = new  # type: ignore[method-assign]
     return made
 
 

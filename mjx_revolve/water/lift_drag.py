@@ -27,11 +27,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mjx_revolve.numerics.lazy import jax, jnp
 from mjx_revolve.numerics.spatial import (
     Scalar,
     Vec,

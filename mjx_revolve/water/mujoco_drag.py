@@ -8,11 +8,10 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mjx_revolve.numerics.lazy import jnp, mujoco
 from mjx_revolve.numerics.spatial import (
     Vec,
     add,

@@ -138,6 +138,9 @@ class World:
         drag: name of a drag law.
         coefficients: of laws, by name, for modules that give none of their own.
         added_mass: whether the water that a module carries along is part of its inertia.
+        near_surface: whether that water follows the draught of what floats, and is less close to
+            the surface, and waves that parts radiate damp their heave and roll; false: it is the
+            submerged share of what a part carries deep down, and no waves are made.
         lift_drag: parameters of `drag: lift_drag`; fins have their own.
         shear: a current that fades with depth, or None. All moving water adds up: current, shear,
             field, gust and waves.
@@ -167,6 +170,7 @@ class World:
     drag: Annotated[DragName, words(drag_names())] = "faces"
     coefficients: Coefficients = ()
     added_mass: Boolean = True
+    near_surface: Boolean = False
     lift_drag: LiftDrag = LiftDrag()
     shear: OrOff[Shear] = None
     current_field: Annotated[InstanceOf[CurrentField] | None, BeforeValidator(_read_field)] = None
@@ -180,7 +184,7 @@ class World:
     def __repr__(self) -> str:
         """Its fields, which tell runs apart; later ones only where they are not as before."""
         values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
-        later = {"coefficients": (), "self_contact": False}
+        later = {"coefficients": (), "near_surface": False, "self_contact": False}
         shown = (f"{k}={v!r}" for k, v in values if k not in later or later[k] != v)
         return f"World({', '.join(shown)})"
 

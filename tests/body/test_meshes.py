@@ -511,5 +511,5 @@ def test_the_experiment_recomputes_the_table(capsys):
     assert sorted(densities.values()) == pytest.approx(
         [560.7, 887.6, 953.3, 1096.9, 1780.8], rel=2e-4
     )
-    assert experiment.main() == 0
+    assert experiment.main([]) == 0
     assert "Erratum" in capsys.readouterr().out

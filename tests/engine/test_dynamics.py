@@ -97,7 +97,7 @@ def test_acceleration_in_float32():
     robot = stock(elbow_robot(world(gravity=9.81)))
     states = drawn(robot, 32)
     expected = mujoco_qacc(mujoco_model(robot, "off"), *states)
-    assert relative(accelerate(robot, *states, x64=False), expected).max() < 1e-5
+    assert relative(accelerate(robot, *states, x64=False), expected).max() < 2e-5
 
 
 @pytest.mark.slow
@@ -108,7 +108,7 @@ def test_acceleration_of_real_bodies(path):
     robot = stock(build_robot(morphology, world(gravity=9.81, drag="inertia_box")))
     states = drawn(robot, 16)
     expected = mujoco_qacc(mujoco_model(robot, "inertia_box"), *states)
-    assert relative(accelerate(robot, *states, x64=False), expected).max() < 1e-5
+    assert relative(accelerate(robot, *states, x64=False), expected).max() < 2e-5
 
 
 @pytest.mark.slow

@@ -40,6 +40,7 @@ BED = {"kind": "flat", "height": -5.0}
 WORLDS = {
     "default": WATER,
     "everything": WATER,  # with thrusters and fins, too
+    "near the surface": WATER | {"near_surface": True},
     "ellipsoid": {"gravity": 9.81, "buoyancy": "partial", "drag": "ellipsoid"},
     "inertia_box": {"drag": "inertia_box"},
     "waves and bed": WATER

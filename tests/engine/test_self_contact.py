@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
+from experiments.self_contact import make_march, random_gaits
 from experiments.water_tank import EMPTY, march
 from laboratory import QUICK, at_rest, body, limp
 from mjx_revolve import load_world
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.population import PopulationEngine, make_population_engine
+from mjx_revolve.engine.population import make_population_engine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.engine.self_pairs import candidate_pairs
@@ -67,15 +67,6 @@ def depths(robot, qpos):
     """`[T, lanes]` of `[T, nq, lanes]` [m]."""
     lanes = range(qpos.shape[-1])
     return np.stack([self_overlap(robot, qpos[..., k]).depth for k in lanes], -1)
-
-
-def gaits(robot, lanes, steps, seed=0):
-    """`[steps, nu, lanes]` sines of all amplitudes, as fast as the servos and faster."""
-    draw = np.random.default_rng(seed)
-    size = robot.num_hinges, lanes
-    time = robot.world.timestep * np.arange(steps)[:, None, None]
-    middle, swing = draw.uniform(-0.5, 0.5, size), draw.uniform(0.2, 1.0, size)
-    return middle + swing * np.sin(draw.uniform(2, 8, size) * time + draw.uniform(0, 7, size))
 
 
 def momentum(robot, qpos, qvel):
@@ -189,7 +180,7 @@ def test_mirror_images():
     robot = jaw(timestep=0.01)
     qpos, qvel = open_jaw(robot, 2)
     qpos[7:, 1] = -qpos[:6:-1, 0]
-    ctrl = INWARDS + 0.3 * gaits(robot, 1, 150)
+    ctrl = INWARDS + 0.3 * random_gaits(robot, 1, 150)
     ctrl = np.concatenate([ctrl, -ctrl[:, ::-1]], -1)
     _, qpos, _, _ = march(robot, 1.5, qpos, qvel, ctrl)
     assert depths(robot, qpos).max(0).min() > 0
@@ -200,19 +191,7 @@ def test_mirror_images():
 
 def march_batch(robots, capacity, lanes, ctrl, steps):
     """`[steps, nq, robots * lanes]` of different bodies side by side, in float64."""
-    world = robots[0].world
-
-    @jax.jit
-    def run(bodies, ctrl):
-        trees = make_batched_trees(world, capacity, bodies, ctrl.shape[-1])
-        engine = PopulationEngine(trees, bodies.plant)
-        rollout = Rollout(engine, open_loop, world, water_of(world))
-        qpos = jnp.zeros((7 + capacity.hinges, ctrl.shape[-1])).at[3].set(1.0).at[2].set(-2.0)
-        start = rollout.init(engine.init(qpos, jnp.zeros_like(qpos[1:])))
-        keep = lambda now, *_: engine.observe(now.state)[0]  # noqa: E731
-        inputs = StepInputs(ctrl=jax.vmap(bodies.plant.arrange)(ctrl))
-        return rollout.advance(start, keep, steps, 1, inputs)[1]
-
+    run = jax.jit(make_march(robots[0].world, capacity, steps))
     with jax.enable_x64(True):
         bodies = pack_bodies([r for r in robots for _ in range(lanes)], capacity, np.float64)
         run = run.lower(bodies, jnp.asarray(ctrl)).compile(QUICK)
@@ -227,7 +206,7 @@ def test_a_body_alone_and_in_a_batch_agree():
     capacity, steps = fit_capacity(robots), 80
     ctrl = np.zeros((steps, 8, 6))
     for k, robot in enumerate(robots):
-        own = gaits(robot, 2, steps)
+        own = random_gaits(robot, 2, steps)
         ctrl[:, : robot.num_hinges, 2 * k : 2 * k + 2] = own + (INWARDS if k < 2 else 0)
     found = march_batch(robots, capacity, 2, ctrl, steps)
     for k, robot in enumerate(robots):
@@ -236,6 +215,10 @@ def test_a_body_alone_and_in_a_batch_agree():
         alone = march(robot, 0.8, *start, ctrl[:, : robot.num_hinges, here])[1]
         np.testing.assert_allclose(found[:, : alone.shape[1], here], alone, atol=1e-9)
         assert (depths(robot, alone).max() > 0) == (k < 2)
+    # The same bits beside other neighbours.
+    order = [0, 1, 4, 5, 2, 3]
+    other = march_batch([robots[k] for k in (0, 2, 1)], capacity, 2, ctrl[..., order], steps)
+    np.testing.assert_array_equal(other[..., :2], found[..., :2])
 
 
 def test_contacts_are_mujocos():
@@ -314,7 +297,7 @@ def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):
     capacity, steps = fit_capacity(robots), round(2.0 / timestep)
     ctrl = np.zeros((steps, capacity.hinges, 4 * len(robots)))
     for k, robot in enumerate(robots):
-        ctrl[:, : robot.num_hinges, 4 * k : 4 * k + 4] = gaits(robot, 4, steps, k)
+        ctrl[:, : robot.num_hinges, 4 * k : 4 * k + 4] = random_gaits(robot, 4, steps, k)
     found = march_batch(robots, capacity, 4, ctrl, steps)
     assert np.isfinite(found).all()
     deep = np.concatenate(

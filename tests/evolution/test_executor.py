@@ -269,13 +269,13 @@ def test_one_compiles_and_the_others_wait(cache):
     together = threading.Barrier(2, timeout=20)
 
     def first():
-        with runtime.compile_lock("program"):
+        with runtime.compile_lock("job", "fingerprint"):
             entered.append("first")
             assert first_may_go.wait(20)
             entered.append("first is done")
 
     def other():
-        with runtime.compile_lock("program"):
+        with runtime.compile_lock("job", "fingerprint"):
             entered.append("other")
             together.wait()  # both are inside at once
 

@@ -22,7 +22,14 @@ from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.evolution.interrupts import Interrupts
-from mjx_revolve.fitting import Recording, Settings, Signal, fit_robot, load_recording, make_noisy
+from mjx_revolve.fitting import (
+    FitSettings,
+    RobotRecording,
+    TimeSeries,
+    fit_robot,
+    load_recording,
+    make_noisy,
+)
 from mjx_revolve.fitting.identify import find_unknown, plan_motions
 from mjx_revolve.fitting.parameters import read_free, with_values
 from mjx_revolve.fitting.problem import make_problem
@@ -102,7 +109,7 @@ def test_a_wild_frame_does_no_harm(auv, signals, fitted):
     time, x = recording.signals["x"]
     bad = x.copy()
     bad[[40, 90]] += 0.5
-    wild = replace(recording, signals={**recording.signals, "x": Signal(time, bad)})
+    wild = replace(recording, signals={**recording.signals, "x": TimeSeries(time, bad)})
     found = fit_robot(auv, [wild], FREE)
     for a, b in zip(found.values, fitted.values, strict=True):
         assert a.value == pytest.approx(b.value, rel=0.02)
@@ -126,7 +133,7 @@ def test_a_common_scale_is_named_and_not_found():
 
 def test_a_robot_that_only_coasts_does_not_tell_its_thrust(auv):
     found = simulate_signals(auv, ["drag"], [0.2], velocity=(0, 0.3, 0, 0, 0, 0.5), duration=6.0)
-    fit = fit_robot(auv, [make_noisy(found)], ["drag", "thrust"], Settings(held_out=0.0))
+    fit = fit_robot(auv, [make_noisy(found)], ["drag", "thrust"], FitSettings(held_out=0.0))
     drag, thrust = fit.values
     assert drag.found and drag.value == pytest.approx(np.exp(0.2), rel=0.05)
     assert not thrust.found
@@ -135,7 +142,7 @@ def test_a_robot_that_only_coasts_does_not_tell_its_thrust(auv):
 
 
 def test_a_plan_knows_more_with_each_motion(auv):
-    settings = Settings(duration=3.0, motions=2)
+    settings = FitSettings(duration=3.0, motions=2)
     plan = plan_motions(auv, ["drag", "thrust"], settings)
     assert len({m.words for m in plan.motions}) == 2
     assert (plan.spreads[1] < plan.spreads[0]).all()
@@ -293,14 +300,14 @@ def test_marks_that_are_not_on_the_robot_are_refused(auv, tmp_path, columns, wor
     where = [f"mark.{k}=core:{','.join(map(str, v))}" for k, v in MARKS.items()]
     recording = load_recording(tmp_path / "swim.csv", auv, read_map(where))
     with pytest.raises(InputError, match=words):
-        make_problem(auv, [recording], ["drag"], Settings())
+        make_problem(auv, [recording], ["drag"], FitSettings())
 
 
 def test_marks_as_they_should_be_begin_where_the_robot_is(auv, tmp_path):
     write_csv(tmp_path / "swim.csv", marks())
     where = [f"mark.{k}=core:{','.join(map(str, v))}" for k, v in MARKS.items()]
     recording = load_recording(tmp_path / "swim.csv", auv, read_map(where))
-    problem = make_problem(auv, [recording], ["drag"], Settings(window=1.0, held_out=0.0))
+    problem = make_problem(auv, [recording], ["drag"], FitSettings(window=1.0, held_out=0.0))
     np.testing.assert_allclose(problem.roots[1, :2, 0], [0.2, 0.0], atol=2e-3)
     np.testing.assert_allclose(problem.roots[1, 7:9, 0], [0.2, 0.0], atol=5e-3)
     np.testing.assert_allclose(problem.roots[1, 12, 0], 0.3, atol=5e-3)
@@ -337,9 +344,9 @@ def test_prescribed_hinges_follow_what_was_measured():
     robot = build_robot(load_morphology("spider"), load_world("lake", bed="off"))
     time = np.arange(0, 2, 0.02)
     hip = 0.5 * np.sin(4 * time)
-    still = {n: Signal(time, 0.1 * time) for n in ("x", "y", "z", "yaw")}
-    recording = Recording("legs", still | {"angle.left_hip": Signal(time, hip)})
-    problem = make_problem(robot, [recording], ["drag"], Settings(held_out=0.0))
+    still = {n: TimeSeries(time, 0.1 * time) for n in ("x", "y", "z", "yaw")}
+    recording = RobotRecording("legs", still | {"angle.left_hip": TimeSeries(time, hip)})
+    problem = make_problem(robot, [recording], ["drag"], FitSettings(held_out=0.0))
     track = problem.simulate([problem.origin()])[:, 0]
     names = [robot.morphology.modules[k].name for k in robot.morphology.hinges]
     angle = problem.states(track, 0, time)[0, :, 13 + names.index("left_hip")]
@@ -371,7 +378,7 @@ class Stop(Interrupts):
 def test_a_fit_that_was_stopped_goes_on_bit_for_bit(signals, tmp_path):
     robot, entry, copies = load_robot("auv", None, None, {"bed": "off"}, False)
     recording = make_noisy(signals, seed=2, name="pool")
-    request = Request(robot, (recording,), tuple(FREE), Settings(), 0, (entry, copies))
+    request = Request(robot, (recording,), tuple(FREE), FitSettings(), 0, (entry, copies))
     whole = FitRun.begin(tmp_path / "whole", request)
     found = whole.run(Stop(10**6))
     whole.write(found, "page")
@@ -417,8 +424,8 @@ def test_two_seconds_of_a_glide_foretell_the_rest_of_its_way():
         given |= {f"mark.{2 * k + 1}": f"link{k}", f"mark.{2 * k + 2}": f"link{k}:{half},0,0"}
     recording = load_recording(SHARED, robot, given)
     late = {n: s.time > 989.05 for n, s in recording.signals.items()}  # the joints have stopped
-    kept = {n: Signal(s.time[late[n]], s.value[late[n]]) for n, s in recording.signals.items()}
-    settings = Settings(held_out=1 - 2.05 / 4.402)
+    kept = {n: TimeSeries(s.time[late[n]], s.value[late[n]]) for n, s in recording.signals.items()}
+    settings = FitSettings(held_out=1 - 2.05 / 4.402)
     fit = fit_robot(robot, [replace(recording, signals=kept)], ["drag", "friction"], settings)
     [p] = fit.predictions
     assert (p.time[~p.held] < 991.1).all() and p.held.sum() == 5

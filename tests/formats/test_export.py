@@ -14,6 +14,7 @@ import pytest
 from exports import ODD, odd_episode
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.episodes import champion as episodes
+from mjx_revolve.episodes import early_checks
 from mjx_revolve.export import main
 from mjx_revolve.formats import export as exporter
 from mjx_revolve.formats.brain import make_brain
@@ -89,6 +90,7 @@ def test_command_writes_only_what_is_named(quick, capsys):
 def test_command_puts_a_champions_files_into_its_run(quick, capsys, monkeypatch, episode):
     champion = dataclasses.replace(episode, folder=quick / "run", fitness=object())
     monkeypatch.setattr(episodes, "load_episode", lambda *_: champion)
+    monkeypatch.setattr(early_checks, "check_episode_files", lambda _: None)
     assert run(capsys, "run")[0] == 0
     assert (quick / "run" / "export" / "robot.urdf").is_file()
 

@@ -30,7 +30,7 @@ def chain_numbers(end=0.0):
         joined=np.array([[1.0, 0.0, 0.0]]),
         ends=np.array([[end, 0.0, 0.0]]),
         rows=np.array([[2.0, 0.1, 0.06]]),
-        coefficients={"drag_coefficient": np.full((1, 3), 1.05)},
+        coefficients={"drag_coefficient": np.full((1, 3), 1.05), "friction": np.array([0.455])},
     )
     numbers = CROSS_FLOW.numbers(parts, WATER)
     return as_components(jax.tree.map(lambda x: x[0], numbers))

@@ -1,0 +1,123 @@
+"""Compiled programs kept on disk by what they were made of: a later process does not trace them.
+
+JAX's compilation cache saves the compiler's time; to ask it, a program must be traced and lowered
+first, which takes seconds here. Commands and their workers keep whole programs besides. A file is
+found by a fingerprint of what its program was made of, our source, the packages, the CPU and the
+arguments' shapes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import pickle
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import monitoring
+from jax.experimental import serialize_executable
+
+from mjx_revolve.numerics import runtime
+from mjx_revolve.numerics.xla import fuses, jit, on_cpu
+
+# JAX tells of a program that it finds in its cache by this name.
+_HIT = "/jax/compilation_cache/cache_hits"
+# Programs that nobody has read for so long are removed [s].
+_LIFE = 30 * 86_400
+_log = logging.getLogger(__name__)
+
+
+class StoredProgram:
+    """`xla.jit` of a function, whose executables are kept beside JAX's compilation cache."""
+
+    def __init__(self, fun: Callable[..., Any], made_of: Any) -> None:
+        """A program.
+
+        Args:
+            fun: of pytrees of arrays; its results are tuples and dictionaries of arrays.
+            made_of: all values that it depends on besides its arguments, which can be pickled; None
+                where they cannot all be named: then nothing is kept.
+        """
+        self._jitted = jit(fun)
+        self._made_of = made_of
+        self._found: dict[Any, Any] = {}
+
+    def __call__(self, *args: Any) -> Any:
+        """Calls it."""
+        folder = runtime.program_folder()
+        if self._made_of is None or folder is None or not on_cpu():
+            return self._jitted(*args)
+        args = jax.tree.map(jax.numpy.asarray, args)
+        leaves, tree = jax.tree.flatten((args, {}))
+        shapes = tuple((x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves)
+        if (tree, shapes) not in self._found:
+            path = folder / self._name(str(tree), shapes)
+            self._found[tree, shapes] = _load(path, tree) or self._compile(path, args)
+        return self._found[tree, shapes](*args)
+
+    def _name(self, *signature: Any) -> str:
+        config: Any = jax.config
+        precision = config.jax_enable_x64, config.jax_default_matmul_precision
+        host = runtime.host_key(), precision, fuses(), os.environ.get("XLA_FLAGS")
+        return hashlib.sha256(pickle.dumps((self._made_of, signature, host))).hexdigest()[:32]
+
+    def _compile(self, path: Path, args: Any) -> Any:
+        with runtime.compile_lock("program", path.name):
+            if (found := _load(path, jax.tree.structure((args, {})))) is not None:
+                return found  # another process has compiled it meanwhile
+            lowered = self._jitted.lower(*args)
+            hits: list[str] = []
+            listen = lambda event, **_: hits.append(event) if event == _HIT else None  # noqa: E731
+            monitoring.register_event_listener(listen)
+            try:
+                made = lowered.compile()
+            finally:
+                monitoring.unregister_event_listener(listen)
+            # XLA:CPU (jaxlib 0.10.2) writes programs that it has itself read from JAX's cache
+            # without some of their functions: those are left to that cache.
+            if not hits:
+                _keep(path, made)
+        return made
+
+
+def _keep(path: Path, made: Any) -> None:
+    """Writes a program; where that fails, starts are slower and results the same."""
+    beside = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        payload, _, out_tree = serialize_executable.serialize(made)
+        content = pickle.dumps((payload, out_tree))
+        path.parent.mkdir(exist_ok=True)
+        beside.write_bytes(hashlib.sha256(content).digest() + content)
+        beside.replace(path)
+        for old in path.parent.iterdir():
+            if time.time() - old.stat().st_mtime > _LIFE:
+                old.unlink()
+    except (OSError, ValueError, RuntimeError) as error:
+        _log.debug("a program is not kept: %s", error)
+    finally:
+        with contextlib.suppress(OSError):
+            beside.unlink(missing_ok=True)
+
+
+def _load(path: Path, tree: Any) -> Any:
+    """The program of a file; None where there is none that is whole."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    content = data[32:]
+    if hashlib.sha256(content).digest() != data[:32]:  # half written
+        return None
+    try:
+        payload, out_tree = pickle.loads(content)
+        with contextlib.suppress(OSError):  # a folder of somebody else
+            os.utime(path)
+        return serialize_executable.deserialize_and_load(payload, tree, out_tree)
+    except Exception as error:  # of another machine or version, however that shows
+        _log.debug("a kept program is not used: %s", error)
+        return None

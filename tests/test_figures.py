@@ -1,0 +1,173 @@
+"""Figures of the pages: each is in a results file or a named constant, and shown as it is."""
+
+import importlib.util
+import re
+
+import pytest
+import yaml
+
+from experiments.common import as_numbers
+from laboratory import ROOT
+from mjx_revolve.view.statistics import interval
+
+spec = importlib.util.spec_from_file_location("figures_of_docs", ROOT / "docs" / "figures.py")
+figures = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(figures)
+
+RESULTS = {
+    "swim": {
+        "date": "2026-11-23",
+        "score": 0.15358,
+        "seconds": 375.0,
+        "none": None,
+        "interval": {"mean": 0.4, "half": 0.1, "text": "0.40 ± 0.10"},
+        "words": ["- one", "- two"],
+        "rows": [{"name": "spider", "speed": 1.5e6}, {"name": "snake", "speed": 2.25e6}],
+    }
+}
+
+
+def fill(text, results=RESULTS):
+    return figures._MARK.sub(lambda mark: figures.fill_mark(mark, results), text)
+
+
+@pytest.mark.parametrize("page", figures.PAGES, ids=lambda page: page.name)
+def test_every_figure_is_traced_and_as_its_results_file_has_it(page):
+    filled, wrong = figures.check_page(page, figures.read_results())
+    assert wrong == []
+    assert filled == page.read_text(encoding="utf-8"), "run: make numbers"
+
+
+@pytest.mark.parametrize(
+    ("template", "shown"),
+    [
+        ("{swim.score:.3f}", "0.154"),
+        ("{swim.score*100:.0f} %", "15 %"),
+        ("{swim.seconds/60:.1f} min on {swim.date}", "6.2 min on 2026-11-23"),
+        ("{swim.interval}, {swim.interval.half:.2f}", "0.40 ± 0.10, 0.10"),
+        ("{swim.rows.snake.speed:,.0f}", "2,250,000"),
+        ("{swim.rows.0.name}", "spider"),
+        ("{swim.none:.2f}", "–"),
+        ("{swim.words}", "\n\n- one\n- two\n\n"),
+    ],
+)
+def test_templates(template, shown):
+    text = f"swims <!--n {template}-->12<!--/--> far"
+    assert fill(text) == f"swims <!--n {template}-->{shown}<!--/--> far"
+    assert fill(fill(text)) == fill(text)
+
+
+def test_a_table_has_a_row_for_each_element():
+    mark = "<!--rows swim.rows | `{name}` | {speed*1e-6:.2f} |-->"
+    head = "| | million/s |\n|---|---|\n"
+    filled = fill(f"{mark}\n\n{head}| old | 1 |\n\n<!--/-->\n")
+    assert filled == f"{mark}\n\n{head}| `spider` | 1.50 |\n| `snake` | 2.25 |\n\n<!--/-->\n"
+    assert fill(filled) == filled
+    with pytest.raises(ValueError, match="without a heading"):
+        fill(f"{mark}<!--/-->")
+
+
+@pytest.mark.parametrize("field", ["lost.score", "swim.lost", "swim.rows.7", "swim.score.mean"])
+def test_a_field_that_no_results_file_has_is_named(field):
+    with pytest.raises(KeyError, match=re.escape(f"of {field!r} in docs/results")):
+        fill(f"<!--n {{{field}}}-->1<!--/-->")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "It swims at .55 body lengths/s.",
+        "It takes 81 seconds.",
+        "It takes 81\nseconds.",
+        "Four times as fast: 75 times MuJoCo's.",
+        "With 0.7 GB of memory",
+        "an error of 12 %",
+        "as 0.2 or so",
+        "8 ± 2 robots",
+        "10 million spiders per second",
+        "**3×** faster",
+        "| a step | 354 |\n",
+        "`0.155` far",
+        "In `code`, 5 minutes.",
+        "![half a metre in 10 s](swim.png)",
+        "```\nmake evolve   # 81 s\n```",
+        "```text\nchampion: 0.55\n```",
+        "<!-- 0.5 --> 2.5 m",
+        "<!--n {swim.score:.1f}-->0.2<!--/--> and 0.3 more",
+        "x <!--n 0.55-->0.55<!--/-->",
+        "x <!--n {swim.score:.1f} in 81 s-->0.2 in 81 s<!--/-->",
+    ],
+)
+def test_figures_outside_marked_places_are_found(text):
+    assert len(list(figures.find_figures(f"Before.\n\n{text}", []))) >= 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "see <!--n {swim.score*100:.0f} % ± {swim.score}-->15 % ± 0.15<!--/-->",
+        "with `--set task.duration=0.5` and `over\ntwo lines 0.5 s`",
+        "JAX 0.10.2 and MuJoCo 4.0, version 1.2.3",
+        "[a link](https://example.org/0.5%20s), 2 cores, seed 0, 16 starts, 3 m deep",
+        "```\nsleep 10.5\n```\n\n```python\nx = 0.5\n```",
+    ],
+)
+def test_what_is_no_measured_figure_is_left_alone(text):
+    assert list(figures.find_figures(f"Before, {text}.", [])) == []
+
+
+def test_constants_stand_in_their_words_only():
+    text = "Limits: at most\n0.5 m. Again 0.5 m.\n\n| key | default |\n|---|---|\n| `x` | 3 |\n"
+    found = list(figures.find_figures(text, ["at most 0.5 m", "| key | default |"]))
+    assert found == [(2, "'0.5' is in no results file")]
+    assert [w for _, w in figures.find_figures("", ["at most 0.5 m"])] == [
+        "'at most 0.5 m' of docs/constants.yaml is not here any more"
+    ]
+
+
+def test_constants_have_reasons_and_words_of_their_page():
+    constants = yaml.safe_load((ROOT / "docs" / "constants.yaml").read_text(encoding="utf-8"))
+    assert {*constants} <= {page.name for page in figures.PAGES}
+    for page, reasons in constants.items():
+        for reason, fragments in reasons.items():
+            assert len(reason) > 5 and fragments, page
+            for fragment in fragments:
+                # A figure alone would allow it anywhere.
+                assert re.search(r"[^\W\d_]{3}", fragment), f"{page}: {fragment}"
+
+
+def test_lines_are_told():
+    text = "One.\n\nSee <!--n {swim.words}-->\n\n- one\n- two\n\n<!--/-->\nand 0.3 more.\n"
+    assert list(figures.find_figures(text, [])) == [(9, "'0.3' is in no results file")]
+
+
+def test_a_marked_place_does_not_begin_a_line():
+    """There a renderer takes the whole line for HTML, and no text."""
+    found = list(figures.find_figures("It swims\n<!--n {swim.score}-->1<!--/--> far.", []))
+    assert found == [(2, "a line begins with a marked place")]
+
+
+@pytest.mark.parametrize("page", figures.PAGES, ids=lambda page: page.name)
+def test_marked_places_do_not_disturb_what_is_rendered(page):
+    """As GitHub renders it: the same without them."""
+    markdown = pytest.importorskip("markdown_it").MarkdownIt("commonmark").enable("table")
+    text = page.read_text(encoding="utf-8")
+    plain = figures._MARK.sub(lambda mark: mark[4], text)
+    rendered = re.sub(r"<!--.*?-->", "", markdown.render(text), flags=re.S)
+    assert rendered.split() == markdown.render(plain).split()
+
+
+def test_results_say_what_they_depend_on():
+    for name, result in figures.read_results().items():
+        assert result["study"] == name
+        assert re.fullmatch(r"20\d\d-\d\d-\d\d", result["date"])
+        assert {"versions", "machine", "seeds", "numbers"} <= {*result}
+        assert "mjx_revolve" in result["versions"]
+
+
+def test_an_interval_that_is_not_known_is_null():
+    assert as_numbers(interval([0.1, 0.3])) == {
+        "mean": pytest.approx(0.2), "half": pytest.approx(1.27, abs=0.01), "size": 2,
+        "text": "0.2 ± 1.3",
+    }  # fmt: skip
+    assert as_numbers(interval([])) == {"mean": None, "half": None, "size": 0, "text": "–"}
