@@ -84,8 +84,9 @@ def swim_randomly(names: Sequence[str]) -> Iterator[Page]:
     bodies = []
     for name in names:
         body = load_morphology(name)
-        with contextlib.suppress(InputError):  # what floats, floats
-            body = trim_neutral(body, water.density)
+        if body.num_hinges or body.num_thrusters:  # what cannot swim, sinks
+            with contextlib.suppress(InputError):  # what floats, floats
+                body = trim_neutral(body, water.density)
         bodies.append(body)
     fitness = make_mixed_fitness(
         "fish_swim", bodies, **{"task.duration": SECONDS, "task.start_tilt": 0.0}

@@ -91,7 +91,7 @@ def read_notebook(path: Path) -> str:
 
 def list_texts(folder: Path) -> dict[str, str]:
     """The pages of prose by name, in reading order, as Markdown; the README is `index`."""
-    pages = [*list_pages(), *sorted((ROOT / "notebooks").glob("*.ipynb"))]
+    pages = [*sorted((ROOT / "notebooks").glob("*.ipynb")), *list_pages()]
     texts = {"index": ROOT / "README.md"} | {path.stem: path for path in pages}
     read = {
         name: read_notebook(path) if path.suffix == ".ipynb" else path.read_text(encoding="utf-8")
@@ -148,8 +148,9 @@ def mend_values(document: pdoc.doc.Module) -> None:
     for home, name in re.findall(r"^from \.([\w.]+) import (\w+)", stub, re.MULTILINE):
         member = document.members[name]
         if isinstance(member, pdoc.doc.Variable):
-            made = pdoc.doc.Module(importlib.import_module(f"{document.modulename}.{home}"))
-            vars(member)["docstring"] = made.members[name].docstring
+            made = pdoc.doc.Module(importlib.import_module(f"{document.modulename}.{home}")).members
+            # A value that is made when it is first used has the docstring of what makes it.
+            vars(member)["docstring"] = made.get(name, made.get("__getattr__")).docstring
             vars(member)["default_value_str"] = ""
 
 
