@@ -46,11 +46,13 @@ format: $(READY)  ## let ruff mend what it can
 	$(RUN) -m ruff check --fix .
 	$(RUN) -m ruff format .
 
-docs: $(READY)  ## the documentation and a reference of all functions, as HTML in build/docs
+docs: $(READY)  ## the site in build/docs: pages, reference, gallery; minutes
 	$(RUN) docs/settings.py
 	$(RUN) docs/figures.py
 	for kind in config modules morphology sweep world; do \
 	  $(RUN) -m mjx_revolve schema $$kind > mjx_revolve/schemas/$$kind.json || exit 1; done
+	rm -rf build/docs
+	$(RUN) docs/gallery.py build/docs
 	$(RUN) docs/reference.py build/docs
 
 numbers: $(READY)  ## the figures of README and docs from docs/results

@@ -1,16 +1,17 @@
-"""Writes the documentation as HTML: these pages, and a reference of all modules.
+"""Writes the documentation as HTML: these pages, and a reference of all public names.
 
     python docs/reference.py build/docs
 
-`index.html` is the README; every `docs/*.md` becomes a page; each layer of the package and each
-module has one below `mjx_revolve/`, in reading order. Made by pdoc.
+`index.html` is the README; every `docs/*.md` and every notebook becomes a page; the package and
+each public subpackage has one with the names that it exports. Where `docs/gallery.py` has written
+its pages into the same folder, one leads to them. Made by pdoc.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import pkgutil
+import json
 import re
 import shutil
 import sys
@@ -20,6 +21,10 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import pdoc.doc
+import pdoc.render
+from gallery import describe_gallery
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PACKAGE = "mjx_revolve"
@@ -28,10 +33,10 @@ FIRST = (
     "tutorial", "fit", "settings", "evolution", "viewer", "replay", "live", "report", "sweeps",
     "measures", "interchange", "physics", "parallel",
 )  # fmt: skip
-# The package's layers in reading order: each imports only from itself and from those before it.
-LAYERS = (
-    "inputs", "numerics", "water", "body", "genotypes", "engine", "control", "episodes",
-    "evolution", "formats", "fitting", "view",
+# The public subpackages in reading order: each imports only from itself and from those before it.
+DOORS = (
+    "water", "body", "genotypes", "engine", "control", "episodes", "evolution", "formats",
+    "fitting", "view",
 )  # fmt: skip
 
 _DOT = r'((?:</span><span class="o">)?\.(?:</span><span class="n">)?)'
@@ -53,46 +58,48 @@ def list_pages() -> list[Path]:
     return sorted(DOCS.glob("*.md"), key=lambda path: (place.get(path.stem, 99), path.stem))
 
 
-def list_layers() -> dict[str, list[str]]:
-    """The full names of all public modules by layer, in reading order; the commands come last."""
-    package = importlib.import_module(PACKAGE)
-    layers: dict[str, list[str]] = {layer: [] for layer in LAYERS}
-    commands = []
-    for found in pkgutil.walk_packages(package.__path__, f"{PACKAGE}."):
-        _, layer, *rest = found.name.split(".")
-        if any(part.startswith("_") for part in (layer, *rest)):
-            continue
-        if rest:
-            layers.setdefault(layer, []).append(found.name)
-        elif not found.ispkg:
-            commands.append(found.name)
-    return layers | {"": commands}
+def summary_of(door: str) -> str:
+    """The first line of a subpackage's docstring."""
+    return (importlib.import_module(f"{PACKAGE}.{door}").__doc__ or "").partition("\n")[0]
 
 
-def summary_of(layer: str) -> str:
-    """The first line of a layer's docstring; "" is the front door."""
-    if not layer:
-        return "What users type: arguments in, messages out."
-    return (importlib.import_module(f"{PACKAGE}.{layer}").__doc__ or "").partition("\n")[0]
-
-
-def link_text(text: str, modules: list[str]) -> str:
-    """Turns names of our files in Markdown into links, and pictures' paths into those here."""
+def link_text(text: str) -> str:
+    """Turns names of our pages in Markdown into links, and pictures' paths into those here."""
 
     def link(match: re.Match[str]) -> str:
-        name = match[1]
-        if (DOCS / f"{name}.md").is_file() and match[0].startswith("`docs/"):
-            return f"[{match[0]}]({name}.html)"
-        if f"{PACKAGE}.{name.replace('/', '.')}" in modules and match[0].endswith(".py`"):
-            return f"[{match[0]}]({PACKAGE}/{name}.html)"
-        return match[0]
+        found = (DOCS / f"{match[1]}.md").is_file()
+        return f"[{match[0]}]({match[1]}.html)" if found else match[0]
 
     parts = re.split(r"(^```.*?^```$)", text, flags=re.MULTILINE | re.DOTALL)
     for k in range(0, len(parts), 2):  # not inside blocks
-        parts[k] = re.sub(r"`(?:docs|mjx_revolve)/([\w/]+)\.(?:md|py)`", link, parts[k])
+        parts[k] = re.sub(r"`docs/([\w/]+)\.md`", link, parts[k])
+        parts[k] = re.sub(r"`notebooks/(\w+)\.ipynb`", r"[\g<0>](\1.html)", parts[k])
         parts[k] = re.sub(r"\]\(docs/([\w.]+)\)", r"](\1)", parts[k])
         parts[k] = re.sub(r"\]\((\w+)\.md(#[\w-]+)?\)", r"](\1.html\2)", parts[k])
     return "".join(parts)
+
+
+def read_notebook(path: Path) -> str:
+    """A notebook as Markdown, its code in blocks, without results."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    texts = ("".join(cell["source"]) for cell in cells)
+    return "\n\n".join(
+        text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```"
+        for cell, text in zip(cells, texts, strict=True)
+    )
+
+
+def list_texts(folder: Path) -> dict[str, str]:
+    """The pages of prose by name, in reading order, as Markdown; the README is `index`."""
+    pages = [*sorted((ROOT / "notebooks").glob("*.ipynb")), *list_pages()]
+    texts = {"index": ROOT / "README.md"} | {path.stem: path for path in pages}
+    read = {
+        name: read_notebook(path) if path.suffix == ".ipynb" else path.read_text(encoding="utf-8")
+        for name, path in texts.items()
+    }
+    gallery = describe_gallery(folder)
+    first, *rest = read.items()
+    return dict([first, *([("gallery", gallery)] if gallery else []), *rest])
 
 
 def make_page(name: str, text: str) -> types.ModuleType:
@@ -132,6 +139,21 @@ def mend_checked(module: types.ModuleType) -> None:
                 value.__annotations__ = typing.get_type_hints(value)
 
 
+def mend_values(document: pdoc.doc.Module) -> None:
+    """Gives the tables that a door exports their docstrings, which stand where they are made.
+
+    Their values, which are long, are left out.
+    """
+    stub = Path(document.source_file or "").with_suffix(".pyi").read_text(encoding="utf-8")
+    for home, name in re.findall(r"^from \.([\w.]+) import (\w+)", stub, re.MULTILINE):
+        member = document.members[name]
+        if isinstance(member, pdoc.doc.Variable):
+            made = pdoc.doc.Module(importlib.import_module(f"{document.modulename}.{home}")).members
+            # A value that is made when it is first used has the docstring of what makes it.
+            vars(member)["docstring"] = made.get(name, made.get("__getattr__")).docstring
+            vars(member)["default_value_str"] = ""
+
+
 def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     """Writes all pages.
 
@@ -141,36 +163,27 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     Returns:
         The HTML files, and what pdoc could not make sense of.
     """
-    import pdoc.doc
-    import pdoc.render
-
-    layers = list_layers()
-    modules = [name for found in layers.values() for name in found]
-    package = importlib.import_module(PACKAGE)
-    for layer in ["", *layers]:  # their names are imported when they are first used
-        door = importlib.import_module(f"{PACKAGE}.{layer}".rstrip("."))
-        for name in getattr(door, "__all__", ()):
-            getattr(door, name)
-    pages = {"index": ("README", ROOT / "README.md")}
-    pages |= {path.stem: (title_of(path), path) for path in list_pages()}
+    texts = list_texts(folder)
     documents: dict[str, pdoc.doc.Module] = {
-        name: pdoc.doc.Module(make_page(name, link_text(path.read_text(encoding="utf-8"), modules)))
-        for name, (_, path) in pages.items()
+        name: pdoc.doc.Module(make_page(name, link_text(text))) for name, text in texts.items()
     }
-    for name in [PACKAGE, *(f"{PACKAGE}.{layer}" for layer in layers if layer), *modules]:
-        module = importlib.import_module(name)
+    for door in [PACKAGE, *(f"{PACKAGE}.{door}" for door in DOORS)]:
+        module = importlib.import_module(door)
+        for name in module.__all__:  # which are imported when they are first used
+            getattr(module, name)
         mend_tuples(module)
         mend_checked(module)
-        documents[name] = pdoc.doc.Module(module)
+        documents[door] = pdoc.doc.Module(module)
+        mend_values(documents[door])
     pdoc.render.configure(
         docformat="google",
-        footer_text=f"{PACKAGE} {package.__version__}",
+        footer_text=f"{PACKAGE} {importlib.import_module(PACKAGE).__version__}",
         template_directory=DOCS / "pages",
     )
-    pdoc.render.env.globals["prose"] = [(name, title) for name, (title, _) in pages.items()]
-    pdoc.render.env.globals["layers"] = [
-        (layer, summary_of(layer), found) for layer, found in layers.items()
+    pdoc.render.env.globals["prose"] = [
+        (name, "README" if name == "index" else title_of(text)) for name, text in texts.items()
     ]
+    pdoc.render.env.globals["doors"] = [(door, summary_of(door)) for door in DOORS]
     written = []
     with warnings.catch_warnings(record=True) as complaints:
         warnings.simplefilter("always", UserWarning)
@@ -190,9 +203,9 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     return written, list(dict.fromkeys(found))
 
 
-def title_of(path: Path) -> str:
+def title_of(text: str) -> str:
     """The first heading of a page."""
-    return path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ").partition(":")[0]
+    return text.partition("\n")[0].removeprefix("# ").partition(":")[0]
 
 
 def main() -> int:

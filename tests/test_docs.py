@@ -8,16 +8,21 @@ import collections
 import graphlib
 import importlib
 import inspect
+import json
 import os
 import pkgutil
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
+from html.parser import HTMLParser
+from urllib.parse import unquote
 
 import pytest
 
 import mjx_revolve
+from browser import Browser, needs_browser
 from laboratory import ROOT
 from mjx_revolve.inputs.packages import REQUIREMENTS
 
@@ -60,6 +65,14 @@ def imports_of(path):
             yield from (name.name for name in node.names if name.name.startswith("mjx_revolve"))
 
 
+def listed_doors():
+    """The public subpackages in the order of the reference."""
+    shown = re.search(
+        r"^DOORS = \((.*?)\)", (ROOT / "docs" / "reference.py").read_text(), re.M | re.S
+    )
+    return re.findall(r"\w+", shown[1])
+
+
 def imports_between_layers(layers):
     """Pairs of layers of which the first imports from the second."""
     found = set()
@@ -92,10 +105,7 @@ def test_layers_import_only_from_layers_above_them(layers):
     pairs = imports_between_layers(layers)
     assert len(pairs) > 20
     assert [(a, b) for a, b in pairs if layers.index(a) < layers.index(b)] == []
-    shown = re.search(
-        r"^LAYERS = \((.*?)\)", (ROOT / "docs" / "reference.py").read_text(), re.M | re.S
-    )
-    assert re.findall(r"\w+", shown[1]) == layers
+    assert listed_doors() == [x for x in layers if (PACKAGE / x / "__init__.pyi").is_file()]
 
 
 def test_the_picture_of_the_layers_is_that_of_their_imports(architecture, layers):
@@ -176,24 +186,33 @@ def exists(name):
 
 
 SCRIPTS = [*sorted((ROOT / "examples").glob("*.py"))]
+NOTEBOOKS = [*sorted((ROOT / "notebooks").glob("*.ipynb"))]
 
 
-@pytest.mark.parametrize("path", [*TEXTS, *SCRIPTS], ids=lambda path: path.name)
+def text_of(path):
+    """The text of a file; of a notebook that of its cells."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".ipynb":
+        return text
+    return "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"])
+
+
+@pytest.mark.parametrize("path", [*TEXTS, *SCRIPTS, *NOTEBOOKS], ids=lambda path: path.name)
 def test_texts_and_examples_import_public_names_only(path):
     """From the package, a subpackage or a command; never from a module in a subpackage."""
     for module, names in re.findall(
-        r"^\s*from (mjx_revolve[\w.]*) import (\([^)]*\)|.*)$", path.read_text(), re.MULTILINE
+        r"^\s*from (mjx_revolve[\w.]*) import (\([^)]*\)|.*)$", text_of(path), re.MULTILINE
     ):
         assert module.count(".") <= 1, module
         public = importlib.import_module(module)
-        for name in re.findall(r"\w+", names.partition("#")[0]):
+        for name in re.findall(r"\w+", re.sub(r"#.*| as \w+", "", names)):
             assert name == "main" or name in public.__all__, f"{module}.{name}"
 
 
-@pytest.mark.parametrize("path", [*TEXTS, *COMMENTED], ids=lambda path: path.name)
+@pytest.mark.parametrize("path", [*TEXTS, *COMMENTED, *NOTEBOOKS], ids=lambda path: path.name)
 def test_every_file_and_name_that_a_text_mentions_exists(path):
     """`mjx_revolve/…` and dotted names anywhere; paths of Python files between backticks."""
-    text = path.read_text(encoding="utf-8")
+    text = text_of(path)
     for name in re.findall(r"\bmjx_revolve/[\w/]+\.(?:py|yaml)\b", text):
         assert (ROOT / name).is_file(), name
     for name in re.findall(r"\bmjx_revolve\.\w+(?:\.\w+)*", text):
@@ -276,66 +295,106 @@ def test_no_two_public_classes_have_one_name():
 # ------------------------------------------------------------------ pages
 
 
+def run_script(name, *arguments):
+    """What a script of `docs/` prints."""
+    command = [sys.executable, str(ROOT / "docs" / name), *map(str, arguments)]
+    place = {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | place)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The folder of pages."""
+    """The folder of pages, with one robot in its gallery."""
     pytest.importorskip("pdoc", reason="the reference is made by pdoc")
     folder = tmp_path_factory.mktemp("docs")
-    command = [sys.executable, str(ROOT / "docs" / "reference.py"), str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, ""), done.stderr
-    assert done.stdout.endswith(f"open {folder / 'index.html'}\n")
+    run_script("gallery.py", folder, "--only", "core")
+    done = run_script("reference.py", folder)
+    assert done.stderr == "" and done.stdout.endswith(f"open {folder / 'index.html'}\n")
     return folder
 
 
-@pytest.mark.slow
-def test_every_module_and_every_promised_name_has_its_place(site):
-    for name in MODULES:
-        place = f"{name.replace('.', '/')}.html"
-        text = (site / place).read_text()
-        assert f'href="{"../" * name.count(".")}{place}"' in text  # in its own table of contents
-    front = (site / "mjx_revolve.html").read_text()
-    for name in mjx_revolve.__all__:
-        assert f'<section id="{name}">' in front, name
-        value = getattr(mjx_revolve, name)
-        if inspect.isfunction(value):
-            home = (site / f"{value.__module__.replace('.', '/')}.html").read_text()
-            assert f'<section id="{name}">' in home
+def test_the_gallery_has_every_robot_and_every_task():
+    """At least thirty pages; champions are whole, and of shipped configurations."""
+    from mjx_revolve.episodes import TASKS, load_config
+    from mjx_revolve.inputs.shipped import list_shipped
+
+    names = runpy.run_path(str(ROOT / "docs" / "gallery.py"))["list_names"]()
+    assert sum(map(len, names.values())) >= 30
+    assert names["robots"] == [*list_shipped("morphologies")]
+    configs = [load_config(ROOT / "docs" / "champions" / x / "config.yaml") for x in names["tasks"]]
+    assert {config.task.type for config in configs} == {*TASKS}
+    for name, config in zip(names["tasks"], configs, strict=True):
+        assert config.task.type == load_config(name).task.type
+        assert (ROOT / "docs" / "champions" / name / "champion" / "genes.yaml").is_file()
 
 
 @pytest.mark.slow
-def test_layers_are_listed_in_the_order_in_which_they_are_imported(site):
-    """Each layer in the table of contents, with its idea; none imports from those behind it."""
-    front = (site / "index.html").read_text()
-    listed = re.findall(
-        r'<p class="idea">\s*<a href="mjx_revolve/(\w+)\.html">.*?</a>\s*(\S)', front
-    )
-    layers = [layer for layer, _ in listed]
-    assert {*layers} == {name.split(".")[1] for name in MODULES if name.count(".") > 1}
-    for name in MODULES:
-        layer = name.split(".")[1]
-        if layer not in layers:  # a command
-            continue
-        behind = layers[layers.index(layer) + 1 :]
-        code = inspect.getsource(importlib.import_module(name))
-        for other in re.findall(r"^\s*(?:from|import) mjx_revolve\.(\w+)", code, re.MULTILINE):
-            assert other not in behind, f"{name} imports from {other}"
+def test_the_reference_has_every_public_name_and_no_private_module(site):
+    doors = ["mjx_revolve", *(f"mjx_revolve.{door}" for door in listed_doors())]
+    for door in doors:
+        path = site / f"{door.replace('.', '/')}.html"
+        text = path.read_text()
+        for name in set(importlib.import_module(door).__all__) - {"__version__"}:
+            section = text.partition(f'<section id="{name}">')[2].partition("</section>")[0]
+            assert 'class="docstring"' in section, f"{door}.{name}"
+    assert len([*site.rglob("mjx_revolve/**/*.html")]) == len(doors) - 1
+
+
+class Links(HTMLParser):
+    """The links and the anchors of a page."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.links, self.anchors = [], {"", "top"}
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attrs):
+        for name, value in attrs:
+            if name in ("href", "src"):
+                self.links.append(value)
+            elif name in ("id", "name"):
+                self.anchors.add(value)
 
 
 @pytest.mark.slow
-def test_every_text_is_a_page_and_links_lead_somewhere(site):
-    pages = ["index", *(path.stem for path in (ROOT / "docs").glob("*.md"))]
-    assert "tutorial" in pages
-    for name in pages:
-        path = site / f"{name}.html"
-        text = re.sub(r"<script.*?</script>", "", path.read_text(), flags=re.DOTALL)
-        for target in re.findall(r'(?:href|src)="([^"#]+)', text):
-            if not target.startswith(("http", "data:")):
-                assert (path.parent / target).is_file(), f"{name}: {target}"
-    # Names of our texts and modules are links.
+def test_every_link_leads_somewhere(site):
+    """To a file of the site, and an anchor in it; nothing but links for people leads elsewhere."""
+    pages = {path: Links(path) for path in site.rglob("*.html")}
+    count = 0
+    for path, page in pages.items():
+        for link in page.links:
+            if link.startswith(("http:", "https:", "data:", "mailto:")):
+                continue
+            target, _, anchor = link.partition("#")
+            found = (path.parent / unquote(target)).resolve() if target else path
+            assert found.is_file(), f"{path.name}: {link}"
+            if found.suffix == ".html":
+                assert unquote(anchor) in pages[found].anchors, f"{path.name}: {link}"
+            count += 1
+    assert count > 2000
+    assert {path.stem for path in TEXTS[1:]} <= {path.stem for path in pages}
+    assert {path.stem for path in NOTEBOOKS} <= {path.stem for path in pages}
+    # Names of our texts are links.
     assert '<a href="physics.html"><code>docs/physics.md</code></a>' in (
         (site / "index.html").read_text()
     )
+
+
+@pytest.mark.slow
+@needs_browser
+def test_every_page_opens_without_an_error_and_fetches_nothing(site):
+    with Browser() as browser:
+        for path in sorted(site.rglob("*.html")):
+            if path.parent.name == "gallery":
+                browser.open(path)
+            else:
+                browser.send("Page.navigate", url=path.as_uri())
+                browser.wait("document.readyState === 'complete'")
+            assert browser.errors == [], path.name
+            assert browser.fact("error") is None, path.name
+        assert all(address.startswith("file:") for address in browser.requests)
 
 
 @pytest.mark.slow

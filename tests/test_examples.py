@@ -1,11 +1,14 @@
-"""Each script in `examples/` runs as it stands, imports public names only, and stays short."""
+"""Each script in `examples/` and each notebook runs as it stands; scripts stay short."""
 
 from __future__ import annotations
 
 import ast
 import importlib.util
+import json
 import runpy
 import sys
+import types
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +17,7 @@ from laboratory import ROOT
 # What examples of other people's libraries need.
 LIBRARIES = ("gymnasium", "stable_baselines3", "ribs", "qdax")
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 @pytest.mark.slow
@@ -39,3 +43,31 @@ def test_an_example_is_short_and_starts_with_what_it_shows(path):
     text = path.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 55
     assert ast.get_docstring(ast.parse(text))
+
+
+def show(path, **_):
+    """What notebooks show pictures and pages with: they are there."""
+    assert Path(path).stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(path, tmp_path, monkeypatch, capsys):
+    """Cell by cell in one namespace, with a stand-in for what only a notebook's program has."""
+    monkeypatch.chdir(tmp_path)
+    display = types.SimpleNamespace(Image=show, IFrame=show)
+    monkeypatch.setitem(sys.modules, "IPython", types.SimpleNamespace(version_info=(9,)))
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    names = {"__name__": "__main__"}
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), f"{path.name}: {cell['id']}", "exec"), names)
+    assert [*tmp_path.glob("*.html")] and "nan" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_stored_without_results(path):
+    book = json.loads(path.read_text(encoding="utf-8"))
+    assert (book["nbformat"], book["nbformat_minor"]) == (4, 5)
+    for cell in book["cells"]:
+        assert not cell.get("outputs") and cell.get("execution_count") is None

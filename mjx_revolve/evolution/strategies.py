@@ -51,7 +51,7 @@ def _strategies() -> dict[str, type]:
 
 
 def __getattr__(name: str) -> dict[str, type]:
-    """`STRATEGIES`, evosax's classes by name."""
+    """`STRATEGIES`: evosax's strategies by name, each a class."""
     if name == "STRATEGIES":
         return _strategies()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
