@@ -310,8 +310,9 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
         engine: "population" or "mjx".
 
     Raises:
-        InputError: the bed's contact, or self-contact, is not the engine's; or the step is too
-            long, and the message names the body and the largest stable step.
+        InputError: the bed's contact is not the engine's, or self-contact of modules that can
+            meet; or the step is too long, and the message names the body and the largest stable
+            step.
     """
     bed = robot.world.bed
     if bed is not None and bed.contact == "mjx" and engine != "mjx":
@@ -319,10 +320,13 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
             f"bed.contact: expected 'penalty' with engine: {engine}; found 'mjx' (choose engine: "
             "mjx, or contact: penalty)"
         )
-    if robot.world.self_contact and engine == "mjx":
+    meeting = robot.assembly.meeting_pairs
+    if len(meeting) and engine == "mjx":
+        rows = robot.fluid.module[meeting[0]]
+        first, second = (robot.morphology.modules[k].name for k in rows)
         raise InputError(
-            "self_contact: expected false with engine: mjx, which has no such contact; found true "
-            "(choose engine: population)"
+            "self_contact: expected false with engine: mjx, which has no such contact, as modules "
+            f"{first!r} and {second!r} can meet; found true (choose engine: population)"
         )
     table, world, assembly = robot.fluid, robot.world, robot.assembly
     explicit = np.array([find_drag_law(name).explicit for name in table.drag])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 
 import jax
@@ -19,7 +20,7 @@ from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.population import make_population_engine
-from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.robot import build_robot, check_timestep
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.engine.self_pairs import candidate_pairs
 from mjx_revolve.episodes.rollout import Rollout, StepInputs, open_loop
@@ -313,6 +314,11 @@ def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):
     assert np.median(deep) < 1e-3
 
 
-def test_mjx_refuses_it():
-    with pytest.raises(InputError, match="self_contact: expected false with engine: mjx"):
+def test_mjx_refuses_modules_that_can_meet():
+    """And says which; a body whose modules cannot meet swims in both engines."""
+    words = "self_contact: expected false with engine: mjx.* modules '(.*)' and '(.*)' can meet"
+    with pytest.raises(InputError, match=words) as found:
         make_engine(jaw(), "mjx")
+    match = re.search(words, str(found.value))
+    assert match and {m.name for m in jaw().morphology.modules} > set(match.groups())
+    check_timestep(build_robot(body("spider"), water()), "mjx")
