@@ -60,6 +60,10 @@ class StoredProgram:
             self._found[tree, shapes] = _load(path, tree) or self._compile(path, args)
         return self._found[tree, shapes](*args)
 
+    def cache_size(self) -> int:
+        """How many executables it has, one for each signature of its arguments."""
+        return len(self._found) + self._jitted._cache_size()
+
     def _name(self, *signature: Any) -> str:
         config: Any = jax.config
         precision = config.jax_enable_x64, config.jax_default_matmul_precision

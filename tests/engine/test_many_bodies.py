@@ -286,11 +286,11 @@ def test_scores_are_those_of_each_body_alone(config, fitness, tmp_path):
         speed = np.asarray(measures["speed_m_s"])[here]
         assert speed == pytest.approx(np.asarray(more["speed_m_s"]), abs=1e-5)
     # The same program for other bodies, and bits that do not depend on who swims beside.
-    compiled = fitness.program(genes, key)._cache_size()
+    compiled = fitness.program(genes, key).cache_size()
     others = [robots[1], robots[0], *(robots[k] for k in pick[2:])]
     swapped = jnp.stack([genes[1], genes[0], *genes[2:]])
     once_more = fitness(others, swapped, key)
-    assert fitness.program(genes, key)._cache_size() == compiled
+    assert fitness.program(genes, key).cache_size() == compiled
     assert np.array_equal(np.asarray(once_more)[[1, 0, 2, 3, 4]], np.asarray(scores))
     # Nor on whether they all happen to have its body.
     snakes = fitness([robots[1]] * 5, swapped.at[1:].set(0.0), key)
@@ -313,10 +313,10 @@ def test_a_body_with_a_population_of_its_own(config, fitness):
         assert np.ravel(measures[name]) == pytest.approx(np.asarray(values), abs=1e-4), name
     # One program for any body, and bits that do not depend on who is beside.
     alone, _ = fitness.evaluate(robots[1], genes[1], key)
-    compiled = fitness.program(genes, key)._cache_size()
+    compiled = fitness.program(genes, key).cache_size()
     assert np.array_equal(alone, scores[1])
     again = fitness(robots[0], genes[0].at[1:].set(0.0), key)
-    assert fitness.program(genes, key)._cache_size() == compiled
+    assert fitness.program(genes, key).cache_size() == compiled
     assert again[0] == scores[0, 0] and again[1] != scores[0, 1]
     # Tables as well as robots.
     assert np.array_equal(fitness(fitness.pack(robots), genes, key), scores)

@@ -85,7 +85,7 @@ def test_one_body_and_many_and_its_replay(settings):
     np.testing.assert_allclose(mixed(robots[0], genes, KEY), scores, rtol=1e-3, atol=1e-5)
     # Other draws, the same program.
     assert not np.allclose(fitness(genes, jax.random.key(8)), scores, rtol=1e-3)
-    assert fitness.program(genes, KEY)._cache_size() == 1
+    assert fitness.program(genes, KEY).cache_size() == 1
     one = make_fitness(settings, **{"task.trials": 1})
     score, _ = one.judge(one.replay(genes[0], KEY), KEY)
     assert score == pytest.approx(float(one(genes[:1], KEY)[0]), rel=1e-3)

@@ -104,7 +104,8 @@ def config(folder, kind, **settings):
         "morphology": str(folder / "robot.yaml"),
         "world": "lake",
         "trim": "neutral",
-        "controller": {"type": kind, **settings},
+        # Held, so that what the robot is sent is what the brain says.
+        "controller": {"type": kind, "between": "hold", **settings},
         "task": {"type": "search", "target_distance": 1.0, "sight": 1.05, "duration": 1.5},
     }
 

@@ -654,12 +654,15 @@ def test_the_command_films_a_colony(way, tmp_path, capsys):
 def command(episode, monkeypatch):
     """Runs the command on the made-up episode."""
     import mjx_revolve.episodes.champion
+    import mjx_revolve.episodes.early_checks
     import mjx_revolve.view.viewer
 
     def load(path, world="lake", duration=None, seed=None, individual=None, modules=None):
         return episode
 
     monkeypatch.setattr(mjx_revolve.episodes.champion, "load_episode", load)
+    # Its files are made up, too.
+    monkeypatch.setattr(mjx_revolve.episodes.early_checks, "check_episode_files", lambda _: None)
 
     def write(episode, path):
         write_atomic(path, episode.title.encode())

@@ -318,9 +318,12 @@ def test_phases_of_oscillators_without_neighbours_turn_evenly(lab):
     assert np.allclose(phases, 2 * np.pi * np.sin(genes[:2]) * seconds[:, None], atol=1e-4)
     trajectory = fitness.replay(genes, replay_key(0))
     low, high = fitness.robot.mj_model.actuator_ctrlrange.T
-    # Commands are due every tenth step, of the phases then, and held between.
-    due = np.concatenate([np.zeros((1, 2)), phases[9:99:10]]).repeat(10, axis=0)
-    expected = (low + high) / 2 + (high - low) / 2 * np.tanh(np.sin(due))
+    # Commands are due every tenth step, of the phases then, and targets go there in ten steps.
+    due = np.concatenate([np.zeros((1, 2)), phases[9:99:10]])
+    commands = (low + high) / 2 + (high - low) / 2 * np.tanh(np.sin(due))
+    before = np.concatenate([commands[:1], commands[:-1]])
+    way = np.tile(np.arange(10) / 10, 10)[:, None]
+    expected = before.repeat(10, axis=0) + way * (commands - before).repeat(10, axis=0)
     assert np.allclose(trajectory.ctrl[:100], expected, atol=1e-4)
 
 
