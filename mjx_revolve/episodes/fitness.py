@@ -129,7 +129,7 @@ class Fitness(EpisodeSpec):
         """The controller as a device runs it: called at its rate, with exact sensors.
 
         It acts whenever it is called, and holds nothing; what it is given has the noise, the rate
-        and the delay of real sensors. Its genes are those of `controller`.
+        and the delay of real sensors. It takes the same genes as the controller in the simulation.
         """
         rate, plant = self.controller.rate, plant_of(self.robot)
         body = self.robot.morphology

@@ -335,7 +335,8 @@ def _scores(
         order = jnp.arange(len(lanes.start), dtype=jnp.int32)
         return over_chunks(swim)(jnp.asarray(lanes.brain, jnp.int32), order)
 
-    found = jit(run)(genes, key)
+    # The smaller steps are soon done, even where the compiler has not done its best.
+    found = jit(run, fast=not long)(genes, key)
     return {seconds: np.asarray(x, float) for seconds, x in found.items()}
 
 

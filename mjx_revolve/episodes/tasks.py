@@ -357,6 +357,7 @@ TASKS: Mapping[str, Task] = {
     "follow_bed": Task(follow_bed, _SPEED, start=start_above_bed, on_bed=True),
     "crawl": Task(crawl, _SPEED, start=start_on_bed, on_bed=True),
 }
+"""The tasks by their names in configurations."""
 
 
 def find_task(settings: Any, source: str = "config") -> Task:

@@ -235,6 +235,7 @@ SCHEMES: dict[str, SelectionScheme] = {
     "map_elites": SelectionScheme(_uniformly, _all),
     "random": SelectionScheme(_uniformly, _best_ever),
 }
+"""The schemes of selection by their names in configurations."""
 
 
 def check_selection(settings: SelectionConfig, mu: int) -> None:

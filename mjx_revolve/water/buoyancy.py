@@ -339,6 +339,7 @@ OFF = BuoyancyLaw(
 )
 
 BUOYANCY_LAWS = {law.name: law for law in (PARTIAL, MASK, OFF)}
+"""The buoyancy laws by the names that worlds and modules give."""
 
 
 def find_buoyancy_law(name: str) -> BuoyancyLaw:

@@ -37,6 +37,7 @@ DRAG_LAWS: dict[str, DragLaw] = {
         OFF,
     )
 }
+"""The drag laws by the names that worlds and modules give."""
 
 
 def find_drag_law(name: str) -> DragLaw:
