@@ -7,7 +7,7 @@ TEST   := $(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile 
 READY  := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve test test-quick fuzz check format docs bench dist environments numbers lock clean
+.PHONY: help install evolve test test-all test-quick fuzz check format docs bench dist environments numbers lock clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -28,14 +28,17 @@ install: $(READY)  ## set up .venv
 evolve: $(READY)  ## evolve a swimmer in the lake (into runs/)
 	$(RUN) -m mjx_revolve.evolve configs/lake_swim.yaml
 
-test: $(READY)  ## all tests
+test: $(READY)  ## the tests, but for some long ones
+	$(TEST) -m "not long"
+
+test-all: $(READY)  ## all tests: notebooks, the tutorial and more cases, too; three times as long
 	$(TEST)
 
 fuzz: $(READY)  ## malformed files of all kinds, drawn anew; N of each (default: 2000)
 	MJX_REVOLVE_FUZZ=$(or $(N),2000) $(RUN) -m pytest tests/inputs/test_fuzz.py
 
 test-quick: $(READY)  ## the quick tests, under two minutes
-	$(TEST) -m "not slow"
+	$(TEST) -m "not slow and not long"
 
 check: $(READY)  ## lint, format and types
 	$(RUN) -m ruff check .

@@ -45,6 +45,8 @@ if __name__ == "__main__":
         "task.duration": 3,
         "task.settle": 1,
         "task.trials": 1,
+        "evolution.passport": "false",  # so short a run finds nothing to judge
+        "bodies.selection.passport": "made",
     }
     arguments = [f"--set={key}={value}" for key, value in settings.items()]
     sys.exit(main(["lake_coevolve", "--out", "worms", *arguments]))

@@ -7,6 +7,7 @@ import gc
 import os
 import shutil
 import tempfile
+from collections import Counter
 
 # One cache of compiled programs for the session: its workers, the commands that tests run, and the
 # processes that they start, compile a program once, and the user's own cache stays as it is. XLA's
@@ -97,3 +98,10 @@ _LONGEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     place = {name: number for number, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+    seen: Counter[str] = Counter()
+    for item in items:
+        if (sampled := item.get_closest_marker("sampled")) is not None:
+            name = item.nodeid.partition("[")[0]
+            seen[name] += 1
+            if seen[name] > sampled.args[0]:
+                item.add_marker(pytest.mark.long)

@@ -106,14 +106,14 @@ def test_the_shipped_smoke_run(smoke):
     check_files(smoke)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_shipped_auv_holds_its_depth_as_its_file_says(tmp_path):
     """With a seed that used to learn nothing; without thrust it scores -1.7 body lengths."""
     command("evolve", "auv_hold_depth", "--seed", 4, "--out", tmp_path / "auv")
     assert -0.06 < yaml.safe_load((tmp_path / "auv/champion/genes.yaml").read_text())["score"] < 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_film_of_a_run(smoke):
     try:
         find_opengl()

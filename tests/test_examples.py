@@ -20,8 +20,13 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def long_ones(path):
+    """What evolves with workers, draws pages or differentiates takes a quarter of a minute."""
+    long = path.stem[:2] in ("10", "11", "12", "16")
+    return pytest.param(path, marks=pytest.mark.long if long else pytest.mark.slow)
+
+
+@pytest.mark.parametrize("path", map(long_ones, EXAMPLES), ids=lambda path: path.stem)
 def test_an_example_runs(path, tmp_path, monkeypatch, capsys):
     text = path.read_text(encoding="utf-8")
     needed = [name for name in LIBRARIES if f"import {name}" in text or f"from {name}" in text]
@@ -50,7 +55,7 @@ def show(path, **_):
     assert Path(path).stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(path, tmp_path, monkeypatch, capsys):
     """Cell by cell in one namespace, with a stand-in for what only a notebook's program has."""

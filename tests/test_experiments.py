@@ -254,7 +254,7 @@ def test_every_row_of_the_benchmark_can_be_made():
             assert (ROOT / "morphologies" / f"{row.robot}.yaml").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_quick_benchmark_runs_and_keeps_its_numbers(tmp_path, capsys, monkeypatch):
     # What its rows measure is not looked at: the older emitters take half of the time to compile.
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
@@ -311,7 +311,7 @@ def test_a_step_along_the_gradient_never_lowers_the_score():
     assert optimisers.line_search(lambda step: float("nan"), 0.5) == (0.0, 0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_three_optimisers_share_one_fitness(monkeypatch):
     # Half the hinges, half the time to compile.
     fish = str(ROOT / "morphologies" / "fish.yaml")

@@ -181,7 +181,7 @@ def test_a_ships_section_bobs_too_slowly_and_rolls_too_far():
     assert heave == pytest.approx(1e3 * data.WAVE_AMPLITUDE, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command(tmp_path, capsys):
     assert measured.main(["--quick", "--out", str(tmp_path)]) == 0
     assert "ours / measured" in capsys.readouterr().out

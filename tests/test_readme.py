@@ -98,7 +98,7 @@ def test_the_readme_has_commands_and_programs():
     assert len(programs(readme)) > 6 and len([*commands(readme)]) > 12
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_readmes_programs_run():
     """All but the last, which reads a run that is made by hand; smaller, so that it takes less."""
     *texts, archive = programs(PAGES[0])

@@ -64,7 +64,7 @@ def metrics(folder):
     return {name: values.tolist() for name, values in found.items() if name not in CLOCK}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch, capsys):
     two = ("--only", "bed,open_water")
     assert study(tmp_path, *two, "--generations", "2") == 0
@@ -172,7 +172,7 @@ def test_budgets_are_equal(settings):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_a_body_scores_at_rest_is_told():
     """A spider hangs as it starts; a crooked body turns at first, and its core moves."""
     case = ENVIRONMENTS["open_water"]

@@ -153,7 +153,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_process_with_workers_goes_on(folder, no_pictures):
     """Real processes: kill -9 in the second run; here, without workers, to the end."""
     options = ("toy.yaml", "--seeds", "2", "--set", "evolution.generations=12", "--out")

@@ -106,7 +106,7 @@ def follow(blocks, folder):
     return printed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_prints_what_the_text_says(desk):
     _, printed = desk
     assert len(printed) == sum(block.language == "text" for block in BLOCKS)
@@ -119,7 +119,7 @@ def test_it_prints_what_the_text_says(desk):
             place = match.end()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_writes_what_the_text_says(desk):
     folder, _ = desk
     names = set(re.findall(r"`((?:mine|runs)/[\w./]+)`", plain_text()))
@@ -129,7 +129,7 @@ def test_it_writes_what_the_text_says(desk):
         assert path.is_dir() if name.endswith("/") else path.is_file(), name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_numbers_are_about_those_of_the_text(desk):
     """Masses and counts to the digit; scores as far as few generations and other CPUs give them."""
     folder, printed = desk

@@ -186,6 +186,7 @@ def test_creep_stays_below_the_stated_speed(lake_core):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("bed", [FLAT, LAKE], ids=["flat", "lake"])
 def test_a_spider_lands_and_stays(bed):
     """Legs first, on its back, on a slope: on top of the bed in float32 after 15 s, and calm."""

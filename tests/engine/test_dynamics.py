@@ -101,6 +101,7 @@ def test_acceleration_in_float32():
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("path", REAL, ids=lambda p: f"{p.parent.name}-{p.stem}")
 def test_acceleration_of_real_bodies(path):
     """Every shipped and wild morphology in MuJoCo's inertia box, float32."""
@@ -277,6 +278,7 @@ def test_the_two_engines_agree_on_one_module():
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", FULL)
 def test_the_two_engines_agree(case):
     """The same with hinges and servos, and each of the other laws."""

@@ -129,6 +129,7 @@ def alike_acceleration(robot, capacity, arrays):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", WORLDS)
 def test_accelerations_are_those_of_each_body_alone(name):
     robots = zoo(name)
@@ -210,7 +211,7 @@ def test_room_for_all_bodies_of_so_many_modules():
         pack_bodies([build_robot(random_body(0, 8, 0), tank)], capacity)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_trajectory_is_that_of_the_body_alone():
     """Lagged thrusters, carried water and all, through the compiled step that users run."""
     robots, each = zoo("everything"), 2
@@ -298,7 +299,7 @@ def test_scores_are_those_of_each_body_alone(config, fitness, tmp_path):
     assert np.asarray(fitness([robots[1]], swapped[:1], key))[0] == np.asarray(scores)[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_body_with_a_population_of_its_own(config, fitness):
     """One body for all, or several with as many individuals each: as if they were side by side."""
     robots = [fitness.build(random_body(3, 6)), fitness.build(body("snake"))]
@@ -357,6 +358,7 @@ NOISY = {
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("kind", "other", "tank", "task", "checked"),
     [
@@ -430,6 +432,7 @@ def test_types_that_no_example_has_score_as_alone(stranger):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("hinge", [False, True])
 def test_bodies_of_one_module_score_in_a_batch_and_with_populations_of_their_own(config, hinge):
     """Two cores, or with a hinge each; three individuals of each, who are told apart if they can.

@@ -88,6 +88,7 @@ def swim(robot, qpos, qvel, ctrl):
         return np.moveaxis(np.asarray(way), -1, 0)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name, axes, world",
     [
@@ -173,7 +174,7 @@ def test_a_symmetric_beat_goes_straight_once_it_has_begun():
     assert abs(slow[1]) < abs(course[1]) / 10
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_course_converges_with_the_time_step():
     """It is of the first strokes, not of the step: halved steps change it less and less."""
     found = []

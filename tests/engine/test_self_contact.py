@@ -82,6 +82,7 @@ def momentum(robot, qpos, qvel):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("timestep", [0.005, 0.01, 0.02])
 def test_servos_at_full_torque_press_less_than_2_mm(timestep):
     robot = jaw(timestep=timestep)
@@ -199,7 +200,7 @@ def march_batch(robots, capacity, lanes, ctrl, steps):
         return np.asarray(run(bodies, jnp.asarray(ctrl)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_body_alone_and_in_a_batch_agree():
     world = water(timestep=0.01)
     robots = [build_robot(x, world) for x in (fork(3, 1), fork(3, 0), body("spider"))]
@@ -268,7 +269,7 @@ def test_pairs_that_can_never_meet_cost_nothing():
     assert len(ends) <= 6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gradients_through_a_contact_are_finite():
     robot = jaw(timestep=0.02)
     engine = make_population_engine(robot)
@@ -289,6 +290,7 @@ def test_gradients_through_a_contact_are_finite():
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("timestep", [0.005, 0.02])
 def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):
     world = water(timestep=timestep)

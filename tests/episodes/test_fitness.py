@@ -126,7 +126,7 @@ def test_under_jit_and_vmap(fitness, population, scores):
     np.testing.assert_allclose(both.reshape(-1), scores[:40], atol=2e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gradient_points_uphill(settings):
     short = make_fitness(settings, **{"task.duration": 0.6, "task.trials": 1})
     genes = 0.3 * jnp.ones((1, short.num_genes))

@@ -27,7 +27,7 @@ def short(monkeypatch):
     monkeypatch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, short):
     """A robot that a current carries keeps its score in all other trials."""
     settings = swimmer(tmp_path, OAR, TASK) | {"world": {"name": "lake", "current": [0.2, 0, 0]}}

@@ -70,7 +70,7 @@ def test_draws_are_the_keys_and_within_their_ranges(settings):
     assert plain.variation is None and Variation._fields == tuple(RobustConfig.model_fields)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_body_and_many_and_its_replay(settings):
     """The same scores from both programs, and from the trajectory of each trial."""
     fitness = make_fitness(settings)

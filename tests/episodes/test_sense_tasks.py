@@ -148,7 +148,7 @@ def test_a_pursuer_is_the_robots_own(chased):
     assert first == pytest.approx(0.4 - 0.3 * one.robot.world.timestep, abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bodies_in_a_batch_are_pursued_alike(chased):
     fitness, genes, _ = chased
     many = make_mixed_fitness(fitness.config, [fitness.robot.morphology])

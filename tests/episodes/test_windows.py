@@ -67,6 +67,7 @@ def mean_gain(windows, episodes):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", BRAINS)
 def test_closed_loop_gradients_are_those_of_differences(settings, kind):
     """Through sensors with noise, brain, servos and water, in float64, over 0.4 s."""
@@ -79,7 +80,7 @@ def test_closed_loop_gradients_are_those_of_differences(settings, kind):
         check_gradient(mean_gain(windows, episodes), np.asarray(genes[0]), gradient)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gradients_for_many_bodies_are_those_of_differences(settings, tmp_path):
     """A closed loop of two different bodies side by side, by JAX's own gradient."""
     (tmp_path / "turned.yaml").write_text(
@@ -115,7 +116,7 @@ def windows(brain):
     return make_windows(brain, 0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_windows_carried_on_are_one_long_rollout(brain, windows):
     """The program of the fitness knows of no windows: the same scores, to rounding in float64.
 
@@ -146,7 +147,7 @@ def test_windows_carried_on_are_one_long_rollout(brain, windows):
         check_gradient(value, np.asarray(new[0]), gradient, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_memory_grows_with_the_state_and_not_with_the_steps_working(windows):
     """XLA's own sum of what lives beside arguments and results."""
     with jax.enable_x64(True):  # as above, so that nothing is compiled again

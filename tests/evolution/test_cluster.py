@@ -153,6 +153,7 @@ def test_a_lost_worker_costs_nothing(cluster, executor, kind, caplog):
     ]
 
 
+@pytest.mark.long
 def test_a_block_that_kills_scores_worst_and_is_named(executor, caplog):
     population = np.random.default_rng(4).normal(size=(10, 5)).astype(np.float32)
     population[5] = 200.0
@@ -191,7 +192,7 @@ def test_workers_of_another_source_are_refused(cluster, executor, config, caplog
     assert worker.blocks == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_lost_scheduler_ends_the_run_which_goes_on_elsewhere(
     cluster, executor, config, capsys, monkeypatch, tmp_path
 ):

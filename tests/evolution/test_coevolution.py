@@ -298,6 +298,7 @@ def contents(folder):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("bodies", [
     {"learning": {"population_size": 4, "generations": 2, "strategy": "CMA_ES"}},
     pytest.param(ARCHIVE, marks=pytest.mark.slow),

@@ -275,7 +275,7 @@ def test_it_goes_on_from_any_checkpoint_bit_for_bit(history, config):
             assert np.array_equal(last[name][..., here], same[name][..., here]), name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_writes_and_resumes_a_run(tmp_path, history, capsys):
     """Stopped after five intervals and resumed, its events are those of `history`."""
     path, run = tmp_path / "colony.yaml", tmp_path / "run"

@@ -317,6 +317,7 @@ def pids_of(executor):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @needs_proc
 @pytest.mark.parametrize(
     ("kind", "how"),

@@ -411,7 +411,7 @@ def test_the_page_shows_what_was_found(fitted):
 # --- measured -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not SHARED.is_file(), reason=f"EPFL's glide is not there: {SHARED}")
 def test_two_seconds_of_a_glide_foretell_the_rest_of_its_way():
     """AmphiBot's marks: drag and friction from 2 s of them, the way of the others within 3 %."""

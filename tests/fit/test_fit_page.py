@@ -14,7 +14,7 @@ def test_every_block_is_of_a_known_kind():
     assert {b.language for b in BLOCKS if not b.path} == {"", "python", "text"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_prints_what_the_page_says(tmp_path):
     import re
 

@@ -234,6 +234,7 @@ KINDS = [*CONTROLLERS, "mine.py:matrix"]
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_episode_with_sensors_gives_the_same_commands(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -265,7 +265,7 @@ def test_a_lost_file_is_told_and_the_rest_is_read(folder):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_evolving_with_workers_and_resuming(folder):
     """In processes of its own: workers get the code, the run folder keeps it, and goes on."""
 

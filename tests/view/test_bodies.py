@@ -439,7 +439,7 @@ def test_a_film_of_ancestors(run, monkeypatch, capsys):
     assert "6 s, 2 robots" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_many_swim_as_each_does_alone(run):
     """One compiled program for all gives what each gets alone, up to rounding."""
     together = load_individuals(run, [1, 5], seed=3)

@@ -171,7 +171,7 @@ def run(tmp_path_factory):
         yield folder / "run"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_leaves_its_pictures(run):
     for name in ("fitness", "population", "lives", "families", "arena", "bodies"):
         assert (run / f"{name}.png").read_bytes().startswith(b"\x89PNG")

@@ -459,7 +459,7 @@ def test_gif_reads_back_with_the_film_s_time_and_colours():
     assert total == 1000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_long_and_noisy_gifs_get_smaller():
     random = np.random.default_rng(0)
     every = gif_stride(30, 6000)

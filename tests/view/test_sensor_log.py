@@ -78,7 +78,7 @@ def seen(tmp_path_factory):
     return fitness, trajectory, trace_sensors(fitness, trajectory, KEY, trial=1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_is_what_the_brain_was_told(seen):
     """From the trajectory alone, with its noise, rates and delays; single precision apart."""
     fitness, trajectory, felt = seen
@@ -177,7 +177,7 @@ def test_brains_that_feel_nothing_declared_have_no_picture(tmp_path):
     assert trace_sensors(fitness, None, KEY) == ()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_report_shows_what_was_felt(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     oar_robot(world()).morphology.save("elbow.yaml")
