@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from experiments import measured_data as data
 from experiments.measured_cases import body as chain
@@ -102,6 +103,48 @@ def test_what_is_held_out_is_foretold_better_than_before(fitted):
     assert 0.2 < prediction.held.mean() < 0.3
     off = [prediction.error(x, True) for x in (prediction.fitted, prediction.before)]
     assert off[0] < 0.03 and off[0] < off[1] / 5
+
+
+def felt(signals, rate=50.0):
+    """What an IMU in the core and a depth gauge say of poses, of unit quaternions and metres."""
+    draw = np.random.default_rng(0)
+    time = signals["x"].time
+    dt = time[1] - time[0]
+    position = np.stack([signals[axis].value for axis in "xyz"], -1)
+    quaternion = np.stack([signals[f"q{axis}"].value for axis in "wxyz"], -1)
+    attitude = Rotation.from_quat(quaternion, scalar_first=True)
+    turning = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / dt
+    acceleration = np.diff(position, 2, axis=0) / dt**2
+    pushing = attitude[1:-1].inv().apply(acceleration + np.array([0, 0, 9.81]))
+    at = np.arange(time[2], time[-3], 1 / rate)
+    found = {}
+    for k, axis in enumerate("xyz"):
+        gyro = np.interp(at, time[:-1] + dt / 2, turning[:, k])
+        accelerometer = np.interp(at, time[1:-1], pushing[:, k])
+        found[f"gyro.{axis}"] = TimeSeries(at, gyro + 0.01 * draw.normal(size=len(at)))
+        found[f"accel.{axis}"] = TimeSeries(at, accelerometer + 0.1 * draw.normal(size=len(at)))
+    depth = -np.interp(at, time, position[:, 2])
+    return found | {"depth": TimeSeries(at, depth + 0.005 * draw.normal(size=len(at)))}
+
+
+@pytest.mark.slow
+def test_an_imu_and_a_depth_gauge_stand_for_attitude_and_height(auv, signals):
+    """And commands whose clock is late; the coefficients and the delay are found all the same."""
+    late = {
+        name: TimeSeries(one.time + 0.08, one.value) if name.startswith("command") else one
+        for name, one in signals.items()
+    }
+    filmed = make_noisy(late, seed=1).signals
+    seen = {n: one for n, one in filmed.items() if n not in ("z", "qw", "qx", "qy", "qz")}
+    recording = RobotRecording("imu", seen | felt(signals))
+    fit = fit_robot(auv, [recording], [*FREE, "clock"], FitSettings(held_out=0.0))
+    found = [value.value for value in fit.values]
+    np.testing.assert_allclose(found, np.exp(TRUE), rtol=0.01)
+    # Half a step of the integrator lies between a pose and the velocity that leads to it.
+    (clock,) = (value for _, name, value, _ in fit.local if name == "clock")
+    assert abs(clock - 0.08) < 0.005
+    for kind, noise in {"gyro": 0.01, "accelerometer": 0.1, "depth": 0.005}.items():
+        assert fit.estimate.noise[kind] == pytest.approx(noise, rel=0.15)
 
 
 def test_a_wild_frame_does_no_harm(auv, signals, fitted):
