@@ -144,6 +144,17 @@ GROUPS = (
         1,
         12.0,
     ),
+    # Modules of one robot push each other apart on both sides.
+    Group(
+        "256 bodies of 4 to 16 hinges that touch themselves, ellipsoid law",
+        (
+            Row("ours, with contact", "mixed", "touching", population=256, each_core=True),
+            Row("MuJoCo C, threads, its contacts", "threads", "touching", population=256),
+            Row("ours, without contact", "mixed", "ellipsoid", population=256, each_core=True),
+        ),
+        1,
+        15.0,
+    ),
     Group(
         "26 bodies of 4 to 16 hinges with 64 learners each, ellipsoid law",
         (

@@ -22,7 +22,8 @@ from typing import Any
 
 # Physics by the changes to the default world. In "ellipsoid" the robot is weightless and under
 # water, as a body of the water's density is, so that MuJoCo C has the same water. Joint limits are
-# MuJoCo's own constraints in C and MJX, springs in ours.
+# MuJoCo's own constraints in C and MJX, springs in ours; so are contacts of modules of one robot in
+# "touching", of the same pairs in both. Without a word these are off where MuJoCo is beside us.
 PHYSICS: dict[str, dict[str, Any]] = {
     "default": {"name": "lake"},
     "mask": {"name": "lake", "buoyancy": "mask"},
@@ -30,20 +31,24 @@ PHYSICS: dict[str, dict[str, Any]] = {
     "no_added_mass": {"name": "lake", "added_mass": False},
     "ellipsoid": {
         "name": "empty_underwater", "gravity": 0.0, "buoyancy": "off", "drag": "ellipsoid",
-        "added_mass": False,
+        "added_mass": False, "self_contact": False,
+    },
+    "touching": {
+        "name": "empty_underwater", "gravity": 0.0, "buoyancy": "off", "drag": "ellipsoid",
+        "added_mass": False, "self_contact": True,
     },
     "inertia_box": {
         "name": "empty_underwater", "gravity": 0.0, "buoyancy": "off", "drag": "inertia_box",
-        "added_mass": False,
+        "added_mass": False, "self_contact": False,
     },
     "none": {
         "name": "empty_underwater", "gravity": 0.0, "buoyancy": "off", "drag": "off",
-        "added_mass": False,
+        "added_mass": False, "self_contact": False,
     },
     # MuJoCo's own contacts with the lake's bed; gravity is cut to what buoyancy leaves of it.
     "bed": {
         "name": "lake", "buoyancy": "off", "drag": "ellipsoid", "added_mass": False,
-        "bed": {"kind": "lake", "contact": "mjx"},
+        "bed": {"kind": "lake", "contact": "mjx"}, "self_contact": False,
     },
 }  # fmt: skip
 # Brains, by the changes to the default controller. Eight units at each of the spider's eight hinges

@@ -439,12 +439,7 @@ def make_batched_trees(
             np.repeat(np.arange(1, capacity.rows + 1), capacity.shells),
         )
         first, second = bodies.first, bodies.second
-        if not bodies.alike:
-            met = Meetings.different(boxes, body, first, second, steady)
-        else:
-            real = jnp.sum(first != second, dtype=jnp.int32)  # its pairs stand in front
-            found = len(first) if steady else real
-            met = Meetings.alike(boxes, body, first, second, found, lanes)
+        met = Meetings.of(boxes, body, first, second, steady)
     return BatchedTrees(world, capacity, bodies, lanes, stack_indices, table, count, met)
 
 

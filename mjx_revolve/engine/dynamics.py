@@ -9,6 +9,7 @@ Spatial quantities are (angular, linear), in each body's own frame, about its ow
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -22,11 +23,10 @@ from mjx_revolve.engine.self_contact import (
     Acceleration,
     Bodies,
     Respond,
-    any_lane,
     contact_acceleration,
 )
 from mjx_revolve.engine.servos import end_stop, servo
-from mjx_revolve.engine.state import State, effective_gravity, has_acceleration, integrate
+from mjx_revolve.engine.state import State, effective_gravity, has_acceleration
 from mjx_revolve.engine.tree import Tree
 from mjx_revolve.numerics.articulated import eliminate_joint, solve_root, to_parent, upper
 from mjx_revolve.numerics.inertia import (
@@ -60,7 +60,7 @@ from mjx_revolve.numerics.spatial import (
     vscale,
     vsub,
 )
-from mjx_revolve.numerics.xla import fuse, take_lanes
+from mjx_revolve.numerics.xla import take_lanes
 from mjx_revolve.water.flow import Water, needs_horizontal_position
 from mjx_revolve.water.world import World
 
@@ -174,7 +174,7 @@ def accelerate(
     clearance: Any = ()
     if meets:
         factors = _Factors(moved, saved, _unflatten(whole, symmetric)[0], symmetric)
-        qacc, clearance = _with_contact(tree, state, water, qacc, factors, dt)
+        qacc, clearance = _with_contact(tree, state, qacc, factors, dt)
     return (
         qacc,
         jnp.broadcast_to(jnp.asarray(power, dtype), lanes),
@@ -199,14 +199,29 @@ class _Factors(NamedTuple):
     symmetric: bool
 
 
-def _make_respond(tree: Tree, factors: _Factors, which: jax.Array) -> Respond:
+def _look_at(
+    tree: Tree, factors: _Factors, steps: Any, which: jax.Array
+) -> tuple[Bodies, Callable[[], Respond]]:
+    """Some robots: their bodies' poses; what makes their response to further forces.
+
+    `steps` are the angles by which hinges turn in the step.
+    """
+    few, places = tree.at_lanes(which), tree.hinge_positions(which)
+    turns = tree.saved_at_lanes(factors.moved, lambda moved: moved[1], which)
+    own = jax.tree.map(lambda x: take_lanes(x, which), steps)
+    like = jnp.zeros(len(which), jax.tree.leaves(own)[0].dtype)
+    bodies = Bodies(*body_frames(few, turns, places, own, like))
+    return bodies, lambda: _make_respond(tree, factors, which, turns, places)
+
+
+def _make_respond(
+    tree: Tree, factors: _Factors, which: jax.Array, turns: Any, places: Any
+) -> Respond:
     """For some of the robots, what further forces on their bodies add to all accelerations."""
     lanes, symmetric = len(which), factors.symmetric
     own = lambda x: take_lanes(x, which) if jnp.shape(x)[-1:] not in ((), (1,)) else x  # noqa: E731
     block: Block = jax.tree.map(own, factors.root)
-    turns = tree.saved_at_lanes(factors.moved, lambda moved: moved[1], which)
     saved = tree.saved_at_lanes(factors.saved, lambda saved: (saved[0][:3], saved[2]), which)
-    places = tree.hinge_positions(which)
     few = tree.at_lanes(which)
 
     def collect(_: Level, children: Any, turn: Any, place: Any, saved: Any, *wrench: Any) -> Any:
@@ -254,49 +269,31 @@ def _make_respond(tree: Tree, factors: _Factors, which: jax.Array) -> Respond:
 
 
 def _with_contact(
-    tree: Tree,
-    state: State,
-    water: Water,
-    qacc: tuple[Vec, Vec, Any],
-    factors: _Factors,
-    dt: float,
-) -> tuple[tuple[Vec, Vec, Any], Any]:
+    tree: Tree, state: State, qacc: tuple[Vec, Vec, Any], factors: _Factors, dt: float
+) -> tuple[tuple[Vec, Vec, Any], jax.Array]:
     """Accelerations with those of contacts within the robot, and the clearance; see `State`.
 
-    Where robots are alike, nothing is looked at while none can have moved as far as its clearance.
+    A robot is not looked at while its hinges cannot have turned far enough to close its clearance.
     """
     like = state.position[0]
-    meetings = tree.meetings(like)
-    nothing = jnp.zeros((6 + len(tree.join_rows(state.angle, like)), len(like)), like.dtype)
-    still = water._replace(current=(0.0, 0.0, 0.0))
-    ahead = integrate(state, still, qacc, dt, tree.carries)
-    wanted = meetings.count > 0  # a chunk of robots none of which can meet itself pays nothing
-    left = state.clearance
-    if tree.alike:
-        ways = tree.join_rows(tree.map(_sweep, ahead.speed), like)
-        left = left - dt * total(*[ways[k] for k in range(len(ways))])
-        wanted = any_lane(left < 0) & wanted
-
-    def push() -> tuple[jax.Array, Any]:
-        bodies = Bodies(*body_frames(tree, state, ahead))
-        found, clearance = contact_acceleration(
-            meetings,
-            bodies,
-            lambda which: _make_respond(tree, factors, which),
-            dt,
-        )
-        return found, clearance if tree.alike else ()
-
-    found, clearance = jax.lax.cond(wanted, fuse(push), lambda: (nothing, left))
+    steps = jax.tree.map(lambda v, a: dt * (v + dt * a), state.speed, qacc[2])
+    ways = tree.join_rows(tree.map(_sweep, steps), like)
+    found, clearance = contact_acceleration(
+        tree.meetings(like),
+        state.clearance - total(*[ways[k] for k in range(len(ways))]),
+        lambda which: _look_at(tree, factors, steps, which),
+        6 + len(ways),
+        dt,
+    )
     robot = tuple(found[:3]), tuple(found[3:6]), tree.split_rows(found[6:])
     sums: tuple[Vec, Vec, Any] = jax.tree.map(jnp.add, qacc, robot)
     return sums, clearance
 
 
-def _sweep(level: Level, speed: Scalar) -> Scalar:
-    """At what speed boxes may near each other by each hinge's turning [m/s]."""
+def _sweep(level: Level, step: Scalar) -> Scalar:
+    """By how much boxes may near each other by each hinge's turning [m]."""
     assert level.hinges is not None
-    return mul(level.hinges.lever, jnp.abs(speed))
+    return mul(level.hinges.lever, jnp.abs(step))
 
 
 def with_bed(

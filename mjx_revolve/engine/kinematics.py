@@ -128,34 +128,49 @@ class BodyFrames(NamedTuple):
     """Poses of rigid bodies, `[1 + nhinge, lanes]` each, in the order of `Tree.join_rows`.
 
     Attributes:
-        rotation: world from body.
-        position: of the origins, world frame [m].
+        rotation: root's frame from body.
+        position: of the origins, root's frame [m].
     """
 
     rotation: Mat
     position: Vec
 
 
-def body_frames(tree: Tree, *states: State) -> tuple[BodyFrames, ...]:
-    """Poses of the core's rigid body, then of what each hinge carries; frames as in `level`.
+def body_frames(
+    tree: Tree, turns: Any, places: Any, steps: Any, like: jax.Array
+) -> tuple[BodyFrames, BodyFrames]:
+    """Poses of a robot's bodies now, and when its hinges have turned further; as in `level`.
 
-    Of each of some states, all in one pass.
+    Args:
+        tree: the robots.
+        turns: joint values: parent from child now.
+        places: joint values: of the hinges in the parents' frames [m].
+        steps: joint values: by what angle they turn [rad].
+        like: `[lanes]`.
+
+    Returns:
+        Both poses.
     """
-    root = tuple((tuple(map(_row, quat_to_mat(x.quat))), _row(x.position)) for x in states)
+    unit = tuple(tuple(float(i == j) for j in range(3)) for i in range(3))
+    root = (unit, (0.0, 0.0, 0.0))
 
-    def move(level: Level, parents: Any, *angles: Scalar) -> Any:
-        assert level.hinges is not None
-        found = []
-        for (rotation, position), angle in zip(parents, angles, strict=True):
-            place = vadd(position, matvec(rotation, level.hinges.position))
-            found.append((matmul(rotation, hinge_rotation(level.hinges, angle)), place))
-        return tuple(found), tuple(found)
+    def move(_: Level, parents: Any, turn: Mat, place: Vec, step: Scalar) -> Any:
+        s, c = sincos(step)
+        ahead = tuple((add(mul(c, x), mul(s, y)), sub(mul(c, y), mul(s, x)), z) for x, y, z in turn)
+        found = tuple(
+            (matmul(rotation, own), vadd(position, matvec(rotation, place)))
+            for (rotation, position), own in zip(parents, (turn, ahead), strict=True)
+        )
+        return found, found
 
-    like = states[0].position[0]
-    below = tree.forward_pass(move, root, *(x.angle for x in states))
+    below = tree.forward_pass(move, (root, root), turns, places, steps)
     rows = tree.stack_saved(below, lambda saved: saved, like)
-    frames = jax.tree.map(lambda *x: jnp.concatenate(x), root, rows)
-    return tuple(BodyFrames(*x) for x in frames)
+
+    def join(first: float, others: jax.Array) -> jax.Array:
+        return jnp.concatenate([jnp.full((1, *like.shape), first, like.dtype), others])
+
+    frames = jax.tree.map(join, (root, root), rows)
+    return BodyFrames(*frames[0]), BodyFrames(*frames[1])
 
 
 def body_motions(tree: Tree, state: State) -> BodyMotion:

@@ -11,11 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.level import Level
-from mjx_revolve.numerics.spatial import Mat, Vec, matvec, vadd
-from mjx_revolve.numerics.xla import materialize
-
-# Pairs of robots that differ which are looked at together. A choice.
-_WIDTH = 256
+from mjx_revolve.numerics.spatial import Mat, Vec, dot
 
 
 class Boxes(NamedTuple):
@@ -66,78 +62,33 @@ def _flat(level: Level, count: int, dtype: Any, x: Any) -> jax.Array:
 
 
 class Meetings(NamedTuple):
-    """Pairs of boxes that can meet, of all robots: in blocks, as the step looks at them.
+    """Pairs of boxes of a robot that can meet, `[npair, lanes]`, or `[npair, 1]` of robots alike.
 
-    Boxes are the shells of the levels, the root's first; box k of robot r has the number
-    k · lanes + r.
+    Boxes are the shells of the levels, the root's first.
 
     Attributes:
-        boxes: their shapes; of one lane where robots are alike.
+        lanes: of the shapes: 1 of robots alike.
+        shapes: `[n, nshell lanes]` the numbers of `Boxes` side by side, and last the radius of each
+            one's bounding sphere [m]: one loop finds all of a box.
         body: `[nshell]` the body of each: 0 is the root, k + 1 the tree's row k; NumPy's.
-        first: `[nblock, width]` the one box of each pair, int32.
-        second: the other box; the same one for padding. A robot's pairs stand in its own order.
-        count: how many blocks to look at, a number or int32.
+        first: the one box of each pair, int32.
+        second: the other box; the same one for padding, which stands behind all pairs.
+        count: `[lanes]` or `[1]` how many pairs a robot has, int32.
+        steady: whether loops are to have a known length, so that they have derivatives.
     """
 
-    boxes: Boxes
+    lanes: int
+    shapes: Any
     body: np.ndarray
     first: Any
     second: Any
     count: Any
-
-    @property
-    def steady(self) -> bool:
-        """Whether loops are to have a known length, so that they have derivatives."""
-        return isinstance(self.count, int)
-
-    def centers(self, position: Vec, rotation: Mat) -> Vec:
-        """`[nshell, lanes]` centres of the boxes [m], of `[nbody, lanes]` poses of the bodies."""
-        lanes, own = position[0].shape[1], self.boxes.position
-        counts = np.bincount(self.body, minlength=len(position[0]))
-        if np.any(np.diff(self.body) < 0) or len(set(counts[1:].tolist())) > 1:
-            position, rotation = jax.tree.map(lambda x: x[self.body], (position, rotation))
-            return vadd(position, matvec(rotation, own))
-        # Root and rows by themselves, box after box, as XLA:CPU has vectors for it.
-        parts = []
-        root, row = int(counts[0]), int(counts[-1])
-        for bodies, start, n in (slice(0, 1), 0, root), (slice(1, None), root, row):
-            if not n:
-                continue
-            at, turn = jax.tree.map(lambda x: x[bodies], (position, rotation))  # noqa: B023
-            place = [x[start:][: n * len(at[0])].reshape(-1, n, x.shape[-1]) for x in own]
-            each = [vadd(at, matvec(turn, tuple(x[:, k] for x in place))) for k in range(n)]
-            parts.append([jnp.stack([materialize(x[i]) for x in each], 1) for i in range(3)])
-        return tuple(
-            materialize(jnp.concatenate([x.reshape(-1, lanes) for x in component]))
-            for component in zip(*parts, strict=True)
-        )
+    steady: bool
 
     @staticmethod
-    def alike(
-        boxes: Boxes, body: np.ndarray, first: Any, second: Any, count: Any, lanes: int
-    ) -> Meetings:
-        """Of robots that are all alike, from `[npair, 1]` shells: a block for each pair."""
-        lane = np.arange(lanes, dtype=np.int32)
-        return Meetings(boxes, body, first * lanes + lane, second * lanes + lane, count)
-
-    @staticmethod
-    def different(
-        boxes: Boxes, body: np.ndarray, first: jax.Array, second: jax.Array, steady: bool
-    ) -> Meetings:
-        """Of robots with pairs of their own, from `[npair, lanes]` shells: one list of all pairs.
-
-        `steady` says whether loops are to have a known length.
-        """
-        lanes = first.shape[1]
-        real = (first != second).reshape(-1)
-        place = jnp.where(real, jnp.cumsum(real, dtype=jnp.int32) - 1, 2 * len(real) + _WIDTH)
-        lane = jnp.arange(lanes, dtype=jnp.int32)
-
-        def listed(shell: jax.Array) -> jax.Array:
-            number = (shell * lanes + lane).reshape(-1)
-            found = jnp.zeros(-(-len(real) // _WIDTH) * _WIDTH, jnp.int32)
-            return found.at[place].set(number, mode="drop").reshape(-1, _WIDTH)
-
-        one, other = listed(first), listed(second)
-        count = -(-jnp.sum(real, dtype=jnp.int32) // _WIDTH)
-        return Meetings(boxes, body, one, other, len(one) if steady else count)
+    def of(boxes: Boxes, body: np.ndarray, first: Any, second: Any, steady: bool) -> Meetings:
+        """Of pairs of shells."""
+        radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size))
+        count = (first != second).sum(0).astype(np.int32)
+        shapes = jnp.stack([x.reshape(-1) for x in (*jax.tree.leaves(boxes), radius)])
+        return Meetings(radius.shape[1], shapes, body, first, second, count, steady)

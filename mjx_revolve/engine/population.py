@@ -188,7 +188,7 @@ def init(tree: Tree, qpos: jax.Array, qvel: jax.Array) -> State:
         qacc_prev=jax.tree.map(jnp.zeros_like, rates) if tree.carries else (),
         command=jnp.zeros((count, *lanes), qpos.dtype) if count else (),
         submerged=submerged if tree.carries or jax.tree.leaves(submerged) else (),
-        clearance=jnp.full(lanes, -1, qpos.dtype) if tree.meets and tree.alike else (),
+        clearance=jnp.full(lanes, -1, qpos.dtype) if tree.meets else (),
     )
 
 

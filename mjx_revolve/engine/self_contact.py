@@ -28,32 +28,29 @@ import jax
 import jax.numpy as jnp
 
 from mjx_revolve.engine.kinematics import BodyFrames
-from mjx_revolve.engine.meetings import Boxes, Meetings
-from mjx_revolve.numerics.boxes import BoxPair, box_contact, last_of, weight
-from mjx_revolve.numerics.spatial import (
-    Mat,
-    Scalar,
-    Vec,
-    cross,
+from mjx_revolve.engine.meetings import Meetings
+from mjx_revolve.numerics.boxes import (
+    BoxPair,
+    box_contact,
     dot,
-    matmul,
-    matTvec,
+    mat_t_vec,
     matvec,
-    vadd,
-    vscale,
-    vsub,
+    weight,
 )
+from mjx_revolve.numerics.spatial import Scalar, cross
 from mjx_revolve.numerics.xla import fuse, materialize, take_lanes
 
 # Contacts of one robot at a time. A choice: few robots have more.
 _MOST = 8
-# Pairs that are looked at exactly at a time, and robots whose contacts are solved together: enough
-# for vector registers. Few robots of a chunk have contacts at a time. Choices.
-_PAIRS, _ROBOTS = 32, 8
-# Pairs that are near which are listed at a time, where robots differ. A choice.
-_ROOM = 2048
+# Robots that are looked at together, and pairs of theirs whose spheres, or boxes, are compared
+# at a time: enough for vector registers. Few robots of a chunk are near contact. Choices.
+_ROBOTS, _SPHERES, _PAIRS = 8, 64, 32
+# Pairs that are near which are listed at a time, where loops need no known length. A choice.
+_ROOM = 256
 # Flags in a word.
 _WORD = 32
+# The clearance of robots none of whose boxes can meet [m].
+_FAR = 1e3
 # What no contact needs [m/s²].
 _NONE = -1e9
 # Overlap that is let be [m], the share of the rest that is parted in a step, and the top speed of
@@ -98,83 +95,69 @@ Respond = Callable[[tuple[jax.Array, ...]], Acceleration]
 
 def contact_acceleration(
     meetings: Meetings,
-    bodies: Bodies,
-    respond_at: Callable[[jax.Array], Respond],
+    clearance: jax.Array,
+    look_at: Callable[[jax.Array], tuple[Bodies, Callable[[], Respond]]],
+    rows: int,
     dt: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Accelerations of robots by contacts of their own modules.
 
+    Only robots are looked at that have used up their clearance, a few at a time.
+
     Args:
         meetings: which boxes can meet.
-        bodies: of the robots.
-        respond_at: which lanes, int32 → their responses to forces.
+        clearance: `[lanes]` least distance by which boxes stay apart at the end of the step [m];
+            negative where that is not known.
+        look_at: which lanes, int32 → their bodies, and what makes their responses to forces.
+        rows: of `Acceleration.robot`.
         dt: of the step [s].
 
     Returns:
-        As `Acceleration.robot`; and, where robots are alike, `State.clearance`.
+        As `Acceleration.robot`; and the clearance as it is known then.
     """
-    nbody, lanes = bodies.now.position[0].shape
-    nothing = jnp.zeros((6 + nbody - 1, lanes), bodies.now.position[0].dtype)
-    look_up, gather = _make_search(meetings, bodies)
-    blocks, width = meetings.first.shape
-    room = blocks * width if meetings.steady else min(blocks * width, _ROOM)
-    start = jnp.zeros(room + max(width, _PAIRS), jnp.int32), jnp.int32(0)
-    clear = jnp.full(width, 1e3, nothing.dtype)
-    table = ContactTable(
-        jnp.full((_MOST, lanes), _NONE, nothing.dtype),
-        jnp.zeros((_MOST + 1, 14, lanes), nothing.dtype),
-    )
+    lanes, dtype, steady = len(clearance), clearance.dtype, meetings.steady
+    wanted = (clearance < 0) & (meetings.count > 0)
+    size = min(_ROBOTS, lanes)
+    most = -(-lanes // size)
+    start = jnp.zeros((rows, lanes), dtype), clearance
 
-    def measure(listed: Any, table: ContactTable) -> ContactTable:
-        return _measure_all(listed, look_up, table, dt, meetings.steady)
+    def look() -> Any:
+        room = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
+        listed, count = _append(wanted, jnp.arange(lanes, dtype=jnp.int32), room, steady)
 
-    def resolve(table: ContactTable) -> jax.Array:
-        lane = jnp.arange(lanes, dtype=jnp.int32)
-        size = min(_ROBOTS, lanes)
-        most = -(-lanes // size)
-        start = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
-        touches = table.need[0] > 0
-        for k in range(1, _MOST):
-            touches = touches | (table.need[k] > 0)
-        touching, count = _append(touches, lane, start, meetings.steady)
-
-        def solve(k: Any, total: jax.Array) -> jax.Array:
-            which = jax.lax.dynamic_slice(touching, (k * size,), (size,))
+        def visit(k: Any, found: Any) -> Any:
+            which = jax.lax.dynamic_slice(listed, (k * size,), (size,))
             real = k * size + jnp.arange(size, dtype=jnp.int32) < count
-            own: ContactTable = jax.tree.map(lambda x: take_lanes(x, which), table)
-            contacts = _Contacts(own, real, nbody, dt)
-            found = contacts.solve(respond_at(which), len(total))
+            bodies, make_respond = look_at(which)
+            table = _find_contacts(meetings, which, real, bodies, dt)
 
-            def write(j: Any, total: jax.Array) -> jax.Array:
-                place = jnp.int32(0), which[j]
-                old = jax.lax.dynamic_slice(total, place, (len(total), 1))
-                new = jax.lax.dynamic_slice(found, (jnp.int32(0), j), (len(total), 1))
-                return jax.lax.dynamic_update_slice(total, jnp.where(real[j], new, old), place)
+            def resolve(total: jax.Array) -> jax.Array:
+                contacts = _Contacts(table, len(bodies.now.position[0]), dt)
+                return _put(total, contacts.solve(make_respond(), rows), which, real)
 
-            return _loop(size, write, total)
+            touches = table.need[0] > 0
+            for j in range(1, _MOST):
+                touches = touches | (table.need[j] > 0)
+            total, left = found
+            total = jax.lax.cond(any_lane(touches), resolve, lambda x: x, total)
+            return total, _put(left[None], table.clear[None], which, real)[0]
 
-        return _repeat(-(-count // size), most, solve, nothing, meetings.steady)
+        return _repeat(-(-count // size), most, visit, start, steady)
 
-    if meetings.steady:
-        _, listed, clear = _loop(
-            meetings.count, lambda _, x: gather(x), (jnp.int32(0), start, clear)
-        )
-        found = jax.lax.cond(
-            listed[1] > 0, lambda: resolve(measure(listed, table)), lambda: nothing
-        )
-        return found, clear
+    found: tuple[jax.Array, jax.Array] = jax.lax.cond(any_lane(wanted), fuse(look), lambda: start)
+    return found
 
-    def more(carry: Any) -> Any:
-        """The next blocks, until the list is full."""
-        block, clear, table = carry
-        wanted = lambda x: (x[0] < meetings.count) & (x[1][1] + width <= room)  # noqa: E731
-        block, listed, clear = jax.lax.while_loop(wanted, gather, (block, start, clear))
-        return block, clear, measure(listed, table)
 
-    _, clear, table = jax.lax.while_loop(
-        lambda x: x[0] < meetings.count, more, (jnp.int32(0), clear, table)
-    )
-    return resolve(table), clear
+def _put(into: jax.Array, columns: jax.Array, which: jax.Array, real: jax.Array) -> jax.Array:
+    """`[n, lanes]` with `[n, few]` columns in place of the real ones of some lanes."""
+
+    def write(j: Any, into: jax.Array) -> jax.Array:
+        place = jnp.int32(0), which[j]
+        old = jax.lax.dynamic_slice(into, place, (len(into), 1))
+        new = jax.lax.dynamic_slice(columns, (jnp.int32(0), j), (len(into), 1))
+        return jax.lax.dynamic_update_slice(into, jnp.where(real[j], new, old), place)
+
+    return _loop(len(which), write, into)
 
 
 def _loop(count: Any, body: Callable[[jax.Array, Any], Any], carry: Any) -> Any:
@@ -243,74 +226,100 @@ def any_lane(found: jax.Array) -> jax.Array:
 # ------------------------------------------------------------------ pairs in contact
 
 
-def _make_search(meetings: Meetings, bodies: Bodies) -> tuple[Any, Any]:
-    """Pairs whose bounding spheres overlap at the end of the step.
-
-    Returns:
-        A function: numbers of pairs → their two boxes. And one that looks at the next block:
-        (block, (numbers of such pairs, how many there are), the spheres' clearance `[width]`).
-    """
-    lanes, dtype = bodies.now.position[0].shape[-1], bodies.now.position[0].dtype
+def _find_contacts(
+    meetings: Meetings, which: jax.Array, real: jax.Array, bodies: Bodies, dt: float
+) -> ContactTable:
+    """The contacts of some robots, of pairs whose bounding spheres overlap at the step's end."""
+    size, dtype, steady = len(which), bodies.now.position[0].dtype, meetings.steady
+    npair, lanes = meetings.first.shape
+    width = size * max(1, _SPHERES // size)
+    most = -(-npair * size // width)
+    numbers = [jnp.asarray(x, dtype).reshape(-1) for x in jax.tree.leaves(bodies)]
+    frames, shapes = materialize(jnp.stack(numbers)), meetings.shapes
+    pick = lambda x, k: materialize(take_lanes(x, k))  # noqa: E731
     body = jnp.asarray(meetings.body, jnp.int32)
-    boxes = meetings.boxes
-    bodies = jax.tree.map(materialize, bodies)
-    center = meetings.centers(bodies.ahead.position, bodies.ahead.rotation)
-    center = tuple(x.reshape(-1) for x in center)
-    radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size)).reshape(-1)
-    frames, shells = jax.tree.map(lambda x: x.reshape(-1), (bodies, boxes))
-    pick = lambda xs, k: jax.tree.map(lambda x: take_lanes(x, k), xs)  # noqa: E731
-    alike = boxes.half_size[0].shape[-1] == 1
-    shape_of = (lambda k: k // lanes) if alike else (lambda k: k)
-    width = meetings.first.shape[1]
-    blocks = tuple(map(jnp.asarray, (meetings.first, meetings.second)))
-    every = tuple(x.reshape(-1) for x in blocks)
+    pairs = [jnp.asarray(x, jnp.int32).reshape(-1) for x in (meetings.first, meetings.second)]
 
-    def look_up(pair: jax.Array) -> tuple[_Given, ...]:
+    def flat(k: jax.Array, lane: jax.Array, lanes: int) -> jax.Array:
+        return k if lanes == 1 else k * lanes + take_lanes(which, lane)
+
+    def look_up(number: jax.Array) -> tuple[_Given, ...]:
+        """The two boxes of pairs, whose numbers are those of a robot's pairs · size + the robot."""
+        lane = number % size
         found = []
-        for number in every:
-            which = take_lanes(number, pair)
-            own = take_lanes(body, which // lanes)
-            frame = own * lanes + which % lanes
-            found.append(
-                _Given(
-                    own.astype(dtype),
-                    pick(frames, frame),
-                    pick(shells, shape_of(which)),
-                    which % lanes,
-                )
-            )
+        for every in pairs:
+            shell = take_lanes(every, flat(number // size, lane, lanes))
+            place = flat(shell, lane, meetings.lanes)
+            found.append(_Given(shell, take_lanes(body, shell), place, lane))
         return tuple(found)
 
+    def sphere(box: _Given) -> tuple[jax.Array, jax.Array]:
+        frame = pick(frames[12:], box.body * size + box.lane)
+        place, radius = pick(shapes[:3], box.number), pick(shapes[-1:], box.number)
+        return frame[9:] + matvec(frame[:9].reshape(3, 3, -1), place), radius[0]
+
     def gather(carry: Any) -> Any:
+        """The next spheres."""
         block, listed, clear = carry
-        pair = tuple(jax.lax.dynamic_index_in_dim(x, block, 0, False) for x in blocks)
-        away = tuple(take_lanes(x, pair[1]) - take_lanes(x, pair[0]) for x in center)
-        reach = sum(take_lanes(radius, shape_of(x)) for x in pair)
-        real, square = pair[0] != pair[1], dot(away, away)
-        near = real & (square < reach * reach)
         number = block * width + jnp.arange(width, dtype=jnp.int32)
-        if alike:
-            clear = jnp.where(real, jnp.minimum(clear, jnp.sqrt(square) - reach), clear)
-        return block + 1, _append(near, number, listed, meetings.steady), clear
+        one, other = look_up(jnp.minimum(number, npair * size - 1))
+        (start, radius), (end, far) = sphere(one), sphere(other)
+        away, reach = end - start, radius + far
+        given = take_lanes(real, one.lane) & (one.shell != other.shell) & (number < npair * size)
+        square = dot(away, away)
+        near = given & (square < reach * reach)
+        apart = jnp.where(given & ~near, jnp.sqrt(square) - reach, _FAR)
+        for k in range(0, width, size):
+            clear = jnp.minimum(clear, apart[k : k + size])
+        return block + 1, _append(near, number, listed, steady), clear
 
-    return look_up, gather
+    def examine(listed: Any, table: ContactTable) -> ContactTable:
+        """The contacts of listed pairs join those of each robot; the weakest give way."""
+        numbers, count = listed
 
+        def measure(k: Any, table: ContactTable) -> ContactTable:
+            given = look_up(jax.lax.dynamic_slice(numbers, (k * _PAIRS,), (_PAIRS,)))
+            shown = tuple(
+                (pick(frames, x.body * size + x.lane), pick(shapes[:-1], x.number)) for x in given
+            )
+            need, gap, *units = _measure(shown, dt)
+            rest = jnp.stack([*(x.body.astype(dtype) for x in given), *units])
+            left = count - k * _PAIRS
+            if steady:
+                listed = jnp.arange(_PAIRS, dtype=jnp.int32) < left
+                need, gap = jnp.where(listed, need, _NONE), jnp.where(listed, gap, _FAR)
+            left = _PAIRS if steady else jnp.minimum(left, _PAIRS)
+            return _insert(table, left, (need, gap, rest), given[0].lane)
 
-def _measure_all(
-    listed: Any, look_up: Any, table: ContactTable, dt: float, steady: bool
-) -> ContactTable:
-    """The contacts of listed pairs join those of each robot; the weakest give way."""
-    numbers, count = listed
+        return _repeat(-(-count // _PAIRS), -(-npair * size // _PAIRS), measure, table, steady)
 
-    def examine(k: Any, table: ContactTable) -> ContactTable:
-        pair = jax.lax.dynamic_slice(numbers, (k * _PAIRS,), (_PAIRS,))
-        given = look_up(pair)
-        need, *rest = _measure(given, dt)
-        need = jnp.where(k * _PAIRS + jnp.arange(_PAIRS, dtype=jnp.int32) < count, need, _NONE)
-        return _insert(table, need, jnp.stack(rest), given[0].lane)
+    clear = jnp.full(size, _FAR, dtype)
+    table = ContactTable(
+        jnp.full((_MOST, size), _NONE, dtype), jnp.zeros((_MOST + 1, 14, size), dtype), clear
+    )
+    room = most * width if steady else min(most * width, _ROOM)
+    start = jnp.zeros(room + max(width, _PAIRS), jnp.int32), jnp.int32(0)
+    if steady:
+        _, listed, clear = _loop(most, lambda _, x: gather(x), (jnp.int32(0), start, clear))
+        table = examine(listed, table)
+    else:
+        count = jnp.int32(0)
+        for k in range(size):
+            own = meetings.count[0] if lanes == 1 else meetings.count[which[k]]
+            count = jnp.maximum(count, jnp.where(real[k], own, 0))
+        blocks = -(-count * size // width)
 
-    most = -(-(len(numbers) - 1) // _PAIRS)
-    return _repeat(-(-count // _PAIRS), most, examine, table, steady)
+        def more(carry: Any) -> Any:
+            """The next blocks, until the list is full."""
+            block, clear, table = carry
+            wanted = lambda x: (x[0] < blocks) & (x[1][1] + width <= room)  # noqa: E731
+            block, listed, clear = jax.lax.while_loop(wanted, gather, (block, start, clear))
+            return block, clear, examine(listed, table)
+
+        _, clear, table = jax.lax.while_loop(
+            lambda x: x[0] < blocks, more, (jnp.int32(0), clear, table)
+        )
+    return table._replace(clear=jnp.minimum(clear, table.clear))
 
 
 class ContactTable(NamedTuple):
@@ -321,72 +330,95 @@ class ContactTable(NamedTuple):
             positive where boxes stay apart unless other contacts push them together.
         rest: `[_MOST + 1, 14, lanes]` the numbers of both bodies, and torque and force of a unit
             force on each, own frames; the last contact is none.
+        clear: `[lanes]` how far at least boxes are apart at the step's end [m].
     """
 
     need: jax.Array
     rest: jax.Array
+    clear: jax.Array
 
 
 class _Given(NamedTuple):
-    """One box of each pair, `[n]` each.
+    """One box of each pair, `[n]` int32 each.
 
     Attributes:
-        number: of its body.
-        body: that body.
-        box: on it.
+        shell: it.
+        body: its body.
+        number: of its shape.
         lane: its robot.
     """
 
+    shell: jax.Array
+    body: jax.Array
     number: jax.Array
-    body: Bodies
-    box: Boxes
     lane: jax.Array
 
 
-def _measure(given: tuple[_Given, ...], dt: float) -> list[jax.Array]:
-    """What pairs need, and the 14 other numbers of them; see `ContactTable`."""
+class _Side(NamedTuple):
+    """One box of each pair and its body, `[3, n]` and `[3, 3, n]`.
 
-    def pose(frame: BodyFrames, box: Boxes) -> tuple[Vec, Mat]:
-        """Centres and rotations of boxes."""
-        center = vadd(frame.position, matvec(frame.rotation, box.position))
-        if box.rotation is None:
-            return center, frame.rotation
-        return center, matmul(frame.rotation, box.rotation)
+    Attributes:
+        pose: rotation and position of the body, now and at the end of the step.
+        half: half edges of the box [m].
+        boxes: its rotation and centre, likewise.
+    """
+
+    pose: tuple[tuple[jax.Array, jax.Array], ...]
+    half: jax.Array
+    boxes: tuple[tuple[jax.Array, jax.Array], ...]
+
+    @staticmethod
+    def of(frames: jax.Array, shape: jax.Array) -> _Side:
+        """Of the numbers of `Bodies` and of `Boxes`, one below the other."""
+        mat = lambda x: x.reshape(3, 3, x.shape[-1])  # noqa: E731
+        pose = tuple((mat(frames[k : k + 9]), frames[k + 9 : k + 12]) for k in (0, 12))
+        boxes = []
+        for turn, position in pose:
+            own = turn
+            if len(shape) > 6:
+                other = mat(shape[3:12])
+                own = sum(turn[:, k][:, None] * other[k][None] for k in range(3))
+            boxes.append((own, position + matvec(turn, shape[:3])))
+        return _Side(pose, shape[-3:], tuple(boxes))
+
+
+def _measure(given: tuple[tuple[jax.Array, jax.Array], ...], dt: float) -> Any:
+    """What pairs need, their gaps, and torque and force on both; see `ContactTable`."""
 
     def compute(given: Any) -> Any:
-        (one, box), (other, second) = given
-        sides = [tuple(pose(x, shape) for x in body) for body, shape in given]
-        half = box.half_size, second.half_size
+        sides = [_Side.of(*x) for x in given]
+        one, other = sides
         pair, later = (
-            BoxPair(vsub(y[0], x[0]), x[1], y[1], *half) for x, y in zip(*sides, strict=True)
+            BoxPair(second[1] - first[1], first[0], second[0], one.half, other.half)
+            for first, second in zip(one.boxes, other.boxes, strict=True)
         )
         contact = box_contact(pair, later)
         closing = jnp.maximum(contact.start - contact.gap, 0)
         parted = jnp.clip(-_SHARE * (contact.start + _SLOP), 0, dt * _TOP)
         target = jnp.minimum(contact.start, 0) + jnp.minimum(parted, closing)
         need = (target - contact.gap) / dt**2
-        point = vadd(sides[0][0][0], contact.point)
-        arms = [matTvec(x.now.rotation, vsub(point, x.now.position)) for x in (one, other)]
-        # Where the point ends that is fixed to each body.
-        ends = [
-            vadd(x.ahead.position, matvec(x.ahead.rotation, arm))
-            for x, arm in zip((one, other), arms, strict=True)
-        ]
-        speed = dot(contact.normal, vsub(ends[1], ends[0])) / dt
+        point = one.boxes[0][1] + contact.point
+        ends, units = [], []
+        for side, sign in zip(sides, (-1.0, 1.0), strict=True):
+            (turn, position), (turned, moved) = side.pose
+            arm = mat_t_vec(turn, point - position)
+            # Where the point ends that is fixed to the body.
+            ends.append(moved + matvec(turned, arm))
+            push = sign * mat_t_vec(turn, contact.normal)
+            units += [*cross(tuple(arm), tuple(push)), *push]
+        speed = dot(contact.normal, ends[1] - ends[0]) / dt
         # Normals turn within the step; so that no work is done, boxes part no faster than they met.
         need = jnp.minimum(need, 2 * jnp.maximum(-speed, 0) / dt)
-        units = []
-        for x, arm, sign in zip((one, other), arms, (-1.0, 1.0), strict=True):
-            push = vscale(sign, matTvec(x.now.rotation, contact.normal))
-            units += [*cross(arm, push), *push]
-        return need, *units
+        return need, contact.gap, *units
 
-    need, *units = fuse(compute)(tuple(x[1:3] for x in given))
-    return [need, *(x.number for x in given), *units]
+    return fuse(compute)(given)
 
 
-def _insert(table: ContactTable, need: jax.Array, rest: jax.Array, lane: jax.Array) -> ContactTable:
-    """Contacts of such lanes, each in place of its robot's weakest one so far."""
+def _insert(
+    table: ContactTable, count: Any, found: tuple[jax.Array, ...], lane: jax.Array
+) -> ContactTable:
+    """So many contacts of such lanes, each in place of its robot's weakest one so far."""
+    need, gap, rest = found
 
     def one(j: Any, table: ContactTable) -> ContactTable:
         zero, own = jnp.int32(0), lane[j]
@@ -398,52 +430,52 @@ def _insert(table: ContactTable, need: jax.Array, rest: jax.Array, lane: jax.Arr
         slot = slot.astype(jnp.int32)
         most = jnp.maximum(need[j], least).reshape(1, 1)
         new = jax.lax.dynamic_slice(rest, (zero, j), (14, 1))[None]
+        clear = jnp.minimum(table.clear[own], gap[j]).reshape(1)
         # What is not read is written where it stands; what is too weak, behind the others.
         place = jnp.where(need[j] > least, slot, _MOST), zero, own
         return ContactTable(
             jax.lax.dynamic_update_slice(table.need, most, (slot, own)),
             jax.lax.dynamic_update_slice(table.rest, new, place),
+            jax.lax.dynamic_update_slice(table.clear, clear, (own,)),
         )
 
-    return _loop(len(lane), one, table)
+    return _loop(count, one, table)
 
 
 # ------------------------------------------------------------------ forces
 
 
 class _Contacts:
-    """Contacts of some robots, `[k, lanes]` each.
+    """Contacts of some robots, `[_MOST, lanes]` each.
 
     Attributes:
         need: acceleration along the normal that each needs [m/s²]; not positive: no contact.
-        bodies: numbers of the two bodies.
-        unit: torque and force of a unit force on each.
+        numbers: `[_MOST, 14, lanes]` numbers of the two bodies, torque and force of a unit force.
     """
 
-    def __init__(self, table: ContactTable, real: jax.Array, count: int, dt: float) -> None:
-        rows = [table.rest[:_MOST, k] for k in range(14)]
-        self.count, self.dt = count, dt
-        self.need = jnp.where(real, table.need, _NONE)
-        self.bodies = tuple(x.astype(jnp.int32) for x in rows[:2])
-        self.unit = rows[2:8], rows[8:14]
+    def __init__(self, table: ContactTable, count: int, dt: float) -> None:
+        self.count, self.dt, self.need = count, dt, table.need
+        self.numbers = table.rest[:_MOST]
+        lane = jnp.arange(table.need.shape[-1], dtype=jnp.int32)
+        sides = jnp.swapaxes(self.numbers, 0, 1)
+        self._places = [(x.astype(jnp.int32) * len(lane) + lane).reshape(-1) for x in sides[:2]]
+        self._units = [materialize(x.reshape(6, -1)) for x in (sides[2:8], sides[8:])]
 
-    def _spread(self, force: jax.Array) -> tuple[jax.Array, ...]:
-        """Torque and force on all bodies of forces along the normals, six of `[nbody, lanes]`."""
-        number = jnp.arange(self.count, dtype=jnp.int32)[:, None]
-        found = [jnp.zeros((self.count, force.shape[-1]), force.dtype)] * 6
-        for body, unit in zip(self.bodies, self.unit, strict=True):
-            for k in range(len(force)):
-                own = weight(number == body[k], force) * force[k]
-                found = [x + own * y[k] for x, y in zip(found, unit, strict=True)]
-        return tuple(found)
+    def _spread(self, chosen: jax.Array) -> tuple[jax.Array, ...]:
+        """Torque and force on all bodies of unit forces, `[nbody, lanes]` each; one of a lane."""
+        own = materialize(_sum([chosen[k] * self.numbers[k] for k in range(_MOST)]))
+        number = jnp.arange(self.count, dtype=own.dtype)[:, None]
+        here = [weight(number == own[side], own) for side in range(2)]
+        return tuple(here[0] * own[2 + k] + here[1] * own[8 + k] for k in range(6))
 
     def _gather(self, acceleration: tuple[jax.Array, ...]) -> jax.Array:
-        """Acceleration of the contacts along their normals `[k, lanes]`."""
-        total = jnp.zeros_like(self.need)
-        for body, unit in zip(self.bodies, self.unit, strict=True):
-            for x, y in zip(acceleration, unit, strict=True):
-                total = total + jnp.take_along_axis(x, body, 0, mode="promise_in_bounds") * y
-        return total
+        """Acceleration of the contacts along their normals `[_MOST, lanes]`."""
+        joined = materialize(jnp.stack([x.reshape(-1) for x in acceleration]))
+        found = []
+        for place, unit in zip(self._places, self._units, strict=True):
+            felt = unit * take_lanes(joined, place)
+            found += [felt[k] for k in range(6)]
+        return _sum(found).reshape(self.need.shape)
 
     def solve(self, respond: Respond, rows: int) -> jax.Array:
         """The accelerations by all contacts, `Acceleration.robot` of so many rows.
@@ -458,16 +490,17 @@ class _Contacts:
 
         def sweep(columns: jax.Array, inverse: jax.Array, now: Any) -> Any:
             old, moving = now
-            force, most = [old[k] for k in range(_MOST)], jnp.zeros(lanes, old.dtype)
+            force, most = [], jnp.zeros(lanes, old.dtype)
+            missing = self.need - _sum([columns[j] * old[j] for j in range(_MOST)])
             for k in range(_MOST):
-                missing = self.need[k] - _sum([columns[j, k] * x for j, x in enumerate(force)])
-                new = jnp.maximum(force[k] + missing * inverse[k], 0)
-                force[k] = force[k] + moving * (new - force[k])
-                most = jnp.maximum(most, jnp.abs(force[k] - old[k]) * columns[k, k])
+                change = jnp.maximum(old[k] + missing[k] * inverse[k], 0) - old[k]
+                force.append(old[k] + moving * change)
+                missing = missing - columns[k] * (moving * change)
+                most = jnp.maximum(most, moving * jnp.abs(change) * columns[k, k])
             return jnp.stack(force), moving * weight(most * self.dt**2 > _ENOUGH, most)
 
         def settle(force: jax.Array, columns: jax.Array, moving: jax.Array) -> jax.Array:
-            diagonal = jnp.stack([columns[k, k] for k in range(_MOST)])
+            diagonal = _diagonal(columns)
             taken = weight(diagonal > 0, diagonal)
             inverse = taken / (diagonal + 1 - taken)
             step = fuse(lambda now: sweep(columns, inverse, now), inline=True)
@@ -485,7 +518,7 @@ class _Contacts:
             for k in range(1, _MOST):
                 better.append(weight(missing[k] > worst, worst))
                 worst = jnp.maximum(worst, missing[k])
-            chosen = jnp.stack(last_of(better)) * wanting
+            chosen = jnp.stack(_last_of(better)) * wanting
             change = respond(self._spread(chosen))
             own = self._gather(change.bodies) + _SOFTNESS * chosen
             columns = (1 - chosen[:, None]) * columns + chosen[:, None] * own
@@ -505,13 +538,26 @@ class _Contacts:
 
     def _missing(self, force: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
         """What contacts miss that do not take part [m/s²]; `[lanes]` 1 where any misses much."""
-        missing, worst = [], jnp.full_like(force[0], _NONE)
-        for k in range(_MOST):
-            own = self.need[k] - _sum([columns[j, k] * force[j] for j in range(_MOST)])
-            taken = weight(columns[k, k] > 0, own)
-            missing.append((1 - taken) * own + taken * _NONE)
+        missing = self.need - _sum([columns[j] * force[j] for j in range(_MOST)])
+        taken = weight(_diagonal(columns) > 0, force)
+        missing = (1 - taken) * missing + taken * _NONE
+        worst = missing[0]
+        for k in range(1, _MOST):
             worst = jnp.maximum(worst, missing[k])
-        return jnp.stack(missing), weight(worst * self.dt**2 > _ENOUGH, worst)
+        return missing, weight(worst * self.dt**2 > _ENOUGH, worst)
+
+
+def _diagonal(columns: jax.Array) -> jax.Array:
+    return jnp.stack([columns[k, k] for k in range(_MOST)])
+
+
+def _last_of(better: list[jax.Array]) -> list[jax.Array]:
+    """1 for the last of some things that was better than those before it, 0 for the others."""
+    share, left = [], jnp.ones_like(better[0])
+    for x in reversed(better):
+        share.append(left * x)
+        left = left * (1 - x)
+    return [left, *reversed(share)]
 
 
 def _sum(xs: list[jax.Array]) -> jax.Array:

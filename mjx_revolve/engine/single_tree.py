@@ -81,7 +81,7 @@ class SingleTree:
         """Which boxes can meet, level after level."""
         first, second = self.pairs.T[..., None]
         boxes = Boxes.of(self.all, like.dtype)
-        return Meetings.alike(boxes, self.shells, first, second, len(first), like.shape[0])
+        return Meetings.of(boxes, self.shells, first, second, True)
 
     @property
     def touches(self) -> bool:

@@ -50,7 +50,7 @@ class State(NamedTuple):
             of parts whose drag law has a memory, `PartDragLaw.memory` rows of all parts each; empty
             without added mass and memories.
         clearance: least distance by which boxes of a robot that can meet stay apart, `[lanes]` [m];
-            not positive: unknown. Empty where robots differ or have no such boxes.
+            not positive: unknown. Empty without such boxes.
     """
 
     position: Lanes

@@ -62,6 +62,7 @@ from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
 from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.water.world import World, is_left_out
 
 # What a task cannot do without; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {
@@ -83,6 +84,8 @@ OLDER: dict[str, dict[str, Any]] = {
     "task": OLDER_TASK,
     "controller": {"rate": None, "between": "hold"},
 }
+OLDER_WORLD = {"self_contact": False}
+"""What worlds had in runs whose folders do not state it; others state it (`with_stated`)."""
 # Those that have a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
@@ -574,14 +577,33 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
-        data = with_older_values(data)
+        data = with_older_values(data, path.parent)
     return make_config(data, path.parent, overrides, short_path(path))
 
 
-def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
+def with_older_values(data: Mapping[str, Any], folder: str | Path) -> dict[str, Any]:
     """A run folder's settings with the values that older versions had where they lack a setting."""
     own = {name: data.get(name) for name in OLDER}
-    return {**data} | {k: {**OLDER[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
+    found = {**data} | {k: {**OLDER[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
+    if "world" in found:
+        found["world"] = with_stated(found["world"], OLDER_WORLD, folder)
+    return found
+
+
+def with_stated(world: Any, fields: Mapping[str, Any], folder: str | Path = "") -> Any:
+    """A world's settings with those fields that neither they nor the world's file state."""
+    given = {"name": world} if isinstance(world, str) else world
+    if not isinstance(given, Mapping) or not isinstance(given.get("name"), str):
+        return world
+    beside = Path(folder) / given["name"]
+    file = beside if beside.is_file() else given["name"]
+    added = {k: x for k, x in fields.items() if k not in given and is_left_out(file, k)}
+    return {**given, **added} if added else world
+
+
+def state_world(world: Any) -> Any:
+    """A world's settings with today's values of what older versions had otherwise."""
+    return with_stated(world, {name: getattr(World, name) for name in OLDER_WORLD})
 
 
 def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:

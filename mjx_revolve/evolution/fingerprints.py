@@ -41,9 +41,12 @@ def hash_text(*texts: str) -> str:
 
 def plain_settings(config: Config) -> dict[str, Any]:
     """All settings that may not change while a run goes on; a world is always a mapping."""
+    from mjx_revolve.episodes.config import state_world
+
     data = config.model_dump()
     for key in FREE_SETTINGS:
         del data["evolution"][key]
+    data["world"] = state_world(data["world"])
     if isinstance(data["world"], str):
         data["world"] = {"name": data["world"]}
     return data
@@ -59,7 +62,7 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
         config: of the run.
         by_path: whether current fields and data count by their path, as they did in older runs.
     """
-    from mjx_revolve.episodes.config import OLDER, Config
+    from mjx_revolve.episodes.config import OLDER, OLDER_WORLD, Config
     from mjx_revolve.episodes.settings import map_files
 
     def by_content(file: NamedFile) -> str:
@@ -72,6 +75,9 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     data = plain_settings(config)
     del data["morphology"], data["modules"]
     data["world"]["name"] = Path(data["world"]["name"]).name
+    for name, value in OLDER_WORLD.items():  # older runs lack them
+        if data["world"].get(name) == value:
+            del data["world"][name]
     data = map_files(data, by_content, Config)
     for section in ("controller", "task"):
         if not data[section]["params"]:  # older runs have none

@@ -34,7 +34,7 @@ import numpy as np
 import yaml
 
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.episodes.config import Config, dump_config, make_config
+from mjx_revolve.episodes.config import Config, dump_config, make_config, state_world
 from mjx_revolve.episodes.individual_log import (
     EVENTS,
     GENERATIONS,
@@ -245,6 +245,7 @@ def _info_text(info: Mapping[str, Any]) -> bytes:
 def _config_text(config: Config, folder: Path) -> bytes:
     """The text of `config.yaml`."""
     head = "# The resolved configuration of this run; it loads again as it stands.\n"
+    config = config.model_copy(update={"world": state_world(config.world)})
     return (head + dump_config(config, folder)).encode()
 
 

@@ -1,13 +1,14 @@
-"""Distance and penetration depth of turned boxes, by components, by separating axes.
+"""Distance and penetration depth of turned boxes, by separating axes.
 
 Two convex bodies are apart where their shadows on some axis are; of two boxes, 15 axes decide:
 three face normals of each, and the nine cross products of their edges (Gottschalk, Lin and Manocha
 1996, OBBTree, SIGGRAPH). The largest gap over these axes is, where it is negative, minus the
 penetration depth: the least translation that parts the boxes.
 
-Functions take NumPy's arrays or JAX's, and return the same; see `spatial` for vectors. Choices are
-sums with weights of 0 and 1: XLA:CPU makes a branch of a choice between numbers in memory, and no
-vectors.
+Functions take NumPy's arrays or JAX's, and return the same: vectors `[3, ...]`, matrices
+`[3, 3, ...]`, rows first. Axes stand in five groups of three: the first box's, the second's, and
+those of each of the first's edges with the second's. Choices are sums with weights of 0 and 1:
+XLA:CPU makes a branch of a choice between numbers in memory, and no vectors.
 """
 
 from __future__ import annotations
@@ -17,19 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_revolve.numerics.spatial import (
-    Mat,
-    Scalar,
-    Vec,
-    dot,
-    matTvec,
-    matvec,
-    namespace,
-    transpose,
-    vadd,
-    vscale,
-    vsub,
-)
+from mjx_revolve.numerics.spatial import Scalar, namespace
+from mjx_revolve.numerics.xla import materialize
 
 # An axis of two edges counts only where it parts the boxes by so much more than a face [m]: faces
 # are steadier, and close to parallel edges have no axis. A choice.
@@ -45,35 +35,35 @@ _FLAT = 0.05
 
 
 class BoxPair(NamedTuple):
-    """Two boxes; all components broadcast against each other.
+    """Two boxes; all arrays broadcast against each other behind their first axes.
 
     Attributes:
-        offset: from the first box's centre to the second's, world frame [m].
-        first: world from the first box's axes.
-        second: world from the second box's axes.
-        first_half: half edges of the first [m].
-        second_half: half edges of the second [m].
+        offset: `[3, ...]` from the first box's centre to the second's, world frame [m].
+        first: `[3, 3, ...]` world from the first box's axes.
+        second: `[3, 3, ...]` world from the second box's axes.
+        first_half: `[3, ...]` half edges of the first [m].
+        second_half: `[3, ...]` half edges of the second [m].
     """
 
-    offset: Vec
-    first: Mat
-    second: Mat
-    first_half: Vec
-    second_half: Vec
+    offset: Any
+    first: Any
+    second: Any
+    first_half: Any
+    second_half: Any
 
 
 class BoxAxes(NamedTuple):
-    """Shadows of two boxes on the 15 axes.
+    """Shadows of two boxes on the 15 axes, five groups `[3, ...]`.
 
     Attributes:
         offset: of the second centre from the first along each axis, with its sign [m].
         reach: sum of the half shadows of both [m].
     """
 
-    offset: tuple[Scalar, ...]
-    reach: tuple[Scalar, ...]
+    offset: tuple[Any, ...]
+    reach: tuple[Any, ...]
 
-    def gaps(self, side: tuple[Scalar, ...] | None = None) -> tuple[Scalar, ...]:
+    def gaps(self, side: tuple[Any, ...] | None = None) -> tuple[Any, ...]:
         """Gap along each axis [m], negative for an overlap.
 
         Args:
@@ -87,32 +77,55 @@ class BoxAxes(NamedTuple):
         return tuple(x * s - r for x, r, s in every)
 
 
+def matvec(matrix: Any, x: Any) -> Any:
+    """M x of `[3, 3, ...]` and `[3, ...]`."""
+    return matrix[:, 0] * x[0] + matrix[:, 1] * x[1] + matrix[:, 2] * x[2]
+
+
+def mat_t_vec(matrix: Any, x: Any) -> Any:
+    """Mᵀ x."""
+    return matrix[0] * x[0] + matrix[1] * x[1] + matrix[2] * x[2]
+
+
+def dot(a: Any, b: Any) -> Any:
+    """A · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _joined(parts: Sequence[Any], axis: int = 0) -> Any:
+    xp = namespace(parts[0])
+    found = xp.concatenate(parts, axis)
+    return found if xp is np else materialize(found)
+
+
+def _stacked(rows: Sequence[Any]) -> Any:
+    xp = namespace(rows[0])
+    rows = xp.broadcast_arrays(*rows)
+    return _joined([x[None] for x in rows])
+
+
 def box_axes(pair: BoxPair, parallel: float = _PARALLEL) -> BoxAxes:
-    """Shadows of two boxes on the 15 axes: the first's, the second's, then edge by edge.
+    """Shadows of two boxes on the 15 axes.
 
     Edges whose squared sine is below `parallel` have no axis: there the reach is 1e3 m, so that the
     gap is never the largest.
     """
-    xp = namespace(pair.offset[0])
-    a, b = pair.first_half, pair.second_half
-    t = matTvec(pair.first, pair.offset)
-    turn = _relative(pair)
-    size = tuple(tuple(xp.abs(x) for x in row) for row in turn)
-    columns = transpose(size)
-    offset = [*t, *matTvec(turn, t)]
-    reach = [a[i] + dot(size[i], b) for i in range(3)]
-    reach += [b[j] + dot(columns[j], a) for j in range(3)]
+    a, b, turn = pair.first_half, pair.second_half, _relative(pair)
+    xp, t = namespace(turn), mat_t_vec(pair.first, pair.offset)
+    size = xp.abs(turn)
+    offset = [t, mat_t_vec(turn, t)]
+    reach = [a + matvec(size, b), b + mat_t_vec(size, a)]
+    # The second's edges once more behind the last.
+    round_b, round_size = _joined([b, b[:2]]), _joined([size, size[:, :2]], 1)
     for i in range(3):
         i1, i2 = (i + 1) % 3, (i + 2) % 3
-        for j in range(3):
-            j1, j2 = (j + 1) % 3, (j + 2) % 3
-            square = 1 - turn[i][j] * turn[i][j]
-            crossed = weight(square > parallel, square)
-            inverse = crossed / xp.sqrt(xp.maximum(square, parallel))
-            offset.append((t[i2] * turn[i1][j] - t[i1] * turn[i2][j]) * inverse)
-            both = a[i1] * size[i2][j] + a[i2] * size[i1][j]
-            both = both + b[j1] * size[i][j2] + b[j2] * size[i][j1]
-            reach.append(both * inverse + 1e3 * (1 - crossed))
+        square = 1 - turn[i] * turn[i]
+        crossed = weight(square > parallel, square)
+        inverse = crossed / xp.sqrt(xp.maximum(square, parallel))
+        offset.append((t[i2] * turn[i1] - t[i1] * turn[i2]) * inverse)
+        both = a[i1] * size[i2] + a[i2] * size[i1]
+        both = both + round_b[1:4] * round_size[i, 2:5] + round_b[2:5] * round_size[i, 1:4]
+        reach.append(both * inverse + 1e3 * (1 - crossed))
     return BoxAxes(tuple(offset), tuple(reach))
 
 
@@ -122,10 +135,10 @@ def weight(condition: Any, like: Scalar) -> Scalar:
     return xp.where(condition, 1.0, 0.0).astype(like.dtype)
 
 
-def _relative(pair: BoxPair) -> Mat:
+def _relative(pair: BoxPair) -> Any:
     """The second box's axes, seen from the first: first from second."""
-    columns = transpose(pair.second)
-    return transpose(tuple(matTvec(pair.first, x) for x in columns))
+    one, other = pair.first, pair.second
+    return sum(one[k][:, None] * other[k][None] for k in range(3))
 
 
 def box_gap(pair: BoxPair) -> Scalar:
@@ -133,12 +146,15 @@ def box_gap(pair: BoxPair) -> Scalar:
 
     Negative: minus the penetration depth. Positive: they are apart, by at least that distance.
     """
-    gaps = box_axes(pair).gaps()
-    xp = namespace(gaps[0])
-    found = gaps[0]
-    for gap in gaps[1:]:
-        found = xp.maximum(found, gap)
-    return found
+    return _largest(box_axes(pair).gaps())
+
+
+def _largest(groups: Sequence[Any]) -> Any:
+    """Over all axes of some groups."""
+    xp, found = namespace(groups[0]), groups[0]
+    for group in groups[1:]:
+        found = xp.maximum(found, group)
+    return xp.maximum(xp.maximum(found[0], found[1]), found[2])
 
 
 class BoxContact(NamedTuple):
@@ -147,14 +163,14 @@ class BoxContact(NamedTuple):
     Attributes:
         gap: along the normal [m]; negative for an overlap.
         start: the same now, where `gap` is that a step later [m].
-        normal: unit vector from the first box to the second, world frame.
-        point: in the middle between them, from the first box's centre, world frame [m].
+        normal: `[3, ...]` unit vector from the first box to the second, world frame.
+        point: `[3, ...]` in the middle between them, from the first box's centre, world frame [m].
     """
 
-    gap: Scalar
-    start: Scalar
-    normal: Vec
-    point: Vec
+    gap: Any
+    start: Any
+    normal: Any
+    point: Any
 
 
 def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
@@ -178,117 +194,92 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     side = tuple(1 - 2 * weight(x < 0, x) for x in axes.offset)
     score = now
     if ahead is not None:
-        parts = now[0]
-        for gap in now[1:]:
-            parts = xp.maximum(parts, gap)
-        least = xp.minimum(parts, 0) - _FACES_FIRST
+        least = xp.minimum(_largest(now), 0) - _FACES_FIRST
         parting = [weight(n >= least, n) for n in now]
         later = box_axes(ahead).gaps(side)
         score = tuple(w * x - 1e3 * (1 - w) for w, x in zip(parting, later, strict=True))
     turn = _relative(pair)
-    best, taken = score[0], []
-    for k in range(1, 15):
-        better = weight(score[k] > best + (_FACES_FIRST if k > 5 else 0), best)
-        best = better * score[k] + (1 - better) * best
-        taken.append(better)
-    share = last_of(taken)
-    start = _sum(share, now)
+    face, crossing = _largest(score[:2]), _largest(score[2:])
+    edges = weight(crossing > face + _FACES_FIRST, face)
+    best = face + edges * (crossing - face)
+    share = _first_of(score, face, crossing, edges)
+    start = sum(s[k] * x[k] for s, x in zip(share, now, strict=True) for k in range(3))
     signed = [x * y for x, y in zip(share, side, strict=True)]
     normal = _axis(turn, signed)
     # What touches first is what reaches farthest at the end of the step.
     turn_ahead = turn if ahead is None else _relative(ahead)
     toward = normal if ahead is None else _axis(turn_ahead, signed)
     # The features that look at each other, seen from the first box.
-    t = matTvec(pair.first, pair.offset)
-    back = transpose(turn)
+    t = mat_t_vec(pair.first, pair.offset)
     one, spread = _feature(toward, pair.first_half)
-    backward = matTvec(turn_ahead, tuple(-x for x in toward))
-    other, other_spread = _feature(backward, pair.second_half)
-    away = vsub(vadd(t, matvec(turn, other)), one)
-    on_first = _common(spread, away, turn, other_spread)
-    on_second = _common(other_spread, matvec(back, tuple(-x for x in away)), back, spread)
-    on_second = vadd(away, matvec(turn, on_second))
+    other, other_spread = _feature(-mat_t_vec(turn_ahead, toward), pair.second_half)
+    away = t + matvec(turn, other) - one
+    size, back = xp.abs(turn), mat_t_vec(turn, away)
+    on_first = _common(spread, away, matvec(size, other_spread))
+    on_second = away + matvec(turn, _common(other_spread, -back, mat_t_vec(size, spread)))
     # Of two edges, the point of the first that is nearest to the second.
-    edge = tuple(sum(share[6 + 3 * i : 9 + 3 * i]) for i in range(3))
-    other_edge = matvec(turn, tuple(sum(share[6 + j :: 3]) for j in range(3)))
-    kinds = sum(share[:3]), sum(share[3:6]), sum(edge)
+    edge = _stacked([x[0] + x[1] + x[2] for x in share[2:]])
+    other_edge = matvec(turn, share[2] + share[3] + share[4])
     cosine = dot(edge, other_edge)
     way = dot(edge, away) - cosine * dot(other_edge, away)
-    way = way / (1 - kinds[2] * cosine * cosine)
+    way = way / (1 - edges * cosine * cosine)
     reach = dot(edge, spread)
-    crossing = vscale(xp.clip(way, -reach, reach), edge)
-    point = tuple(_sum(kinds, x) for x in zip(on_first, on_second, crossing, strict=True))
+    first = share[0][0] + share[0][1] + share[0][2]
+    point = first * on_first + (1 - edges - first) * on_second
+    point = point + edges * xp.clip(way, -reach, reach) * edge
     # In the middle between the two along the normal.
-    point = vadd(point, vscale(0.5 * dot(normal, away) - dot(normal, point), normal))
-    return BoxContact(best, start, matvec(pair.first, normal), matvec(pair.first, vadd(one, point)))
+    point = point + (0.5 * dot(normal, away) - dot(normal, point)) * normal
+    return BoxContact(best, start, matvec(pair.first, normal), matvec(pair.first, one + point))
 
 
-def last_of(better: Sequence[Scalar]) -> list[Scalar]:
-    """1 for the last of some things that was better than those before it, 0 for the others.
-
-    Args:
-        better: 1 or 0 for each thing but the first.
-
-    Returns:
-        For each thing, the first among them.
-    """
-    xp = namespace(better[0])
-    share, left = [], xp.ones_like(better[0])
-    for x in reversed(better):
-        share.append(left * x)
-        left = left * (1 - x)
-    return [left, *reversed(share)]
-
-
-def _sum(weights: Sequence[Scalar], values: Sequence[Scalar]) -> Scalar:
-    """Sum of products."""
-    return sum(w * x for w, x in zip(weights, values, strict=True))
-
-
-def _axis(turn: Mat, share: Sequence[Scalar]) -> Vec:
-    """The sum of the 15 axes, unit vectors in the first box's frame, by such shares."""
-    xp = namespace(turn[0][0])
-    found = vadd(tuple(share[:3]), matvec(turn, tuple(share[3:6])))
-    for i in range(3):
-        scaled = []
-        for j in range(3):
-            square = 1 - turn[i][j] * turn[i][j]
-            scaled.append(share[6 + 3 * i + j] / xp.sqrt(xp.maximum(square, _PARALLEL)))
-        # e_i × Σ of the second box's axes.
-        x = matvec(turn, tuple(scaled))
-        i1, i2 = (i + 1) % 3, (i + 2) % 3
-        parts = list(found)
-        parts[i1], parts[i2] = parts[i1] - x[i2], parts[i2] + x[i1]
-        found = tuple(parts)
+def _first_of(score: Sequence[Any], face: Any, crossing: Any, edges: Any) -> list[Any]:
+    """1 for the first axis of the best kind with the best score, 0 for all others, by groups."""
+    found, left = [], 1 - edges
+    for k, group in enumerate(score):
+        left = edges if k == 2 else left
+        best = weight(group >= (face if k < 2 else crossing), group)
+        rows = []
+        for x in best:
+            rows.append(left * x)
+            left = left * (1 - x)
+        found.append(_stacked(rows))
     return found
 
 
-def _feature(normal: Vec, half: Vec) -> tuple[Vec, Vec]:
+def _axis(turn: Any, share: Sequence[Any]) -> Any:
+    """The sum of the 15 axes, unit vectors in the first box's frame, by such shares."""
+    xp = namespace(turn)
+    crossed = []
+    for i in range(3):
+        square = 1 - turn[i] * turn[i]
+        crossed.append(matvec(turn, share[2 + i] / xp.sqrt(xp.maximum(square, _PARALLEL))))
+    # e_i × Σ of the second box's axes.
+    x, y, z = crossed
+    edges = _stacked([y[2] - z[1], z[0] - x[2], x[1] - y[0]])
+    return share[0] + matvec(turn, share[1]) + edges
+
+
+def _feature(normal: Any, half: Any) -> tuple[Any, Any]:
     """Middle of a box's corner, edge or face that lies farthest along a direction; its half edges.
 
     Both in the box's frame.
     """
-    xp = namespace(normal[0])
-    share = tuple(xp.clip(x / _FLAT, -1, 1) for x in normal)
-    middle = tuple(s * h for s, h in zip(share, half, strict=True))
-    return middle, tuple((1 - xp.abs(s)) * h for s, h in zip(share, half, strict=True))
+    xp = namespace(normal)
+    share = xp.clip(normal / _FLAT, -1, 1)
+    return share * half, (1 - xp.abs(share)) * half
 
 
-def _common(spread: Vec, away: Vec, turn: Mat, other_spread: Vec) -> Vec:
+def _common(spread: Any, away: Any, reach: Any) -> Any:
     """Middle of what two features have in common along the axes of the first's box.
 
-    From the middle of the first feature. `away` leads to that of the second, `turn` turns the
-    second's axes into the first's, and both spreads are half edges of the features.
+    From the middle of the first feature, of half edges `spread`. `away` leads to that of the
+    second, which reaches so far along each axis.
     """
-    xp = namespace(away[0])
-    found = []
-    for i in range(3):
-        reach = dot(tuple(xp.abs(x) for x in turn[i]), other_spread)
-        low = xp.maximum(-spread[i], away[i] - reach)
-        high = xp.minimum(spread[i], away[i] + reach)
-        # With nothing in common, the end of the other one: the gap is that at its corner.
-        found.append(xp.clip(0.5 * (low + high), away[i] - reach, away[i] + reach))
-    return tuple(found)
+    xp = namespace(spread)
+    low = xp.maximum(-spread, away - reach)
+    high = xp.minimum(spread, away + reach)
+    # With nothing in common, the end of the other one: the gap is that at its corner.
+    return xp.clip(0.5 * (low + high), away - reach, away + reach)
 
 
 def pair_of(
@@ -306,8 +297,8 @@ def pair_of(
         halves: of the second.
 
     Returns:
-        The pairs, by components.
+        The pairs.
     """
-    vec = lambda x: tuple(x[..., i] for i in range(3))  # noqa: E731
-    mat = lambda x: tuple(tuple(x[..., i, j] for j in range(3)) for i in range(3))  # noqa: E731
+    vec = lambda x: np.moveaxis(x, -1, 0)  # noqa: E731
+    mat = lambda x: np.moveaxis(x, (-2, -1), (0, 1))  # noqa: E731
     return BoxPair(vec(centers - center), mat(rotation), mat(rotations), vec(half), vec(halves))

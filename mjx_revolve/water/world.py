@@ -178,7 +178,7 @@ class World:
     waves: Annotated[TupleOf[Wave], BeforeValidator(_read_waves)] = ()
     water_depth: Annotated[Number, Ge(1e-2), Unit("m")] | None = None
     surface_tension: Annotated[OrOff[SurfaceTension], BeforeValidator(_read_tension)] = None
-    self_contact: Boolean = False
+    self_contact: Boolean = True
     timestep: Annotated[Number, Ge(1e-5), Le(0.1), Unit("s")] = 0.005
 
     def __repr__(self) -> str:
@@ -229,15 +229,7 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         InputError: no such world, an unknown field, or a value out of range; the message names
             the file and the field.
     """
-    shipped = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
-    if not isinstance(name, str | Path):
-        raise InputError(f"world: expected a name or a path; found {show(name)}")
-    check_path(name)
-    path = _FOLDER / f"{name}.yaml" if str(name) in shipped else Path(name)
-    if not path.exists() and path.suffix not in (".yaml", ".yml"):
-        raise InputError(
-            f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
-        )
+    path = _find_world(name)
     data = load_yaml(path)
     with reading(path):
         if not isinstance(data, dict):
@@ -256,6 +248,29 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     with reading(f"world {world.name}"):
         world = read(World, fields | {"current_field": world.current_field} | overrides)
     return _note_of_density(world)
+
+
+def _find_world(name: str | Path) -> Path:
+    """The file of a world."""
+    shipped = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
+    if not isinstance(name, str | Path):
+        raise InputError(f"world: expected a name or a path; found {show(name)}")
+    check_path(name)
+    path = _FOLDER / f"{name}.yaml" if str(name) in shipped else Path(name)
+    if not path.exists() and path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
+        )
+    return path
+
+
+def is_left_out(name: str | Path, field: str) -> bool:
+    """Whether the file of a world leaves a field at its default; false where it cannot be read."""
+    try:
+        data = load_yaml(_find_world(name))
+    except InputError:
+        return False
+    return isinstance(data, dict) and field not in data
 
 
 def _note_of_density(world: World) -> World:

@@ -99,7 +99,7 @@ def test_point_of_flat_faces_is_the_middle_of_what_they_share():
 def test_a_box_that_would_pass_through_another_within_a_step_is_seen():
     unit, thin = np.eye(3)[None], np.array([[0.05, 0.05, 0.001]])
     now = pair_of(np.zeros((1, 3)), unit, thin, np.array([[0.0, 0.0, 0.01]]), unit, thin)
-    ahead = now._replace(offset=(*now.offset[:2], now.offset[2] - 0.02))
+    ahead = now._replace(offset=now.offset - np.array([[0], [0], [0.02]]))
     contact = box_contact(now, ahead)
     assert contact.gap[0] == pytest.approx(-0.012)
     assert contact.normal[2][0] == 1
