@@ -308,7 +308,8 @@ def fit_capacity(
     points, root_points = _count_points(assembly, order) if near else (0, 0)
     meeting = _list_pairs(robots)
     shells, root_shells = _count_shells(assembly, order, meeting)
-    if modules and world.self_contact:
+    more = bool(modules or hinges or rows or kinds) and world.self_contact
+    if more:
         shells = sum(group.parts for group in groups)
         root_shells = sum(group.root_parts for group in groups)
     if modules:
@@ -337,7 +338,7 @@ def fit_capacity(
         root_points=root_points,
         shells=shells,
         root_shells=root_shells,
-        meetings=_most_meetings(robots, root_shells + count * shells, bool(modules)),
+        meetings=_most_meetings(robots, root_shells + count * shells, more),
         carries=carries,
         timestep=world.timestep,
         nothing=jax.tree.map(lambda x: x[-1:], columns.parts),
@@ -439,7 +440,7 @@ def _count_points(assembly: Assembly, order: RowOrder) -> tuple[int, int]:
 
 def _most_meetings(robots: Sequence[Robot], shells: int, more: bool) -> int:
     """Room for pairs of boxes: as many as any of these robots has, or as any other may have."""
-    if more and robots[0].world.self_contact:
+    if more:
         return shells * (shells - 1) // 2
     return max(len(robot.assembly.meeting_pairs) for robot in robots)
 

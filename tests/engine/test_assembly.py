@@ -96,7 +96,7 @@ def test_numbers_are_those_of_mujocos_model():
         close(ours.position, data.xpos)
         close(ours.rotation, data.xmat.reshape(-1, 3, 3))
         close(ours.axis[moved], m.jnt_axis[1:])
-        close(ours.range[moved], m.jnt_range[1:])
+        close(ours.stops[moved], m.jnt_range[1:])
         close(ours.damping[moved], m.dof_damping[6:])
         close(ours.speed[moved], m.jnt_user[1:, 0])
         servos = list(robot.servos)
