@@ -4,11 +4,11 @@ Where Revolve's code differs from its documentation, or leaves something open:
 
 - `phase_offset` counts periods, not radians: an Oscillator gives
   1/2 - a/2 + a (sin(2π/T (t - T φ)) + 1)/2, whatever its inputs are.
-- Files in the wild give an Oscillator a `gain` in place of an `amplitude`; it is read as one.
-- All neurons are updated at once, from each other's values of the update before; those begin at 0.
+- Some files give an Oscillator a `gain` in place of an `amplitude`; it is read as one.
+- All neurons are updated at once, from the values of the update before; those begin at 0.
 - The network is updated 8 times a second, and its outputs are held in between.
 - An output is clipped to 0 to 1, and that is the hinge's whole range; of several for one hinge, the
-  first in the file counts. A hinge without any stays in the middle.
+  first in the file counts. A hinge without an output stays in the middle.
 - The inputs of a module are its input neurons in the file's order: of the core its accelerometer's
   x, y, z, then its gyro's [m/s², rad/s]; of a touch sensor its two cells, the force of the bed on
   its left and its right half as seen in the direction in which it is attached, as a share of 1 N.
@@ -57,8 +57,8 @@ PARAMS: dict[str, tuple[str, ...]] = {
     "Oscillator": ("period", "phase_offset", "amplitude"),
 }
 _OTHERWISE = {"amplitude": "gain"}
-# Largest change of a written number by its gene, for a period the factor; choices, about the ranges
-# that Revolve draws them from.
+# Largest change of a number of the file by its gene, for a period the factor; choices, about the
+# ranges that Revolve draws them from.
 _REACH = {"weight": 2.0, "bias": 1.0, "gain": 1.0, "phase_offset": 0.5, "amplitude": 1.0}
 _PERIODS = 4.0
 _CELLS, _INERTIAL = 2, 6  # inputs of a touch sensor, and of the core
@@ -148,7 +148,7 @@ class _File:
 
 
 class NeuralNetwork(NamedTuple):
-    """A network as it is written.
+    """A network as in the file.
 
     Attributes:
         neurons: in the file's order.
@@ -195,7 +195,7 @@ def _genes_of(network: NeuralNetwork) -> list[tuple[str, Any]]:
 
 
 def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
-    """A network as a morphology file has it, with its numbers changed by genes.
+    """A network in the form of a morphology file, with its numbers changed by genes.
 
     Args:
         brain: under `brain` in the file.
@@ -203,7 +203,7 @@ def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
         source: the file, in messages.
 
     Returns:
-        A new one: with genes of 0 it does what the given one does with these.
+        A new network: with genes of 0 it acts as the given one does with `genes`.
     """
     network, made = read_neural_network(brain, source), copy.deepcopy(brain)
     params = {str(key): value for key, value in (made.get("params") or {}).items()}
@@ -221,14 +221,14 @@ def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
 
 
 def _moved(kind: str, written: float, folded: Any) -> Any:
-    """A written number, changed by a gene."""
+    """A number of the file, changed by a gene."""
     if kind == "period":
         return written * _PERIODS**folded
     return written + _REACH[kind] * folded
 
 
 def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -> Controller:
-    """A robot's own network. Genes of 0 run it as it is written; they move its numbers.
+    """The network in a robot's file; genes change its numbers, genes of 0 leave them as they are.
 
     Args:
         plant: of the robot.

@@ -1,7 +1,7 @@
-"""What sensors read of the engine's state, at the core and at modules, for every engine.
+"""True sensor readings from the engine's state, at the core and at modules, for every engine.
 
-The core is one of the places where a sensor may be mounted: the same function computes the readings
-of the core, of one module, and of a type of modules, from the pose and the motion of its frame.
+One function computes the readings at the core, at one module, and at a type of modules, from the
+pose and the motion of the frame there.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def is_module_signal(name: str) -> bool:
 
 
 class EpisodeContext(NamedTuple):
-    """What an episode adds to a robot's own state for sensors to read, `[lanes]` each or None.
+    """Inputs of sensors that belong to the episode rather than the robot, `[lanes]` each or None.
 
     Attributes:
         target: initial position of the target, world frame, three of `[lanes]` [m].
@@ -91,7 +91,7 @@ class NearestRobot(NamedTuple):
     Attributes:
         toward: from core to core, core frame, three of `[lanes]` [m]; `NO_NEIGHBOUR` long if there
             is none.
-        tag: number that tells robots apart, `[lanes]` [-]; 0 if there is none.
+        tag: number that identifies the robot, `[lanes]` [-]; 0 if there is none.
     """
 
     toward: Any
@@ -111,7 +111,7 @@ class PreviousMotion(NamedTuple):
 
 
 class SensorMemory(NamedTuple):
-    """Part of the rollout state: what readings need of earlier steps; None where none needs it.
+    """Part of the rollout state: values of earlier steps that readings depend on; None if unused.
 
     Attributes:
         acceleration: of the core over the last step, world frame, three of `[lanes]` [m/s²].
@@ -129,11 +129,12 @@ class SensorMemory(NamedTuple):
 
 
 class SensorReadings(NamedTuple):
-    """True values at the core, or at modules: what a controller and its sensors read.
+    """True values at the core, or at modules, before noise, rate and delay of sensors.
 
     At the core and at one module `[lanes]` each, vectors three of them, in the frame of the core or
-    in that of the module's main box (of its moving part). On a type of modules `[1 + hinge rows,
-    lanes]`: of the first such module on the core's rigid body, and on what each hinge carries.
+    in that of the module's main box (of its moving part). At a type of modules `[1 + hinge rows,
+    lanes]`: at the first such module on the core's rigid body, and on the body that each hinge
+    moves.
 
     Attributes:
         height: of the centre above the still surface, negative under water [m].
@@ -152,8 +153,8 @@ class SensorReadings(NamedTuple):
             optional: see `OPTIONAL_SIGNALS`.
         load: torque of the servos under the last command, as `angle` [N·m]; optional.
         work: done by servos and propellers so far [J]; core only, optional.
-        touch: normal force of the bed on the core's rigid body, then on what each hinge carries,
-            `[1 + hinge rows, lanes]` [N]; of a module on its rigid body; optional.
+        touch: normal force of the bed on the core's rigid body, then on the body that each hinge
+            moves, `[1 + hinge rows, lanes]` [N]; at a module that on its rigid body; optional.
         nearest: the nearest other robot; core only, optional.
         modules: readings at modules, by signal; core only.
         course: direction to keep to, a unit vector; 0 without; core only.
@@ -203,7 +204,7 @@ class _Frame(NamedTuple):
         rotation: world from module.
         velocity: world frame [m/s].
         angular_velocity: module frame [rad/s].
-        acceleration: over the last step, world frame [m/s²]; None where it is not computed.
+        acceleration: over the last step, world frame [m/s²]; None if not computed.
     """
 
     position: Vec
@@ -233,7 +234,7 @@ def _site_frame(
         rate = 1 / timestep
         gain = vscale(rate, vsub(matvec(body, motion.velocity), past.velocity))
         turning = vscale(rate, vsub(spin, past.angular_velocity))
-        # In the middle of the step, so that the mean over it is good to second order.
+        # At the middle of the step, so that the mean over it is accurate to second order.
         middle = vscale(0.5, vadd(spin, past.angular_velocity))
         own = vadd(cross(turning, offset), cross(middle, cross(middle, offset)))
         acceleration = vadd(gain, matvec(body, own))
@@ -297,19 +298,19 @@ def read_sensors(
     meeting: InteractionForces = NO_INTERACTION,
     motion: BodyMotion | None = None,
 ) -> SensorReadings:
-    """The readings at the core, and at the modules that are named.
+    """The readings at the core, and at the modules named in `signals`.
 
     Args:
-        world: around the robots; None where no sensor reads water or bed.
+        world: around the robots; None if no sensor reads water or bed.
         engine: of the robots.
         state: of the engine.
         water: at this time; heights count from its still surface.
         time: since the episode's start [s].
         context: of the episode.
         memory: from `init_memory` or `update_memory`.
-        signals: which of `OPTIONAL_SIGNALS`, and which modules.
+        signals: the `OPTIONAL_SIGNALS`, and the modules, that are read.
         meeting: interaction with the other robots of the same world.
-        motion: of all rigid bodies, where it is known already.
+        motion: of all rigid bodies; computed if None.
 
     Raises:
         InputError: there is no such module.
@@ -429,13 +430,13 @@ def update_memory(
 
 
 def _motion_to_keep(motion: BodyMotion) -> PreviousMotion:
-    """What the next step needs of the bodies' motion."""
+    """The fields of the bodies' motion that the next step's readings depend on."""
     body: Mat = (motion.x_axis, motion.y_axis, motion.z_axis)
     return PreviousMotion(matvec(body, motion.velocity), motion.angular_velocity)
 
 
 class _RestingEngine:
-    """The engine's functions that readings need, for robots at rest: gives shapes."""
+    """The functions of an `Engine` that readings call, for robots at rest: gives shapes."""
 
     def __init__(self, plant: Plant, lanes: int) -> None:
         self.plant = plant
@@ -465,7 +466,7 @@ class _RestingEngine:
 
 
 def readings_at_rest(plant: Plant, lanes: int, signals: Sequence[str]) -> SensorReadings:
-    """Readings of the right shapes, to try a controller on.
+    """Readings of the right shapes, to check a controller with.
 
     Raises:
         InputError: there is no such module.

@@ -82,7 +82,8 @@ class Hinges(NamedTuple):
         range: limits of the joint, low and high [rad].
         stop: stiffness of the end stops [N·m/rad].
         motor: the line between speed and torque near the top speed, far above any torque where
-            a servo has none: torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s].
+            a servo has none: torque at the top speed [N·m], gradient [N·m·s/rad], top speed
+            [rad/s].
         base_inertia: of all that is on the parent's side of the hinge, about its axis, at rest
             [kg·m²].
         lever: how far boxes of the robot can move for each radian, one seen from another [m]; 0

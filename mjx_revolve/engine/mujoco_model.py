@@ -32,7 +32,7 @@ _LEAST_CONTACTS = 32
 # Corners within this of the outermost lie flush with it [m].
 _FLUSH = 1e-3
 
-# Colour of a module whose YAML gives none (Revolve's default grey).
+# Colour of a module without one in its YAML (Revolve's default grey).
 _GREY = (0.5, 0.5, 0.5)
 
 
@@ -199,7 +199,7 @@ def _add_thruster(
     """A thruster as stock MuJoCo can have it: a filtered force at a site, linear in the command.
 
     Our engines take lag and limits from here and thrust from the thruster's own curve, which
-    MuJoCo cannot hold; its gain is the curve's slope between the ends of the command's range.
+    MuJoCo cannot represent; its gain is the mean gradient of the curve over the command's range.
     """
     thruster = part.thruster
     assert thruster is not None

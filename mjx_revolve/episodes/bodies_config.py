@@ -82,7 +82,7 @@ class SelectionConfig(Settings):
     """Maximised, or with a minus before it minimised: `score`, `novelty`, or a measure or
     descriptor by name. `nsga2` takes several, all others one."""
     novelty: TupleOf[str] = ()
-    """Descriptors and measures in whose space `novelty` is the mean distance to neighbours."""
+    """Descriptors and measures: `novelty` is the mean distance to neighbours in their space."""
     neighbours: Annotated[Integer, Ge(1)] = 15
     """Number of neighbours."""
     passport: Literal["required", "made"] = "made"

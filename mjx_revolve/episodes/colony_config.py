@@ -1,8 +1,8 @@
 """Settings of a colony, robots that evolve in one world: `colony` in a configuration.
 
-After Revolve's online evolution (the "triangle of life": Eiben et al. 2013, ECAL), whose numbers
-are the order of magnitude of those here: 10 to 75 robots, meeting within 1 m, 2 to 6 children a
-pair, clinics 2 to 4 m across.
+After Revolve's online evolution (the "triangle of life": Eiben et al. 2013, ECAL), with defaults of
+the same order of magnitude: 10 to 75 robots, mating within 1 m, 2 to 6 children for each pair,
+birth clinics 2 to 4 m across.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ArenaConfig(Settings):
     size: Annotated[Positive, Unit("m")] = 16.0
     """Edge of the square [m]."""
     depth: Annotated[Positive, Unit("m")] = 6.0
-    """Robots whose cores sink below this are lost [m]."""
+    """A robot with its core below this depth is lost [m]."""
     edge: Literal["wrap", "lost"] = "wrap"
     """A robot that leaves the square comes back in on the other side (`wrap`), or is lost."""
 

@@ -1,8 +1,8 @@
 """The configuration of a run: a small YAML file, checked before anything expensive starts.
 
-A file names the robot and the world, its controller, its task and how it is evolved. `load_config`
-reads one, applies overrides, checks every value and resolves the paths; `dump_config` writes the
-resolved values back, so that a run folder documents itself.
+A file names robot, world, controller, task and settings of evolution. `load_config` reads it,
+applies overrides, checks every value and resolves the paths; `dump_config` writes the resolved
+values, so that a run folder documents itself.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
-# What a task cannot do without; `tasks.TASKS` has the tasks themselves.
+# Required settings of each task; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {
     "directed_swim": (),
     "speed": (),
@@ -76,14 +76,14 @@ TASKS: dict[str, tuple[str, ...]] = {
     "follow_bed": ("height",),
     "crawl": (),
 }
-# What runs of versions without these settings had: their controllers gave a command at every step,
-# their robots' places were their cores', and their lengths those at rest.
+# Values in effect in runs of versions without these settings: a command at every step, positions of
+# robots at their cores, and lengths at rest.
 OLDER_TASK = {"point": "core", "length": "rest"}
 OLDER: dict[str, dict[str, Any]] = {
     "task": OLDER_TASK,
     "controller": {"rate": None, "between": "hold"},
 }
-# Those that have a target.
+# Tasks with a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
 
@@ -117,7 +117,7 @@ _Modules = Annotated[str, MinLen(1), words("the path of a YAML, or nothing")]
 
 
 class ControllerConfig(Section):
-    """What turns genes into joint targets."""
+    """Settings of the controller, which maps genes to joint targets."""
 
     type: Annotated[str, one_of(CONTROLLERS), File("code")] = "cpg"
     """`cpg`, `sine`, `feedback`, `mlp`, `rnn`, `sensory_cpg`, `splines`, `brain` (what the
@@ -173,9 +173,9 @@ class ControllerConfig(Section):
 
 
 class RobustConfig(Settings):
-    """By what factor coefficients may be larger or smaller that are drawn anew for each trial.
+    """Largest factors by which coefficients are multiplied or divided, drawn anew for each trial.
 
-    Uniformly in the factor's logarithm, the same for all individuals.
+    Uniform in the factor's logarithm, the same for all individuals.
     """
 
     drag: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.5
@@ -193,20 +193,20 @@ class RobustConfig(Settings):
 
 @also(OFF, {"const": True})
 def _read_robust(value: Any) -> Any:
-    """`true` as all usual ranges."""
+    """`true` as the default range of each coefficient."""
     return {} if value is True else None if is_off(value) else value
 
 
 class TaskConfig(Section):
-    """What the robot is scored for, and how its episodes start."""
+    """Settings of the task: its score and how its episodes start."""
 
     type: Annotated[str, one_of(TASKS), File("code")]
     """What is scored: a task, see the table above, or FILE.py:FUNCTION, a function like those."""
     unit: Literal["body_lengths", "m"] = "body_lengths"
-    """What ways are measured in by tasks whose scores have body lengths in their unit. Where bodies
-    evolve, a body length is a choice of theirs: `m` compares them by what they swim."""
+    """Unit of lengths in scores that are in body lengths. If bodies evolve, so does their length:
+    `m` compares them by the distance in metres."""
     point: Literal["center_of_mass", "core"] = "center_of_mass"
-    """Whose way is scored and measured: the robot's centre of mass, without the water that it
+    """The point of scores and measures: the robot's centre of mass, without the water that it
     holds or carries, or the core's centre, which gains by being shaken. Sensors stay the core's."""
     length: Literal["stretched", "rest"] = "stretched"
     """What a body length is: of the body stretched out, the longest way through it with its hinges
@@ -325,7 +325,7 @@ class TaskConfig(Section):
 
 
 class EvolutionConfig(Settings):
-    """How genes are searched for."""
+    """Settings of the search over genes."""
 
     strategy: Annotated[str, MinLen(1)] = "CMA_ES"
     """Name of an evosax strategy; `mjx_revolve.evolution.strategies.STRATEGIES` lists them."""
@@ -348,7 +348,7 @@ class EvolutionConfig(Settings):
 
 @dataclass(frozen=True)
 class _Overrides:
-    """What was typed beside a file; a configuration with it equals one without.
+    """Overrides from the command line, for messages; they do not count in comparisons.
 
     Attributes:
         settings: values by dotted key.
@@ -409,7 +409,7 @@ class Config(Settings):
         return self
 
     def _check_colony(self) -> None:
-        """Refuses what a colony has no use for."""
+        """Refuses settings that a colony does not use."""
         if self.bodies is None:
             raise ConstraintError("bodies", "how bodies evolve, as there is a colony", "nothing")
         for name, usual in (("learning", LearningConfig()), ("selection", SelectionConfig())):
@@ -432,12 +432,12 @@ class Config(Settings):
         return self._source
 
     def origin(self, place: str) -> str:
-        """What a message about a setting begins with: the option that set it, or the file."""
+        """The beginning of a message about a setting: the option that set it, or the file."""
         typed = sets(self._overrides.settings, place)
         return f"{self._overrides.label} " if typed else f"{self._source}: "
 
     def blame(self, error: InputError) -> InputError:
-        """The same error with its place behind the option that set it, or behind the file."""
+        """The same error, its message prefixed by the option that set the value, or by the file."""
         label, text = self._overrides.label, str(error).removeprefix(f"{self._source}: ")
         if label and text.startswith(f"{label} "):
             return error
@@ -456,7 +456,7 @@ class Config(Settings):
         return tuple(found)
 
     def for_body(self, morphology: str | Path) -> Config:
-        """The same for one body alone, from a morphology's path; only its brain would evolve."""
+        """The configuration for the evolution of one body's brain, given a morphology's path."""
         return self.model_copy(update={"morphology": str(morphology), "bodies": None})
 
     @property
@@ -466,7 +466,7 @@ class Config(Settings):
 
     @property
     def subject(self) -> str:
-        """What is done and where, in words: `directed_swim in lake`."""
+        """Task and world in words: `directed_swim in lake`."""
         return f"{self.task.name} in {Path(self.world_name).stem}"
 
     @property
@@ -487,10 +487,10 @@ def make_config(
 
     Args:
         data: the settings, nested like the YAML file.
-        folder: what relative paths in `data` start from. Relative paths in overrides start from
-            the current folder, because that is where they are typed.
+        folder: base of relative paths in `data`. Those in overrides are relative to the current
+            folder, as on the command line.
         overrides: see `load_config`.
-        source: what messages call the settings.
+        source: name of the settings in messages.
 
     Returns:
         The checked configuration, its paths absolute.
@@ -515,7 +515,7 @@ def make_config(
     except ValidationError as error:
         problems = find_problems(error, Config, merged)
         at = f"{label} {', '.join(settings)}: "
-        blamed = bool(settings) and _is_valid(data, folder)  # without what was typed
+        blamed = bool(settings) and _is_valid(data, folder)  # valid without the overrides
 
         def before(place: str) -> str:
             return at if blamed and not sets(settings, place) else origin(place)[1]

@@ -1,8 +1,8 @@
 """Scores of a population: the evaluation behind `Fitness` and `MixedFitness`.
 
-`EpisodeSpec` holds what all episodes of a configuration have in common; its two variants in
-`fitness` add one body, or room for many. An individual's episodes run in lanes of a chunk of fixed
-shape, so its score does not depend on the population around it.
+`EpisodeSpec` holds the common properties of all episodes of a configuration; its two subclasses in
+`fitness` add one body, or a capacity for many. An individual's episodes run in lanes of a chunk of
+fixed shape, so its score does not depend on the population around it.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Episodes(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EpisodeSpec(ABC):
-    """What all episodes of a configuration have in common.
+    """The common properties of all episodes of a configuration.
 
     Attributes:
         config: what it was made from.
@@ -118,7 +118,7 @@ class EpisodeSpec(ABC):
 
     @abstractmethod
     def _engine(self, bodies: Any, lanes: int, differentiable: bool) -> Engine:
-        """What steps bodies `[lanes]`."""
+        """The engine for bodies `[lanes]`."""
 
     @abstractmethod
     def _geometry(self, bodies: Any) -> BodyGeometry:
@@ -155,7 +155,7 @@ class EpisodeSpec(ABC):
         return self.num_records * self.record_every
 
     def draw_starts(self, key: jax.Array) -> Starts:
-        """What a key's episodes start from, the same for all bodies."""
+        """The starts of a key's episodes, the same for all bodies."""
         return draw_starts(self.settings, self.world, key, self.num_timesteps)
 
     def precise_starts(self, population: jax.Array, key: jax.Array) -> Starts:
@@ -236,8 +236,8 @@ class EpisodeSpec(ABC):
 
         Args:
             fun: the function.
-            name: tells it from others of this specification.
-            *more: what it depends on besides.
+            name: unique in this specification.
+            *more: further values that it depends on.
         """
         config = self.config
         if config.task.is_user_code or config.controller.is_user_code:
@@ -249,7 +249,7 @@ class EpisodeSpec(ABC):
     @property
     @abstractmethod
     def _bodies_key(self) -> Any:
-        """What programs depend on of the bodies."""
+        """The properties of the bodies that compiled programs depend on."""
 
     def _score(self, bodies: Any, population: jax.Array, key: jax.Array) -> Any:
         """Scores and measures `[P]` of a population of one body."""
@@ -263,7 +263,7 @@ class EpisodeSpec(ABC):
     ) -> Callable[[jax.Array, jax.Array], Scores]:
         """A function of (individuals, their trials) `[lanes]` that scores these episodes."""
         score: Any = partial(self._score_chunk, alike, False)
-        if self.config.engine == "population":  # MJX's step is differentiated as it is
+        if self.config.engine == "population":  # MJX's step is differentiated by JAX itself
             score = differentiate_as(score, partial(self._score_chunk, alike, True))
         return partial(score, bodies, population, starts)
 
@@ -298,8 +298,8 @@ class EpisodeSpec(ABC):
     ) -> Chunk:
         """One chunk of episodes at their starts.
 
-        A chunk picks its own from what all chunks share, so that nothing is kept for each episode
-        of a population but its scores. `alike`: whether all individuals have one body.
+        A chunk selects its own starts and genes from those of all chunks, so that only scores are
+        kept for each episode of a population. `alike`: whether all individuals have one body.
         """
         own = (lambda x: x) if alike else (lambda x: x[..., individual])
         bodies = jax.tree.map(lambda x: own(jnp.asarray(x)), bodies)
@@ -347,10 +347,10 @@ class EpisodeSpec(ABC):
         context: EpisodeContext,
         clock: Int[Array, "..."],
     ) -> tuple[Float[Array, " lanes"], Array]:
-        """Scores of episodes under way, as if from now on nothing moved.
+        """Scores of episodes under way, if nothing moved from now on.
 
         Args:
-            track: rows to come repeat the present, as `scoring.extend_track` has them.
+            track: future rows repeat the present one, as from `scoring.extend_track`.
             position: of the robots at the start, from `start_point`.
             geometry: of the bodies.
             context: of the episodes.
@@ -398,7 +398,7 @@ class EpisodeSpec(ABC):
     def _complete(
         self, track: dict[str, jax.Array], context: EpisodeContext
     ) -> dict[str, jax.Array]:
-        """A track with target and course along the way, if the task asks for them."""
+        """A track with the paths of target and course, if the task records them."""
         interval = self.record_every * self.world.timestep
         time = interval * jnp.arange(1, self.num_records + 1, dtype=track["position"].dtype)
         track = dict(track)
@@ -412,7 +412,7 @@ class EpisodeSpec(ABC):
 
 
 def widen(now: RolloutState) -> RolloutState:
-    """A rollout state whose scalars have lanes."""
+    """A rollout state with its scalars broadcast to lanes."""
     lanes = now.energy.shape
     return jax.tree.map(lambda x: jnp.broadcast_to(x, lanes) if x.ndim == 0 else x, now)
 
@@ -430,7 +430,7 @@ def as_precise(tree: Any, like: jax.Array) -> Any:
 
 
 def task_recorder(engine: Engine, task: Task, world: World) -> Recorder:
-    """Records fields of a `tasks.Track` for a task; a pursuer's place, where there is one."""
+    """The recorder of a task: fields of a `tasks.Track`, and the position of a pursuer, if any."""
 
     def record(now: RolloutState, ctrl: jax.Array, water: Water) -> dict[str, jax.Array]:
         root = engine.root(now.state)

@@ -126,10 +126,10 @@ class Fitness(EpisodeSpec):
         return found
 
     def bare_controller(self) -> Controller:
-        """The controller as a device runs it: called at its rate, with exact sensors.
+        """The controller for a real device: called at its rate, with readings of real sensors.
 
-        It acts whenever it is called, and holds nothing; what it is given has the noise, the rate
-        and the delay of real sensors. It takes the same genes as the controller in the simulation.
+        It gives a command at each call and simulates no noise, rate or delay of sensors: its inputs
+        have those already. It takes the same genes as the controller in the simulation.
         """
         rate, plant = self.controller.rate, plant_of(self.robot)
         body = self.robot.morphology
@@ -168,7 +168,7 @@ class Fitness(EpisodeSpec):
         """Scores one episode, as evolution does, from its trajectory.
 
         Args:
-            trajectory: from `replay(genes, key)`, whole.
+            trajectory: from `replay(genes, key)`, all rows.
             key: draws its start.
 
         Returns:
@@ -200,7 +200,7 @@ class Fitness(EpisodeSpec):
             qpos: Any, qvel: Any, ctrl: Any, command: Any, energy: Any, water: Any, height: Any,
             context: EpisodeContext, variation: Any, target: Any,
         ) -> Any:  # fmt: skip
-            # The rows of the episode stand side by side, as if they were a population.
+            # The rows of the episode are the lanes, like a population.
             engine = with_variation(self.engine, variation)
             state = engine.init(qpos, qvel)
             if command.shape[0] and hasattr(state, "command"):
@@ -251,7 +251,7 @@ class MixedFitness(EpisodeSpec):
     Attributes:
         capacity: what the bodies must fit.
         touches: whether robots may come near the bed.
-        controller_settings: of the controller, with all sensors that there are.
+        controller_settings: of the controller, with all sensors.
     """
 
     capacity: Capacity
@@ -275,11 +275,11 @@ class MixedFitness(EpisodeSpec):
         return self.capacity, self.touches, self.controller_settings.model_dump_json()
 
     def build(self, morphology: Morphology) -> Robot:
-        """Compiles a body for this world, trimmed as the configuration says."""
+        """Compiles a body for this world, trimmed if the configuration says so."""
         return _build(self.config, self.world, morphology)
 
     def controller_of(self, body: Plant | Robot) -> Controller:
-        """The controller of one body alone, whose genes are named after its own joints."""
+        """The controller of one body alone, with genes named after its own joints."""
         return _find_controller(self.config, self.controller_settings, as_plant(body))
 
     def pad_genes(self, genes: Any, robot: Robot) -> Any:
@@ -377,10 +377,10 @@ class MixedFitness(EpisodeSpec):
         return jax.lax.map(run, (each, population))
 
     def _score_different(self, bodies: PackedBodies, population: jax.Array, starts: Starts) -> Any:
-        """Scores and measures `[P]` of a population whose bodies differ."""
+        """Scores and measures `[P]` of a population of different bodies."""
         trials = self.settings.trials
         individual, trial = list_episodes(len(population), trials)
-        # A chunk takes as long as its largest body: those of a size share chunks.
+        # A chunk takes as long as its largest body: bodies of equal size share chunks.
         order = jnp.argsort(bodies.count, stable=True).astype(individual.dtype)
         chunk = self.chunk_scores(False, bodies, population, starts)
         scores = average_trials(over_chunks(chunk)(order[individual], trial), trials)
@@ -575,8 +575,8 @@ def make_mixed_fitness(
         The fitness function.
 
     Raises:
-        InputError: the configuration or the world is wrong, or asks for what only bodies of one
-            kind may have; the message says where.
+        InputError: the configuration or the world is wrong, or has a setting that requires bodies
+            of one kind; the message says where.
     """
     config = _read(config, overrides)
     if config.engine != "population":
@@ -590,7 +590,7 @@ def make_mixed_fitness(
     if not robots:
         raise InputError("examples: expected at least one morphology; found none")
     figures = [body_geometry(robot) for robot in robots]
-    if modules:  # what will come is no longer than this, and sinks only if one of its types does
+    if modules:  # no body is longer than this, and one sinks only if one of its types does
         types = {m.kind.name: m.kind for robot in robots for m in robot.morphology.modules}
         types |= {kind.name: kind for kind in kinds}
         longest = modules * max(_diagonal(kind) for kind in types.values())
@@ -599,7 +599,7 @@ def make_mixed_fitness(
         figures.append(figures[0]._replace(length=longest, sinks=sinks))
     reach = max(max_distance(config.task, world, figure) for figure in figures)
     touches = may_touch_bed(task, config.task, world, reach)
-    if config.colony is not None:  # a long life leads anywhere
+    if config.colony is not None:  # in a long life a robot may get anywhere
         touches = world.bed is not None
     shown = [*robots, *_show_kinds(kinds, robots, hinges)]
     _check_alike(config, examples)
@@ -614,9 +614,9 @@ def make_mixed_fitness(
 def _show_kinds(
     kinds: Sequence[ModuleType], robots: Sequence[Robot], hinges: int
 ) -> Iterator[Robot]:
-    """A core with a module of each type that the robots lack, so that there is room for its parts.
+    """Bodies with a module of each type that the robots lack, so that the capacity includes it.
 
-    Those with a hinge are left out where bodies may have none.
+    Types with a hinge are left out if bodies may have none.
     """
     known = {module.kind.name for robot in robots for module in robot.morphology.modules}
     bodies = [robot.morphology for robot in robots]
@@ -638,7 +638,7 @@ def _show_kinds(
 
 
 def _diagonal(kind: ModuleType) -> float:
-    """How long a module can make a body [m]: no less than its boxes, one behind the other."""
+    """An upper bound of the length that a module adds to a body [m]."""
     return sum(float(np.linalg.norm(box.size)) for part in kind.parts for box in part.boxes)
 
 
@@ -651,7 +651,7 @@ def read_modules(config: Config) -> Mapping[str, ModuleType]:
 
 
 def _read(config: Any, overrides: dict[str, Any]) -> Config:
-    """A configuration from whatever a user may give."""
+    """A configuration from a `Config`, a path or a mapping, with overrides."""
     if isinstance(config, Config):
         if not overrides:
             return config
@@ -662,7 +662,7 @@ def _read(config: Any, overrides: dict[str, Any]) -> Config:
 
 
 def _place(config: Config) -> tuple[World, Task]:
-    """The world and the task, which must suit each other."""
+    """The world and the task, checked for compatibility."""
     try:
         world = load_world(config.world_name, **config.world_overrides)
     except InputError as error:
@@ -693,7 +693,7 @@ def _place(config: Config) -> tuple[World, Task]:
 
 
 def _check_robust(config: Config, world: World) -> None:
-    """Refuses to vary what cannot be varied."""
+    """Refuses `task.robust` for laws with coefficients that cannot be varied."""
     if config.task.robust is None:
         return
     if config.engine != "population":
@@ -704,7 +704,7 @@ def _check_robust(config: Config, world: World) -> None:
     if not find_drag_law(world.drag).varied:
         *most, last = (name for name, law in DRAG_LAWS.items() if law.varied)
         raise InputError(
-            f"{config.source}: task.robust: expected a world whose drag is {', '.join(most)} or "
+            f"{config.source}: task.robust: expected a world with drag {', '.join(most)} or "
             f"{last}, as MuJoCo's laws are not varied; found {world.drag}"
         )
 

@@ -1,7 +1,7 @@
-"""Our water as a pure environment, of one robot: `reset` and `step`, as brax has them.
+"""A pure environment of one robot, with `reset` and `step` as in brax.
 
-Both can be jitted, vmapped and scanned. Under `jax.vmap` the batch becomes the lanes that our step
-is made for; its states are those of one environment each, on the first axis.
+Both can be jitted, vmapped and scanned. Under `jax.vmap` the batch becomes the lanes of our step;
+states have the environments on the first axis.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from mjx_revolve.episodes.fitness import make_fitness
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class WaterState:
-    """An environment, with the names that brax has.
+    """State of an environment, with brax's names.
 
     Attributes:
         pipeline_state: of the episode.
         obs: `[k]` observation, between -1 and 1.
         reward: of the last step; 0 after `reset`.
         done: 1.0 if the last step ended the episode, else 0.0.
-        metrics: `score`: the task's so far, the episode's when it is over.
-        info: `truncation`: 1.0 if its time ended it; what others keep there stays.
+        metrics: `score`: the task's so far; at the end, the episode's.
+        info: `truncation`: 1.0 if the episode's time is over; entries of wrappers are kept.
     """
 
     pipeline_state: EnvironmentState
@@ -55,7 +55,7 @@ def _from_lanes(tree: Any) -> Any:
 
 
 def _of_one(run: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of lanes as one of a single lane, whose batches become lanes."""
+    """A function of lanes as a function of a single lane; `jax.vmap` maps batches to lanes."""
 
     @custom_vmap
     def single(*given: Any) -> Any:
@@ -81,7 +81,7 @@ class FunctionalEnv:
         environment: that it steps.
         observation_size: numbers of an observation; `environment.observation_names` has them.
         action_size: numbers of an action; `environment.action_names` has them.
-        backend: of the physics, as brax asks for it.
+        backend: of the physics; part of brax's interface.
     """
 
     backend = "mjx_revolve"
@@ -103,7 +103,7 @@ class FunctionalEnv:
 
     @property
     def unwrapped(self) -> FunctionalEnv:
-        """Itself, as brax asks for it."""
+        """The environment itself; part of brax's interface."""
         return self
 
     def reset(self, rng: jax.Array) -> WaterState:
@@ -140,14 +140,14 @@ def make_functional_env(
         sensors: as in `make_vector_env`.
         control_rate: as in `make_vector_env` [Hz].
         auto_reset: an episode that is over begins anew in the same step, as the next one of its
-            key; else it goes on unscored, and whoever steps it resets it.
+            key; if false, the caller resets it.
         **overrides: as `make_fitness` takes them.
 
     Returns:
         The environment.
 
     Raises:
-        InputError: the configuration is wrong, or has no one body.
+        InputError: the configuration is wrong, or evolves bodies.
     """
     fitness = make_fitness(config, **overrides)
     return FunctionalEnv(make_environment(fitness, control_rate, sensors), auto_reset)

@@ -30,7 +30,7 @@ from mjx_revolve.water.world import World
 
 
 class RolloutState(NamedTuple):
-    """State of a chunk of rollouts; of `advance`, all that one step leaves to the next.
+    """State of a chunk of rollouts between two steps.
 
     Attributes:
         state: of the engine.
@@ -78,7 +78,7 @@ class Policy(Protocol):
 
 
 class Recorder(Protocol):
-    """Selects what to keep of a rollout."""
+    """Selects the recorded values of a rollout."""
 
     def __call__(self, now: RolloutState, ctrl: Float[Array, "n lanes"], water: Water, /) -> Any:
         """(state after a step, its ctrl, its water) → a pytree of arrays."""
@@ -255,8 +255,8 @@ class Rollout:
             records: number of records.
             every: steps between them.
             inputs: `[records * every, ...]`.
-            differentiable: whether each step is computed again on the way back, so that memory
-                grows with the state and not with its working.
+            differentiable: whether each step is computed again in the backward pass
+                (checkpointing), so that only states are kept.
 
         Returns:
             The state after the last step, and the records, `[records, ...]` each.

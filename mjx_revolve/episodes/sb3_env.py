@@ -1,4 +1,4 @@
-"""Our vector environment as Stable-Baselines3 takes it, which has an interface of its own.
+"""The vector environment with Stable-Baselines3's interface.
 
 `stable_baselines3` is an extra, imported when the first environment is made.
 """
@@ -20,7 +20,7 @@ from mjx_revolve.numerics.xla import LANES
 
 @lru_cache(maxsize=1)
 def _make_class() -> type:
-    """The class, whose base is Stable-Baselines3's."""
+    """The subclass of Stable-Baselines3's `VecEnv`, which is imported late."""
     from stable_baselines3.common.vec_env import VecEnv
 
     class WaterVecEnv(VecEnv):
@@ -62,15 +62,15 @@ def _make_class() -> type:
             return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
         def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-            """There is no environment by itself to set it of."""
+            """Not supported: there are no single environments."""
             raise NotImplementedError
 
         def env_method(self, method_name: str, *args: Any, indices: Any = None, **kw: Any) -> Any:
-            """There is no environment by itself to call."""
+            """Not supported: there are no single environments."""
             raise NotImplementedError
 
         def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-            """None is."""
+            """False for all."""
             return [False] * len(list(self._get_indices(indices)))
 
     return WaterVecEnv

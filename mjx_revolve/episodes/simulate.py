@@ -42,7 +42,7 @@ from mjx_revolve.water.flow import Water, water_of
 )  # fmt: skip
 @dataclass(frozen=True, repr=False)
 class Trajectory:
-    """What a robot did, one row after each step.
+    """Motion of one robot, one row after each step.
 
     Attributes:
         time: `[T]` [s]; the first row is one timestep after the start.
@@ -172,8 +172,7 @@ def simulate(
         water: surface and current, by default the world's; each a number or `[T]`, a row for each
             step. It replaces the world's gusts.
         engine: "population" or "mjx".
-        once: whether it is compiled in haste, as little is simulated by it: one is sooner done with
-            a minute or less.
+        once: compile quickly into a slower program; faster in all for a minute or less.
         context: of the sensors, a number each; by default no target, and noise that `key` draws.
         variation: factors on coefficients of water and motors, a number each; by default none.
 

@@ -1,4 +1,4 @@
-"""What differs from episode to episode: where robots start, and the water around them."""
+"""Random quantities of episodes: start poses, water, targets, courses, coefficients."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _SEA = 1000.0
 
 
 class Starts(NamedTuple):
-    """What differs between a key's episodes.
+    """Random quantities of a key's episodes.
 
     Attributes:
-        place: drawn around 0 [m]; the task makes a start position of it.
+        place: offset drawn around 0 [m], from which the task makes a start position.
         quat: of the core, world from body (w, x, y, z).
         water: `[trials]`; None where it does not vary.
         gusts: velocity around the episode's current [m/s]; None without.
@@ -53,7 +53,7 @@ class Starts(NamedTuple):
 
 
 def check_key(key: Any) -> None:
-    """Refuses what `jax.random` does not draw from, such as a bare seed.
+    """Refuses anything but a key of `jax.random`, such as a seed.
 
     Args:
         key: from `jax.random.key`, or one of the older arrays of uint32.
@@ -95,7 +95,7 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
     full = jnp.full((trials,), 0.0, place.dtype)
     water = Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
     if world.waves:
-        # Episodes begin at any moment of the sea.
+        # Episodes begin at a random time of the waves.
         time_key = jax.random.fold_in(key, 2)
         water = water._replace(time=jax.random.uniform(time_key, (trials,), maxval=_SEA))
     water = jax.tree.map(lambda x: jnp.broadcast_to(x, (trials,)), water)
@@ -209,7 +209,7 @@ def start_pose(
 def _righting(up: Any) -> tuple[Any, ...]:
     """The least turn (w, x, y, z) that brings a direction, a unit vector, upright."""
     x, y, z = (jnp.asarray(component) for component in up)
-    # Half way round, where any horizontal axis would do, it is x.
+    # For half a turn any horizontal axis would do; x is used.
     over = jnp.where(z < -1 + 1e-6, 1.0, 0.0)
     w, x, y = (1 - over) * (1 + z), over + (1 - over) * y, -(1 - over) * x
     norm = jnp.sqrt(w * w + x * x + y * y)
@@ -233,7 +233,7 @@ def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Wa
         water: its current is that around which the gusts blow.
 
     Returns:
-        Water whose current and acceleration are `[steps, ...]`.
+        Water with current and acceleration `[steps, ...]`.
     """
     base = water_of(world) if water is None else water
     current = tuple(c + path[:-1, i] for i, c in enumerate(base.current))

@@ -1,4 +1,4 @@
-"""A rollout that keeps its path, and the way back along it: gradients by what drives it."""
+"""A rollout that records its states, and its backward pass: gradients by controller parameters."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def advance_taped(
     records: int,
     every: int,
 ) -> tuple[RolloutState, Any, Pull]:
-    """`Rollout.advance` with a way back, which may be gone once.
+    """`Rollout.advance` with a backward pass, which may be called once.
 
-    Each step is kept as its state before, and computed again on the way back. Gradients by the
-    parameters are not gathered in the loop, where they would be arrays as large as the parameters
-    at every step, but from all steps of a record at once: the loop only finds the gradients by the
-    commands and by the controllers' states.
+    The state before each step is kept, and the step computed again in the backward pass. Gradients
+    by the parameters are not summed in the loop, where each step would add arrays as large as the
+    parameters, but over all steps of a record at once: the loop computes only gradients by commands
+    and by controllers' states.
 
     Args:
         make: parameters of the controllers → rollout.
@@ -46,7 +46,7 @@ def advance_taped(
         every: steps between them.
 
     Returns:
-        The state after the last step; the records, `[records, ...]` each; and the way back:
+        The state after the last step; the records, `[records, ...]` each; and the backward pass:
         gradients by the records → (gradients by `now`, gradients by `float_leaves(parameters)`).
     """
     rollout = make(parameters)

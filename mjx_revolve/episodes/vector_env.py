@@ -1,4 +1,4 @@
-"""Our water as a vector environment of Gymnasium, for whatever learns by its interface.
+"""A vector environment of Gymnasium.
 
 `gymnasium` is an extra, `pip install 'gymnasium>=1.1'`, imported when the first environment is
 made. All environments are stepped in one compiled call.
@@ -35,10 +35,10 @@ AUTORESET_MODES = ("NextStep", "SameStep")
 def _next_step(
     environment: Environment, state: EnvironmentState, action: jax.Array
 ) -> tuple[EnvironmentState, jax.Array, StepResult, jax.Array]:
-    """A control period; what was over before it begins anew instead, without a reward.
+    """A control period; episodes that were over before it are restarted instead, without reward.
 
     Returns:
-        The state, `[k, lanes]` observations, what came of it, and the observations again.
+        The state, `[k, lanes]` observations, the result, and the observations again.
     """
     over = state.ended
     moved, outcome = environment.step(state, action)
@@ -56,7 +56,7 @@ def _next_step(
 
 @lru_cache(maxsize=1)
 def _make_class() -> type:
-    """The class, whose base is Gymnasium's."""
+    """The subclass of Gymnasium's `VectorEnv`, which is imported late."""
     from gymnasium.error import ResetNeeded
     from gymnasium.spaces import Box
     from gymnasium.vector import AutoresetMode, VectorEnv
@@ -81,8 +81,8 @@ def _make_class() -> type:
             self.single_action_space = Box(-1.0, 1.0, (done,), np.float32)
             self.observation_space = batch_space(self.single_observation_space, num_envs)
             self.action_space = batch_space(self.single_action_space, num_envs)
-            # Chunks of fixed shape, as those of a fitness: what an environment does depends
-            # neither on how many there are nor on which others there are.
+            # Chunks of fixed shape, as those of a fitness: an environment's results do not
+            # depend on the number or the state of others.
             self._lanes = LANES if on_cpu() else num_envs
             self._chunks = -(-num_envs // self._lanes)
             self._state: EnvironmentState | None = None
@@ -115,7 +115,7 @@ def _make_class() -> type:
             return jnp.moveaxis(x.reshape(self._chunks, self._lanes, *x.shape[1:]), 1, -1)
 
         def _join(self, x: jax.Array) -> jax.Array:
-            """The way back."""
+            """The inverse of `_split`."""
             x = jnp.moveaxis(x, -1, 1)
             return x.reshape(-1, *x.shape[2:])[: self.num_envs]
 
@@ -134,7 +134,7 @@ def _make_class() -> type:
                 `[num_envs, k]` observations, and {}.
 
             Raises:
-                InputError: the seed or the mask is none.
+                InputError: the seed or the mask is wrong.
             """
             mask = self._read_mask(options)
             if seed is None and self._state is None:
@@ -188,9 +188,9 @@ def _make_class() -> type:
                 actions: `[num_envs, n]` between -1 and 1; see `Environment.step`.
 
             Returns:
-                `[num_envs, k]` observations, `[num_envs]` rewards, which blew up (terminated),
-                whose time is over (truncated), and infos: `score` where one of these is true, in
-                `final_info` beside `final_obs` in mode SameStep.
+                `[num_envs, k]` observations, `[num_envs]` rewards, terminated (the rollout blew
+                up), truncated (the episode's time is over), and infos: `score` where one of these
+                is true, in `final_info` beside `final_obs` in mode SameStep.
 
             Raises:
                 InputError: the actions have another shape.
@@ -240,29 +240,31 @@ def make_vector_env(
 ) -> Any:
     """A `gymnasium.vector.VectorEnv` of a configuration: its robot, its water, its task.
 
-    Observations `[num_envs, k]` are what sensors tell, each between -1 and 1: the robot's as a
-    whole, then joint after joint; `observation_names` has them. Actions `[num_envs, n]` between -1
-    and 1 are the ranges of hinges' targets and thrusters' commands, as `action_names` has them.
+    Observations `[num_envs, k]` are outputs of sensors, each between -1 and 1: those of the robot
+    as a whole, then joint after joint, in the order of `observation_names`. Actions `[num_envs, n]`
+    are between -1 and 1, the ends of the range of each hinge's targets and each thruster's
+    commands, in the order of `action_names`.
     Rewards add up to the task's score (see `environment`). An episode is truncated after
     `task.duration`, and terminated if it blows up, which costs `scoring.WORST`. `task.trials` and
     the rest of `controller` do not matter.
 
     Args:
         config: a `Config`, the path of a YAML file, a shipped configuration's name, or a mapping.
-        num_envs: how many environments; on a CPU, multiples of 64 make the most of it.
-        sensors: what is seen, kinds' names or mappings, as in `controller.sensors`; by default
-            these, or else the robot's own, or else `sensors.DEFAULT_SENSORS`.
+        num_envs: number of environments; on a CPU, multiples of 64 are most efficient.
+        sensors: names of kinds or mappings, as in `controller.sensors`; by default those of the
+            configuration, or else the robot's own, or else `sensors.DEFAULT_SENSORS`.
         control_rate: actions in a second [Hz]; by default the possible one nearest to 20.
-        autoreset_mode: `NextStep`, Gymnasium's own: an episode that is over begins anew at the next
-            step, whose action is not used; or `SameStep`: at once, its last observation in infos.
+        autoreset_mode: `NextStep`, Gymnasium's default: an episode that is over restarts at the
+            next step, which ignores the action; or `SameStep`: at once, with its last observation
+            in infos.
         **overrides: as `make_fitness` takes them.
 
     Returns:
         The environments. The same seed gives the same numbers, bit for bit, on one kind of
-        processor; what environment i does depends on its seed and its actions alone.
+        processor; environment i depends on its seed and its actions alone.
 
     Raises:
-        InputError: gymnasium is not installed, the configuration is wrong, or it has no one body.
+        InputError: gymnasium is not installed, the configuration is wrong, or it evolves bodies.
     """
     check_package("make_vector_env", "gymnasium")
     whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)

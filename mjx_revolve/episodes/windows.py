@@ -1,11 +1,11 @@
-"""Gradients of scores by genes through the water, a window of an episode at a time.
+"""Gradients of scores by genes through the simulation, one window of an episode at a time.
 
-What a robot does now follows from what it did, so the gradient of a long episode by its genes is a
-product of very many matrices: it grows without bound where the motion is chaotic, as a closed loop
-of sensors, network and servos easily is. Truncated backpropagation through time (Williams and Peng
-1990, Neural Computation 2) cuts the episode into windows: each begins where the one before it has
-ended, and what came before it is taken as given. A window's gain is the task's score so far, less
-that at its beginning, as of `environment`; so the gains of an episode add up to its score. Short
+The gradient of a long episode by its genes is a product of many Jacobians: it grows without bound
+if the motion is chaotic, as a closed loop of sensors, network and servos easily is. Truncated
+backpropagation through time (Williams and Peng 1990, Neural Computation 2) cuts the episode into
+windows. Each begins where the one before it has ended, and its start state is a constant. A
+window's gain is the increase of the task's score so far, as the reward in `environment`; so the
+gains of an episode add up to its score. Short
 windows of many episodes side by side are also how SHAC learns (Xu et al. 2022, Accelerated policy
 learning with parallel differentiable simulation, ICLR), which adds a critic for what comes after a
 window; there is none here.
@@ -39,12 +39,12 @@ from mjx_revolve.numerics.xla import is_traced, jit, over_chunks
 
 
 class Gradients(NamedTuple):
-    """What comes of a window.
+    """The result of a window.
 
     Attributes:
-        gain: the score so far, less that of the window before. Of a rollout that blows up, what
-            brings the sum to `scoring.WORST`.
-        gradient: of the gain by the individual's genes within the window; 0 where it is no number.
+        gain: the score so far, less that of the window before. For a rollout that blows up, the sum
+            of its gains is `scoring.WORST`.
+        gradient: of the gain by the individual's genes within the window; 0 in place of NaN.
     """
 
     gain: Float[Array, "P trials"]
@@ -98,7 +98,7 @@ class TruncatedBPTT:
     def step(self, population: Any, episodes: Episodes) -> tuple[Gradients, Episodes]:
         """Advances episodes by a window.
 
-        The genes need not be those of the window before: an optimiser may learn on the way.
+        The genes need not be those of the window before: an optimiser may change them in between.
 
         Args:
             population: `[P, num_genes]`.
@@ -239,8 +239,8 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> TruncatedBPT
 
     Args:
         fitness: from `make_fitness`.
-        horizon: length of a window [s]; by default the whole episode, whose gradients are then
-            those of the fitness itself.
+        horizon: length of a window [s]; by default the whole episode: gradients are then those of
+            the fitness itself.
 
     Returns:
         An optimiser's source of gradients.

@@ -1,9 +1,9 @@
-"""Blocks of a population: how it is cut, how one block is scored, and how one crosses a process.
+"""Blocks of a population: splitting, scoring, and sending to another process.
 
-A block is a tuple of what `fitness.evaluate` takes before the key: `(genes,)` where all individuals
-have one body. All blocks of genes have one shape, that of one chunk of `xla.LANES` lanes, so that
-each is one run of the same compiled program wherever it is scored. That is why scores do not
-depend, to the last bit, on the number of workers or on which worker scores what.
+A block is a tuple of the arguments of `fitness.evaluate` before the key: `(genes,)` if all
+individuals have one body. All blocks of genes have one shape, that of one chunk of `xla.LANES`
+lanes, so that each is one run of the same compiled program in any process. So scores are equal to
+the last bit for any number of workers.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Brains for bodies that change: their inheritance, and their genes for a controller.
+"""Brains for bodies that evolve: their inheritance, and their genes for a controller.
 
-A brain is a plain value that JSON can hold: genes by name (`joints`), or the weights of a network
-that computes each joint's genes from its position (`cppn`, after Stanley's HyperNEAT, Artificial
-Life 15, 2009). For learning it is a vector of the same length for all bodies, so that one strategy
-serves all.
+A brain is a plain value for JSON: genes by name (`joints`), or the weights of a network that
+computes each joint's genes from its position (`cppn`, after Stanley's HyperNEAT, Artificial Life
+15, 2009). For learning it is a vector of the same length for all bodies, so that one strategy can
+be used for all.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class GeneLayout(NamedTuple):
 
     Attributes:
         names: `[n]`, after the body's own joints.
-        genes: `[n]` the joint, pair or robot that each belongs to.
+        genes: `[n]` meaning of each: the joint, pair or robot that it controls.
         place: `[n, 3]` position of its joint at rest, of a pair the middle, else 0; core frame [m].
         reach: `[n, 3]` from a pair's earlier joint to the later one, else 0 [m].
         columns: `[n]` its index among the genes for all bodies.
@@ -104,7 +104,7 @@ class BrainEncoding(Protocol):
         """Vectors `[..., size]` as genes for all bodies `[..., width]`."""
 
     def check(self, brain: Any) -> Any:
-        """The brain that a file holds; raises `InputError` where it is none."""
+        """The brain in a file; raises `InputError` for anything else."""
 
 
 def make_brain_encoding(settings: BrainsConfig, common: Controller) -> BrainEncoding:
@@ -143,14 +143,14 @@ class NamedGenes:
     ) -> dict[str, float]:
         """Genes by name, the first parent's first, with noise.
 
-        Those of a copied joint are its original's, those of a new one the nearest joint's that are
-        inherited; where there is none, they are drawn.
+        A copied joint has the genes of its original, a new one those of the nearest joint with
+        inherited genes; if there is none, they are drawn.
         """
         noise = self.settings.mutation * rng.standard_normal(len(layout.names))
         fresh = self.settings.std_init * rng.standard_normal(len(layout.names))
         known: Mapping[str, float] = {k: v for p in reversed(parents) for k, v in p.items()}
-        # A copy has a number behind its original's name; so has what a second parent gives where
-        # the first one has that name, too.
+        # The name of a copy is its original's with a number; so is that of a second parent's module
+        # with a name that the first one has, too.
         copied = {k: v for p in parents for k, v in p.items()}
         found = [known.get(n, copied.get(_COPY.sub("", n))) for n in layout.names]
         have = np.array([value is not None for value in found], bool)
@@ -234,7 +234,7 @@ class PatternNetwork:
     def draw(self, rng: np.random.Generator, layout: GeneLayout) -> list[float]:
         """Normally distributed weights."""
         weights = rng.standard_normal(self.size)
-        # So that genes, whatever their number of inputs, come out about as wide as drawn ones.
+        # Scaled so that the spread of genes does not depend on the number of inputs.
         weights[self.first : self.second] *= self.settings.std_init / np.sqrt(_HIDDEN / 2)
         weights[self.second :] *= self.settings.std_init
         return _weights(weights)

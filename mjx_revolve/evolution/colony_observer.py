@@ -1,4 +1,4 @@
-"""A colony's life from a checkpoint on, with the poses of all its robots, for pages and films."""
+"""A colony replayed from a checkpoint, with the poses of all its robots, for pages and films."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class ObservedRobot:
     """A robot of a colony, and its poses.
 
     Attributes:
-        individual: as it was at the end.
+        individual: in its last state.
         robot: its body.
         born: time of birth [s].
-        end: time of death [s]; None where it lives on.
-        cause: of its death; "" where it lives on.
+        end: time of death [s]; None if it is alive.
+        cause: of its death; "" if it is alive.
         time: `[T]` of its poses [s].
         qpos: `[T, 7 + num_hinges]` MuJoCo's, world frame; from one row to the next it may have been
             put back into the arena from beyond an edge.
@@ -47,14 +47,14 @@ class ObservedRobot:
 def observe_colony(
     config: Config, fitness: BodyFitness, search: Colony, begin: float, duration: float, gap: float
 ) -> tuple[list[ObservedRobot], list[Mapping[str, Any]]]:
-    """Lets a colony live on, and keeps the poses of its robots.
+    """Advances a colony and records the poses of its robots.
 
     Args:
         config: its settings.
         fitness: of its bodies.
-        search: where it goes on.
-        begin: first time that is kept [s], at the start of the next interval.
-        duration: length of what is kept [s], to the end of an interval.
+        search: the colony at the start.
+        begin: start of the record [s], rounded up to the next interval.
+        duration: length of the record [s], rounded up to the end of an interval.
         gap: approximate time between poses [s].
 
     Returns:
@@ -68,18 +68,18 @@ def observe_colony(
     poses: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     events: list[Mapping[str, Any]] = []
     while _time_of(fitness, search) < begin - 1e-9:
-        asked = evolution.ask(search)
-        search = evolution.tell(asked, evolution.evaluate(asked)).search
+        proposal = evolution.ask(search)
+        search = evolution.tell(proposal, evolution.evaluate(proposal)).search
     until = _time_of(fitness, search) + duration
     while _time_of(fitness, search) < until - 1e-9:
-        asked = evolution.ask(search)
-        trajectory = evolution.evaluate(asked, rows)
-        search = evolution.tell(asked, trajectory).search
-        for number, member in asked.colony.members.items():
+        proposal = evolution.ask(search)
+        trajectory = evolution.evaluate(proposal, rows)
+        search = evolution.tell(proposal, trajectory).search
+        for number, member in proposal.colony.members.items():
             own = trajectory.qpos[:, : 7 + member.individual.body.num_hinges, member.slot]
             whole = np.isfinite(own).all(1).cumprod().astype(bool)
             poses.setdefault(number, []).append((trajectory.time[whole], own[whole]))
-        members |= asked.colony.members
+        members |= proposal.colony.members
         members |= {n: replace(m, individual=rules.measured(m)) for n, m in search.members.items()}
         members |= {i.number: replace(members[i.number], individual=i) for i in search.died}
         events += search.events
@@ -107,7 +107,7 @@ def observe_colony(
 def open_colony(
     folder: Path, begin: float | None = None
 ) -> tuple[Config, BodyFitness, Colony, float]:
-    """A colony at a checkpoint of its run; the folder stays as it is.
+    """A colony at a checkpoint of its run; the folder is not changed.
 
     Args:
         folder: the run folder.

@@ -1,7 +1,7 @@
-"""What all searches share: a generation (ask, evaluate, tell), its row, the champion's choice.
+"""The common part of all searches: a generation (ask, evaluate, tell), its row, the champion.
 
-A search over genes, over bodies, and a colony differ in what they ask for and in what they do with
-the results. The clock, the order of the steps and the columns of `metrics.csv` stand here once.
+A search over genes, a search over bodies, and a colony implement `Evolution`. The clock, the order
+of the steps and the columns of `metrics.csv` are here.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Scored = tuple[np.ndarray, dict[str, np.ndarray]]
 # Fresh episodes per candidate to choose the champion. The reported score comes from others
 # (`REPORT_EPISODES`), because the best of several means is biased upwards, too.
 CHOOSE_EPISODES = 8
-# How many of the best are tried where a passport is required. A choice: half a minute each.
+# Number of best candidates for which a passport is made if required. A choice: half a minute each.
 _TRIED = 4
 # A stream of random numbers that no generation uses.
 CHOOSE_STREAM = 2**32 - 1
@@ -38,13 +38,13 @@ class Champion:
         genes: `[G]`; those of the body's own controller.
         score: mean over `REPORT_EPISODES` fresh keys; `FAILED_SCORE` stands for a failed rollout.
             Before the final evaluation: the score in its own generation.
-        origin: where it came from, in words.
+        origin: of its genes, in words.
         std: standard deviation over those keys; NaN before.
         measures: mean of each measure over those keys.
         key: the first of those keys, to replay; None before.
         body: its body, where bodies have evolved.
         individual: its number, where bodies have evolved.
-        passport: what it was tried for; None: it was not.
+        passport: results of its tests; None: it was not tested.
     """
 
     genes: np.ndarray
@@ -63,12 +63,12 @@ class Generation(NamedTuple):
 
     Attributes:
         search: the search after it.
-        scores: `[P]` scores that its row summarises; not finite: failed.
+        scores: `[P]` scores, for statistics in its row; not finite: failed.
         champion: the best score so far.
         columns: further columns of its row, in their order.
         evaluated: individuals that it has scored.
         evaluations: individuals that the search has scored so far.
-        simulated: simulated time [s], where the row tells how many times real time it went; or 0.
+        simulated: simulated time [s], for the column `times_real_time`; 0: no such column.
     """
 
     search: Any
@@ -83,21 +83,21 @@ class Generation(NamedTuple):
 class Evolution(Protocol):
     """A kind of search. Its state is a frozen dataclass with `generation` and `seconds`.
 
-    All that passes from one generation to the next is that value, so a search that is read back
-    from disk continues with the same bits.
+    A search depends on that value alone, so one that is read back from disk continues with the same
+    bits.
     """
 
     def start(self) -> Any:
         """The search before its first generation."""
 
     def ask(self, search: Any) -> Any:
-        """What the next generation evaluates."""
+        """The individuals of the next generation, to be evaluated."""
 
-    def evaluate(self, asked: Any) -> Any:
+    def evaluate(self, proposal: Any) -> Any:
         """The results of what `ask` returned."""
 
-    def tell(self, asked: Any, results: Any) -> Generation:
-        """The search with the results taken in."""
+    def tell(self, proposal: Any, results: Any) -> Generation:
+        """The search after the generation, given its results."""
 
     def to_arrays(self, search: Any) -> dict[str, Any]:
         """The search as named arrays, for a checkpoint."""
@@ -136,8 +136,8 @@ def run_generations(
     search = evolution.start() if search is None else search
     while search.generation < generations:
         began = time.perf_counter()
-        asked = evolution.ask(search)
-        found = evolution.tell(asked, evolution.evaluate(asked))
+        proposal = evolution.ask(search)
+        found = evolution.tell(proposal, evolution.evaluate(proposal))
         seconds = time.perf_counter() - began
         search = replace(found.search, seconds=search.seconds + seconds)
         row = {

@@ -1,4 +1,4 @@
-"""What co-evolution and colony share: columns and lines about the living, elites, the champion."""
+"""The common part of co-evolution and colony: columns and lines about the living, the champion."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from mjx_revolve.evolution.individuals import Individual, best_individuals
 from mjx_revolve.evolution.learning import score_brains
 from mjx_revolve.inputs.errors import InputError
 
-# Descriptors whose population mean goes into the metrics.
+# Descriptors with their population mean in the metrics.
 MEAN_DESCRIPTORS = ("num_modules", "num_hinges", "length", "mass", "branching", "limbs", "symmetry")
 
 
 class IndividualEvolution:
-    """A search whose state has `elites` and `living`, both individuals."""
+    """A search; its state has `elites` and `living`, both individuals."""
 
     def __init__(self, config: Config, executor: Executor) -> None:
         """Prepares a search with an executor over a `BodyFitness`."""

@@ -32,13 +32,13 @@ class Individual:
         number: unique in a run; children have larger ones than their parents.
         parents: their numbers; of two, the first gave the body.
         born: generation of birth.
-        origin: how it came about: `random`, `seed NAME`, `mutation`, `crossover`, ...
+        origin: the operation that made it: `random`, `seed NAME`, `mutation`, `crossover`, ...
         genome: of the genotype's kind.
-        body: what the genome develops into, not trimmed.
+        body: that the genome develops into, not trimmed.
         brain: at birth; see `brains.BrainEncoding`.
-        learnt: the best brain that was tried; None before that, and where every trial failed.
-        genes: `learnt` as genes of the body's own controller; None where there is none.
-        score: of `learnt`; NaN where there is none.
+        learnt: the best brain that was tried; None before learning, and if every trial failed.
+        genes: `learnt` as genes of the body's own controller; None without `learnt`.
+        score: of `learnt`; NaN without `learnt`.
         measures: of `learnt`, see `measures`.
         trials: brains that were tried.
     """
@@ -89,7 +89,7 @@ def best_individuals(individuals: Iterable[Individual]) -> tuple[Individual, ...
 def to_record(individual: Individual, genotype: Genotype) -> dict[str, Any]:
     """An individual as plain values by name, for JSON; floats keep their bits.
 
-    `genome` is None where the body says all.
+    `genome` is None if the body is the genome.
     """
     body = individual.body.to_mapping()
     genome = genotype.to_plain(individual.genome)

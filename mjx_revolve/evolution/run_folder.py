@@ -51,7 +51,7 @@ from mjx_revolve.inputs.files import check_path, resolve_inside, with_path, writ
 
 try:
     import fcntl
-except ImportError:  # not on Windows: there, nothing keeps two processes off one folder
+except ImportError:  # not on Windows: there, run folders are not locked
     fcntl = None  # type: ignore[assignment]
 
 LOGS = (INDIVIDUALS, GENERATIONS, EVENTS)
@@ -97,7 +97,7 @@ class RunFolder(RunReader):
     # --- metrics ---
 
     def append_metrics(self, row: Mapping[str, float]) -> None:
-        """Adds figures by column to `metrics.csv`, whose first line brings the columns."""
+        """Appends a row to `metrics.csv`; the file's first line names the columns."""
         text = io.StringIO()
         writer = csv.writer(text)
         try:
@@ -186,7 +186,7 @@ class RunFolder(RunReader):
         )
 
     def rewind(self, checkpoint: Checkpoint | None) -> None:
-        """Forgets what came after a checkpoint: metrics, checkpoints, half-written files.
+        """Removes all later than a checkpoint: metrics, checkpoints, half-written files.
 
         Args:
             checkpoint: the checkpoint; None: the run's beginning.
@@ -254,7 +254,7 @@ def _number(value: float) -> str:
 
 
 def _check_meta(meta: Mapping[str, Any]) -> None:
-    """Refuses plain values by which a run could not go on, or would cut files not its own.
+    """Refuses plain values with which a run could not be resumed, or would cut other files.
 
     Raises:
         DamageError: they are others.
@@ -321,7 +321,7 @@ def check_new_folder(folder: str | Path, option: str = "--out") -> None:
 
 
 def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[RunFolder, Config]:
-    """Makes a run folder and writes down what will run.
+    """Makes a run folder with configuration and inputs.
 
     Args:
         folder: a new or empty folder.
@@ -403,7 +403,7 @@ def open_run_folder(folder: str | Path) -> RunFolder:
 
 
 def _check_writable(path: Path, folder: Path) -> None:
-    """Refuses what would have a run write, cut or delete files that are not its own, or hang."""
+    """Refuses links and special files in a folder: a run could harm other files, or hang."""
     with reading(folder):
         real = resolve_inside(path.name, folder)
     if path.name in ("checkpoints", "champion", "inputs"):

@@ -24,7 +24,7 @@ from mjx_revolve.inputs.errors import InputError
 
 # SV_CMA_ES and SV_Open_ES evolve several populations side by side, which is another loop.
 _NOT_OFFERED = ("SV_CMA_ES", "SV_Open_ES")
-# Names that people use, beside evosax's. Case, `-` and `_` do not matter anyway.
+# Common names, beside evosax's. Case, `-` and `_` do not matter.
 _OTHER_NAMES = {
     "de": "DifferentialEvolution",
     "ga": "SimpleGA",
@@ -33,7 +33,7 @@ _OTHER_NAMES = {
     "learnedes": "LES",
     "learnedga": "LGA",
 }
-# What a failed rollout scores where no other score of its generation can tell.
+# The score of a failed rollout if no rollout of its generation has a score.
 FAILED_SCORE = -1e6
 # The step size never falls below this fraction of `std_init`: under noisy scores, a smaller step
 # measures only the noise.
@@ -153,7 +153,7 @@ class Strategy:
     def tell(
         self, key: jax.Array, population: np.ndarray, scores: np.ndarray, state: dict[str, Any]
     ) -> dict[str, Any]:
-        """Learns from a generation.
+        """Updates the state by the scores of a generation.
 
         Args:
             key: for strategies that draw numbers here, too.
@@ -185,7 +185,7 @@ class Strategy:
         if std is None or self.population_based:
             return state
         floor = np.float32(STD_FLOOR * self.std_init)
-        # maximum hands NaN on: a broken state stays visible, and the loop restarts it.
+        # np.maximum propagates NaN: a broken state stays visible, and the loop restarts it.
         algorithm = state["algorithm"].replace(std=np.maximum(std, floor).astype(std.dtype))
         return state | {"algorithm": algorithm}
 
@@ -202,7 +202,7 @@ def find_strategy(name: str) -> str:
     """Finds a strategy's evosax name.
 
     Args:
-        name: as the user wrote it; case, `-` and `_` do not matter, and `DE` will do.
+        name: given by the user; case, `-` and `_` do not matter, and `DE` is an alias.
 
     Returns:
         The name in `STRATEGIES`.

@@ -12,9 +12,9 @@ import numpy as np
 
 from mjx_revolve.body.module_types import Part
 
-# A link must weigh something; what has no mass of its own gets this [kg].
+# Mass of a link without mass [kg], as a link must have some.
 LEAST = 1e-6
-# Radius of a ballast, as `robot.py` has it [m].
+# Radius of a ballast [m], as in `engine/assembly.py`.
 _BALLAST = 1e-3
 # Share of a thruster's mass that is its propeller: it only makes it spin.
 _ROTOR = 0.05
@@ -57,7 +57,7 @@ def propeller(part: Part) -> tuple[np.ndarray, float]:
 def moments(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass [kg], `[3]` centre [m] and `[3, 3]` inertia about it [kg·m²] of a pseudo-inertia.
 
-    What weighs nothing becomes a small body of `LEAST` at the origin.
+    A body without mass becomes a small one of `LEAST` at the origin.
     """
     if body[3, 3] <= 0:
         body = spread(LEAST, np.zeros(3), 5e-5 * np.eye(3))

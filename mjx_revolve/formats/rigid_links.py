@@ -1,7 +1,8 @@
-"""Rigid links of robots from elsewhere, read from URDF or from MuJoCo's MJCF.
+"""Rigid links of robots, read from URDF or from MuJoCo's MJCF.
 
-Both become the same: links that hinges move, each with its shapes as boxes. What is fixed to a link
-belongs to it. What a robot here cannot have is named in `RigidRobot.missing`.
+The result is the same for both: links that hinges move, each with its shapes as boxes. Links that
+are fixed to another one are merged into it. Unsupported properties are named in
+`RigidRobot.missing`.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class RigidLink:
         limits: `range` [rad], `effort` [N·m] and `speed` [rad/s] of the hinge, where given.
         inertia: `[4, 4]` pseudo-inertia (see `inertias`), link frame.
         solid: shapes that collide.
-        seen: shapes that are looked at.
+        seen: visible shapes.
     """
 
     name: str
@@ -80,7 +81,7 @@ class RigidRobot:
     Attributes:
         name: of the robot.
         links: each after its parent.
-        missing: what was not taken over, in words.
+        missing: properties that were not imported, in words.
     """
 
     name: str
@@ -159,7 +160,7 @@ def closed_volume(triangles: np.ndarray) -> tuple[float, np.ndarray] | None:
 
 
 def _mesh(triangles: np.ndarray, place: Any, rgb: Any, name: str, missing: list[str]) -> Shape:
-    """The shape of a mesh, whose triangles are in its own frame."""
+    """The shape of a mesh, with triangles in the mesh's own frame."""
     position, rotation = place
     low, high = triangles.min((0, 1)), triangles.max((0, 1))
     size, middle = np.maximum(high - low, 1e-4), (low + high) / 2

@@ -17,8 +17,8 @@ T = TypeVar("T")
 
 # Bounds on length and mass are kept up to rounding.
 SLACK = 1 + 1e-9
-# Variations of a parent that are tried before it is left as it is, and random genomes before there
-# are said to be none. Choices: most bounds let every second or third pass.
+# Variations of a parent that are tried before it is returned unchanged, and random genomes before
+# an error. Choices: with most bounds every second or third is in the space.
 TRIES = 50
 _RANDOM_TRIES = 300
 # How many results `cached` keeps: a choice, those of some generations.
@@ -28,23 +28,22 @@ _CACHED = 1000
 class Genotype(NamedTuple):
     """A representation of bodies: plain functions of genomes, which are plain values.
 
-    All genomes that they return develop into bodies of the space, and all randomness comes from the
-    generator that they are given. `make_genotype` makes one from functions that need not keep to
-    the space.
+    All genomes that they return develop into bodies in the space, and all randomness comes from the
+    generator argument. `make_genotype` makes one from functions that may leave the space.
 
     Attributes:
         name: in a configuration.
-        random: generator → genome. Raises `InputError` where none of many draws is in the space.
-        mutate: (generator, genome) → genome that differs a little; the genome itself where none of
-            `TRIES` mutants is in the space.
-        cross: (generator, genome, genome) → one child; the first genome itself where none of
-            `TRIES` children is in the space.
-        develop: genome → valid body in the space, without a brain. A module that stays in its place
-            keeps its name.
+        random: generator → genome. Raises `InputError` if none of many draws is in the space.
+        mutate: (generator, genome) → mutant; the genome itself if none of `TRIES` mutants is in the
+            space.
+        cross: (generator, genome, genome) → one child; the first genome itself if none of `TRIES`
+            children is in the space.
+        develop: genome → valid body in the space, without a brain. A module that keeps its position
+            in the tree keeps its name.
         adopt: body → genome that develops into it, but for its brain and path. Raises `InputError`
-            where it is not in the space. None where there is no such genome.
-        to_plain: genome → what JSON can hold, exactly.
-        from_plain: its inverse. Raises `InputError` where it is no such genome.
+            if the body is not in the space. None if bodies cannot be converted.
+        to_plain: genome → plain values for JSON, exactly.
+        from_plain: the inverse of `to_plain`. Raises `InputError` for anything else.
     """
 
     name: str
@@ -77,7 +76,7 @@ class Space:
         max_length: longest edge of the bounding box at rest [m]; None: any.
         max_mass: [kg]; None: any.
         max_of: most modules of a type, by its name; of others, any number.
-        accepts: whether a body within these bounds will do.
+        accepts: body → whether it is accepted, for further bounds.
     """
 
     catalogue: Mapping[str, ModuleType]
@@ -98,7 +97,7 @@ class Space:
         return tuple(self.catalogue[name] for name in self.modules)
 
     def refuses(self, body: Morphology) -> str | None:
-        """Why a body is not in the space, "expected X; found Y"; None where it is."""
+        """Why a body is not in the space, "expected X; found Y"; None if it is."""
         strange = next((m.type for m in body.modules if m.type not in self.catalogue), None)
         if strange is not None:
             return f"expected types of modules of the catalogue; found {show(strange)}"
@@ -132,7 +131,7 @@ def make_space(
     Args:
         bodies: settings like `episodes.bodies_config.BodiesConfig`.
         catalogue: all types of modules by name and alias.
-        accepts: whether a body within the settings' bounds will do, such as a capacity.
+        accepts: body → whether it is accepted, for bounds that are no settings, as a capacity.
 
     Returns:
         The space; its types go by their names, not by their aliases.
@@ -196,19 +195,19 @@ def make_genotype(
     from_plain: Callable[[Any], Any],
     adopt: Callable[[Morphology], Any] | None = None,
 ) -> Genotype:
-    """A genotype that keeps to the space, from functions that need not.
+    """A genotype that keeps to the space, from functions that may leave it.
 
     Args:
         space: of the bodies.
         name: in a configuration.
         place: where the bounds were given, for messages.
         draw: generator → any genome.
-        mutate: (generator, genome) → varied genome; None where what it drew cannot be done.
-        cross: (generator, genome, genome) → child; None where that cannot be done.
+        mutate: (generator, genome) → mutant; None if the drawn mutation is impossible.
+        cross: (generator, genome, genome) → child; None if impossible.
         develop: genome → body.
-        to_plain: genome → what JSON can hold.
-        from_plain: its inverse; raises `InputError`.
-        adopt: body in the space → genome that develops into it; None where there is none.
+        to_plain: genome → plain values for JSON.
+        from_plain: the inverse of `to_plain`; raises `InputError`.
+        adopt: body in the space → genome that develops into it; None if there is none.
     """
     develop = cached(develop)
 
@@ -264,10 +263,10 @@ def make_genotype(
 
 
 def cached(function: Callable[[Any], T]) -> Callable[[Any], T]:
-    """The same function with its last results kept, by the identity of its argument.
+    """The same function with its last results cached by the identity of its argument.
 
     Variation develops a genome to see whether it is in the space; evaluation develops it again.
-    Genomes need no hash. They are kept beside the result, so that no other gets their id.
+    Genomes need no hash. They are kept with the result, so that their id is not reused.
     """
     known: dict[int, tuple[Any, T]] = {}
 

@@ -35,23 +35,23 @@ _Rate = Annotated[NonNegative, Unit("-")]
 
 @checked
 class TreeSettings:
-    """How often each mutation is drawn, relative to the others; one is made at a time.
+    """Relative weights of the mutations; a mutant has one of them.
 
     Attributes:
-        add: a module at a free slot.
-        delete: a module that carries none.
-        prune: a module with all that it carries.
-        duplicate: a subtree, at a free slot.
-        mirror: the mirror image of a limb takes the place of what is at the opposite slot.
-        swap: two subtrees exchange their places.
-        retype: a module becomes one of another type.
-        turn: a module is turned with all that it carries.
+        add: add a module at a free slot.
+        delete: remove a module without children.
+        prune: remove a subtree.
+        duplicate: copy a subtree to a free slot.
+        mirror: put the mirror image of a limb at the opposite slot, in place of the subtree there.
+        swap: exchange two subtrees.
+        retype: give a module another type.
+        turn: turn a module with its subtree.
 
     Raises:
         InputError: a number is negative, or all are 0.
     """
 
-    # Choices: mostly small changes; as much comes as goes.
+    # Choices: mostly small changes; bodies neither grow nor shrink on average.
     add: _Rate = 3.0
     delete: _Rate = 2.0
     prune: _Rate = 0.5
@@ -62,7 +62,7 @@ class TreeSettings:
     turn: _Rate = 1.5
 
     def __post_init__(self) -> None:
-        """Checks that something can happen."""
+        """Checks that a mutation has a positive weight."""
         if not any(getattr(self, field.name) for field in fields(self)):
             raise ConstraintError("", "a number > 0 among the mutations", "all of them 0")
 
@@ -102,7 +102,7 @@ def make_tree(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
 
 
 def _try(edit: Callable[..., Morphology | None], *arguments: Any) -> Morphology | None:
-    """An edit; None where it cannot be done."""
+    """The result of an edit; None if it is invalid."""
     try:
         return edit(*arguments)
     except InputError:
@@ -110,7 +110,7 @@ def _try(edit: Callable[..., Morphology | None], *arguments: Any) -> Morphology 
 
 
 def _pick(rng: np.random.Generator, things: Any) -> Any:
-    """One of several."""
+    """A random one of several things."""
     return things[rng.integers(len(things))]
 
 
@@ -156,7 +156,7 @@ def _path(body: Morphology, index: int) -> tuple[int, ...]:
 
 
 def _drawn(rng: np.random.Generator, body: Morphology) -> int | None:
-    """A module that is not the core."""
+    """Index of a random module, not the core; None if there is none."""
     return int(rng.integers(1, body.num_modules)) if body.num_modules > 1 else None
 
 
@@ -244,7 +244,7 @@ _MUTATIONS: dict[str, Callable[[Space, np.random.Generator, Morphology], Morphol
 
 
 def _size(body: Morphology, index: int) -> int:
-    """Modules of a subtree."""
+    """Number of modules of a subtree."""
     inside = {index}
     for i in range(index + 1, body.num_modules):
         if body.modules[i].parent not in inside:
@@ -257,15 +257,15 @@ def _size(body: Morphology, index: int) -> int:
 
 
 def opposite_slot(kind: ModuleType, slot: int) -> int | None:
-    """The slot at the other side of a module.
+    """The slot at the opposite side of a module.
 
     Args:
         kind: the module's type.
         slot: one of its slots.
 
     Returns:
-        Its mirror image, in the upright plane in which the module is attached, or of a core across
-        the slot's direction; None where there is none, or where it is the slot itself.
+        The mirror image of the slot in the upright plane through the module's mount direction (for
+        a core, the plane normal to the slot's direction); None if it has none or is its own.
     """
     away = kind.slots[slot].direction if kind.mount is None else _side(kind)
     found = _mirrored_slot(kind, slot, away)
@@ -273,17 +273,17 @@ def opposite_slot(kind: ModuleType, slot: int) -> int | None:
 
 
 def mirror_limb(body: Morphology, index: int) -> Morphology | None:
-    """A body with the mirror image of a subtree in its place; only to be grafted from.
+    """A body with a subtree replaced by its mirror image; only a donor for grafting.
 
-    Seen from where it is attached, the image has left and right exchanged: turns the other way
-    round, and slots at the other side.
+    Left and right are exchanged, as seen from the mount: orientations change sign, and slots are
+    those at the opposite side.
 
     Args:
         body: the robot.
         index: of the subtree's first module, not the core.
 
     Returns:
-        The body, with poses unchanged; None where a slot has no mirror image.
+        The body, with poses not updated; None if a slot has no mirror image.
     """
     modules = list(body.modules)
     for i in range(index, index + _size(body, index)):
@@ -298,14 +298,14 @@ def mirror_limb(body: Morphology, index: int) -> Morphology | None:
 
 
 def _side(kind: ModuleType) -> tuple[float, float, float]:
-    """A module's direction to the right: across the one in which it is attached, and level."""
+    """A module's direction to the right: level, normal to its mount direction."""
     assert kind.mount is not None
     x, y, _ = kind.mount.outward
     return (y, -x, 0.0)
 
 
 def _mirrored_slot(kind: ModuleType, slot: int, away: tuple[float, float, float]) -> int | None:
-    """The slot that lies where another one lies in a mirror; `away` is the mirror's normal."""
+    """The slot at the mirror image of another one; `away` is the mirror plane's normal."""
     normal = np.array(away)
 
     def image(vector: Any) -> np.ndarray:

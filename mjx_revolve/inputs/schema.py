@@ -1,7 +1,7 @@
 """Types of users' values, checked by pydantic with error messages of ours.
 
-A `@checked` class is a frozen dataclass whose values are checked whenever one is made, in code, by
-`dataclasses.replace` or from a mapping in a file::
+A `@checked` class is a frozen dataclass. Its values are checked whenever an instance is made: in
+code, by `dataclasses.replace`, or from a mapping in a file::
 
     @checked
     class Jet:
@@ -111,7 +111,7 @@ Direction = Annotated[Vector, AfterValidator(_unit_vector), Unit("-")]
 
 
 def also(*forms: dict[str, Any]) -> Callable[[F], F]:
-    """States, as JSON Schema, which further forms a function before validation takes."""
+    """States, as JSON Schema, the further forms that a "before" validator accepts."""
 
     def state(function: F) -> F:
         function.also = forms  # type: ignore[attr-defined]
@@ -126,7 +126,7 @@ ONE: dict[str, Any] = {}
 
 
 def is_off(value: Any) -> bool:
-    """Whether a value means none: YAML 1.1 reads a bare `off` as False."""
+    """Whether a value means "off": YAML 1.1 reads a bare `off` as False."""
     return value is None or value is False or (isinstance(value, str) and value == "off")
 
 
@@ -197,7 +197,7 @@ def read(kind: Any, value: Any, place: str = "", context: Any = None) -> Any:
         context: `info.context` of validators.
 
     Raises:
-        InputError: it is something else.
+        InputError: the value is not of that type.
     """
     try:
         return _adapter(kind).validate_python(value, context=context)

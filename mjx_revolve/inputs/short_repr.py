@@ -6,8 +6,8 @@ import dataclasses
 import reprlib
 from typing import Any
 
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 80
+_SHORT_REPR = reprlib.Repr()
+_SHORT_REPR.maxstring = _SHORT_REPR.maxother = 80
 
 
 def short_repr(value: Any) -> str:
@@ -31,4 +31,4 @@ def _field(name: str, value: Any) -> str:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         text = repr(value)
         return f"{name}={text if len(text) <= 200 else type(value).__name__ + '(...)'}"
-    return f"{name}={_SHORT.repr(value)}"
+    return f"{name}={_SHORT_REPR.repr(value)}"

@@ -17,7 +17,7 @@ from mjx_revolve.inputs.errors import ConstraintError, InputError, show
 
 
 def refuse(problems: Mapping[str, str], origin: Callable[[str], str] = lambda _: "") -> InputError:
-    """All problems as one error: the first, and how many more there are where.
+    """All problems as one error: the first in full, and the places of the others.
 
     Args:
         problems: by place, from `find_problems`.
@@ -31,7 +31,7 @@ def refuse(problems: Mapping[str, str], origin: Callable[[str], str] = lambda _:
 
 # The longest list of names before a suggestion [characters].
 _MAX_NAMES = 100
-# What pydantic calls a key of a model or of a dataclass that there is no field for.
+# Pydantic's error types for a key that is no field of a model or of a dataclass.
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 
@@ -170,7 +170,7 @@ def _names(kind: Any, prefix: str = "") -> dict[str, str]:
 
 
 def _suggest(name: str, known: Sequence[str], place: Sequence[Any], root: Any) -> str:
-    """The name the user may have meant: a sibling, or a field from elsewhere."""
+    """The most similar known name: of a sibling, or of a field in another section."""
     for names in ({key: join(*place, key) for key in known}, _names(root)):
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
         if near:

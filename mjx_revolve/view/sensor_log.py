@@ -1,4 +1,4 @@
-"""Sensor traces: what the sensors gave along an episode, in their units, and the true values."""
+"""Sensor traces: outputs of the sensors along an episode, in their units, and the true values."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class SensorTrace(NamedTuple):
 
     Attributes:
         sensor: as it is declared.
-        rows: names of the rigid bodies or hinges that it speaks of, "" for the robot as a whole.
+        rows: names of the rigid bodies or hinges that it measures; "" for the robot as a whole.
         given: `[T, parts, rows]` input of the controller before each step, in the sensor's unit.
-        true: `[T, parts, rows]` what was so at that time; infinite where there is no such value,
-            as without a bed.
+        true: `[T, parts, rows]` true value at that time; infinite if there is none, as without a
+            bed.
     """
 
     sensor: Sensor
@@ -47,7 +47,7 @@ class SensorTrace(NamedTuple):
 def trace_sensors(
     fitness: Fitness, trajectory: Trajectory, key: jax.Array, trial: int = 0
 ) -> tuple[SensorTrace, ...]:
-    """What a controller was given in an episode, by its own observer.
+    """The inputs of a controller in an episode, by its own observer.
 
     Args:
         fitness: of one body.
@@ -169,8 +169,8 @@ def _compiled(fitness: Fitness, steps: int) -> Any:
         def step(now: RolloutState, k: jax.Array) -> Any:
             own = jax.tree.map(lambda x: x[k][None], water)
             inputs = StepInputs(own, engine.plant.arrange(ctrl[k][:, None]))
-            (seen, *found), asked, _, motion = rollout.act(now, inputs)
-            then = rollout.update(now, state_at(k + 1), power[k][None], (seen,), asked, motion)
+            (seen, *found), command, _, motion = rollout.act(now, inputs)
+            then = rollout.update(now, state_at(k + 1), power[k][None], (seen,), command, motion)
             return then, found
 
         state = state_at(0)

@@ -1,7 +1,6 @@
-"""What is laid over a film's frames: motes in the water, marks, and words.
+"""The overlay of a film's frames: motes in the water, marks, and words.
 
-Motes and marks show that robots move; the words say what is shown, how long, how fast, how deep,
-and how large things are.
+Motes and marks make motion visible; the words are title, time, speed, depth and a scale.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""What water does to light: a picture of bare things becomes one of things in the water.
+"""Shading of rendered frames as under water.
 
-MuJoCo draws bodies and the bed as if in clear air, with the distance of every pixel. Here the water
-comes in between: it swallows red first and scatters blue, light comes from above in shafts and in
-moving bright lines, and the surface is seen from below or from above, with the world's waves and
-small ripples of its own. Pure JAX, one compiled function for a frame. Distances are measured by the
-camera's from the robot, so that small and large robots are seen equally well: it is for looking at,
-and no model of visibility.
+MuJoCo draws bodies and the bed in clear air, with the distance of every pixel. This adds the water:
+it absorbs red first and scatters blue, light comes from above in shafts and caustics, and the
+surface is seen from below or from above, with the world's waves and small ripples. Pure JAX, one
+compiled function for a frame. Distances are relative to the camera's distance from the robot, so
+that small and large robots are seen equally well: it is no physical model of visibility.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from mjx_revolve.view.palette import SKY_HIGH, SKY_LOW, SUN, WATER_AHEAD, WATER_
 from mjx_revolve.water.flow import Water, surface
 from mjx_revolve.water.world import World
 
-# What is lost along the camera's distance from the robot, red, green and blue [-].
+# Share of light absorbed along the camera's distance from the robot, red, green and blue [-].
 _LOSS = np.array([0.40, 0.19, 0.15])
 # What daylight loses with depth [1/m], as in clear lakes, and the least that is left: pictures from
 # the bottom would be black.
 _FADING = np.array([0.14, 0.040, 0.028])
-_LEAST = np.array([0.30, 0.52, 0.60])
+_LEAST_LIGHT = np.array([0.30, 0.52, 0.60])
 _BODY = np.array([0.03, 0.29, 0.37])  # of water that is looked into from above
 _SKY, _ZENITH, _SUN = np.array(SKY_LOW), np.array(SKY_HIGH), np.array(SUN)
 _WINDOW = np.array([0.74, 0.95, 1.0])  # the sky through the surface, from below
 _SHINE = np.array([0.62, 0.95, 1.0])  # of shafts of light
 _INDEX = 1.333  # of refraction
-# Ripples: wavelength in camera distances, direction [rad], slope [-], phase [rad].
+# Ripples: wavelength in camera distances, direction [rad], steepness [-], phase [rad].
 _RIPPLES = (
     (0.83, 0.3, 0.050, 0.0), (0.57, 1.4, 0.050, 1.9), (0.41, -0.8, 0.050, 4.0),
     (0.29, 2.3, 0.045, 2.2), (0.21, 0.9, 0.045, 5.1), (0.155, -1.9, 0.040, 0.7),
@@ -54,7 +53,7 @@ Shader = Callable[..., jax.Array]
 
 
 class _View(NamedTuple):
-    """What a camera looks at, and through."""
+    """A camera, the world and the water of a frame."""
 
     world: World
     origin: tuple[float, float]  # x and y in the world of the place from which all is counted [m]
@@ -85,7 +84,7 @@ def make_shader(
     above: bool,
     origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Shader:
-    """Compiles what the world's water does to pictures.
+    """Compiles the shader of a world's water.
 
     Args:
         world: surface, waves, gravity.
@@ -143,12 +142,12 @@ def _soften(color: Any, depth: Any) -> Any:
 
 
 def _to_light(color: Any) -> Any:
-    """Screen colours to light, that adds up; a square is close to sRGB's curve and quick."""
+    """Screen colours to linear light; a square is close to sRGB's curve and quick."""
     return color * color
 
 
 def _to_screen(light: Any) -> Any:
-    """Light to screen colours; what is too bright fades to white rather than to a stain."""
+    """Linear light to screen colours; too bright colours fade to white."""
     light = jnp.maximum(light, 0.0)
     over = jnp.maximum(light - 1.0, 0.0).mean(-1, keepdims=True)
     return jnp.sqrt(jnp.clip(light + 0.5 * over, 0.0, 1.0))
@@ -166,7 +165,7 @@ def open_water(up: Any) -> Any:
 def daylight(depth: Any) -> Any:
     """Share of the light that reaches a depth below the surface [m], `[..., 3]`; 1 above it."""
     left = jnp.exp(-_FADING * jnp.maximum(jnp.asarray(depth), 0.0)[..., None])
-    return _LEAST + (1 - _LEAST) * left
+    return _LEAST_LIGHT + (1 - _LEAST_LIGHT) * left
 
 
 def transmission(path: Any, distance: float) -> Any:
@@ -209,22 +208,22 @@ def bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> 
 
 
 def _meet_surface(view: _View, most: float) -> tuple[Any, Any]:
-    """Distance at which rays meet the surface, infinite beyond `most`, and its slope there."""
+    """Distance at which rays meet the surface, infinite beyond `most`, and its gradient there."""
     world, water = view.world, view.water
     still, up = view.depth(view.position[2]), view.ray[..., 2]
     towards = up * still > 0
     safe = jnp.where(towards, up, 1.0)
     s = jnp.clip(still / safe, 0.0, most)
-    slope: Any = (0.0, 0.0)
+    gradient: Any = (0.0, 0.0)
     if any(wave.amplitude > 0 for wave in world.waves):
         for _ in range(3):
             x, y, _ = view.along(s)
-            height, slope = surface(world, water, x + view.origin[0], y + view.origin[1])
+            height, gradient = surface(world, water, x + view.origin[0], y + view.origin[1])
             s = jnp.clip((height - view.position[2]) / safe, 0.0, most)
-    return jnp.where(towards & (s < most), s, jnp.inf), slope
+    return jnp.where(towards & (s < most), s, jnp.inf), gradient
 
 
-def _surface_normal(view: _View, near: Any, slope: Any, rough: float) -> Any:
+def _surface_normal(view: _View, near: Any, gradient: Any, rough: float) -> Any:
     """Upward unit normal of the surface at distances along the rays, with waves and ripples.
 
     Both are left out where a pixel covers more than they are long, or they would glitter.
@@ -238,7 +237,7 @@ def _surface_normal(view: _View, near: Any, slope: Any, rough: float) -> Any:
     ripples = rough / (1 + (12 * covers / distance) ** 2)
     x, y, _ = view.along(near)
     fine, _ = _ripples(distance, world.gravity, view.water.time, x, y)
-    dx, dy = (waves * slope[i] + ripples * fine[i] for i in (0, 1))
+    dx, dy = (waves * gradient[i] + ripples * fine[i] for i in (0, 1))
     size = jax.lax.rsqrt(1 + dx * dx + dy * dy)
     return jnp.stack([-dx * size, -dy * size, size], axis=-1)
 
@@ -259,12 +258,12 @@ def _step(value: Any, low: float, high: float) -> Any:
 
 
 def _under_sun(view: _View, x: Any, y: Any, depth: Any) -> tuple[Any, Any]:
-    """Where the sunlight came through the surface that falls on points at a depth."""
+    """Where the sunlight on points at a depth has entered through the surface."""
     return x + depth * SUN[0] / SUN[2], y + depth * SUN[1] / SUN[2]
 
 
 def _sunlit(view: _View, far: Any) -> Any:
-    """Light that falls on things under water, next to that which MuJoCo lit them with."""
+    """Light on objects under water, relative to MuJoCo's own lighting."""
     x, y, z = view.along(jnp.minimum(far, 1e3))
     depth = view.depth(z)
     through = _under_sun(view, x, y, depth)
@@ -275,11 +274,11 @@ def _sunlit(view: _View, far: Any) -> Any:
 
 
 def _in_water(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
-    """What a camera in the water sees, and how clearly it sees the edges of things."""
+    """Colours seen by a camera in the water, and the visibility of edges."""
     ahead = open_water(view.ray[..., 2]) * view.own_light
-    s, slope = _meet_surface(view, _HORIZON * view.distance)
+    s, gradient = _meet_surface(view, _HORIZON * view.distance)
     backdrop = jax.lax.cond(
-        jnp.isfinite(s).any(), lambda: _ceiling(view, s, slope, ahead), lambda: ahead
+        jnp.isfinite(s).any(), lambda: _ceiling(view, s, gradient, ahead), lambda: ahead
     )
     through = transmission(jnp.minimum(far, s), view.distance)
     things = scene * _sunlit(view, far) * through + ahead * (1 - through)
@@ -287,10 +286,10 @@ def _in_water(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
     return picture + _shafts(view, jnp.minimum(far, s)) * view.own_light, 1.0
 
 
-def _ceiling(view: _View, s: Any, slope: Any, ahead: Any) -> Any:
+def _ceiling(view: _View, s: Any, gradient: Any, ahead: Any) -> Any:
     """The surface from below: a bright window where light gets in, elsewhere a mirror."""
     near = jnp.minimum(s, _HORIZON * view.distance)
-    normal = _surface_normal(view, near, slope, 1.6)
+    normal = _surface_normal(view, near, gradient, 1.6)
     cosine = jnp.clip((view.ray * normal).sum(-1), 0.0, 1.0)
     # Snell: above 1 the ray cannot leave the water. The window's rim is softer than true ones.
     outside = 1 - _INDEX**2 * (1 - cosine**2)
@@ -333,11 +332,11 @@ def _sky(up: Any) -> Any:
 
 
 def _from_air(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
-    """What a camera in the air sees, and how clearly it sees the edges of things."""
+    """Colours seen by a camera in the air, and the visibility of edges."""
     distance, most = view.distance, 400 * view.distance
-    s, slope = _meet_surface(view, most)
+    s, gradient = _meet_surface(view, most)
     near = jnp.minimum(s, most)
-    normal = _surface_normal(view, near, slope, 1.0)
+    normal = _surface_normal(view, near, gradient, 1.0)
     cosine = jnp.clip(-(view.ray * normal).sum(-1), 0.0, 1.0)
     mirrored = view.ray + 2 * cosine[..., None] * normal
     # Schlick's approximation of what a surface mirrors.
