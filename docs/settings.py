@@ -138,7 +138,13 @@ def make_page() -> str:
         needs = [f"`{x}`" for x in settings.TASKS[name]] + ["a world with a bed"] * task.on_bed
         said = re.sub(r" \[[^\]]+\].$", "", first_paragraph(task.score))
         lines.append(f"| `{name}` | {said} | {task.unit} | {', '.join(needs)} |")
-    lines += ["", "## Controllers", "", "`controller.type`; a function in a user's own file as well.", ""]
+    lines += [
+        "",
+        "## Controllers",
+        "",
+        "`controller.type`; a function in a user's own file as well.",
+        "",
+    ]
     lines += ["| controller | | settings that only it has |", "|---|---|---|"]
     for name, kind in CONTROLLERS.items():
         only = ", ".join(f"`{x}`" for x in kind.settings)

@@ -166,7 +166,7 @@ def _make(
     )
 
 
-def _read_sensors(value: Any, source: str) -> tuple[Sensor, ...] | None:
+def _read_sensors(value: object, source: str) -> tuple[Sensor, ...] | None:
     """The sensors of a robot; None if the file has no such key."""
     if value is None:
         return None
@@ -174,7 +174,7 @@ def _read_sensors(value: Any, source: str) -> tuple[Sensor, ...] | None:
     return found
 
 
-def _check_known(item: dict[Any, Any], known: tuple[str, ...], place: str) -> None:
+def _check_known(item: Mapping[object, object], known: tuple[str, ...], place: str) -> None:
     for key in item:
         if key not in known:
             raise InputError(f"{place}: expected only {', '.join(known)}; found {show(key)}")
@@ -258,7 +258,7 @@ def read_module(
 
 
 def _read_type(
-    name: Any, place: str, modules: Mapping[str, ModuleType], is_root: bool
+    name: object, place: str, modules: Mapping[str, ModuleType], is_root: bool
 ) -> ModuleType:
     """The type of a module; a core must be the root, and any other type must not."""
     kind = modules.get(name) if isinstance(name, str) else None
@@ -289,7 +289,7 @@ def _read_children(item: dict[str, Any], place: str, module: Module) -> dict[int
     return found
 
 
-def read_slot(value: Any, kind: ModuleType, place: str) -> int:
+def read_slot(value: object, kind: ModuleType, place: str) -> int:
     """The number of one of a type's slots.
 
     Args:
@@ -303,8 +303,11 @@ def read_slot(value: Any, kind: ModuleType, place: str) -> int:
     Raises:
         InputError: the type has no such slot.
     """
-    text = isinstance(value, str) and re.fullmatch(r"[0-9]{1,9}", value)
-    number = int(value) if text or isinstance(value, np.integer) else value
+    number = value
+    if isinstance(value, np.integer) or (
+        isinstance(value, str) and re.fullmatch(r"[0-9]{1,9}", value)
+    ):
+        number = int(value)
     if isinstance(number, int) and not isinstance(number, bool) and number in kind.slots:
         return number
     wanted = f"one of the slots {', '.join(map(str, sorted(kind.slots)))} of type {kind.name}"
@@ -315,7 +318,7 @@ def read_slot(value: Any, kind: ModuleType, place: str) -> int:
     raise InputError(f"{place}: expected {wanted}; found {show(value)}")
 
 
-def _read_id(value: Any, place: str) -> str:
+def _read_id(value: object, place: str) -> str:
     """A name, or "" where there is none."""
     if value is None:
         return ""
@@ -334,7 +337,7 @@ def _read_id(value: Any, place: str) -> str:
     return name
 
 
-def read_orientation(value: Any, place: str) -> float:
+def read_orientation(value: object, place: str) -> float:
     """A module's turn.
 
     Args:
@@ -357,7 +360,7 @@ def read_orientation(value: Any, place: str) -> float:
 
 
 def _read_params(
-    params: Any, place: str
+    params: object, place: str
 ) -> tuple[tuple[float, float, float] | None, dict[str, Any]]:
     """The colour, and everything else with the overrides checked."""
     if params is None:

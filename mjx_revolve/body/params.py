@@ -37,7 +37,7 @@ _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
 @also({"type": "string", "pattern": "^\\s*[-+]?[.0-9][.0-9eE+-]*[\\s;,]*$"})
-def read_number(value: Any) -> Any:
+def read_number(value: object) -> object:
     """Text such as `0.707;`, as found in files, as a number, in lists too; else as it is."""
     if isinstance(value, list):
         return [read_number(x) for x in value]
@@ -58,7 +58,7 @@ MODULE_FACTORS = {"mass": 1.05, "thrust": 1.3, "servo_speed": 1.1, "servo_effort
 `Coefficient.spread`; a choice, but for the servos' speed (`docs/sensitivity.md`)."""
 
 
-def _read_factors(value: Any) -> Any:
+def _read_factors(value: object) -> dict[str, object]:
     """Factors, checked: those of `MODULE_FACTORS` here, those on coefficients by `Factors`."""
     if not isinstance(value, dict):
         return read(_Some, value)
@@ -70,7 +70,7 @@ def _read_factors(value: Any) -> Any:
 
 
 # Params that are assigned to the same field of every part.
-_PLAIN: dict[str, Any] = {
+_PLAIN: dict[str, object] = {
     "drag_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
     "added_mass_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
     "entrained_water": Annotated[Share, _Loose],
@@ -80,7 +80,7 @@ _PLAIN: dict[str, Any] = {
     "added_mass": Boolean,
 }
 # All overrides; colours are none.
-_OVERRIDES: dict[str, Any] = _PLAIN | {
+_OVERRIDES: dict[str, object] = _PLAIN | {
     "mass": Annotated[_Amount, Unit("kg")],
     "volume": Annotated[_Amount, Unit("m3")],
     "electronics_volume": Annotated[_Amount, Unit("m3")],
@@ -102,7 +102,7 @@ PARAMS: dict[str, Any] = _OVERRIDES | dict.fromkeys(
 )
 
 
-def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
+def check_overrides(params: Mapping[str, object], place: str) -> dict[str, Any]:
     """The params with overrides and colours checked, numbers as floats.
 
     Args:

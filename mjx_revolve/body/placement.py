@@ -80,7 +80,7 @@ class Module:
                 yield self.position + self.rotation @ local, np.asarray(box.size) / 2
 
 
-def same(a: Any, b: Any) -> bool:
+def same(a: object, b: object) -> bool:
     """Equal plain data; unlike ==, nan is equal to itself and 1 is not 1.0 or true."""
     return repr(a) == repr(b)
 

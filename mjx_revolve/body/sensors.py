@@ -143,14 +143,15 @@ SENSORS: Mapping[str, SensorKind] = {
 
 
 @also({"type": "number"})
-def _read_range(value: Any) -> Any:
+def _read_range(value: object) -> object:
     """A number r as -r to r."""
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    return (-value, value) if plain else as_tuple(value)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return -value, value
+    return as_tuple(value)
 
 
 @also({"type": "integer"})
-def _read_id(value: Any) -> Any:
+def _read_id(value: object) -> object:
     """Names in YAML may be numbers."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
@@ -273,11 +274,11 @@ class Sensor:
         """Names of its outputs."""
         return tuple(f"{self.label} {part}".strip() for part in self.kind.parts)
 
-    def to_mapping(self) -> dict[str, Any]:
+    def to_mapping(self) -> dict[str, object]:
         """A mapping as in a morphology file, without default values."""
-        usual: dict[str, Any] = {"name": "", "at": None, "each": None}
+        usual: dict[str, object] = {"name": "", "at": None, "each": None}
         usual |= {"unit": None, "range": None, "noise": 0.0, "rate": None, "delay": 0.0}
-        found: dict[str, Any] = {"type": self.type}
+        found: dict[str, object] = {"type": self.type}
         for key, value in usual.items():
             own = getattr(self, key)
             if own != value:
@@ -286,7 +287,7 @@ class Sensor:
 
 
 @also({"type": "string"})
-def _read_sensor(value: Any) -> Any:
+def _read_sensor(value: object) -> object:
     """A kind's name alone as a mapping with that type."""
     return {"type": value} if isinstance(value, str) else value
 

@@ -214,7 +214,7 @@ class Morphology:
         """Measures of the body; see `descriptors.describe`."""
         return describe(self.modules, self.extent)
 
-    def to_mapping(self) -> dict[str, Any]:
+    def to_mapping(self) -> dict[str, object]:
         """The body as a mapping like a morphology file; `make_morphology` reads it back.
 
         Types are given by name: reading a robot with a user's own types takes those types again.
@@ -234,7 +234,7 @@ class Morphology:
             items.append(item)
             if module.parent >= 0:
                 items[module.parent].setdefault("children", {})[module.slot] = item
-        data: dict[str, Any] = {"id": self.name, "body": items[0]}
+        data: dict[str, object] = {"id": self.name, "body": items[0]}
         if self.sensors is not None:
             data["sensors"] = [sensor.to_mapping() for sensor in self.sensors]
         if self.brain is not None:
@@ -271,7 +271,7 @@ class _Dumper(yaml.SafeDumper):
 
     yaml_implicit_resolvers = SafeLoader.yaml_implicit_resolvers
 
-    def ignore_aliases(self, data: Any) -> bool:
+    def ignore_aliases(self, data: object) -> bool:
         """Writes shared values in full."""
         return True
 

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import Observer
@@ -26,7 +28,7 @@ from mjx_revolve.engine.robot import Robot
 # How long commands take to fade in, so that no joint jumps at the start [s]; a choice.
 _FADE = 0.5
 
-StepOutput = tuple[Any, jax.Array]
+StepOutput = tuple[PyTree, jax.Array]
 """State and commands after a controller's step."""
 
 
@@ -47,9 +49,9 @@ class Gene(NamedTuple):
 class _Controller(NamedTuple):
     num_genes: int
     gene_names: tuple[str, ...]
-    decode: Callable[[jax.Array, Plant], Any]
-    init: Callable[[Any], Any]
-    step: Callable[[Any, Any, jax.Array, SensorReadings], StepOutput]
+    decode: Callable[[jax.Array, Plant], PyTree]
+    init: Callable[[PyTree], PyTree]
+    step: Callable[[PyTree, PyTree, jax.Array, SensorReadings], StepOutput]
     genes: tuple[Gene, ...] = ()
     signals: tuple[str, ...] = ()
     observer: Observer | None = None
@@ -95,10 +97,10 @@ class BoundController:
     """A controller with one individual's genes, as `simulate` takes it."""
 
     controller: Controller
-    genes: Any
+    genes: ArrayLike
 
 
-def bind_genes(controller: Controller, genes: Any) -> BoundController:
+def bind_genes(controller: Controller, genes: ArrayLike) -> BoundController:
     """Joins a controller and one individual's genes `[num_genes]`, as `ctrl` of `simulate`."""
     return BoundController(controller, genes)
 
@@ -164,9 +166,9 @@ class GeneBlocks:
 def make_controller(
     plant: Plant,
     genes: Sequence[Gene],
-    decode: Callable[[jax.Array, Plant], Any],
-    init: Callable[[Any], Any],
-    step: Callable[[Any, Any, jax.Array, SensorReadings], StepOutput],
+    decode: Callable[[jax.Array, Plant], PyTree],
+    init: Callable[[PyTree], PyTree],
+    step: Callable[[PyTree, PyTree, jax.Array, SensorReadings], StepOutput],
 ) -> Controller:
     """A controller with `gene_names` made from `genes`; arguments are fields of `Controller`."""
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.control.controller import (
     Controller,
@@ -47,7 +47,7 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
     fastest = np.pi * max_frequency * (1 + made_for.num_hinges)
     blocks = GeneBlocks(made_for, ("w", "hinge"), ("c", "pair"), ("thrust", "thruster"))
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         values, rows = blocks.split(jnp.sin(genes), plant), plant.num_hinge_rows
         weights = np.pi * max_frequency * values["c"]
         coupling = pair_matrix(weights, -weights, plant)
@@ -57,11 +57,13 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
         turn = _propagator(w, coupling, dt, fastest)
         return w, coupling, amplitude * reach[:rows], middle[:rows], constant, turn
 
-    def init(parameters: Any) -> Any:
+    def init(parameters: PyTree) -> PyTree:
         w = parameters[0]
         return jnp.zeros_like(w), jnp.ones_like(w)
 
-    def step(parameters: Any, before: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, before: PyTree, time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         _, _, reach, center, constant, turn = parameters
         state = jnp.concatenate(before)
         after = tuple(jnp.split(apply_matrix(turn, state) if turn else state, 2))

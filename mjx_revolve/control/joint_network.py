@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import (
@@ -98,7 +99,7 @@ def make_joint_network(
     names += [f"{h}>thrust" for h in units] if made_for.num_thrusters else []
     genes = [Gene(name, "robot") for name in names]
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         folded, lanes, start = jnp.sin(genes), genes.shape[1:], 0
 
         def take(*shape: int) -> jax.Array:
@@ -139,14 +140,16 @@ def make_joint_network(
             plant.source[: plant.num_hinge_rows],
         )
 
-    def init(parameters: Any) -> Any:
+    def init(parameters: PyTree) -> PyTree:
         (base, *_), _, _, _, _ = parameters
         rows = parameters[4].shape[0]
         like = base[0][:rows]
         sent = tuple(jnp.zeros_like(like) for _ in range(messages)) if rows else ()
         return observer.init(like), sent, jnp.zeros_like(base) if recurrent else ()
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, state: PyTree, time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         network, clock, near, (reach, middle), number = parameters
         base, layer, back, pace, target, message = network
         samples, sent, memory = state

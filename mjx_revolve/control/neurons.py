@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from annotated_types import Unit
+from jaxtyping import PyTree
 from pydantic import BeforeValidator
 
 from mjx_revolve.body.tree import Morphology
@@ -259,7 +260,7 @@ def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -
     touched = dict.fromkeys(x[0] for _, x in inputs if is_module_signal(x[0]))
     signals += ("cells", *touched) if touched else ()
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         folded, lanes = jnp.sin(genes), genes.shape[1:]
         weights = jnp.zeros((len(moving), len(sources), *lanes), genes.dtype)
         values = [[jnp.full(lanes, x, genes.dtype) for x in own] for own in network.params]
@@ -278,12 +279,14 @@ def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -
             tables[kind] = [jnp.stack(x) for x in zip(*own, strict=True)]
         return columns, tables, plant.middle(genes), plant.reach(genes)
 
-    def init(parameters: Any) -> Any:
+    def init(parameters: PyTree) -> PyTree:
         middle = parameters[2]
         still = jnp.zeros((len(moving), *middle.shape[1:]), middle.dtype)
         return jnp.full((), -1, middle.dtype), still
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, state: PyTree, time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         columns, tables, middle, reach = parameters
         last, values = state
         count = count_samples(time, RATE)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from mjx_revolve.control.controller import Controller, StepOutput
 from mjx_revolve.control.readings import SensorReadings
@@ -30,7 +31,7 @@ class HeldState(NamedTuple):
     """
 
     number: jax.Array
-    own: Any
+    own: PyTree
     ctrl: Any
     last: Any
 
@@ -53,19 +54,19 @@ def hold_commands(controller: Controller, plant: Plant, ramp: bool = False) -> C
     rate = plant.rate
     assert rate is not None
 
-    def decode(genes: jax.Array, body: Plant) -> Any:
+    def decode(genes: jax.Array, body: Plant) -> PyTree:
         lanes = genes.shape[1:]
         # XLA's loops cannot carry arrays of size 0.
         still = jnp.zeros((body.num_rows, *lanes), genes.dtype) if body.num_rows else ()
         begin = HeldState(jnp.full(lanes, -1, genes.dtype), (), still, still if ramp else ())
         return controller.decode(genes, body.at_rate(rate)), begin
 
-    def init(parameters: Any) -> HeldState:
+    def init(parameters: PyTree) -> HeldState:
         own, begin = parameters
         return begin._replace(own=controller.init(own))
 
     def step(
-        parameters: Any, state: HeldState, time: jax.Array, sense: SensorReadings
+        parameters: PyTree, state: HeldState, time: jax.Array, sense: SensorReadings
     ) -> StepOutput:
         last, before, held, start = state
         number = count_samples(time, rate)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.control.courses import Course
 from mjx_revolve.control.pursuit import Pursuer, PursuitLimits, init_pursuer, step_pursuer
@@ -70,8 +71,8 @@ class EpisodeContext(NamedTuple):
 
     target: Any = None
     drift: Any = None
-    noise: Any = None
-    sight: Any = None
+    noise: jax.Array | None = None
+    sight: jax.Array | None = None
     pursuit: PursuitLimits | None = None
     course: Course | None = None
 
@@ -94,8 +95,8 @@ class NearestRobot(NamedTuple):
         tag: number that identifies the robot, `[lanes]` [-]; 0 if there is none.
     """
 
-    toward: Any
-    tag: Any
+    toward: Vec
+    tag: jax.Array
 
 
 class PreviousMotion(NamedTuple):
@@ -121,9 +122,9 @@ class SensorMemory(NamedTuple):
         pursuer: state of a target that pursues the robot.
     """
 
-    acceleration: Any = None
-    ctrl: Any = None
-    work: Any = None
+    acceleration: Vec | None = None
+    ctrl: jax.Array | None = None
+    work: jax.Array | None = None
     past: PreviousMotion | None = None
     pursuer: Pursuer | None = None
 
@@ -163,27 +164,27 @@ class SensorReadings(NamedTuple):
         cells: normal force of the bed on the left and the right half of one module [N]; optional.
     """
 
-    height: Any
-    climb: Any
+    height: jax.Array
+    climb: jax.Array
     up: Vec
     angular_velocity: Vec
-    north: Any = None
-    angle: Any = None
-    speed: Any = None
-    flow: Any = None
-    altitude: Any = None
-    target: Any = None
-    noise: Any = None
-    force: Any = None
-    load: Any = None
-    work: Any = None
-    touch: Any = None
+    north: Vec | None = None
+    angle: jax.Array | None = None
+    speed: jax.Array | None = None
+    flow: Vec | None = None
+    altitude: jax.Array | None = None
+    target: Vec | None = None
+    noise: jax.Array | None = None
+    force: Vec | None = None
+    load: jax.Array | None = None
+    work: jax.Array | None = None
+    touch: jax.Array | None = None
     nearest: NearestRobot | None = None
     modules: Any = None
-    course: Any = None
-    seen: Any = None
-    present: Any = None
-    cells: Any = None
+    course: Vec | None = None
+    seen: jax.Array | np.ndarray | None = None
+    present: jax.Array | None = None
+    cells: tuple[jax.Array, jax.Array] | None = None
 
     @property
     def spin(self) -> Vec:
@@ -248,7 +249,7 @@ def _site_frame(
 
 
 def _read_frame(
-    world: World | None, water: Water, target: Vec | None, sight: Any, frame: _Frame
+    world: World | None, water: Water, target: Vec | None, sight: jax.Array | None, frame: _Frame
 ) -> SensorReadings:
     """The readings that follow from a frame."""
     x, y, z = frame.position
@@ -289,7 +290,7 @@ def _read_frame(
 def read_sensors(
     world: World | None,
     engine: Engine,
-    state: Any,
+    state: PyTree,
     water: Water,
     time: jax.Array,
     context: EpisodeContext,
@@ -369,7 +370,7 @@ def _plain(x: Any, like: jax.Array) -> Any:
 
 
 def init_memory(
-    signals: Sequence[str], engine: Engine, state: Any, context: EpisodeContext = _NO_CONTEXT
+    signals: Sequence[str], engine: Engine, state: PyTree, context: EpisodeContext = _NO_CONTEXT
 ) -> SensorMemory:
     """The memory before the first step: at rest, no work done, servos commanded to stay.
 
@@ -443,24 +444,24 @@ class _RestingEngine:
         self._joints = jnp.zeros((plant.num_hinge_rows, lanes), jnp.float32)
         self._bodies = jnp.zeros((1 + plant.num_hinge_rows, lanes), jnp.float32)
 
-    def root(self, state: Any) -> RootState:
+    def root(self, state: PyTree) -> RootState:
         x = self._bodies[0]
         return RootState((x,) * 3, (x,) * 4, (x,) * 3, (x,) * 3)
 
-    def joints(self, state: Any) -> tuple[jax.Array, jax.Array]:
+    def joints(self, state: PyTree) -> tuple[jax.Array, jax.Array]:
         return self._joints, self._joints
 
-    def servo_torque(self, state: Any, ctrl: jax.Array) -> jax.Array:
+    def servo_torque(self, state: PyTree, ctrl: jax.Array) -> jax.Array:
         return self._joints
 
-    def contact_force(self, state: Any, water: Water) -> jax.Array:
+    def contact_force(self, state: PyTree, water: Water) -> jax.Array:
         return self._bodies
 
-    def body_motions(self, state: Any) -> BodyMotion:
+    def body_motions(self, state: PyTree) -> BodyMotion:
         x = self._bodies
         return BodyMotion((x,) * 3, (x,) * 3, (x,) * 3, x, (x,) * 3, (x,) * 3, (x, x))
 
-    def contact_by_half(self, state: Any, water: Water) -> Any:
+    def contact_by_half(self, state: PyTree, water: Water) -> Any:
         x = self._bodies[0]
         return defaultdict(lambda: (x, x))
 

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.sensors import Sensor, check_names
@@ -106,8 +107,8 @@ class Observer:
         return tuple(found)
 
     def observe(
-        self, state: Any, time: jax.Array, sense: SensorReadings, joint: Any
-    ) -> tuple[Any, Observation]:
+        self, state: PyTree, time: jax.Array, sense: SensorReadings, joint: Any
+    ) -> tuple[PyTree, Observation]:
         """The state and the observation before a step.
 
         Args:
@@ -180,7 +181,7 @@ class Observer:
         return robot, joints
 
     def _hold(
-        self, sensor: Sensor, state: Any, time: jax.Array, count: jax.Array, values: Any
+        self, sensor: Sensor, state: PyTree, time: jax.Array, count: jax.Array, values: Any
     ) -> tuple[Any, Any]:
         """The samples after this step, and the sample that is the sensor's output."""
         last, kept = state

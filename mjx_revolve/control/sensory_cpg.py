@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import (
@@ -85,7 +86,7 @@ def make_sensory_cpg(
     count = 1 if made_for.rate is None else math.ceil(made_for.timestep / _PHASE_STEP - 1e-6)
     dt = made_for.timestep / count
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         values = blocks.split(jnp.sin(genes), plant)
         some = lambda names: [values[name] for name in names]  # noqa: E731
         sine, cosine = sincos(np.pi * values["lag"])
@@ -98,12 +99,14 @@ def make_sensory_cpg(
             plant.source[: plant.num_hinge_rows],
         )
 
-    def init(parameters: Any) -> Any:
+    def init(parameters: PyTree) -> PyTree:
         still, bias = jnp.zeros_like(parameters[0][0]), jnp.zeros_like(parameters[1][0])
         # XLA's loops cannot carry arrays of size 0.
         return observer.init(still), (still, still) if still.shape[0] else (), bias
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, state: PyTree, time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         waves, offsets, rate, near, (reach, middle), number = parameters
         (size, on_phase, on_size), (bias, on_offset, on_bend) = waves, offsets
         samples, oscillators, offset = state

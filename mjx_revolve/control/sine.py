@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +18,9 @@ from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import safe_norm, sincos
+
+_Sizes = tuple[tuple[jax.Array, jax.Array], ...]  # sine and cosine of each harmonic
+_Waves = tuple[_Sizes, jax.Array, jax.Array, jax.Array]  # and offset, frequency, middle
 
 
 def make_sine(
@@ -49,7 +50,7 @@ def make_sine(
     waves = [(name, "actuator") for pair in names for name in pair]
     blocks = GeneBlocks(made_for, *waves, ("offset", "actuator"), ("frequency", "robot"))
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> _Waves:
         values = blocks.split(genes, plant)
         reach, center = amplitude * plant.reach(genes), plant.middle(genes)
         rate = 2 * np.pi * max_frequency * (1 + jnp.sin(values["frequency"])) / 2
@@ -65,7 +66,9 @@ def make_sine(
     return make_controller(made_for, blocks.genes, decode, lambda parameters: (), _step)
 
 
-def _step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+def _step(
+    parameters: _Waves, state: tuple[()], time: jax.Array, sense: SensorReadings
+) -> StepOutput:
     """The step of a `Controller` made of sines."""
     sizes, offset, rate, center = parameters
     fade, wave = fade_in(time), offset

@@ -19,6 +19,9 @@ from mjx_revolve.control.controller import (
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.numerics.spatial import Scalar
+
+_Curves = tuple[tuple[Scalar, ...], jax.Array, jax.Array]  # coefficients, frequency, middle
 
 
 def make_splines(
@@ -47,14 +50,16 @@ def make_splines(
     blocks = GeneBlocks(made_for, *((name, "actuator") for name in names), ("frequency", "robot"))
     solve = np.linalg.inv(_weights_of(np.arange(points), points))
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> _Curves:
         values, reach = blocks.split(jnp.sin(genes), plant), amplitude * plant.reach(genes)
         through = [reach * values[name] for name in names]
         # The B-spline's coefficients, so that the curve goes through the points.
         rows = [sum(float(w) * x for w, x in zip(row, through, strict=True)) for row in solve]
         return tuple(rows), max_frequency * (1 + values["frequency"]) / 2, plant.middle(genes)
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: _Curves, state: tuple[()], time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         rows, rate, middle = parameters
         turns = rate * time
         at = points * (turns - jnp.floor(turns))

@@ -192,7 +192,7 @@ class RobustConfig(Settings):
 
 
 @also(OFF, {"const": True})
-def _read_robust(value: Any) -> Any:
+def _read_robust(value: object) -> object:
     """`true` as the default range of each coefficient."""
     return {} if value is True else None if is_off(value) else value
 
@@ -355,7 +355,7 @@ class _Overrides:
         label: of messages about them.
     """
 
-    settings: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    settings: Mapping[str, object] = field(default_factory=dict, compare=False)
     label: str = field(default="", compare=False)
 
 
@@ -470,7 +470,7 @@ class Config(Settings):
         return f"{self.task.name} in {Path(self.world_name).stem}"
 
     @property
-    def world_overrides(self) -> dict[str, Any]:
+    def world_overrides(self) -> dict[str, object]:
         """Keyword arguments for `load_world(config.world_name, **config.world_overrides)`."""
         if isinstance(self.world, str):
             return {}
@@ -478,9 +478,9 @@ class Config(Settings):
 
 
 def make_config(
-    data: Mapping[str, Any],
+    data: Mapping[str, object],
     folder: str | Path = ".",
-    overrides: Mapping[str, Any] | Sequence[str] = (),
+    overrides: Mapping[str, object] | Sequence[str] = (),
     source: str = "config",
 ) -> Config:
     """Checks a mapping of settings.
@@ -525,7 +525,7 @@ def make_config(
     return config
 
 
-def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
+def _is_valid(data: Mapping[str, object], folder: str | Path) -> bool:
     try:
         make_config(data, folder)
     except InputError:
@@ -550,7 +550,7 @@ def _resolve(file: NamedFile, folder: Path, before: str) -> str:
     return file.at(path)
 
 
-def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) -> Config:
+def load_config(path: str | Path, overrides: Mapping[str, object] | Sequence[str] = ()) -> Config:
     """Reads a configuration file.
 
     Args:
@@ -578,13 +578,13 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
     return make_config(data, path.parent, overrides, short_path(path))
 
 
-def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
+def with_older_values(data: Mapping[str, object]) -> dict[str, object]:
     """A run folder's settings with the values that older versions had where they lack a setting."""
     own = {name: data.get(name) for name in OLDER}
     return {**data} | {k: {**OLDER[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
 
 
-def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:
+def override_config(config: Config, overrides: Mapping[str, object] | Sequence[str]) -> Config:
     """Applies overrides to a configuration that was already checked.
 
     Args:

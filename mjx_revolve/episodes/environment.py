@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -137,7 +137,7 @@ class Environment:
         return jax.tree.map(lambda x: x[..., 0], draw_starts(task, fitness.world, key, steps))
 
     def _rollout(
-        self, starts: Starts, position: jax.Array, ctrl: jax.Array, clock: Any = None
+        self, starts: Starts, position: jax.Array, ctrl: jax.Array, clock: jax.Array | None = None
     ) -> Rollout:
         """A rollout under constant commands, `clock` timesteps after the start."""
         fitness, signals = self.fitness, self.observer.signals
@@ -250,13 +250,16 @@ class Environment:
         return state, seen, result, last
 
 
-def choose(mask: Bool[Array, " lanes"], new: Any, old: Any) -> Any:
+T = TypeVar("T")
+
+
+def choose(mask: Bool[Array, " lanes"], new: T, old: T) -> T:
     """Pytrees `[..., lanes]`, the new one where the mask is true."""
     return jax.tree.map(lambda a, b: jnp.where(mask, a, b), new, old)
 
 
 def make_environment(
-    fitness: Fitness, control_rate: float | None = None, sensors: Sequence[Any] | None = None
+    fitness: Fitness, control_rate: float | None = None, sensors: Sequence[object] | None = None
 ) -> Environment:
     """Makes the environment of a fitness.
 

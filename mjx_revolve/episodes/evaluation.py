@@ -11,11 +11,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.courses import course_path
@@ -63,6 +65,8 @@ from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.flow import Water, flow
 from mjx_revolve.water.world import World
 
+B = TypeVar("B")  # bodies: their tables, or () where the specification has one body
+
 
 class Chunk(NamedTuple):
     """A chunk of episodes before their first step.
@@ -101,7 +105,7 @@ class Episodes(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class EpisodeSpec(ABC):
+class EpisodeSpec(ABC, Generic[B]):
     """The common properties of all episodes of a configuration.
 
     Attributes:
@@ -117,11 +121,11 @@ class EpisodeSpec(ABC):
     controller: Controller
 
     @abstractmethod
-    def _engine(self, bodies: Any, lanes: int, differentiable: bool) -> Engine:
+    def _engine(self, bodies: B, lanes: int, differentiable: bool) -> Engine:
         """The engine for bodies `[lanes]`."""
 
     @abstractmethod
-    def _geometry(self, bodies: Any) -> BodyGeometry:
+    def _geometry(self, bodies: B) -> BodyGeometry:
         """Sizes of bodies, `[lanes]` or one."""
 
     @property
@@ -174,14 +178,14 @@ class EpisodeSpec(ABC):
         center = tuple(jnp.asarray(x, root.dtype) for x in geometry.center)
         return root[:3] + jnp.stack(matvec(quat_to_mat(tuple(root[3:7])), center))
 
-    def check_population(self, population: Any, ranks: tuple[int, ...] = (2,)) -> jax.Array:
+    def check_population(self, population: ArrayLike, ranks: tuple[int, ...] = (2,)) -> jax.Array:
         """A population as an array.
 
         Raises:
             InputError: it has another shape than `[P, num_genes]` (or, of rank 3, `[B, P,
                 num_genes]`), or there are no genes to evolve.
         """
-        shape, count = jnp.shape(population), self.num_genes
+        shape, count = np.shape(population), self.num_genes
         if len(shape) in ranks and shape[-1] == count and 0 not in shape:
             return jnp.asarray(population)
         if count == 0:
@@ -251,7 +255,7 @@ class EpisodeSpec(ABC):
     def _bodies_key(self) -> Any:
         """The properties of the bodies that compiled programs depend on."""
 
-    def _score(self, bodies: Any, population: jax.Array, key: jax.Array) -> Any:
+    def _score(self, bodies: B, population: jax.Array, key: jax.Array) -> Any:
         """Scores and measures `[P]` of a population of one body."""
         individual, trial = list_episodes(len(population), self.settings.trials)
         starts = self.precise_starts(population, key)
@@ -259,7 +263,7 @@ class EpisodeSpec(ABC):
         return average_trials(over_chunks(chunk)(individual, trial), self.settings.trials)
 
     def chunk_scores(
-        self, alike: bool, bodies: Any, population: jax.Array, starts: Starts
+        self, alike: bool, bodies: B, population: jax.Array, starts: Starts
     ) -> Callable[[jax.Array, jax.Array], Scores]:
         """A function of (individuals, their trials) `[lanes]` that scores these episodes."""
         score: Any = partial(self._score_chunk, alike, False)
@@ -271,7 +275,7 @@ class EpisodeSpec(ABC):
         self,
         alike: bool,
         differentiable: bool,
-        bodies: Any,
+        bodies: B,
         population: jax.Array,
         starts: Starts,
         individual: Int[Array, " lanes"],
@@ -290,7 +294,7 @@ class EpisodeSpec(ABC):
         self,
         alike: bool,
         differentiable: bool,
-        bodies: Any,
+        bodies: B,
         population: jax.Array,
         starts: Starts,
         individual: Int[Array, " lanes"],

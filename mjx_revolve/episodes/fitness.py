@@ -18,6 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.coefficients import correct_types, load_coefficients
@@ -64,7 +65,7 @@ _TRACE_INTERVAL = 0.02
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fitness(EpisodeSpec):
+class Fitness(EpisodeSpec[tuple[()]]):
     """Scores of a population of one body: `fitness(population, key)`.
 
     Attributes:
@@ -82,10 +83,10 @@ class Fitness(EpisodeSpec):
         what = self.config.subject
         return f"Fitness({what}, {self.robot.morphology!r}, {self.num_genes} genes)"
 
-    def _engine(self, bodies: Any, lanes: int, differentiable: bool) -> Engine:
+    def _engine(self, bodies: tuple[()], lanes: int, differentiable: bool) -> Engine:
         return self.engine
 
-    def _geometry(self, bodies: Any) -> BodyGeometry:
+    def _geometry(self, bodies: tuple[()]) -> BodyGeometry:
         return self.geometry
 
     @property
@@ -94,7 +95,7 @@ class Fitness(EpisodeSpec):
         listening = _listening(self.config, read_modules(self.config), body)
         return body, listening.model_dump_json()
 
-    def __call__(self, population: Any, key: jax.Array) -> jax.Array:
+    def __call__(self, population: ArrayLike, key: jax.Array) -> jax.Array:
         """Scores a population.
 
         Args:
@@ -106,7 +107,9 @@ class Fitness(EpisodeSpec):
         """
         return self.evaluate(population, key)[0]
 
-    def evaluate(self, population: Any, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def evaluate(
+        self, population: ArrayLike, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Scores and measures of a population.
 
         Args:
@@ -141,7 +144,7 @@ class Fitness(EpisodeSpec):
             plant = plant.at_rate(rate)
         return _find_controller(self.config, settings, plant, body)
 
-    def replay(self, genes: Any, key: jax.Array, trial: int = 0) -> Trajectory:
+    def replay(self, genes: ArrayLike, key: jax.Array, trial: int = 0) -> Trajectory:
         """One episode of one individual, in full.
 
         Args:
@@ -245,7 +248,7 @@ class Fitness(EpisodeSpec):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MixedFitness(EpisodeSpec):
+class MixedFitness(EpisodeSpec[PackedBodies]):
     """Scores of different bodies: `fitness(robots, population, key)`.
 
     Attributes:
@@ -282,7 +285,7 @@ class MixedFitness(EpisodeSpec):
         """The controller of one body alone, with genes named after its own joints."""
         return _find_controller(self.config, self.controller_settings, as_plant(body))
 
-    def pad_genes(self, genes: Any, robot: Robot) -> Any:
+    def pad_genes(self, genes: ArrayLike, robot: Robot) -> Any:
         """The genes of one body's own controller as this fitness takes them.
 
         Args:
@@ -304,7 +307,7 @@ class MixedFitness(EpisodeSpec):
         wide[..., indices] = genes
         return wide
 
-    def own_genes(self, genes: Any, robot: Robot) -> Any:
+    def own_genes(self, genes: ArrayLike, robot: Robot) -> Any:
         """The inverse: those of `[..., num_genes]` that a body's own controller takes."""
         genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
         return genes[..., self._indices(robot)]
@@ -313,13 +316,13 @@ class MixedFitness(EpisodeSpec):
         return gene_indices(self.controller_of(robot), self.controller)
 
     def __call__(
-        self, robots: Robot | Sequence[Robot] | PackedBodies, population: Any, key: jax.Array
+        self, robots: Robot | Sequence[Robot] | PackedBodies, population: ArrayLike, key: jax.Array
     ) -> Any:
         """Scores a population; arguments as in `evaluate`."""
         return self.evaluate(robots, population, key)[0]
 
     def evaluate(
-        self, robots: Robot | Sequence[Robot] | PackedBodies, population: Any, key: jax.Array
+        self, robots: Robot | Sequence[Robot] | PackedBodies, population: ArrayLike, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Scores and measures of a population.
 
@@ -393,7 +396,7 @@ class MixedFitness(EpisodeSpec):
         return max(n for n in range(1, most + 1) if self.record_every % n == 0)
 
     def replay(
-        self, robots: Sequence[Robot], genes: Sequence[Any], key: jax.Array, trial: int = 0
+        self, robots: Sequence[Robot], genes: Sequence[ArrayLike], key: jax.Array, trial: int = 0
     ) -> list[Trajectory]:
         """One episode of each of many bodies, from the same start.
 
@@ -502,7 +505,9 @@ def _own_trajectory(
 # ------------------------------------------------------------------ making them
 
 
-def make_fitness(config: Config | str | Path | Mapping[str, Any], **overrides: Any) -> Fitness:
+def make_fitness(
+    config: Config | str | Path | Mapping[str, object], **overrides: object
+) -> Fitness:
     """Builds the fitness function of a configuration.
 
     Args:
@@ -550,13 +555,13 @@ def fit_body(config: Config, morphology: Morphology) -> Fitness:
 
 
 def make_mixed_fitness(
-    config: Config | str | Path | Mapping[str, Any],
+    config: Config | str | Path | Mapping[str, object],
     examples: Sequence[Morphology],
     hinges: int = 0,
     rows: int = 0,
     kinds: Sequence[ModuleType] = (),
     modules: int = 0,
-    **overrides: Any,
+    **overrides: object,
 ) -> MixedFitness:
     """Builds the fitness function of a configuration for bodies of many kinds.
 
@@ -650,7 +655,9 @@ def read_modules(config: Config) -> Mapping[str, ModuleType]:
     return correct_types(modules, load_coefficients(config.coefficients), config.coefficients)
 
 
-def _read(config: Any, overrides: dict[str, Any]) -> Config:
+def _read(
+    config: Config | str | Path | Mapping[str, object], overrides: dict[str, object]
+) -> Config:
     """A configuration from a `Config`, a path or a mapping, with overrides."""
     if isinstance(config, Config):
         if not overrides:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -46,11 +46,14 @@ class WaterState:
         return replace(self, **changes)
 
 
-def _to_lanes(tree: Any) -> Any:
+T = TypeVar("T")
+
+
+def _to_lanes(tree: T) -> T:
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
 
 
-def _from_lanes(tree: Any) -> Any:
+def _from_lanes(tree: T) -> T:
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), tree)
 
 
@@ -123,12 +126,12 @@ class FunctionalEnv:
 
 
 def make_functional_env(
-    config: Config | str | Path | Mapping[str, Any],
+    config: Config | str | Path | Mapping[str, object],
     *,
-    sensors: Sequence[Any] | None = None,
+    sensors: Sequence[object] | None = None,
     control_rate: float | None = None,
     auto_reset: bool = False,
-    **overrides: Any,
+    **overrides: object,
 ) -> FunctionalEnv:
     """A pure environment of a configuration: `state = env.reset(key)`, `env.step(state, action)`.
 

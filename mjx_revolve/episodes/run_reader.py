@@ -88,7 +88,7 @@ class RunReader:
         """Whether its champion was evaluated on fresh starts."""
         return (self.path / "run.json").is_file() and "finished" in self.info
 
-    def load_config(self, **overrides: Any) -> Config:
+    def load_config(self, **overrides: object) -> Config:
         """The configuration, with settings replaced by their dotted names."""
         return load_config(self.path / "config.yaml", overrides)
 
@@ -300,7 +300,7 @@ class ChampionRecord:
             )
         return found
 
-    def load_config(self, **overrides: Any) -> Config:
+    def load_config(self, **overrides: object) -> Config:
         """The run's configuration; where bodies have evolved, of the champion's body alone.
 
         Raises:

@@ -82,11 +82,11 @@ class NamedFile(NamedTuple):
         return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-Change = Callable[[NamedFile], Any]
+Change = Callable[[NamedFile], object]
 
 
 def map_files(
-    settings: Mapping[str, Any], change: Change, model: type[BaseModel], within: str = ""
+    settings: Mapping[str, object], change: Change, model: type[BaseModel], within: str = ""
 ) -> dict[str, Any]:
     """Replaces the texts of all settings that name files.
 
@@ -121,7 +121,7 @@ def _is_section(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
-def _map_value(kind: str, place: str, value: Any, change: Change) -> Any:
+def _map_value(kind: str, place: str, value: object, change: Change) -> object:
     if isinstance(value, Mapping):
         paths = {key: f"{place}.{key}" for key in value}
         if kind == "world":
@@ -153,7 +153,7 @@ def _is_path(world: str) -> bool:
 
 
 def copy_files(
-    settings: Mapping[str, Any], model: type[BaseModel]
+    settings: Mapping[str, object], model: type[BaseModel]
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """All files that settings name, so that they can be moved together with the settings.
 
@@ -269,7 +269,7 @@ class Section(Settings):
         """Whether the type is a function in a user's own file."""
         return parse_user_function(self.type) is not None
 
-    def refuse_params(self, params: Mapping[str, Any]) -> None:
+    def refuse_params(self, params: Mapping[str, object]) -> None:
         """Raises `ConstraintError` for `params` of a type that is one of ours."""
         if params and not self.is_user_code:
             raise ConstraintError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import BoundController, Controller
 from mjx_revolve.control.readings import EpisodeContext
@@ -143,11 +145,11 @@ def _compiled(
 
 def simulate(
     robot: Robot,
-    ctrl: Any = None,
+    ctrl: ArrayLike | BoundController | Callable[[jax.Array], ArrayLike] | None = None,
     duration: float | None = None,
     *,
-    qpos: Any = None,
-    qvel: Any = None,
+    qpos: ArrayLike | None = None,
+    qvel: ArrayLike | None = None,
     key: jax.Array | None = None,
     water: Water | None = None,
     engine: str = "population",
@@ -260,7 +262,7 @@ def _steps(rows: Any, duration: float | None, dt: float) -> int:
     return max(1, round((5.0 if duration is None else duration) / dt))
 
 
-def _array(place: str, value: Any, shape: tuple[int, ...] | None) -> jax.Array:
+def _array(place: str, value: ArrayLike, shape: tuple[int, ...] | None) -> jax.Array:
     try:
         array = jnp.asarray(value, dtype=jnp.result_type(float))
     except (TypeError, ValueError):

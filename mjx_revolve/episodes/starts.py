@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.spatial import quat_mul
+from mjx_revolve.numerics.spatial import Vec, quat_mul
 from mjx_revolve.water.flow import Water, gust_path, water_of
 from mjx_revolve.water.world import World
 
@@ -52,7 +52,7 @@ class Starts(NamedTuple):
     course: Course | None = None
 
 
-def check_key(key: Any) -> None:
+def check_key(key: object) -> None:
     """Refuses anything but a key of `jax.random`, such as a seed.
 
     Args:
@@ -158,7 +158,7 @@ def episode_context(
     """
     like = position[0]
     wide = lambda x: jnp.full_like(like, x)  # noqa: E731
-    target: Any = None
+    target: Vec | None = None
     if starts.towards is not None:
         target = tuple(position + starts.towards)
     elif task.target is not None:
@@ -206,7 +206,7 @@ def start_pose(
     return jnp.concatenate([position, quat])
 
 
-def _righting(up: Any) -> tuple[Any, ...]:
+def _righting(up: Vec) -> tuple[jax.Array, ...]:
     """The least turn (w, x, y, z) that brings a direction, a unit vector, upright."""
     x, y, z = (jnp.asarray(component) for component in up)
     # For half a turn any horizontal axis would do; x is used.
@@ -280,7 +280,7 @@ def pick_water(world: World, starts: Starts, trial: int) -> Water | None:
     return gusty_water(world, starts.gusts[..., trial], water)
 
 
-def _euler_quat(roll: Any, pitch: Any, yaw: Any) -> jax.Array:
+def _euler_quat(roll: jax.Array, pitch: jax.Array, yaw: jax.Array) -> jax.Array:
     """`[4, n]` quaternion (w, x, y, z) of roll, then pitch, then yaw [rad]."""
     (cr, sr), (cp, sp), (cy, sy) = ((jnp.cos(x / 2), jnp.sin(x / 2)) for x in (roll, pitch, yaw))
     return jnp.stack(

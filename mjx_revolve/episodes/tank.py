@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.engine.batched_trees import make_batched_trees
@@ -172,7 +173,7 @@ class Tank:
     def add(
         self,
         robot: Robot,
-        genes: Any,
+        genes: ArrayLike | None,
         position: Sequence[float],
         quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
         world: int = 0,

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.plant import BodyGeometry
+from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.measure_table import records_of
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.user_code import (
@@ -26,7 +27,7 @@ from mjx_revolve.inputs.user_code import (
     parse_user_function,
     short_name,
 )
-from mjx_revolve.numerics.spatial import safe_norm
+from mjx_revolve.numerics.spatial import Scalar, safe_norm
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
@@ -108,7 +109,7 @@ class Track:
 
 
 def start_at_depth(
-    settings: Any, world: World, figure: BodyGeometry, place: jax.Array
+    settings: TaskConfig, world: World, figure: BodyGeometry, place: jax.Array
 ) -> jax.Array:
     """The core at the task's depth below the still surface.
 
@@ -124,7 +125,9 @@ def start_at_depth(
     return place.at[2].add(world.surface_height - settings.depth)
 
 
-def start_on_bed(settings: Any, world: World, figure: BodyGeometry, place: jax.Array) -> jax.Array:
+def start_on_bed(
+    settings: TaskConfig, world: World, figure: BodyGeometry, place: jax.Array
+) -> jax.Array:
     """The lowest corner 5 mm above the bed, whatever the tilt; arguments of `start_at_depth`."""
     assert world.bed is not None
     below = reach_below(settings, figure)
@@ -132,14 +135,14 @@ def start_on_bed(settings: Any, world: World, figure: BodyGeometry, place: jax.A
 
 
 def start_above_bed(
-    settings: Any, world: World, figure: BodyGeometry, place: jax.Array
+    settings: TaskConfig, world: World, figure: BodyGeometry, place: jax.Array
 ) -> jax.Array:
     """The core at the task's height above the bed; arguments of `start_at_depth`."""
     assert world.bed is not None
     return place.at[2].set(bed_height(world.bed, place[0], place[1]) + settings.height)
 
 
-def reach_below(settings: Any, figure: BodyGeometry) -> Any:
+def reach_below(settings: TaskConfig, figure: BodyGeometry) -> Scalar:
     """How far the rest pose reaches below the core's centre, in any attitude drawn [m].
 
     A tilt of three standard deviations is taken for the largest.
@@ -162,10 +165,10 @@ class Task:
         point: the point of `Track.position`, as in `task.point`.
     """
 
-    score: Callable[[Track, Any], jax.Array]
+    score: Callable[[Track, TaskConfig], jax.Array]
     unit: str = ""
     records: tuple[str, ...] = ()
-    start: Callable[[Any, World, BodyGeometry, jax.Array], jax.Array] = start_at_depth
+    start: Callable[[TaskConfig, World, BodyGeometry, jax.Array], jax.Array] = start_at_depth
     on_bed: bool = False
     measure: str = "speed_m_s"
     point: str = "core"
@@ -183,7 +186,7 @@ def _keeping(error: jax.Array, tolerance: float) -> jax.Array:
     return 1 - beyond * beyond * (3 - 2 * beyond)
 
 
-def _keeps_depth(track: Track, settings: Any) -> jax.Array:
+def _keeps_depth(track: Track, settings: TaskConfig) -> jax.Array:
     """`[S - 1, lanes]` share of each interval's progress that counts."""
     middle = (track.position[1:, 2] + track.position[:-1, 2]) / 2
     return _keeping(middle - track.start_height, settings.depth_tolerance)
@@ -196,7 +199,7 @@ def moved_through_water(track: Track) -> jax.Array:
     return jnp.diff(track.position, axis=0) - track.interval * water
 
 
-def directed_swim(track: Track, settings: Any) -> jax.Array:
+def directed_swim(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a direction, over ground, while the robot keeps its depth [body lengths/s].
 
     With a `horizon`, over that time, if the motion is continued: see `_foretold`.
@@ -211,7 +214,7 @@ def directed_swim(track: Track, settings: Any) -> jax.Array:
     return counted / (track.duration * track.length)
 
 
-def speed(track: Track, settings: Any) -> jax.Array:
+def speed(track: Track, settings: TaskConfig) -> jax.Array:
     """Net horizontal speed through the water while the robot keeps its depth [body lengths/s].
 
     In any direction; drift with a current does not count. With a `horizon`, net over that time, if
@@ -250,7 +253,7 @@ def _foretold(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
     return size * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 
 
-def reach_target(track: Track, settings: Any) -> jax.Array:
+def reach_target(track: Track, settings: TaskConfig) -> jax.Array:
     """How much nearer to the target the robot ends than it began [body lengths]."""
     fixed = None if settings.target is None else np.asarray(settings.target, float)
 
@@ -263,7 +266,7 @@ def reach_target(track: Track, settings: Any) -> jax.Array:
     return (away[0] - away[1]) / track.length
 
 
-def _left_of_way(track: Track, settings: Any) -> jax.Array:
+def _left_of_way(track: Track, settings: TaskConfig) -> jax.Array:
     """`[S, lanes]` least distance to the target so far, as a share of the first distance.
 
     1 until the robot comes nearer, 0 from the time at which it touches the target.
@@ -274,7 +277,7 @@ def _left_of_way(track: Track, settings: Any) -> jax.Array:
     return jax.lax.cummin(beyond) / jnp.maximum(beyond[0], 1e-6)
 
 
-def search(track: Track, settings: Any) -> jax.Array:
+def search(track: Track, settings: TaskConfig) -> jax.Array:
     """The share of the way to the target that is covered, on average over time [of the way].
 
     At each time the largest share so far: coming near once is enough, and touching the target
@@ -283,7 +286,7 @@ def search(track: Track, settings: Any) -> jax.Array:
     return 1 - jnp.mean(_left_of_way(track, settings), 0)
 
 
-def escape(track: Track, settings: Any) -> jax.Array:
+def escape(track: Track, settings: TaskConfig) -> jax.Array:
     """The pursuer's least distance so far, on average over time [of the first distance].
 
     1 if the pursuer never comes nearer than at the start. 0 counts from the time at which it
@@ -293,7 +296,7 @@ def escape(track: Track, settings: Any) -> jax.Array:
     return jnp.mean(_left_of_way(track, settings) * keeps, 0)
 
 
-def follow_course(track: Track, settings: Any) -> jax.Array:
+def follow_course(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a course that turns, over ground, at its depth [body lengths/s]."""
     assert track.course is not None
     moved = jnp.diff(track.position, axis=0)
@@ -304,14 +307,14 @@ def follow_course(track: Track, settings: Any) -> jax.Array:
     return counted / (track.duration * track.length)
 
 
-def hold_depth(track: Track, settings: Any) -> jax.Array:
+def hold_depth(track: Track, settings: TaskConfig) -> jax.Array:
     """Minus the root mean square distance from the start's depth [body lengths]."""
     error = (track.position[:, 2] - track.start_height) / track.length
     # The tiny term keeps the gradient finite where the error is 0.
     return -jnp.sqrt(jnp.mean(error * error, 0) + 1e-12)
 
 
-def hold_heading(track: Track, settings: Any) -> jax.Array:
+def hold_heading(track: Track, settings: TaskConfig) -> jax.Array:
     """Minus the root mean square errors of depth and of heading, added up [body lengths + rad].
 
     Heading is the direction of the core's x axis seen from above; its target is `direction`.
@@ -334,7 +337,7 @@ def follow_bed(track: Track, settings: Any) -> jax.Array:
     return crawl(replace(track, clearance=height), settings)
 
 
-def crawl(track: Track, settings: Any) -> jax.Array:
+def crawl(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a direction while the core stays near the bed [body lengths/s]."""
     direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
     moved = jnp.diff(track.position, axis=0)
@@ -360,7 +363,7 @@ TASKS: Mapping[str, Task] = {
 """The tasks by their names in configurations."""
 
 
-def find_task(settings: Any, source: str = "config") -> Task:
+def find_task(settings: TaskConfig, source: str = "config") -> Task:
     """The task that a configuration names, with the records of its `measures`.
 
     Args:
@@ -416,7 +419,7 @@ def find_task(settings: Any, source: str = "config") -> Task:
     return task
 
 
-def _score_in_metres(score: Callable, track: Track, settings: Any) -> jax.Array:
+def _score_in_metres(score: Callable, track: Track, settings: TaskConfig) -> jax.Array:
     """The score of a body of length 1 m."""
     return score(replace(track, length=1.0), settings)
 

@@ -14,6 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.environment import (
@@ -100,7 +102,7 @@ def _make_class() -> type:
                 state, seen = jax.lax.map(lambda given: environment.begin(*given), given)
                 return state, self._join(seen)
 
-            def resume(mask: jax.Array, new: Any, old: Any) -> Any:
+            def resume(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
                 pick = jax.vmap(choose)
                 return pick(self._split(mask), new, old)
 
@@ -120,8 +122,11 @@ def _make_class() -> type:
             return x.reshape(-1, *x.shape[2:])[: self.num_envs]
 
         def reset(
-            self, *, seed: Any = None, options: dict[str, Any] | None = None
-        ) -> tuple[np.ndarray, dict[str, Any]]:
+            self,
+            *,
+            seed: int | Sequence[int | None] | None = None,
+            options: dict[str, object] | None = None,
+        ) -> tuple[np.ndarray, dict[str, object]]:
             """Begins episodes.
 
             Args:
@@ -156,7 +161,7 @@ def _make_class() -> type:
             self._state, self._seen = state, np.array(seen, np.float32)
             return self._seen.copy(), {}
 
-        def _read_seeds(self, seed: Any) -> np.ndarray:
+        def _read_seeds(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
             found = np.asarray(seed)
             whole = np.issubdtype(found.dtype, np.integer) and found.shape in ((), (self.num_envs,))
             if not whole or not np.all((found >= 0) & (found < 2**32)):
@@ -168,7 +173,7 @@ def _make_class() -> type:
                 found = (int(found) + np.arange(self.num_envs, dtype=np.int64)) % 2**32
             return found.astype(np.uint32)
 
-        def _read_mask(self, options: Mapping[str, Any] | None) -> np.ndarray | None:
+        def _read_mask(self, options: Mapping[str, object] | None) -> np.ndarray | None:
             if not options or "reset_mask" not in options:
                 return None
             mask = np.asarray(options["reset_mask"])
@@ -180,8 +185,8 @@ def _make_class() -> type:
             return mask
 
         def step(
-            self, actions: Any
-        ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+            self, actions: ArrayLike
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, object]]:
             """A control period of all environments.
 
             Args:
@@ -198,14 +203,14 @@ def _make_class() -> type:
             """
             if self._state is None:
                 raise ResetNeeded("expected a call of reset before step")
-            given = np.asarray(actions, np.float32)
+            given = jnp.asarray(actions, jnp.float32)
             shape = (self.num_envs, len(self.action_names))
             if given.shape != shape:
                 raise InputError(f"actions: expected {list(shape)}; found {list(given.shape)}")
             self._state, seen, outcome, last = self._step(self._state, given)
             self._seen = np.array(seen)
             terminated, truncated = np.array(outcome.terminated), np.array(outcome.truncated)
-            infos: dict[str, Any] = {}
+            infos: dict[str, object] = {}
             over = terminated | truncated
             if over.any():
                 score = np.where(over, np.asarray(outcome.score), 0.0)
@@ -217,7 +222,7 @@ def _make_class() -> type:
             rewards = np.asarray(outcome.reward).astype(np.float64)
             return self._seen.copy(), rewards, terminated, truncated, infos
 
-        def close_extras(self, **kwargs: Any) -> None:
+        def close_extras(self, **kwargs: object) -> None:
             """Lets go of the state."""
             self._state = None
 
@@ -230,13 +235,13 @@ def _make_class() -> type:
 
 
 def make_vector_env(
-    config: Config | str | Path | Mapping[str, Any],
+    config: Config | str | Path | Mapping[str, object],
     num_envs: int = LANES,
     *,
-    sensors: Sequence[Any] | None = None,
+    sensors: Sequence[object] | None = None,
     control_rate: float | None = None,
     autoreset_mode: str = "NextStep",
-    **overrides: Any,
+    **overrides: object,
 ) -> Any:
     """A `gymnasium.vector.VectorEnv` of a configuration: its robot, its water, its task.
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.episodes.evaluation import Episodes, narrow, task_recorder, widen
@@ -77,7 +78,7 @@ class TruncatedBPTT:
         """Length of a window [s]."""
         return self.records * self.fitness.record_every * self.fitness.world.timestep
 
-    def init(self, population: Any, key: jax.Array) -> Episodes:
+    def init(self, population: ArrayLike, key: jax.Array) -> Episodes:
         """Episodes at their starts, those of `fitness(population, key)`.
 
         Args:
@@ -95,7 +96,7 @@ class TruncatedBPTT:
         run = self._init if is_traced(population, key) else self._compiled[0]
         return run(population, key)
 
-    def step(self, population: Any, episodes: Episodes) -> tuple[Gradients, Episodes]:
+    def step(self, population: ArrayLike, episodes: Episodes) -> tuple[Gradients, Episodes]:
         """Advances episodes by a window.
 
         The genes need not be those of the window before: an optimiser may change them in between.

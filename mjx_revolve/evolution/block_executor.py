@@ -14,6 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from numpy.typing import ArrayLike
+
 from mjx_revolve.evolution.jobs import Job, WorkerError
 from mjx_revolve.inputs.errors import InputError
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.blocks import Block, Scored
+    from mjx_revolve.evolution.blocks import Block, KeyData, Scored
 
 _log = logging.getLogger(__name__)
 AnyWorker = TypeVar("AnyWorker")
@@ -65,11 +67,13 @@ class Executor:
         """How many processes score."""
         return 1
 
-    def __call__(self, population: Any, key: jax.Array) -> np.ndarray:
+    def __call__(self, population: ArrayLike, key: jax.Array) -> np.ndarray:
         """Scores a population: `[P]`; see `evaluate`."""
         return self.evaluate(population, key)[0]
 
-    def evaluate(self, population: Any, key: jax.Array) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def evaluate(
+        self, population: ArrayLike, key: jax.Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Scores a population and measures how it moved.
 
         Args:
@@ -129,7 +133,7 @@ class Executor:
 
         return [evaluate_block(self.fitness, block, key) for block in blocks]
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """The executor's kind and size, for `run.json`."""
         return {"count": self.num_workers, "block": self.block}
 
@@ -176,7 +180,7 @@ class WorkerExecutor(Executor, ABC, Generic[AnyWorker]):
         """The workers that can take a block."""
 
     @abstractmethod
-    def send(self, worker: AnyWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+    def send(self, worker: AnyWorker, number: int, block: Block, key: KeyData) -> None:
         """Gives a block to a worker."""
 
     @abstractmethod

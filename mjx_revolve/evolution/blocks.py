@@ -17,6 +17,7 @@ from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.numerics.xla import LANES, on_cpu
 
 Block = tuple[Any, ...]
+KeyData = tuple[np.ndarray, str]  # a random key as `key_as_data` has it
 """The arguments of `fitness.evaluate` before the key; the first has one entry per individual."""
 Scored = tuple[np.ndarray, dict[str, np.ndarray]]
 """`[rows]` scores and measures of a block, float32."""
@@ -31,12 +32,12 @@ def evaluate_block(fitness: Any, block: Block, key: jax.Array) -> Scored:
     }
 
 
-def key_as_data(key: jax.Array) -> tuple[np.ndarray, str]:
+def key_as_data(key: jax.Array) -> KeyData:
     """A key as values that can be sent to another process: numbers, and the kind of key."""
     return np.asarray(jax.random.key_data(key)), str(jax.random.key_impl(key))
 
 
-def key_from_data(data: tuple[np.ndarray, str]) -> jax.Array:
+def key_from_data(data: KeyData) -> jax.Array:
     """The inverse of `key_as_data`."""
     return jax.random.wrap_key_data(jax.numpy.asarray(data[0]), impl=data[1])
 

@@ -209,7 +209,9 @@ def _examples(genotype: Genotype) -> list[Morphology]:
     return [genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES)]
 
 
-def _load_seed(path: str, modules: Any, config: Config, space: Space) -> Morphology:
+def _load_seed(
+    path: str, modules: Mapping[str, ModuleType], config: Config, space: Space
+) -> Morphology:
     body = load_morphology(path, modules, config.allow_overlap)
     reason = space.refuses(body)
     if reason:

@@ -9,11 +9,12 @@ be used for all.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
 from annotated_types import Len
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import Controller, Gene, gene_indices
 from mjx_revolve.engine.plant import Plant
@@ -182,7 +183,7 @@ class NamedGenes:
         return read(_NAMED, brain, "brain")
 
 
-def _named(layout: GeneLayout, values: Any) -> dict[str, float]:
+def _named(layout: GeneLayout, values: Iterable[float]) -> dict[str, float]:
     return {n: float(np.float32(x)) for n, x in zip(layout.names, values, strict=True)}
 
 
@@ -263,5 +264,5 @@ class PatternNetwork:
         return read(weights, brain, "brain")
 
 
-def _weights(values: Any) -> list[float]:
+def _weights(values: ArrayLike) -> list[float]:
     return [float(x) for x in np.asarray(values, np.float32)]

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import jax
 
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.blocks import Block, Scored
+    from mjx_revolve.evolution.blocks import Block, KeyData, Scored
 
 # Time between two checks of the list of workers [s].
 _TICK = 1.0
@@ -86,7 +86,7 @@ def _open(pickled: bytes) -> tuple[Any, deque[float], tempfile.TemporaryDirector
     return fitness, deque(maxlen=101), scratch
 
 
-def prepare(limits: Limits, pickled: bytes) -> tuple[dict[str, Any], dict[str, str]]:
+def prepare(limits: Limits, pickled: bytes) -> tuple[dict[str, object], dict[str, str]]:
     """Opens a job and compiles its fitness, once per process.
 
     Returns:
@@ -99,7 +99,7 @@ def prepare(limits: Limits, pickled: bytes) -> tuple[dict[str, Any], dict[str, s
     return identity, {"CPUs": runtime.cpu_model(), "XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
 
 
-def score(limits: Limits, pickled: bytes, block: Block, key: tuple[Any, str]) -> Scored:
+def score(limits: Limits, pickled: bytes, block: Block, key: KeyData) -> Scored:
     """Scores a block."""
     from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
 
@@ -183,7 +183,7 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
         """How many processes score."""
         return len(self._fit())
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """See `Executor`; workers of a cluster come and go."""
         return {"cluster": self.place, "block": self.block}
 
@@ -198,7 +198,7 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
         """See `WorkerExecutor`; one that has room for two blocks stands there twice."""
         return [w for k in range(self._at_once) for w in self._fit() if len(w.blocks) <= k]
 
-    def send(self, worker: ClusterWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+    def send(self, worker: ClusterWorker, number: int, block: Block, key: KeyData) -> None:
         """See `WorkerExecutor`."""
         worker.blocks.append((number, self._submit(worker.address, score, block, key)))
 

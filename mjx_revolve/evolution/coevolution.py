@@ -185,7 +185,7 @@ class BodyEvolution(IndividualEvolution):
         """The individuals with what they have learnt, their scores and measures."""
         return learn(self.executor, proposal.offspring, proposal.key)
 
-    def tell(self, proposal: _Proposal, results: list[Individual]) -> Generation:
+    def tell(self, proposal: _Proposal, results: list[Individual]) -> Generation[BodySearch]:
         """The search with survivors, elites and archives brought up to date.
 
         Columns: failed (individuals of which every trial failed), living, living_mean, the best

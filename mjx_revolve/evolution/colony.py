@@ -170,7 +170,7 @@ def make_rules(fitness: BodyFitness) -> Rules:
     return Rules(colony, fitness, look, looks, window, fitness.config.evolution.population_size)
 
 
-def _event(time: float, name: str, number: int, position: np.ndarray, **facts: Any) -> Event:
+def _event(time: float, name: str, number: int, position: np.ndarray, **facts: object) -> Event:
     """An event as plain values."""
     where = [round(float(x), 3) if np.isfinite(x) else None for x in position]
     return {"time": round(float(time), 6), "event": name, "id": number, "place": where} | facts

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +11,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.run_reader import RunReader, find_run
 from mjx_revolve.evolution.body_fitness import BodyFitness, make_body_fitness
-from mjx_revolve.evolution.colony import Colony, Member
+from mjx_revolve.evolution.colony import Colony, Event, Member
 from mjx_revolve.evolution.colony_search import ColonyEvolution
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.individuals import Individual
@@ -46,7 +44,7 @@ class ObservedRobot:
 
 def observe_colony(
     config: Config, fitness: BodyFitness, search: Colony, begin: float, duration: float, gap: float
-) -> tuple[list[ObservedRobot], list[Mapping[str, Any]]]:
+) -> tuple[list[ObservedRobot], list[Event]]:
     """Advances a colony and records the poses of its robots.
 
     Args:
@@ -66,7 +64,7 @@ def observe_colony(
     rows = steps // max(k for k in range(1, wanted + 1) if steps % k == 0)
     members: dict[int, Member] = {}
     poses: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    events: list[Mapping[str, Any]] = []
+    events: list[Event] = []
     while _time_of(fitness, search) < begin - 1e-9:
         proposal = evolution.ask(search)
         search = evolution.tell(proposal, evolution.evaluate(proposal)).search

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -112,7 +112,7 @@ class ColonyEvolution(IndividualEvolution):
         self._held = None
         return self.tank.advance(self.rules.interval, self.rules.look / rows)
 
-    def tell(self, proposal: ColonyInterval, results: TankTrajectory) -> Generation:
+    def tell(self, proposal: ColonyInterval, results: TankTrajectory) -> Generation[Colony]:
         """The colony with the rules applied.
 
         Columns: failed, living, living_mean, time [s], births, matings, deaths by cause, expected
@@ -221,7 +221,7 @@ class ColonyEvolution(IndividualEvolution):
 
     # --- to and from a checkpoint
 
-    def to_arrays(self, search: Colony) -> dict[str, Any]:
+    def to_arrays(self, search: Colony) -> dict[str, np.ndarray]:
         """A colony as named arrays."""
         # Parents as they were when they mated; of several matings, their bodies and brains are one.
         parents = [parent for pending in search.pending_births for parent in pending.parents]

@@ -102,12 +102,12 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     return hash_text(_dump(data))
 
 
-def _dump(data: Any) -> str:
+def _dump(data: object) -> str:
     """Nested values as JSON, the same for the same; keys may be other than texts in `params`."""
     return json.dumps(_text_keys(data), sort_keys=True, default=str)
 
 
-def _text_keys(value: Any) -> Any:
+def _text_keys(value: object) -> object:
     if isinstance(value, dict):
         return {str(key): _text_keys(item) for key, item in value.items()}
     return [_text_keys(item) for item in value] if isinstance(value, list | tuple) else value

@@ -143,7 +143,7 @@ class GeneEvolution:
             )
         return scores, measures
 
-    def tell(self, proposal: _Proposal, results: Scored) -> Generation:
+    def tell(self, proposal: _Proposal, results: Scored) -> Generation[GeneSearch]:
         """The search with the strategy's state and the elites brought up to date.
 
         Columns: step_size (root mean square over the genes of the population's standard deviation),

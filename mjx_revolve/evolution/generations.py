@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from dataclasses import Field, dataclass, field, replace
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import numpy as np
@@ -58,7 +58,24 @@ class Champion:
     passport: Passport | None = None
 
 
-class Generation(NamedTuple):
+class SearchState(Protocol):
+    """State of any search: a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def generation(self) -> int:
+        """Number of finished generations."""
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in generations [s]."""
+
+
+S = TypeVar("S", bound=SearchState)
+
+
+class Generation(NamedTuple, Generic[S]):
     """A generation's result.
 
     Attributes:
@@ -71,7 +88,7 @@ class Generation(NamedTuple):
         simulated: simulated time [s], for the column `times_real_time`; 0: no such column.
     """
 
-    search: Any
+    search: S
     scores: np.ndarray
     champion: float
     columns: Mapping[str, float]
@@ -80,47 +97,51 @@ class Generation(NamedTuple):
     simulated: float = 0.0
 
 
-class Evolution(Protocol):
+P = TypeVar("P")  # what is evaluated
+R = TypeVar("R")  # its results
+
+
+class Evolution(Protocol[S, P, R]):
     """A kind of search. Its state is a frozen dataclass with `generation` and `seconds`.
 
     A search depends on that value alone, so one that is read back from disk continues with the same
     bits.
     """
 
-    def start(self) -> Any:
+    def start(self) -> S:
         """The search before its first generation."""
 
-    def ask(self, search: Any) -> Any:
+    def ask(self, search: S) -> P:
         """The individuals of the next generation, to be evaluated."""
 
-    def evaluate(self, proposal: Any) -> Any:
+    def evaluate(self, proposal: P) -> R:
         """The results of what `ask` returned."""
 
-    def tell(self, proposal: Any, results: Any) -> Generation:
+    def tell(self, proposal: P, results: R) -> Generation[S]:
         """The search after the generation, given its results."""
 
-    def to_arrays(self, search: Any) -> dict[str, Any]:
+    def to_arrays(self, search: S) -> dict[str, np.ndarray]:
         """The search as named arrays, for a checkpoint."""
 
-    def from_arrays(self, arrays: Mapping[str, np.ndarray]) -> Any:
+    def from_arrays(self, arrays: Mapping[str, np.ndarray]) -> S:
         """The inverse of `to_arrays`; raises `InputError` for arrays of another search."""
 
-    def logs(self, search: Any) -> Mapping[str, Sequence[str]]:
+    def logs(self, search: S) -> Mapping[str, Sequence[str]]:
         """Lines that the last generation adds to the run folder's logs, by the file's name."""
 
-    def files(self, search: Any) -> Mapping[str, bytes]:
+    def files(self, search: S) -> Mapping[str, bytes]:
         """Files of the run folder that are written anew with each checkpoint, by name."""
 
-    def best(self, search: Any) -> Champion | None:
+    def best(self, search: S) -> Champion | None:
         """The champion so far, not yet evaluated on fresh starts; None: every rollout failed."""
 
-    def choose_champion(self, search: Any) -> Champion:
+    def choose_champion(self, search: S) -> Champion:
         """The champion of a finished search, evaluated on fresh starts."""
 
 
 def run_generations(
-    evolution: Evolution, generations: int, search: Any = None
-) -> Iterator[tuple[Any, dict[str, float]]]:
+    evolution: Evolution[S, P, R], generations: int, search: S | None = None
+) -> Iterator[tuple[S, dict[str, float]]]:
     """Runs a search, one generation at a time.
 
     Args:

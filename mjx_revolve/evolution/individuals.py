@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, make_morphology
 from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.genotypes.genotype import Genotype
@@ -86,7 +87,7 @@ def best_individuals(individuals: Iterable[Individual]) -> tuple[Individual, ...
 # --- to and from files
 
 
-def to_record(individual: Individual, genotype: Genotype) -> dict[str, Any]:
+def to_record(individual: Individual, genotype: Genotype) -> dict[str, object]:
     """An individual as plain values by name, for JSON; floats keep their bits.
 
     `genome` is None if the body is the genome.
@@ -110,7 +111,9 @@ def to_record(individual: Individual, genotype: Genotype) -> dict[str, Any]:
     }
 
 
-def from_record(record: Any, genotype: Genotype, modules: Any, check: Any) -> Individual:
+def from_record(
+    record: Any, genotype: Genotype, modules: Mapping[str, ModuleType], check: Callable[[Any], Any]
+) -> Individual:
     """The inverse of `to_record`.
 
     Args:
@@ -160,7 +163,7 @@ def to_text(individual: Individual, genotype: Genotype) -> str:
     return json.dumps(to_record(individual, genotype), separators=(",", ":"))
 
 
-def to_records(individuals: Iterable[Individual], genotype: Genotype) -> list[dict[str, Any]]:
+def to_records(individuals: Iterable[Individual], genotype: Genotype) -> list[dict[str, object]]:
     """Records of individuals by number, each once; of several states of one, the last counts."""
     known = {individual.number: individual for individual in individuals}
     return [to_record(known[number], genotype) for number in sorted(known)]
@@ -205,7 +208,7 @@ def reading_state(
         raise InputError(f"expected {what}; found {reason}") from None
 
 
-def pack_json(value: Any) -> np.ndarray:
+def pack_json(value: object) -> np.ndarray:
     """Plain values as an array of bytes."""
     return np.frombuffer(json.dumps(value).encode(), np.uint8)
 

@@ -41,7 +41,9 @@ class Perturbation:
         rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
         return state + self.std * rng.standard_normal((self.count, len(state))), state
 
-    def tell(self, key: jax.Array, population: Any, scores: Any, state: np.ndarray) -> np.ndarray:
+    def tell(
+        self, key: jax.Array, population: np.ndarray, scores: np.ndarray, state: np.ndarray
+    ) -> np.ndarray:
         """The same state."""
         return state
 

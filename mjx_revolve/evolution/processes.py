@@ -39,7 +39,7 @@ from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.blocks import Block, Scored
+    from mjx_revolve.evolution.blocks import Block, KeyData, Scored
 
 # The program of a worker: it has the same module search path as this process.
 _PROGRAM = (
@@ -143,7 +143,7 @@ class LocalWorker:
             theirs.close()
         self.send((core, str(cache) if cache else None))
 
-    def send(self, message: Any) -> None:
+    def send(self, message: object) -> None:
         """Sends a message; the worker's death shows when its answer is read."""
         with contextlib.suppress(OSError):
             self.channel.send(message)
@@ -248,7 +248,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         """See `WorkerExecutor`."""
         return [w for w in self.workers if w.ready and w.block is None]
 
-    def send(self, worker: LocalWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+    def send(self, worker: LocalWorker, number: int, block: Block, key: KeyData) -> None:
         """See `WorkerExecutor`."""
         worker.block, worker.age = number, 0.0
         worker.send((block, key))

@@ -373,7 +373,7 @@ class Run:
         config = self.config
         say("judging the champion on fresh starts")
         champion = self.evolution.choose_champion(self.search)
-        facts: dict[str, Any] = {
+        facts: dict[str, object] = {
             "score": champion.score,
             "score_std": champion.std,
             "origin": champion.origin,
@@ -475,7 +475,7 @@ def check_unchanged(old: Config, new: Config, label: str) -> None:
         raise InputError(f"{label}: {found[0]}{more}; only {free} may change")
 
 
-def _differences(old: Any, new: Any, place: str = "") -> list[str]:
+def _differences(old: object, new: object, place: str = "") -> list[str]:
     """Places at which two nested values differ, with both values."""
     if isinstance(old, dict) and isinstance(new, dict):
         return [
@@ -499,7 +499,7 @@ def _portable(settings: Sequence[str], config: Config) -> list[str]:
     return portable
 
 
-def describe_host() -> dict[str, Any]:
+def describe_host() -> dict[str, object]:
     """Program and machine, on which the bits of a run depend besides its configuration."""
     info = runtime.describe_process()
     return {key: info[key] for key in _HOST}

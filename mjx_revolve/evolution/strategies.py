@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.episodes.bodies_config import LearningConfig
 from mjx_revolve.episodes.config import EvolutionConfig
@@ -92,6 +93,9 @@ def losses_from_scores(scores: np.ndarray, penalty: float | None = None) -> np.n
     return losses
 
 
+State = dict[str, Any]  # "fresh", and "algorithm": evosax's own
+
+
 @dataclass(frozen=True)
 class Strategy:
     """A strategy with its settings; the state is passed in and handed back.
@@ -114,7 +118,7 @@ class Strategy:
     std_init: float
     population_based: bool
 
-    def init(self, key: jax.Array, mean: Any = None) -> dict[str, Any]:
+    def init(self, key: jax.Array, mean: ArrayLike | None = None) -> State:
         """Starts a search.
 
         Args:
@@ -135,7 +139,7 @@ class Strategy:
         state = self.algorithm.init(key_init, population, jnp.zeros(shape[0]), self.params)
         return _on_host({"fresh": True, "algorithm": state})
 
-    def ask(self, key: jax.Array, state: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
+    def ask(self, key: jax.Array, state: State) -> tuple[np.ndarray, State]:
         """Draws the next population.
 
         Args:
@@ -151,8 +155,8 @@ class Strategy:
         return np.asarray(population), _on_host({"fresh": state["fresh"], "algorithm": algorithm})
 
     def tell(
-        self, key: jax.Array, population: np.ndarray, scores: np.ndarray, state: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, key: jax.Array, population: np.ndarray, scores: np.ndarray, state: State
+    ) -> State:
         """Updates the state by the scores of a generation.
 
         Args:
@@ -176,11 +180,11 @@ class Strategy:
         state = _on_host({"fresh": False, "algorithm": algorithm})
         return self._floor_std(state)
 
-    def mean(self, state: dict[str, Any]) -> np.ndarray | None:
+    def mean(self, state: State) -> np.ndarray | None:
         """The centre of the distribution, `[G]`; None for a population-based strategy."""
         return None if self.population_based else np.asarray(state["algorithm"].mean)
 
-    def _floor_std(self, state: dict[str, Any]) -> dict[str, Any]:
+    def _floor_std(self, state: State) -> State:
         std = getattr(state["algorithm"], "std", None)
         if std is None or self.population_based:
             return state
@@ -334,7 +338,7 @@ def _make_strategy(
     )
 
 
-def _as_param(key: str, value: Any, default: Any) -> Any:
+def _as_param(key: str, value: object, default: jax.Array) -> jax.Array:
     """A setting with the shape of evosax's default."""
     shape = np.shape(default)
     kind = f"numbers of shape {list(shape)}" if shape else "a finite number"

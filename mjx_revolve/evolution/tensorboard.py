@@ -67,7 +67,7 @@ class TensorBoardLog:
         except OSError as error:
             raise with_path(error, self._folder) from None
 
-    def _write(self, **event: Any) -> None:
+    def _write(self, **event: object) -> None:
         from tensorboardX.proto.event_pb2 import Event
 
         with self._naming_folder():

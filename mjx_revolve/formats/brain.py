@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import Controller
@@ -106,7 +107,7 @@ class Brain:
     sensors: tuple[Sensor, ...]
 
 
-def champion_brain(fitness: Fitness, genes: Any) -> Brain:
+def champion_brain(fitness: Fitness, genes: ArrayLike) -> Brain:
     """The brain of an individual, with the rate and the sensors of its configuration.
 
     Args:
@@ -128,7 +129,7 @@ def champion_brain(fitness: Fitness, genes: Any) -> Brain:
 def make_brain(
     robot: Robot,
     controller: Controller,
-    genes: Any,
+    genes: ArrayLike,
     rate: float | None,
     sensors: Sequence[Sensor] = (),
     seen: bool = False,

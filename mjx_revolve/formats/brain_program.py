@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jax.extend import core
+from numpy.typing import ArrayLike
 
 from mjx_revolve.inputs.errors import InputError
 
@@ -172,7 +173,7 @@ class Builder:
             self.values.append(value)
         return number
 
-    def constant(self, data: Any) -> int:
+    def constant(self, data: ArrayLike) -> int:
         """A constant of any shape."""
         flat = np.asarray(data).reshape(-1)
         return self.add(Value(kind_of(flat.dtype), flat.size, "constant", data=flat))
@@ -196,7 +197,7 @@ class Builder:
                 return other
         return self.add(Value(kind, size, name, args))
 
-    def take(self, args: Sequence[int], index: Any) -> int:
+    def take(self, args: Sequence[int], index: ArrayLike) -> int:
         """Elements of values that stand one behind the other."""
         parts = []  # of (value, element), with takes of takes resolved
         for number in args:

@@ -6,9 +6,8 @@ physically consistent inertial parameter identification.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.body.module_types import Part
 
@@ -20,7 +19,7 @@ _BALLAST = 1e-3
 _ROTOR = 0.05
 
 
-def spread(mass: float, center: Any, square: np.ndarray) -> np.ndarray:
+def spread(mass: float, center: ArrayLike, square: np.ndarray) -> np.ndarray:
     """`[4, 4]` pseudo-inertia of a body; those of bodies in one frame add up.
 
     Args:

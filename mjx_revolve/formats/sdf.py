@@ -11,7 +11,6 @@ Sources: gz-sim, `src/systems/` `buoyancy`, `hydrodynamics`, `lift_drag`, `thrus
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import jax
@@ -111,7 +110,7 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
 # ------------------------------------------------------------------------- elements
 
 
-def _pose(position: Any, rotation: np.ndarray, **relative_to: str) -> Element:
+def _pose(position: Iterable[float], rotation: np.ndarray, **relative_to: str) -> Element:
     return node("pose", [*position, *roll_pitch_yaw(rotation)], **relative_to)
 
 

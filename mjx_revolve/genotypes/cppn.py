@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Unit
@@ -109,7 +109,7 @@ class CPPN(NamedTuple):
             values[node.number] = FUNCTIONS[node.function](total(node.number))
         return np.stack([total(k) for k in range(self.num_outputs)], axis=1)
 
-    def to_plain(self) -> dict[str, Any]:
+    def to_plain(self) -> dict[str, object]:
         """The network as plain values for JSON, exactly; `read_cppn` is the inverse."""
         return {
             "num_inputs": self.num_inputs,
@@ -371,7 +371,7 @@ class _Plain:
             raise ConstraintError("links", "one between two ends", "two with the same ends")
 
 
-def read_cppn(plain: Any, place: str = "network") -> CPPN:
+def read_cppn(plain: object, place: str = "network") -> CPPN:
     """A network from what `CPPN.to_plain` made.
 
     Raises:

@@ -11,7 +11,6 @@ or exceed a bound are left out.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -39,7 +38,7 @@ _SLOPE = 3.0
 _DISTANCES = 1.0, 4.0
 
 
-def make_cppn(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
+def make_cppn(space: Space, params: Mapping[str, object], place: str) -> Genotype[CPPN]:
     """CPPNs over the positions of modules; no body can be converted to a genome.
 
     Args:
@@ -53,7 +52,7 @@ def make_cppn(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
     settings = read(CPPNSettings, dict(params), f"{place}.params")
     outputs = 2 + len(space.modules)
 
-    def from_plain(plain: Any) -> CPPN:
+    def from_plain(plain: object) -> CPPN:
         network = read_cppn(plain, "genome")
         found = (network.num_inputs, network.num_outputs)
         if found != (_INPUTS, outputs):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from mjx_revolve.body.tree import Morphology
 from mjx_revolve.inputs.errors import InputError, show
 
 T = TypeVar("T")
+G = TypeVar("G")  # a genome
 
 # Bounds on length and mass are kept up to rounding.
 SLACK = 1 + 1e-9
@@ -25,7 +26,7 @@ _RANDOM_TRIES = 300
 _CACHED = 1000
 
 
-class Genotype(NamedTuple):
+class Genotype(NamedTuple, Generic[G]):
     """A representation of bodies: plain functions of genomes, which are plain values.
 
     All genomes that they return develop into bodies in the space, and all randomness comes from the
@@ -47,13 +48,13 @@ class Genotype(NamedTuple):
     """
 
     name: str
-    random: Callable[[np.random.Generator], Any]
-    mutate: Callable[[np.random.Generator, Any], Any]
-    cross: Callable[[np.random.Generator, Any, Any], Any]
-    develop: Callable[[Any], Morphology]
-    adopt: Callable[[Morphology], Any] | None
-    to_plain: Callable[[Any], Any]
-    from_plain: Callable[[Any], Any]
+    random: Callable[[np.random.Generator], G]
+    mutate: Callable[[np.random.Generator, G], G]
+    cross: Callable[[np.random.Generator, G, G], G]
+    develop: Callable[[G], Morphology]
+    adopt: Callable[[Morphology], G | None] | None
+    to_plain: Callable[[G], object]
+    from_plain: Callable[[Any], G]
 
 
 def accept_all(body: Morphology) -> bool:
@@ -187,14 +188,14 @@ def make_genotype(
     name: str,
     place: str,
     *,
-    draw: Callable[[np.random.Generator], Any],
-    mutate: Callable[[np.random.Generator, Any], Any],
-    cross: Callable[[np.random.Generator, Any, Any], Any],
-    develop: Callable[[Any], Morphology],
-    to_plain: Callable[[Any], Any],
-    from_plain: Callable[[Any], Any],
-    adopt: Callable[[Morphology], Any] | None = None,
-) -> Genotype:
+    draw: Callable[[np.random.Generator], G],
+    mutate: Callable[[np.random.Generator, G], G | None],
+    cross: Callable[[np.random.Generator, G, G], G | None],
+    develop: Callable[[G], Morphology],
+    to_plain: Callable[[G], object],
+    from_plain: Callable[[Any], G],
+    adopt: Callable[[Morphology], G | None] | None = None,
+) -> Genotype[G]:
     """A genotype that keeps to the space, from functions that may leave it.
 
     Args:
@@ -211,7 +212,7 @@ def make_genotype(
     """
     develop = cached(develop)
 
-    def random(rng: np.random.Generator) -> Any:
+    def random(rng: np.random.Generator) -> G:
         reason: str | None = None
         for _ in range(_RANDOM_TRIES):
             genome = draw(rng)
@@ -223,10 +224,10 @@ def make_genotype(
             f"that does (the last: {reason})"
         )
 
-    def within(vary: Callable[..., Any]) -> Callable[..., Any]:
+    def within(vary: Callable[..., G | None]) -> Callable[..., G]:
         """The first variation that is in the space, or the first parent."""
 
-        def varied(rng: np.random.Generator, *parents: Any) -> Any:
+        def varied(rng: np.random.Generator, *parents: G) -> G:
             for _ in range(TRIES):
                 child = vary(rng, *parents)
                 if child is not None and space.refuses(develop(child)) is None:
@@ -240,12 +241,12 @@ def make_genotype(
         if reason is not None:
             raise InputError(f"{body.path or body.name}: {reason}")
 
-    def read(plain: Any) -> Any:
+    def read(plain: object) -> G:
         genome = from_plain(plain)
         check(develop(genome))
         return genome
 
-    def adopted(body: Morphology) -> Any:
+    def adopted(body: Morphology) -> G | None:
         assert adopt is not None
         check(body)
         return adopt(replace(body, brain=None, path=None))
@@ -262,15 +263,15 @@ def make_genotype(
     )
 
 
-def cached(function: Callable[[Any], T]) -> Callable[[Any], T]:
+def cached(function: Callable[[G], T]) -> Callable[[G], T]:
     """The same function with its last results cached by the identity of its argument.
 
     Variation develops a genome to see whether it is in the space; evaluation develops it again.
     Genomes need no hash. They are kept with the result, so that their id is not reused.
     """
-    known: dict[int, tuple[Any, T]] = {}
+    known: dict[int, tuple[G, T]] = {}
 
-    def look_up(value: Any) -> T:
+    def look_up(value: G) -> T:
         if id(value) not in known:
             if len(known) >= _CACHED:
                 known.clear()

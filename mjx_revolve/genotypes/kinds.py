@@ -23,7 +23,7 @@ from mjx_revolve.inputs.user_code import (
 
 
 def find_genotype(
-    name: str, space: Space, params: Mapping[str, Any], source: str = "config"
+    name: str, space: Space, params: Mapping[str, object], source: str = "config"
 ) -> Genotype:
     """The genotype that a configuration names.
 

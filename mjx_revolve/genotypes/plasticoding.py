@@ -21,7 +21,7 @@ so that a rule can describe any body.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Unit
@@ -124,7 +124,7 @@ class PlasticodingSettings:
             raise ConstraintError("", "a number > 0 among add, delete and swap", "all of them 0")
 
 
-def make_plasticoding(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
+def make_plasticoding(space: Space, params: Mapping[str, object], place: str) -> Genotype[Grammar]:
     """Revolve's L-system: genomes are grammars.
 
     Args:
@@ -394,10 +394,10 @@ class _Plain:
 
     name: Text
     rules: dict[Text, TupleOf[Text]]
-    seed: dict[Text, Any] | None = None
+    seed: dict[Text, object] | None = None
 
 
-def _to_plain(grammar: Grammar) -> dict[str, Any]:
+def _to_plain(grammar: Grammar) -> dict[str, object]:
     return {
         "name": grammar.name,
         "rules": {letter: list(rule) for letter, rule in grammar.rules.items()},
@@ -405,7 +405,7 @@ def _to_plain(grammar: Grammar) -> dict[str, Any]:
     }
 
 
-def _read(plain: Any, names: Sequence[str], space: Space) -> Grammar:
+def _read(plain: object, names: Sequence[str], space: Space) -> Grammar:
     """A grammar from plain values, the inverse of `_to_plain`."""
     found = read(_Plain, plain, "genome")
     seed = None

@@ -6,12 +6,13 @@ joint stay with it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Annotated, Any
+from typing import Annotated, TypeVar
 
 import numpy as np
 from annotated_types import Unit
+from numpy.typing import ArrayLike
 
 from mjx_revolve.body.edits import (
     add_module,
@@ -31,6 +32,8 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import ConstraintError, NonNegative, checked, read
 
 _Rate = Annotated[NonNegative, Unit("-")]
+
+T = TypeVar("T")
 
 
 @checked
@@ -67,7 +70,7 @@ class TreeSettings:
             raise ConstraintError("", "a number > 0 among the mutations", "all of them 0")
 
 
-def make_tree(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
+def make_tree(space: Space, params: Mapping[str, object], place: str) -> Genotype[Morphology]:
     """The direct genotype: genomes are bodies.
 
     Args:
@@ -101,7 +104,7 @@ def make_tree(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
     )
 
 
-def _try(edit: Callable[..., Morphology | None], *arguments: Any) -> Morphology | None:
+def _try(edit: Callable[..., Morphology | None], *arguments: object) -> Morphology | None:
     """The result of an edit; None if it is invalid."""
     try:
         return edit(*arguments)
@@ -109,9 +112,9 @@ def _try(edit: Callable[..., Morphology | None], *arguments: Any) -> Morphology 
         return None
 
 
-def _pick(rng: np.random.Generator, things: Any) -> Any:
+def _pick(rng: np.random.Generator, things: Sequence[T]) -> T:
     """A random one of several things."""
-    return things[rng.integers(len(things))]
+    return things[int(rng.integers(len(things)))]
 
 
 def _turn(rng: np.random.Generator) -> float:
@@ -308,10 +311,10 @@ def _mirrored_slot(kind: ModuleType, slot: int, away: tuple[float, float, float]
     """The slot at the mirror image of another one; `away` is the mirror plane's normal."""
     normal = np.array(away)
 
-    def image(vector: Any) -> np.ndarray:
+    def image(vector: ArrayLike) -> np.ndarray:
         return np.array(vector) - 2 * (normal @ np.array(vector)) * normal
 
-    def pose(one: Slot, through: Callable[[Any], np.ndarray]) -> np.ndarray:
+    def pose(one: Slot, through: Callable[[ArrayLike], np.ndarray]) -> np.ndarray:
         return np.concatenate([through(one.position), through(one.direction), through(one.up)])
 
     wanted = pose(kind.slots[slot], image)
@@ -333,8 +336,7 @@ def _exchange(
         return None
     taken = _drawn(rng, a)
     if taken is None:
-        parent, slot = _pick(rng, free_slots(a))
-        return graft_subtree(a, parent, slot, b, given)
+        return graft_subtree(a, *_pick(rng, free_slots(a)), b, given)
     if a.num_modules - _size(a, taken) + _size(b, given) > space.max_modules:
         return None
     old = a.modules[taken]

@@ -13,7 +13,6 @@ import re
 import reprlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 # The longest value, without blanks or in quotes, that a message repeats [characters].
 _MAX_VALUE = 200
@@ -80,7 +79,7 @@ def note(text: str) -> None:
     logging.getLogger(__name__).warning("%s", plain(text))
 
 
-def show(value: Any) -> str:
+def show(value: object) -> str:
     """A value as a message shows it: short."""
     try:
         return _SHORT_REPR.repr(value)

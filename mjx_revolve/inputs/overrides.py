@@ -20,7 +20,7 @@ def copy_plain(value: Any) -> Any:
     return value
 
 
-def read_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> tuple[dict[str, Any], str]:
+def read_overrides(overrides: Mapping[str, object] | Sequence[str]) -> tuple[dict[str, Any], str]:
     """Values by dotted key, and the label of messages about them.
 
     Args:
@@ -83,7 +83,7 @@ def merge_override(
         here[leaf] = copy_plain(value)
 
 
-def sets(overrides: Mapping[str, Any], place: str) -> bool:
+def sets(overrides: Mapping[str, object], place: str) -> bool:
     """Whether overrides, by dotted key, set what is at a dotted place, or something in it."""
     for key, value in overrides.items():
         if f"{key}.".startswith(f"{place}."):

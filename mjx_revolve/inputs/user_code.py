@@ -14,10 +14,12 @@ import traceback
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.trust import audit
+
+T = TypeVar("T")
 
 # Longest message of another library in ours [characters].
 _MAX_MESSAGE = 200
@@ -35,7 +37,7 @@ class UserFunction(NamedTuple):
     function: str
 
 
-def parse_user_function(name: Any) -> UserFunction | None:
+def parse_user_function(name: object) -> UserFunction | None:
     """File and function of FILE.py:FUNCTION; None for anything else."""
     if not isinstance(name, str):
         return None
@@ -156,8 +158,8 @@ def explain(error: BaseException, path: str, expected: str) -> str:
 
 
 def call_user_function(
-    name: str, expected: str, function: Callable[..., Any], *arguments: Any
-) -> Any:
+    name: str, expected: str, function: Callable[..., T], *arguments: object
+) -> T:
     """Calls a user's function, or one that it made.
 
     Args:

@@ -12,8 +12,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from annotated_types import DocInfo, Ge, Gt, Le, Lt, Unit, doc
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
 
 from mjx_revolve.inputs.errors import ConstraintError, InputError, show
+
+Step = str | int  # of a dotted place: a key or an index
 
 
 def refuse(problems: Mapping[str, str], origin: Callable[[str], str] = lambda _: "") -> InputError:
@@ -35,7 +38,7 @@ _MAX_NAMES = 100
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 
-def find_problems(error: ValidationError, kind: Any, data: Any) -> dict[str, str]:
+def find_problems(error: ValidationError, kind: Any, data: object) -> dict[str, str]:
     """Pydantic's errors as "expected X; found Y" by place, the first of each.
 
     Args:
@@ -53,7 +56,7 @@ def find_problems(error: ValidationError, kind: Any, data: Any) -> dict[str, str
     return problems
 
 
-def _problem(error: Any, kind: Any, data: Any) -> tuple[str, str]:
+def _problem(error: ErrorDetails, kind: Any, data: Any) -> tuple[str, str]:
     """The place of an error, and "expected X; found Y"."""
     steps = list(error["loc"])
     names = list(fields_of(kind))
@@ -89,12 +92,12 @@ def _problem(error: Any, kind: Any, data: Any) -> tuple[str, str]:
     return join(*taken), f"expected {describe(annotation)}; found {text}"
 
 
-def join(*steps: Any) -> str:
+def join(*steps: object) -> str:
     """A dotted place from its steps, without empty ones."""
     return ".".join(str(step) for step in steps if step != "")
 
 
-def _look_up(data: Any, steps: list[Any], otherwise: Any) -> tuple[list[Any], Any]:
+def _look_up(data: Any, steps: list[Step], otherwise: object) -> tuple[list[Step], Any]:
     """The value at a place; the place ends early where a short form stands for the whole."""
     for i, step in enumerate(steps):
         if (
@@ -139,9 +142,9 @@ def _is_union(annotation: Any) -> bool:
     return get_origin(annotation) in (Union, types.UnionType)
 
 
-def _follow(annotation: Any, steps: Sequence[Any]) -> tuple[list[Any], Any]:
+def _follow(annotation: Any, steps: Sequence[Step]) -> tuple[list[Step], Any]:
     """As many steps as can be followed into a type, and the annotation there."""
-    taken: list[Any] = []
+    taken: list[Step] = []
     for step in steps:
         kind, metadata, _ = _open(annotation)
         fields, arguments = fields_of(kind), get_args(kind)
@@ -169,7 +172,7 @@ def _names(kind: Any, prefix: str = "") -> dict[str, str]:
     return found
 
 
-def _suggest(name: str, known: Sequence[str], place: Sequence[Any], root: Any) -> str:
+def _suggest(name: str, known: Sequence[str], place: Sequence[Step], root: Any) -> str:
     """The most similar known name: of a sibling, or of a field in another section."""
     for names in ({key: join(*place, key) for key in known}, _names(root)):
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)

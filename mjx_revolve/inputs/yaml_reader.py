@@ -39,7 +39,7 @@ class SafeLoader(yaml.SafeLoader):
 
     _depth = _count = 0
 
-    def fetch_flow_collection_start(self, token: Any) -> None:
+    def fetch_flow_collection_start(self, token: yaml.Token) -> None:
         """Scans a `[` or a `{`; PyYAML's time grows with the square of how many are open."""
         if self.flow_level > _MAX_DEPTH:
             raise _too_deep()
@@ -113,7 +113,7 @@ for _name in ("binary", "omap", "pairs", "set"):  # bytes, tuples and sets: no f
     SafeLoader.add_constructor(f"tag:yaml.org,2002:{_name}", _refuse_tag)
 
 
-def _check_size(data: Any) -> None:
+def _check_size(data: object) -> None:
     stack, count = [(data, 0)], 0
     while stack:
         item, depth = stack.pop()

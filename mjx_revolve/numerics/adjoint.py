@@ -10,17 +10,19 @@ like the step itself. It takes 3 times as long as the forward pass.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from mjx_revolve.numerics.xla import in_fused_calls, in_one_array, is_wide
 
+P = ParamSpec("P")
+R = TypeVar("R")
 
-def differentiate_as(
-    fun: Callable[..., Any], differentiated: Callable[..., Any]
-) -> Callable[..., Any]:
+
+def differentiate_as(fun: Callable[P, R], differentiated: Callable[P, R]) -> Callable[P, R]:
     """`fun`, but differentiated as another form of the same function.
 
     XLA takes minutes over the derivative of one long function, and seconds over many short ones.
@@ -28,15 +30,17 @@ def differentiate_as(
     called = jax.custom_jvp(fun)
 
     @called.defjvp
-    def _differentiate(primals: Any, tangents: Any) -> Any:
+    def _differentiate(primals: PyTree, tangents: PyTree) -> PyTree:
         return jax.jvp(differentiated, primals, tangents)
 
     return called
 
 
 def fused_back(
-    step: Callable[[Any, Any, Any], Any], carry: Any, row: Any, offset: jax.Array
-) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any, Any], tuple[Any, jax.Array]]]:
+    step: Callable[[PyTree, PyTree, PyTree], PyTree], carry: PyTree, row: PyTree, offset: jax.Array
+) -> tuple[
+    Callable[[PyTree, PyTree], PyTree], Callable[[PyTree, PyTree, PyTree], tuple[PyTree, jax.Array]]
+]:
     """The forward and the backward step of a loop that is differentiated.
 
     Args:
@@ -56,10 +60,10 @@ def fused_back(
     wide = [is_wide(x) for x in jax.tree.leaves(carry)]
     none = jnp.zeros_like(offset)
 
-    def spread(carry: Any) -> list[jax.Array]:
+    def spread(carry: PyTree) -> list[jax.Array]:
         return [x for x, w in zip(jax.tree.leaves(carry), wide, strict=True) if w]
 
-    def back(gradient: Any, carry: Any, row: Any) -> Any:
+    def back(gradient: PyTree, carry: PyTree, row: PyTree) -> PyTree:
         leaves, tree = jax.tree.flatten(carry)
 
         def run(values: list[jax.Array], offset: jax.Array) -> list[jax.Array]:

@@ -13,7 +13,7 @@ vectors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -116,7 +116,7 @@ def box_axes(pair: BoxPair, parallel: float = _PARALLEL) -> BoxAxes:
     return BoxAxes(tuple(offset), tuple(reach))
 
 
-def weight(condition: Any, like: Scalar) -> Scalar:
+def weight(condition: Scalar, like: Scalar) -> Scalar:
     """1 where a condition holds, else 0, of the type of another number."""
     xp = namespace(like)
     return xp.where(condition, 1.0, 0.0).astype(like.dtype)

@@ -21,6 +21,7 @@ from typing import Any
 import jax
 from jax import monitoring
 from jax.experimental import serialize_executable
+from jaxtyping import PyTree
 
 from mjx_revolve.numerics import runtime
 from mjx_revolve.numerics.xla import fuses, jit, on_cpu
@@ -35,7 +36,7 @@ _log = logging.getLogger(__name__)
 class StoredProgram:
     """`xla.jit` of a function with its executables kept beside JAX's compilation cache."""
 
-    def __init__(self, fun: Callable[..., Any], made_of: Any) -> None:
+    def __init__(self, fun: Callable[..., PyTree], made_of: object) -> None:
         """Compiles nothing yet.
 
         Args:
@@ -47,7 +48,7 @@ class StoredProgram:
         self._made_of = made_of
         self._found: dict[Any, Any] = {}
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """Calls it."""
         folder = runtime.program_folder()
         if self._made_of is None or folder is None or not on_cpu():
@@ -64,13 +65,13 @@ class StoredProgram:
         """Number of executables, one for each signature of the arguments."""
         return len(self._found) + self._jitted._cache_size()
 
-    def _name(self, *signature: Any) -> str:
+    def _name(self, *signature: object) -> str:
         config: Any = jax.config
         precision = config.jax_enable_x64, config.jax_default_matmul_precision
         host = runtime.host_key(), precision, fuses(), os.environ.get("XLA_FLAGS")
         return hashlib.sha256(pickle.dumps((self._made_of, signature, host))).hexdigest()[:32]
 
-    def _compile(self, path: Path, args: Any) -> Any:
+    def _compile(self, path: Path, args: PyTree) -> Any:
         with runtime.compile_lock("program", path.name):
             if (found := _load(path, jax.tree.structure((args, {})))) is not None:
                 return found  # another process has compiled it meanwhile
@@ -108,7 +109,7 @@ def _keep(path: Path, made: Any) -> None:
             beside.unlink(missing_ok=True)
 
 
-def _load(path: Path, tree: Any) -> Any:
+def _load(path: Path, tree: PyTree) -> Any:
     """The program of a file; None if it is missing or damaged."""
     try:
         data = path.read_bytes()

@@ -310,7 +310,7 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def describe_process() -> dict[str, Any]:
+def describe_process() -> dict[str, object]:
     """The command, and all that the bits of a run depend on: for `run.json`. Imports JAX.
 
     Returns:

@@ -10,6 +10,7 @@ that an axis-aligned robot pays nothing for rotations that it does not have.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -114,17 +115,17 @@ def cross(a: Vec, b: Vec) -> Vec:
     )
 
 
-def vadd(a: Any, b: Any) -> Any:
+def vadd(a: Iterable[Scalar], b: Iterable[Scalar]) -> Vec:
     """A + b, component by component."""
     return tuple(add(x, y) for x, y in zip(a, b, strict=True))
 
 
-def vsub(a: Any, b: Any) -> Any:
+def vsub(a: Iterable[Scalar], b: Iterable[Scalar]) -> Vec:
     """A - b, component by component."""
     return tuple(sub(x, y) for x, y in zip(a, b, strict=True))
 
 
-def vscale(s: Scalar, a: Any) -> Any:
+def vscale(s: Scalar, a: Iterable[Scalar]) -> Vec:
     """S a, component by component."""
     return tuple(mul(s, x) for x in a)
 

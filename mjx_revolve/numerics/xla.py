@@ -17,8 +17,8 @@ notices if they lose their effect). Results do not depend on them, but for the l
 
 Other layers use `fuse_step`, `fuse` and `materialize`, all identities to JAX: jit, vmap and grad go
 through them. They do nothing on other back ends, nor with the environment variable
-`MJX_REVOLVE_FUSE=0`: the results are the same, but slower. So an error in XLA can be distinguished from one
-in this package.
+`MJX_REVOLVE_FUSE=0`: the results are the same, but slower. So an error in XLA can be distinguished
+from one in this package.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, TypeVarTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import PyTree
 
 from mjx_revolve.numerics.runtime import LANES as LANES
 
@@ -65,6 +66,9 @@ _VIEWS = {
 _COST |= dict.fromkeys(_VIEWS, 0)
 _LOOPS = {"cond", "scan", "while"}
 
+Ts = TypeVarTuple("Ts")
+R = TypeVar("R")
+
 
 def on_cpu() -> bool:
     """Whether JAX's default back end is the CPU."""
@@ -91,12 +95,12 @@ def compiler_options(fast: bool = False) -> dict[str, Any] | None:
     return {"xla_cpu_prefer_vector_width": 512}
 
 
-def jit(fun: Callable[..., Any], fast: bool = False, **settings: Any) -> Any:
+def jit(fun: Callable[..., PyTree], fast: bool = False, **settings: Any) -> Any:
     """`jax.jit` with `compiler_options`; JAX accepts those on the outermost jit only."""
     return jax.jit(fun, compiler_options=compiler_options(fast), **settings)
 
 
-def is_traced(*args: Any) -> bool:
+def is_traced(*args: PyTree) -> bool:
     """Whether arguments are traced: they belong to an outer program with its own options."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(args))
 
@@ -135,7 +139,7 @@ def materialize(x: jax.Array) -> jax.Array:
     return materialize_p.bind(x) if fuses() else x
 
 
-def fuse(fun: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:
+def fuse(fun: Callable[[*Ts], R], inline: bool = False) -> Callable[[*Ts], R]:
     """The same function, with each intermediate value computed once by XLA.
 
     Args:
@@ -145,14 +149,17 @@ def fuse(fun: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:
     Returns:
         The same function.
     """
-    shared = lambda *args: Graph(fun, args)(*args) if fuses() else fun(*args)  # noqa: E731
+
+    def shared(*args: *Ts) -> R:
+        return Graph(fun, args)(*args) if fuses() else fun(*args)
+
     return shared if inline else fuse_call(shared)
 
 
-def fuse_call(fun: Callable[..., Any]) -> Callable[..., Any]:
+def fuse_call(fun: Callable[[*Ts], R]) -> Callable[[*Ts], R]:
     """The same function (element-wise but for loops), compiled by XLA:CPU into one call."""
 
-    def called(*args: Any) -> Any:
+    def called(*args: *Ts) -> R:
         return jax.tree.map(
             lambda x: set_xla_metadata(x, inlineable="false", xla_cpu_small_call="true"),
             jax.jit(fun)(*args),
@@ -178,7 +185,7 @@ class Graph:
         size: number of stored values.
     """
 
-    def __init__(self, fun: Callable[..., Any], examples: Any) -> None:
+    def __init__(self, fun: Callable[..., PyTree], examples: PyTree) -> None:
         """Traces `fun` (of pytrees of arrays) on arguments like `examples`."""
         closed, shapes = jax.make_jaxpr(fun, return_shape=True)(*examples)
         self._structure = jax.tree.structure(shapes)
@@ -193,13 +200,15 @@ class Graph:
         self._stored = self._choose()
         self.size = len(self._stored)
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """Computes the function."""
         values = self._constants | dict(zip(self._arguments, jax.tree.leaves(args), strict=True))
         self._compute(self._operations, values)
         return self._finish(values)
 
-    def in_pieces(self, size: int, pack: Callable[[Any], Any], unpack: Callable[..., Any]) -> Any:
+    def in_pieces(
+        self, size: int, pack: Callable[[PyTree], PyTree], unpack: Callable[..., PyTree]
+    ) -> Any:
         """The function cut into pieces, each compiled by `fuse_call`.
 
         XLA's time for a function grows faster than its length, and pieces compile in parallel.
@@ -223,7 +232,7 @@ class Graph:
         cuts = [self._cut(k, own[k] if k < count - 1 else ends, piece, made) for k in range(count)]
         read = {v for _, inputs in cuts for v in inputs}
 
-        def run(*args: Any) -> Any:
+        def run(*args: PyTree) -> PyTree:
             values: dict[int, Any] = {}
             leaves, tree = jax.tree.flatten(args)
             for number, (operations, inputs) in enumerate(cuts):
@@ -238,7 +247,7 @@ class Graph:
                 )
 
                 def compute(
-                    given: Any, *xs: Any, cut: Any = (operations, inputs, outputs, last, used)
+                    given: PyTree, *xs: Any, cut: Any = (operations, inputs, outputs, last, used)
                 ) -> Any:
                     operations, inputs, outputs, last, used = cut
                     local = self._constants | dict(zip(inputs, xs, strict=True))
@@ -351,11 +360,11 @@ class Graph:
             for v, x in zip(op.outputs, out, strict=True):
                 values[v] = materialize_p.bind(x) if self._stored.get(v) else x
 
-    def _finish(self, values: dict[int, Any]) -> Any:
+    def _finish(self, values: dict[int, Any]) -> PyTree:
         return jax.tree.unflatten(self._structure, [_value(values, v) for v in self._results])
 
 
-def _used_inputs(fun: Callable[..., Any], args: list[Any], wanted: list[bool]) -> list[bool]:
+def _used_inputs(fun: Callable[..., PyTree], args: list[Any], wanted: list[bool]) -> list[bool]:
     """Which arguments of a function its wanted results depend on."""
     jaxpr = jax.make_jaxpr(fun)(*args).jaxpr
     ends = (v for v, w in zip(jaxpr.outvars, wanted, strict=True) if w)
@@ -385,7 +394,9 @@ def take_lanes(x: jax.Array, which: jax.Array) -> jax.Array:
     return jax.lax.gather(x, which[:, None], dims, (*x.shape[:-1], 1), mode=mode)
 
 
-def fuse_step(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any) -> Any:
+def fuse_step(
+    step: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], carry: PyTree, row: PyTree
+) -> Any:
     """The fastest form of a loop's step over a chunk of a population.
 
     A step becomes one function, or several if it is long; XLA's loop calls them. The carry is
@@ -412,7 +423,7 @@ def fuse_step(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any)
     return fused, pack, unpack
 
 
-def _piece_size(examples: Any) -> int:
+def _piece_size(examples: PyTree) -> int:
     lanes = max((x.shape[-1] for x in jax.tree.leaves(examples) if jnp.ndim(x)), default=1)
     return _PIECE if lanes > 1 else _PIECE_OF_ONE
 
@@ -422,7 +433,7 @@ def is_wide(x: jax.Array) -> bool:
     return x.ndim > 0 and bool(jnp.issubdtype(x.dtype, jnp.floating))
 
 
-def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+def in_one_array(carry: PyTree) -> tuple[Callable[[PyTree], PyTree], Callable[[PyTree], PyTree]]:
     """Functions that pack what a loop carries.
 
     Args:
@@ -436,12 +447,12 @@ def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]
     wide = [is_wide(x) for x in leaves]
     rows = np.cumsum([0] + [x.size // x.shape[-1] for x, w in zip(leaves, wide, strict=True) if w])
 
-    def pack(carry: Any) -> Any:
+    def pack(carry: PyTree) -> PyTree:
         leaves = jax.tree.leaves(carry)
         blocks = [x.reshape(-1, x.shape[-1]) for x in leaves if is_wide(x)]
         return jnp.concatenate(blocks), [x for x in leaves if not is_wide(x)]
 
-    def unpack(packed: Any) -> Any:
+    def unpack(packed: PyTree) -> PyTree:
         block, others = packed[0], iter(packed[1])
         slices = (block[a:b] for a, b in itertools.pairwise(rows))
         found = [
@@ -454,8 +465,11 @@ def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]
 
 
 def in_fused_calls(
-    fun: Callable[..., Any], examples: Any, pack: Callable[[Any], Any], unpack: Callable[..., Any]
-) -> Callable[..., Any]:
+    fun: Callable[..., PyTree],
+    examples: PyTree,
+    pack: Callable[[PyTree], PyTree],
+    unpack: Callable[..., PyTree],
+) -> Callable[..., PyTree]:
     """A function of packed arguments and results, as a few calls of compiled pieces.
 
     Args:
@@ -473,7 +487,7 @@ def in_fused_calls(
     return found
 
 
-def over_chunks(fun: Callable[..., Any], lanes: int | None = None) -> Callable[..., Any]:
+def over_chunks(fun: Callable[[*Ts], R], lanes: int | None = None) -> Callable[[*Ts], R]:
     """Runs `fun` over the population in chunks of equal shape.
 
     The chunk's shape is fixed and the last one is padded with copies of the first individual, so an
@@ -487,7 +501,7 @@ def over_chunks(fun: Callable[..., Any], lanes: int | None = None) -> Callable[.
         The same function for any population size.
     """
 
-    def chunked(*args: Any) -> Any:
+    def chunked(*args: *Ts) -> R:
         population = jax.tree.leaves(args)[0].shape[-1]
         size = lanes or (LANES if on_cpu() else population)
         count = -(-population // size)

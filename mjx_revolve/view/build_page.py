@@ -205,7 +205,7 @@ def ballast_words(balance: Balance) -> list[str]:
     return found
 
 
-def joint_rows(robot: Robot) -> list[dict[str, Any]]:
+def joint_rows(robot: Robot) -> list[dict[str, object]]:
     """The hinges in the order of the controller's commands, and how they turn."""
     body, rows = robot.morphology, []
     joints = {link.joint.ctrl: link.joint for link in make_links(robot) if link.joint is not None}
@@ -224,7 +224,7 @@ def joint_rows(robot: Robot) -> list[dict[str, Any]]:
     return rows
 
 
-def _thruster_rows(robot: Robot) -> list[dict[str, Any]]:
+def _thruster_rows(robot: Robot) -> list[dict[str, object]]:
     """The thrusters, behind the hinges in the order of the controller's commands."""
     low, high, place, axis = (x[robot.num_hinges :] for x in read_actuators([robot.morphology]))
     return [
@@ -323,7 +323,7 @@ def _draw(scene: Scene, whole: Scene, view: np.ndarray) -> str:
     return _source(buffer.getvalue(), "image/png")
 
 
-def _stl_files(body: Morphology) -> list[dict[str, Any]]:
+def _stl_files(body: Morphology) -> list[dict[str, object]]:
     """The parts' shapes in millimetres, as downloads."""
     found = []
     for name, mesh in make_meshes(body).items():

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
@@ -148,6 +149,6 @@ def _no_arrows(why: str | None = None) -> Packed:
     }
 
 
-def _first(value: Any) -> float:
+def _first(value: ArrayLike) -> float:
     """A number, or the first of its rows."""
     return float(np.ravel(np.asarray(value, float))[0])

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.kinematics import mass_centers
 from mjx_revolve.engine.plant import body_geometry
@@ -217,9 +218,9 @@ def counted_time(task: TaskConfig, timestep: float) -> float:
     return sample_rows(task, timestep)[0] * timestep * (1 + first_scored_row(task, timestep))
 
 
-def count_finite(values: Any) -> int:
+def count_finite(values: ArrayLike) -> int:
     """How many rows `[T, n]` there are before the first that is not finite."""
-    finite = np.isfinite(values).all(axis=1)
+    finite = np.isfinite(np.asarray(values)).all(axis=1)
     return len(finite) if finite.all() else int(finite.argmin())
 
 

@@ -13,12 +13,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
+from mjx_revolve.view.page_data import Packed
 from mjx_revolve.view.palette import page_palette
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ def write_colony_page(
     return PageSummary(len(content), poses, gap)
 
 
-def fill_page(template: str, **values: Any) -> str:
+def fill_page(template: str, **values: object) -> str:
     """A page of `viewer_page/`, with all files that it needs inside.
 
     Args:
@@ -173,7 +174,7 @@ def _episode_subtitle(episode: Episode) -> str:
 
 def _fit(
     robots: Sequence[ReplayRobot], window: tuple[float, float] | None, room: int
-) -> tuple[int, float, dict[str, Any]]:
+) -> tuple[int, float, Packed]:
     """As many poses as fit into so many bytes: how many, how far apart [s], and packed."""
     from mjx_revolve.view.page_data import pack_poses
 

@@ -116,7 +116,7 @@ def _make_rings(film: Film, notes: ColonyNotes) -> _Dots:
     distance = film.shots.distance
 
     def draw(picture: np.ndarray, depth: np.ndarray, frame: int) -> None:
-        def ring(middle: Any, radius: float, alpha: float, color: RGB) -> None:
+        def ring(middle: np.ndarray | RGB, radius: float, alpha: float, color: RGB) -> None:
             count = max(12, round(2 * math.pi * radius / (_SPACE * distance)))
             angle = 2 * np.pi * np.arange(count) / count
             points = middle + radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.numerics.spatial import sincos
+from mjx_revolve.numerics.spatial import Scalar, Vec, sincos
 from mjx_revolve.view.film.camera import FOVY
 from mjx_revolve.view.film.stage import BACKGROUND
 from mjx_revolve.view.palette import SKY_HIGH, SKY_LOW, SUN, WATER_AHEAD, WATER_DOWN, WATER_UP
@@ -62,17 +62,17 @@ class _View(NamedTuple):
     position: jax.Array  # [3] of the camera [m]
     ray: jax.Array  # [height, width, 3] unit vectors
 
-    def along(self, s: Any) -> tuple[Any, Any, Any]:
+    def along(self, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """x, y and z of the points at distances along the rays [m]."""
         x, y, z = (self.position[i] + s * self.ray[..., i] for i in range(3))
         return x, y, z
 
-    def depth(self, z: Any) -> Any:
+    def depth(self, z: jax.Array) -> jax.Array:
         """Below the still surface [m]."""
         return self.water.surface_height - z
 
     @property
-    def own_light(self) -> Any:
+    def own_light(self) -> jax.Array:
         """Daylight where the camera is."""
         return daylight(self.depth(self.position[2]))
 
@@ -124,7 +124,7 @@ def make_shader(
     return shader
 
 
-def _soften(color: Any, depth: Any) -> Any:
+def _soften(color: jax.Array, depth: jax.Array) -> jax.Array:
     """Mixes pixels with their neighbours across hard edges on one face: MuJoCo's shadows."""
     sides = [jnp.roll(color, step, axis) for axis in (0, 1) for step in (1, -1)]
     depths = [jnp.roll(depth, step, axis) for axis in (0, 1) for step in (1, -1)]
@@ -141,19 +141,19 @@ def _soften(color: Any, depth: Any) -> Any:
     return color + share * (mean - color)
 
 
-def _to_light(color: Any) -> Any:
+def _to_light(color: jax.Array | np.ndarray) -> jax.Array:
     """Screen colours to linear light; a square is close to sRGB's curve and quick."""
-    return color * color
+    return jnp.square(color)
 
 
-def _to_screen(light: Any) -> Any:
+def _to_screen(light: jax.Array) -> jax.Array:
     """Linear light to screen colours; too bright colours fade to white."""
     light = jnp.maximum(light, 0.0)
     over = jnp.maximum(light - 1.0, 0.0).mean(-1, keepdims=True)
     return jnp.sqrt(jnp.clip(light + 0.5 * over, 0.0, 1.0))
 
 
-def open_water(up: Any) -> Any:
+def open_water(up: jax.Array) -> jax.Array:
     """Light of water without end, `[..., 3]`, by the sine of the angle at which one looks up."""
     up = jnp.asarray(up)[..., None]
     rising = 1 - jnp.exp(-1.6 * jnp.maximum(up, 0.0))
@@ -162,13 +162,13 @@ def open_water(up: Any) -> Any:
     return ahead + (top - ahead) * rising + (low - ahead) * falling
 
 
-def daylight(depth: Any) -> Any:
+def daylight(depth: jax.Array) -> jax.Array:
     """Share of the light that reaches a depth below the surface [m], `[..., 3]`; 1 above it."""
     left = jnp.exp(-_FADING * jnp.maximum(jnp.asarray(depth), 0.0)[..., None])
     return _LEAST_LIGHT + (1 - _LEAST_LIGHT) * left
 
 
-def transmission(path: Any, distance: float) -> Any:
+def transmission(path: jax.Array, distance: float) -> jax.Array:
     """Share of light, `[..., 3]`, that passes through water of a length [m].
 
     Less of it is lost close to the camera than Beer and Lambert would have it, so that the robot
@@ -180,9 +180,11 @@ def transmission(path: Any, distance: float) -> Any:
     return jnp.exp(-_LOSS * (0.27 * path + beyond)[..., None])
 
 
-def _ripples(distance: float, gravity: float, time: Any, x: Any, y: Any) -> tuple[Any, ...]:
-    """Slopes of the ripples, and the second derivatives xx, xy, yy of their height."""
-    total: list[Any] = [0.0] * 5
+def _ripples(
+    distance: float, gravity: float, time: jax.Array, x: jax.Array, y: jax.Array
+) -> tuple[Vec, Vec]:
+    """Gradient of the ripples, and the second derivatives xx, xy, yy of their height."""
+    total: list[Scalar] = [0.0] * 5
     for share, angle, steep, phase in _RIPPLES:
         k = 2 * math.pi / (share * distance)
         # They run as waves do, but no faster than the eye can follow around a small robot.
@@ -195,7 +197,9 @@ def _ripples(distance: float, gravity: float, time: Any, x: Any, y: Any) -> tupl
     return tuple(total[:2]), tuple(total[2:])
 
 
-def bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> Any:
+def bright_lines(
+    distance: float, gravity: float, time: jax.Array, x: jax.Array, y: jax.Array
+) -> jax.Array:
     """Brightness, about 1 on average, of sunlight that ripples have gathered into lines.
 
     Rays that a surface of height h bends land at x + f ∇h, so light is denser by 1 / |det(1 + f
@@ -207,14 +211,14 @@ def bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> 
     return jnp.minimum(1.0 / (jnp.abs(density) + 0.22), 4.0) * 0.95
 
 
-def _meet_surface(view: _View, most: float) -> tuple[Any, Any]:
+def _meet_surface(view: _View, most: float) -> tuple[jax.Array, Vec]:
     """Distance at which rays meet the surface, infinite beyond `most`, and its gradient there."""
     world, water = view.world, view.water
     still, up = view.depth(view.position[2]), view.ray[..., 2]
     towards = up * still > 0
     safe = jnp.where(towards, up, 1.0)
     s = jnp.clip(still / safe, 0.0, most)
-    gradient: Any = (0.0, 0.0)
+    gradient: Vec = (0.0, 0.0)
     if any(wave.amplitude > 0 for wave in world.waves):
         for _ in range(3):
             x, y, _ = view.along(s)
@@ -223,7 +227,7 @@ def _meet_surface(view: _View, most: float) -> tuple[Any, Any]:
     return jnp.where(towards & (s < most), s, jnp.inf), gradient
 
 
-def _surface_normal(view: _View, near: Any, gradient: Any, rough: float) -> Any:
+def _surface_normal(view: _View, near: jax.Array, gradient: Vec, rough: float) -> jax.Array:
     """Upward unit normal of the surface at distances along the rays, with waves and ripples.
 
     Both are left out where a pixel covers more than they are long, or they would glitter.
@@ -242,7 +246,7 @@ def _surface_normal(view: _View, near: Any, gradient: Any, rough: float) -> Any:
     return jnp.stack([-dx * size, -dy * size, size], axis=-1)
 
 
-def _facing_up(view: _View, far: Any) -> Any:
+def _facing_up(view: _View, far: jax.Array) -> jax.Array:
     """How far the faces that are seen look up, from the distances of neighbouring pixels."""
     place = jnp.minimum(far, 1e3)[..., None] * view.ray
     right = jnp.diff(place, axis=1, append=place[:, -1:])
@@ -251,18 +255,20 @@ def _facing_up(view: _View, far: Any) -> Any:
     return normal[..., 2] * jax.lax.rsqrt((normal**2).sum(-1) + 1e-20)
 
 
-def _step(value: Any, low: float, high: float) -> Any:
+def _step(value: jax.Array, low: float, high: float) -> jax.Array:
     """0 below low, 1 above high, smooth between."""
     value = jnp.clip((value - low) / (high - low), 0.0, 1.0)
     return value * value * (3 - 2 * value)
 
 
-def _under_sun(view: _View, x: Any, y: Any, depth: Any) -> tuple[Any, Any]:
+def _under_sun(
+    view: _View, x: jax.Array, y: jax.Array, depth: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Where the sunlight on points at a depth has entered through the surface."""
     return x + depth * SUN[0] / SUN[2], y + depth * SUN[1] / SUN[2]
 
 
-def _sunlit(view: _View, far: Any) -> Any:
+def _sunlit(view: _View, far: jax.Array) -> jax.Array:
     """Light on objects under water, relative to MuJoCo's own lighting."""
     x, y, z = view.along(jnp.minimum(far, 1e3))
     depth = view.depth(z)
@@ -273,7 +279,7 @@ def _sunlit(view: _View, far: Any) -> Any:
     return daylight(depth) * (1 + share * (lines - 1))[..., None]
 
 
-def _in_water(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
+def _in_water(view: _View, scene: jax.Array, far: jax.Array) -> tuple[jax.Array, float]:
     """Colours seen by a camera in the water, and the visibility of edges."""
     ahead = open_water(view.ray[..., 2]) * view.own_light
     s, gradient = _meet_surface(view, _HORIZON * view.distance)
@@ -286,7 +292,7 @@ def _in_water(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
     return picture + _shafts(view, jnp.minimum(far, s)) * view.own_light, 1.0
 
 
-def _ceiling(view: _View, s: Any, gradient: Any, ahead: Any) -> Any:
+def _ceiling(view: _View, s: jax.Array, gradient: Vec, ahead: jax.Array) -> jax.Array:
     """The surface from below: a bright window where light gets in, elsewhere a mirror."""
     near = jnp.minimum(s, _HORIZON * view.distance)
     normal = _surface_normal(view, near, gradient, 1.6)
@@ -302,19 +308,19 @@ def _ceiling(view: _View, s: Any, gradient: Any, ahead: Any) -> Any:
     return jnp.where(jnp.isfinite(s)[..., None], seen * through + ahead * (1 - through), ahead)
 
 
-def _shafts(view: _View, far: Any) -> Any:
+def _shafts(view: _View, far: jax.Array) -> jax.Array:
     """Light that the water scatters out of the sun's beams, on a coarse grid of rays."""
     half, distance = _COARSE // 2, view.distance
     some = view._replace(ray=view.ray[half::_COARSE, half::_COARSE])
     reach = jnp.minimum(far[half::_COARSE, half::_COARSE], 6 * distance)
-    total: Any = 0.0
+    total: Scalar = 0.0
     for j in range(_SAMPLES):
         s = reach * (j + 0.5) / _SAMPLES
         x, y, z = some.along(s)
         depth = view.depth(z)
         x, y = _under_sun(view, x, y, depth)
         # Wide and slow: what is left of the lines after a way through the water.
-        beam: Any = 0.0
+        beam: Scalar = 0.0
         for k, angle, rate in _BEAMS:
             turn = k / distance * (math.cos(angle) * x + math.sin(angle) * y)
             beam = beam + jnp.sin(turn + rate * view.water.time + 1.7 * k)
@@ -325,13 +331,13 @@ def _shafts(view: _View, far: Any) -> Any:
     return _SHAFTS * fine[..., None] * _to_light(_SHINE)
 
 
-def _sky(up: Any) -> Any:
+def _sky(up: jax.Array) -> jax.Array:
     """The sky, by the sine of the angle at which one looks up."""
     low, high = _to_light(_SKY), _to_light(_ZENITH)
     return low + (high - low) * (1 - jnp.exp(-3.0 * jnp.clip(up, 0.0, 1.0)))[..., None]
 
 
-def _from_air(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
+def _from_air(view: _View, scene: jax.Array, far: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Colours seen by a camera in the air, and the visibility of edges."""
     distance, most = view.distance, 400 * view.distance
     s, gradient = _meet_surface(view, most)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Annotated, Any
+from typing import Annotated
 
 from annotated_types import Ge, Le, Unit
 
@@ -83,13 +83,13 @@ class Reset:
 
 
 Command = Drop | Remove | Current | Pause | Rate | Reset
-_COMMANDS: dict[str, Any] = {
+_COMMANDS: dict[str, type] = {
     "drop": Drop, "remove": Remove, "current": Current, "pause": Pause, "rate": Rate,
     "reset": Reset,
 }  # fmt: skip
 
 
-def read_command(data: Any) -> Command:
+def read_command(data: object) -> Command:
     """Reads what a page has posted.
 
     Args:

@@ -15,7 +15,7 @@ from concurrent.futures import TimeoutError as NotYet
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, NoReturn
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.live.commands import read_command
@@ -93,7 +93,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _MAX_SILENCE
     server_version, sys_version = "mjx_revolve", ""
 
-    def log_message(self, format: str, *args: Any) -> None:
+    def log_message(self, format: str, *args: object) -> None:
         """Logs no requests."""
 
     def do_GET(self) -> None:
@@ -202,5 +202,5 @@ def _read_json(text: bytes) -> Any:
         raise InputError(f"expected JSON; found none: {reason}") from None
 
 
-def _refuse_constant(name: str) -> Any:
+def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no number of JSON")

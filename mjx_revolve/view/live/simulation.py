@@ -14,11 +14,11 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -129,7 +129,7 @@ class LiveSimulation:
         self._speed = 0.0  # the rate that is kept up [-]
         self._slice_since: float | None = None  # when the present slice began
         self._stopped = threading.Event()
-        self._commands: queue.Queue[tuple[Command, Future[Any]]] = queue.Queue()
+        self._commands: queue.Queue[tuple[Command, Future[int | None]]] = queue.Queue()
         self._listeners: list[queue.Queue[str | None]] = []
         self._lock = threading.Lock()
         self._count = 0  # of all robots that were ever dropped
@@ -138,7 +138,7 @@ class LiveSimulation:
 
     # ------------------------------------------------------------------ from any thread
 
-    def ask(self, command: Command) -> Future[Any]:
+    def ask(self, command: Command) -> Future[int | None]:
         """Queues a command.
 
         Args:
@@ -147,7 +147,7 @@ class LiveSimulation:
         Returns:
             Of a `Drop` the robot's key, of others None; or an `InputError`.
         """
-        future: Future[Any] = Future()
+        future: Future[int | None] = Future()
         self._commands.put((command, future))
         return future
 
@@ -411,7 +411,7 @@ class LiveSimulation:
         )
 
 
-def _poses_event(times: Any, rows: dict[int, np.ndarray]) -> str:
+def _poses_event(times: Iterable[float], rows: dict[int, np.ndarray]) -> str:
     """Poses `[T, width]` by key, at times `[T]` [s]."""
     numbers = np.concatenate([x.ravel() for x in rows.values()]) if rows else np.zeros(0)
     return _event(
@@ -425,6 +425,6 @@ def _poses_event(times: Any, rows: dict[int, np.ndarray]) -> str:
     )
 
 
-def _event(name: str, data: Any) -> str:
+def _event(name: str, data: object) -> str:
     """A server-sent event."""
     return f"event: {name}\ndata: {json.dumps(data, separators=(',', ':'), allow_nan=False)}\n\n"

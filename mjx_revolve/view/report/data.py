@@ -118,10 +118,10 @@ def _read_info(record: RunRecord) -> None:
 
 
 def _split_unknown(
-    data: Mapping[str, Any], model: type[BaseModel] = Config, prefix: str = ""
-) -> tuple[dict[str, Any], list[str]]:
+    data: Mapping[str, object], model: type[BaseModel] = Config, prefix: str = ""
+) -> tuple[dict[str, object], list[str]]:
     """Settings of this version, and the names of all others."""
-    known: dict[str, Any] = {}
+    known: dict[str, object] = {}
     unknown: list[str] = []
     for key, value in data.items():
         if key not in model.model_fields:

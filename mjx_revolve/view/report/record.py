@@ -183,7 +183,7 @@ class RunRecord:
         return f"{self.label}: {self.state}: {'; '.join(p.text for p in self.problems)}"
 
 
-def number(value: Any) -> float | None:
+def number(value: object) -> float | None:
     """A finite number as a float; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
