@@ -55,7 +55,7 @@ _OFTEN = 0.99
 
 # What is required. All are choices, with these reasons.
 KEPT = 0.8
-"""Least share of the score that is left over 30 and 120 s: who turns or rises loses all of it."""
+"""Least share of the score over 30 and 120 s: a robot that turns or rises loses all of it."""
 STEP = 0.1
 """Largest change of the score at half and a quarter of the step, as a share of it or of what the
 brain adds to it, whichever is more: half of what two measurements of one real robot differ by."""
