@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BeforeValidator
 from mjx_revolve.body.servo import EFFORT, REACH, SPEED
 from mjx_revolve.inputs.schema import (
     ConstraintError,
+    Id,
     NonNegative,
     Number,
     Positive,
@@ -150,13 +151,7 @@ def _read_range(value: object) -> object:
     return as_tuple(value)
 
 
-@also({"type": "integer"})
-def _read_id(value: object) -> object:
-    """Names in YAML may be numbers."""
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
-_Id = Annotated[Text, BeforeValidator(_read_id), MinLen(1), words("a name")]
+_Id = Annotated[Id, MinLen(1)]
 _Limits = Annotated[
     tuple[Number, Number],
     BeforeValidator(_read_range),

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.plant import Plant
@@ -23,7 +24,7 @@ UNITS: dict[str, str] = {
 """The keys of `describe_gait` in order, with units."""
 
 
-def describe_gait(plant: Plant, settings: Any, genes: Any) -> dict[str, float]:
+def describe_gait(plant: Plant, settings: Any, genes: ArrayLike) -> dict[str, float]:
     """Periods, phases and amplitudes of the hinges' targets, after Revolve's brain descriptors.
 
     Revolve (`measure_brain.py`) takes medians, over the parameters' ranges, and squashed standard

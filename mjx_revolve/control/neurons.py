@@ -37,13 +37,13 @@ from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import (
     ConstraintError,
+    Id,
     Number,
     Positive,
     Text,
     TupleOf,
     checked,
     read,
-    words,
 )
 from mjx_revolve.numerics.spatial import sincos
 
@@ -65,14 +65,6 @@ _PERIODS = 4.0
 _CELLS, _INERTIAL = 2, 6  # inputs of a touch sensor, and of the core
 
 
-def _read_id(value: Any) -> Any:
-    """Names in YAML may be numbers."""
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
-_Id = Annotated[Text, BeforeValidator(_read_id), words("a name")]
-
-
 @checked
 class Neuron:
     """A neuron of a file.
@@ -84,10 +76,10 @@ class Neuron:
         part_id: the module that it belongs to; hidden ones need none.
     """
 
-    id: _Id
+    id: Id
     layer: Literal["input", "hidden", "output"]
     type: Literal["Input", "Simple", "Sigmoid", "Oscillator"]
-    part_id: _Id | None = None
+    part_id: Id | None = None
 
     def __post_init__(self) -> None:
         """Checks that the type fits the layer."""
@@ -100,8 +92,8 @@ class Neuron:
 class Synapse:
     """A connection of a file."""
 
-    src: _Id
-    dst: _Id
+    src: Id
+    dst: Id
     weight: Number
 
 
@@ -127,7 +119,7 @@ class _File:
 
     neurons: Annotated[TupleOf[Neuron], BeforeValidator(_as_list)]
     connections: Annotated[TupleOf[Synapse], _OrNone] = ()
-    params: Annotated[dict[_Id, dict[Text, Any]], BeforeValidator(lambda x: x or {})] = field(
+    params: Annotated[dict[Id, dict[Text, Any]], BeforeValidator(lambda x: x or {})] = field(
         default_factory=dict
     )
     type: Any = None

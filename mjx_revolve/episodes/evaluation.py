@@ -16,7 +16,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import Controller
@@ -226,7 +226,7 @@ class EpisodeSpec(ABC, Generic[B]):
 
     # ------------------------------------------------------------------ scores
 
-    def program(self, population: jax.Array, key: jax.Array) -> Any:
+    def program(self, population: jax.Array, key: jax.Array) -> PyTree:
         """A function of (bodies, population, key) that scores; compiled, unless it is traced."""
         check_key(key)
         return self._score if is_traced(population, key) else self._jitted
@@ -235,7 +235,7 @@ class EpisodeSpec(ABC, Generic[B]):
     def _jitted(self) -> Any:
         return self.keep(self._score, "score")
 
-    def keep(self, fun: Callable[..., Any], name: str, *more: Any) -> StoredProgram:
+    def keep(self, fun: Callable[..., PyTree], name: str, *more: object) -> StoredProgram:
         """A compiled function of this specification, kept on disk unless a user's code is in it.
 
         Args:
@@ -252,10 +252,10 @@ class EpisodeSpec(ABC, Generic[B]):
 
     @property
     @abstractmethod
-    def _bodies_key(self) -> Any:
+    def _bodies_key(self) -> object:
         """The properties of the bodies that compiled programs depend on."""
 
-    def _score(self, bodies: B, population: jax.Array, key: jax.Array) -> Any:
+    def _score(self, bodies: B, population: jax.Array, key: jax.Array) -> PyTree:
         """Scores and measures `[P]` of a population of one body."""
         individual, trial = list_episodes(len(population), self.settings.trials)
         starts = self.precise_starts(population, key)
@@ -426,7 +426,7 @@ def narrow(now: RolloutState, like: RolloutState) -> RolloutState:
     return jax.tree.map(lambda x, kind: x[..., 0] if kind.ndim == 0 else x, now, like)
 
 
-def as_precise(tree: Any, like: jax.Array) -> Any:
+def as_precise(tree: PyTree, like: jax.Array) -> PyTree:
     """The tree with its floats in the precision of `like`."""
     number = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
     cast = lambda x: x.astype(like.dtype) if number(x) else x  # noqa: E731

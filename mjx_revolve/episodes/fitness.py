@@ -18,6 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
@@ -90,7 +91,7 @@ class Fitness(EpisodeSpec[tuple[()]]):
         return self.geometry
 
     @property
-    def _bodies_key(self) -> Any:
+    def _bodies_key(self) -> object:
         body = self.robot.morphology
         listening = _listening(self.config, read_modules(self.config), body)
         return body, listening.model_dump_json()
@@ -200,9 +201,10 @@ class Fitness(EpisodeSpec[tuple[()]]):
         """The task and the measures of one lane, compiled once for all champions."""
 
         def run(
-            qpos: Any, qvel: Any, ctrl: Any, command: Any, energy: Any, water: Any, height: Any,
-            context: EpisodeContext, variation: Any, target: Any,
-        ) -> Any:  # fmt: skip
+            qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, command: jax.Array,
+            energy: jax.Array, water: Water, height: jax.Array,
+            context: EpisodeContext, variation: Variation | None, target: PyTree,
+        ) -> PyTree:  # fmt: skip
             # The rows of the episode are the lanes, like a population.
             engine = with_variation(self.engine, variation)
             state = engine.init(qpos, qvel)
@@ -274,7 +276,7 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         return bodies.figure
 
     @property
-    def _bodies_key(self) -> Any:
+    def _bodies_key(self) -> object:
         return self.capacity, self.touches, self.controller_settings.model_dump_json()
 
     def build(self, morphology: Morphology) -> Robot:
@@ -357,7 +359,7 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         found = self.program(population, key)(bodies, population, key)
         return jax.tree.map(lambda x: x[0], found) if single else found
 
-    def _score(self, bodies: PackedBodies, population: jax.Array, key: jax.Array) -> Any:
+    def _score(self, bodies: PackedBodies, population: jax.Array, key: jax.Array) -> PyTree:
         starts, bodies = self.precise_starts(population, key), as_precise(bodies, population)
         if population.ndim == 2:
             return self._score_different(bodies, population, starts)
@@ -372,14 +374,16 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         trials = self.settings.trials
         individual, trial = list_episodes(population.shape[1], trials)
 
-        def run(own: tuple[PackedBodies, jax.Array]) -> Any:
+        def run(own: tuple[PackedBodies, jax.Array]) -> PyTree:
             chunk = self.chunk_scores(True, *own, starts)
             return average_trials(over_chunks(chunk)(individual, trial), trials)
 
         each = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), -1, 0)[..., None], bodies)
         return jax.lax.map(run, (each, population))
 
-    def _score_different(self, bodies: PackedBodies, population: jax.Array, starts: Starts) -> Any:
+    def _score_different(
+        self, bodies: PackedBodies, population: jax.Array, starts: Starts
+    ) -> PyTree:
         """Scores and measures `[P]` of a population of different bodies."""
         trials = self.settings.trials
         individual, trial = list_episodes(len(population), trials)
@@ -429,14 +433,16 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
     def _trace(self) -> Any:
         """A function of (bodies, population, key, trials) that records whole episodes."""
 
-        def run(bodies: PackedBodies, population: jax.Array, key: jax.Array, trial: Any) -> Any:
+        def run(
+            bodies: PackedBodies, population: jax.Array, key: jax.Array, trial: jax.Array
+        ) -> PyTree:
             starts = self.precise_starts(population, key)
 
-            def trace(individual: jax.Array, trial: jax.Array) -> Any:
+            def trace(individual: jax.Array, trial: jax.Array) -> PyTree:
                 chunk = self.prepare(False, False, bodies, population, starts, individual, trial)
                 engine, every = chunk.rollout.engine, self.trace_every
 
-                def record(now: RolloutState, ctrl: jax.Array, water: Water) -> Any:
+                def record(now: RolloutState, ctrl: jax.Array, water: Water) -> PyTree:
                     qpos, qvel = engine.observe(now.state)
                     row = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl, "energy": now.energy,
                            "command": engine.thruster_command(now.state)}  # fmt: skip

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jaxtyping import PyTree
 
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.environment import Environment, EnvironmentState, make_environment
@@ -57,16 +58,16 @@ def _from_lanes(tree: T) -> T:
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), tree)
 
 
-def _of_one(run: Callable[..., Any]) -> Callable[..., Any]:
+def _of_one(run: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """A function of lanes as a function of a single lane; `jax.vmap` maps batches to lanes."""
 
     @custom_vmap
-    def single(*given: Any) -> Any:
+    def single(*given: PyTree) -> PyTree:
         lane = jax.tree.map(lambda x: x[..., None], given)
         return jax.tree.map(lambda x: x[..., 0], run(*lane))
 
     @single.def_vmap
-    def batch(size: int, batched: Any, *given: Any) -> Any:
+    def batch(size: int, batched: PyTree, *given: PyTree) -> PyTree:
         whole = jax.tree.map(
             lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *x.shape)),
             given, tuple(batched),
@@ -95,7 +96,7 @@ class FunctionalEnv:
         self.observation_size = len(environment.observation_names)
         self.action_size = len(environment.action_names)
 
-        def advance(state: Any, action: Any) -> Any:
+        def advance(state: PyTree, action: jax.Array) -> PyTree:
             if auto_reset:
                 return environment.step_and_restart(state, action)[:3]
             moved, result = environment.step(state, action)

@@ -80,7 +80,7 @@ def _make_class() -> type:
             super().reset(seed=seed)
             return self.env.reset(seed=seed)[0][0], {}
 
-        def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
             """A control period; `score` in the infos of the last."""
             seen, rewards, terminated, truncated, infos = self.env.step(np.asarray(action)[None])
             info = {"score": float(infos["score"][0])} if infos else {}

@@ -28,7 +28,7 @@ def _make_class() -> type:
 
         def __init__(self, env: Any) -> None:
             self.env = env
-            self.actions: Any = None
+            self.actions: np.ndarray | None = None
             super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
         def reset(self) -> np.ndarray:
@@ -37,7 +37,7 @@ def _make_class() -> type:
             self._reset_seeds()
             return self.env.reset(seed=seeds)[0]
 
-        def step_async(self, actions: Any) -> None:
+        def step_async(self, actions: np.ndarray) -> None:
             """Keeps the actions of the next step."""
             self.actions = actions
 
@@ -57,19 +57,21 @@ def _make_class() -> type:
             """Lets go of the state."""
             self.env.close()
 
-        def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        def get_attr(self, attr_name: str, indices: object = None) -> list[Any]:
             """An attribute, the same for all of them."""
             return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
-        def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
             """Not supported: there are no single environments."""
             raise NotImplementedError
 
-        def env_method(self, method_name: str, *args: Any, indices: Any = None, **kw: Any) -> Any:
+        def env_method(
+            self, method_name: str, *args: object, indices: object = None, **kw: object
+        ) -> Any:
             """Not supported: there are no single environments."""
             raise NotImplementedError
 
-        def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        def env_is_wrapped(self, wrapper_class: object, indices: object = None) -> list[bool]:
             """False for all."""
             return [False] * len(list(self._get_indices(indices)))
 
@@ -77,7 +79,7 @@ def _make_class() -> type:
 
 
 def make_sb3_env(
-    config: Config | str | Path | Mapping[str, Any], num_envs: int = LANES, **settings: Any
+    config: Config | str | Path | Mapping[str, object], num_envs: int = LANES, **settings: Any
 ) -> Any:
     """A `VecEnv` of Stable-Baselines3, for its PPO, SAC and others.
 

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import BoundController, Controller
@@ -89,9 +90,9 @@ def _compiled(
     back = np.argsort(own[unvaried.plant.source[:, 0]]).astype(np.int32)
 
     def run(
-        qpos: Any,
-        qvel: Any,
-        drive_input: Any,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        drive_input: PyTree,
         water: Water | None,
         context: EpisodeContext,
         variation: Variation | None,
@@ -115,7 +116,7 @@ def _compiled(
         signals = () if controller is None else controller.signals
         rollout = Rollout(simulator, policy, robot.world, water_of(robot.world), context, signals)
 
-        def record(now: RolloutState, ctrl: jax.Array, water: Water) -> Any:
+        def record(now: RolloutState, ctrl: jax.Array, water: Water) -> PyTree:
             return now.state, ctrl, now.energy, now.memory.pursuer
 
         now = rollout.init(simulator.init(qpos[:, None], qvel[:, None]), controller_state)

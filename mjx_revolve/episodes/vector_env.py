@@ -92,12 +92,12 @@ def _make_class() -> type:
             same = mode == "SameStep"
             advance = environment.step_and_restart if same else partial(_next_step, environment)
 
-            def step(state: EnvironmentState, actions: jax.Array) -> Any:
+            def step(state: EnvironmentState, actions: jax.Array) -> PyTree:
                 found = jax.lax.map(lambda given: advance(*given), (state, self._split(actions)))
                 state, seen, outcome, last = found
                 return state, self._join(seen), jax.tree.map(self._join, outcome), self._join(last)
 
-            def begin(seed: jax.Array, episode: jax.Array) -> Any:
+            def begin(seed: jax.Array, episode: jax.Array) -> PyTree:
                 given = self._split(seed), self._split(episode)
                 state, seen = jax.lax.map(lambda given: environment.begin(*given), given)
                 return state, self._join(seen)

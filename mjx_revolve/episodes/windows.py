@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 from numpy.typing import ArrayLike
 
 from mjx_revolve.control.readings import EpisodeContext
@@ -153,7 +153,7 @@ class TruncatedBPTT:
         row = partial(rollout.record, recorder, now, self._still(genes), inputs)
         return fitness.init_episodes(now, starts, root[:3], row)
 
-    def _rollout(self, starts: Starts, position: jax.Array, parameters: Any) -> Rollout:
+    def _rollout(self, starts: Starts, position: jax.Array, parameters: PyTree) -> Rollout:
         controller, engine = self.fitness.controller, self.fitness.engine
         policy = controlled(controller, parameters)
         return self.fitness.make_rollout(engine, policy, controller.signals, starts, position)
@@ -225,7 +225,7 @@ class TruncatedBPTT:
         fitness, every = self.fitness, self.fitness.record_every
         place = fitness.start_point(fitness.geometry, episodes.starts)
 
-        def run(rows: dict[str, jax.Array]) -> Any:
+        def run(rows: dict[str, jax.Array]) -> PyTree:
             track = extend_track(episodes.track, rows, clock // every)
             then = clock + self.records * every
             score, _ = fitness.score_so_far(track, place, fitness.geometry, context, then)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Annotated, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from annotated_types import Len
@@ -83,28 +83,31 @@ def gene_layout(own: Controller, common: Controller, plant: Plant) -> GeneLayout
     return GeneLayout(own.gene_names, own.genes, place, reach, columns, common.num_genes)
 
 
-class BrainEncoding(Protocol):
+B = TypeVar("B")  # a brain
+
+
+class BrainEncoding(Protocol[B]):
     """A kind of brain. All randomness comes from the generators that are passed in."""
 
     size: int
     """Length of the vectors."""
 
-    def draw(self, rng: np.random.Generator, layout: GeneLayout) -> Any:
+    def draw(self, rng: np.random.Generator, layout: GeneLayout) -> B:
         """A brain drawn anew."""
 
-    def inherit(self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout) -> Any:
+    def inherit(self, rng: np.random.Generator, parents: Sequence[B], layout: GeneLayout) -> B:
         """A child's brain; its body is the first parent's, but for mutations."""
 
-    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+    def to_vector(self, brain: B, layout: GeneLayout) -> np.ndarray:
         """The brain as a vector `[size]`."""
 
-    def from_vector(self, vector: np.ndarray, layout: GeneLayout) -> Any:
+    def from_vector(self, vector: np.ndarray, layout: GeneLayout) -> B:
         """The inverse of `to_vector`."""
 
     def express(self, vectors: np.ndarray, layout: GeneLayout) -> np.ndarray:
         """Vectors `[..., size]` as genes for all bodies `[..., width]`."""
 
-    def check(self, brain: Any) -> Any:
+    def check(self, brain: object) -> B:
         """The brain in a file; raises `InputError` for anything else."""
 
 
@@ -140,7 +143,7 @@ class NamedGenes:
         return _named(layout, self.settings.std_init * rng.standard_normal(len(layout.names)))
 
     def inherit(
-        self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout
+        self, rng: np.random.Generator, parents: Sequence[dict[str, float]], layout: GeneLayout
     ) -> dict[str, float]:
         """Genes by name, the first parent's first, with noise.
 
@@ -162,7 +165,7 @@ class NamedGenes:
             values[k] = values[alike[int(np.argmin(away))]] if alike else fresh[k]
         return _named(layout, values + noise)
 
-    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+    def to_vector(self, brain: dict[str, float], layout: GeneLayout) -> np.ndarray:
         """Genes for all bodies, 0 for those that the body lacks."""
         vector = np.zeros(layout.width, np.float32)
         vector[layout.columns] = [brain.get(name, 0.0) for name in layout.names]
@@ -178,7 +181,7 @@ class NamedGenes:
         genes[..., layout.columns] = vectors[..., layout.columns]
         return genes
 
-    def check(self, brain: Any) -> dict[str, float]:
+    def check(self, brain: object) -> dict[str, float]:
         """Genes by name."""
         return read(_NAMED, brain, "brain")
 
@@ -241,7 +244,7 @@ class PatternNetwork:
         return _weights(weights)
 
     def inherit(
-        self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout
+        self, rng: np.random.Generator, parents: Sequence[list[float]], layout: GeneLayout
     ) -> list[float]:
         """Each weight is one of the parents', with noise."""
         found = np.array(parents[0])
@@ -249,7 +252,7 @@ class PatternNetwork:
             found = np.where(rng.random(self.size) < 0.5, found, parents[1])
         return _weights(found + self.settings.mutation * rng.standard_normal(self.size))
 
-    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+    def to_vector(self, brain: list[float], layout: GeneLayout) -> np.ndarray:
         """The weights."""
         return np.array(brain, np.float32)
 
@@ -257,7 +260,7 @@ class PatternNetwork:
         """The weights."""
         return _weights(vector)
 
-    def check(self, brain: Any) -> list[float]:
+    def check(self, brain: object) -> list[float]:
         """As many weights as the network has."""
         count = self.size
         weights = Annotated[list[Number], Len(count, count), words(f"{count} weights")]

@@ -120,6 +120,13 @@ def also(*forms: Mapping[str, object]) -> Callable[[F], F]:
     return state
 
 
+@also({"type": "integer"})
+def _read_id(value: object) -> object:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Id = Annotated[Text, BeforeValidator(_read_id), words("a name")]
+"""A name, which YAML may give as a number."""
 OFF = {"enum": ["off", False, None]}
 ONE: dict[str, object] = {}
 """One of a list's items by itself."""

@@ -114,7 +114,7 @@ def _look_up(data: Any, steps: list[Step], otherwise: object) -> tuple[list[Step
 # --- what annotations say, in words ---------------------------------------------------------------
 
 
-def fields_of(kind: Any) -> dict[str, FieldInfo]:
+def fields_of(kind: object) -> dict[str, FieldInfo]:
     """The fields of a checked class or a model by name; empty for other types."""
     return getattr(kind, "model_fields", None) or getattr(kind, "__pydantic_fields__", {})
 
@@ -138,7 +138,7 @@ def _open(annotation: Any) -> tuple[Any, list[Any], bool]:
             return annotation, metadata, optional
 
 
-def _is_union(annotation: Any) -> bool:
+def _is_union(annotation: object) -> bool:
     return get_origin(annotation) in (Union, types.UnionType)
 
 
@@ -164,7 +164,7 @@ def _follow(annotation: Any, steps: Sequence[Step]) -> tuple[list[Step], Any]:
     return taken, annotation
 
 
-def _names(kind: Any, prefix: str = "") -> dict[str, str]:
+def _names(kind: object, prefix: str = "") -> dict[str, str]:
     """All fields' dotted names by their last part."""
     found: dict[str, str] = {}
     for name, field in fields_of(kind).items():
@@ -172,7 +172,7 @@ def _names(kind: Any, prefix: str = "") -> dict[str, str]:
     return found
 
 
-def _suggest(name: str, known: Sequence[str], place: Sequence[Step], root: Any) -> str:
+def _suggest(name: str, known: Sequence[str], place: Sequence[Step], root: object) -> str:
     """The most similar known name: of a sibling, or of a field in another section."""
     for names in ({key: join(*place, key) for key in known}, _names(root)):
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
@@ -186,7 +186,7 @@ _COUNTS = {2: "two", 3: "three"}
 _SIGNS = {Gt: "> ", Ge: ">= ", Lt: "< ", Le: "<= "}
 
 
-def describe(annotation: Any) -> str:
+def describe(annotation: object) -> str:
     """The values of a type in words: "a number > 0 and <= 20 [Hz]"."""
     kind, metadata, optional = _open(annotation)
     said = [item.documentation for item in metadata if isinstance(item, DocInfo)]

@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.readings import EpisodeContext, SensorReadings
 from mjx_revolve.control.sensors import Observation, Observer, count_samples
 from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.rollout import Rollout, RolloutState, StepInputs, with_variation
 from mjx_revolve.episodes.simulate import Trajectory
@@ -127,7 +129,9 @@ def _split(
         yield np.concatenate([np.reshape(x, (*x.shape[:2], -1)) for x in columns], 2)
 
 
-def _plain(sensors: Sequence[Sensor], sense: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+def _plain(
+    sensors: Sequence[Sensor], sense: SensorReadings
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """What is true, as an `Observation` has its numbers, in the sensors' units."""
     robot: list[Any] = []
     joint: list[Any] = []
@@ -150,13 +154,15 @@ def _compiled(fitness: Fitness, steps: int) -> Any:
     observer, rate = fitness.controller.observer, fitness.controller.rate
     assert observer is not None
 
-    def run(rows: Any, context: EpisodeContext, variation: Any) -> Any:
+    def run(rows: PyTree, context: EpisodeContext, variation: Variation | None) -> PyTree:
         engine = with_variation(fitness.engine, variation)
         qpos, qvel, ctrl, power, water = rows
         number = jnp.asarray(engine.plant.source[: engine.plant.num_hinge_rows])
         state_at = lambda k: engine.init(qpos[k][:, None], qvel[k][:, None])  # noqa: E731
 
-        def policy(state: Any, time: Any, readings: SensorReadings, ctrl: Any) -> Any:
+        def policy(
+            state: PyTree, time: jax.Array, readings: SensorReadings, ctrl: PyTree
+        ) -> PyTree:
             if rate is not None:
                 time = count_samples(time, rate) / rate
             seen, observed = observer.observe(state[0], time, readings, number)
@@ -166,7 +172,7 @@ def _compiled(fitness: Fitness, steps: int) -> Any:
             engine, policy, fitness.world, water_of(fitness.world), context, observer.signals
         )
 
-        def step(now: RolloutState, k: jax.Array) -> Any:
+        def step(now: RolloutState, k: jax.Array) -> PyTree:
             own = jax.tree.map(lambda x: x[k][None], water)
             inputs = StepInputs(own, engine.plant.arrange(ctrl[k][:, None]))
             (seen, *found), command, _, motion = rollout.act(now, inputs)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.plant import plant_of
@@ -118,7 +119,7 @@ def cpg_phases(fitness: Fitness, genes: np.ndarray, steps: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def _oscillators(fitness: Fitness, steps: int) -> Any:
+def _oscillators(fitness: Fitness, steps: int) -> PyTree:
     """The states of all oscillators, `[steps, nhinge]` each, from genes."""
     plant = plant_of(fitness.robot)
     # Its oscillators at all times, not only when it commands.
@@ -126,10 +127,10 @@ def _oscillators(fitness: Fitness, steps: int) -> Any:
     controller = find_controller(plant, settings)
     blind: Any = None  # oscillators sense nothing
 
-    def run(genes: jax.Array) -> Any:
+    def run(genes: jax.Array) -> PyTree:
         parameters = controller.decode(genes[:, None], plant)
 
-        def step(state: Any, time: jax.Array) -> tuple[Any, Any]:
+        def step(state: PyTree, time: jax.Array) -> tuple[PyTree, PyTree]:
             state, _ = controller.step(parameters, state, time, blind)
             return state, (state[0][:, 0], state[1][:, 0])
 
