@@ -33,7 +33,9 @@ _LEAST_CONTACTS = 32
 _FLUSH = 1e-3
 
 # Colour of a module without one in its YAML (Revolve's default grey).
-_GREY = (0.5, 0.5, 0.5)
+GREY = (0.5, 0.5, 0.5)
+# Colour of a bed; a choice.
+SAND = (0.76, 0.70, 0.50)
 
 
 def compile_model(assembly: Assembly) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
@@ -79,7 +81,7 @@ def _add_bed(spec: mujoco.MjSpec, morphology: Morphology, world: World) -> None:
         return
     half, points = bed.extent / 2, 201
     common: dict[str, Any] = {"name": "bed", "contype": 0, "conaffinity": 0}
-    common["rgba"] = [0.76, 0.70, 0.50, 1.0]
+    common["rgba"] = [*SAND, 1.0]
     if bed.contact == "mjx":
         # Modules (contype 1) meet the bed (conaffinity 1), not each other. Its priority makes the
         # bed's friction count, not the larger of the two.
@@ -227,7 +229,7 @@ def _add_geoms(
     body: Any, module: Module, part: Part, place: np.ndarray, turn: np.ndarray, world: World
 ) -> None:
     """One geom for each box; the first carries the part's mass and MuJoCo's ellipsoid."""
-    rgb = module.rgb if module.rgb is not None else _GREY
+    rgb = module.rgb if module.rgb is not None else GREY
     for k, box in enumerate(part.boxes):
         geom = body.add_geom(
             name=f"{module.name}/{part.name}" + (f"/{k}" if k else ""),

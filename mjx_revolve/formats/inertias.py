@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mjx_revolve.body.module_types import Part
+from mjx_revolve.engine.assembly import BALLAST_RADIUS
 
 # Mass of a link without mass [kg], as a link must have some.
 LEAST = 1e-6
-# Radius of a ballast [m], as in `engine/assembly.py`.
-_BALLAST = 1e-3
 # Share of a thruster's mass that is its propeller: it only makes it spin.
 _ROTOR = 0.05
 
@@ -39,7 +38,7 @@ def part_spread(part: Part) -> np.ndarray:
     The mass is spread evenly over the main box; a ballast is a small ball.
     """
     box = spread(part.mass, np.zeros(3), np.diag(np.square(part.boxes[0].size)) / 12)
-    ball = spread(part.ballast_mass, part.ballast_position, _BALLAST**2 / 5 * np.eye(3))
+    ball = spread(part.ballast_mass, part.ballast_position, BALLAST_RADIUS**2 / 5 * np.eye(3))
     return box + ball - (0 if part.thruster is None else propeller(part)[0])
 
 

@@ -18,6 +18,7 @@ from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.body.solids import part_mesh
+from mjx_revolve.engine.mujoco_model import GREY
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.bed import Bed, bed_height
@@ -29,8 +30,6 @@ from mjx_revolve.water.world import World
 # The names of ROS (REP 105) for the fixed frame, for the odometry's, and for the robot's main part.
 WORLD, ODOM, BASE = "world", "odom", "base_link"
 
-# Colour of a module without one in its YAML: that of its geoms in the model.
-_GREY = (0.5, 0.5, 0.5)
 
 # A bed within this depth below the surface is exported [m]: a robot starts 1 m deep.
 _BED_DEPTH = 5.0
@@ -276,7 +275,7 @@ def _place_parts(robot: Robot, taken: set[str]) -> list[PlacedPart]:
                 for k in range(len(part.boxes))
             ),
             mesh=mesh,
-            rgb=module.rgb if module.rgb is not None else _GREY,
+            rgb=module.rgb if module.rgb is not None else GREY,
             position=table.position[row],
             rotation=table.rotation[row],
         )

@@ -16,6 +16,7 @@ from xml.etree.ElementTree import Element
 import jax
 import numpy as np
 
+from mjx_revolve.engine.mujoco_model import SAND
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.formats.inertias import moments, part_spread, propeller
 from mjx_revolve.formats.links import (
@@ -47,8 +48,6 @@ _STEP = 0.001
 _THRUST_COEFFICIENT = 0.3
 # Gazebo's names of forces and of velocities, after Fossen.
 _FORCES = "xyzkmn", "UVWPQR"
-# Of a bed, as in `engine/mujoco_model.py`.
-_SAND = (0.76, 0.70, 0.50)
 
 _NOTE = """
   {title} in its water, for Gazebo Harmonic or newer (gz-sim 8, with its default physics, DART):
@@ -170,7 +169,7 @@ def _surroundings(robot: Robot) -> Iterator[Element]:
             node(
                 "link",
                 node("collision", solid, node("surface", rough), name="collision"),
-                node("visual", seen, _material(_SAND), name="visual"),
+                node("visual", seen, _material(SAND), name="visual"),
                 name="bed",
             ),
             name="bed",
