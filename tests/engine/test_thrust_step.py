@@ -160,6 +160,7 @@ def test_a_linear_thruster_is_mujocos_filtered_actuator():
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["auv", "fin"])
 def test_the_two_engines_agree(name):
     """Through the surface, in a current, thrusters and fins at work; half a second in float64."""
