@@ -1,6 +1,6 @@
 """Distance and penetration depth of turned boxes, by separating axes.
 
-Two convex bodies are apart where their shadows on some axis are; of two boxes, 15 axes decide:
+Two convex bodies are apart where their projections on some axis are; of two boxes, 15 axes decide:
 three face normals of each, and the nine cross products of their edges (Gottschalk, Lin and Manocha
 1996, OBBTree, SIGGRAPH). The largest gap over these axes is, where it is negative, minus the
 penetration depth: the least translation that parts the boxes.
@@ -14,7 +14,7 @@ XLA:CPU makes a branch of a choice between numbers in memory, and no vectors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +29,8 @@ _PARALLEL = 1e-6
 # The same where the boxes turn within a step: the axis of two edges swings with them, and flips
 # where they become parallel. A choice: 18 degrees.
 _SWINGING = 0.1
-# Sine of the slope below which an edge lies flat on a face [-]: the contact point then moves from
-# the edge's end to its middle. A choice.
+# Sine of the angle between an edge and a face below which the edge lies flat on it [-]: the contact
+# point then moves from the edge's end to its middle. A choice.
 _FLAT = 0.05
 
 
@@ -45,30 +45,30 @@ class BoxPair(NamedTuple):
         second_half: `[3, ...]` half edges of the second [m].
     """
 
-    offset: Any
-    first: Any
-    second: Any
-    first_half: Any
-    second_half: Any
+    offset: Scalar
+    first: Scalar
+    second: Scalar
+    first_half: Scalar
+    second_half: Scalar
 
 
 class BoxAxes(NamedTuple):
-    """Shadows of two boxes on the 15 axes, five groups `[3, ...]`.
+    """Projections of two boxes on the 15 axes, five groups `[3, ...]`.
 
     Attributes:
         offset: of the second centre from the first along each axis, with its sign [m].
-        reach: sum of the half shadows of both [m].
+        reach: sum of both boxes' half widths along each axis [m].
     """
 
-    offset: tuple[Any, ...]
-    reach: tuple[Any, ...]
+    offset: tuple[Scalar, ...]
+    reach: tuple[Scalar, ...]
 
-    def gaps(self, side: tuple[Any, ...] | None = None) -> tuple[Any, ...]:
+    def gaps(self, side: tuple[Scalar, ...] | None = None) -> tuple[Scalar, ...]:
         """Gap along each axis [m], negative for an overlap.
 
         Args:
-            side: by default either; else the signs of the offset along each axis which count as
-                apart: a box that has passed through the other is then deep in it.
+            side: the sign of the offset along each axis that counts as apart, so that a box that
+                has passed through the other counts as deep in it; None: either sign.
         """
         xp = namespace(self.offset[0])
         if side is None:
@@ -77,38 +77,38 @@ class BoxAxes(NamedTuple):
         return tuple(x * s - r for x, r, s in every)
 
 
-def matvec(matrix: Any, x: Any) -> Any:
+def matvec(matrix: Scalar, x: Scalar) -> Scalar:
     """M x of `[3, 3, ...]` and `[3, ...]`."""
     return matrix[:, 0] * x[0] + matrix[:, 1] * x[1] + matrix[:, 2] * x[2]
 
 
-def mat_t_vec(matrix: Any, x: Any) -> Any:
+def mat_t_vec(matrix: Scalar, x: Scalar) -> Scalar:
     """Mᵀ x."""
     return matrix[0] * x[0] + matrix[1] * x[1] + matrix[2] * x[2]
 
 
-def dot(a: Any, b: Any) -> Any:
+def dot(a: Scalar, b: Scalar) -> Scalar:
     """A · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _joined(parts: Sequence[Any], axis: int = 0) -> Any:
+def _joined(parts: Sequence[Scalar], axis: int = 0) -> Scalar:
     xp = namespace(parts[0])
     found = xp.concatenate(parts, axis)
     return found if xp is np else materialize(found)
 
 
-def _stacked(rows: Sequence[Any]) -> Any:
+def _stacked(rows: Sequence[Scalar]) -> Scalar:
     xp = namespace(rows[0])
     rows = xp.broadcast_arrays(*rows)
     return _joined([x[None] for x in rows])
 
 
 def box_axes(pair: BoxPair, parallel: float = _PARALLEL) -> BoxAxes:
-    """Shadows of two boxes on the 15 axes.
+    """Projections of two boxes on the 15 axes.
 
-    Edges whose squared sine is below `parallel` have no axis: there the reach is 1e3 m, so that the
-    gap is never the largest.
+    Edges with a squared sine below `parallel` have no axis: their reach is set to 1e3 m, so that
+    their gap is never the largest.
     """
     a, b, turn = pair.first_half, pair.second_half, _relative(pair)
     xp, t = namespace(turn), mat_t_vec(pair.first, pair.offset)
@@ -129,13 +129,13 @@ def box_axes(pair: BoxPair, parallel: float = _PARALLEL) -> BoxAxes:
     return BoxAxes(tuple(offset), tuple(reach))
 
 
-def weight(condition: Any, like: Scalar) -> Scalar:
+def weight(condition: Scalar, like: Scalar) -> Scalar:
     """1 where a condition holds, else 0, of the type of another number."""
     xp = namespace(like)
     return xp.where(condition, 1.0, 0.0).astype(like.dtype)
 
 
-def _relative(pair: BoxPair) -> Any:
+def _relative(pair: BoxPair) -> Scalar:
     """The second box's axes, seen from the first: first from second."""
     one, other = pair.first, pair.second
     return sum(one[k][:, None] * other[k][None] for k in range(3))
@@ -149,7 +149,7 @@ def box_gap(pair: BoxPair) -> Scalar:
     return _largest(box_axes(pair).gaps())
 
 
-def _largest(groups: Sequence[Any]) -> Any:
+def _largest(groups: Sequence[Scalar]) -> Scalar:
     """Over all axes of some groups."""
     xp, found = namespace(groups[0]), groups[0]
     for group in groups[1:]:
@@ -167,10 +167,10 @@ class BoxContact(NamedTuple):
         point: `[3, ...]` in the middle between them, from the first box's centre, world frame [m].
     """
 
-    gap: Any
-    start: Any
-    normal: Any
-    point: Any
+    gap: Scalar
+    start: Scalar
+    normal: Scalar
+    point: Scalar
 
 
 def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
@@ -206,7 +206,7 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     start = sum(s[k] * x[k] for s, x in zip(share, now, strict=True) for k in range(3))
     signed = [x * y for x, y in zip(share, side, strict=True)]
     normal = _axis(turn, signed)
-    # What touches first is what reaches farthest at the end of the step.
+    # The feature that touches first is the one that reaches farthest at the end of the step.
     turn_ahead = turn if ahead is None else _relative(ahead)
     toward = normal if ahead is None else _axis(turn_ahead, signed)
     # The features that look at each other, seen from the first box.
@@ -232,7 +232,9 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     return BoxContact(best, start, matvec(pair.first, normal), matvec(pair.first, one + point))
 
 
-def _first_of(score: Sequence[Any], face: Any, crossing: Any, edges: Any) -> list[Any]:
+def _first_of(
+    score: Sequence[Scalar], face: Scalar, crossing: Scalar, edges: Scalar
+) -> list[Scalar]:
     """1 for the first axis of the best kind with the best score, 0 for all others, by groups."""
     found, left = [], 1 - edges
     for k, group in enumerate(score):
@@ -246,7 +248,7 @@ def _first_of(score: Sequence[Any], face: Any, crossing: Any, edges: Any) -> lis
     return found
 
 
-def _axis(turn: Any, share: Sequence[Any]) -> Any:
+def _axis(turn: Scalar, share: Sequence[Scalar]) -> Scalar:
     """The sum of the 15 axes, unit vectors in the first box's frame, by such shares."""
     xp = namespace(turn)
     crossed = []
@@ -259,7 +261,7 @@ def _axis(turn: Any, share: Sequence[Any]) -> Any:
     return share[0] + matvec(turn, share[1]) + edges
 
 
-def _feature(normal: Any, half: Any) -> tuple[Any, Any]:
+def _feature(normal: Scalar, half: Scalar) -> tuple[Scalar, Scalar]:
     """Middle of a box's corner, edge or face that lies farthest along a direction; its half edges.
 
     Both in the box's frame.
@@ -269,7 +271,7 @@ def _feature(normal: Any, half: Any) -> tuple[Any, Any]:
     return share * half, (1 - xp.abs(share)) * half
 
 
-def _common(spread: Any, away: Any, reach: Any) -> Any:
+def _common(spread: Scalar, away: Scalar, reach: Scalar) -> Scalar:
     """Middle of what two features have in common along the axes of the first's box.
 
     From the middle of the first feature, of half edges `spread`. `away` leads to that of the
@@ -286,7 +288,7 @@ def pair_of(
     center: np.ndarray, rotation: np.ndarray, half: np.ndarray,
     centers: np.ndarray, rotations: np.ndarray, halves: np.ndarray,
 ) -> BoxPair:  # fmt: skip
-    """Pairs of boxes of arrays `[..., 3]` and `[..., 3, 3]`, for `box_gap` and its like.
+    """Pairs of boxes from arrays `[..., 3]` and `[..., 3, 3]`, for `box_gap` and `box_contact`.
 
     Args:
         center: of the first boxes, world frame [m].

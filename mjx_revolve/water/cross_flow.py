@@ -14,7 +14,7 @@ never positive, and for small waves its mean thrust is Lighthill's, ½ m (ẏ² 
 How much of a chain a part is, is a share c: 1 in a row of parts that is five times as long as high,
 falling to 0 where it is 2.5 times as long, times the share of the part's joined ends that its
 neighbours cover. A part by itself is a row of its own: a long one is a rod, which has the drag of a
-chain and sheds nothing at its ends (the source of that knows bodies that swim, with one tail), and
+chain and sheds nothing at its ends (the source of that is for swimming bodies with one tail), and
 a compact one has its faces' drag. In between coefficients are interpolated; the strips then stand
 at c of the part's half length, and what that leaves of the drag against turning, 1 - c³ of it,
 stays with the faces: no part is dragged twice. The ends of a row are chain as well, as the C_d of
