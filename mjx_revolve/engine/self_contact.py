@@ -42,14 +42,14 @@ from mjx_revolve.numerics.xla import fuse, materialize, take_lanes
 
 # Contacts of one robot at a time. A choice: few robots have more.
 _MOST = 8
-# Robots that are looked at together, and pairs of theirs whose spheres, or boxes, are compared
-# at a time: enough for vector registers. Few robots of a chunk are near contact. Choices.
+# Robots that are tested together, and pairs of spheres, and of boxes, that are compared at a
+# time: enough for vector registers. Few robots of a chunk are near contact. Choices.
 _ROBOTS, _SPHERES, _PAIRS = 8, 64, 32
 # Pairs that are near which are listed at a time, where loops need no known length. A choice.
 _ROOM = 256
 # Flags in a word.
 _WORD = 32
-# The clearance of robots none of whose boxes can meet [m].
+# The clearance of robots without boxes that can meet [m].
 _FAR = 1e3
 # What no contact needs [m/s²].
 _NONE = -1e9
@@ -229,7 +229,7 @@ def any_lane(found: jax.Array) -> jax.Array:
 def _find_contacts(
     meetings: Meetings, which: jax.Array, real: jax.Array, bodies: Bodies, dt: float
 ) -> ContactTable:
-    """The contacts of some robots, of pairs whose bounding spheres overlap at the step's end."""
+    """Contacts of some robots: pairs with bounding spheres that overlap at the end of the step."""
     size, dtype, steady = len(which), bodies.now.position[0].dtype, meetings.steady
     npair, lanes = meetings.first.shape
     width = size * max(1, _SPHERES // size)
@@ -244,7 +244,7 @@ def _find_contacts(
         return k if lanes == 1 else k * lanes + take_lanes(which, lane)
 
     def look_up(number: jax.Array) -> tuple[_Given, ...]:
-        """The two boxes of pairs, whose numbers are those of a robot's pairs · size + the robot."""
+        """The two boxes of pairs, numbered by place among the robot's pairs · size + robot."""
         lane = number % size
         found = []
         for every in pairs:
@@ -360,7 +360,7 @@ class _Side(NamedTuple):
     Attributes:
         pose: rotation and position of the body, now and at the end of the step.
         half: half edges of the box [m].
-        boxes: its rotation and centre, likewise.
+        boxes: its rotation and centre at both times.
     """
 
     pose: tuple[tuple[jax.Array, jax.Array], ...]

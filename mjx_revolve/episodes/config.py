@@ -85,7 +85,7 @@ OLDER: dict[str, dict[str, Any]] = {
     "controller": {"rate": None, "between": "hold"},
 }
 OLDER_WORLD = {"self_contact": False}
-"""What worlds had in runs whose folders do not state it; others state it (`with_stated`)."""
+"""Values of worlds in run folders that do not state them; newer ones do (`state_world`)."""
 # Tasks with a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
