@@ -84,8 +84,8 @@ OLDER: dict[str, dict[str, Any]] = {
     "task": OLDER_TASK,
     "controller": {"rate": None, "between": "hold"},
 }
-OLDER_WORLD = {"self_contact": False}
-"""Values of worlds in run folders that do not state them; newer ones do (`state_world`)."""
+OLDER_WORLD = {"drag": "faces", "self_contact": False}
+"""Values of worlds in run folders that do not state them; newer folders do (`state_world`)."""
 # Tasks with a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
@@ -183,8 +183,8 @@ class RobustConfig(Settings):
     """
 
     drag: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.5
-    """On the faces' drag, and on drag and lift of fins. Hoerner (1965, Fluid-Dynamic Drag) has .80
-    for a cube edge on, 1.17 for a plate, 2.05 for a long square rod; ours is 1.05 [-]."""
+    """On drag, and on drag and lift of fins. Hoerner (1965, Fluid-Dynamic Drag) has .80 for a cube
+    edge on, 1.17 for a plate, 2.05 for a long square rod; ours are 1.05, 1.17 and 1.75 [-]."""
     added_mass: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.35
     """On the water that is carried along. Of a cube .64 to .68 of its volume are measured, where
     Lamb's ellipsoid has .50 [-]."""

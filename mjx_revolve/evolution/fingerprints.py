@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +54,7 @@ def plain_settings(config: Config) -> dict[str, Any]:
     return data
 
 
-def settings_hash(config: Config, by_path: bool = False) -> str:
+def settings_hash(config: Config, by_path: bool = False, older_world: Collection[str] = ()) -> str:
     """Fingerprint of all settings that may not change within a run.
 
     Files count by their content, not by their path; so do the users' own tasks and controllers.
@@ -62,9 +63,11 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     Args:
         config: of the run.
         by_path: whether current fields and data count by their path, as they did in older runs.
+        older_world: fields of the world that are left out with values of older runs.
     """
     from mjx_revolve.episodes.config import OLDER, OLDER_WORLD, Config
     from mjx_revolve.episodes.settings import map_files
+    from mjx_revolve.water.world import World
 
     def by_content(file: NamedFile) -> str:
         if file.kind == "morphology":
@@ -76,8 +79,8 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     data = plain_settings(config)
     del data["morphology"], data["modules"]
     data["world"]["name"] = Path(data["world"]["name"]).name
-    for name, value in OLDER_WORLD.items():  # older runs lack them
-        if data["world"].get(name) == value:
+    for name, older in OLDER_WORLD.items():
+        if data["world"].get(name) == (older if name in older_world else getattr(World, name)):
             del data["world"][name]
     data = map_files(data, by_content, Config)
     for section in ("controller", "task"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import itertools
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TextIO
 
-from mjx_revolve.episodes.config import Config, load_config, override_config
+from mjx_revolve.episodes.config import OLDER_WORLD, Config, load_config, override_config
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.passport import PASSPORT, make_passport
 from mjx_revolve.episodes.settings import NamedFile, map_files
@@ -198,7 +199,9 @@ class Run:
         begun = checkpoint.meta if checkpoint else files.info
         settled = settings_hash(config)
         known = begun.get("settings_hash", settled)  # an older version's run.json has none
-        if known not in (settled, settings_hash(config, by_path=True)):
+        worlds = [(), *((name,) for name in OLDER_WORLD), tuple(OLDER_WORLD)]
+        ways = itertools.product((False, True), worlds)
+        if known not in {settings_hash(config, *way) for way in ways}:
             raise InputError(
                 f"{label}: expected the config.yaml that it began with; found it changed"
             )

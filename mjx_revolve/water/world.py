@@ -135,7 +135,8 @@ class World:
         current: velocity of the water, world frame [m/s], length 3.
         bed: the ground, or None.
         buoyancy: name of a buoyancy law.
-        drag: name of a drag law.
+        drag: name of a drag law. `cross_flow` has those of chains, thin plates and fins in it, and
+            that of faces for compact parts; `faces` has that for all.
         coefficients: of laws, by name, for modules that give none of their own.
         added_mass: whether the water that a module carries along is part of its inertia.
         near_surface: whether that water follows the draught of what floats, and is less close to
@@ -167,7 +168,7 @@ class World:
         words("'off', a height in metres or a mapping with kind"),
     ] = None
     buoyancy: Annotated[BuoyancyName, words(buoyancy_names())] = "partial"
-    drag: Annotated[DragName, words(drag_names())] = "faces"
+    drag: Annotated[DragName, words(drag_names())] = "cross_flow"
     coefficients: Coefficients = ()
     added_mass: Boolean = True
     near_surface: Boolean = False

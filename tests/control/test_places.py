@@ -33,7 +33,7 @@ from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes.config import OLDER, OLDER_TASK, OLDER_WORLD, make_config
+from mjx_revolve.episodes.config import OLDER, OLDER_TASK, make_config
 from mjx_revolve.episodes.fitness import fit_body, make_mixed_fitness
 from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs import schema
@@ -506,8 +506,8 @@ def test_a_runs_fingerprint_knows_the_sensors_of_types(tmp_path):
     base = {
         "morphology": str(tmp_path / "oar.yaml"),
         "modules": str(tmp_path / "modules.yaml"),
-        # Those had no rate, measured cores and lengths at rest, and passed through themselves.
-        "world": {"name": "lake", **OLDER_WORLD},
+        "world": "lake",
+        # Those had no rate, and measured cores and lengths at rest.
         "controller": {
             "type": "mlp",
             "sensors": ["tilt", {"type": "gyro", "range": 5}],

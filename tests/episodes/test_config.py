@@ -264,18 +264,18 @@ def test_our_own_files_load(path):
     assert load_config(path).world_name
 
 
-def test_older_run_folders_keep_worlds_without_self_contact(tmp_path):
-    """Unless they or their world's file state it; runs of this version do."""
-    stated, left_out = tmp_path / "stated.yaml", tmp_path / "left_out.yaml"
-    stated.write_text("density: 1000\nself_contact: true\n")
-    left_out.write_text("density: 1000\n")
-    off = {"self_contact": False}
+def test_older_run_folders_keep_the_values_of_their_worlds(tmp_path):
+    """Unless they or their world's file state them; runs of this version do."""
+    (tmp_path / "stated.yaml").write_text("density: 1000\nself_contact: true\ndrag: faces\n")
+    (tmp_path / "left_out.yaml").write_text("density: 1000\n")
+    old = {"drag": "faces", "self_contact": False}
     for world, expected in (
-        ("lake", {"name": "lake", **off}),
-        ("left_out.yaml", {"name": "left_out.yaml", **off}),
-        ({"name": "lake", "density": 1025.0}, {"name": "lake", "density": 1025.0, **off}),
-        ({"name": "lake", "self_contact": True}, {"name": "lake", "self_contact": True}),
+        ("lake", {"name": "lake", **old}),
+        ("left_out.yaml", {"name": "left_out.yaml", **old}),
+        ({"name": "lake", "density": 1025.0}, {"name": "lake", "density": 1025.0, **old}),
+        ({"name": "lake", "self_contact": True}, {"name": "lake", **old, "self_contact": True}),
         ("stated.yaml", "stated.yaml"),
     ):
         assert config.with_older_values({"world": world}, tmp_path)["world"] == expected
-    assert config.state_world("lake") == {"name": "lake", "self_contact": True}
+    now = {"name": "lake", "drag": "cross_flow", "self_contact": True}
+    assert config.state_world("lake") == now
