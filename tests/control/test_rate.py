@@ -14,7 +14,13 @@ from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.episodes.config import ControllerConfig, dump_config, load_config, make_config
+from mjx_revolve.episodes.config import (
+    OLDER_WORLD,
+    ControllerConfig,
+    dump_config,
+    load_config,
+    make_config,
+)
 from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs.errors import InputError
 
@@ -128,7 +134,7 @@ def test_older_runs_have_no_rate_and_keep_their_fingerprint(tmp_path):
     (tmp_path / "config.yaml").write_text(text)
     older = load_config(tmp_path / "config.yaml")
     assert (older.controller.rate, older.controller.between) == (None, "hold")
-    assert settings_hash(older) == settings_hash(config)
+    assert settings_hash(older, older_world=OLDER_WORLD) == settings_hash(config)
     assert settings_hash(load_config(tmp_path / "config.yaml", {"controller.rate": 20.0})) != (
         settings_hash(config)
     )
