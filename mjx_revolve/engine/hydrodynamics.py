@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.level import Level, Parts, ThrusterMounts, is_present
+from mjx_revolve.engine.level import Level, Parts, ThrusterMounts
 from mjx_revolve.numerics.inertia import (
     BodyMotion,
     SpatialInertia,
@@ -31,6 +31,7 @@ from mjx_revolve.numerics.spatial import (
     add,
     cross,
     dot,
+    is_present,
     matTvec,
     matvec,
     mul,

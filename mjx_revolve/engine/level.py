@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.numerics.spatial import Mat, Scalar, Sym, Vec
+from mjx_revolve.numerics.spatial import Mat, Scalar, Sym, Vec, is_present
 from mjx_revolve.water.added_mass import CarriedWater
 from mjx_revolve.water.buoyancy import find_buoyancy_law
 from mjx_revolve.water.drag import OFF, find_drag_law
@@ -29,11 +29,6 @@ from mjx_revolve.water.laws import PartDragLaw, law_numbers, part_field
 _SHAPE = "the robot's shape, which is known"
 _MEASURED = "thrusters keep their curves, which are measured"
 _INSIDE = "its own fields say"
-
-
-def is_present(x: Scalar) -> bool:
-    """Whether a number is more than a plain zero; what is traced counts as something."""
-    return isinstance(x, jax.Array) or bool(np.any(x))
 
 
 class PartLaws(NamedTuple):

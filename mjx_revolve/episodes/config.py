@@ -62,6 +62,7 @@ from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
 from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.water.world import World, is_left_out
 
 # Required settings of each task; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {
@@ -83,6 +84,8 @@ OLDER: dict[str, dict[str, Any]] = {
     "task": OLDER_TASK,
     "controller": {"rate": None, "between": "hold"},
 }
+OLDER_DRAG = "faces"
+"""What runs have whose folder states no drag law; others state it (`with_drag`)."""
 # Tasks with a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
@@ -180,8 +183,8 @@ class RobustConfig(Settings):
     """
 
     drag: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.5
-    """On the faces' drag, and on drag and lift of fins. Hoerner (1965, Fluid-Dynamic Drag) has .80
-    for a cube edge on, 1.17 for a plate, 2.05 for a long square rod; ours is 1.05 [-]."""
+    """On drag, and on drag and lift of fins. Hoerner (1965, Fluid-Dynamic Drag) has .80 for a cube
+    edge on, 1.17 for a plate, 2.05 for a long square rod; ours are 1.05, 1.17 and 1.75 [-]."""
     added_mass: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.35
     """On the water that is carried along. Of a cube .64 to .68 of its volume are measured, where
     Lamb's ellipsoid has .50 [-]."""
@@ -576,14 +579,27 @@ def load_config(path: str | Path, overrides: Mapping[str, object] | Sequence[str
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
-        data = with_older_values(data)
+        data = with_older_values(data, path.parent)
     return make_config(data, path.parent, overrides, short_path(path))
 
 
-def with_older_values(data: Mapping[str, object]) -> dict[str, object]:
+def with_older_values(data: Mapping[str, Any], folder: str | Path) -> dict[str, Any]:
     """A run folder's settings with the values that older versions had where they lack a setting."""
     own = {name: data.get(name) for name in OLDER}
-    return {**data} | {k: {**OLDER[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
+    found = {**data} | {k: {**OLDER[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
+    if "world" in found:
+        found["world"] = with_drag(found["world"], OLDER_DRAG, folder)
+    return found
+
+
+def with_drag(world: Any, drag: str, folder: str | Path = "") -> Any:
+    """A world's settings with a drag law where neither they nor the world's file state one."""
+    given = {"name": world} if isinstance(world, str) else world
+    if not isinstance(given, Mapping) or "drag" in given or not isinstance(given.get("name"), str):
+        return world
+    beside = Path(folder) / given["name"]
+    left_out = is_left_out(beside if beside.is_file() else given["name"], "drag")
+    return {**given, "drag": drag} if left_out else world
 
 
 def override_config(config: Config, overrides: Mapping[str, object] | Sequence[str]) -> Config:
@@ -620,5 +636,7 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
             return file.text
         return file.at(path.relative_to(root).as_posix())
 
-    data = map_files(copy_plain(config.model_dump()), shorten, Config)
+    data = copy_plain(config.model_dump())
+    data["world"] = with_drag(data["world"], World.drag)
+    data = map_files(data, shorten, Config)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None)

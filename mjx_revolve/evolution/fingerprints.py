@@ -42,15 +42,19 @@ def hash_text(*texts: str) -> str:
 
 def plain_settings(config: Config) -> dict[str, Any]:
     """All settings that may not change within a run; a world is always a mapping."""
+    from mjx_revolve.episodes.config import with_drag
+    from mjx_revolve.water.world import World
+
     data = config.model_dump()
     for key in FREE_SETTINGS:
         del data["evolution"][key]
+    data["world"] = with_drag(data["world"], World.drag)
     if isinstance(data["world"], str):
         data["world"] = {"name": data["world"]}
     return data
 
 
-def settings_hash(config: Config, by_path: bool = False) -> str:
+def settings_hash(config: Config, by_path: bool = False, older_drag: bool = False) -> str:
     """Fingerprint of all settings that may not change within a run.
 
     Files count by their content, not by their path; so do the users' own tasks and controllers.
@@ -59,9 +63,11 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     Args:
         config: of the run.
         by_path: whether current fields and data count by their path, as they did in older runs.
+        older_drag: whether the drag law that is left out is that of older runs.
     """
-    from mjx_revolve.episodes.config import OLDER, Config
+    from mjx_revolve.episodes.config import OLDER, OLDER_DRAG, Config
     from mjx_revolve.episodes.settings import map_files
+    from mjx_revolve.water.world import World
 
     def by_content(file: NamedFile) -> str:
         if file.kind == "morphology":
@@ -73,6 +79,8 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     data = plain_settings(config)
     del data["morphology"], data["modules"]
     data["world"]["name"] = Path(data["world"]["name"]).name
+    if data["world"].get("drag") == (OLDER_DRAG if older_drag else World.drag):
+        del data["world"]["drag"]
     data = map_files(data, by_content, Config)
     for section in ("controller", "task"):
         if not data[section]["params"]:  # older runs have none

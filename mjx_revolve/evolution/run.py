@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import itertools
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -198,7 +199,8 @@ class Run:
         begun = checkpoint.meta if checkpoint else files.info
         settled = settings_hash(config)
         known = begun.get("settings_hash", settled)  # an older version's run.json has none
-        if known not in (settled, settings_hash(config, by_path=True)):
+        ways = itertools.product((False, True), repeat=2)
+        if known not in {settings_hash(config, *way) for way in ways}:
             raise InputError(
                 f"{label}: expected the config.yaml that it began with; found it changed"
             )

@@ -47,6 +47,11 @@ def _as(a: Scalar, like: jax.Array) -> Scalar:
     return np.asarray(a, like.dtype) if isinstance(a, np.ndarray | np.generic) else a
 
 
+def is_present(x: Scalar) -> bool:
+    """Whether a number is more than a plain zero; what is traced counts as something."""
+    return isinstance(x, jax.Array) or bool(np.any(x))
+
+
 def mul(a: Scalar, b: Scalar) -> Scalar:
     """Product; folds constant 0, 1 and -1."""
     if _constant(a) and _constant(b):

@@ -154,7 +154,7 @@ def _read_config(record: RunRecord) -> None:
         names = ", ".join(unknown)
         record.note("version", f"config.yaml: this version does not know {names}; read without")
     try:
-        known = with_older_values(locate_files(known, find_copies(record.folder)))
+        known = with_older_values(locate_files(known, find_copies(record.folder)), record.folder)
         record.config = make_config(known, record.folder, source=str(path))
     except InputError as error:
         spare = record.folder / "champion" / "morphology.yaml"
