@@ -62,7 +62,7 @@ from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
 from mjx_revolve.inputs.yaml_reader import load_yaml
-from mjx_revolve.water.world import World, is_left_out
+from mjx_revolve.water.world import is_left_out
 
 # What a task cannot do without; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {
@@ -634,7 +634,5 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
             return file.text
         return file.at(path.relative_to(root).as_posix())
 
-    data = copy_plain(config.model_dump())
-    data["world"] = with_drag(data["world"], World.drag)
-    data = map_files(data, shorten, Config)
+    data = map_files(copy_plain(config.model_dump()), shorten, Config)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None)

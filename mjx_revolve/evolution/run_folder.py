@@ -34,7 +34,7 @@ import numpy as np
 import yaml
 
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.episodes.config import Config, dump_config, make_config
+from mjx_revolve.episodes.config import Config, dump_config, make_config, with_drag
 from mjx_revolve.episodes.individual_log import (
     EVENTS,
     GENERATIONS,
@@ -48,6 +48,7 @@ from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.inputs.commands import check_no_sweep
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import check_path, resolve_inside, with_path, write_atomic
+from mjx_revolve.water.world import World
 
 try:
     import fcntl
@@ -245,6 +246,8 @@ def _info_text(info: Mapping[str, Any]) -> bytes:
 def _config_text(config: Config, folder: Path) -> bytes:
     """The text of `config.yaml`."""
     head = "# The resolved configuration of this run; it loads again as it stands.\n"
+    # Runs whose folder has no drag law are older ones.
+    config = config.model_copy(update={"world": with_drag(config.world, World.drag)})
     return (head + dump_config(config, folder)).encode()
 
 
