@@ -71,13 +71,16 @@ class Hinges(NamedTuple):
         damping: passive [N·m·s/rad].
         gain: of the servo, per target angle [N·m/rad].
         stiffness: of the servo, per joint angle [N·m/rad].
+        implicit_stiffness: what the servo has besides, on the joint angle at the end of the step
+            [N·m/rad].
         servo_damping: of the servo, per joint speed [N·m·s/rad].
         effort: torque limits of the servo, low and high [N·m].
         target: limits of the servo's target, low and high [rad].
         range: limits of the joint, low and high [rad].
         stop: stiffness of the end stops [N·m/rad].
         motor: the line between speed and torque near the top speed, far above any torque where
-            a servo has none: torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s].
+            a servo has none: torque at the top speed [N·m], gradient [N·m·s/rad], top speed
+            [rad/s].
         base_inertia: of all that is on the parent's side of the hinge, about its axis, at rest
             [kg·m²].
         lever: how far boxes of the robot can move for each radian, one seen from another [m]; 0
@@ -91,6 +94,7 @@ class Hinges(NamedTuple):
     damping: Scalar
     gain: Scalar
     stiffness: Scalar
+    implicit_stiffness: Scalar
     servo_damping: Scalar
     effort: tuple[Scalar, Scalar]
     target: tuple[Scalar, Scalar]

@@ -14,7 +14,7 @@ never positive, and for small waves its mean thrust is Lighthill's, ½ m (ẏ² 
 How much of a chain a part is, is a share c: 1 in a row of parts that is five times as long as high,
 falling to 0 where it is 2.5 times as long, times the share of the part's joined ends that its
 neighbours cover. A part by itself is a row of its own: a long one is a rod, which has the drag of a
-chain and sheds nothing at its ends (the source of that knows bodies that swim, with one tail), and
+chain and sheds nothing at its ends (the source of that is for swimming bodies with one tail), and
 a compact one has its faces' drag. In between coefficients are interpolated, and so are the drag of
 the whole velocity across the part and of each component by itself; the strips then stand at c of
 the part's half length, and what that leaves of the drag against turning, 1 - c³ of it, stays with
@@ -76,7 +76,7 @@ _SHAPE = "the robot's shape, which is known"
 _AHEAD = 0.1
 # Least Reynolds number at which friction is taken; below it the damping is that at it. A choice.
 _LEAST_REYNOLDS = 1e3
-# Squared speed that is added where a square root has no slope at rest [m²/s²].
+# Squared speed that is added where a square root has no gradient at rest [m²/s²].
 _STILL = 1e-18
 
 

@@ -1,4 +1,4 @@
-"""Fins whose lift lags behind their angle, and whose drag follows from their lift.
+"""Fins with lift that lags behind their angle, and drag that follows from their lift.
 
 Of the flow in the plane across the span, u along the chord and w across it, w where thin-airfoil
 theory takes the incidence, at three quarters of the chord. A foil that changes its incidence sheds
@@ -17,8 +17,8 @@ there is no suction, and the force is normal to the plate, C_L tan α. On top co
 the stall, what the fin has across the flow. Lift is across the velocity of the point where it acts,
 and drag never below 0, so the water never works: energy that a wake gives back is left out.
 
-It is stepped exactly for a velocity that holds for the step, knows velocities through the water
-only, and forgets out of the water. Against turning a fin has its faces' drag, as in `lift_drag`.
+It is stepped exactly for a velocity that holds for the step, depends on velocities through the
+water only, and decays out of the water. Against turning a fin has its faces' drag (`lift_drag`).
 """
 
 from __future__ import annotations

@@ -292,6 +292,6 @@ LIFT_DRAG = PartDragLaw(
     sdf=Export(
         "lift_drag",
         note="LiftDrag lifts and drags the fins",
-        missing="the current at the fins: Gazebo's LiftDrag knows the wind only",
+        missing="the current at the fins: Gazebo's LiftDrag has the wind only",
     ),
 )

@@ -2,8 +2,8 @@
 
 A plate that swings meets the vortices that it has shed a moment ago, and is dragged by several
 times its steady drag: C_d = A / KC + B across a flow that oscillates, KC = U T / b the
-Keulegan-Carpenter number (Ikeda's fit, ITTC). A step knows neither amplitude nor period, so each
-plate keeps four numbers of how its middle moved along its normal, v its velocity there through the
+Keulegan-Carpenter number (Ikeda's fit, ITTC). Amplitude and period are not known in a step, so each
+plate keeps four numbers of its middle's motion along its normal, v its velocity there through the
 water and τ a time (the filters are a choice; no simulator that was read has such a memory):
 
     v̄' = (v - v̄) / τ          its mean velocity
