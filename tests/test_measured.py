@@ -49,9 +49,12 @@ def test_a_rod_meets_what_a_rod_meets(steady, on_faces):
 
 def test_a_plate_sinks_by_its_drag():
     """Terminal speeds are within 10 % of what the measured C_d gives."""
-    row = measured_cases.sinking_plate()
-    assert row.ours == pytest.approx(row.measured * np.sqrt(1.16 / 1.17), rel=2e-3)
-    assert abs(row.ratio - 1) < 0.1
+    row = measured_cases.sinking_plate("faces")
+    assert row.ours == pytest.approx(row.measured * np.sqrt(1.16 / 1.05), rel=1e-3)
+    # One that remembers how it began to sink is still a little slower than by its C_d of 1.17.
+    found = measured_cases.sinking_plate()
+    assert 0.94 < found.ours / (found.measured * np.sqrt(1.16 / 1.17)) < 1.0
+    assert all(abs(x.ratio - 1) < 0.1 for x in (row, found))
 
 
 @pytest.fixture(scope="module")

@@ -231,7 +231,7 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
         tip = vadd(across, vscale(numbers.end, spin))
         left = jnp.maximum(neg(ahead), 0)
         square = left * left
-        whole = square + _AHEAD**2 * (_STILL + ahead * ahead + dot(tip, tip))
+        whole = square + _STILL + _AHEAD**2 * (ahead * ahead + dot(tip, tip))
         share = mul(square / whole, wet)
         lost = tuple(mul(mul(m, left), share) for m in numbers.shed)
         push = tuple(mul(m, x) for m, x in zip(lost, tip, strict=True))
