@@ -36,9 +36,13 @@ from mjx_revolve.inputs.schema import Integer, Number, checked
 # Records lie no further apart [s]: interpolation is then good to a millimetre and a tenth of a
 # degree.
 _RECORD = 0.01
-# Steps of the differences by which derivatives are found; in float64 they cost four digits of 16.
-_STEP = 1e-4
-_CLOCK_STEP = 1e-3
+# Steps of the differences by which derivatives are found. A servo reaches its limit at one step of
+# time or at the next one, so that motions jump a little as numbers grow: over a ten-thousandth such
+# a jump may pass for a slope. Free numbers are changed both ways by some hundredths, or a fifth of
+# what is not known of them; what is left of curvature is a ten-thousandth. Choices.
+_STEP, _FREE_STEP, _FREE_SHARE = 1e-3, 0.02, 0.2
+# In place of states of a simulation that diverged.
+_DIVERGED = 1e6
 START = 12
 """Corrections of a start: position, rotation (body), velocity, angular velocity (body)."""
 # Standard deviations of where a window begins: more than smoothing can be wrong by, [m, rad, m/s,
@@ -163,8 +167,8 @@ class FitProblem:
 
     @property
     def lanes(self) -> int:
-        """Variants of each recording: as it is, and one for each derivative."""
-        return 1 + len(self.parameters) + len(self.local) + START
+        """Variants of each recording: as it is, and those of its derivatives."""
+        return 1 + 2 * len(self.parameters) + len(self.local) + START
 
     def origin(self) -> Point:
         """The priors' medians."""
@@ -194,7 +198,7 @@ class FitProblem:
             k = self.local.index("clock")
             base = shifts[0].local[:, k]
             pair = [[f(t + s) for f, t in zip(self.commands, base, strict=True)]
-                    for s in (0.0, _CLOCK_STEP)]  # fmt: skip
+                    for s in (0.0, _STEP)]  # fmt: skip
             # [2, R, K, N, nu] to [K, N, nu, 2, R]
             ctrl = np.moveaxis(np.array(pair), (0, 1), (3, 4))
             drive = replace(drive, ctrl=ctrl)
@@ -215,11 +219,11 @@ class FitProblem:
             For each channel `[n, d]` residuals, `[n, d, P + L + 12]` derivatives, and the track
             `[R, K, records, 13 + hinges]`.
         """
-        points, robots = [point], [with_values(self.robot, self.parameters, point.free)]
         count, own = len(self.parameters), len(self.local)
-        for k in range(count):
-            points.append(replace(point, free=point.free + _STEP * np.eye(count)[k]))
-            robots.append(with_values(self.robot, self.parameters, points[-1].free))
+        steps = np.minimum(_FREE_STEP, [_FREE_SHARE * p.spread for p in self.parameters])
+        frees = [point.free, *(point.free + np.diag(steps)), *(point.free - np.diag(steps))]
+        points = [replace(point, free=free) for free in frees]
+        robots = [with_values(self.robot, self.parameters, free) for free in frees]
         for k in range(own):
             clock = self.local[k] == "clock"  # its commands are the drive's later ones
             step = 0.0 if clock else _STEP
@@ -229,22 +233,25 @@ class FitProblem:
             points.append(replace(point, starts=point.starts + shift))
         robots += [robots[0]] * (own + START)
         tracks = self._simulate(robots, points)
-        steps = np.full(self.lanes - 1, _STEP)
-        steps[count : count + own][[n == "clock" for n in self.local]] = _CLOCK_STEP
         values, slopes = [], []
         for left in self.residuals(tracks):
             values.append(left[0])
-            slopes.append(np.moveaxis(left[1:] - left[0], 0, -1) / steps)
+            known = np.where(np.abs(left) < _DIVERGED / 10, left, np.nan)
+            up, down, rest = np.split(known[1:], [count, 2 * count])
+            both = np.moveaxis(up - down, 0, -1) / (2 * steps)
+            one = np.moveaxis(rest - known[0], 0, -1) / _STEP
+            slopes.append(np.concatenate([both, one], -1))
         return values, slopes, tracks[0]
 
     def residuals(self, tracks: np.ndarray) -> list[np.ndarray]:
-        """`[V, n, d]` of each channel, from `simulate`'s tracks."""
-        return [
-            channel.residual(
-                self.states(tracks[:, channel.recording], channel.recording, channel.time)
-            )
-            for channel in self.channels
-        ]
+        """`[V, n, d]` of each channel, from `simulate`'s tracks; huge where those diverged."""
+        found = []
+        for channel in self.channels:
+            r = channel.recording
+            states = self.states(tracks[:, r], r, channel.time)
+            broken = ~np.isfinite(states).all(-1, keepdims=True)
+            found.append(channel.residual(np.where(broken, _DIVERGED, states)))
+        return found
 
     def states(self, track: np.ndarray, recording: int, time: np.ndarray) -> np.ndarray:
         """`[V, n, 13 + hinges]` states at times, from `[V, K, records, ...]`."""
@@ -348,10 +355,9 @@ def make_problem(
     )
     ctrl = np.stack([f(0.0) for f in commands], -1)
     ctrl = np.stack([ctrl, ctrl], -2)
-    lanes = 1 + len(parameters) + len(local) + START
-    later = np.zeros(lanes, bool)
+    later = np.zeros(1 + 2 * len(parameters) + len(local) + START, bool)
     if "clock" in local:
-        later[1 + len(parameters) + local.index("clock")] = True
+        later[1 + 2 * len(parameters) + local.index("clock")] = True
     angles, speeds = (
         np.stack([v.hinges_at(v.begin, prescribed, dt)[k] for v in views], -1) for k in range(2)
     )
