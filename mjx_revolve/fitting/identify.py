@@ -78,7 +78,7 @@ def _list(names: Sequence[str]) -> str:
 
 
 def is_found(parameter: Parameter, width: float) -> bool:
-    """Whether a number is found: whether its interval, so wide, is far narrower than the prior's."""
+    """Whether a number is found: its interval, of that width, is far narrower than before."""
     return width < SHARE * 2 * 1.96 * parameter.spread
 
 
