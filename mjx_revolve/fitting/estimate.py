@@ -27,6 +27,8 @@ _TOLERANCE = 0.02
 # noise; intervals are widened by what is left (Birge 1932). A choice.
 _FEW = 30
 _LEAST_NOISE = 0.02  # of `NOISE`: no recording is better, and what was simulated has none at all
+# With short windows the search need not arrive, and makes so many steps at most. Choices.
+_SHORT_STEPS, _SHORT_TOLERANCE = 20, 0.1
 _LARGEST_STEP = 1.0  # in a logarithm, or in units of the prior
 # Rounds in which ends of intervals are looked for at most, by how much an end may move in one, and
 # by how much the last one moves them. Choices.
@@ -303,8 +305,6 @@ def begin(problem: FitProblem, seed: int) -> FitState:
             replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)
         ]
     none = np.zeros(problem.drive.resets.shape)
-    if len(points) == 1:
-        return FitState(origin, noise, none)
     costs = _costs(problem, points, noise)
     best = origin
     if problem.free_heading.any():
@@ -315,7 +315,21 @@ def begin(problem: FitProblem, seed: int) -> FitState:
         problem.roots[:] = _turned(problem.roots, starts[:, 5])
     else:
         best = points[int(np.argmin(costs.sum(1)))]
-    return FitState(best, noise, none)
+    first = FitState(best, noise, none)
+    if (problem.short == problem.drive.resets).all():
+        return first
+    return _arrive(problem.in_pieces(), first)
+
+
+def _arrive(pieces: FitProblem, state: FitState) -> FitState:
+    """Where the search begins in earnest: where one with short windows has led."""
+    model = linearize(pieces, state.point)
+    for _ in range(_SHORT_STEPS):
+        state, model = advance(pieces, state, model)
+        if state.moved < _SHORT_TOLERANCE:
+            break
+    noise = {kind: NOISE[kind] for kind in state.noise}
+    return FitState(state.point, noise, np.zeros_like(state.damping))
 
 
 def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:

@@ -41,6 +41,9 @@ _RECORD = 0.01
 # a jump may pass for a slope. Free numbers are changed both ways by some hundredths, or a fifth of
 # what is not known of them; what is left of curvature is a ten-thousandth. Choices.
 _STEP, _FREE_STEP, _FREE_SHARE = 1e-3, 0.02, 0.2
+# The search begins with windows that are so many times shorter: a robot that tumbles for seconds
+# leads a search that begins far from its numbers astray. A choice.
+_PARTS = 4
 # In place of states of a simulation that diverged.
 _DIVERGED = 1e6
 START = 12
@@ -136,14 +139,15 @@ class FitProblem:
         begin: `[R]` times at which they begin [s].
         end: `[R]` and end.
         fitted_until: `[R]` up to where they are fitted; nothing of those held out.
-        window: length of a window [s].
+        piece: length of a piece of a window [s]; K pieces.
         drive: what is given of them.
         roots: `[K, 13, R]` where windows begin, by smoothing.
         start_spread: `[K, 12, R]` of the corrections' priors.
-        segment: `[K, R]` the window in which each one's simulation begins.
         channels: the measurements.
         variants: of the robot, one for each free number.
         free_heading: `[R]` whether nothing says which way the robot heads at first.
+        commands: by recording and by how late its clock is.
+        short: `[K, R]` which pieces begin anew where windows are short.
     """
 
     robot: Robot
@@ -154,16 +158,25 @@ class FitProblem:
     begin: np.ndarray
     end: np.ndarray
     fitted_until: np.ndarray
-    window: float
+    piece: float
     every: int
     drive: Drive
     roots: np.ndarray
     start_spread: np.ndarray
-    segment: np.ndarray
     channels: tuple[Channel, ...]
     variants: Variants
     free_heading: np.ndarray
     commands: tuple[Callable[[float], np.ndarray], ...]
+    short: np.ndarray
+
+    def in_pieces(self) -> FitProblem:
+        """The same with short windows."""
+        return replace(self, drive=replace(self.drive, resets=self.short))
+
+    @property
+    def window(self) -> float:
+        """Length of a window [s]."""
+        return _PARTS * self.piece
 
     @property
     def lanes(self) -> int:
@@ -256,7 +269,7 @@ class FitProblem:
     def states(self, track: np.ndarray, recording: int, time: np.ndarray) -> np.ndarray:
         """`[V, n, 13 + hinges]` states at times, from `[V, K, records, ...]`."""
         windows, count = track.shape[1:3]
-        passed = (time - self.begin[recording]) / self.window
+        passed = (time - self.begin[recording]) / self.piece
         # A frame where a window ends and the next begins is of the one that has run.
         k = np.clip(np.ceil(passed - 1e-9).astype(int) - 1, 0, windows - 1)
         place = np.clip((passed - k) * (count - 1), 0, count - 1)
@@ -264,7 +277,7 @@ class FitProblem:
         f = (place - i)[:, None]
         a, b = track[:, k, i], track[:, k, i + 1]
         found = a + f * (b - a)
-        h = self.window / (count - 1)
+        h = self.piece / (count - 1)
         found[..., :3] += (
             f
             * (1 - f)
@@ -280,9 +293,10 @@ class FitProblem:
 
     def window_of(self, recording: int, time: np.ndarray) -> np.ndarray:
         """`[n]` the windows in which the simulations that times belong to began."""
-        passed = (time - self.begin[recording]) / self.window
+        passed = (time - self.begin[recording]) / self.piece
         k = np.clip(np.ceil(passed - 1e-9).astype(int) - 1, 0, len(self.roots) - 1)
-        found: np.ndarray = self.segment[k, recording]
+        begun = np.where(self.drive.resets[:, recording], np.arange(len(self.roots)), 0)
+        found: np.ndarray = np.maximum.accumulate(begun)[k]
         return found
 
 
@@ -337,15 +351,17 @@ def make_problem(
     dt = robot.world.timestep
     window = float(min(settings.window, usual.max()))
     every = max(1, int(_RECORD / dt + 1e-9))
-    steps = max(1, math.ceil(window / dt / every - 1e-9)) * every
-    window = steps * dt
-    windows = max(1, math.ceil((end - begin).max() / window - 1e-6))
+    steps = max(1, math.ceil(window / _PARTS / dt / every - 1e-9)) * every
+    piece = steps * dt
+    windows = max(1, math.ceil((end - begin).max() / piece - 1e-6))
     resets = np.zeros((windows, len(recordings)), bool)
+    short = resets.copy()
     for r, view in enumerate(views):
-        many = 1 if held[r] or view.loose else max(1, int(usual[r] / window + 0.25))
-        resets[:many, r] = True
-    segment = np.maximum.accumulate(np.where(resets, np.arange(windows)[:, None], 0), 0)
-    at = begin + window * np.arange(windows)[:, None]
+        whole = held[r] or view.loose
+        many = 1 if whole else max(1, int(usual[r] / piece / _PARTS + 0.25))
+        resets[: many * _PARTS : _PARTS, r] = True
+        short[: 1 if whole else max(1, int(usual[r] / piece + 0.25)), r] = True
+    at = begin + piece * np.arange(windows)[:, None]
     starts = [view.starts(t) for view, t in zip(views, at.T, strict=True)]
     roots, spread = (np.stack([s[k] for s in starts], -1) for k in range(2))
     count = windows * steps
@@ -369,9 +385,9 @@ def make_problem(
     ]
     variants = _variants(robot, tuple(own), tuple(h in prescribed for h in hinges))
     return FitProblem(
-        robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, window,
-        every, drive, roots, spread, segment, tuple(channels), variants,
-        np.array([v.heading is None for v in views]), commands,
+        robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, piece,
+        every, drive, roots, spread, tuple(channels), variants,
+        np.array([v.heading is None for v in views]), commands, short,
     )  # fmt: skip
 
 
