@@ -182,7 +182,7 @@ def test_the_interval_of_a_servos_limit_is_no_narrower_where_the_motion_jumps():
         robot, [make_noisy(found, rate=60)], ["servo_speed"], FitSettings(held_out=0.0)
     )
     noise, spread = NOISE, []
-    for offset in np.linspace(0.055, 0.065, 11):
+    for offset in 0.06 + 2e-4 * np.arange(20):
         point = replace(problem.origin(), free=np.array([offset]))
         model = linearize(problem, point)
         spread.append(normal_equations(problem, model, point, noise).matrix[0, 0] ** -0.5)
