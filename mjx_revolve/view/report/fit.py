@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -73,7 +75,7 @@ def plot_prediction(p: Prediction) -> Figure:
     """A way from above, and its coordinates over time; what was held out on grey ground."""
     figure = new_figure(WIDE, 3.4)
     seen = [k for k in range(3) if np.isfinite(p.recorded[:, k]).any()]
-    layout = [["way", "xyz"[k]] for k in seen]
+    layout: Any = [["way", "xyz"[k]] for k in seen]
     above, *axes = figure.subplot_mosaic(layout, width_ratios=[1.1, 1]).values()
     rows = thin(len(p.time), 1500)
     lines = (("recorded", p.recorded, INK, 2.6), ("before", p.before, ORANGE, 1.0),
