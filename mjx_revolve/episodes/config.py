@@ -85,7 +85,7 @@ OLDER: dict[str, dict[str, Any]] = {
     "controller": {"rate": None, "between": "hold"},
 }
 OLDER_DRAG = "faces"
-"""What runs have whose folder states no drag law; others state it (`with_drag`)."""
+"""The drag law of runs with none in their folder; newer folders state it (`with_drag`)."""
 # Tasks with a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 

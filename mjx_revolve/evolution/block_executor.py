@@ -14,14 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from numpy.typing import ArrayLike
-
 from mjx_revolve.evolution.jobs import Job, WorkerError
 from mjx_revolve.inputs.errors import InputError
 
 if TYPE_CHECKING:
     import jax
     import numpy as np
+    from numpy.typing import ArrayLike
 
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.evolution.blocks import Block, KeyData, Scored

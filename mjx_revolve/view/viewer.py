@@ -19,11 +19,11 @@ import numpy as np
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
-from mjx_revolve.view.page_data import Packed
 from mjx_revolve.view.palette import page_palette
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.champion import Episode
+    from mjx_revolve.view.page_data import Packed
     from mjx_revolve.view.recording import Mark, ReplayRobot
 
 _FILES = Path(__file__).parent / "viewer_page"

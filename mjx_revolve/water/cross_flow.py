@@ -76,7 +76,7 @@ _SHAPE = "the robot's shape, which is known"
 _AHEAD = 0.1
 # Least Reynolds number at which friction is taken; below it the damping is that at it. A choice.
 _LEAST_REYNOLDS = 1e3
-# Squared speed that is added where a square root has no slope at rest [m²/s²].
+# Squared speed that is added where a square root has no derivative at rest [m²/s²].
 _STILL = 1e-18
 
 
