@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from mjx_revolve.fitting.run import FitRun
 
 _FREE = "drag,added_mass"
+_MUCH = 5.0
+"""Times the usual noise [-] beyond which residuals are no noise. A choice."""
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -169,6 +171,8 @@ def _finish(run: FitRun, interrupts: Interrupts) -> int:
 
 def describe(fit: Fit) -> list[str]:
     """What a fit has found, in lines."""
+    from mjx_revolve.fitting.problem import NOISE
+
     lines = []
     for v in fit.values:
         unit = v.unit or "times what it was"
@@ -183,6 +187,12 @@ def describe(fit: Fit) -> list[str]:
             f"{p.name}, {what}: {p.error(p.fitted, held):.3g} off (before: "
             f"{p.error(p.before, held):.3g}), of a way of {p.way:.3g}"
         )
+    for kind, sigma in fit.estimate.noise.items():
+        if sigma > _MUCH * NOISE[kind]:
+            lines.append(
+                f"{kind}: {sigma:.2g} is left, {sigma / NOISE[kind]:.0f} times what is usual: the "
+                "law or the robot is another one, or the search went astray; trust no interval"
+            )
     if not fit.state.finished:
         lines.append("the search has not arrived: give it more --set iterations")
     if fit.advice:

@@ -62,7 +62,7 @@ from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
 from mjx_revolve.inputs.yaml_reader import load_yaml
-from mjx_revolve.water.world import is_left_out
+from mjx_revolve.water.world import World, is_left_out
 
 # Required settings of each task; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {

@@ -48,7 +48,6 @@ from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.inputs.commands import check_no_sweep
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import check_path, resolve_inside, with_path, write_atomic
-from mjx_revolve.water.world import World
 
 try:
     import fcntl

@@ -2,8 +2,8 @@
 
 Residuals are weighted by the noise that is estimated on the way; single wild frames count less
 (Huber 1964). Windows' beginnings are eliminated one by one (Schur complements), so that cost grows
-with the length of a recording and not with its cube. Intervals are those of the linear model at the
-solution, in logarithms, with the noise's own correlation in time.
+with the length of a recording and not with its cube. Intervals are by profile likelihood, with the
+noise's own correlation in time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,12 @@ _TOLERANCE = 0.02
 # noise; intervals are widened by what is left (Birge 1932). A choice.
 _FEW = 30
 _LEAST_NOISE = 0.02  # of `NOISE`: no recording is better, and what was simulated has none at all
+# With short windows the search need not arrive, and makes so many steps at most. Choices.
+_SHORT_STEPS, _SHORT_TOLERANCE = 20, 0.1
 _LARGEST_STEP = 1.0  # in a logarithm, or in units of the prior
+# Rounds in which ends of intervals are looked for at most, by how much an end may move in one, and
+# by how much the last one moves them. Choices.
+_ROUNDS, _ROUND_FACTOR, _ROUND_TOLERANCE = 6, 2.0, 0.02
 
 
 class System(NamedTuple):
@@ -172,15 +177,24 @@ def step(problem: FitProblem, state: FitState, system: System) -> tuple[Point, f
     move = np.linalg.solve(damped, slope)
     limit = max(1.0, float(np.abs(move[:count]).max(initial=0.0)) / _LARGEST_STEP)
     move = move / limit
+    reached = _reached(problem, point, system, move, state.damping)
+    return reached, float(np.abs(move / spread)[:count].max(initial=0.0))
+
+
+def _reached(
+    problem: FitProblem, point: Point, system: System, move: np.ndarray, damping: np.ndarray
+) -> Point:
+    """Where a `[G]` move of the common numbers leads, windows' beginnings with it."""
+    count = len(problem.parameters)
     free = np.array(
         [p.bound(x) for p, x in zip(problem.parameters, point.free + move[:count], strict=True)]
     )
     starts = point.starts.copy()
     for k, r, block, coupling, pull in system.starts:
-        own = block + state.damping[k, r] * np.diag(np.diag(block))
+        own = block + damping[k, r] * np.diag(np.diag(block))
         starts[k, :, r] += np.linalg.solve(own, pull - coupling @ move)
     local = point.local + move[count:].reshape(point.local.shape)
-    return Point(free, local, starts), float(np.abs(move / spread)[:count].max(initial=0.0))
+    return Point(free, local, starts)
 
 
 def estimate_noise(problem: FitProblem, values: list[np.ndarray], used: float) -> dict[str, float]:
@@ -291,8 +305,6 @@ def begin(problem: FitProblem, seed: int) -> FitState:
             replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)
         ]
     none = np.zeros(problem.drive.resets.shape)
-    if len(points) == 1:
-        return FitState(origin, noise, none)
     costs = _costs(problem, points, noise)
     best = origin
     if problem.free_heading.any():
@@ -303,7 +315,21 @@ def begin(problem: FitProblem, seed: int) -> FitState:
         problem.roots[:] = _turned(problem.roots, starts[:, 5])
     else:
         best = points[int(np.argmin(costs.sum(1)))]
-    return FitState(best, noise, none)
+    first = FitState(best, noise, none)
+    if (problem.short == problem.drive.resets).all():
+        return first
+    return _arrive(problem.in_pieces(), first)
+
+
+def _arrive(pieces: FitProblem, state: FitState) -> FitState:
+    """Where the search begins in earnest: where one with short windows has led."""
+    model = linearize(pieces, state.point)
+    for _ in range(_SHORT_STEPS):
+        state, model = advance(pieces, state, model)
+        if state.moved < _SHORT_TOLERANCE:
+            break
+    noise = {kind: NOISE[kind] for kind in state.noise}
+    return FitState(state.point, noise, np.zeros_like(state.damping))
 
 
 def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -366,9 +392,9 @@ class Estimate:
 
     Attributes:
         offsets: `[P]` of the free numbers from the priors' medians.
+        ends: `[P, 2]` of their intervals, likewise.
         covariance: `[P, P]` of them.
         information: `[P, P]` what the data alone say, windows' and recordings' own numbers unknown.
-        quantile: standard deviations from an interval's middle to its end.
         local: `[R, L]`, and
         local_spread: `[R, L]` their standard deviations.
         noise: standard deviations by kind.
@@ -376,9 +402,9 @@ class Estimate:
     """
 
     offsets: np.ndarray
+    ends: np.ndarray
     covariance: np.ndarray
     information: np.ndarray
-    quantile: float
     local: np.ndarray
     local_spread: np.ndarray
     noise: dict[str, float]
@@ -386,8 +412,8 @@ class Estimate:
 
     def interval(self, problem: FitProblem, k: int) -> tuple[float, float, float]:
         """Value, lower and upper end of a free number."""
-        parameter, half = problem.parameters[k], self.quantile * np.sqrt(self.covariance[k, k])
-        low, middle, high = (parameter.value(self.offsets[k] + x) for x in (-half, 0.0, half))
+        low, high = self.ends[k]
+        middle, low, high = (problem.parameters[k].value(x) for x in (self.offsets[k], low, high))
         return middle, low, high
 
 
@@ -411,13 +437,78 @@ def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
     )
     # Few data say little of their own noise; the priors bound what that can do.
     degrees = max(float(rows) - numbers_used(problem, system), 4.0)
+    quantile = float(student.ppf((1 + LEVEL) / 2, degrees))
     return Estimate(
         state.point.free,
+        _profile(problem, state.point, model, system, noise, quantile),
         covariance[:count, :count],
         (alone + alone.T) / 2,
-        float(student.ppf((1 + LEVEL) / 2, degrees)),
         state.point.local,
         np.sqrt(np.diag(covariance)[count:]).reshape(state.point.local.shape),
         {kind: sigma / np.sqrt(inflation[kind]) for kind, sigma in state.noise.items()},
         inflation,
     )
+
+
+def _profile(
+    problem: FitProblem, best: Point, model: Model, system: System, noise: dict[str, float],
+    quantile: float,
+) -> np.ndarray:  # fmt: skip
+    """`[P, 2]` ends of intervals by profile likelihood (Venzon and Moolgavkar 1988), offsets.
+
+    A number's end is where the cost, least by all other numbers, has grown by quantile² / 2. All
+    ends are looked for at once, in lanes: each round moves a number to where its cost would have
+    grown so much if it grew as a square, and the others by the slopes at the best point.
+
+    Args:
+        problem: that was solved.
+        best: its solution.
+        model: the problem there.
+        system: normal equations there.
+        noise: standard deviations by kind, with correlation.
+        quantile: standard deviations from a number to its end if all were linear.
+    """
+    count, clock = len(problem.parameters), [n == "clock" for n in problem.local]
+    prior = np.zeros_like(system.matrix)
+    prior[:count, :count] = prior_matrix(problem)
+    still = np.zeros(problem.drive.resets.shape)
+    windows, rest = costs_of(problem, best, model.values, noise)
+    least = float(windows.sum()) + rest
+    covariance = np.linalg.inv(system.matrix + prior)
+    ways = [(k, side) for k in range(count) for side in (-1.0, 1.0)]
+    points = []
+    for k, side in ways:
+        move = covariance[:, k] * side * quantile / np.sqrt(covariance[k, k])
+        centred = system._replace(starts=[(*x[:4], 0 * x[4]) for x in system.starts])
+        points.append(_reached(problem, best, centred, move, still))
+    for _ in range(_ROUNDS):
+        tracks = problem.simulate(points)
+        left = problem.residuals(tracks)
+        moved = 0.0
+        for i, (k, _) in enumerate(ways):
+            values = [x[i] for x in left]
+            for c, channel in enumerate(problem.channels):
+                # All of them are simulated with the commands at the best point's clock.
+                late = (points[i].local - best.local)[channel.recording] * clock
+                own = model.slopes[c][..., count : count + len(clock)]
+                values[c] = values[c] + np.where(late, own * late, 0.0).sum(-1)
+            windows, rest = costs_of(problem, points[i], values, noise)
+            grown = max(float(windows.sum()) + rest - least, 1e-9)
+            factor = quantile / np.sqrt(2 * grown)
+            factor = min(max(factor, 1 / _ROUND_FACTOR), _ROUND_FACTOR)
+            moved = max(moved, abs(factor - 1))
+            there = replace(model, values=values)
+            now = normal_equations(problem, there, points[i], noise)
+            slope = now.slope.copy()
+            slope[:count] -= prior[:count, :count] @ points[i].free
+            move = np.zeros(len(slope))
+            move[k] = (factor - 1) * (points[i].free[k] - best.free[k])
+            others = np.arange(len(slope)) != k
+            matrix = now.matrix + prior
+            pull = slope[others] - matrix[others, k] * move[k]
+            move[others] = np.linalg.solve(matrix[np.ix_(others, others)], pull)
+            points[i] = _reached(problem, points[i], now, move, still)
+        if moved < _ROUND_TOLERANCE:
+            break
+    ends = np.array([p.free[k] for p, (k, _) in zip(points, ways, strict=True)])
+    return np.sort(ends.reshape(count, 2), 1)

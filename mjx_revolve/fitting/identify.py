@@ -77,9 +77,9 @@ def _list(names: Sequence[str]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def is_found(parameter: Parameter, variance: float) -> bool:
-    """Whether a number is found: far better known than before."""
-    return float(np.sqrt(variance)) < SHARE * parameter.spread
+def is_found(parameter: Parameter, width: float) -> bool:
+    """Whether a number is found: its interval, of that width, is far narrower than before."""
+    return width < SHARE * 2 * 1.96 * parameter.spread
 
 
 # --- motions --------------------------------------------------------------------------------------
@@ -169,6 +169,8 @@ def motion_problem(
 def information_of(problem: FitProblem) -> np.ndarray:
     """`[R, P, P]` what each recording of a problem would tell by itself, with usual noise."""
     model = linearize(problem, problem.origin())
+    if not np.isfinite(model.track).all():
+        raise InputError("plan: expected motions that can be simulated; found some that diverge")
     count, own = len(problem.parameters), len(problem.local)
     found = []
     for r in range(len(problem.recordings)):
@@ -221,8 +223,6 @@ def plan_motions(
     motions = list_motions(robot, settings)
     problem = motion_problem(robot, motions, free, settings)
     each = information_of(problem)
-    if not np.isfinite(each).all():
-        raise InputError("plan: expected motions that can be simulated; found some that diverge")
     parameters = problem.parameters
     total = np.zeros((len(parameters),) * 2) if known is None else known.copy()
     prior = np.diag([p.spread**-2.0 for p in parameters])

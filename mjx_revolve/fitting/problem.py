@@ -36,9 +36,16 @@ from mjx_revolve.inputs.schema import Integer, Number, checked
 # Records lie no further apart [s]: interpolation is then good to a millimetre and a tenth of a
 # degree.
 _RECORD = 0.01
-# Steps of the differences by which derivatives are found; in float64 they cost four digits of 16.
-_STEP = 1e-4
-_CLOCK_STEP = 1e-3
+# Steps of the differences by which derivatives are found. A servo reaches its limit at one step of
+# time or at the next one, so that motions jump a little as numbers grow: over a ten-thousandth such
+# a jump may pass for a slope. Free numbers are changed both ways by some hundredths, or a fifth of
+# what is not known of them; what is left of curvature is a ten-thousandth. Choices.
+_STEP, _FREE_STEP, _FREE_SHARE = 1e-3, 0.02, 0.2
+# The search begins with windows that are so many times shorter: a robot that tumbles for seconds
+# leads a search that begins far from its numbers astray. A choice.
+_PARTS = 4
+# In place of states of a simulation that diverged.
+_DIVERGED = 1e6
 START = 12
 """Corrections of a start: position, rotation (body), velocity, angular velocity (body)."""
 # Standard deviations of where a window begins: more than smoothing can be wrong by, [m, rad, m/s,
@@ -132,14 +139,15 @@ class FitProblem:
         begin: `[R]` times at which they begin [s].
         end: `[R]` and end.
         fitted_until: `[R]` up to where they are fitted; nothing of those held out.
-        window: length of a window [s].
+        piece: length of a piece of a window [s]; K pieces.
         drive: what is given of them.
         roots: `[K, 13, R]` where windows begin, by smoothing.
         start_spread: `[K, 12, R]` of the corrections' priors.
-        segment: `[K, R]` the window in which each one's simulation begins.
         channels: the measurements.
         variants: of the robot, one for each free number.
         free_heading: `[R]` whether nothing says which way the robot heads at first.
+        commands: by recording and by how late its clock is.
+        short: `[K, R]` which pieces begin anew where windows are short.
     """
 
     robot: Robot
@@ -150,21 +158,30 @@ class FitProblem:
     begin: np.ndarray
     end: np.ndarray
     fitted_until: np.ndarray
-    window: float
+    piece: float
     every: int
     drive: Drive
     roots: np.ndarray
     start_spread: np.ndarray
-    segment: np.ndarray
     channels: tuple[Channel, ...]
     variants: Variants
     free_heading: np.ndarray
     commands: tuple[Callable[[float], np.ndarray], ...]
+    short: np.ndarray
+
+    def in_pieces(self) -> FitProblem:
+        """The same with short windows."""
+        return replace(self, drive=replace(self.drive, resets=self.short))
+
+    @property
+    def window(self) -> float:
+        """Length of a window [s]."""
+        return _PARTS * self.piece
 
     @property
     def lanes(self) -> int:
-        """Variants of each recording: as it is, and one for each derivative."""
-        return 1 + len(self.parameters) + len(self.local) + START
+        """Variants of each recording: as it is, and those of its derivatives."""
+        return 1 + 2 * len(self.parameters) + len(self.local) + START
 
     def origin(self) -> Point:
         """The priors' medians."""
@@ -194,7 +211,7 @@ class FitProblem:
             k = self.local.index("clock")
             base = shifts[0].local[:, k]
             pair = [[f(t + s) for f, t in zip(self.commands, base, strict=True)]
-                    for s in (0.0, _CLOCK_STEP)]  # fmt: skip
+                    for s in (0.0, _STEP)]  # fmt: skip
             # [2, R, K, N, nu] to [K, N, nu, 2, R]
             ctrl = np.moveaxis(np.array(pair), (0, 1), (3, 4))
             drive = replace(drive, ctrl=ctrl)
@@ -215,11 +232,11 @@ class FitProblem:
             For each channel `[n, d]` residuals, `[n, d, P + L + 12]` derivatives, and the track
             `[R, K, records, 13 + hinges]`.
         """
-        points, robots = [point], [with_values(self.robot, self.parameters, point.free)]
         count, own = len(self.parameters), len(self.local)
-        for k in range(count):
-            points.append(replace(point, free=point.free + _STEP * np.eye(count)[k]))
-            robots.append(with_values(self.robot, self.parameters, points[-1].free))
+        steps = np.minimum(_FREE_STEP, [_FREE_SHARE * p.spread for p in self.parameters])
+        frees = [point.free, *(point.free + np.diag(steps)), *(point.free - np.diag(steps))]
+        points = [replace(point, free=free) for free in frees]
+        robots = [with_values(self.robot, self.parameters, free) for free in frees]
         for k in range(own):
             clock = self.local[k] == "clock"  # its commands are the drive's later ones
             step = 0.0 if clock else _STEP
@@ -229,27 +246,30 @@ class FitProblem:
             points.append(replace(point, starts=point.starts + shift))
         robots += [robots[0]] * (own + START)
         tracks = self._simulate(robots, points)
-        steps = np.full(self.lanes - 1, _STEP)
-        steps[count : count + own][[n == "clock" for n in self.local]] = _CLOCK_STEP
         values, slopes = [], []
         for left in self.residuals(tracks):
             values.append(left[0])
-            slopes.append(np.moveaxis(left[1:] - left[0], 0, -1) / steps)
+            known = np.where(np.abs(left) < _DIVERGED / 10, left, np.nan)
+            up, down, rest = np.split(known[1:], [count, 2 * count])
+            both = np.moveaxis(up - down, 0, -1) / (2 * steps)
+            one = np.moveaxis(rest - known[0], 0, -1) / _STEP
+            slopes.append(np.concatenate([both, one], -1))
         return values, slopes, tracks[0]
 
     def residuals(self, tracks: np.ndarray) -> list[np.ndarray]:
-        """`[V, n, d]` of each channel, from `simulate`'s tracks."""
-        return [
-            channel.residual(
-                self.states(tracks[:, channel.recording], channel.recording, channel.time)
-            )
-            for channel in self.channels
-        ]
+        """`[V, n, d]` of each channel, from `simulate`'s tracks; huge where those diverged."""
+        found = []
+        for channel in self.channels:
+            r = channel.recording
+            states = self.states(tracks[:, r], r, channel.time)
+            broken = ~np.isfinite(states).all(-1, keepdims=True)
+            found.append(channel.residual(np.where(broken, _DIVERGED, states)))
+        return found
 
     def states(self, track: np.ndarray, recording: int, time: np.ndarray) -> np.ndarray:
         """`[V, n, 13 + hinges]` states at times, from `[V, K, records, ...]`."""
         windows, count = track.shape[1:3]
-        passed = (time - self.begin[recording]) / self.window
+        passed = (time - self.begin[recording]) / self.piece
         # A frame where a window ends and the next begins is of the one that has run.
         k = np.clip(np.ceil(passed - 1e-9).astype(int) - 1, 0, windows - 1)
         place = np.clip((passed - k) * (count - 1), 0, count - 1)
@@ -257,7 +277,7 @@ class FitProblem:
         f = (place - i)[:, None]
         a, b = track[:, k, i], track[:, k, i + 1]
         found = a + f * (b - a)
-        h = self.window / (count - 1)
+        h = self.piece / (count - 1)
         found[..., :3] += (
             f
             * (1 - f)
@@ -273,9 +293,10 @@ class FitProblem:
 
     def window_of(self, recording: int, time: np.ndarray) -> np.ndarray:
         """`[n]` the windows in which the simulations that times belong to began."""
-        passed = (time - self.begin[recording]) / self.window
+        passed = (time - self.begin[recording]) / self.piece
         k = np.clip(np.ceil(passed - 1e-9).astype(int) - 1, 0, len(self.roots) - 1)
-        found: np.ndarray = self.segment[k, recording]
+        begun = np.where(self.drive.resets[:, recording], np.arange(len(self.roots)), 0)
+        found: np.ndarray = np.maximum.accumulate(begun)[k]
         return found
 
 
@@ -330,15 +351,17 @@ def make_problem(
     dt = robot.world.timestep
     window = float(min(settings.window, usual.max()))
     every = max(1, int(_RECORD / dt + 1e-9))
-    steps = max(1, math.ceil(window / dt / every - 1e-9)) * every
-    window = steps * dt
-    windows = max(1, math.ceil((end - begin).max() / window - 1e-6))
+    steps = max(1, math.ceil(window / _PARTS / dt / every - 1e-9)) * every
+    piece = steps * dt
+    windows = max(1, math.ceil((end - begin).max() / piece - 1e-6))
     resets = np.zeros((windows, len(recordings)), bool)
+    short = resets.copy()
     for r, view in enumerate(views):
-        many = 1 if held[r] or view.loose else max(1, int(usual[r] / window + 0.25))
-        resets[:many, r] = True
-    segment = np.maximum.accumulate(np.where(resets, np.arange(windows)[:, None], 0), 0)
-    at = begin + window * np.arange(windows)[:, None]
+        whole = held[r] or view.loose
+        many = 1 if whole else max(1, int(usual[r] / piece / _PARTS + 0.25))
+        resets[: many * _PARTS : _PARTS, r] = True
+        short[: 1 if whole else max(1, int(usual[r] / piece + 0.25)), r] = True
+    at = begin + piece * np.arange(windows)[:, None]
     starts = [view.starts(t) for view, t in zip(views, at.T, strict=True)]
     roots, spread = (np.stack([s[k] for s in starts], -1) for k in range(2))
     count = windows * steps
@@ -348,10 +371,9 @@ def make_problem(
     )
     ctrl = np.stack([f(0.0) for f in commands], -1)
     ctrl = np.stack([ctrl, ctrl], -2)
-    lanes = 1 + len(parameters) + len(local) + START
-    later = np.zeros(lanes, bool)
+    later = np.zeros(1 + 2 * len(parameters) + len(local) + START, bool)
     if "clock" in local:
-        later[1 + len(parameters) + local.index("clock")] = True
+        later[1 + 2 * len(parameters) + local.index("clock")] = True
     angles, speeds = (
         np.stack([v.hinges_at(v.begin, prescribed, dt)[k] for v in views], -1) for k in range(2)
     )
@@ -363,9 +385,9 @@ def make_problem(
     ]
     variants = _variants(robot, tuple(own), tuple(h in prescribed for h in hinges))
     return FitProblem(
-        robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, window,
-        every, drive, roots, spread, segment, tuple(channels), variants,
-        np.array([v.heading is None for v in views]), commands,
+        robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, piece,
+        every, drive, roots, spread, tuple(channels), variants,
+        np.array([v.heading is None for v in views]), commands, short,
     )  # fmt: skip
 
 

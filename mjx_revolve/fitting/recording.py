@@ -133,7 +133,7 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     with reading(path):
         if path.is_dir() and (path / "run.json").is_file():
             signals = _read_run(path)
-        elif path.is_dir() or path.suffix == ".mcap":
+        elif path.is_dir() or path.suffix in (".mcap", ".db3"):
             signals = _read_bag(path, rest)
         else:
             signals = _read_csv(path, rest, robot)
@@ -262,7 +262,11 @@ def _unit(column: str) -> tuple[str, float]:
 
 
 def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
-    """Topics by their types; of several of one type the first, or what `odometry=/topic` names."""
+    """Topics by their types; of several of one type the first, or what `odometry=/topic` names.
+
+    All of joints, points (marks, by the last of their topics' names) and numbers (`depth`, or what
+    `command.port=/topic*FACTOR` names) are read.
+    """
     check_package("a bag", "rosbags")
     from rosbags.rosbag2 import Reader
     from rosbags.typesys import Stores, get_typestore
@@ -270,18 +274,27 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
     kept: dict[str, list[tuple[float, float]]] = {}
     chosen: dict[str, str] = {}
+    named = {}
+    for name, source in columns.items():
+        match = _SOURCE.match(source)
+        assert match is not None
+        named[match["column"]] = name, float(match["factor"] or 1.0)
     try:
         with Reader(path) as bag:
             for connection, stamp, raw in bag.messages():
                 kind, topic = connection.msgtype.rpartition("/")[2], connection.topic
                 if (use := _TOPICS.get(kind)) is None:
                     continue
-                role = f"{kind} {topic}" if kind == "JointState" else kind
+                role = f"{kind} {topic}" if kind in _MANY else kind
                 if chosen.setdefault(role, columns.get(kind.lower(), topic)) != topic:
                     continue
                 message = store.deserialize_cdr(raw, connection.msgtype)
                 for name, value in use(message, topic):
-                    kept.setdefault(name, []).append((1e-9 * stamp, float(value)))
+                    name, factor = (
+                        named.get(topic, (name, 1.0)) if kind in _NUMBERS else (name, 1.0)
+                    )
+                    if name:
+                        kept.setdefault(name, []).append((1e-9 * stamp, factor * float(value)))
     except InputError:
         raise
     except Exception as error:  # rosbags' own kinds, struct's, zstd's
@@ -324,13 +337,27 @@ def _imu(message: Any, topic: str) -> Iterable[tuple[str, float]]:
         yield from ((f"{kind}.{axis}", getattr(vector, axis)) for axis in "xyz")
 
 
+def _point(message: Any, topic: str) -> Iterable[tuple[str, float]]:
+    name = topic.rpartition("/")[2]
+    yield from ((f"mark.{name}.{axis}", getattr(message.point, axis)) for axis in "xyz")
+
+
+def _number(message: Any, topic: str) -> Iterable[tuple[str, float]]:
+    yield ("depth" if topic.rpartition("/")[2] == "depth" else ""), message.data
+
+
 _TOPICS: dict[str, Callable[[Any, str], Iterable[tuple[str, float]]]] = {
     "Odometry": lambda m, _: _pose(m.pose.pose),
     "PoseStamped": lambda m, _: _pose(m.pose),
     "JointState": _joints,
     "Float64MultiArray": _array,
     "Imu": _imu,
+    "PointStamped": _point,
+    "Float64": _number,
+    "Float32": _number,
 }
+_NUMBERS = "Float64", "Float32"
+_MANY = ("JointState", "PointStamped", *_NUMBERS)
 
 
 def _read_run(path: Path) -> dict[str, TimeSeries]:

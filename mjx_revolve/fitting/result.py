@@ -235,7 +235,7 @@ def conclude(
     values = []
     for k, parameter in enumerate(problem.parameters):
         value, low, high = found.interval(problem, k)
-        known = is_found(parameter, found.covariance[k, k])
+        known = is_found(parameter, float(np.ptp(found.ends[k])))
         values.append(FittedValue(parameter.name, parameter.unit, value, low, high, known))
     unknown = tuple(find_unknown(problem.parameters, found.information))
     local = tuple(

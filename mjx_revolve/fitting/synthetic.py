@@ -57,7 +57,8 @@ def simulate_signals(
     point = problem.origin()
     point.free[:] = offsets
     point.local[0] = current[:2]
-    track = problem.simulate([point])[0, 0, 0]
+    pieces = problem.simulate([point])[0, 0]
+    track = np.concatenate([pieces[0], *pieces[1:, 1:]])
     at = problem.every * dt * np.arange(len(track))
     return commands | {n: TimeSeries(at, x) for n, x in zip(_POSE, track.T[:7], strict=True)}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -72,26 +74,27 @@ def _predictions(fit: Fit) -> str:
 def plot_prediction(p: Prediction) -> Figure:
     """A way from above, and its coordinates over time; what was held out on grey ground."""
     figure = new_figure(WIDE, 3.4)
-    above, *axes = figure.subplot_mosaic(
-        [["way", "0"], ["way", "1"], ["way", "2"]], width_ratios=[1.1, 1]
-    ).values()
+    seen = [k for k in range(3) if np.isfinite(p.recorded[:, k]).any()]
+    layout: Any = [["way", "xyz"[k]] for k in seen]
+    above, *axes = figure.subplot_mosaic(layout, width_ratios=[1.1, 1]).values()
     rows = thin(len(p.time), 1500)
     lines = (("recorded", p.recorded, INK, 2.6), ("before", p.before, ORANGE, 1.0),
              ("fitted", p.fitted, BLUE, 1.2))  # fmt: skip
     for name, track, color, width in lines:
         alpha = 0.35 if name == "recorded" else 1.0
         above.plot(track[rows, 0], track[rows, 1], color=color, lw=width, alpha=alpha, label=name)
-        for k, axis in enumerate(axes):
+        for k, axis in zip(seen, axes, strict=True):
             axis.plot(p.time[rows], track[rows, k], color=color, lw=width, alpha=alpha)
     above.set_aspect("equal", adjustable="datalim")
     above.set_xlabel("x (m)")
     above.set_ylabel("y (m)")
     above.legend(loc="best")
-    for k, axis in enumerate(axes):
+    for k, axis in zip(seen, axes, strict=True):
         axis.set_ylabel(f"{'xyz'[k]} (m)")
+        axis.sharex(axes[-1])
         if p.held.any() and not p.held.all():
             axis.axvspan(p.time[p.held][0], p.time[-1], color=GREY, alpha=0.15, lw=0)
-        if k < 2:
+        if axis is not axes[-1]:
             axis.tick_params(labelbottom=False)
     axes[-1].set_xlabel("time (s); grey: held out")
     return figure

@@ -1,0 +1,193 @@
+"""Fits from each kind of recording, by the command: what is read is what was there."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_fit import felt, write_csv
+
+from mjx_revolve import fit as command
+from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.fitting import TimeSeries, make_noisy, run, simulate_signals
+from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.water.world import load_world
+
+FREE = ["drag", "thrust"]
+TRUE = [1.3, 0.8]
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+SETTINGS = ["--free", "drag,thrust", "--set", "window=3", "--set", "held_out=0"]
+MARKS = {"bow": np.array([0.0, 0.1, 0.0]), "stern": np.array([0.0, -0.1, 0.0]),
+         "top": np.array([0.03, 0.0, 0.05])}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def auv():
+    """One robot for all, so that one compiled program serves all of them."""
+    world = load_world("lake", bed="off", drag="faces", self_contact=False)
+    return build_robot(load_morphology("auv"), world)
+
+
+@pytest.fixture(scope="module")
+def signals(auv):
+    ctrl = np.zeros((1200, 4))
+    names = [auv.mj_model.actuator(k).name for k in range(4)]
+    ctrl[40:800, names.index("port")], ctrl[40:500, names.index("starboard")] = 0.6, 0.5
+    return simulate_signals(auv, FREE, np.log(TRUE), ctrl)
+
+
+@pytest.fixture
+def fit(auv, tmp_path, monkeypatch):
+    """Runs the command on a recording; returns what `fit.json` and the lines say."""
+    monkeypatch.setattr(run, "load_robot", lambda *_: (auv, {"robot": "inputs/robot.yaml",
+                        "world": "lake", "world_fields": {"bed": "off", "drag": "faces",
+                        "self_contact": False}}, {}))  # fmt: skip
+
+    def go(*recordings, more=()):
+        arguments = ["auv", *map(str, recordings), *SETTINGS, "--out", str(tmp_path / "out")]
+        assert run_command(command.main, [*arguments, *more]) == 0
+        return json.loads((tmp_path / "out" / "fit.json").read_text())
+
+    return go
+
+
+def check(found, within=0.03):
+    for value, truth in zip(found["values"], TRUE, strict=True):
+        assert value["found"]
+        assert value["value"] == pytest.approx(truth, rel=within)
+        assert value["low"] / 1.02 < truth < value["high"] * 1.02
+
+
+def at_frames(recording):
+    """Columns of a table, commands at frames' times."""
+    time = recording.signals["x"].time
+    columns = {"time": time} | {name: recording.signals[name].value for name in POSE}
+    for name, one in recording.signals.items():
+        if name.startswith("command."):
+            rows = np.searchsorted(one.time, time, side="right") - 1
+            columns[name] = one.value[rows]
+    return columns
+
+
+def seen_marks(recording):
+    """`mark.NAME.AXIS` of three points on the core, each with 3 mm of noise."""
+    signals = recording.signals
+    position = np.stack([signals[axis].value for axis in "xyz"], -1)
+    turn = Rotation.from_quat(np.stack([signals[n].value for n in POSE[3:]], -1), scalar_first=True)
+    draw, found = np.random.default_rng(4), {}
+    for name, place in MARKS.items():
+        seen = position + turn.apply(place) + 0.003 * draw.normal(size=position.shape)
+        found |= {f"mark.{name}.{axis}": seen[:, k] for k, axis in enumerate("xyz")}
+    return found
+
+
+def as_map(names):
+    return [f"--map=mark.{n}=core:{','.join(map(str, MARKS[n]))}" for n in names]
+
+
+def test_a_table_of_poses_with_a_gap_and_lost_frames(fit, signals, tmp_path, capsys):
+    columns = at_frames(make_noisy(signals, lost=0.05, seed=1))
+    kept = (columns["time"] < 3.0) | (columns["time"] > 3.6)  # no command changes then
+    write_csv(tmp_path / "swim.csv", {name: x[kept] for name, x in columns.items()})
+    check(fit(tmp_path / "swim.csv"))
+    assert "1 gaps of up to 0.6" in capsys.readouterr().out
+
+
+def test_two_marks_from_above_in_units_of_their_own(fit, signals, tmp_path):
+    recording = make_noisy(signals, position=1e-4, attitude=1e-4, seed=1)
+    columns, seen = at_frames(recording), seen_marks(recording)
+    table = {"t_ms": 1e3 * columns["time"]}
+    for name in ("bow", "stern"):
+        table |= {f"mark.{name}.{a}_mm": 1e3 * seen[f"mark.{name}.{a}"] for a in "xy"}
+    table |= {name: x for name, x in columns.items() if name.startswith("command.")}
+    write_csv(tmp_path / "swim.csv", table)
+    check(fit(tmp_path / "swim.csv", more=as_map(("bow", "stern"))), 0.05)
+
+
+def write_bag(path, series, plugin):
+    """A ROS 2 bag with poses as odometry or marks, commands, an IMU and depth; times from 100 s."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="the package rosbags writes bags")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    make = lambda kind, *values: types[kind](*values)  # noqa: E731
+    rows = []
+    point = lambda xyz, kind="Point": make(f"geometry_msgs/msg/{kind}", *map(float, xyz))  # noqa: E731
+
+    def header(t):
+        stamp = make("builtin_interfaces/msg/Time", int(t), 0)
+        return make("std_msgs/msg/Header", stamp, "world")
+
+    none = np.zeros(36)
+    marks = sorted({name.split(".")[1] for name in series if name.startswith("mark.")})
+    if "x" in series:
+        time = series["x"].time
+        table = np.stack([series[name].value for name in POSE], -1)
+        for t, row in zip(time, table, strict=True):
+            turn = make("geometry_msgs/msg/Quaternion", *map(float, [*row[4:], row[3]]))
+            pose = make("geometry_msgs/msg/Pose", point(row[:3]), turn)
+            still = make("geometry_msgs/msg/Twist", *[point((0, 0, 0), "Vector3")] * 2)
+            message = make("nav_msgs/msg/Odometry", header(t), "base_link",
+                           make("geometry_msgs/msg/PoseWithCovariance", pose, none),
+                           make("geometry_msgs/msg/TwistWithCovariance", still, none))  # fmt: skip
+            rows.append((t, "/odom", message))
+    for name in marks:
+        both = [series[f"mark.{name}.{axis}"] for axis in "xyz"]
+        for t, *place in zip(both[0].time, *(x.value for x in both), strict=True):
+            message = make("geometry_msgs/msg/PointStamped", header(t), point(place))
+            rows.append((t, f"/tracker/{name}", message))
+    if "gyro.x" in series:
+        turn = make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        felt_ = [[series[f"{kind}.{a}"].value for a in "xyz"] for kind in ("gyro", "accel")]
+        for k, t in enumerate(series["gyro.x"].time):
+            gyro, push = (point([x[k] for x in kind], "Vector3") for kind in felt_)
+            values = header(t), turn, none[:9], gyro, none[:9], push, none[:9]
+            rows.append((t, "/imu", make("sensor_msgs/msg/Imu", *values)))
+    if "depth" in series:
+        for t, value in zip(*series["depth"], strict=True):
+            rows.append((t, "/depth", make("std_msgs/msg/Float64", float(value))))
+    for name in (n for n in series if n.startswith("command.")):
+        for t, value in zip(series[name].time[::5], series[name].value[::5], strict=True):
+            topic = f"/thrusters/{name.partition('.')[2]}"
+            rows.append((t, topic, make("std_msgs/msg/Float64", 100 * float(value))))
+    with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[plugin]) as writer:
+        topics = {}
+        for t, topic, message in sorted(rows, key=lambda row: row[0]):
+            kind = message.__msgtype__
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=store)
+            stamp = round(1e9 * (100 + t))
+            writer.write(topics[topic], stamp, store.serialize_cdr(message, kind))
+
+
+def commands_of(auv):
+    names = [auv.mj_model.actuator(k).name for k in range(auv.mj_model.nu)]
+    return [f"--map=command.{name}=/thrusters/{name}*0.01" for name in names]
+
+
+@pytest.mark.parametrize(("plugin", "bare"), [("MCAP", False), ("MCAP", True), ("SQLITE3", False),
+                                              ("SQLITE3", True)])  # fmt: skip
+def test_a_bag_of_either_kind_as_a_folder_and_as_a_file(
+    fit, auv, signals, tmp_path, plugin, bare
+):  # fmt: skip
+    recording = make_noisy(signals, seed=1)
+    write_bag(tmp_path / "swim", recording.signals, plugin)
+    path = tmp_path / "swim"
+    if bare:
+        [path] = [f for f in path.iterdir() if f.suffix in (".mcap", ".db3")]
+    check(fit(path, more=commands_of(auv)))
+
+
+@pytest.mark.slow
+def test_a_bag_with_marks_an_imu_and_depth(fit, auv, signals, tmp_path):
+    recording = make_noisy(signals, position=1e-4, attitude=1e-4, seed=1)
+    time = recording.signals["x"].time
+    series = {n: TimeSeries(time, x) for n, x in seen_marks(recording).items()}
+    series |= {n: s for n, s in signals.items() if n.startswith("command.")} | felt(signals)
+    write_bag(tmp_path / "swim", series, "SQLITE3")
+    found = fit(tmp_path / "swim", more=[*commands_of(auv), *as_map(MARKS)])
+    check(found, 0.01)
+    assert {"marks", "gyro", "accelerometer", "depth"} == set(found["noise"])
+    assert found["noise"]["marks"] == pytest.approx(0.003, rel=0.2)
