@@ -7,7 +7,7 @@ by half of the skin (Verlet 1967, Physical Review 159); in between, only these p
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,11 +21,13 @@ from mjx_revolve.engine.spheres import Spheres
 from mjx_revolve.engine.state import State
 from mjx_revolve.numerics.spatial import (
     Scalar,
+    Sym,
     Vec,
     cross,
     dot,
     matTvec,
     matvec,
+    symvec,
     vadd,
     vscale,
     vsub,
@@ -44,9 +46,9 @@ _SPEED_MARGIN = 1.2
 _PAIRS, _FOUND, _PUSHED = 4, 512, 64
 # Room in the list for so many pairs of spheres per robot; more than heaps have. A choice.
 _ROOM = 64
-# Share of the mass that a contact may stop in a step, so that a body between several others does
-# not get more than it takes: stable up to four at a time. A choice.
-_SHARE = 0.5
+# At most so many sweeps over all contacts, and what the last one may still change in the speed of
+# any [m/s]. Choices: two plates that meet flat need six.
+_SWEEPS, _ENOUGH = 16, 1e-3
 # Below this distance [m] two centres have no direction from one to the other.
 _TINY = 1e-6
 
@@ -99,45 +101,59 @@ def penalty_force(
     parameters: ContactParameters,
     depth: Scalar,
     normal: Vec,
+    before: Vec,
     velocity: Vec,
-    mass: Scalar,
-    slip_mass: Scalar,
+    inverse: Callable[[Vec], tuple[Scalar, Scalar]],
+    old: tuple[Scalar, Vec],
     dt: float,
-) -> Vec:
-    """Force on a sphere in contact with another.
+) -> tuple[Scalar, Vec]:
+    """Force on a sphere in contact with another, brought nearer to what the law asks for.
 
-    Normal, with d > 0 the depth and v the speed inwards at the end of the step: F = k d + c v, c
-    critical damping of the reduced mass m of the two bodies where they touch; as F slows them
-    within the step,
+    Normal, with d the depth at the beginning of the step and v the speed inwards at its end:
+    F = k d + (dt k + c) v ≥ 0, a spring at the end of the step and a damper, c critical damping of
+    the reduced mass of the two rigid bodies, by themselves, along the normal. d may be negative:
+    what would meet within the step is met. Tangential: Coulomb's, -μ F v_t / √(v_t² + v_c²) with
+    v_c = 1 mm/s and the slip v_t at the end of the step, and never more than μ F.
 
-        F = (k d + (dt k + c) v) / (1 + (dt² k + dt c) / m) ≥ 0,
-
-    a spring and a damper as dt goes to 0, and at any dt no more than what stops m. m is a lower
-    bound, that of the two rigid bodies without those that hang on them, so that it is stable.
-    Tangential: Coulomb's, -μ F v_t / √(v_t² + v_c²) with v_c = 1 mm/s, bounded in the same way.
+    v follows from the forces of all contacts; each comes nearer to its own by what its bodies
+    need, each of them split into equal pieces, one for each of its contacts: so that all contacts
+    may move at once and none makes energy (Tonge, Benevolenski and Voroshilov 2012, Mass Splitting
+    for Jitter-Free Parallel Rigid Body Simulation, § 4).
 
     Args:
         parameters: stiffness, damping and friction.
         depth: of one sphere in the other [m], negative apart.
         normal: unit vector from the other sphere's centre to that of this one.
-        velocity: of this one relative to the other at the contact [m/s].
-        mass: reduced mass of the two along the normal [kg].
-        slip_mass: a lower bound of it across the normal [kg].
+        before: velocity of this one relative to the other at the contact, at the beginning of the
+            step [m/s].
+        velocity: the same at its end, as the forces so far make it.
+        inverse: direction → inverse reduced mass of the two bodies along it, of the whole bodies
+            and of the contact's pieces [1/kg].
+        old: normal force [N] and friction so far.
         dt: of the step [s].
 
     Returns:
-        The force, in the frame of the arguments [N].
+        Normal force [N], and friction, in the frame of the arguments [N].
     """
     k = parameters.stiffness
+    ahead = depth - dt * dot(before, normal)
+    whole, pieces = inverse(normal)
+    damper = 2 * parameters.damping * jnp.sqrt(k / whole)
+    damper = dt * k + damper * jnp.clip(ahead / DAMPER_DEPTH, 0, 1)
     inwards = -dot(velocity, normal)
-    fade = jnp.clip(depth / DAMPER_DEPTH, 0, 1)
-    damper = (dt * k + 2 * parameters.damping * jnp.sqrt(k * mass)) * fade
-    force = (k * depth + damper * inwards) / (1 + dt * damper / mass)
-    force = jnp.where((depth > 0) & (force > 0), force, 0)
+    force, friction = old
+    missing = k * depth + damper * inwards - force
+    force = jnp.maximum(force + missing / (1 + dt * damper * pieces), 0)
+    force = jnp.where(ahead > 0, force, 0)
     slip = tuple(v + inwards * n for v, n in zip(velocity, normal, strict=True))
     grip = parameters.friction * force / jnp.sqrt(dot(slip, slip) + CREEP_SPEED**2)
-    grip = grip / (1 + dt * grip / slip_mass)
-    return tuple(force * n - grip * s for n, s in zip(normal, slip, strict=True))
+    change = tuple(-grip * s - f for s, f in zip(slip, friction, strict=True))
+    size = jnp.sqrt(dot(change, change))
+    _, pieces = inverse(vscale(1 / jnp.maximum(size, _TINY), change))
+    friction = vadd(friction, vscale(1 / (1 + dt * grip * pieces), change))
+    size = jnp.sqrt(dot(friction, friction))
+    bound = parameters.friction * force / jnp.maximum(size, _TINY)
+    return force, vscale(jnp.minimum(bound, 1), friction)
 
 
 class _Side(NamedTuple):
@@ -152,7 +168,8 @@ class _Side(NamedTuple):
         axes: of the world in the body's frame.
         radius: [m].
         inverse_mass: [1/kg].
-        inverse_inertia: [1/(kg m²)].
+        inverse_inertia: about the mass centre, body frame [1/(kg m²)].
+        contacts: of the body, at least 1.
     """
 
     center: Vec
@@ -163,18 +180,32 @@ class _Side(NamedTuple):
     axes: tuple[Vec, Vec, Vec]
     radius: jax.Array
     inverse_mass: jax.Array
-    inverse_inertia: jax.Array
+    inverse_inertia: Sym
+    contacts: Scalar = 1.0
 
     def velocity_at(self, point: Vec) -> Vec:
         """Velocity of the body at a point [m/s]."""
         return vadd(self.velocity, cross(self.angular_velocity, vsub(point, self.origin)))
 
-    def inverse_at(self, point: Vec, normal: Vec) -> tuple[Scalar, Scalar]:
-        """Upper bounds of the inverse mass along the normal, and across it [1/kg]."""
-        arm = vsub(point, self.mass_center)
-        lever = cross(arm, normal)
-        along = self.inverse_mass + dot(lever, lever) * self.inverse_inertia
-        return along, self.inverse_mass + dot(arm, arm) * self.inverse_inertia
+    def pushed(self, torque: Vec, force: Vec, time: float) -> _Side:
+        """Its velocity after a wrench about the origin, body frame [N·m, N], for a time [s]."""
+        torque, force = matvec(self.axes, torque), matvec(self.axes, force)
+        arm = vsub(self.mass_center, self.origin)
+        turned = self._lighten(vsub(torque, cross(arm, force)))
+        gain = vsub(vscale(self.inverse_mass, force), cross(turned, arm))
+        return self._replace(
+            velocity=vadd(self.velocity, vscale(time, gain)),
+            angular_velocity=vadd(self.angular_velocity, vscale(time, turned)),
+        )
+
+    def inverse_at(self, point: Vec, direction: Vec) -> Scalar:
+        """Inverse mass at a point along a direction, of the body by itself [1/kg]."""
+        lever = cross(vsub(point, self.mass_center), direction)
+        return self.inverse_mass + dot(lever, self._lighten(lever))
+
+    def _lighten(self, torque: Vec) -> Vec:
+        """Angular acceleration by a torque, world frame [rad/s²]."""
+        return matvec(self.axes, symvec(self.inverse_inertia, matTvec(self.axes, torque)))
 
 
 def _depth(one: _Side, other: _Side) -> jax.Array:
@@ -183,29 +214,63 @@ def _depth(one: _Side, other: _Side) -> jax.Array:
     return one.radius + other.radius - jnp.sqrt(dot(apart, apart) + _TINY**2)
 
 
-def _collide(
-    parameters: ContactParameters, one: _Side, other: _Side, share: jax.Array, dt: float
-) -> Any:
-    """Wrenches of spheres on the bodies of both, as `penalty_force` has them.
+def _closing(one: _Side, other: _Side) -> jax.Array:
+    """Speed at which spheres come nearer [m/s]."""
+    normal, point, _ = _contact(one, other)
+    return -dot(normal, vsub(one.velocity_at(point), other.velocity_at(point)))
 
-    `share` is that of the reduced mass which each contact may stop. Returns torque and force about
-    the bodies' origins, their frames, six of `[n]` for each side.
-    """
+
+def _contact(one: _Side, other: _Side) -> tuple[Vec, Vec, jax.Array]:
+    """Normal, point and depth of spheres in contact."""
     apart = vsub(one.center, other.center)
     normal = vscale(1 / jnp.sqrt(dot(apart, apart) + _TINY**2), apart)
     depth = _depth(one, other)
     # The middle of the overlap, the same point for both, so that angular momentum is kept.
-    point = vadd(other.center, vscale(other.radius - 0.5 * depth, normal))
-    velocity = vsub(one.velocity_at(point), other.velocity_at(point))
-    inverse = vadd(one.inverse_at(point, normal), other.inverse_at(point, normal))
-    mass, slip_mass = (share / x for x in inverse)
-    force = penalty_force(parameters, depth, normal, velocity, mass, slip_mass, dt)
+    return normal, vadd(other.center, vscale(other.radius - 0.5 * depth, normal)), depth
+
+
+def _collide(
+    parameters: ContactParameters,
+    sides: Sequence[_Side],
+    felt: Sequence[Vec],
+    old: jax.Array,
+    dt: float,
+) -> tuple[jax.Array, Any, jax.Array]:
+    """Forces of contacts nearer to what `penalty_force` asks for.
+
+    Args:
+        parameters: of the contact.
+        sides: both spheres of each pair.
+        felt: the bodies' wrenches by all contacts so far, about their origins, own frames.
+        old: `[4, n]` normal force and friction so far, world frame [N].
+        dt: of the step [s].
+
+    Returns:
+        New forces, as `old`; their wrenches, torque and force, six of `[n]` for each side; and
+        what the change of force is in speed of the contact, `[n]` [m/s].
+    """
+    normal, point, depth = _contact(*sides)
+    pushed = [side.pushed(x[:3], x[3:], dt) for side, x in zip(sides, felt, strict=True)]
+    before, velocity = (
+        vsub(a.velocity_at(point), b.velocity_at(point)) for a, b in (sides, pushed)
+    )
+
+    def inverse(direction: Vec) -> tuple[Scalar, Scalar]:
+        one, other = (side.inverse_at(point, direction) for side in sides)
+        return one + other, sides[0].contacts * one + sides[1].contacts * other
+
+    force, friction = penalty_force(
+        parameters, depth, normal, before, velocity, inverse, (old[0], tuple(old[1:])), dt
+    )
+    new = jnp.stack([force, *friction])
+    change = dt * inverse(normal)[0] * jnp.abs(force - old[0])
+    push = vadd(vscale(force, normal), friction)
 
     def wrench(side: _Side, force: Vec) -> tuple[Scalar, ...]:
         torque = cross(vsub(point, side.origin), force)
         return (*matTvec(side.axes, torque), *matTvec(side.axes, force))
 
-    return wrench(one, force), wrench(other, tuple(-x for x in force))
+    return new, (wrench(sides[0], push), wrench(sides[1], tuple(-x for x in push))), change
 
 
 class NeighbourList(NamedTuple):
@@ -372,7 +437,9 @@ class _Contact:
         # Of each sphere, robot after robot: the row of its body's frame, and its constants.
         lane = jnp.arange(lanes, dtype=jnp.int32)
         self.frame_of = (own.row * lanes + lane).T.reshape(-1)
-        numbers = (*own.center, *own.mass_center, own.radius, own.inverse_mass, own.inverse_inertia)
+        numbers = (
+            *own.center, *own.mass_center, own.radius, own.inverse_mass, *own.inverse_inertia
+        )  # fmt: skip
         self.numbers = jnp.stack([x.T.reshape(-1) for x in numbers])
         far = jnp.sqrt(dot(own.center, own.center))
         count = trees.capacity.rows + 1
@@ -388,26 +455,31 @@ class _Contact:
     def wrench(self, state: State, neighbours: NeighbourList) -> tuple[Any, NeighbourList]:
         """Sum of all contacts, as `InteractionForces.wrench`, and the neighbours."""
         frames = frames_of(self.trees, state)
-        stale = (neighbours.moved > _SKIN / 2) | (neighbours.strayed > _ROBOT_SKIN / 2)
-        neighbours = jax.lax.cond(stale, lambda: self._find(frames, neighbours), lambda: neighbours)
-        shape = self.radius.shape
-        nothing = jnp.zeros((6, shape[0] * shape[1]), self.radius.dtype)
-        total = jax.lax.cond(
-            neighbours.gap < 2 * neighbours.moved,
-            lambda: self._add_up(frames, neighbours, nothing),
-            lambda: nothing,
-        )
-        parts = [total[k].reshape(shape) for k in range(6)]
-        root, below = (tuple(x[:1] for x in parts), tuple(x[1:, None] for x in parts))
         speed = jnp.sqrt(dot(frames.velocity, frames.velocity))
         turning = jnp.sqrt(dot(frames.angular_velocity, frames.angular_velocity))
         speed = jnp.max(speed + self.radius * turning, 0)
         # Robots with a state that is not finite have no contact.
         way = jnp.where(self.present & jnp.isfinite(speed), _SPEED_MARGIN * self.dt * speed, 0)
-        neighbours = neighbours._replace(
-            moved=neighbours.moved + jnp.max(jnp.where(neighbours.close, way, 0)),
-            strayed=neighbours.strayed + jnp.max(way),
+
+        def farthest(neighbours: NeighbourList) -> tuple[jax.Array, jax.Array]:
+            """Bounds of movement until the end of this step."""
+            moved = neighbours.moved + jnp.max(jnp.where(neighbours.close, way, 0))
+            return moved, neighbours.strayed + jnp.max(way)
+
+        moved, strayed = farthest(neighbours)
+        stale = (moved > _SKIN / 2) | (strayed > _ROBOT_SKIN / 2)
+        neighbours = jax.lax.cond(stale, lambda: self._find(frames, neighbours), lambda: neighbours)
+        moved, strayed = farthest(neighbours)
+        shape = self.radius.shape
+        nothing = jnp.zeros((6, shape[0] * shape[1]), self.radius.dtype)
+        total = jax.lax.cond(
+            neighbours.gap < 2 * moved,
+            lambda: self._add_up(frames, neighbours, nothing),
+            lambda: nothing,
         )
+        parts = [total[k].reshape(shape) for k in range(6)]
+        root, below = (tuple(x[:1] for x in parts), tuple(x[1:, None] for x in parts))
+        neighbours = neighbours._replace(moved=moved, strayed=strayed)
         return ((root[:3], root[3:]), (below[:3], below[3:])), neighbours
 
     # --- the neighbour list
@@ -542,49 +614,78 @@ class _Contact:
             ]
             return found, own
 
-        def touching_pairs(start: jax.Array, pairs: jax.Array) -> jax.Array:
+        def spread(own: Any, values: jax.Array) -> jax.Array:
+            """Sums over each body of `[n, 2 × pairs]`, the first sides' before the others'."""
+            on = (jnp.concatenate(own)[:, None] == each).astype(values.dtype)
+            return jnp.matmul(values, on, precision="highest")
+
+        def look(start: jax.Array, found: Any) -> Any:
+            """Pairs that touch by the end of the step, and the number of each body's."""
+            flags, counts = found
+            (one, other), own = sides(start)
             real = start + jnp.arange(_PUSHED, dtype=jnp.int32) < neighbours.pairs
-            touching = real & (_depth(*sides(start)[0]) > 0)
-            first, second = (
-                part(x, start) // self.size for x in (neighbours.first, neighbours.second)
-            )
-            pair = jnp.where(touching, first * self.trees.lanes + second, -1)
-            return jax.lax.dynamic_update_slice(pairs, pair, (start,))
+            touching = real & (_depth(one, other) + self.dt * _closing(one, other) > 0)
+            number = jnp.tile(touching.astype(counts.dtype), 2)[None]
+            some = jnp.any(touching)
+            counts = jax.lax.cond(some, lambda: counts + spread(own, number), lambda: counts)
+            return jax.lax.dynamic_update_slice(flags, touching, (start,)), counts
 
-        # The pair of robots of each pair of spheres in contact; -1 for others.
-        pairs = run(touching_pairs, jnp.full(neighbours.first.shape[0] + _PUSHED, -1, jnp.int32))
+        room = neighbours.first.shape[0] + _PUSHED
+        touching, counts = run(look, (jnp.zeros(room, bool), nothing[:1]))
 
-        def push(start: jax.Array, total: jax.Array) -> jax.Array:
-            pair = part(pairs, start)
+        def sweep(now: Any) -> Any:
+            """All contacts once, each with the velocities that the last sweep left."""
+            count, forces, felt, _ = now
 
-            def collide() -> jax.Array:
-                (one, other), own = sides(start)
+            def push(start: jax.Array, found: Any) -> Any:
+                flags = part(touching, start)
 
-                def count(begin: jax.Array, total: jax.Array) -> jax.Array:
-                    same = pair[:, None] == part(pairs, begin)[None]
-                    return total + jnp.sum(same, 1, dtype=total.dtype)
+                def collide() -> Any:
+                    forces, total, most = found
+                    both, own = sides(start)
+                    both = [
+                        side._replace(contacts=jnp.maximum(counts[0, k], 1))
+                        for side, k in zip(both, own, strict=True)
+                    ]
+                    old = jax.lax.dynamic_slice(forces, (jnp.int32(0), start), (4, _PUSHED))
+                    on = [tuple(felt[:, k]) for k in own]
+                    new, wrenches, change = _collide(self.parameters, both, on, old, self.dt)
+                    wide = jnp.concatenate([jnp.stack(x) for x in wrenches], 1)
+                    wide = jnp.where(jnp.tile(flags, 2), wide, 0)
+                    new = jnp.where(flags, new, 0)
+                    forces = jax.lax.dynamic_update_slice(forces, new, (jnp.int32(0), start))
+                    most = jnp.maximum(most, jnp.max(jnp.where(flags, change, 0)))
+                    return forces, total + spread(own, wide), most
 
-                # The contacts of two robots share the mass that may be stopped.
-                share = _SHARE / jnp.maximum(run(count, jnp.zeros(_PUSHED, total.dtype)), 1)
-                wrenches = _collide(self.parameters, one, other, share, self.dt)
-                wide = jnp.concatenate([jnp.stack(x) for x in wrenches], 1)
-                wide = jnp.where(jnp.tile(pair >= 0, 2), wide, 0)
-                on = (jnp.concatenate(own)[:, None] == each).astype(wide.dtype)
-                return total + jnp.matmul(wide, on, precision="highest")
+                return jax.lax.cond(jnp.any(flags), collide, lambda: found)
 
-            return jax.lax.cond(jnp.any(pair >= 0), collide, lambda: total)
+            return count + 1, *run(push, (forces, nothing, jnp.zeros_like(nothing[0, 0])))
 
-        return jax.lax.cond(jnp.any(pairs >= 0), lambda: run(push, nothing), lambda: nothing)
+        def wanted(now: Any) -> jax.Array:
+            return (now[0] < _SWEEPS) & (now[3] > _ENOUGH)
+
+        some = jnp.where(jnp.any(touching), jnp.inf, 0).astype(nothing.dtype)
+        start = jnp.int32(0), jnp.zeros((4, room), nothing.dtype), nothing, some
+        total: jax.Array = jax.lax.while_loop(wanted, sweep, start)[2]
+        return total
 
 
 def _side(frame: jax.Array, numbers: jax.Array) -> _Side:
-    """From `[18, n]` of frames and `[9, n]` of spheres."""
+    """From `[18, n]` of frames and `[14, n]` of spheres."""
     f, x = frame, numbers
     axes = (tuple(f[9:12]), tuple(f[12:15]), tuple(f[15:18]))
     origin = tuple(f[:3])
     place = lambda local: vadd(origin, matvec(axes, tuple(local)))  # noqa: E731
     return _Side(
-        place(x[:3]), origin, place(x[3:6]), tuple(f[3:6]), tuple(f[6:9]), axes, x[6], x[7], x[8]
+        place(x[:3]),
+        origin,
+        place(x[3:6]),
+        tuple(f[3:6]),
+        tuple(f[6:9]),
+        axes,
+        x[6],
+        x[7],
+        tuple(x[8:14]),
     )
 
 

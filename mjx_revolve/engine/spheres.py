@@ -18,6 +18,7 @@ from mjx_revolve.engine.batch import Capacity, assemble_all, order_rows
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import SYM
 
 # The least radius as a share of a box's longest half edge, so that a rod has two spheres, and a
 # plate four, which stick out of it by as much. A choice.
@@ -33,7 +34,8 @@ class Spheres(NamedTuple):
         radius: [m]; 0 for padding.
         mass_center: of that body, its own frame, three of `[S, P]` [m].
         inverse_mass: of that body, without the water that it carries [1/kg].
-        inverse_inertia: the largest of that body's about its centre of mass [1/(kg m²)].
+        inverse_inertia: of that body about its centre of mass, its own frame, six of `[S, P]`
+            [1/(kg m²)].
     """
 
     row: Any
@@ -131,18 +133,18 @@ def pack_spheres(
         found[rank, owner] = values
         return found
 
-    lightest = np.linalg.eigvalsh(assembly.inertia)[:, 0]
-    inverse = lambda x: 1 / np.maximum(x, 1e-12)  # noqa: E731
     body = balls.body
     center = turned(back[body], balls.center)
+    own, where = np.unique(body, return_inverse=True)
+    lightness = np.linalg.inv(back[own] @ assembly.inertia[own] @ columns.frame[own])[where]
     middle = turned(back[body], assembly.center[body])
     found = Spheres(
         row=table(first[body].astype(np.int32)),
         center=tuple(table(center[:, i]) for i in range(3)),
         radius=table(balls.radius),
         mass_center=tuple(table(middle[:, i]) for i in range(3)),
-        inverse_mass=table(inverse(assembly.mass)[body]),
-        inverse_inertia=table(inverse(lightest)[body]),
+        inverse_mass=table(1 / assembly.mass[body]),
+        inverse_inertia=tuple(table(lightness[:, i, j]) for i, j in SYM),
     )
 
     def wide(x: np.ndarray) -> np.ndarray:

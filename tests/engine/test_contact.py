@@ -91,6 +91,22 @@ def test_a_landing_point_is_gripped_by_what_stops_it_at_any_step(dt):
     assert -float(lie[0][0][0]) == pytest.approx(FLAT.friction * float(lie[0][2][0]), rel=1e-3)
 
 
+@pytest.mark.parametrize("dt", [0.02, 0.005, 0.000625])
+def test_what_lands_does_not_bounce_whatever_stands_behind_the_point(dt):
+    """A point with a share of 1 g, and ten times as much behind it: at any step it lands at
+    .3 m/s, stays within 2 mm, and never comes out faster than at a sixth of that."""
+    mass, share = 0.01, 1e-3
+    force = jax.jit(lambda d, v: bed_contact(FLAT, d, (0.0, 0.0, 1.0), (0.0, 0.0, v), share, dt))
+    height, speed, deepest, fastest = 1e-3, -0.3, 0.0, -1.0
+    for _ in range(round(0.1 / dt)):
+        push, damping, _ = force(jnp.full(1, -height), jnp.full(1, speed))
+        speed += dt * float(push[2][0]) / (mass + dt * float(damping[0]))
+        height += dt * speed
+        deepest, fastest = min(deepest, height), max(fastest, speed)
+    assert fastest < 0.05
+    assert -2e-3 < deepest < 1e-3
+
+
 def test_force_is_continuous_where_a_point_touches_down():
     depth = jnp.linspace(-1e-5, 1e-5, 2001)
     for speed in (0.0, -0.5):
