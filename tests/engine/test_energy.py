@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from test_self_contact import fork
 
 from laboratory import OAR, read
 from mjx_revolve import build_robot, load_morphology, load_world, simulate
 from mjx_revolve.engine.energy import energy_balance
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.water.flow import water_of
-from test_self_contact import fork
 
 pytestmark = pytest.mark.slow
 
