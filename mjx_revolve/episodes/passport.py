@@ -32,7 +32,7 @@ from mjx_revolve.episodes.scoring import PASSPORT_STREAM, replay_key
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.yaml_reader import load_yaml
-from mjx_revolve.numerics.xla import jit, over_chunks
+from mjx_revolve.numerics.xla import over_chunks
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.flow import water_of
@@ -225,11 +225,14 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
     varied = fitness.config.engine == "population" and find_drag_law(fitness.world.drag).varied
     tried = _variants() if varied else {}
     few = _Lanes(np.arange(_FEW), np.ones(_FEW, int), None)
-    # XLA compiles without Python's lock: the three programs side by side.
+    # XLA compiles without Python's lock: the three programs side by side. That of half a step is
+    # sooner swum than compiled well.
     with ThreadPoolExecutor(3) as threads:
         coarse = threads.submit(_scores, fitness, genes, key, _all_lanes(tried), True)
         fine = {
-            part: threads.submit(_scores, _with_step(fitness, part), genes, key, few, False)
+            part: threads.submit(
+                _scores, _with_step(fitness, part), genes, key, few, False, part == 2
+            )
             for part in (2, 4)
         }
         scores = coarse.result()
@@ -300,7 +303,12 @@ def _with_step(fitness: Fitness, part: int) -> Fitness:
 
 
 def _scores(
-    fitness: Fitness, genes: jax.Array, key: jax.Array, lanes: _Lanes, long: bool
+    fitness: Fitness,
+    genes: jax.Array,
+    key: jax.Array,
+    lanes: _Lanes,
+    long: bool,
+    fast: bool = False,
 ) -> dict[float, np.ndarray]:
     """Scores of lanes after some times.
 
@@ -310,6 +318,7 @@ def _scores(
         key: draws the starts.
         lanes: what is tried.
         long: whether it swims longer than the task lasts.
+        fast: whether the program is compiled in haste.
 
     Returns:
         `[lanes]` by time [s]: the task's duration first, then the longer ones.
@@ -346,8 +355,10 @@ def _scores(
         order = jnp.arange(len(lanes.start), dtype=jnp.int32)
         return over_chunks(swim)(jnp.asarray(lanes.brain, jnp.int32), order)
 
-    # The smaller steps are soon done, even where the compiler has not done its best.
-    found = jit(run, fast=not long)(genes, key)
+    # Kept, the programs are there for the next champion of this body.
+    made_of = jax.tree.map(np.ndarray.tolist, lanes)
+    program = fitness.keep(run, "passport", made_of, times, fast=fast)
+    found = program(genes, key)
     return {seconds: np.asarray(x, float) for seconds, x in found.items()}
 
 

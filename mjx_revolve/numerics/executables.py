@@ -35,22 +35,23 @@ _log = logging.getLogger(__name__)
 class StoredProgram:
     """`xla.jit` of a function, whose executables are kept beside JAX's compilation cache."""
 
-    def __init__(self, fun: Callable[..., Any], made_of: Any) -> None:
+    def __init__(self, fun: Callable[..., Any], made_of: Any, fast: bool = False) -> None:
         """A program.
 
         Args:
             fun: of pytrees of arrays; its results are tuples and dictionaries of arrays.
             made_of: all values that it depends on besides its arguments, which can be pickled; None
                 where they cannot all be named: then nothing is kept.
+            fast: as of `xla.jit`.
         """
-        self._jitted = jit(fun)
-        self._made_of = made_of
+        self._jitted = jit(fun, fast=fast)
+        self._made_of = made_of, fast
         self._found: dict[Any, Any] = {}
 
     def __call__(self, *args: Any) -> Any:
         """Calls it."""
         folder = runtime.program_folder()
-        if self._made_of is None or folder is None or not on_cpu():
+        if self._made_of[0] is None or folder is None or not on_cpu():
             return self._jitted(*args)
         args = jax.tree.map(jax.numpy.asarray, args)
         leaves, tree = jax.tree.flatten((args, {}))
