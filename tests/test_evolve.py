@@ -24,13 +24,18 @@ from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.evolution import run as beginning
 from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.view import results
 from toys import DroppedError, Quadratic, contents, dropping
+
+save_pictures = results.save_pictures
 
 # --- the command line ---
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
+    """Runs end without their plots, which take a second each."""
+    monkeypatch.setattr(results, "save_pictures", lambda start, champion: None)
     return toys.enter_folder(tmp_path, monkeypatch)
 
 
@@ -42,7 +47,8 @@ def run_main(*argv, make_fitness=toy):
     return run_command(lambda argv: command.main(argv, make_fitness), [str(a) for a in argv])
 
 
-def test_a_run_documents_itself(folder, capsys):
+def test_a_run_documents_itself(folder, monkeypatch, capsys):
+    monkeypatch.setattr(results, "save_pictures", save_pictures)
     assert run_main("toy.yaml", "--out", "run", "--seed", 5, "--set", "task.duration=4") == 0
     out = capsys.readouterr().out
     assert out.startswith("loading toy.yaml\n")

@@ -81,7 +81,7 @@ def experiment(tmp_path_factory):
     return folder, printed.getvalue(), dict(zip(RUNS, falls, strict=True))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("run", "expected"), [("air", 9.81), ("mask", 0.60648)])
 def test_the_spider_falls_as_fast_as_it_must(experiment, run, expected):
     _, _, falls = experiment
@@ -141,7 +141,7 @@ def test_heights_that_are_none_are_refused(tmp_path):
         load_thesis(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_falling_spider_writes_its_table_and_its_plot(experiment):
     folder, printed, _ = experiment
     for line in ("no buoyancy (air)", "thesis's buoyancy, no drag", "default water"):

@@ -76,6 +76,13 @@ def desk(tmp_path_factory):
     return folder, follow(BLOCKS, folder)
 
 
+@pytest.fixture
+def files(tmp_path):
+    """A folder with the files that the reader writes; no command was run."""
+    follow([block for block in BLOCKS if block.path], tmp_path)
+    return tmp_path
+
+
 def follow(blocks, folder):
     """Does all that blocks say in a folder; what was printed, [(block, output)]."""
     python = folder / ".venv" / "bin" / "python"
@@ -156,11 +163,9 @@ def test_numbers_are_about_those_of_the_text(desk):
     assert "generation 30:" in climb
 
 
-@pytest.mark.slow
-def test_the_settings_that_it_proposes_exist(desk, monkeypatch):
+def test_the_settings_that_it_proposes_exist(files, monkeypatch):
     """Each `--set` in the text, and each line of YAML for the world."""
-    folder, _ = desk
-    monkeypatch.chdir(folder)
+    monkeypatch.chdir(files)
     settings = re.findall(r"--set (\S+?=[^\s`]+)", plain_text())
     assert len(settings) >= 5
     for setting in settings:
@@ -174,14 +179,13 @@ def test_the_settings_that_it_proposes_exist(desk, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_mistake_that_it_mentions_is_one_line(desk):
-    folder, _ = desk
-    own = (folder / "mine" / "tasks.py").read_text()
-    (folder / "mine" / "slip.py").write_text(own.replace("track.position -", "track.positions -"))
+def test_the_mistake_that_it_mentions_is_one_line(files):
+    own = (files / "mine" / "tasks.py").read_text()
+    (files / "mine" / "slip.py").write_text(own.replace("track.position -", "track.positions -"))
     command = (
         ".venv/bin/python -m mjx_revolve.evolve mine/stay.yaml --set task.type=mine/slip.py:stay"
     )
     place = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command.split(), cwd=folder, env=place, capture_output=True, text=True)
+    done = subprocess.run(command.split(), cwd=files, env=place, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "mine/slip.py: line 6: expected stay to" in done.stderr

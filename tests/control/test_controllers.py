@@ -41,16 +41,20 @@ def robot_of(name):
 
 def play(robot, controller, genes, steps, dt=0.005, order=None):
     """`[steps, nu, lanes]` targets and the controller's states, in float64."""
-    with jax.enable_x64(True):
-        parameters = controller.decode(jnp.asarray(genes, jnp.float64), plant_of(robot, order))
+    plant = plant_of(robot, order)
+
+    @jax.jit
+    def run(genes):
+        parameters = controller.decode(genes, plant)
 
         def step(state, k):
             state, target = controller.step(parameters, state, k * dt, STILL)
             return state, (target, state)
 
-        run = jax.jit(lambda: jax.lax.scan(step, controller.init(parameters), jnp.arange(steps)))
-        targets, states = run()[1]
-        return np.asarray(targets), jax.tree.map(np.asarray, states)
+        return jax.lax.scan(step, controller.init(parameters), jnp.arange(steps))[1]
+
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, run(jnp.asarray(genes, jnp.float64)))
 
 
 def drawn(controller, lanes=4, seed=0, scale=1.5):

@@ -246,7 +246,7 @@ def test_it_rests_where_the_penalty_has_it(wet):
 # ------------------------------------------------------------------------- slow ones
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_friction_nothing_slows():
     robot = block(bed=FLAT | {"friction": 0.0})
     qpos, qvel = at_rest(robot, 1, FLOOR - sunk(robot, WEIGHT))
@@ -330,7 +330,7 @@ def test_a_core_lands_in_the_lake():
     assert slid[3] > 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_jointed_body_lies_still_in_float32():
     """More contacts than it needs, upright and on its back; on top of the bed, and calm."""
     robot = elbow_robot(load_world("empty_underwater", bed=FLAT))

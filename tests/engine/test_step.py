@@ -323,7 +323,8 @@ def test_switches_of_single_modules(switch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("switch", ["buoyancy", "added_mass"])
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("switch", ["added_mass", "buoyancy"])
 def test_switches_of_single_modules_in_mjx(switch):
     """Both engines share the water; one switch of its forces and one of the inertia will do."""
     check_switch(switch, -2.0, -0.5, ("population", "mjx"))
@@ -373,7 +374,7 @@ def test_ballast_in_the_keel_rights_a_body():
 # ------------------------------------------------------------------------- gradients
 
 
-def check_slope(robot, inputs, steps=20, tolerance=1e-4):
+def check_slope(robot, *cases, steps=20, tolerance=1e-4):
     """In float64, the gradient through a rollout against central differences over 2 µ."""
 
     def end(inputs):
@@ -397,36 +398,31 @@ def check_slope(robot, inputs, steps=20, tolerance=1e-4):
         "current": np.zeros(3),
         "time": 0.0,
     }
-    with jax.enable_x64(True):
-        inputs = jax.tree.map(jnp.asarray, usual | inputs)
-        value = jax.jit(end, compiler_options=QUICK)
-        slope = jax.jit(jax.grad(end), compiler_options=SLOPE)
-        flat, build = ravel_pytree(inputs)
-        found = np.asarray(ravel_pytree(slope(inputs))[0])
-        assert np.all(np.isfinite(found))
-        expected = [
-            (float(value(build(flat + s))) - float(value(build(flat - s)))) / 2e-6
-            for s in 1e-6 * np.eye(len(flat))
-        ]
-        assert found == pytest.approx(expected, rel=tolerance, abs=1e-6)
-    assert np.sum(np.abs(found) > 1e-3) > 5
-
-
-def trimmed(tank):
-    return build_robot(trim_neutral(body("core"), RHO), tank)
+    value = jax.jit(end, compiler_options=QUICK)
+    slope = jax.jit(jax.grad(end), compiler_options=SLOPE)
+    for case in cases:
+        with jax.enable_x64(True):
+            inputs = jax.tree.map(jnp.asarray, usual | case)
+            flat, build = ravel_pytree(inputs)
+            found = np.asarray(ravel_pytree(slope(inputs))[0])
+            assert np.all(np.isfinite(found))
+            expected = [
+                (float(value(build(flat + s))) - float(value(build(flat - s)))) / 2e-6
+                for s in 1e-6 * np.eye(len(flat))
+            ]
+            assert found == pytest.approx(expected, rel=tolerance, abs=1e-6)
+        assert np.sum(np.abs(found) > 1e-3) > 5
 
 
 @pytest.mark.slow
-def test_gradient_at_rest():
-    """Level, still, deep: drag's |v| and every angle stand at their kinks."""
-    check_slope(trimmed(world(**WATER)), {})
+def test_gradient_at_rest_and_at_the_waterline():
+    """Level, still, deep: drag's |v| and every angle stand at their kinks.
 
-
-@pytest.mark.slow
-def test_gradient_at_the_waterline():
-    """The core's centre in the surface, and its deck or its keel just in it."""
-    robot = build_robot(body("core"), world(**WATER))
-    check_slope(robot, {"place": np.array([0.0, 0.0, -0.001]), "qvel": np.full(6, 0.05)})
+    And a core's centre in the surface, its deck or its keel just in it.
+    """
+    robot = build_robot(trim_neutral(body("core"), RHO), world(**WATER))
+    waterline = {"place": np.array([0.0, 0.0, -0.001]), "qvel": np.full(6, 0.05)}
+    check_slope(robot, {}, waterline)
 
 
 @pytest.mark.slow

@@ -100,11 +100,12 @@ def test_thrust_off_the_centre_turns_too():
     assert qacc[5] == pytest.approx(-0.5 * 0.03 / (NEUTRAL * 0.1**2 / 6), rel=1e-9)
 
 
-@pytest.mark.parametrize(("height", "share"), [(1.0, 0.0), (0.0, 0.5), (-1.0, 1.0)])
-def test_out_of_the_water_there_is_nothing_to_push(height, share):
+def test_out_of_the_water_there_is_nothing_to_push():
     """In the air it falls, and neither flies nor spins; half in it, it has half of its thrust."""
-    robot = driven(world(**WATER), gain=0.5, torque_ratio=0.02)
-    qacc = accelerate(robot, *at_rest(robot, 1, height), np.ones((1, 1)))[:, 0]
+    robot, share = driven(world(**WATER), gain=0.5, torque_ratio=0.02), np.array([0.0, 0.5, 1.0])
+    qpos, qvel = at_rest(robot, 3)
+    qpos[2] = 1.0, 0.0, -1.0
+    qacc = accelerate(robot, qpos, qvel, np.ones((1, 3)))
     inertia = NEUTRAL + share * RHO * robot.fluid.added_mass[0, 0]
     assert qacc[0] == pytest.approx(0.5 * share / inertia, abs=1e-12)
     assert qacc[2] == pytest.approx(-(1 - share) * NEUTRAL * G / inertia, abs=1e-9)
@@ -159,6 +160,7 @@ def test_a_linear_thruster_is_mujocos_filtered_actuator():
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["auv", "fin"])
 def test_the_two_engines_agree(name):
     """Through the surface, in a current, thrusters and fins at work; half a second in float64."""

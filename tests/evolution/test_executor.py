@@ -52,7 +52,8 @@ def own_settings(monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a config, current."""
+    """A folder with a config, current; runs end without their plots, which take a second each."""
+    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
     monkeypatch.chdir(tmp_path)
     toys.write_config(tmp_path / "toy.yaml", population_size=10, checkpoint_every=4)
     return tmp_path

@@ -42,15 +42,16 @@ ERROR = {True: 1e-14, False: 1e-6}  # float64, float32
 
 
 @lru_cache
-def _cut(half, mode):
-    return jax.jit(lambda up, depth: BUOYANCY_LAWS[mode].submersion(up, depth, half))
+def _cut(mode):
+    """One program for all boxes."""
+    return jax.jit(BUOYANCY_LAWS[mode].submersion)
 
 
 def cut(up, depth, half, mode="partial", x64=True):
     """`cut_box` of many states of one box: `[n, 3]`, `[n]`, `[3]` to `[n]`, `[n, 3]`."""
     with jax.enable_x64(x64):
         up = tuple(jnp.asarray(x) for x in np.asarray(up, float).T)
-        share, moment = _cut(tuple(half), mode)(up, jnp.asarray(depth))
+        share, moment = _cut(mode)(up, jnp.asarray(depth), tuple(half))
         return np.asarray(share), np.stack(moment, -1)
 
 
@@ -142,25 +143,27 @@ def tilted(angle):
     return (0.6 * jnp.sin(angle), 0.8 * jnp.sin(angle), jnp.cos(angle))
 
 
-@pytest.mark.parametrize("name", ["cube", "TouchSensor-sensor"])
-def test_force_moment_and_gradients_are_continuous_through_the_surface(name):
-    """Halving the spacing of the samples halves the largest jump; a jump would stay."""
-    half = BOXES[name]
+@jax.jit
+def table(depth, angle, half):
+    """Share and moment, and their slopes by depth and angle, of a row of depths."""
 
     def everything(depth, angle):
         share, moment = cut_box(tilted(angle), depth, tuple(half))
         return jnp.stack([share, *(m / half.max() for m in moment)])
 
-    @jax.jit
-    def table(depth, angle):
-        rows = jax.vmap(everything, (0, None))(depth, angle)
-        slope = jax.vmap(jax.jacfwd(everything, (0, 1)), (0, None))(depth, angle)
-        return rows, jnp.concatenate([slope[0] * half.max(), slope[1]], 1)
+    rows = jax.vmap(everything, (0, None))(depth, angle)
+    slope = jax.vmap(jax.jacfwd(everything, (0, 1)), (0, None))(depth, angle)
+    return rows, jnp.concatenate([slope[0] * half.max(), slope[1]], 1)
 
+
+@pytest.mark.parametrize("name", ["cube", "TouchSensor-sensor"])
+def test_force_moment_and_gradients_are_continuous_through_the_surface(name):
+    """Halving the spacing of the samples halves the largest jump; a jump would stay."""
+    half = BOXES[name]
     depth = np.linspace(-1.2, 1.2, 8001) * np.linalg.norm(half)
     for tilt in (0.0, 1e-3, 0.02, 0.3, np.pi / 4):
         with jax.enable_x64(True):
-            tables = table(depth, tilt)
+            tables = table(depth, tilt, half)
         # Tilted by 1e-3, the slopes' ramp is a few samples wide; for 0 see the next test.
         for rows in map(np.asarray, tables if tilt > 0.01 else tables[:1]):
             fine = np.abs(np.diff(rows, axis=0)).max(0)
@@ -243,26 +246,29 @@ STATES = {
 }
 
 
+def everything(state, half):
+    """Share and moment at a depth and a vertical."""
+    share, moment = cut_box(tuple(state[1:]), state[0], tuple(half))
+    return jnp.stack([share, *moment])
+
+
+run, *slopes = map(jax.jit, (everything, jax.jacfwd(everything), jax.jacrev(everything)))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STATES)
 @pytest.mark.parametrize("half", [(0.5, 0.5, 0.5), (0.3, 0.2, 0.1)])
 def test_gradients_against_differences(name, half):
     """Forward and backward, share and moment by depth and vertical, also where edges are equal."""
     up, level = STATES[name]
-    state = np.array([level * (np.abs(up) @ np.array(half)), *up])
-
-    def everything(state):
-        share, moment = cut_box(tuple(state[1:]), state[0], half)
-        return jnp.stack([share, *moment])
-
+    state, step = np.array([level * (np.abs(up) @ np.array(half)), *up]), 1e-6
     with jax.enable_x64(True):
-        run = jax.jit(everything)
-        step = 1e-6
-        rows = [(run(state + e) - run(state - e)) / (2 * step) for e in step * np.eye(4)]
+        value = lambda state: np.asarray(run(state, half))  # noqa: E731
+        rows = [(value(state + e) - value(state - e)) / (2 * step) for e in step * np.eye(4)]
         expected = np.stack(rows, -1)
-        for mode in (jax.jacfwd, jax.jacrev):
+        for slope in slopes:
             # Third slopes of W jump at the edges of a cut: differences there err by the step.
-            assert np.asarray(mode(everything)(state)) == pytest.approx(expected, abs=2e-5)
+            assert np.asarray(slope(state, half)) == pytest.approx(expected, abs=2e-5)
 
 
 @pytest.mark.parametrize("x64", [True, False])

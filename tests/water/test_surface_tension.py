@@ -22,9 +22,10 @@ BOXES = {"core": CORE, "plate": np.array([0.03, 0.02, 5e-4]), "cube": np.full(3,
 
 
 @lru_cache
-def _pull(half, angle, exposed):
+def _pull(angle, exposed):
+    """One program for all boxes."""
     return jax.jit(
-        lambda up, depth: surface_tension(up, depth, half, TENSION, WEIGHT, angle, exposed),
+        lambda up, depth, half: surface_tension(up, depth, half, TENSION, WEIGHT, angle, exposed),
         compiler_options=QUICK,
     )
 
@@ -33,7 +34,7 @@ def pull(up, depth, half, angle=0.0, exposed=(1.0, 1.0, 1.0), x64=True):
     """`surface_tension` of many states of one box: `[n, 3]`, `[n]` to twice `[n, 3]`."""
     with jax.enable_x64(x64):
         up = tuple(jnp.asarray(x) for x in np.asarray(up, float).T)
-        force, torque = _pull(tuple(half), angle, exposed)(up, jnp.asarray(depth))
+        force, torque = _pull(angle, exposed)(up, jnp.asarray(depth), tuple(half))
         return np.stack(force, -1), np.stack(torque, -1)
 
 
