@@ -138,12 +138,18 @@ def make_page() -> str:
         needs = [f"`{x}`" for x in settings.TASKS[name]] + ["a world with a bed"] * task.on_bed
         said = re.sub(r" \[[^\]]+\].$", "", first_paragraph(task.score))
         lines.append(f"| `{name}` | {said} | {task.unit} | {', '.join(needs)} |")
-    lines += ["", "## Controllers", "", "`controller.type`; likewise.", ""]
+    lines += [
+        "",
+        "## Controllers",
+        "",
+        "`controller.type`; a function in a user's own file as well.",
+        "",
+    ]
     lines += ["| controller | | settings that only it has |", "|---|---|---|"]
     for name, kind in CONTROLLERS.items():
         only = ", ".join(f"`{x}`" for x in kind.settings)
         lines.append(f"| `{name}` | {first_paragraph(kind.make)} | {only} |")
-    lines += ["", "## A configuration", "", "`docs/evolution.md` tells more of `bodies`.", ""]
+    lines += ["", "## A configuration", "", "`docs/evolution.md` describes `bodies`.", ""]
     lines += table(settings.Config)
     for name, kind in sections(settings.Config):
         lines += [f"### `{name}`: {first_paragraph(kind)}", ""]

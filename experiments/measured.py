@@ -65,7 +65,7 @@ def _finish(*all_axes: Any, legends: bool = True) -> None:
 
 
 @in_style
-def draw_drag(steady: Found, oscillating: Found, remembered: Found) -> Any:
+def draw_drag(steady: Found, oscillating: Found, faces: Found) -> Any:
     """C_d of bodies in a steady flow, and of a plate in an oscillating one."""
     from experiments.measured_data import plate_drag, plate_drag_at_bilge
     from mjx_revolve.view.plots import COLORS
@@ -77,14 +77,14 @@ def draw_drag(steady: Found, oscillating: Found, remembered: Found) -> Any:
     left.set_yticks(place, [r.what for r in steady.rows], fontsize=8)
     left.set_xlabel("C_d on the frontal area", fontsize=9)
     left.set_title("steady drag")
-    number, ours = oscillating.lines["faces"]
+    number, ours = oscillating.lines["cross_flow"]
     fine = np.geomspace(number[0], number[-1], 100)
     right.plot(fine, [plate_drag(x) for x in fine], color=_GREY, label="measured (fit)")
     bilge = [plate_drag_at_bilge(x) for x in fine]
     right.plot(fine, bilge, color=_GREY, linestyle=":", label="measured (bilge keels)")
     right.plot(number, ours, "o-", color=COLORS[0], label="ours", markersize=4)
-    right.plot(*remembered.lines["cross_flow"], "s-", color=COLORS[1], markersize=4,
-               label="ours, cross_flow")  # fmt: skip
+    right.plot(*faces.lines["faces"], "s-", color=COLORS[1], markersize=4,
+               label="drag: faces")  # fmt: skip
     right.axvspan(5, 15, color=COLORS[4], alpha=0.12, linewidth=0)
     right.text(8.6, 0.15, "limbs", fontsize=8, ha="center", color="#8a6000")
     right.set_xscale("log")
@@ -259,12 +259,12 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.view.plots import figure_png
 
     steady, swung = cases.steady_drag(), cases.oscillating()
-    remembered = cases.oscillating(drag="cross_flow")
+    on_faces = cases.oscillating(drag="faces")
     plates, falls, vehicle = cases.polars(), cases.coins(), cases.rov()
     glide, swum = cases.amphibot_glide(), cases.swimmers()
     figures = {
         "measured_swimmers": draw_swimmers(glide, swum),
-        "measured_drag": draw_drag(steady, swung, remembered),
+        "measured_drag": draw_drag(steady, swung, on_faces),
         "measured_plates": draw_polars(plates),
         "measured_coins": draw_coins(falls),
         "measured_rov": draw_rov(vehicle),
@@ -286,25 +286,25 @@ def main(argv: list[str] | None = None) -> int:
         figures["measured_section"] = draw_section(floats)
     lines = table(rows)
     print("\n".join(align([lines[0], ("",) * len(HEADINGS), *lines[1:]], left=(0, 1))))
-    steady_by_law = {}
+    by_law = {}
     for law in cases.LAWS[1:]:
-        steady_by_law[law] = {r.what: r.ours for r in cases.steady_drag(law).rows}
-        numbers = ", ".join(f"{ours:.2f} {what}" for what, ours in steady_by_law[law].items())
+        by_law[law] = {r.what: r.ours for r in cases.steady_drag(law).rows}
+        numbers = ", ".join(f"{ours:.2f} {what}" for what, ours in by_law[law].items())
         print(f"steady C_d by drag: {law}: {numbers}")
     bias, scatter = cases.log_scatter([r for r in swum.rows if r.case == "lamprey robot"][:-1])
     print(f"lamprey robot, nine gaits: bias {bias:.2f}, scatter {scatter:.2f}")
     if options.results:
-        law = "cross_flow"
-        crossed = [*cases.amphibot_glide(law).rows, *cases.swimmers(law).rows, *cases.foil(law)]
-        crossed += [*remembered.rows, *cases.steady_drag(law).rows, cases.sinking_plate(law)]
-        crossed += [*cases.polars(drag=law).rows, *cases.coins(law).rows]
-        few = [r for r in crossed if r.case == "lamprey robot"][:-1]
+        law = "faces"
+        former = [*cases.amphibot_glide(law).rows, *cases.swimmers(law).rows, *cases.foil(law)]
+        former += [*on_faces.rows, *cases.steady_drag(law).rows, cases.sinking_plate(law)]
+        former += [*cases.polars(drag=law).rows, *cases.coins(law).rows]
+        few = [r for r in former if r.case == "lamprey robot"][:-1]
         numbers: dict[str, Any] = {
             "lamprey": {"bias": bias, "scatter": scatter},
-            "cases": group(rows, steady_by_law),
-            "cross_flow": {
+            "cases": group(rows, by_law | {law: {r.what: r.ours for r in former}}),
+            "faces": {
                 "lamprey": dict(zip(("bias", "scatter"), cases.log_scatter(few), strict=True)),
-                "cases": group(crossed, {}),
+                "cases": group(former, {}),
             },
         }
         write_results("measured", numbers, ())

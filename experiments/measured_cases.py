@@ -30,8 +30,8 @@ from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
 
 G = 9.81
-LAWS = ("faces", "ellipsoid", "inertia_box")
-"""Of drag: ours, and MuJoCo's two."""
+LAWS = (World.drag, "faces", "ellipsoid", "inertia_box")
+"""Of drag: ours by default, ours of faces, and MuJoCo's two."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def driven(
 # ------------------------------------------------------------------------- steady drag
 
 
-def steady_drag(law: str = "faces", speed: float = 0.3) -> Found:
+def steady_drag(law: str = World.drag, speed: float = 0.3) -> Found:
     """C_d on the frontal area of plates, rods and a torpedo, by one of the laws."""
     world, rows = tank(drag=law), []
     for what, (name, angle, area, measured) in data.STEADY_DRAG.items():
@@ -204,7 +204,7 @@ def steady_drag(law: str = "faces", speed: float = 0.3) -> Found:
     return Found(rows, lines)
 
 
-def sinking_plate(drag: str = "faces") -> Row:
+def sinking_plate(drag: str = World.drag) -> Row:
     """Terminal speed of a square plate that sinks broadside, 1 kg on 0.1 m, by the steps."""
     world = tank(gravity=G, buoyancy="partial", drag=drag, added_mass=True)
     robot = body("SquarePlate", world)
@@ -220,7 +220,7 @@ def sinking_plate(drag: str = "faces") -> Row:
 # ------------------------------------------------------------------------- plates at an angle
 
 
-def polars(speed: float = 0.5, drag: str = "lift_drag") -> Found:
+def polars(speed: float = 0.5, drag: str = World.drag) -> Found:
     """Lift and drag coefficients of flat plates over their angle of attack."""
     world, rows, lines = tank(drag=drag), [], {}
     for polar in data.POLARS:
@@ -247,7 +247,7 @@ DROPS = 64
 TILT = 5.0  # by which they may be off the level when let go, standard deviation [deg]; a choice
 
 
-def fall(coin: data.Coin, drag: str = "faces") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fall(coin: data.Coin, drag: str = World.drag) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drops of a coin in 38 cm of water.
 
     Args:
@@ -272,7 +272,7 @@ def fall(coin: data.Coin, drag: str = "faces") -> tuple[np.ndarray, np.ndarray, 
     return time, depth.mean(1), np.array(landed)
 
 
-def coins(drag: str = "faces") -> Found:
+def coins(drag: str = World.drag) -> Found:
     """How fast coins fall, and how far from the plumb line they land."""
     rows = []
     for coin in data.COINS:
@@ -293,7 +293,7 @@ _COIN = "coins that fall"
 
 def oscillating(
     numbers: Sequence[float] = (3, 5, 8, 15, 30, 60, 120),
-    drag: str = "faces",
+    drag: str = World.drag,
     speed: float = 0.5,
     settle: float = 12.0,
 ) -> Found:
@@ -334,7 +334,7 @@ def oscillating(
 _SAMPLES = 20  # steps from one record to the next
 
 
-def _pool(drag: str = "faces", timestep: float = 0.001) -> World:
+def _pool(drag: str = World.drag, timestep: float = 0.001) -> World:
     return tank(gravity=G, buoyancy="partial", drag=drag, added_mass=True, timestep=timestep)
 
 
@@ -385,7 +385,7 @@ def swim(
     return np.array(speeds), float(np.nanmax(np.where(size > 0, error, 0.0)))
 
 
-def amphibot_glide(drag: str = "faces") -> Found:
+def amphibot_glide(drag: str = World.drag) -> Found:
     """Way and rotation of a chain with frozen joints that glides at the surface."""
     glide, robot = data.AMPHIBOT_GLIDE, body("ChainHead", _pool(drag), "ChainModule", 6)
     angles, half = np.radians(glide.angles), data.CHAIN_MODULE / 2
@@ -422,7 +422,7 @@ def amphibot_glide(drag: str = "faces") -> Found:
     return Found(rows, {"way": (time, way), "rotation": (time, rotation)})
 
 
-def swimmers(drag: str = "faces") -> Found:
+def swimmers(drag: str = World.drag) -> Found:
     """Speeds of chains that swim by their joints: AmphiBot, the lamprey robot, Mamba's ratio."""
     gait, pool = data.AMPHIBOT_SWIM, _pool(drag)
     [speed], _ = swim(body("ChainHead", pool, "ChainModule", 6), [gait])
@@ -450,7 +450,7 @@ def log_scatter(rows: Sequence[Row]) -> tuple[float, float]:
 # ------------------------------------------------------------------------- a flapping foil
 
 
-def foil(drag: str = "faces", phases: int = 512, periods: int = 6) -> list[Row]:
+def foil(drag: str = World.drag, phases: int = 512, periods: int = 6) -> list[Row]:
     """Thrust and efficiency of a towed foil that heaves and pitches, in its last period.
 
     Its added mass is left out: in a motion that repeats, its mean force and power are 0.
@@ -497,7 +497,7 @@ _AXES = {"surge": 0, "sway": 1, "heave": 2}
 
 def rov() -> Found:
     """Drag and added mass of a remotely operated vehicle, from its outer box alone."""
-    world = tank(drag="faces", added_mass=False)
+    world = tank(drag=World.drag, added_mass=False)
     robot = body("BlueRov2Heavy", world)
     added, _ = carried(body("BlueRov2Heavy", tank(added_mass=True)))
     speeds = np.linspace(0.0, 1.2, 25)
@@ -530,7 +530,7 @@ def wavelength(xi: float) -> float:
 
 def _flume(**fields: Any) -> World:
     return tank(
-        gravity=G, buoyancy="partial", drag="faces", added_mass=True, density=1000.0, **fields
+        gravity=G, buoyancy="partial", drag=World.drag, added_mass=True, density=1000.0, **fields
     )
 
 

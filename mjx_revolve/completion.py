@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
         description="Print a script by which a shell completes commands and shipped names.",
         epilog='example: eval "$(mjx-revolve completion bash)" in ~/.bashrc',
     )
-    parser.add_argument("shell", choices=("bash", "zsh"), help="whose script")
+    parser.add_argument("shell", choices=("bash", "zsh"), help="the shell of the script")
     print(make_script(parser.parse_args(argv).shell), end="")
     return 0
 

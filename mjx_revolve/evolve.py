@@ -181,7 +181,7 @@ def _check(arguments: argparse.Namespace) -> Config | None:
 
 
 def _evolve(run: Run, interrupts: Interrupts) -> int:
-    """Evolves a run whose arguments are right."""
+    """Evolves a run with checked arguments."""
     config, place = run.config, short_path(run.folder.path)
     if run.is_finished:
         print(

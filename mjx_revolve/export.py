@@ -84,7 +84,7 @@ def _all_files(folder: Path) -> dict[str, Path]:
 
 
 def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
-    """The files that were asked for by name."""
+    """The files that options name."""
     files = {}
     for name, (_, endings, _) in _FORMATS.items():
         if getattr(arguments, name) is None:
@@ -137,7 +137,7 @@ def main(argv: list[str] | None = None) -> int:
 
     check_episode_files(arguments)
     runtime.prepare_process()
-    # JAX takes seconds to import: not for those who ask for help.
+    # JAX takes seconds to import: not for `--help`.
     from mjx_revolve.episodes.champion import load_asked
     from mjx_revolve.formats.export import export_robot
 

@@ -38,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     arguments = parser.parse_args(argv)
     read_file(arguments.file, 1)  # it is there
-    # MuJoCo takes a second to import: not for those who ask for help.
+    # MuJoCo takes a second to import: not for `--help`.
     from mjx_revolve.formats.import_robot import import_robot
 
     robot = import_robot(arguments.file)

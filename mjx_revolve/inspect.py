@@ -80,7 +80,7 @@ def main(argv: list[str] | None = None) -> int:
         arguments.file, modules=MODULES | modules, allow_overlap=arguments.allow_overlap
     )
     if arguments.picture is not None:
-        # Matplotlib takes a second to import: only for those who ask for a picture.
+        # Matplotlib takes a second to import: only for a picture.
         from mjx_revolve.view.pictures import draw_morphology
 
         draw_morphology(morphology, arguments.picture)

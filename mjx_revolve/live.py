@@ -18,8 +18,8 @@ from mjx_revolve.inputs.trust import add_trust_argument, opening
 if TYPE_CHECKING:
     from mjx_revolve.view.live.simulation import LiveSimulation
 
-_ROOM = 8  # robots in the water at once: two cores keep them in real time
-_PATIENCE = 3.0  # for the slice that is being stepped, at the end [s]
+_MAX_ROBOTS = 8  # robots in the water at once: two cores keep them in real time
+_STOP_TIMEOUT = 3.0  # for the slice that is being stepped, at the end [s]
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -56,7 +56,7 @@ def main(argv: list[str] | None = None) -> int:
         help="of the page on 127.0.0.1 (default: any that is free)",
     )  # fmt: skip
     parser.add_argument(
-        "--robots", type=whole(1, 64), default=_ROOM, metavar="N",
+        "--robots", type=whole(1, 64), default=_MAX_ROBOTS, metavar="N",
         help="for how many there is room; more are slower (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
@@ -131,7 +131,7 @@ def _watch(simulation: LiveSimulation, window: bool) -> None:
     except InputError as error:  # no screen, after all
         wrong.append(error)
     simulation.stop()
-    thread.join(_PATIENCE)
+    thread.join(_STOP_TIMEOUT)
     if thread.is_alive():
         # XLA compiles, and cannot be stopped; nothing is left that would be lost.
         said, code = (f"error: {wrong[0]}", 2) if wrong else ("ended", 0)

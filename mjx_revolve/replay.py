@@ -90,7 +90,7 @@ def _parser() -> Parser:
     parser.add_argument(
         "--html", action="store_true", help="only the page for a browser; needs no OpenGL"
     )
-    parser.add_argument("--view", action="store_true", help="look at it in MuJoCo's viewer instead")
+    parser.add_argument("--view", action="store_true", help="show it in MuJoCo's viewer instead")
     return parser
 
 
@@ -115,15 +115,15 @@ def _paths_in(place: Path, name: str, kinds: Sequence[str]) -> dict[str, Path]:
 
 
 def _named_paths(out: str, kinds: Sequence[str], name: str) -> dict[str, Path]:
-    """Where `--out` wants which kind of file; in a folder, of this name."""
+    """The path of `--out`, checked for the kind of file; in a folder, with this name."""
     path = Path(out)
     kind = path.suffix.lower()
     check_place(path / "any" if path.is_dir() else path, f"--out {out}")
     if kind in _KINDS and not path.is_dir():
         if kind not in kinds:
-            asked = "--html" if kinds == (".html",) else "a film of several robots"
+            cause = "--html" if kinds == (".html",) else "a film of several robots"
             raise InputError(
-                f"--out {out}: expected a name that ends in {' or '.join(kinds)}, with {asked}"
+                f"--out {out}: expected a name that ends in {' or '.join(kinds)}, with {cause}"
             )
         return {kind: path}
     # A new folder may have a dot in its name (v0.2), but x.avi is a slip.

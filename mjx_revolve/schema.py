@@ -61,7 +61,7 @@ def _modules(generate: Generate) -> Schema:
 
 
 def _morphology(generate: Generate) -> Schema:
-    """A tree of modules; see `make_morphology`. Types may be one's own, brains are anybody's."""
+    """A tree of modules; see `make_morphology`. Types may be users' own; brains are not checked."""
     from pydantic import ConfigDict, create_model
 
     from mjx_revolve.body.catalogue import MODULES

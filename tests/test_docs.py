@@ -15,6 +15,7 @@ import re
 import runpy
 import subprocess
 import sys
+import tokenize
 import tomllib
 from html.parser import HTMLParser
 from urllib.parse import unquote
@@ -281,6 +282,39 @@ def test_every_file_and_name_that_a_docstring_mentions_exists(identifiers):
                 if not known:
                     wrong.append(f"{path.relative_to(ROOT)}:{line}: {said}")
     assert wrong == []
+
+
+# Things are not persons, one docstring needs no other one, and a gradient is no slope. Words of the
+# package's docstrings, comments and messages, and of texts, where users are persons, too.
+NOT_PROSE = (
+    r"\b(?:nobody|somebody|anybody|told|asked|likewise|finds out|gives up|is let be|tells apart)\b"
+    r"|\bas there(?= *[,.;:)]|$)"
+)
+NOT_CODE = NOT_PROSE + r"|\b(?:who|whom|whose|knows|everybody)\b"
+SLOPES = {"bed", "coefficients", "contact", "estimate", "lift_drag", "plates"}  # of a bed, of lift
+
+
+def prose(path):
+    """Lines of the comments and of the strings of a Python file, docstrings among them."""
+    with path.open("rb") as file:
+        for token in tokenize.tokenize(file.readline):
+            kind = tokenize.tok_name[token.type]
+            if kind in ("COMMENT", "STRING", "FSTRING_MIDDLE"):
+                for k, line in enumerate(token.string.split("\n")):
+                    yield token.start[0] + k, line
+
+
+def test_things_are_not_persons():
+    wrong = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        pattern = NOT_CODE if path.stem in SLOPES else NOT_CODE + r"|\bslopes?\b"
+        wrong += [
+            (path, number, x) for number, line in prose(path) for x in re.findall(pattern, line)
+        ]
+    for path in [*TEXTS, *sorted((ROOT / "configs").glob("*.yaml"))]:
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            wrong += [(path, number, x) for x in re.findall(NOT_PROSE, line)]
+    assert [f"{path.relative_to(ROOT)}:{number}: {x}" for path, number, x in wrong] == []
 
 
 def test_no_two_public_classes_have_one_name():

@@ -16,7 +16,13 @@ def steady():
     return measured_cases.steady_drag()
 
 
-def test_steady_drag_is_near_that_of_plates_and_far_from_that_of_long_rods(steady):
+@pytest.fixture(scope="module")
+def on_faces():
+    return measured_cases.steady_drag("faces")
+
+
+def test_drag_on_faces_is_near_that_of_plates_and_far_from_that_of_long_rods(on_faces):
+    steady = on_faces
     found = ratios(steady.rows)
     for name in ("square plate, broadside", "disc, broadside"):
         assert 0.85 < found[name] < 1.0
@@ -31,8 +37,8 @@ def test_steady_drag_is_near_that_of_plates_and_far_from_that_of_long_rods(stead
     np.testing.assert_allclose(ours, by_hand, rtol=1e-9)
 
 
-def test_a_rod_meets_what_a_rod_meets_with_the_law_of_chains(steady):
-    found, before = ratios(measured_cases.steady_drag("cross_flow").rows), ratios(steady.rows)
+def test_a_rod_meets_what_a_rod_meets(steady, on_faces):
+    found, before = ratios(steady.rows), ratios(on_faces.rows)
     assert found["square rod, face on"] == pytest.approx(1.75 / 2.0, rel=1e-6)
     assert found["square rod, edge on"] == pytest.approx(1.75 / 2**0.5 / 1.6, rel=1e-6)
     for name in ("square plate, broadside", "disc, broadside"):
@@ -44,13 +50,13 @@ def test_a_rod_meets_what_a_rod_meets_with_the_law_of_chains(steady):
 def test_a_plate_sinks_by_its_drag():
     """Terminal speeds are within 10 % of what the measured C_d gives."""
     row = measured_cases.sinking_plate()
-    assert row.ours == pytest.approx(row.measured * np.sqrt(1.16 / 1.05), rel=1e-3)
+    assert row.ours == pytest.approx(row.measured * np.sqrt(1.16 / 1.17), rel=2e-3)
     assert abs(row.ratio - 1) < 0.1
 
 
 @pytest.fixture(scope="module")
 def polars():
-    return measured_cases.polars()
+    return measured_cases.polars(drag="faces")
 
 
 def test_plates_lift_as_measured_before_they_stall(polars):
@@ -72,7 +78,7 @@ def test_plates_drag_too_little_beyond_fifteen_degrees(polars):
 
 @pytest.mark.slow
 def test_coins_fall_as_fast_as_measured_and_far_too_straight():
-    for row in measured_cases.coins().rows:
+    for row in measured_cases.coins("faces").rows:
         if row.unit == "m/s":
             assert 0.9 < row.ratio < 1.25
         else:
@@ -80,16 +86,16 @@ def test_coins_fall_as_fast_as_measured_and_far_too_straight():
 
 
 @pytest.mark.slow
-def test_a_chain_that_glides_turns_too_far():
-    found = ratios(measured_cases.amphibot_glide().rows)
+def test_a_chain_of_faces_glides_and_turns_too_far():
+    found = ratios(measured_cases.amphibot_glide("faces").rows)
     assert found["glide, way after 0.13 s"] == pytest.approx(1.0, abs=0.05)
     assert found["glide, way after 4.4 s"] == pytest.approx(1.14, abs=0.01)
     assert found["glide, rotation after 4.4 s"] == pytest.approx(2.7, abs=0.02)
 
 
 @pytest.mark.slow
-def test_a_chain_glides_as_far_as_measured_with_the_law_of_chains():
-    found = ratios(measured_cases.amphibot_glide("cross_flow").rows)
+def test_a_chain_glides_as_far_as_measured():
+    found = ratios(measured_cases.amphibot_glide().rows)
     assert all(abs(x - 1) < 0.04 for name, x in found.items() if "way" in name)
     assert found["glide, rotation after 4.4 s"] == pytest.approx(2.01, abs=0.02)
 
@@ -109,23 +115,23 @@ def test_bias_and_scatter_of_ratios():
 
 
 def test_a_flapping_foil_thrusts_too_much_unless_its_lift_lags():
-    found = ratios(measured_cases.foil())
+    found = ratios(measured_cases.foil("faces"))
     assert 1.5 < found["C_T, Schouveiler"] < 1.75
     assert 1.65 < found["C_T, Read"] < 1.85
     # Drag has no thrust, and none is without power.
     assert 0.0 < found["η, Read"] * 0.43 < 1.0
-    found = ratios(measured_cases.foil("cross_flow", phases=256))
+    found = ratios(measured_cases.foil(phases=256))
     assert all(abs(found[f"C_T, {who}"] - 1) < 0.2 for who in ("Schouveiler", "Read"))
 
 
 def test_an_oscillating_plate_drags_several_times_too_little_unless_it_remembers():
-    found = measured_cases.oscillating((8, 30))
+    found = measured_cases.oscillating((8, 30), "faces")
     # Whatever the number: ours knows no vortices that stay with the plate.
     np.testing.assert_allclose(found.lines["faces"][1], 1.05, rtol=1e-3)
     assert 0.2 < ratios(found.rows)["C_d of a plate, U T / b = 8"] < 0.22
     assert data.plate_drag(1000.0) == 1.95  # a steady two-dimensional plate
     few = (3, 5, 8, 15, 30, 60)
-    found = ratios(measured_cases.oscillating(few, "cross_flow").rows)
+    found = ratios(measured_cases.oscillating(few).rows)
     for number in few:
         name = f"C_d of a plate, U T / b = {number}"
         assert min(abs(found[x] - 1) for x in (name, f"{name}, bilge keels")) < 0.1

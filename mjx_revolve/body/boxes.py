@@ -51,16 +51,16 @@ def boxes_overlap(
 ) -> np.ndarray:
     """Separating axis theorem for `n` pairs of boxes, or for one box against `n` others.
 
-    Two boxes are apart when their shadows are apart on one of 15 axes: three normals of each and
-    the nine cross products of their edges (Gottschalk, Lin and Manocha, OBBTree, SIGGRAPH 1996).
+    Two boxes are apart when their projections are apart on one of 15 axes: three normals of each
+    and the nine cross products of their edges (Gottschalk, Lin and Manocha 1996, SIGGRAPH).
 
     Args:
-        center: `[n, 3]` or `[3]` of the ones [m].
+        center: `[n, 3]` or `[3]` centres of the first boxes [m].
         rotation: `[n, 3, 3]` or `[3, 3]` their axes as columns.
         half: `[n, 3]` or `[3]` their half edges [m].
-        centers: `[n, 3]` of the others [m].
-        rotations: `[n, 3, 3]` of the others.
-        halves: `[n, 3]` of the others [m].
+        centers: `[n, 3]` centres of the second boxes [m].
+        rotations: `[n, 3, 3]` their axes as columns.
+        halves: `[n, 3]` their half edges [m].
 
     Returns:
         `[n]` whether they overlap by more than 1 nm.

@@ -3,7 +3,7 @@
 Users add their own types in YAML with `load_modules` and merge them:
 `MODULES | load_modules("my_modules.yaml")`.
 
-Frames follow Revolve: core and brick look along +y, all others along +x. Slots are
+Frames follow Revolve: the front of core and brick is +y, that of all others +x. Slots are
 0 back (-y, where a brick is attached), 1 front (+y), 2 (+x) and 3 (-x); a hinge has slot 1 only;
 sensor, thrusters and fin have none.
 
@@ -95,11 +95,11 @@ _TOUCH_SENSOR = ModuleType(
     sensor=True,
 )
 
-# Thrusters and fin are ours: Revolve has neither. What has no source below is a choice.
+# Thrusters and fin are ours: Revolve has neither. Numbers without a source below are choices.
 
 # A ducted propeller of the hobby class, 30 mm across: half a newton, for which an ideal propeller
-# needs .3 W, and .1 s to answer. Mesh volume: a duct with a wall of 2 mm (7.0 cm³) and a motor of
-# 12 × 35 mm (4.0 cm³); half of the room that they leave is taken to go along. Reaction torque:
+# takes .3 W, with a lag of .1 s. Mesh volume: a duct with a wall of 2 mm (7.0 cm³) and a motor of
+# 12 × 35 mm (4.0 cm³); half of the free volume is entrained water. Reaction torque:
 # K_Q / K_T of about 1/7 at standstill (Carlton, Marine Propellers and Propulsion, chapter 6) times
 # a propeller of 24.5 mm.
 _DUCT, _DUCT_LENGTH = 0.030, 0.040
@@ -136,8 +136,8 @@ _LIFT_THRUSTER = ModuleType(
 # Data 10-20V (September 2019), every 50 µs, as the BlueROV2 node of CentraleNantesROV has it in its
 # map from thrust to PWM; a propeller 76 mm across, from their bluerov2_description. Mass and
 # density, 0.3603 kg and 1880 kg/m³, from Blue Robotics' documentation as quoted in
-# SSModelGit/TAMU_ROVm, T200Parameters.mo. Its length, and that half of its room goes along, are
-# choices; a lag and a torque of the propeller were not found.
+# SSModelGit/TAMU_ROVm, T200Parameters.mo. Its length, and half of its free volume as entrained
+# water, are choices; a lag and a torque of the propeller were not found.
 _T200_LENGTH, _T200_ACROSS = 0.088, 0.076
 _T200 = ModuleType(
     name="T200",
@@ -165,14 +165,14 @@ _T200 = ModuleType(
     mount=Mount((-_T200_LENGTH / 2, 0.0, 0.0), (1.0, 0.0, 0.0)),
 )  # fmt: skip
 
-# The frame of a BlueROV2 Heavy without its eight T200, ahead is +x: M. von Benzon et al., An
+# The frame of a BlueROV2 Heavy without its eight T200, front along +x: M. von Benzon et al., An
 # Open-Source Benchmark Simulator: Control of a BlueROV2 Underwater Robot, JMSE 10 (2022), 1898,
 # table A1: 13.5 kg, 13.4 l, centre of buoyancy 1 cm above that of mass, inertia 0.26, 0.23, 0.37
 # kg m², added mass, damping, and the thrusters' places and directions, y and z turned to ours; as
-# quoted in AndreasKing-Goks/0_THESIS, BlueROV2_param.m, and elsewhere alike. Three boxes hold what
-# the thrusters leave of masses and volumes, of such sizes that the whole has the published inertia
-# and centres, inside the vehicle's outer sizes, 0.457 × 0.575 × 0.254 m. In its slots, T200 are
-# held by their backs.
+# quoted in AndreasKing-Goks/0_THESIS, BlueROV2_param.m, and the same elsewhere. Three boxes have
+# the mass and volume of the vehicle without its thrusters. Their sizes give the whole the published
+# inertia and centres, within the vehicle's outer sizes, 0.457 × 0.575 × 0.254 m. The slots hold
+# T200 by their backs.
 _HALF = math.sqrt(0.5)
 _BLUEROV2_THRUSTERS = (
     ((0.156, -0.111, -0.085), (_HALF, _HALF, 0.0)),
@@ -187,7 +187,7 @@ _BLUEROV2_THRUSTERS = (
 
 
 def _t200_slot(place: tuple[float, ...], direction: tuple[float, float, float]) -> Slot:
-    """Where a T200 is held whose middle comes to lie at a place."""
+    """The slot that holds a T200 with its middle at a point [m], core frame."""
     x, y, z = (p - _T200_LENGTH / 2 * d for p, d in zip(place, direction, strict=True))
     return Slot((x, y, z), direction, (1.0, 0.0, 0.0) if direction[2] else (0.0, 0.0, 1.0))
 
@@ -225,15 +225,14 @@ _BLUEROV2 = ModuleType(
     slots={k: _t200_slot(*at) for k, at in enumerate(_BLUEROV2_THRUSTERS, 1)},
 )
 
-# A stiff plate of ABS (1050 kg/m³), 60 × 50 × 2 mm with corners rounded to 10 mm, whose leading
-# edge is where it is mounted, as a tail's. Its box's face stands for its area, 3 % too much.
+# A stiff plate of ABS (1050 kg/m³), 60 × 50 × 2 mm with corners rounded to 10 mm, mounted at its
+# leading edge like a tail. Its area is taken as that of its box's face, 3 % too much.
 # Lift before the stall: 2π A / (2 + √(A² + 4)) per rad (Helmbold 1942) for the aspect ratio
 # A = 50/60, which makes 1.26. Such plates stall late, at 30° to 40° (Torres and Mueller, AIAA
-# Journal 42, 2004): 30°; from there the lift falls to none at 90°. Drag: what a force normal to the
-# plate has, lift × tan α, whose mean before the stall is that of .465 |α|; then up to the 1.17 of a
-# square plate across the flow (Hoerner, Fluid-Dynamic Drag, 1965, chapter 3). That friction is left
-# out, and that the centre of pressure stays in the middle, are choices: a tail works at large
-# angles.
+# Journal 42, 2004): 30°; from there the lift falls to 0 at 90°. Drag: that of a force normal to the
+# plate, lift × tan α, with the same mean before the stall as .465 |α|; then up to the 1.17 of a
+# square plate across the flow (Hoerner, Fluid-Dynamic Drag, 1965, chapter 3). Two choices: friction
+# is left out, as a tail works at large angles, and the centre of pressure stays in the middle.
 _FIN_STALL = math.radians(TODAY["fin_stall"].value)
 _FIN_LIFT = 2 * math.pi * (50 / 60) / (2 + math.hypot(50 / 60, 2))
 _FIN_DRAG = TODAY["fin_drag"].value
@@ -266,7 +265,7 @@ MODULES: dict[str, ModuleType] = _with_aliases(
 """The catalogue by name and alias: Revolve's values, our thrusters and fin, T200 and BlueROV2."""
 
 # The thesis's Table 1 prints the two hinge masses the other way round. It also gives the touch
-# sensor the brick's box; that is not taken over, since it says nowhere how such a box is attached.
+# sensor the brick's box; that is not taken over, as the thesis does not say how it is attached.
 THESIS_MODULES: dict[str, ModuleType] = MODULES | _with_aliases(
     replace(
         _HINGE,
@@ -338,7 +337,7 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
                 mass: 0.05
                 fossen:              # known water, in place of our laws; fields of `Fossen`
                   added_mass: [0.01, 0.04, 0.04, 0, 2.0e-6, 2.0e-6]     # or six rows of six
-                  linear_damping: [0.05, 0.1, 0.1, 0, 0, 0]             # likewise
+                  linear_damping: [0.05, 0.1, 0.1, 0, 0, 0]             # or six rows of six
                   quadratic_damping: [0.4, 1.2, 1.2, 0, 1.0e-5, 1.0e-5]
           Jet:
             mount: -x

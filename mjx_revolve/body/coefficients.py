@@ -1,4 +1,4 @@
-"""Coefficients of a robot that swam, in a YAML that morphologies and configurations name.
+"""Coefficients fitted to a real robot, in a YAML file that morphologies and configurations name.
 
     modules:
       all: {factors: {drag: 1.31, added_mass: 0.87}}    # of every module
@@ -102,7 +102,7 @@ def _correct(module: Module, entries: Entries) -> Module:
 
 
 def _suited(entry: Mapping[str, Any], kind: ModuleType) -> dict[str, Any]:
-    """An entry without what only thrusters have, where there is none."""
+    """An entry without the coefficients of thrusters, if the type has no thruster."""
     thruster = kind.is_thruster
     return {k: v for k, v in entry.items() if thruster or k not in ("thruster", "thrust")}
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_revolve.body.placement import Module
 
-# Positions nearer than this are the same place [m]; a choice, far below a module's size.
+# Positions nearer than this count as equal [m]; a choice, far below a module's size.
 _SAME_PLACE = 1e-3
 
 UNITS: dict[str, str] = {
@@ -52,13 +52,13 @@ def describe(modules: Sequence[Module], extent: np.ndarray) -> dict[str, float]:
     `measure_body_3d.py`), with the limits that it uses. m is `absolute_size`, and a module's
     children do not count its sensors. `docs/measures.md` has Revolve's names beside these.
 
-    Cells are those of Revolve's grid: the core's is (0, 0, 0), each module takes the one that
-    follows its parent's in the direction in which it is attached (core frame, the nearest axis).
-    Modules of any size take one cell, and modules that bend back may share one.
+    Cells are those of Revolve's grid: the core has cell (0, 0, 0), and each module the cell next to
+    its parent's in the direction in which it is attached (core frame, the nearest axis). A module
+    of any size takes one cell; modules of a limb that bends back may share one.
 
-    What differs from Revolve: our modules differ in size, so `coverage` compares volumes, and the
+    Differences from Revolve: our modules differ in size, so `coverage` compares volumes, and the
     symmetries compare types and positions at rest (to 1 mm) where Revolve compares cells. Sensors
-    take no cells, as in its paper, and make no hinge active; its code counts them there.
+    take no cells, as in its paper, and make no hinge active; its code counts them.
 
     Args:
         modules: of the robot, the core first, parents before their children.
@@ -68,8 +68,8 @@ def describe(modules: Sequence[Module], extent: np.ndarray) -> dict[str, float]:
         Units are in `UNITS`; shares lie between 0 and 1 with the catalogue's modules.
 
         - num_modules, num_bricks, num_hinges, num_sensors, num_thrusters, num_fins: counts (bricks:
-          all that is rigid and is neither core, sensor, thruster nor fin; fins: modules with a part
-          whose drag is that of a plate with lift);
+          all rigid modules but core, sensors, thrusters and fins; fins: modules with a part under
+          the drag law `lift_drag`);
         - mass, volume, box_volume: as the properties of a `Morphology`;
         - extent_x, extent_y, extent_z, length: bounding box at rest and its longest edge;
         - absolute_size: m, modules without sensors;
@@ -79,9 +79,9 @@ def describe(modules: Sequence[Module], extent: np.ndarray) -> dict[str, float]:
         - chain_length: modules on the longest way from the core to a tip, sensors included;
         - extensiveness: modules with one child, core not counted;
         - length_of_limbs: extensiveness over m - 2;
-        - branching_modules_count: bricks and cores whose slots are all filled;
+        - branching_modules_count: bricks and cores with all slots filled;
         - branching: branching_modules_count over floor((m - 2) / 3);
-        - active_hinges_count: hinges that carry something;
+        - active_hinges_count: hinges that carry a module;
         - joints: active_hinges_count over m - 2;
         - sensors: sensors over slots that no other kind of module fills;
         - coverage: boxes' volumes over that of the bounding box;
@@ -166,7 +166,7 @@ def _ratio(part: float, whole: float) -> float:
 
 
 def _cells(modules: Sequence[Module]) -> list[list[int]]:
-    """Where each module stands in Revolve's grid."""
+    """The cell of each module in Revolve's grid, (x, y, z)."""
     outward = [(0.0, 0.0, 0.0) if m.kind.mount is None else m.kind.mount.outward for m in modules]
     turns = np.array([module.rotation for module in modules])
     way = np.einsum("mij,mj->mi", turns, np.array(outward))

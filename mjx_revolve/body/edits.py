@@ -1,14 +1,13 @@
-"""Edits of bodies: a new body that is valid, or an `InputError` that says why there is none.
+"""Edits of bodies: each returns a new valid body, or raises an `InputError` that says why not.
 
-No body is changed; what moves is laid out anew and compared with all modules, the rest is kept as
-it is. A module is addressed by its name or its index; its subtree is the module with all that it
-carries. New subtrees take their place among their siblings by slot, so that in a body whose file
-lists slots in order, grafting back what was removed gives the body back. Modules keep their names;
-where a new one's name is taken, it gets the first free of the suffixes _2, _3 and so on in place of
-the one that it has.
+No body is changed in place. Modules that move are placed anew and compared with all others. A
+module is addressed by its name or its index; its subtree is the module with all its descendants. A
+new subtree is inserted among its siblings in the order of slots: in a body with slots in order,
+grafting back a removed subtree gives the same body. Modules keep their names; a new module with a
+name that is taken gets the first free of the suffixes _2, _3 and so on.
 
 A core is the root of a body: it can be replaced, but neither removed, turned nor grafted. In all
-edits `allow_overlap` keeps a body whose modules overlap at rest; `overlaps` then names them.
+edits `allow_overlap` accepts a body with modules that overlap at rest; `overlaps` then names them.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from mjx_revolve.inputs.errors import InputError, show
 
 
 def free_slots(body: Morphology) -> tuple[tuple[int, int], ...]:
-    """Slots that carry nothing.
+    """Slots without a child.
 
     Args:
         body: the robot.
@@ -74,14 +73,14 @@ def add_module(
         params: as in a morphology file; see `make_morphology`.
         name: by default its type and the number of modules.
         modules: the types of modules by name and alias.
-        allow_overlap: as above.
+        allow_overlap: accept modules that overlap at rest.
 
     Returns:
         The new body.
 
     Raises:
-        InputError: there is no such module, slot or type, the slot is taken, something in the
-            module is wrong, it overlaps with another one, or there would be too many.
+        InputError: there is no such module, slot or type, the slot is taken, a param is wrong, the
+            module overlaps with another one, or there would be too many.
     """
     above, at = _find_slot(body, parent, slot)
     item = {"id": name, "type": type, "orientation": orientation, "params": params}
@@ -107,15 +106,15 @@ def graft_subtree(
         slot: the parent's slot.
         donor: the robot that the subtree is copied from.
         module: the subtree's first module in it.
-        orientation: of that module [deg]; by default as it is.
-        allow_overlap: as above.
+        orientation: of that module [deg]; None: unchanged.
+        allow_overlap: accept modules that overlap at rest.
 
     Returns:
         The new body.
 
     Raises:
-        InputError: there is no such module or slot, the slot is taken, the module is a core, what
-            is grafted overlaps with other modules, or there would be too many.
+        InputError: there is no such module or slot, the slot is taken, the module is a core, the
+            grafted subtree overlaps with other modules, or there would be too many.
     """
     above, at = _find_slot(body, parent, slot)
     index = _find(donor, module, core=False)
@@ -127,7 +126,7 @@ def graft_subtree(
 
 
 def remove_module(body: Morphology, module: str | int) -> Morphology:
-    """Takes a module away, with all that it carries.
+    """Removes a module with all its descendants.
 
     Args:
         body: the robot.
@@ -154,24 +153,24 @@ def replace_module(
 ) -> Morphology:
     """Gives a module another type, or other params.
 
-    It keeps its name, place and orientation, and its colour unless `params` hold another one;
-    what it carries moves to the same slots of the new type.
+    The module keeps its name, slot and orientation, and its colour unless `params` hold another
+    one; its children move to the same slots of the new type.
 
     Args:
         body: the robot.
         module: the module; a core can become another core.
-        type: the new type, by name or alias; it may be the one that it has.
+        type: the new type, by name or alias; it may be the same type.
         params: all of the new params, as in a morphology file; by default none.
         drop_children: remove the children for which the new type has no slot.
         modules: the types of modules by name and alias.
-        allow_overlap: as above.
+        allow_overlap: accept modules that overlap at rest.
 
     Returns:
         The new body.
 
     Raises:
-        InputError: there is no such module or type, something in the params is wrong, the new type
-            lacks the slot of a child, or modules would overlap.
+        InputError: there is no such module or type, a param is wrong, the new type lacks the slot
+            of a child, or modules would overlap.
     """
     index = _find(body, module)
     old, place = body.modules[index], _place(body, index)
@@ -197,13 +196,13 @@ def replace_module(
 def turn_module(
     body: Morphology, module: str | int, orientation: float, allow_overlap: bool = False
 ) -> Morphology:
-    """Turns a module, with all that it carries, about the direction in which it is attached.
+    """Turns a module, with its descendants, about the direction in which it is attached.
 
     Args:
         body: the robot.
         module: the module, not the core.
         orientation: the new one [deg].
-        allow_overlap: as above.
+        allow_overlap: accept modules that overlap at rest.
 
     Returns:
         The new body.
@@ -226,16 +225,16 @@ def swap_subtrees(
 
     Args:
         body: the robot.
-        module: first module of the one, not the core.
-        other: first module of the other, which neither carries.
-        allow_overlap: as above.
+        module: root of the first subtree, not the core.
+        other: root of the second subtree; neither is a descendant of the other.
+        allow_overlap: accept modules that overlap at rest.
 
     Returns:
         The new body.
 
     Raises:
-        InputError: there is no such module, one is the core or carries the other, or modules would
-            overlap.
+        InputError: there is no such module, one is the core or a descendant of the other, or
+            modules would overlap.
     """
     first, second = sorted(_find(body, which, core=False) for which in (module, other))
     tree: Sequence[Module] = body.modules
@@ -260,10 +259,10 @@ def exchange_subtrees(
 
     Args:
         a: a robot.
-        module_a: first module of its subtree, not the core.
-        b: a robot; where it is `a` itself, two copies of it exchange their subtrees.
-        module_b: first module of its subtree, not the core.
-        allow_overlap: as above.
+        module_a: root of its subtree, not the core.
+        b: a robot; it may be `a` itself: then two copies of it exchange their subtrees.
+        module_b: root of its subtree, not the core.
+        allow_overlap: accept modules that overlap at rest.
 
     Returns:
         The new bodies; each keeps its name, core and brain.
@@ -286,7 +285,7 @@ def exchange_subtrees(
 
 
 def _place(body: Morphology, index: int) -> str:
-    """Where an edit takes place, for messages."""
+    """The place of an edit, for messages."""
     return f"{body.path or body.name}: {body.modules[index].name}"
 
 
@@ -321,7 +320,7 @@ def _find_slot(body: Morphology, parent: str | int, slot: int) -> tuple[int, int
 
 
 def _end(modules: Sequence[Module], index: int) -> int:
-    """Where a subtree ends: the modules lie depth first, so that it is a run of them."""
+    """Index behind the last module of a subtree, which is contiguous: modules are depth first."""
     stop = index + 1
     while stop < len(modules) and modules[stop].parent >= index:
         stop += 1
@@ -329,7 +328,7 @@ def _end(modules: Sequence[Module], index: int) -> int:
 
 
 def _cut(modules: Sequence[Module], index: int) -> list[Module]:
-    """A subtree whose parents are counted from its own first module."""
+    """A subtree, with indices of parents relative to its own first module."""
     root, *rest = modules[index : _end(modules, index)]
     return [replace(root, parent=-1), *(replace(m, parent=m.parent - index) for m in rest)]
 
@@ -344,10 +343,10 @@ def _splice(
 
     Args:
         modules: the tree.
-        index: of the subtree that gives way; with a `target`, of the module that the new subtree
-            comes before.
+        index: of the subtree that is replaced; with a `target`, of the module before which the new
+            subtree is inserted.
         graft: the new subtree, as from `_cut`; empty for none.
-        target: parent and slot of the new subtree where nothing gives way.
+        target: parent and slot of the new subtree if it replaces none.
 
     Returns:
         The modules.
@@ -383,7 +382,7 @@ def _insert(
 
 
 def _name_apart(graft: Sequence[Module], kept: Iterable[Module]) -> list[Module]:
-    """A subtree whose names are none of those kept."""
+    """A subtree, renamed so that no name is among those kept."""
     taken = {*RESERVED, *(module.name for module in kept)}
     used = taken | {module.name for module in graft}
     found = []
@@ -402,7 +401,7 @@ def _name_apart(graft: Sequence[Module], kept: Iterable[Module]) -> list[Module]
 def _finish(
     body: Morphology, modules: Sequence[Module], allow_overlap: bool, place: str = ""
 ) -> Morphology:
-    """The edited body, where it is one; what lies as it did was compared before."""
+    """The edited body, checked; modules that did not move need no comparison with each other."""
     if len(modules) > MAX_MODULES:
         raise InputError(f"{place}: expected at most {MAX_MODULES} modules; found {len(modules)}")
     check_rigid(modules, place)

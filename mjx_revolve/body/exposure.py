@@ -1,7 +1,7 @@
-"""Which faces the water reaches: modules hide the faces by which they are joined.
+"""The share of each face that is exposed to the water: modules cover the faces by which they join.
 
-Without this, a chain of modules would meet the water head-on with the front of every module in it,
-and a limb would be no harder to move sideways than lengthwise; swimming lives on that difference.
+Without it, a chain of modules would have the frontal drag of every module in it, and a limb the
+same drag along and across its length. Undulatory swimming depends on that difference.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ _POINTS = 24  # at most 31: a row of them is a number
 _BITS = 1 << np.arange(_POINTS + 1, dtype=np.uint32)
 # For each axis of a part, the two others.
 _BESIDE = ((1, 2), (0, 2), (0, 1))
-# A hair of slack [m], so that flush neighbours count whatever the rounding.
+# Tolerance [m], so that flush neighbours count in spite of rounding.
 _SLACK = 1e-6
 
 
 class Exposure(NamedTuple):
-    """What neighbours leave of parts at rest, `[npart, 3]` along each part's x, y and z axes.
+    """Exposure of parts at rest, `[npart, 3]` along each part's x, y and z axes.
 
-    A row is a straight line of parts, of which each covers some of the next one's end. Parts of all
-    modules stand in order.
+    A row is a straight line of parts, each of which covers a share of the next one's end. Parts of
+    all modules in order.
 
     Attributes:
-        shares: of the silhouette that no other part covers [-]. Opposite faces are averaged, as
-            drag and added mass are the same in both directions.
-        joined: of the ends by which a part is in a row, the share that its neighbours cover [-]; 1
-            of a part that is a row by itself.
+        shares: share of the silhouette that no other part covers [-]. Opposite faces are averaged,
+            as drag and added mass are the same in both directions.
+        joined: share of a part's ends that its neighbours in the row cover [-]; 1 for a part that
+            is a row by itself.
         ends: 1 or -1 where a row ends with this part, in that direction; 0 elsewhere.
-        rows: length of the row [m]; of a lone part its own.
+        rows: length of the row [m]; of a single part its own.
     """
 
     shares: np.ndarray
@@ -47,15 +47,15 @@ class Exposure(NamedTuple):
 
 
 def exposure(parts: RestPose) -> Exposure:
-    """What the water reaches of each part's faces, and where rows of parts end.
+    """The exposed share of each part's faces, and the rows that parts form.
 
-    A choice: the pose at rest stands for all poses; a bent hinge opens a little more.
+    A choice: computed at rest and used for all poses; a bent hinge exposes a little more.
 
     Args:
         parts: of one body, `Morphology.layout`, or of several.
     """
     part, box, center, turn = _near(parts)
-    # Boxes that stand square to a face cover a rectangle of it: each axis tells on its own.
+    # Boxes parallel to a face cover a rectangle of it: each axis is tested on its own.
     square = (np.abs(turn - np.round(turn)) < 1e-9).all(axis=(1, 2))
     reach = turned(np.abs(turn), parts.box_half[box]) + _SLACK
     own = parts.box_part
@@ -68,15 +68,15 @@ def exposure(parts: RestPose) -> Exposure:
     side, axis, pair = np.nonzero((before & square[:, None, None]).transpose(1, 2, 0))
     covered = np.zeros((len(parts.low), 2, 3, _POINTS), np.uint32)
     neighbour = np.full((len(parts.low), 2, 3), -1)
-    if len(pair):  # those of a part, a side and an axis stand together, as those of a part do
+    if len(pair):  # pairs of one part, side and axis are contiguous
         within = _spans(parts, part, center, reach)
         beside = np.array(_BESIDE)[axis]
         hits = _rectangles(within[pair, beside[:, 0]], within[pair, beside[:, 1]])
         face = (part[pair] * 2 + side) * 3 + axis
         start = np.flatnonzero(np.append(True, np.diff(face)))
         covered.reshape(-1, _POINTS)[face[start]] = np.bitwise_or.reduceat(hits, start)
-        # The last write holds: the box that covers most of a face. Those that only reach past an
-        # edge of it have their centres beside the part, not in front of it.
+        # The last write holds: the box that covers most of a face. Boxes that only reach past an
+        # edge have their centres beside the part, not in front of it.
         most = np.argsort(np.bitwise_count(hits).sum(1), kind="stable")
         face_height = np.where(side, parts.high[part[pair], axis], -parts.low[part[pair], axis])
         ahead = np.where(side, 1, -1) * center[pair, axis] > face_height
@@ -103,7 +103,10 @@ def exposure(parts: RestPose) -> Exposure:
 
 
 def _row_lengths(parts: RestPose, neighbour: np.ndarray) -> np.ndarray:
-    """`[npart, 3]` lengths of rows, from the part that covers most of each face; -1 for none."""
+    """`[npart, 3]` lengths of rows [m].
+
+    `neighbour` is the part that covers most of each face; -1 for none.
+    """
     size = parts.high - parts.low
     length = size.copy()
     part, axis = (x.ravel() for x in np.indices(size.shape))
@@ -126,7 +129,7 @@ def _row_lengths(parts: RestPose, neighbour: np.ndarray) -> np.ndarray:
 
 
 def _near(parts: RestPose) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Parts and boxes of other parts that may cover a face of theirs.
+    """Candidate pairs: a part, and a box of another part that may cover one of its faces.
 
     Returns:
         `[pair]` parts and `[pair]` boxes; `[pair, 3]` centre [m] and `[pair, 3, 3]` rotation of the
@@ -149,13 +152,13 @@ def _near(parts: RestPose) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
 
 def _spans(parts: RestPose, part: np.ndarray, center: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Which points along each edge of parts some boxes reach.
+    """The sample points along each edge of a part that a box covers.
 
     Args:
-        parts: all of them.
-        part: `[n]` which.
-        center: `[n, 3]` of a box, part frame [m].
-        reach: `[n, 3]` of it from there along the part's axes [m].
+        parts: all parts.
+        part: `[n]` indices of parts.
+        center: `[n, 3]` centre of a box, part frame [m].
+        reach: `[n, 3]` half extents of that box along the part's axes [m].
 
     Returns:
         `[n, 3]` points as bits.
@@ -168,5 +171,5 @@ def _spans(parts: RestPose, part: np.ndarray, center: np.ndarray, reach: np.ndar
 
 
 def _rectangles(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """`[n, points]` the points of `[n]` rows and `[n]` columns, bits are the columns."""
+    """`[n, points]` bit sets of the points in `[n]` rows and `[n]` columns."""
     return (rows[:, None] >> np.arange(_POINTS, dtype=np.uint32) & 1) * columns[:, None]

@@ -16,12 +16,12 @@ from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import Boolean, TupleOf, checked, read, words
 
 # Boxes of a part: the memory for their union grows with the cube of their number, 70 MB here.
-_MOST = 100
+_MAX_BOXES = 100
 
 
 @checked
 class _File:
-    """A file of module types: each as `_Written` has it, by name."""
+    """A file of module types, by name."""
 
     modules: Annotated[dict[Name, Any], MinLen(1), words("a mapping from names to module types")]
 
@@ -44,7 +44,7 @@ def read_modules(data: Any, usual: Mapping[str, ModuleType]) -> dict[str, Module
 
     Args:
         data: the file's values.
-        usual: types whose aliases go to those of the same name that give none.
+        usual: types with aliases, which a type of the same name inherits unless it gives its own.
 
     Returns:
         The types by name and alias.
@@ -93,7 +93,7 @@ def _read_part(item: dict[str, Any], index: int, place: str) -> Part:
         boxes = (read(Box, {"size": item["size"]}, place),)
     else:
         several = Annotated[
-            TupleOf[Box], MinLen(1), MaxLen(_MOST), words(f"a list of 1 to {_MOST} boxes")
+            TupleOf[Box], MinLen(1), MaxLen(_MAX_BOXES), words(f"a list of 1 to {_MAX_BOXES} boxes")
         ]
         boxes = read(several, item["boxes"], f"{place}.boxes")
     center = np.array([box.position for box in boxes])

@@ -75,32 +75,32 @@ class Part:
 
     Attributes:
         name: unique in its module.
-        boxes: what it collides with; the first is its main box, which is the envelope for clipping
-            at the surface and for added mass, and is centred on the part's frame.
-        mass: [kg], spread evenly over the main box; without the ballast.
-        volume: of the material, from the mesh [m³]; what displaces water.
+        boxes: collision boxes; the first is the main box, the envelope for clipping at the surface
+            and for added mass, centred on the part's frame.
+        mass: [kg], uniform over the main box; without the ballast.
+        volume: of the material, from the mesh [m³]; it displaces water.
         electronics_volume: sealed volume that the mesh lacks [m³]; displaces water too.
         center_of_volume: of mesh and electronics, part frame [m].
         position: of the part's frame, module frame [m].
         coefficients: of laws, by name; by default the world's.
         drag_coefficient: of a face that meets the flow, or three, across the part's axes [-].
         added_mass_coefficient: multiplies the main box's added mass; or three, along its axes [-].
-        factors: on coefficients of laws, by name, on LAW.FIELD of laws with parameters, and on all
-            that laws vary as `drag` or as `added_mass`; in place of those of robots that swam.
+        factors: fitted factors on coefficients of laws, by name, on LAW.FIELD of laws with
+            parameters, or on all coefficients of `drag` or `added_mass` together.
         contact: whether it touches the bed.
-        buoyancy: name of a buoyancy law; by default the world's choice. What a world switches off
-            stays off, here and below.
+        buoyancy: name of a buoyancy law; by default the world's. A law that the world switches off
+            stays off; so for `drag` and `added_mass`.
         drag: name of a drag law of parts; by default "fossen" where that is stated, "lift_drag" for
             a fin, else the world's choice.
         added_mass: false for none; by default the world's choice.
-        entrained_water: share of the room in the main box that mesh, electronics and ballast leave
-            free, whose water is carried along, 0 to 1 [-].
+        entrained_water: water that moves with the part, as a share of the main box's volume without
+            mesh, electronics and ballast, 0 to 1 [-].
         ballast_mass: a point mass [kg].
         ballast_volume: a point volume that displaces water: a float, or the ballast's own [m³].
         ballast_position: of both, part frame [m].
         lift_drag: parameters of Gazebo's LiftDrag, which make the part a fin.
-        fossen: added mass and damping known from elsewhere, which replace those of our laws, the
-            entrained water among them.
+        fossen: added mass and damping from another source, in place of those of our laws and of
+            the entrained water.
         thruster: makes the part a thruster.
 
     Raises:
@@ -153,7 +153,7 @@ class Part:
 
     @property
     def free_volume(self) -> float:
-        """Room in the main box that mesh, electronics and ballast leave to the water [m³]."""
+        """Volume of the main box without mesh, electronics and ballast [m³]."""
         return max(self.boxes[0].volume - self.total_volume, 0.0)
 
     @property
@@ -174,7 +174,7 @@ class Part:
 
     @property
     def box_volume(self) -> float:
-        """Sum of its boxes' volumes [m³]; where boxes overlap, that share counts twice."""
+        """Sum of its boxes' volumes [m³]; the overlap of two boxes counts twice."""
         return sum(box.volume for box in self.boxes)
 
     @cached_property
@@ -228,8 +228,8 @@ class Slot:
     """Where a child can be attached.
 
     Attributes:
-        position: where the child's mount comes to lie, module frame [m].
-        direction: unit vector along which the child looks, module frame.
+        position: of the child's mount, module frame [m].
+        direction: unit vector of the child's front, module frame.
         up: unit vector along which the child's z points (before its `orientation` turns it), module
             frame; perpendicular to `direction`.
 
@@ -253,7 +253,7 @@ class Mount:
     """Where a module is attached to its parent.
 
     Attributes:
-        position: the point that comes to lie at the parent's slot, module frame [m].
+        position: the point that is fixed to the parent's slot, module frame [m].
         outward: unit vector away from the parent, module frame; perpendicular to z.
 
     Raises:
@@ -264,7 +264,7 @@ class Mount:
     outward: Direction
 
     def __post_init__(self) -> None:
-        """Checks that it looks out level."""
+        """Checks that `outward` is level."""
         if abs(self.outward[2]) > 1e-9:
             level = "a vector perpendicular to the module's z"
             raise ConstraintError("outward", level, show(list(self.outward)))
@@ -278,8 +278,7 @@ class ModuleType:
         name: the `type` in a morphology file.
         parts: with a hinge, the first is fixed to the parent's body, the others and all slots move.
         mount: where it is attached to its parent; None for a core, the root of a robot.
-        slots: where children can be attached, by number; 0 is kept for the mount where there is
-            one.
+        slots: where children can be attached, by number; 0 is reserved for the mount, if any.
         hinge: the motorised hinge, if there is one.
         sensor: a sensor; left out of the descriptors that count a body's size.
         aliases: further names in morphology files.

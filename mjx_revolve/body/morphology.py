@@ -1,8 +1,8 @@
 """Bodies read: from Revolve's YAML, or from a mapping like it, checked and laid out at rest.
 
 A morphology file is Revolve's YAML: `id`, `body` (a tree of modules, each with `id`, `type`,
-`orientation`, `params` and `children` by slot) and `brain`; and `sensors` and `coefficients` (the
-path of a file of what was fitted, relative to the morphology's), which Revolve has not.
+`orientation`, `params` and `children` by slot) and `brain`. Revolve lacks `sensors` and
+`coefficients` (the path of a file of fitted coefficients, relative to the morphology's).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = [
     "trim_neutral",
 ]
 
-# Evolved robots have about 30 modules. The limit is a choice: it keeps a mistake from taking hours.
+# Evolved robots have about 30 modules. The limit is a choice: a mistake must not take hours.
 MAX_MODULES = 1000
 
 # Names that the MuJoCo model keeps for itself.
@@ -62,7 +62,7 @@ def load_morphology(
         path: the file, or a shipped morphology's name; without an `id` in it, the robot is named
             after it.
         modules: the types of modules by name and alias.
-        allow_overlap: load a robot whose modules overlap at rest; `overlaps` then names them.
+        allow_overlap: accept modules that overlap at rest; `overlaps` then names them.
 
     Returns:
         The morphology.
@@ -87,12 +87,12 @@ def make_morphology(
 ) -> Morphology:
     """Makes a robot's body from a mapping like a morphology file.
 
-    Read as found in the wild: slots may be numbers or text; a module's `slot` key means nothing;
-    `orientation` (0), `params` and `id` may be missing (a module without id is named after its type
-    and place in the order); numbers in `params` may be written like `0.707;`; the brain is kept as
-    it is, and so are keys of `params` that do not look like ours. Where an id repeats, or is one
-    that MuJoCo needs, the later modules get the suffix _2, _3 and so on. Anything else unexpected
-    is refused.
+    Files of Revolve differ among each other, so these forms are accepted: slots as numbers or text;
+    a key `slot` of a module, which is ignored; no `orientation` (0), `params` or `id` (a module
+    without id is named after its type and number); numbers in `params` like `0.707;`. The brain is
+    kept as it is, and so are keys of `params` that do not resemble ours. Where an id repeats, or is
+    reserved by MuJoCo, the later modules get the suffix _2, _3 and so on. Everything else
+    unexpected is refused.
 
     `params` may hold `red`, `green`, `blue` (0 to 1, all or none) and these overrides; numbers are
     >= 0:
@@ -109,13 +109,13 @@ def make_morphology(
       `entrained_water` (share of the box's free volume, 0 to 1) of every part [-];
     - `coefficients`: a mapping of coefficients of laws that have no key of their own;
     - `factors`: a mapping of factors on any coefficient of a law, on `drag` or `added_mass` as a
-      whole, and on `mass`, `thrust`, `servo_speed` and `servo_effort`: what was fitted to a robot
-      that swam (`docs/fit.md`);
+      whole, and on `mass`, `thrust`, `servo_speed` and `servo_effort`, as fitted to a real robot
+      (`docs/fit.md`);
     - `buoyancy`, `drag` (a law's name or `off`) and `added_mass` (true or false): the module's own
-      choice where the world's does not suit it;
-    - `lift_drag`: a mapping with fields of `LiftDrag`, such as `{cla: 2.0}`; it changes a fin and
-      makes a fin of any other module;
-    - `fossen`: a mapping with fields of `Fossen`: added mass and damping known from elsewhere, of a
+      laws in place of the world's;
+    - `lift_drag`: a mapping with fields of `LiftDrag`, such as `{cla: 2.0}`; it changes a fin, or
+      makes any other module a fin;
+    - `fossen`: a mapping with fields of `Fossen`: added mass and damping from another source, of a
       module with one part, in place of those of our laws;
     - `thruster`: a mapping with fields of `Thruster`, such as `{torque_ratio: -0.0035}` for a
       left-handed propeller; `thrust` [N] at its highest command, which scales its curve.
@@ -124,7 +124,7 @@ def make_morphology(
         mapping: `id`, `body`, `sensors`, `brain` and `coefficients`, or a body's tree of modules
             alone; copied.
         modules: the types of modules by name and alias.
-        allow_overlap: make a robot whose modules overlap at rest; `overlaps` then names them.
+        allow_overlap: accept modules that overlap at rest; `overlaps` then names them.
         name: of the robot, where the mapping has no `id`.
         source: what to call the mapping in messages.
 
@@ -166,15 +166,15 @@ def _make(
     )
 
 
-def _read_sensors(value: Any, source: str) -> tuple[Sensor, ...] | None:
-    """The sensors of a robot; None where a file does not speak of them."""
+def _read_sensors(value: object, source: str) -> tuple[Sensor, ...] | None:
+    """The sensors of a robot; None if the file has no such key."""
     if value is None:
         return None
     found: tuple[Sensor, ...] = read(SensorRow, value, f"{source}: sensors")
     return found
 
 
-def _check_known(item: dict[Any, Any], known: tuple[str, ...], place: str) -> None:
+def _check_known(item: Mapping[object, object], known: tuple[str, ...], place: str) -> None:
     for key in item:
         if key not in known:
             raise InputError(f"{place}: expected only {', '.join(known)}; found {show(key)}")
@@ -207,21 +207,21 @@ def read_module(
     parent: int,
     slot: int,
 ) -> Module:
-    """Reads one module without its children and puts it in its place.
+    """Reads one module without its children and computes its pose at rest.
 
     Args:
         item: the mapping with its type.
         place: where, for messages.
         modules: the types of modules by name and alias.
         tree: the robot's modules so far.
-        parent: index of its parent in them; -1 for the core.
-        slot: the parent's slot, which it has; -1 for the core.
+        parent: index of its parent in `tree`; -1 for the core.
+        slot: an existing slot of the parent; -1 for the core.
 
     Returns:
-        The module; where it has no name, it is named after its type and its place in the order.
+        The module; without an id, it is named after its type and its number.
 
     Raises:
-        InputError: something in it is wrong.
+        InputError: a value in it is wrong.
     """
     if not isinstance(item, dict):
         found = "nothing" if item is None else show(item)
@@ -258,9 +258,9 @@ def read_module(
 
 
 def _read_type(
-    name: Any, place: str, modules: Mapping[str, ModuleType], is_root: bool
+    name: object, place: str, modules: Mapping[str, ModuleType], is_root: bool
 ) -> ModuleType:
-    """The type of a module, checked against where it stands."""
+    """The type of a module; a core must be the root, and any other type must not."""
     kind = modules.get(name) if isinstance(name, str) else None
     if kind is not None and (kind.mount is None) == is_root:
         return kind
@@ -289,7 +289,7 @@ def _read_children(item: dict[str, Any], place: str, module: Module) -> dict[int
     return found
 
 
-def read_slot(value: Any, kind: ModuleType, place: str) -> int:
+def read_slot(value: object, kind: ModuleType, place: str) -> int:
     """The number of one of a type's slots.
 
     Args:
@@ -303,8 +303,11 @@ def read_slot(value: Any, kind: ModuleType, place: str) -> int:
     Raises:
         InputError: the type has no such slot.
     """
-    text = isinstance(value, str) and re.fullmatch(r"[0-9]{1,9}", value)
-    number = int(value) if text or isinstance(value, np.integer) else value
+    number = value
+    if isinstance(value, np.integer) or (
+        isinstance(value, str) and re.fullmatch(r"[0-9]{1,9}", value)
+    ):
+        number = int(value)
     if isinstance(number, int) and not isinstance(number, bool) and number in kind.slots:
         return number
     wanted = f"one of the slots {', '.join(map(str, sorted(kind.slots)))} of type {kind.name}"
@@ -315,7 +318,7 @@ def read_slot(value: Any, kind: ModuleType, place: str) -> int:
     raise InputError(f"{place}: expected {wanted}; found {show(value)}")
 
 
-def _read_id(value: Any, place: str) -> str:
+def _read_id(value: object, place: str) -> str:
     """A name, or "" where there is none."""
     if value is None:
         return ""
@@ -328,13 +331,13 @@ def _read_id(value: Any, place: str) -> str:
         name = str(value)
     except ValueError:
         raise InputError(f"{place}: expected a name or a number; found {show(value)}") from None
-    # It goes into XML, pages and terminals; lines and tabs harm none of them.
+    # Names appear in XML, HTML pages and terminals; line breaks and tabs are safe in all of them.
     if not name.replace("\n", "").replace("\t", "").isprintable():
         raise InputError(f"{place}: expected printable characters; found {show(value)}")
     return name
 
 
-def read_orientation(value: Any, place: str) -> float:
+def read_orientation(value: object, place: str) -> float:
     """A module's turn.
 
     Args:
@@ -357,7 +360,7 @@ def read_orientation(value: Any, place: str) -> float:
 
 
 def _read_params(
-    params: Any, place: str
+    params: object, place: str
 ) -> tuple[tuple[float, float, float] | None, dict[str, Any]]:
     """The colour, and everything else with the overrides checked."""
     if params is None:
@@ -376,7 +379,7 @@ def _read_params(
 
 
 def _with_unique_names(modules: list[Module], source: str) -> tuple[Module, ...]:
-    """Tells apart the modules that share a name, or have one that MuJoCo needs."""
+    """The modules with unique names: suffixes for repeated names and for those of MuJoCo's own."""
     names = [m.name for m in modules]
     taken, seen = {*names}, {*RESERVED}
     for i, name in enumerate(names):
@@ -405,7 +408,7 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
 
     Args:
         morphology: a robot that, without electronics in its core, is heavier than the water that
-            it displaces. What electronics volume the core has is replaced.
+            it displaces. The core's electronics volume is replaced.
         density: of the water [kg/m³].
 
     Returns:
@@ -418,7 +421,7 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
     core = morphology.modules[0]
     inside = sum(part.electronics_volume for part in core.kind.parts)
     total = morphology.mass / density - (morphology.volume - inside)
-    if total < -1e-9 * morphology.volume:  # neutral to rounding is no floating
+    if total < -1e-9 * morphology.volume:  # neutral to rounding counts as neutral
         raise InputError(
             f"{morphology.path or morphology.name}: expected a robot that sinks in water of "
             f"{density:g} kg/m3 and can be trimmed by adding volume; found one that floats: its "

@@ -1,6 +1,6 @@
-"""What a module's `params` in a morphology file change of its type: masses, volumes, laws, numbers.
+"""A module's `params` in a morphology file: overrides of its type's masses, volumes and laws.
 
-`load_morphology` lists them for users.
+The docstring of `make_morphology` lists them for users.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
 @also({"type": "string", "pattern": "^\\s*[-+]?[.0-9][.0-9eE+-]*[\\s;,]*$"})
-def read_number(value: Any) -> Any:
+def read_number(value: object) -> object:
     """Text such as `0.707;`, as found in files, as a number, in lists too; else as it is."""
     if isinstance(value, list):
         return [read_number(x) for x in value]
@@ -54,12 +54,12 @@ _Place = Annotated[Triple[Annotated[Number, _Loose]], AfterValidator(list), Unit
 _Some = Annotated[dict[Text, Any], MinLen(1), words("a mapping with any of its fields")]
 
 MODULE_FACTORS = {"mass": 1.05, "thrust": 1.3, "servo_speed": 1.1, "servo_effort": 1.3}
-"""Factors on what is no water's, with `Coefficient.spread`; a choice, but for the servos' speed
-(`docs/sensitivity.md`)."""
+"""Factors on quantities of modules rather than of the water, with their spread as in
+`Coefficient.spread`; a choice, but for the servos' speed (`docs/sensitivity.md`)."""
 
 
-def _read_factors(value: Any) -> Any:
-    """Those of modules, as numbers; the others stay for `Factors`."""
+def _read_factors(value: object) -> dict[str, object]:
+    """Factors, checked: those of `MODULE_FACTORS` here, those on coefficients by `Factors`."""
     if not isinstance(value, dict):
         return read(_Some, value)
     water = {key: x for key, x in value.items() if key not in MODULE_FACTORS}
@@ -69,8 +69,8 @@ def _read_factors(value: Any) -> Any:
     return found | {k: list(x) if isinstance(x, tuple) else x for k, x in water.items()}
 
 
-# What every part takes over as it is.
-_PLAIN: dict[str, Any] = {
+# Params that are assigned to the same field of every part.
+_PLAIN: dict[str, object] = {
     "drag_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
     "added_mass_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
     "entrained_water": Annotated[Share, _Loose],
@@ -79,8 +79,8 @@ _PLAIN: dict[str, Any] = {
     "drag": PartDrag,
     "added_mass": Boolean,
 }
-# The others; colours are no overrides, and checked beside them.
-_OVERRIDES: dict[str, Any] = _PLAIN | {
+# All overrides; colours are none.
+_OVERRIDES: dict[str, object] = _PLAIN | {
     "mass": Annotated[_Amount, Unit("kg")],
     "volume": Annotated[_Amount, Unit("m3")],
     "electronics_volume": Annotated[_Amount, Unit("m3")],
@@ -94,15 +94,15 @@ _OVERRIDES: dict[str, Any] = _PLAIN | {
     "fossen": _Some,
     "thruster": _Some,
 }
-# How alike a key and one of ours are that is taken for a slip of the finger: one letter in four. A
-# choice; what others write into `params` is kept.
-_ALIKE = 0.8
+# Similarity (of difflib) above which an unknown key counts as a misspelt one of ours: one letter in
+# four. A choice; other unknown keys are kept, as other programs write their own.
+_SIMILARITY = 0.8
 PARAMS: dict[str, Any] = _OVERRIDES | dict.fromkeys(
     COLORS, Annotated[Share, _Loose, words("a number from 0 to 1")]
 )
 
 
-def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
+def check_overrides(params: Mapping[str, object], place: str) -> dict[str, Any]:
     """The params with overrides and colours checked, numbers as floats.
 
     Args:
@@ -117,7 +117,7 @@ def check_overrides(params: Mapping[str, Any], place: str) -> dict[str, Any]:
     """
     for key in params:
         if isinstance(key, str) and key not in PARAMS:
-            near = difflib.get_close_matches(key.strip().lower(), PARAMS, n=1, cutoff=_ALIKE)
+            near = difflib.get_close_matches(key.strip().lower(), PARAMS, n=1, cutoff=_SIMILARITY)
             if near:
                 raise InputError(
                     f"{place}: expected {near[0]}, or a key less like it; found {show(key)}"
@@ -147,7 +147,7 @@ def apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
         The changed type.
 
     Raises:
-        InputError: a value is out of range, or of something that the type does not have.
+        InputError: a value is out of range, or for a thruster, fin or part that the type lacks.
     """
     if not _OVERRIDES.keys() & params:
         return kind
@@ -172,7 +172,7 @@ def apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
     elif "ballast" in params:
         changes[0]["mass"] = changes[0].get("mass", parts[0].mass) + params["ballast"]
     if "lift_drag" in params:
-        # A module without a fin becomes one, whole.
+        # In a module without a fin, all parts become one.
         for part, change in zip(parts, changes, strict=True):
             if part.lift_drag is not None or not kind.is_fin:
                 change["lift_drag"] = replace(part.lift_drag or LiftDrag(), **params["lift_drag"])
@@ -195,7 +195,7 @@ def apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
 
 
 def _multiply(kind: ModuleType, factors: Mapping[str, Any]) -> ModuleType:
-    """The type with factors on its numbers; those that it has none of do nothing."""
+    """The type with factors on its numbers; factors on quantities that it lacks have no effect."""
     water = {name: factor for name, factor in factors.items() if name not in MODULE_FACTORS}
     mass, thrust, speed, effort = (factors.get(name, 1.0) for name in MODULE_FACTORS)
 
@@ -217,7 +217,7 @@ def _multiply(kind: ModuleType, factors: Mapping[str, Any]) -> ModuleType:
 
 
 def multiply_factors(one: Any, other: Any) -> Any:
-    """The product of two factors, each a number or three along axes."""
+    """The product of two factors, each a number or three along the part's axes."""
     wide = [x if isinstance(x, tuple | list) else [x] * 3 for x in (one, other)]
     found = [a * b for a, b in zip(*wide, strict=True)]
     return found if isinstance(one, tuple | list) or isinstance(other, tuple | list) else found[0]

@@ -16,7 +16,7 @@ from mjx_revolve.inputs.errors import InputError
 
 # Boxes are shrunk by this much at each face [m] before they are tested for overlap, thin ones by
 # half their half-edge at most. A choice: a brick's box stands 1.5 mm proud of its attachment faces,
-# so that two bricks on neighbouring faces of a third share 3 mm by design.
+# so that two bricks on adjacent faces of a third overlap by 3 mm by design.
 OVERLAP_TOLERANCE = 0.002
 
 
@@ -80,7 +80,7 @@ class Module:
                 yield self.position + self.rotation @ local, np.asarray(box.size) / 2
 
 
-def same(a: Any, b: Any) -> bool:
+def same(a: object, b: object) -> bool:
     """Equal plain data; unlike ==, nan is equal to itself and 1 is not 1.0 or true."""
     return repr(a) == repr(b)
 
@@ -107,11 +107,11 @@ def attach(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pose of a child at rest.
 
-    The child's outward axis comes to lie along the slot's direction and its z along the slot's up;
-    then it is turned by its orientation about that direction (right-handed, as in Revolve).
+    The child's outward axis is along the slot's direction and its z along the slot's `up`; then it
+    is turned by its orientation about that direction (right-handed, as in Revolve).
 
     Args:
-        parent: the module that carries it, placed.
+        parent: the module that carries it, with its pose.
         slot: one of the parent's slots.
         kind: the child's type, which has a mount.
         orientation: the child's [deg].
@@ -133,8 +133,8 @@ class RestPose(NamedTuple):
     """All parts at rest and all of their boxes, part after part, of one body or several.
 
     Attributes:
-        parts: those that differ, each once.
-        kind: `[npart]` which of them each part is.
+        parts: the distinct parts.
+        kind: `[npart]` index of each part in `parts`.
         body: `[npart]` index of each part's body.
         module: `[npart]` index of its module, counted through all bodies.
         position: `[npart, 3]` origin of the part's frame, core frame [m].
@@ -166,7 +166,7 @@ class RestPose(NamedTuple):
         return self.position[k] + turned(self.rotation[k], self.box_position)
 
     def box_reaches(self) -> np.ndarray:
-        """`[nbox, 3]` how far each box reaches from its centre along the core's axes [m]."""
+        """`[nbox, 3]` half extents of each box along the core's axes [m]."""
         return turned(np.abs(self.rotation[self.box_part]), self.box_half)
 
     def corners(self) -> np.ndarray:
@@ -187,17 +187,17 @@ def turned(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def counted(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Runs of some lengths: whose run each place lies in, and which place of the run it is."""
+    """For runs of `[n]` lengths, one after another: each item's run, and its index in the run."""
     owner = np.repeat(np.arange(len(count)), count)
     return owner, np.arange(len(owner)) - (np.cumsum(count) - count)[owner]
 
 
 def pairs_within(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of things of the same body, for which two lists are sorted.
+    """All pairs of items of the same body, one item from each of two sorted lists.
 
     Args:
-        first: `[n]` bodies of the things on the one side, in order.
-        second: `[m]` bodies of those on the other side, in order.
+        first: `[n]` body of each item of the first list, ascending.
+        second: `[m]` body of each item of the second list, ascending.
 
     Returns:
         `[pair]` indices into `first` and `[pair]` into `second`, sorted.
@@ -219,10 +219,10 @@ class _Parts(NamedTuple):
 
 
 def _place_parts(bodies: Sequence[Sequence[Module]]) -> _Parts:
-    """Where the parts of some bodies lie at rest."""
+    """Poses of the parts of some bodies at rest."""
     modules = [m for body in bodies for m in body]
     listed = [part for m in modules for part in m.kind.parts]
-    # Most modules share their type, and so its parts: what follows from a part is read once.
+    # Most modules share a type and its parts: each distinct part is read once.
     given = {id(part): part for part in listed}
     number = {key: k for k, key in enumerate(given)}
     kind = np.array([number[id(part)] for part in listed])
@@ -290,7 +290,7 @@ def find_overlaps(
     compared = np.full(len(modules), moved is None)
     compared[list(moved or ())] = True
     rows = np.flatnonzero(compared[all_parts.module])
-    # Few boxes are so near that the core's axes do not tell them apart.
+    # Most pairs are already apart along the core's axes.
     gap = np.abs(center[rows, None] - center) - reach[rows, None] - reach
     first, second = np.nonzero((gap < 0).all(-1))
     first = rows[first]

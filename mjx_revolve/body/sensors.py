@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BeforeValidator
 from mjx_revolve.body.servo import EFFORT, REACH, SPEED
 from mjx_revolve.inputs.schema import (
     ConstraintError,
+    Id,
     NonNegative,
     Number,
     Positive,
@@ -30,20 +31,20 @@ from mjx_revolve.inputs.schema import (
 
 
 class SensorKind(NamedTuple):
-    """What a sensor measures.
+    """A kind of sensor.
 
     Attributes:
-        parts: names of its numbers; "" for a single one.
-        unit: of them.
+        parts: names of its components; ("",) for a single one.
+        unit: of the components.
         where: "robot": once, at the core, or at modules; "joint": at each hinge; "body": of the
-            core's rigid body and of what each hinge carries; "module": only at a module.
-        range: lowest and highest, as of most such devices; choices.
-        signal: `SensorReadings` → its numbers, in the order
-            of `parts`: `[lanes]` each of a robot, `[hinge rows, lanes]` of joints,
-            `[1 + hinge rows, lanes]` of bodies; of modules as their readings have them.
-        what: it is, in words.
-        signals: the one of `OPTIONAL_SIGNALS` that it needs, or "".
-        sits: whether it may sit on modules.
+            core's rigid body and of the body that each hinge moves; "module": only at a module.
+        range: lowest and highest value, as of most such devices; choices.
+        signal: `SensorReadings` → its components, in the order of `parts`: `[lanes]` each for a
+            robot, `[hinge rows, lanes]` for joints, `[1 + hinge rows, lanes]` for bodies; for
+            modules shaped as the module's readings.
+        what: description.
+        signals: the one of `OPTIONAL_SIGNALS` that it requires, or "".
+        sits: whether it may be mounted on modules.
     """
 
     parts: tuple[str, ...]
@@ -65,7 +66,7 @@ def _length(toward: Any) -> Any:
 def _distance(sense: Any) -> Any:
     if sense.seen is None:
         return _length(sense.target)
-    # A target that is not visible is as far away as the range goes; where it is, the factor is 1.
+    # A target that is not visible reads as the upper end of the range; `seen` is 1 where it is.
     return _length(sense.target) + (1.0 - sense.seen) * 1e9
 
 
@@ -78,13 +79,13 @@ _Range = tuple[float, float]
 
 
 def _number(field: str, unit: str, limits: _Range, what: str, **more: Any) -> SensorKind:
-    """A kind whose signal is a field of the readings."""
+    """A kind with one component, which is a field of the readings."""
     read = attrgetter(field)
     return SensorKind(("",), unit, "robot", limits, lambda s: (read(s),), what)._replace(**more)
 
 
 def _vector(field: str, unit: str, most: float, what: str, **more: Any) -> SensorKind:
-    """A kind whose signal is a field of three components, each from -most to most."""
+    """A kind with three components, a vector field of the readings, each from -most to most."""
     kind = SensorKind(("x", "y", "z"), unit, "robot", (-most, most), attrgetter(field), what)
     return kind._replace(**more)
 
@@ -119,7 +120,7 @@ SENSORS: Mapping[str, SensorKind] = {
         signal=lambda s: (_length(s.nearest.toward),), **_NEAREST,
     ),
     "nearest_tag": _number("nearest.tag", "-", (-1, 1),
-                           "by which the nearest other robot can be told apart", **_NEAREST),
+                           "number that identifies the nearest other robot", **_NEAREST),
     "course": _vector("course", "-", 1, "the direction to keep to, core frame"),
     "battery": _number(
         "work", "J", (0, 100), "work that servos and propellers have done so far",
@@ -143,19 +144,14 @@ SENSORS: Mapping[str, SensorKind] = {
 
 
 @also({"type": "number"})
-def _read_range(value: Any) -> Any:
+def _read_range(value: object) -> object:
     """A number r as -r to r."""
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    return (-value, value) if plain else as_tuple(value)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return -value, value
+    return as_tuple(value)
 
 
-@also({"type": "integer"})
-def _read_id(value: Any) -> Any:
-    """Names in YAML may be numbers."""
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
-_Id = Annotated[Text, BeforeValidator(_read_id), MinLen(1), words("a name")]
+_Id = Annotated[Id, MinLen(1)]
 _Limits = Annotated[
     tuple[Number, Number],
     BeforeValidator(_read_range),
@@ -167,20 +163,20 @@ _Limits = Annotated[
 class Sensor:
     """A sensor of a robot.
 
-    Its output is a number between -1 and 1: the true value, with noise, clipped to the range. A
-    range that holds 0 is divided by its larger end, so that 0 stays 0; another one counts from its
-    middle, so that its ends are -1 and 1.
+    Its output is a number between -1 and 1: the true value, with noise, clipped to the range and
+    scaled. If the range contains 0, values are divided by its larger end, so that 0 stays 0; else
+    its ends are mapped to -1 and 1.
 
     Attributes:
         type: its kind, a name in `SENSORS`.
         name: of its own; by default the type, behind the module where it sits on one.
-        unit: of range and noise, if it is written: that of the kind.
+        unit: of range and noise; if given, it must be that of the kind.
         range: lowest and highest value, or one number for both signs; by default the kind's.
-        noise: standard deviation, of every sample by itself [unit].
+        noise: standard deviation, independent for each sample [unit].
         rate: of samples, which are held in between; by default one before every step [Hz].
         delay: age of its output [s].
-        at: id of the module that it sits on, of one robot; by default it sits at the core.
-        each: type of modules that it sits on, wherever there are some.
+        at: id of the module that carries it, of one robot; by default it is at the core.
+        each: type of the modules that carry one each.
 
     Raises:
         InputError: there is no such kind, or a number is out of range.
@@ -209,7 +205,7 @@ class Sensor:
             raise ConstraintError("range", "the lowest below the highest", show(list(self.limits)))
 
     def _check_place(self) -> None:
-        """Checks that such a sensor may sit where it does."""
+        """Checks that such a sensor may be mounted there."""
         kind, key = self.kind, "at" if self.at is not None else "each"
         if self.at is not None and self.each is not None:
             raise ConstraintError("each", "none, as there is `at`", show(self.each))
@@ -225,14 +221,14 @@ class Sensor:
 
     @property
     def place(self) -> str:
-        """The module signal of where it sits; "" for the core."""
+        """The signal of the module that carries it; "" for the core."""
         if self.at is not None:
             return f"at {self.at}"
         return "" if self.each is None else f"each {self.each}"
 
     @property
     def where(self) -> str:
-        """Whether its numbers are "robot", "joint" or "body", as of a kind."""
+        """The kind's `where`: "robot", "joint", "body" or "module"."""
         return "body" if self.each is not None else "robot" if self.place else self.kind.where
 
     @property
@@ -247,12 +243,12 @@ class Sensor:
 
     @property
     def kind(self) -> SensorKind:
-        """What it measures."""
+        """Its row of `SENSORS`."""
         return SENSORS[self.type]
 
     @property
     def label(self) -> str:
-        """Its name, or its type behind the module that it sits on."""
+        """Its name; by default its type, after the module that carries it."""
         return self.name or f"{self.at or self.each or ''} {self.type}".strip()
 
     @property
@@ -262,7 +258,7 @@ class Sensor:
 
     @property
     def scaling(self) -> tuple[float, float]:
-        """The value that is observed as 0, and the observed change per unit [unit, 1/unit]."""
+        """The value with output 0, and the output per unit of value [unit, 1/unit]."""
         low, high = self.limits
         if low <= 0 <= high:
             return 0.0, 1 / max(-low, high)
@@ -270,14 +266,14 @@ class Sensor:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its numbers."""
+        """Names of its outputs."""
         return tuple(f"{self.label} {part}".strip() for part in self.kind.parts)
 
-    def to_mapping(self) -> dict[str, Any]:
-        """As a file has it, without what is usual."""
-        usual: dict[str, Any] = {"name": "", "at": None, "each": None}
+    def to_mapping(self) -> dict[str, object]:
+        """A mapping as in a morphology file, without default values."""
+        usual: dict[str, object] = {"name": "", "at": None, "each": None}
         usual |= {"unit": None, "range": None, "noise": 0.0, "rate": None, "delay": 0.0}
-        found: dict[str, Any] = {"type": self.type}
+        found: dict[str, object] = {"type": self.type}
         for key, value in usual.items():
             own = getattr(self, key)
             if own != value:
@@ -286,8 +282,8 @@ class Sensor:
 
 
 @also({"type": "string"})
-def _read_sensor(value: Any) -> Any:
-    """A kind's name alone as a sensor of it."""
+def _read_sensor(value: object) -> object:
+    """A kind's name alone as a mapping with that type."""
     return {"type": value} if isinstance(value, str) else value
 
 

@@ -1,4 +1,4 @@
-"""Numbers of Revolve's servo (SDF/joint.py): what hinges have and sensors span where unsaid."""
+"""Numbers of Revolve's servo (SDF/joint.py): defaults of hinges and of sensors' ranges."""
 
 from __future__ import annotations
 

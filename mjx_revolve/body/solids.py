@@ -1,4 +1,4 @@
-"""The project's own meshes of the modules: what a picture shows, with the tabulated volume.
+"""Meshes of the modules, for pictures, with the tabulated volumes.
 
 They look like RoboGen's printed parts (hollow boxes with windows, a U bracket, a servo with its
 plate, a slab with two pads; the propeller in its duct and the rounded fin are our own) but are
@@ -36,7 +36,7 @@ _WINDOW = 0.62
 # shell of that share, since no surface encloses nothing.
 _SOLID, _LEAST = 0.999, 1e-3
 
-_Body = np.ndarray  # [m, 3, 3] triangles of a closed surface that look outwards
+_Body = np.ndarray  # [m, 3, 3] triangles of a closed surface, normals outwards
 _Corners = tuple[np.ndarray, np.ndarray]  # lowest and highest corner of a box, [3] each
 _Build = Callable[[float], list[_Body]]
 
@@ -62,7 +62,7 @@ def _sweep(axis: int, *outlines: tuple[np.ndarray, float], closed: bool = False)
     """Body through outlines.
 
     Args:
-        axis: that the outlines lie across: 0, 1 or 2 for x, y, z; theirs are the two next, in
+        axis: normal to the outlines: 0, 1 or 2 for x, y, z; their own axes are the two next, in
             cyclic order.
         outlines: `[n, 2]` each [m], with its coordinate along the axis [m].
         closed: join the last with the first, as around a hole; else both are filled.
@@ -378,10 +378,10 @@ def part_mesh(kind: ModuleType, part: Part) -> trimesh.Trimesh:
     """Mesh of one part of a module type, with the part's tabulated volume.
 
     The outer dimensions are those of the part's boxes, except that the pads of a touch sensor, and
-    any part whose tabulated volume exceeds that of its boxes, stand out of them. Types and parts of
-    the catalogue have a shape of their own; all others (and a part of the catalogue whose volume
-    its own shape cannot reach) are hollow boxes with a window in each face. A part that displaces
-    less than a thousandth of its boxes is drawn with that thousandth.
+    any part with a larger tabulated volume than its boxes, stand out of them. Types and parts of
+    the catalogue have a shape of their own; all others (and a part of the catalogue with a volume
+    that its own shape cannot have) are hollow boxes with a window in each face. A part that
+    displaces less than a thousandth of its boxes is drawn with that thousandth.
 
     Args:
         kind: the module type; a hinge frame is bored where its axis is.

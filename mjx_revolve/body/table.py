@@ -53,8 +53,8 @@ def module_table(morphology: Morphology) -> list[str]:
 def thruster_table(morphology: Morphology) -> list[str]:
     """The thrusters of a morphology at rest as lines of an aligned table; none: no lines.
 
-    Where each pushes, which way (core frame), its thrust at both ends of its command's range, its
-    lag and its torque ratio.
+    Position and direction (core frame), thrust at both ends of its command's range, lag and torque
+    ratio.
     """
     rows = [
         ["#", "thruster", "x", "y", "z", "axis x", "y", "z", "astern", "ahead", "lag", "torque"],

@@ -1,7 +1,6 @@
-"""The tree of modules at rest: what a body is, what follows from it, and how it is written.
+"""The tree of modules at rest: `Morphology`, its derived quantities, and how it is saved.
 
-The core's frame is the robot's: at the origin, unturned. All positions are in that frame, at rest
-(hinges at 0), in metres.
+The robot's frame is the core's. All positions are in that frame, at rest (hinges at 0), in metres.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ class Morphology:
     Attributes:
         name: the file's `id`, or its stem.
         modules: the core first; a parent comes before its children.
-        brain: the file's `brain` as it is, for whoever understands it; None where there is none.
+        brain: the file's `brain`, uninterpreted; None if it has none.
         path: the file that it was read from.
         overlaps: names of the pairs of modules that overlap at rest (empty unless allowed).
         sensors: the file's `sensors`; None where it has no such key.
@@ -69,7 +68,7 @@ class Morphology:
         )
 
     def __reduce__(self) -> Any:
-        """Small and quick to send to other processes; the catalogue's types go by name."""
+        """Pickles small and quickly for other processes: the catalogue's types by name."""
         kinds = {id(module.kind): module.kind for module in self.modules}
         number = {key: k for k, key in enumerate(kinds)}
         rows = [
@@ -162,7 +161,7 @@ class Morphology:
             pairs (i, j), i < j, of positions in `hinges`, in order.
         """
         count = 0
-        carries: list[int] = []  # the hinge that moves a module's children, -1 for the core's body
+        carries: list[int] = []  # the hinge that moves a module's children; -1: the core's body
         joined: dict[int, list[int]] = {}
         for module in self.modules:
             body = carries[module.parent] if module.parent >= 0 else -1
@@ -182,12 +181,12 @@ class Morphology:
 
     @property
     def title(self) -> str:
-        """The name that heads pictures: `robot` is what all bodies are called that have grown."""
+        """The name in titles of pictures; evolved bodies, all called `robot`, share one title."""
         return "evolved body" if self.name == "robot" else self.name
 
     @property
     def counts(self) -> str:
-        """How many modules, hinges and thrusters, as far as there are any, in words."""
+        """Numbers of modules, hinges and thrusters, in words; zeros are left out."""
         counts = {
             "module": self.num_modules, "hinge": self.num_hinges, "thruster": self.num_thrusters,
         }  # fmt: skip
@@ -215,10 +214,10 @@ class Morphology:
         """Measures of the body; see `descriptors.describe`."""
         return describe(self.modules, self.extent)
 
-    def to_mapping(self) -> dict[str, Any]:
-        """The body as a morphology file has it: `make_morphology` makes an equal one of it.
+    def to_mapping(self) -> dict[str, object]:
+        """The body as a mapping like a morphology file; `make_morphology` reads it back.
 
-        Types are named: a robot with a user's own types needs those again to be read.
+        Types are given by name: reading a robot with a user's own types takes those types again.
 
         Returns:
             A new mapping with `id`, `body` and, where there are any, `sensors` and `brain`.
@@ -235,7 +234,7 @@ class Morphology:
             items.append(item)
             if module.parent >= 0:
                 items[module.parent].setdefault("children", {})[module.slot] = item
-        data: dict[str, Any] = {"id": self.name, "body": items[0]}
+        data: dict[str, object] = {"id": self.name, "body": items[0]}
         if self.sensors is not None:
             data["sensors"] = [sensor.to_mapping() for sensor in self.sensors]
         if self.brain is not None:
@@ -257,7 +256,7 @@ def _unpack(
     named: list[Any],
     place: bytes,
 ) -> Morphology:
-    """What `Morphology.__reduce__` has packed."""
+    """The inverse of `Morphology.__reduce__`."""
     kinds = [MODULES[kind] if isinstance(kind, str) else kind for kind in named]
     places = np.frombuffer(place).reshape(-1, 4, 3)
     modules = [
@@ -268,19 +267,19 @@ def _unpack(
 
 
 class _Dumper(yaml.SafeDumper):
-    """Puts text in quotes that our own reader would take for a number (`1e-3`)."""
+    """Quotes texts that our own reader would take for a number (`1e-3`)."""
 
     yaml_implicit_resolvers = SafeLoader.yaml_implicit_resolvers
 
-    def ignore_aliases(self, data: Any) -> bool:
-        """Writes shared values out."""
+    def ignore_aliases(self, data: object) -> bool:
+        """Writes shared values in full."""
         return True
 
 
 def save_morphology(morphology: Morphology, path: str | Path) -> None:
     """Writes a robot's body as YAML that `load_morphology` reads back to an equal morphology.
 
-    Types are written by name: a robot with a user's own types needs those again to be read.
+    Types are written by name: reading a robot with a user's own types takes those types again.
 
     Args:
         morphology: the robot.

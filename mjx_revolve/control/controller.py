@@ -1,10 +1,11 @@
 """The interface of controllers: genes to parameters to commands.
 
-A controller is four plain functions over a population on the last axis, made from a table of the
-plant, so that one and the same drives one robot or many different ones. The genes are unbounded
-real numbers, folded into physical ranges by sin(gene), so that any optimiser can move them freely.
-Folded, not squashed: with tanh, an optimum at the end of a range lies at infinity, and strategies
-that adapt their step size follow it until their numbers overflow. Zero genes keep all joints still.
+A controller is a set of pure functions over a population on the last axis, made from a table of the
+plant; the same controller drives one robot or many different ones. The genes are unbounded real
+numbers, mapped to physical ranges by sin(gene), so that any optimiser can change them freely. A
+periodic map is used rather than a sigmoid: with tanh, an optimum at the end of a range is at
+infinity, and strategies that adapt their step size follow it until numbers overflow. With genes of
+zero no joint moves.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import Observer
@@ -25,15 +28,15 @@ from mjx_revolve.engine.robot import Robot
 # How long commands take to fade in, so that no joint jumps at the start [s]; a choice.
 _FADE = 0.5
 
-StepOutput = tuple[Any, jax.Array]
+StepOutput = tuple[PyTree, jax.Array]
 """State and commands after a controller's step."""
 
 
 class Gene(NamedTuple):
-    """What a gene belongs to.
+    """The meaning of a gene.
 
     Attributes:
-        what: the number that it encodes, such as "w" or "offset".
+        what: the parameter that it encodes, such as "w" or "offset".
         place: "hinge", "thruster", "pair" (of neighbouring hinges) or "robot".
         number: index of the hinge, thruster or pair.
     """
@@ -46,9 +49,9 @@ class Gene(NamedTuple):
 class _Controller(NamedTuple):
     num_genes: int
     gene_names: tuple[str, ...]
-    decode: Callable[[jax.Array, Plant], Any]
-    init: Callable[[Any], Any]
-    step: Callable[[Any, Any, jax.Array, SensorReadings], StepOutput]
+    decode: Callable[[jax.Array, Plant], PyTree]
+    init: Callable[[PyTree], PyTree]
+    step: Callable[[PyTree, PyTree, jax.Array, SensorReadings], StepOutput]
     genes: tuple[Gene, ...] = ()
     signals: tuple[str, ...] = ()
     observer: Observer | None = None
@@ -66,12 +69,12 @@ class Controller(_Controller):
         init: parameters → controller state.
         step: (parameters, state, time [s], `SensorReadings`) → (state, `[n, lanes]` joint targets
             [rad] and commands of thrusters [-], in the plant's rows).
-        genes: `[num_genes]` what each belongs to, or () if unknown: only needed to carry genes
+        genes: `[num_genes]` meanings of the genes, or () if unknown: only used to transfer genes
             from one body to another.
-        signals: which of `OPTIONAL_SIGNALS`, and which modules, it reads.
-        observer: of the declared sensors; None without.
-        rate: of its commands, which it holds in between (see `rate.hold_commands`) [Hz]; None: a
-            new one at every step.
+        signals: the `OPTIONAL_SIGNALS`, and the modules, that it reads.
+        observer: of the declared sensors; None if there are none.
+        rate: of its commands, which are held in between (see `rate.hold_commands`) [Hz]; None: a
+            new command at every step.
     """
 
     __slots__ = ()
@@ -94,10 +97,10 @@ class BoundController:
     """A controller with one individual's genes, as `simulate` takes it."""
 
     controller: Controller
-    genes: Any
+    genes: ArrayLike
 
 
-def bind_genes(controller: Controller, genes: Any) -> BoundController:
+def bind_genes(controller: Controller, genes: ArrayLike) -> BoundController:
     """Joins a controller and one individual's genes `[num_genes]`, as `ctrl` of `simulate`."""
     return BoundController(controller, genes)
 
@@ -140,7 +143,7 @@ class GeneBlocks:
 
         Returns:
             `[n, lanes]` of actuators, `[hinge rows, lanes]` of hinges, `[thrusters, lanes]`, all in
-            the plant's rows; pairs and "robot" as they stand.
+            the plant's rows; pairs and "robot" in the order of the genes.
         """
         start, found, rows = 0, {}, plant.num_hinge_rows
         hinges, thrusters = self._sizes["hinge"], self._sizes["thruster"]
@@ -163,11 +166,11 @@ class GeneBlocks:
 def make_controller(
     plant: Plant,
     genes: Sequence[Gene],
-    decode: Callable[[jax.Array, Plant], Any],
-    init: Callable[[Any], Any],
-    step: Callable[[Any, Any, jax.Array, SensorReadings], StepOutput],
+    decode: Callable[[jax.Array, Plant], PyTree],
+    init: Callable[[PyTree], PyTree],
+    step: Callable[[PyTree, PyTree, jax.Array, SensorReadings], StepOutput],
 ) -> Controller:
-    """A controller whose genes are named after what they belong to; fields as of `Controller`."""
+    """A controller with `gene_names` made from `genes`; arguments are fields of `Controller`."""
 
     def name(gene: Gene) -> str:
         if gene.place == "robot":
@@ -180,12 +183,12 @@ def make_controller(
 
 
 def lag_share(plant: Plant, constant: Any) -> Any:
-    """Share of the way that a lag of first order goes from one command to the next.
+    """Share of the step response that a first-order lag reaches from one command to the next.
 
-    Exact for an input that is held; without a rate, as in runs of older versions, Euler's step.
+    Exact for an input that is held. Without a rate, as in runs of older versions, Euler's method.
 
     Args:
-        plant: that the controller is made for.
+        plant: of the controller.
         constant: the lag's time constant [s].
     """
     if plant.rate is None:

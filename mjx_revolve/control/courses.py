@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from mjx_revolve.numerics.spatial import Vec, sincos
+from mjx_revolve.numerics.spatial import Scalar, Vec, sincos
 
 
 class Course(NamedTuple):
@@ -20,12 +20,12 @@ class Course(NamedTuple):
         turns: angles of sudden turns [rad].
     """
 
-    heading: Any
-    rate: Any
-    moments: tuple[Any, ...] = ()
-    turns: tuple[Any, ...] = ()
+    heading: Scalar
+    rate: Scalar
+    moments: tuple[Scalar, ...] = ()
+    turns: tuple[Scalar, ...] = ()
 
-    def at(self, time: Any) -> Vec:
+    def at(self, time: Scalar) -> Vec:
         """The course at a time since the episode's start [s]: a unit vector, world frame."""
         angle = self.heading + self.rate * time
         for moment, turn in zip(self.moments, self.turns, strict=True):

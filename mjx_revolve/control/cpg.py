@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.control.controller import (
     Controller,
@@ -29,9 +29,9 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
     (Lan et al. 2021, Learning locomotion skills in evolvable robots, Neurocomputing 452). The
     system matrix is antisymmetric, so Σ x² + y² is constant. Target of hinge i: amplitude × half
     range × tanh(x_i), from the middle of its range. It starts at x = 0, y = 1: with all weights
-    zero nothing ever moves. From command to command it is exact, by the matrix exponential, so that
-    its frequencies depend neither on the rate nor on the world's step. Thrusters have no
-    neighbours: each runs at a constant command, half range × sin(gene).
+    zero nothing moves. From command to command it is exact, by the matrix exponential, so that its
+    frequencies depend neither on the rate nor on the world's step. Thrusters have no neighbours:
+    each has a constant command, half range × sin(gene).
 
     Genes: one w per hinge, then one c per pair of neighbours, then one command per thruster;
     w = 2π f_max sin(gene), c = π f_max sin(gene).
@@ -43,11 +43,11 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
     """
     made_for = as_plant(body)
     dt = made_for.timestep
-    # The most that the system matrix's rows add up to, with all hinges of the body as neighbours.
+    # Bound of the system matrix's row sums, with all hinges of the body as neighbours.
     fastest = np.pi * max_frequency * (1 + made_for.num_hinges)
     blocks = GeneBlocks(made_for, ("w", "hinge"), ("c", "pair"), ("thrust", "thruster"))
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         values, rows = blocks.split(jnp.sin(genes), plant), plant.num_hinge_rows
         weights = np.pi * max_frequency * values["c"]
         coupling = pair_matrix(weights, -weights, plant)
@@ -57,15 +57,17 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
         turn = _propagator(w, coupling, dt, fastest)
         return w, coupling, amplitude * reach[:rows], middle[:rows], constant, turn
 
-    def init(parameters: Any) -> Any:
+    def init(parameters: PyTree) -> PyTree:
         w = parameters[0]
         return jnp.zeros_like(w), jnp.ones_like(w)
 
-    def step(parameters: Any, before: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, before: PyTree, time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         _, _, reach, center, constant, turn = parameters
         state = jnp.concatenate(before)
         after = tuple(jnp.split(apply_matrix(turn, state) if turn else state, 2))
-        # Without a rate, as of old, a command is that of the next step.
+        # Without a rate, as in older versions, a command is that of the next step.
         targets = center + reach * jnp.tanh((after if made_for.rate is None else before)[0])
         if not constant.shape[0]:
             return after, targets
@@ -77,7 +79,7 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
 def _propagator(
     w: jax.Array, coupling: NeighbourMatrix, dt: float, fastest: float
 ) -> NeighbourMatrix:
-    """The matrix that takes all x, then y, of the oscillators from one time to another.
+    """The state-transition matrix of the oscillators (all x, then all y) over a time.
 
     Taylor's series of the matrix exponential, scaled and squared (Moler and Van Loan 2003, SIAM
     Review 45, method 3); then a step of Newton's iteration for the nearest orthogonal matrix, so
@@ -86,7 +88,7 @@ def _propagator(
     Args:
         w: `[hinge rows, lanes]` of the oscillators [rad/s].
         coupling: between them [rad/s].
-        dt: between the times [s].
+        dt: the time [s].
         fastest: bound of the system matrix's norm [rad/s].
 
     Returns:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -31,14 +29,18 @@ _FEEDBACK = (
     ("spin z", 0.5),
 )
 
+# Bias, gains by feature, middle and half range.
+_Gains = tuple[jax.Array, tuple[jax.Array, ...], jax.Array, jax.Array]
+
 
 def make_feedback(body: Plant | Robot, depth: float = 1.0, gain: float = 2.0) -> Controller:
-    """Commands that are linear in depth and attitude: what an AUV needs to hold its depth.
+    """Commands that are linear in depth and attitude, enough for an AUV to hold its depth.
 
     command_i = middle + half range × clip(sin(b_i) + gain Σ_k sin(W_ik) feature_k, -1, 1), with
-    features depth error (core above `depth` counts positive) [0.2 m], climb [0.1 m/s], roll and
-    pitch (the vertical's y and x in the core's frame) [0.2], and spin about the core's three axes
-    [0.5 rad/s], each divided by the size in brackets. Zero genes: nothing moves.
+    features depth error (core above `depth` counts positive) [0.2 m], vertical velocity [0.1 m/s],
+    roll and pitch (the vertical's y and x in the core's frame) [0.2], and angular velocity about
+    the core's three axes [0.5 rad/s], each divided by the size in brackets. Zero genes: nothing
+    moves.
 
     Args:
         body: a plant or a robot.
@@ -53,13 +55,15 @@ def make_feedback(body: Plant | Robot, depth: float = 1.0, gain: float = 2.0) ->
     biases = GeneBlocks(made_for, ("bias", "actuator")).genes
     genes = [*biases, *(Gene(f, *b[1:]) for b in biases for f, _ in _FEEDBACK)]
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> _Gains:
         folded = jnp.sin(genes)
         weights = gain * folded[n:].reshape(n, count, *genes.shape[1:])
         rows = tuple(plant.arrange(weights[:, k]) for k in range(count))
         return plant.arrange(folded[:n]), rows, plant.middle(genes), plant.reach(genes)
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: _Gains, state: tuple[()], time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         bias, weights, center, reach = parameters
         level = sense.height + depth, sense.climb, sense.up[1], sense.up[0]
         found = (*level, *sense.angular_velocity)

@@ -6,13 +6,14 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.plant import Plant
 
-# Angular frequencies nearer than this, as a share of the fastest, are the same one; a choice.
+# Angular frequencies nearer than this, as a share of the fastest, count as equal; a choice.
 _SAME_RATE = 1e-5
-# Sines are as large as each other within this share, for each rad/s between them; a choice.
+# Amplitudes count as equal within this share for each rad/s between the frequencies; a choice.
 _SAME_SIZE = 1e-4
 
 UNITS: dict[str, str] = {
@@ -23,7 +24,7 @@ UNITS: dict[str, str] = {
 """The keys of `describe_gait` in order, with units."""
 
 
-def describe_gait(plant: Plant, settings: Any, genes: Any) -> dict[str, float]:
+def describe_gait(plant: Plant, settings: Any, genes: ArrayLike) -> dict[str, float]:
     """Periods, phases and amplitudes of the hinges' targets, after Revolve's brain descriptors.
 
     Revolve (`measure_brain.py`) takes medians, over the parameters' ranges, and squashed standard
@@ -77,7 +78,7 @@ def _sine_waves(parameters: Any, hinges: int) -> _Waves:
 
 
 def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
-    """As `_sine_waves`, of the greatest sine of each oscillator."""
+    """Angular frequency, amplitude and phase of the largest sine of each oscillator."""
     w, coupling, reach, *_ = parameters
     matrix = np.zeros((2 * hinges, 2 * hinges))
     for j, column in coupling.items():
@@ -88,11 +89,11 @@ def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
     turns, modes = np.linalg.eigh(1j * matrix)
     start = np.concatenate([np.zeros(hinges), np.ones(hinges)])
     parts = modes[:hinges] * (modes.conj().T @ start)
-    # What oscillates at one frequency is one sine; of each pair ±λ, one half is enough.
+    # Terms of one frequency add up to one sine; of each pair ±λ, one is enough.
     near = _SAME_RATE * max(np.abs(turns).max(), 1e-9)
     same = np.abs(turns[:, None] - turns) < near
     parts = np.where(turns < -near, 2 * parts @ same, 0)
-    # Equal oscillators that are coupled have pairs of equal sines: then the faster.
+    # Coupled equal oscillators have pairs of sines of equal amplitude: the faster one counts.
     best = (np.abs(parts) * (1 - _SAME_SIZE * turns)).argmax(1)
     wave = parts[np.arange(hinges), best]
     # Re(z exp(i ω t)) = |z| sin(ω t + arg z + π/2).
@@ -101,18 +102,18 @@ def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
 
 
 def _splines_waves(parameters: Any, hinges: int) -> _Waves:
-    """As `_sine_waves`, of each curve's first harmonic."""
+    """Angular frequency, amplitude and phase of each curve's first harmonic."""
     rows, rate = parameters[0], 2 * np.pi * np.asarray(parameters[1], float).item()
     points = len(rows)
     turn = np.exp(-2j * np.pi * np.arange(points) / points)
     bumps = turn @ np.stack([np.asarray(row, float)[:hinges, 0] for row in rows])
-    # A cubic B-spline is a box four times folded with itself.
+    # A cubic B-spline is a box convolved three times with itself.
     wave = 2 / points * bumps * np.sinc(1 / points) ** 4
     return np.full(hinges, rate), np.abs(wave), np.angle(1j * wave)
 
 
 def _sensory_waves(parameters: Any, hinges: int) -> _Waves:
-    """As `_sine_waves`, of oscillators at readings of 0, once their phases have settled."""
+    """Frequency, amplitude and phase of oscillators at readings of 0, with settled phases."""
     (size, *_), _, rate, near, (reach, _), _ = parameters
     lag = np.zeros((hinges, hinges), complex)
     for j in near[0]:

@@ -1,8 +1,8 @@
-"""One small network that all joints share, with messages between neighbours.
+"""One small network shared by all joints, with messages between neighbours.
 
-The same weights at each joint, as in Huang, Mordatch & Pathak 2020 (One policy to control them
-all, ICML), so that a brain fits any body, and survives all changes of it. Joints differ by their
-readings, their positions, and their neighbours' messages.
+The weights are the same at each joint, as in Huang, Mordatch & Pathak 2020 (One policy to control
+them all, ICML), so that a brain fits any body. Joints differ in their readings, their positions,
+and their neighbours' messages.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import (
@@ -32,11 +33,11 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import sincos
 from mjx_revolve.numerics.xla import materialize
 
-# A weight of one is sin(gene) times this; a choice, so that tanh can be driven to its ends.
+# A weight is sin(gene) times this; a choice, large enough to saturate tanh.
 _WEIGHT = 2.0
 # Unit of the positions that enter the network [m], about two modules; a choice.
 _LENGTH = 0.1
-# Time constant of messages [s]; a choice. Without a lag, joints that contradict each other would
+# Time constant of messages [s]; a choice. Without a lag, neighbours with opposite responses would
 # chatter at the rate of the steps.
 _MESSAGE_LAG = 0.05
 # Slowest and fastest unit of a recurrent network [s]; choices: a step, and a slow stroke.
@@ -65,10 +66,10 @@ def make_joint_network(
 
         h = tanh(W x),  message = U h,  target = middle + amplitude × half range × tanh(v·h),
 
-    whose targets fade in over half a second. Recurrent, hidden units are leaky and coupled,
+    and targets fade in over half a second. If recurrent, hidden units are leaky and coupled,
     τ_k ḣ_k = -h_k + tanh((W x + R h)_k), τ_k from 0.02 to 1 s (a continuous-time recurrent
     network, Beer 1995, Adaptive Behavior 3, with bounded states). Thrusters have a v of their own,
-    no joint's observations and no neighbours. Weights are 2 sin(gene): zero genes keep all still.
+    no joint observations and no neighbours. Weights are 2 sin(gene): with zero genes nothing moves.
 
     Args:
         body: a plant or a robot.
@@ -98,7 +99,7 @@ def make_joint_network(
     names += [f"{h}>thrust" for h in units] if made_for.num_thrusters else []
     genes = [Gene(name, "robot") for name in names]
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         folded, lanes, start = jnp.sin(genes), genes.shape[1:], 0
 
         def take(*shape: int) -> jax.Array:
@@ -113,7 +114,7 @@ def make_joint_network(
         back = _WEIGHT * take(hidden, hidden) if recurrent else None
         pace = None
         if recurrent:
-            # From the slowest to the fastest in equal ratios, 0.14 s for a gene of 0.
+            # Interpolated in the logarithm between the slowest and the fastest; 0.14 s for gene 0.
             share = (1 + take(hidden)) / 2
             tau = _SLOWEST * jnp.exp(share * np.log(_FASTEST / _SLOWEST))
             pace = lag_share(made_for, tau)[:, None]
@@ -139,14 +140,16 @@ def make_joint_network(
             plant.source[: plant.num_hinge_rows],
         )
 
-    def init(parameters: Any) -> Any:
+    def init(parameters: PyTree) -> PyTree:
         (base, *_), _, _, _, _ = parameters
         rows = parameters[4].shape[0]
         like = base[0][:rows]
         sent = tuple(jnp.zeros_like(like) for _ in range(messages)) if rows else ()
         return observer.init(like), sent, jnp.zeros_like(base) if recurrent else ()
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, state: PyTree, time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         network, clock, near, (reach, middle), number = parameters
         base, layer, back, pace, target, message = network
         samples, sent, memory = state
@@ -161,7 +164,7 @@ def make_joint_network(
 
         activity = base
         if observation.robot:
-            # The part that is the same for all joints is summed once.
+            # Inputs common to all joints are summed once.
             alike = layer[:, 0] * observation.robot[0]
             for k, x in enumerate(observation.robot[1:]):  # no reductions inside the loop
                 alike = alike + layer[:, k + 1] * x

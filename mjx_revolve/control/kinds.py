@@ -63,7 +63,7 @@ def find_controller(
 def _find(
     plant: Plant, settings: Any, source: str, example: Plant | None, body: Morphology | None
 ) -> Controller:
-    """The controller, which acts whenever it is called."""
+    """The controller, without holding its commands."""
     name = settings.type
     if name == "brain":
         return _make_brain(plant, settings, source, body)
@@ -77,7 +77,7 @@ def _find(
 
 
 def _make(name: str, plant: Plant, settings: Any) -> Controller:
-    """A controller of the package, made with the settings that it takes."""
+    """A controller of the package, with those settings that are arguments of its function."""
     kind = CONTROLLERS[name]
     takes = inspect.signature(kind.make).parameters
     given = {key: value for key, value in settings if key in takes}
@@ -86,7 +86,7 @@ def _make(name: str, plant: Plant, settings: Any) -> Controller:
 
 
 def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | None) -> Controller:
-    """What a robot's file has under `brain`."""
+    """The controller under `brain` in the robot's file."""
     if body is None:
         raise InputError(
             f"{source}: controller.type: expected another one, as bodies differ; found 'brain'"
@@ -105,7 +105,7 @@ def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | Non
 
 
 def _check_users_controller(name: str, controller: Any, plant: Plant) -> None:
-    """Refuses what is no controller of a plant, before anything is compiled."""
+    """Raises `InputError` unless a user's function made a controller of the plant."""
     place = function_place(name)
     if not isinstance(controller, Controller):
         raise InputError(f"{place}: expected a Controller; found {type(controller).__name__}")

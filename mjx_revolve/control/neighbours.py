@@ -28,7 +28,7 @@ def pair_matrix(onto_first: jax.Array, onto_second: jax.Array, plant: Plant) -> 
     i, j = wide(plant.first), wide(plant.second)
     lane = jnp.arange(lanes[0]) if lanes else 0
     matrix = jnp.zeros((rows, rows, *lanes), onto_first.dtype)
-    # What is past the end stands for no pair.
+    # An index past the end means no pair.
     matrix = matrix.at[i, j, lane].add(onto_first, mode="drop")
     matrix = matrix.at[j, i, lane].add(onto_second, mode="drop")
     if isinstance(plant.first, jax.Array):

@@ -4,11 +4,11 @@ Where Revolve's code differs from its documentation, or leaves something open:
 
 - `phase_offset` counts periods, not radians: an Oscillator gives
   1/2 - a/2 + a (sin(2π/T (t - T φ)) + 1)/2, whatever its inputs are.
-- Files in the wild give an Oscillator a `gain` in place of an `amplitude`; it is read as one.
-- All neurons are updated at once, from each other's values of the update before; those begin at 0.
+- Some files give an Oscillator a `gain` in place of an `amplitude`; it is read as one.
+- All neurons are updated at once, from the values of the update before; those begin at 0.
 - The network is updated 8 times a second, and its outputs are held in between.
 - An output is clipped to 0 to 1, and that is the hinge's whole range; of several for one hinge, the
-  first in the file counts. A hinge without any stays in the middle.
+  first in the file counts. A hinge without an output stays in the middle.
 - The inputs of a module are its input neurons in the file's order: of the core its accelerometer's
   x, y, z, then its gyro's [m/s², rad/s]; of a touch sensor its two cells, the force of the bed on
   its left and its right half as seen in the direction in which it is attached, as a share of 1 N.
@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from annotated_types import Unit
+from jaxtyping import PyTree
 from pydantic import BeforeValidator
 
 from mjx_revolve.body.tree import Morphology
@@ -36,13 +37,13 @@ from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import (
     ConstraintError,
+    Id,
     Number,
     Positive,
     Text,
     TupleOf,
     checked,
     read,
-    words,
 )
 from mjx_revolve.numerics.spatial import sincos
 
@@ -57,19 +58,11 @@ PARAMS: dict[str, tuple[str, ...]] = {
     "Oscillator": ("period", "phase_offset", "amplitude"),
 }
 _OTHERWISE = {"amplitude": "gain"}
-# Largest change of a written number by its gene, for a period the factor; choices, about the ranges
-# that Revolve draws them from.
+# Largest change of a number of the file by its gene, for a period the factor; choices, about the
+# ranges that Revolve draws them from.
 _REACH = {"weight": 2.0, "bias": 1.0, "gain": 1.0, "phase_offset": 0.5, "amplitude": 1.0}
 _PERIODS = 4.0
 _CELLS, _INERTIAL = 2, 6  # inputs of a touch sensor, and of the core
-
-
-def _read_id(value: Any) -> Any:
-    """Names in YAML may be numbers."""
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
-_Id = Annotated[Text, BeforeValidator(_read_id), words("a name")]
 
 
 @checked
@@ -83,10 +76,10 @@ class Neuron:
         part_id: the module that it belongs to; hidden ones need none.
     """
 
-    id: _Id
+    id: Id
     layer: Literal["input", "hidden", "output"]
     type: Literal["Input", "Simple", "Sigmoid", "Oscillator"]
-    part_id: _Id | None = None
+    part_id: Id | None = None
 
     def __post_init__(self) -> None:
         """Checks that the type fits the layer."""
@@ -99,8 +92,8 @@ class Neuron:
 class Synapse:
     """A connection of a file."""
 
-    src: _Id
-    dst: _Id
+    src: Id
+    dst: Id
     weight: Number
 
 
@@ -126,7 +119,7 @@ class _File:
 
     neurons: Annotated[TupleOf[Neuron], BeforeValidator(_as_list)]
     connections: Annotated[TupleOf[Synapse], _OrNone] = ()
-    params: Annotated[dict[_Id, dict[Text, Any]], BeforeValidator(lambda x: x or {})] = field(
+    params: Annotated[dict[Id, dict[Text, Any]], BeforeValidator(lambda x: x or {})] = field(
         default_factory=dict
     )
     type: Any = None
@@ -148,7 +141,7 @@ class _File:
 
 
 class NeuralNetwork(NamedTuple):
-    """A network as it is written.
+    """A network as in the file.
 
     Attributes:
         neurons: in the file's order.
@@ -195,7 +188,7 @@ def _genes_of(network: NeuralNetwork) -> list[tuple[str, Any]]:
 
 
 def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
-    """A network as a morphology file has it, with its numbers changed by genes.
+    """A network in the form of a morphology file, with its numbers changed by genes.
 
     Args:
         brain: under `brain` in the file.
@@ -203,7 +196,7 @@ def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
         source: the file, in messages.
 
     Returns:
-        A new one: with genes of 0 it does what the given one does with these.
+        A new network: with genes of 0 it acts as the given one does with `genes`.
     """
     network, made = read_neural_network(brain, source), copy.deepcopy(brain)
     params = {str(key): value for key, value in (made.get("params") or {}).items()}
@@ -221,14 +214,14 @@ def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
 
 
 def _moved(kind: str, written: float, folded: Any) -> Any:
-    """A written number, changed by a gene."""
+    """A number of the file, changed by a gene."""
     if kind == "period":
         return written * _PERIODS**folded
     return written + _REACH[kind] * folded
 
 
 def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -> Controller:
-    """A robot's own network. Genes of 0 run it as it is written; they move its numbers.
+    """The network in a robot's file; genes change its numbers, genes of 0 leave them as they are.
 
     Args:
         plant: of the robot.
@@ -259,7 +252,7 @@ def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -
     touched = dict.fromkeys(x[0] for _, x in inputs if is_module_signal(x[0]))
     signals += ("cells", *touched) if touched else ()
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         folded, lanes = jnp.sin(genes), genes.shape[1:]
         weights = jnp.zeros((len(moving), len(sources), *lanes), genes.dtype)
         values = [[jnp.full(lanes, x, genes.dtype) for x in own] for own in network.params]
@@ -278,12 +271,14 @@ def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -
             tables[kind] = [jnp.stack(x) for x in zip(*own, strict=True)]
         return columns, tables, plant.middle(genes), plant.reach(genes)
 
-    def init(parameters: Any) -> Any:
+    def init(parameters: PyTree) -> PyTree:
         middle = parameters[2]
         still = jnp.zeros((len(moving), *middle.shape[1:]), middle.dtype)
         return jnp.full((), -1, middle.dtype), still
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, state: PyTree, time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         columns, tables, middle, reach = parameters
         last, values = state
         count = count_samples(time, RATE)

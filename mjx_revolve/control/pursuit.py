@@ -6,11 +6,11 @@ state is part of the rollout's, in `SensorMemory`.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from mjx_revolve.numerics.spatial import Vec, dot, safe_norm, sincos, vadd, vscale, vsub
+from mjx_revolve.numerics.spatial import Scalar, Vec, dot, safe_norm, sincos, vadd, vscale, vsub
 
 
 class PursuitLimits(NamedTuple):
@@ -21,8 +21,8 @@ class PursuitLimits(NamedTuple):
         turn: largest turning rate [rad/s].
     """
 
-    speed: Any
-    turn: Any
+    speed: Scalar
+    turn: Scalar
 
 
 class Pursuer(NamedTuple):

@@ -1,7 +1,7 @@
-"""What sensors read of the engine's state, at the core and at modules, for every engine.
+"""True sensor readings from the engine's state, at the core and at modules, for every engine.
 
-The core is one of the places where a sensor may be mounted: the same function computes the readings
-of the core, of one module, and of a type of modules, from the pose and the motion of its frame.
+One function computes the readings at the core, at one module, and at a type of modules, from the
+pose and the motion of the frame there.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.control.courses import Course
 from mjx_revolve.control.pursuit import Pursuer, PursuitLimits, init_pursuer, step_pursuer
@@ -57,7 +58,7 @@ def is_module_signal(name: str) -> bool:
 
 
 class EpisodeContext(NamedTuple):
-    """What an episode adds to a robot's own state for sensors to read, `[lanes]` each or None.
+    """Inputs of sensors that belong to the episode rather than the robot, `[lanes]` each or None.
 
     Attributes:
         target: initial position of the target, world frame, three of `[lanes]` [m].
@@ -70,8 +71,8 @@ class EpisodeContext(NamedTuple):
 
     target: Any = None
     drift: Any = None
-    noise: Any = None
-    sight: Any = None
+    noise: jax.Array | None = None
+    sight: jax.Array | None = None
     pursuit: PursuitLimits | None = None
     course: Course | None = None
 
@@ -91,11 +92,11 @@ class NearestRobot(NamedTuple):
     Attributes:
         toward: from core to core, core frame, three of `[lanes]` [m]; `NO_NEIGHBOUR` long if there
             is none.
-        tag: number that tells robots apart, `[lanes]` [-]; 0 if there is none.
+        tag: number that identifies the robot, `[lanes]` [-]; 0 if there is none.
     """
 
-    toward: Any
-    tag: Any
+    toward: Vec
+    tag: jax.Array
 
 
 class PreviousMotion(NamedTuple):
@@ -111,7 +112,7 @@ class PreviousMotion(NamedTuple):
 
 
 class SensorMemory(NamedTuple):
-    """Part of the rollout state: what readings need of earlier steps; None where none needs it.
+    """Part of the rollout state: values of earlier steps that readings depend on; None if unused.
 
     Attributes:
         acceleration: of the core over the last step, world frame, three of `[lanes]` [m/s²].
@@ -121,19 +122,20 @@ class SensorMemory(NamedTuple):
         pursuer: state of a target that pursues the robot.
     """
 
-    acceleration: Any = None
-    ctrl: Any = None
-    work: Any = None
+    acceleration: Vec | None = None
+    ctrl: jax.Array | None = None
+    work: jax.Array | None = None
     past: PreviousMotion | None = None
     pursuer: Pursuer | None = None
 
 
 class SensorReadings(NamedTuple):
-    """True values at the core, or at modules: what a controller and its sensors read.
+    """True values at the core, or at modules, before noise, rate and delay of sensors.
 
     At the core and at one module `[lanes]` each, vectors three of them, in the frame of the core or
-    in that of the module's main box (of its moving part). On a type of modules `[1 + hinge rows,
-    lanes]`: of the first such module on the core's rigid body, and on what each hinge carries.
+    in that of the module's main box (of its moving part). At a type of modules `[1 + hinge rows,
+    lanes]`: at the first such module on the core's rigid body, and on the body that each hinge
+    moves.
 
     Attributes:
         height: of the centre above the still surface, negative under water [m].
@@ -152,8 +154,8 @@ class SensorReadings(NamedTuple):
             optional: see `OPTIONAL_SIGNALS`.
         load: torque of the servos under the last command, as `angle` [N·m]; optional.
         work: done by servos and propellers so far [J]; core only, optional.
-        touch: normal force of the bed on the core's rigid body, then on what each hinge carries,
-            `[1 + hinge rows, lanes]` [N]; of a module on its rigid body; optional.
+        touch: normal force of the bed on the core's rigid body, then on the body that each hinge
+            moves, `[1 + hinge rows, lanes]` [N]; at a module that on its rigid body; optional.
         nearest: the nearest other robot; core only, optional.
         modules: readings at modules, by signal; core only.
         course: direction to keep to, a unit vector; 0 without; core only.
@@ -162,27 +164,27 @@ class SensorReadings(NamedTuple):
         cells: normal force of the bed on the left and the right half of one module [N]; optional.
     """
 
-    height: Any
-    climb: Any
+    height: jax.Array
+    climb: jax.Array
     up: Vec
     angular_velocity: Vec
-    north: Any = None
-    angle: Any = None
-    speed: Any = None
-    flow: Any = None
-    altitude: Any = None
-    target: Any = None
-    noise: Any = None
-    force: Any = None
-    load: Any = None
-    work: Any = None
-    touch: Any = None
+    north: Vec | None = None
+    angle: jax.Array | None = None
+    speed: jax.Array | None = None
+    flow: Vec | None = None
+    altitude: jax.Array | None = None
+    target: Vec | None = None
+    noise: jax.Array | None = None
+    force: Vec | None = None
+    load: jax.Array | None = None
+    work: jax.Array | None = None
+    touch: jax.Array | None = None
     nearest: NearestRobot | None = None
     modules: Any = None
-    course: Any = None
-    seen: Any = None
-    present: Any = None
-    cells: Any = None
+    course: Vec | None = None
+    seen: jax.Array | np.ndarray | None = None
+    present: jax.Array | None = None
+    cells: tuple[jax.Array, jax.Array] | None = None
 
     @property
     def spin(self) -> Vec:
@@ -203,7 +205,7 @@ class _Frame(NamedTuple):
         rotation: world from module.
         velocity: world frame [m/s].
         angular_velocity: module frame [rad/s].
-        acceleration: over the last step, world frame [m/s²]; None where it is not computed.
+        acceleration: over the last step, world frame [m/s²]; None if not computed.
     """
 
     position: Vec
@@ -233,7 +235,7 @@ def _site_frame(
         rate = 1 / timestep
         gain = vscale(rate, vsub(matvec(body, motion.velocity), past.velocity))
         turning = vscale(rate, vsub(spin, past.angular_velocity))
-        # In the middle of the step, so that the mean over it is good to second order.
+        # At the middle of the step, so that the mean over it is accurate to second order.
         middle = vscale(0.5, vadd(spin, past.angular_velocity))
         own = vadd(cross(turning, offset), cross(middle, cross(middle, offset)))
         acceleration = vadd(gain, matvec(body, own))
@@ -247,7 +249,7 @@ def _site_frame(
 
 
 def _read_frame(
-    world: World | None, water: Water, target: Vec | None, sight: Any, frame: _Frame
+    world: World | None, water: Water, target: Vec | None, sight: jax.Array | None, frame: _Frame
 ) -> SensorReadings:
     """The readings that follow from a frame."""
     x, y, z = frame.position
@@ -288,7 +290,7 @@ def _read_frame(
 def read_sensors(
     world: World | None,
     engine: Engine,
-    state: Any,
+    state: PyTree,
     water: Water,
     time: jax.Array,
     context: EpisodeContext,
@@ -297,19 +299,19 @@ def read_sensors(
     meeting: InteractionForces = NO_INTERACTION,
     motion: BodyMotion | None = None,
 ) -> SensorReadings:
-    """The readings at the core, and at the modules that are named.
+    """The readings at the core, and at the modules named in `signals`.
 
     Args:
-        world: around the robots; None where no sensor reads water or bed.
+        world: around the robots; None if no sensor reads water or bed.
         engine: of the robots.
         state: of the engine.
         water: at this time; heights count from its still surface.
         time: since the episode's start [s].
         context: of the episode.
         memory: from `init_memory` or `update_memory`.
-        signals: which of `OPTIONAL_SIGNALS`, and which modules.
+        signals: the `OPTIONAL_SIGNALS`, and the modules, that are read.
         meeting: interaction with the other robots of the same world.
-        motion: of all rigid bodies, where it is known already.
+        motion: of all rigid bodies; computed if None.
 
     Raises:
         InputError: there is no such module.
@@ -368,7 +370,7 @@ def _plain(x: Any, like: jax.Array) -> Any:
 
 
 def init_memory(
-    signals: Sequence[str], engine: Engine, state: Any, context: EpisodeContext = _NO_CONTEXT
+    signals: Sequence[str], engine: Engine, state: PyTree, context: EpisodeContext = _NO_CONTEXT
 ) -> SensorMemory:
     """The memory before the first step: at rest, no work done, servos commanded to stay.
 
@@ -429,43 +431,43 @@ def update_memory(
 
 
 def _motion_to_keep(motion: BodyMotion) -> PreviousMotion:
-    """What the next step needs of the bodies' motion."""
+    """The fields of the bodies' motion that the next step's readings depend on."""
     body: Mat = (motion.x_axis, motion.y_axis, motion.z_axis)
     return PreviousMotion(matvec(body, motion.velocity), motion.angular_velocity)
 
 
 class _RestingEngine:
-    """The engine's functions that readings need, for robots at rest: gives shapes."""
+    """The functions of an `Engine` that readings call, for robots at rest: gives shapes."""
 
     def __init__(self, plant: Plant, lanes: int) -> None:
         self.plant = plant
         self._joints = jnp.zeros((plant.num_hinge_rows, lanes), jnp.float32)
         self._bodies = jnp.zeros((1 + plant.num_hinge_rows, lanes), jnp.float32)
 
-    def root(self, state: Any) -> RootState:
+    def root(self, state: PyTree) -> RootState:
         x = self._bodies[0]
         return RootState((x,) * 3, (x,) * 4, (x,) * 3, (x,) * 3)
 
-    def joints(self, state: Any) -> tuple[jax.Array, jax.Array]:
+    def joints(self, state: PyTree) -> tuple[jax.Array, jax.Array]:
         return self._joints, self._joints
 
-    def servo_torque(self, state: Any, ctrl: jax.Array) -> jax.Array:
+    def servo_torque(self, state: PyTree, ctrl: jax.Array) -> jax.Array:
         return self._joints
 
-    def contact_force(self, state: Any, water: Water) -> jax.Array:
+    def contact_force(self, state: PyTree, water: Water) -> jax.Array:
         return self._bodies
 
-    def body_motions(self, state: Any) -> BodyMotion:
+    def body_motions(self, state: PyTree) -> BodyMotion:
         x = self._bodies
         return BodyMotion((x,) * 3, (x,) * 3, (x,) * 3, x, (x,) * 3, (x,) * 3, (x, x))
 
-    def contact_by_half(self, state: Any, water: Water) -> Any:
+    def contact_by_half(self, state: PyTree, water: Water) -> Any:
         x = self._bodies[0]
         return defaultdict(lambda: (x, x))
 
 
 def readings_at_rest(plant: Plant, lanes: int, signals: Sequence[str]) -> SensorReadings:
-    """Readings of the right shapes, to try a controller on.
+    """Readings of the right shapes, to check a controller with.
 
     Raises:
         InputError: there is no such module.

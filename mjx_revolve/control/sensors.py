@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.sensors import Sensor, check_names
@@ -29,10 +30,11 @@ from mjx_revolve.numerics.xla import materialize
 DEFAULT_SENSORS = tuple(Sensor(type=name) for name in ("tilt", "gyro", "angle", "speed"))
 """The sensors where none are declared."""
 
-# A time this share of a sample before it is due counts as due: more than a float32 clock errs by.
+# A sample counts as due from this share of a period before its time: more than the rounding error
+# of a float32 clock.
 _DUE = 0.01
 # The most samples that a delay may keep; a choice.
-_LONGEST = 256
+_MAX_KEPT = 256
 
 
 def count_samples(time: Any, rate: float) -> jax.Array:
@@ -46,11 +48,11 @@ def count_samples(time: Any, rate: float) -> jax.Array:
 
 
 class Observation(NamedTuple):
-    """Inputs of a brain, each between -1 and 1.
+    """Outputs of the declared sensors, each between -1 and 1.
 
     Attributes:
         robot: of the robot as a whole, `[lanes]` each.
-        joint: of the hinges, `[hinge rows, lanes]` each, in the plant's order; meaningless in rows
+        joint: of the hinges, `[hinge rows, lanes]` each, in the plant's order; undefined in rows
             without a hinge. Empty if there are no hinges.
     """
 
@@ -68,10 +70,10 @@ class Observer:
     def __post_init__(self) -> None:
         """Refuses a delay that is longer than the samples that are kept."""
         for k, sensor in enumerate(self.sensors):
-            if self._kept(sensor) > _LONGEST:
+            if self._kept(sensor) > _MAX_KEPT:
                 rate = self._rate(sensor)
                 raise InputError(
-                    f"sensors.{k}.delay: expected at most {_LONGEST / rate:g} s at {rate:g} Hz; "
+                    f"sensors.{k}.delay: expected at most {_MAX_KEPT / rate:g} s at {rate:g} Hz; "
                     f"found {sensor.delay:g}"
                 )
 
@@ -91,7 +93,7 @@ class Observer:
         return tuple(dict.fromkeys(name for sensor in self.sensors for name in sensor.signals))
 
     def init(self, like: jax.Array) -> Any:
-        """The state: of each sensor with a rate or a delay its last count, and its samples.
+        """The state: for each sensor with a rate or a delay, its last count and its samples.
 
         Args:
             like: `[hinge rows, lanes]` of the floating-point type.
@@ -105,8 +107,8 @@ class Observer:
         return tuple(found)
 
     def observe(
-        self, state: Any, time: jax.Array, sense: SensorReadings, joint: Any
-    ) -> tuple[Any, Observation]:
+        self, state: PyTree, time: jax.Array, sense: SensorReadings, joint: Any
+    ) -> tuple[PyTree, Observation]:
         """The state and the observation before a step.
 
         Args:
@@ -152,7 +154,7 @@ class Observer:
     def _measure(
         self, place: int, sensor: Sensor, count: jax.Array, sense: SensorReadings, joint: Any
     ) -> tuple[list[jax.Array], list[jax.Array]]:
-        """A sample: of the robot, of the hinges."""
+        """A sample of a sensor: values of the robot, values of the hinges."""
         kind, (low, high) = sensor.kind, sensor.limits
         zero, scale = sensor.scaling
         robot: list[jax.Array] = []
@@ -167,7 +169,7 @@ class Observer:
             elif sensor.where == "body":
                 own, hung = (None, None) if there is None else (there[0], there[1:])
                 pieces = [(robot, value[0], None, own), (joints, value[1:], joint, hung)]
-            if not joint.shape[0]:  # XLA takes nothing of no size into its loops
+            if not joint.shape[0]:  # XLA's loops cannot carry arrays of size 0
                 pieces = [piece for piece in pieces if piece[0] is robot]
             for found, true, number, share in pieces:
                 if sensor.noise > 0:
@@ -179,9 +181,9 @@ class Observer:
         return robot, joints
 
     def _hold(
-        self, sensor: Sensor, state: Any, time: jax.Array, count: jax.Array, values: Any
+        self, sensor: Sensor, state: PyTree, time: jax.Array, count: jax.Array, values: Any
     ) -> tuple[Any, Any]:
-        """The samples after this step, and the one that is old enough."""
+        """The samples after this step, and the sample that is the sensor's output."""
         last, kept = state
         first, due = last < 0, count != last
         fresh: list[Any] = []
@@ -206,7 +208,7 @@ def make_observer(
     """An observer of sensors.
 
     Args:
-        sensors: that are declared; None for the default ones.
+        sensors: the declared ones; None for the default ones.
         timestep: between observations [s].
         plant: of the robot, or of the largest one; None to leave modules unchecked.
 

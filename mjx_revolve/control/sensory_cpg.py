@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import (
@@ -27,8 +28,8 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import sincos
 from mjx_revolve.numerics.xla import materialize
 
-# Time in which amplitudes and offsets follow [s], and how strongly neighbours pull [rad/s]:
-# choices, a fifth of a second, and a phase lag that is found within a stroke.
+# Time constant of amplitudes and offsets [s], and coupling strength between neighbours [rad/s]:
+# choices, a fifth of a second, and phases that settle within a stroke.
 _FOLLOW, _PULL = 0.2, 10.0
 # The longest step of the phases [s]: a joint with ten neighbours settles without overshoot.
 _PHASE_STEP = 0.0125
@@ -49,8 +50,9 @@ def make_sensory_cpg(
         ṙ_i = a (A_i + gain Σ_k R_ik s_k - r_i),   ȯ_i = a (B_i + gain Σ_k O_ik s_k - o_i),
 
     with s the observation, φ_ij = -φ_ji, and both sums clipped to ±1. Target of hinge i: middle +
-    amplitude × half range × clip(o_i + r_i sin θ_i, ±1). Everything starts at 0, so no joint jumps,
-    and zero genes keep all still. Thrusters have o only, and of the senses only the robot's.
+    amplitude × half range × clip(o_i + r_i sin θ_i, ±1). All states start at 0, so no joint jumps,
+    and with zero genes nothing moves. Thrusters have o only, and only observations of the robot as
+    a whole.
 
     Args:
         body: a plant or a robot.
@@ -80,11 +82,11 @@ def make_sensory_cpg(
         *((what, "actuator") for what in ("offset", *on_offset)),
     )
     few = len(robot)
-    # The phases' steps between two commands; one without a rate, as of old.
+    # Integration steps of the phases between two commands; one without a rate (older versions).
     count = 1 if made_for.rate is None else math.ceil(made_for.timestep / _PHASE_STEP - 1e-6)
     dt = made_for.timestep / count
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         values = blocks.split(jnp.sin(genes), plant)
         some = lambda names: [values[name] for name in names]  # noqa: E731
         sine, cosine = sincos(np.pi * values["lag"])
@@ -97,12 +99,14 @@ def make_sensory_cpg(
             plant.source[: plant.num_hinge_rows],
         )
 
-    def init(parameters: Any) -> Any:
+    def init(parameters: PyTree) -> PyTree:
         still, bias = jnp.zeros_like(parameters[0][0]), jnp.zeros_like(parameters[1][0])
-        # XLA takes nothing of no size into its loops.
+        # XLA's loops cannot carry arrays of size 0.
         return observer.init(still), (still, still) if still.shape[0] else (), bias
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, state: PyTree, time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         waves, offsets, rate, near, (reach, middle), number = parameters
         (size, on_phase, on_size), (bias, on_offset, on_bend) = waves, offsets
         samples, oscillators, offset = state
@@ -127,7 +131,7 @@ def make_sensory_cpg(
         for k in range(count):
             if k:
                 sine, cosine = map(materialize, sincos(phase))
-            # sin(θ_j - φ - θ_i), the difference taken apart, so that each phase has one sine.
+            # sin(θ_j - φ - θ_i) by the addition theorem, so that each phase has one sine.
             up = apply_matrix(along, sine) - apply_matrix(across, cosine)
             level = apply_matrix(along, cosine) + apply_matrix(across, sine)
             phase = phase + dt * (speed + _PULL * (cosine * up - sine * level))

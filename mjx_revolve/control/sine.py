@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +19,9 @@ from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import safe_norm, sincos
 
+_Sizes = tuple[tuple[jax.Array, jax.Array], ...]  # sine and cosine of each harmonic
+_Waves = tuple[_Sizes, jax.Array, jax.Array, jax.Array]  # and offset, frequency, middle
+
 
 def make_sine(
     body: Plant | Robot, max_frequency: float = 2.0, amplitude: float = 1.0, harmonics: int = 1
@@ -28,12 +29,11 @@ def make_sine(
     """One sine per hinge or thruster: amplitude, phase and offset, and a frequency shared by all.
 
     target_i = offset_i + Σ_k a_ik sin(2π k f t + φ_ik), k = 1 … harmonics. One harmonic is the
-    plain sine; with more, a stroke and its return may differ in speed, which is what rowing needs.
-    Amplitude and phase are evolved as a point in the plane, (u, v): a = amplitude × half range ×
-    sin|(u, v)| / k, φ its angle; so there is no seam at φ = ±π where optimisers get lost, and no
-    amplitude without a sign. Offset = half of half range × sin(gene), f = f_max (1 + sin(gene)) /
-    2. The servo's range clips the sum. Amplitudes and offsets fade in over the first half second,
-    so that no joint jumps at the start.
+    plain sine; with more, the power stroke and the recovery stroke may differ in speed, as in
+    rowing. Amplitude and phase are evolved as a point in the plane, (u, v): a = amplitude × half
+    range × sin|(u, v)| / k, φ its angle; so the map has no discontinuity at φ = ±π. Offset = half
+    of half range × sin(gene), f = f_max (1 + sin(gene)) / 2. The servo's range clips the sum.
+    Amplitudes and offsets fade in over the first half second, so that no joint jumps at the start.
 
     Args:
         body: a plant or a robot.
@@ -50,7 +50,7 @@ def make_sine(
     waves = [(name, "actuator") for pair in names for name in pair]
     blocks = GeneBlocks(made_for, *waves, ("offset", "actuator"), ("frequency", "robot"))
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> _Waves:
         values = blocks.split(genes, plant)
         reach, center = amplitude * plant.reach(genes), plant.middle(genes)
         rate = 2 * np.pi * max_frequency * (1 + jnp.sin(values["frequency"])) / 2
@@ -66,7 +66,9 @@ def make_sine(
     return make_controller(made_for, blocks.genes, decode, lambda parameters: (), _step)
 
 
-def _step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+def _step(
+    parameters: _Waves, state: tuple[()], time: jax.Array, sense: SensorReadings
+) -> StepOutput:
     """The step of a `Controller` made of sines."""
     sizes, offset, rate, center = parameters
     fade, wave = fade_in(time), offset

@@ -19,6 +19,9 @@ from mjx_revolve.control.controller import (
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.numerics.spatial import Scalar
+
+_Curves = tuple[tuple[Scalar, ...], jax.Array, jax.Array]  # coefficients, frequency, middle
 
 
 def make_splines(
@@ -28,9 +31,9 @@ def make_splines(
 
     The policies of RLPower (Kober & Peters 2009; for modular robots D'Angelo, Weel & Eiben 2013):
     target_i(t) = middle + amplitude × half range × s_i(f t mod 1), s_i the periodic cubic spline
-    through sin(gene) at equal distances. There, a learner begins with 3 points and adds some as it
-    goes on, up to 100 (`refine_splines`). f = f_max (1 + sin(gene)) / 2. It fades in over the first
-    half second. Between its points a spline may swing beyond them; the servo's range clips it.
+    through sin(gene) at equal distances. RLPower begins with 3 points and adds points during
+    learning, up to 100 (`refine_splines`). f = f_max (1 + sin(gene)) / 2. Targets fade in over the
+    first half second. Between its points a spline may overshoot them; the servo's range clips it.
 
     Args:
         body: a plant or a robot.
@@ -47,14 +50,16 @@ def make_splines(
     blocks = GeneBlocks(made_for, *((name, "actuator") for name in names), ("frequency", "robot"))
     solve = np.linalg.inv(_weights_of(np.arange(points), points))
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> _Curves:
         values, reach = blocks.split(jnp.sin(genes), plant), amplitude * plant.reach(genes)
         through = [reach * values[name] for name in names]
         # The B-spline's coefficients, so that the curve goes through the points.
         rows = [sum(float(w) * x for w, x in zip(row, through, strict=True)) for row in solve]
         return tuple(rows), max_frequency * (1 + values["frequency"]) / 2, plant.middle(genes)
 
-    def step(parameters: Any, state: Any, time: jax.Array, sense: SensorReadings) -> StepOutput:
+    def step(
+        parameters: _Curves, state: tuple[()], time: jax.Array, sense: SensorReadings
+    ) -> StepOutput:
         rows, rate, middle = parameters
         turns = rate * time
         at = points * (turns - jnp.floor(turns))
@@ -67,9 +72,9 @@ def make_splines(
 
 
 def _weight(way: Any, points: int, xp: Any) -> Any:
-    """How much a B-spline's coefficient counts so far (-points to points) from its own place."""
+    """The cubic B-spline at a distance (-points to points, in knots) from its centre."""
     found: Any = 0.0
-    # A bump is four points wide: of a short ring it meets itself.
+    # A B-spline is four knots wide: on a ring of fewer than that it overlaps itself.
     for turn in (-2, -1, 0, 1, 2) if points < 4 else (-1, 0, 1):
         far = xp.abs(way + turn * points)
         outer, inner = xp.maximum(2 - far, 0), xp.maximum(1 - far, 0)
@@ -78,19 +83,19 @@ def _weight(way: Any, points: int, xp: Any) -> Any:
 
 
 def _weights_of(places: np.ndarray, points: int) -> np.ndarray:
-    """`[places, points]` weights of the coefficients at places of the ring."""
+    """`[places, points]` weights of the coefficients at positions along the closed curve."""
     away: np.ndarray = np.subtract.outer(places, np.arange(points))
     found: np.ndarray = _weight(away, points, np)
     return found
 
 
 def refine_splines(genes: np.ndarray, points: int, more: int) -> np.ndarray:
-    """The genes of curves through more points, which follow the old ones as closely as they can.
+    """Genes for more points, with curves that follow the old ones as closely as possible.
 
     Args:
         genes: `[points * n + 1]` of `make_splines`.
-        points: how many each curve has.
-        more: how many each is to have.
+        points: number of points of each curve.
+        more: the new number.
 
     Returns:
         `[more * n + 1]` genes.
@@ -98,6 +103,6 @@ def refine_splines(genes: np.ndarray, points: int, more: int) -> np.ndarray:
     values = np.sin(np.asarray(genes, float)[:-1]).reshape(points, -1)
     places = np.arange(more) * points / more
     curve = _weights_of(places, points) @ np.linalg.inv(_weights_of(np.arange(points), points))
-    # What swings beyond its points is cut off at the ends of the range.
+    # Overshoots are clipped at the ends of the range.
     found = np.arcsin(np.clip(curve @ values, -1, 1))
     return np.concatenate([found.ravel(), np.asarray(genes, float)[-1:]])

@@ -13,8 +13,8 @@ class ControllerKind(NamedTuple):
     Attributes:
         path: `module.function` in this package. The function takes a plant, and by their
             names those settings of a `ControllerConfig` that its signature has.
-        settings: names of the settings that are of use to this kind only, or to few.
-        fixed: arguments that no setting gives.
+        settings: names of the settings that only this kind, or few kinds, use.
+        fixed: further arguments, which are no settings.
     """
 
     path: str

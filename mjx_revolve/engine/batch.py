@@ -1,9 +1,9 @@
 """Different robots side by side: tables of one shape, so that one compiled program steps them all.
 
-`fit_capacity` fixes what bodies made of some types of modules may differ in, and how large they may
-be; `pack_bodies` puts robots into tables of that capacity. Everything here is NumPy; `rows` has the
-traversal. What is the same in all bodies follows from the types of modules that they are made of,
-not from the bodies at hand: products with such numbers fold away while the step is traced.
+`fit_capacity` fixes in what bodies made of some types of modules may differ, and how large they may
+be; `pack_bodies` writes robots into tables of that capacity. Everything here is NumPy;
+`batched_trees` has the traversal. Numbers that are equal in all bodies of these types of modules
+are constants: products with them fold away while the step is traced.
 """
 
 from __future__ import annotations
@@ -606,7 +606,7 @@ def _pick_rows(
 
 
 def _alike(columns: StepConstants, nothing: Parts) -> StepConstants:
-    """Constants whose parts have all the numbers that `nothing` has."""
+    """Constants of parts with all fields that `nothing` has."""
     wide = partial(jax.tree.map, lambda x: np.broadcast_to(x, (len(columns.part_laws) + 1,)))
     parts = columns.parts
     missing = {
@@ -819,7 +819,7 @@ def _leave_out(level: Level, constant: Level, names: list[str], real: Any) -> Le
 
 
 def _hang(assembly: Assembly, order: RowOrder, capacity: Capacity) -> dict[str, np.ndarray]:
-    """How the rows of robots hang together, padded."""
+    """The tree structure of robots' rows, padded: fields of `PackedBodies`."""
     count = len(assembly.roots)
     at = order.place, order.robot
     slot, inner = np.zeros((capacity.rows, count), int), np.zeros((capacity.rows, count), bool)

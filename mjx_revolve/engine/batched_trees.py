@@ -1,4 +1,4 @@
-"""The trees of many robots, row by row, for steps whose trees are not known while they are traced.
+"""The trees of many robots, row by row; the trees are arguments of the traced step.
 
 Every robot is a root and a list of rows, padded to a fixed number (`batch` makes them): a row is a
 moving body with a few of its parts; a body with more parts than a row holds has overflow rows,
@@ -165,12 +165,12 @@ class BatchedTrees:
         return values[:, 0]
 
     def stack_saved(self, saved: PackedRow, select: Callable[[Any], Any], like: jax.Array) -> Any:
-        """`[rows, lanes]` of what `select` takes."""
+        """`[rows, lanes]` of selected saved values."""
         columns = saved.data.reshape(-1, saved.tree.num_leaves, self.lanes)
         return select(jax.tree.unflatten(saved.tree, list(jnp.moveaxis(columns, 1, 0))))
 
     def at_lanes(self, which: jax.Array) -> BatchedTrees:
-        """Some of the robots; their constants are not theirs."""
+        """A tree with fewer lanes; its constants are not those of the robots in them."""
         indices = self.stack_indices
         if not self.bodies.alike:
             indices = jax.tree.map(lambda x: take_lanes(x, which), indices)
@@ -179,7 +179,7 @@ class BatchedTrees:
     def saved_at_lanes(
         self, saved: PackedRow, select: Callable[[Any], Any], which: jax.Array
     ) -> PackedRow:
-        """Columns of what `select` takes."""
+        """Columns of selected saved values."""
         count = saved.tree.num_leaves
         leaves, tree = jax.tree.flatten(select(jax.tree.unflatten(saved.tree, range(count))))
         columns = saved.data.reshape(-1, count, self.lanes)
@@ -408,7 +408,7 @@ def make_batched_trees(
     Args:
         world: around all of them.
         capacity: the size of the tables.
-        bodies: the tables, of as many robots as there are lanes, or of one that they all are.
+        bodies: the tables, of `lanes` robots, or of one robot for all lanes.
         lanes: number of robots.
         steady: whether padding is visited, too: derivatives need loops of known length.
 

@@ -19,7 +19,7 @@ _COUNTS = ("nbody", "nq", "nv", "nu")
 
 
 def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
-    """Refuses an edited model whose bodies, hinges or actuators are others.
+    """Refuses an edited model with other bodies, hinges or actuators.
 
     Args:
         model: the edited one.

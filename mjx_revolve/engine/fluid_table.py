@@ -1,8 +1,8 @@
-"""What the water needs to know of each part: the per-part tables behind every law.
+"""The per-part tables from which every law of the water takes its numbers.
 
-A *part* is what moves and floats as one box: core, brick, sensor, thruster and fin are one part
-each, an active hinge is two (the frame, fixed to the parent, and the servo holder, which moves).
-Where a part makes no choice of its own, the world's holds.
+A *part* is a rigid box: core, brick, sensor, thruster and fin are one part each, an active hinge is
+two (the frame, fixed to the parent, and the servo holder, which moves). A part without a law of its
+own has the world's.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
 from mjx_revolve.water.plate_wake import PLATE_WAKE, thinness
 from mjx_revolve.water.world import World
 
-_NOTHING = ((0.0,) * 6,) * 6
+_ZERO_MATRIX = ((0.0,) * 6,) * 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,8 @@ class FluidTable:
         exposed: share of each pair of faces that the water reaches [-].
         joined: share that neighbours cover of the ends by which the part is in a row of parts [-];
             1 of a part that is a row by itself.
-        ends: 1 or -1 along an axis at whose end a row of parts ends, in that direction; else 0.
+        ends: 1 or -1 along each axis where a row of parts ends with this part, in that direction;
+            else 0.
         rows: length of that row [m].
         buoyancy: names of the buoyancy laws.
         drag: names of the drag laws.
@@ -117,9 +118,9 @@ class FluidTable:
 def drag_law(part: Part, world: World) -> str:
     """The name of a part's drag law: its own, that of its fin, or the world's.
 
-    A world that switches drag off switches it off for every part, and MuJoCo's laws, which know no
-    fins, hold for fins and for parts that state their own damping, too. Where drag flows across
-    chains, thin parts and fins have laws that remember their wakes.
+    A world without drag has none for any part. MuJoCo's laws are for all parts, fins and parts with
+    a damping of their own included. Under the drag law for flow across chains, thin parts and fins
+    have laws with a memory of their wakes.
     """
     if world.drag == "off":
         return "off"
@@ -157,7 +158,7 @@ def make_fluid_table(
         body: which moving body carries each.
         position: of each part's frame, body frame [m].
         rotation: of each part, body from part.
-        world: whose laws hold where a part has none of its own.
+        world: its laws are those of parts without one of their own.
     """
     parts, kind = layout.parts, layout.kind
     exposed, joined, ends, rows = exposure(layout)
@@ -188,7 +189,9 @@ def make_fluid_table(
     # Water that turns about an axis is pushed by the four faces beside it.
     added_inertia = beside(reached) / 2 * (scale * inertia)[kind]
     stated = np.array([p.fossen is not None for p in parts])[kind]
-    known = np.array([_NOTHING if p.fossen is None else p.fossen.added_mass for p in parts])[kind]
+    known = np.array([_ZERO_MATRIX if p.fossen is None else p.fossen.added_mass for p in parts])[
+        kind
+    ]
     known = known / (world.density or np.inf)
     factors = {
         name: np.array([dict(p.factors).get(name, 1.0) for p in parts])[kind]

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.level import Level, Parts, ThrusterMounts, is_present
+from mjx_revolve.engine.level import Level, Parts, ThrusterMounts
 from mjx_revolve.numerics.inertia import (
     BodyMotion,
     SpatialInertia,
@@ -31,6 +31,7 @@ from mjx_revolve.numerics.spatial import (
     add,
     cross,
     dot,
+    is_present,
     matTvec,
     matvec,
     mul,
@@ -176,17 +177,17 @@ def _immerse(world: World, parts: Parts, motion: BodyMotion, water: Water, wide:
     stream = _stream(world, water, motion, parts.position)
     velocity = vadd(motion.velocity, cross(motion.angular_velocity, parts.position))
     relative = velocity if stream.velocity is None else vsub(velocity, stream.velocity)
-    height, slope = water.surface_height, None
+    height, gradient = water.surface_height, None
     if world.waves:
         x, y, _ = _world_position(motion, parts.position)
-        height, slope = surface(world, water, x, y)
+        height, gradient = surface(world, water, x, y)
     below = sub(height, add(motion.height, dot(motion.z_axis, parts.position)))
     normal = motion.z_axis
-    if slope is not None:
+    if gradient is not None:
         # Distance to the surface's tangent plane, and its normal.
-        steep = jax.lax.rsqrt(1 + slope[0] * slope[0] + slope[1] * slope[1])
+        steep = jax.lax.rsqrt(1 + gradient[0] * gradient[0] + gradient[1] * gradient[1])
         below = below * steep
-        normal = _to_body(motion, (-slope[0] * steep, -slope[1] * steep, steep))
+        normal = _to_body(motion, (-gradient[0] * steep, -gradient[1] * steep, steep))
     up, depth = matTvec(parts.rotation, normal), wide(below)
     law = find_buoyancy_law(parts.laws.buoyancy)
     submerged, moment = law.submersion(up, depth, parts.half_size)
@@ -286,7 +287,7 @@ def _past(
 def _near_surface_slam(
     parts: Parts, carried: CarriedWater, flow: PartFlow, share: Vec, before: PreviousStep
 ) -> tuple[Vec, Vec]:
-    """Force and torque of the slam on parts along whose axes shares grow, part's axes."""
+    """Force and torque of the slam on parts, by the growth of wet shares along the part's axes."""
     k = parts.count
     then = tuple(before.submerged[i * k : (i + 1) * k] for i in range(3))
     turning = (turning_share(x, carried.mass, parts.half_size) for x in (share, then))

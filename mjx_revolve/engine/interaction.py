@@ -39,7 +39,7 @@ _SKIN, _ROBOT_SKIN = 0.08, 0.3
 # Factor by which a speed may grow within a step. A choice.
 _SPEED_MARGIN = 1.2
 # Pairs of robots tested together, pairs of spheres that they may add to the list, and pairs of
-# spheres whose forces are computed together: enough for vector registers, few enough that two
+# spheres with forces computed together: enough for vector registers, few enough that two
 # robots in contact do not cost as much as a crowd. Choices.
 _PAIRS, _FOUND, _PUSHED = 4, 512, 64
 # Room in the list for so many pairs of spheres per robot; more than heaps have. A choice.
@@ -330,7 +330,7 @@ def make_interaction(
         present: `[lanes]` whether a slot is taken; robots in empty slots have no effect.
         worlds: number of worlds, with equal numbers of slots.
         contact: parameters; None for robots that pass through each other.
-        tag: `[lanes]` by which robots can be told apart; None where no sensor sees the nearest.
+        tag: `[lanes]` number that identifies the robot; None if no sensor reads the nearest one's.
 
     Returns:
         The functions. There are loops of unknown length in them: they have forward derivatives
@@ -402,7 +402,7 @@ class _Contact:
         speed = jnp.sqrt(dot(frames.velocity, frames.velocity))
         turning = jnp.sqrt(dot(frames.angular_velocity, frames.angular_velocity))
         speed = jnp.max(speed + self.radius * turning, 0)
-        # Robots whose state is not finite have no contact.
+        # Robots with a state that is not finite have no contact.
         way = jnp.where(self.present & jnp.isfinite(speed), _SPEED_MARGIN * self.dt * speed, 0)
         neighbours = neighbours._replace(
             moved=neighbours.moved + jnp.max(jnp.where(neighbours.close, way, 0)),

@@ -43,7 +43,7 @@ def forward_kinematics(
         tree: the robots.
         state: their velocities relative to the uniform current.
         located: whether horizontal positions are needed.
-        dt: step whose midpoint velocities are needed [s]; 0 for none.
+        dt: timestep, for velocities at its midpoint [s]; 0 for none.
 
     Returns:
         The root's motion; (motion, rotation parent from child) of the bodies below it, as the tree

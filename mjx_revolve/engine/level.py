@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.numerics.spatial import Mat, Scalar, Sym, Vec
+from mjx_revolve.numerics.spatial import Mat, Scalar, Sym, Vec, is_present
 from mjx_revolve.water.added_mass import CarriedWater
 from mjx_revolve.water.buoyancy import find_buoyancy_law
 from mjx_revolve.water.drag import OFF, find_drag_law
@@ -29,11 +29,6 @@ from mjx_revolve.water.laws import PartDragLaw, law_numbers, part_field
 _SHAPE = "the robot's shape, which is known"
 _MEASURED = "thrusters keep their curves, which are measured"
 _INSIDE = "its own fields say"
-
-
-def is_present(x: Scalar) -> bool:
-    """Whether a number is more than a plain zero; what is traced counts as something."""
-    return isinstance(x, jax.Array) or bool(np.any(x))
 
 
 class PartLaws(NamedTuple):
@@ -84,7 +79,8 @@ class Hinges(NamedTuple):
         range: limits of the joint, low and high [rad].
         stop: stiffness of the end stops [N·m/rad].
         motor: the line between speed and torque near the top speed, far above any torque where
-            a servo has none: torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s].
+            a servo has none: torque at the top speed [N·m], gradient [N·m·s/rad], top speed
+            [rad/s].
         base_inertia: of all that is on the parent's side of the hinge, about its axis, at rest
             [kg·m²].
         lever: how far boxes of the robot can move for each radian, one seen from another [m]; 0

@@ -205,7 +205,7 @@ class MjxEngine:
         """The thrusters' commands behind their lag."""
         return state.command
 
-    # By the population engine's functions, whose rows of hinges are those of the levels.
+    # By the population engine's functions; their rows of hinges are those of the levels.
 
     def _state(self, state: MjxState) -> State:
         found = population.init(self.tree, state.qpos, state.qvel)
@@ -380,7 +380,7 @@ def _rigid(plan: MjxEngine, model: Any, data: Any, flow: _Flow) -> _Matrices:
     friction = jnp.asarray(plan.robot.mj_model.dof_damping, flow.qpos.dtype)
     resisted = flow.qvel if plan.tree.carries else 0.0
     force = data.qfrc_passive - data.qfrc_bias - friction * resisted
-    # The current's acceleration is felt as weight is.
+    # The current's acceleration acts like gravity.
     return _Matrices(mass, force - mass[:, :3] @ flow.acceleration)
 
 
@@ -532,13 +532,14 @@ def _contact_force(model: Any, data: Any, mass: jax.Array, smooth: jax.Array) ->
     and constraints): among accelerations a, the least of ½ (a - a₀)ᵀ M (a - a₀) plus the contacts'
     soft constraints on J a. Here a₀ is the acceleration that our scheme gives without contact, and
     M the symmetric part of the matrix that it solves with: inertia, carried water, and the implicit
-    drag, friction and servos of the step. So a contact pushes against what the water adds, and what
-    it asks of the velocity holds at the end of the step.
+    drag, friction and servos of the step. So a contact acts against added mass and drag, too, and
+    its constraint on the velocity holds at the end of the step.
 
-    Approximated: what turns momenta is antisymmetric and of the order of dt, no minimum can hold
-    it, and the solver does not see it; the step that takes the force in does, so momentum is kept
-    and it is the contact that gives way. How soft a contact is (`invweight`) comes from the dry
-    masses. A servo foresees its speed without the contact.
+    Approximated: the gyroscopic part of the matrix is antisymmetric and of the order of dt, so that
+    no minimisation can include it. The solver leaves it out, and the step that applies the force
+    includes it: momentum is conserved, and the constraint is met less exactly. The softness of a
+    contact (`invweight`) follows from the dry masses. A servo predicts its speed without the
+    contact.
 
     Args:
         model: MJX's.

@@ -32,8 +32,10 @@ _LEAST_CONTACTS = 32
 # Corners within this of the outermost lie flush with it [m].
 _FLUSH = 1e-3
 
-# Colour of a module whose YAML gives none (Revolve's default grey).
-_GREY = (0.5, 0.5, 0.5)
+# Colour of a module without one in its YAML (Revolve's default grey).
+GREY = (0.5, 0.5, 0.5)
+# Colour of a bed; a choice.
+SAND = (0.76, 0.70, 0.50)
 
 
 def compile_model(assembly: Assembly) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
@@ -79,7 +81,7 @@ def _add_bed(spec: mujoco.MjSpec, morphology: Morphology, world: World) -> None:
         return
     half, points = bed.extent / 2, 201
     common: dict[str, Any] = {"name": "bed", "contype": 0, "conaffinity": 0}
-    common["rgba"] = [0.76, 0.70, 0.50, 1.0]
+    common["rgba"] = [*SAND, 1.0]
     if bed.contact == "mjx":
         # Modules (contype 1) meet the bed (conaffinity 1), not each other. Its priority makes the
         # bed's friction count, not the larger of the two.
@@ -199,7 +201,7 @@ def _add_thruster(
     """A thruster as stock MuJoCo can have it: a filtered force at a site, linear in the command.
 
     Our engines take lag and limits from here and thrust from the thruster's own curve, which
-    MuJoCo cannot hold; its gain is the curve's slope between the ends of the command's range.
+    MuJoCo cannot represent; its gain is the mean gradient of the curve over the command's range.
     """
     thruster = part.thruster
     assert thruster is not None
@@ -227,7 +229,7 @@ def _add_geoms(
     body: Any, module: Module, part: Part, place: np.ndarray, turn: np.ndarray, world: World
 ) -> None:
     """One geom for each box; the first carries the part's mass and MuJoCo's ellipsoid."""
-    rgb = module.rgb if module.rgb is not None else _GREY
+    rgb = module.rgb if module.rgb is not None else GREY
     for k, box in enumerate(part.boxes):
         geom = body.add_geom(
             name=f"{module.name}/{part.name}" + (f"/{k}" if k else ""),

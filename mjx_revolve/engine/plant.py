@@ -1,7 +1,7 @@
-"""What control and tasks may know of a robot: its actuators as a table, and its size.
+"""The interface of a robot for controllers and tasks: its actuators as a table, and its size.
 
-The same for one robot, where the numbers are constants, and for many different ones, where they
-have the population on the last axis: so a controller or a task is written once for both.
+For one robot the numbers are constants; for many different ones they have the population on the
+last axis. So a controller or a task is written once for both.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class BodyGeometry(NamedTuple):
         length: largest extent at rest [m].
         stretched: largest extent that the body can reach; see `stretched_lengths` [m].
         weight: in air [N].
-        lowest: how far the rest pose reaches below the core's centre [m].
-        radius: how far it reaches from the core's vertical [m].
+        lowest: extent of the rest pose below the core's centre [m].
+        radius: extent of the rest pose from the core's vertical axis [m].
         sinks: whether the water carries less than half of its weight.
         num_hinges: how many hinges it has.
         up: `[3]` or `[3, lanes]` direction from the centre of mass to that of the displaced volume
-            at rest, core frame: what points up once the body hangs still in deep water. (0, 0, 1)
-            where the two are one.
+            at rest, core frame: it points up when the body is in equilibrium in deep water.
+            (0, 0, 1) if the two coincide.
         center: `[3]` or `[3, lanes]` centre of mass at rest, core frame [m].
     """
 
@@ -174,7 +174,7 @@ class Plant:
         source: `[n, lanes]` which of the robot's actuators a row is; past their end: none.
         first: `[num_pairs, lanes]` the row of the pair's earlier hinge; past the end: no pair.
         second: `[num_pairs, lanes]` of the later one.
-        mounts: places of sensors on types of modules, where some are asked for and robots differ.
+        mounts: positions of sensors on types of modules, for robots that differ.
         modules: places of all modules of one robot; None where robots differ.
         rate: of commands, held in between [Hz]; None: one for each of the world's steps.
     """

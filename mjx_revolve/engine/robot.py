@@ -43,23 +43,24 @@ class Robot:
     edited_spec: mujoco.MjSpec | None = field(default=None, repr=False)
 
     def __reduce__(self) -> Any:
-        """What it is made of; what follows from that is made anew. A spec cannot be pickled."""
+        """Pickles body, world and edited model; tables are made anew. A spec cannot be pickled."""
         return Robot, (self.morphology, self.world, self.edited_model)
 
     def with_model(self, model: mujoco.MjSpec | mujoco.MjModel) -> Robot:
         """The robot with an edited MuJoCo model: other masses, inertias, hinges and servos.
 
-        Both engines use these numbers. What follows from the modules' shapes, water and contact
-        points, stays; so bodies, hinges' places and axes, timestep and gravity must stay, too.
+        Both engines use these numbers. The tables of water and contact points follow from the
+        modules' shapes and are not changed; so an edit must not change bodies, hinges' positions
+        and axes, timestep or gravity.
 
         Args:
             model: `mj_spec` or a copy of `mj_model`, edited.
 
         Returns:
-            A new robot; this one stays as it is.
+            A new robot; this one is not changed.
 
         Raises:
-            InputError: MuJoCo refuses the model, or more was edited than that.
+            InputError: MuJoCo refuses the model, or something else was edited.
         """
         spec = model.copy() if isinstance(model, mujoco.MjSpec) else None
         try:
@@ -260,7 +261,7 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
 
 
 # Least mass [kg] and inertia [kg·m²] of a moving body for MuJoCo (mjMINVAL).
-_LEAST = 1e-15
+_MIN_MASS = 1e-15
 
 
 def _is_sound(kind: ModuleType) -> bool:
@@ -276,7 +277,7 @@ def _is_sound(kind: ModuleType) -> bool:
 def _is_heavy(part: Part) -> bool:
     """Whether its main box alone makes a body heavy enough."""
     x, y, _ = sorted(part.boxes[0].size)
-    return part.mass > _LEAST and part.mass / 12 * (x * x + y * y) > _LEAST
+    return part.mass > _MIN_MASS and part.mass / 12 * (x * x + y * y) > _MIN_MASS
 
 
 def export_mjcf(robot: Robot, path: str | Path) -> None:
@@ -294,7 +295,7 @@ def export_mjcf(robot: Robot, path: str | Path) -> None:
 
 # The speed at which a law that a step takes explicitly must still be stable [m/s]; servos, weight
 # and currents lead to a few tenths.
-_BRISK = 1.0
+_REFERENCE_SPEED = 1.0
 
 
 def check_timestep(robot: Robot, engine: str = "population") -> None:
@@ -333,10 +334,10 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
     for body in np.unique(table.body[explicit]):
         rows = explicit & (table.body == body)
         mass = assembly.mass[body] + world.density * table.carried_mass[rows].min(-1).sum()
-        # Twice ½ C_d A v, the slope of the force: the two laws have a C_d of 1 of their own,
+        # Twice ½ C_d A v, the derivative of the force by the speed: both laws have a C_d of 1,
         # whatever the parts' coefficients are.
-        slope = world.density * table.face_area[rows].max(-1).sum() * _BRISK
-        longest = 2 * mass / max(slope, 1e-30)
+        derivative = world.density * table.face_area[rows].max(-1).sum() * _REFERENCE_SPEED
+        longest = 2 * mass / max(derivative, 1e-30)
         if world.timestep > longest:
             raise InputError(
                 f"timestep: expected at most {longest:.2g} s, as drag: {world.drag} is explicit "

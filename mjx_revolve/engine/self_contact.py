@@ -47,7 +47,7 @@ from mjx_revolve.numerics.xla import fuse, materialize, take_lanes
 
 # Contacts of one robot at a time. A choice: few robots have more.
 _MOST = 8
-# Pairs that are looked at exactly at a time, and robots whose contacts are solved together: enough
+# Pairs that are tested exactly at a time, and robots with contacts solved together: enough
 # for vector registers. Few robots of a chunk have contacts at a time. Choices.
 _PAIRS, _ROBOTS = 32, 8
 # Pairs that are near which are listed at a time, where robots differ. A choice.
@@ -56,8 +56,8 @@ _ROOM = 2048
 _WORD = 32
 # What no contact needs [m/s²].
 _NONE = -1e9
-# Overlap that is let be [m], the share of the rest that is parted in a step, and the top speed of
-# that [m/s]. Choices.
+# Overlap that is tolerated [m], the share of the rest that is removed in a step, and the top speed
+# of that [m/s]. Choices.
 _SLOP, _SHARE, _TOP = 5e-4, 1.0, 1.0
 # Sweeps over the forces of several contacts, and the error at which they end [m]. Choices: one
 # sweep is exact for one contact.
@@ -178,7 +178,7 @@ def contact_acceleration(
 
 
 def _loop(count: Any, body: Callable[[jax.Array, Any], Any], carry: Any) -> Any:
-    """`fori_loop` from 0 whose number has 32 bits in either mode."""
+    """`fori_loop` from 0 with a counter of 32 bits in either mode."""
     return jax.lax.fori_loop(0, count, lambda k, x: body(jnp.asarray(k, jnp.int32), x), carry)
 
 
@@ -244,7 +244,7 @@ def any_lane(found: jax.Array) -> jax.Array:
 
 
 def _make_search(meetings: Meetings, bodies: Bodies) -> tuple[Any, Any]:
-    """Pairs whose bounding spheres overlap at the end of the step.
+    """Pairs with bounding spheres that overlap at the end of the step.
 
     Returns:
         A function: numbers of pairs → their two boxes. And one that looks at the next block:
@@ -451,7 +451,7 @@ class _Contacts:
         Contacts take part one after the other, the one that misses most first: a column of W is
         the response to its unit force. Those that take part are solved by projected Gauss-Seidel
         (cf. Cottle, Pang and Stone 1992, The Linear Complementarity Problem, chapter 5), which is
-        exact for one contact, and whose steps each lessen ½ λᵀ W λ - λᵀ need, and with it the
+        exact for one contact, and in which each step lessens ½ λᵀ W λ - λᵀ need, and with it the
         energy. A robot that is done stays as it is, whatever its neighbours in the batch need.
         """
         lanes = self.need.shape[-1]

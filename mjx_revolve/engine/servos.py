@@ -30,9 +30,9 @@ def servo(
 ) -> tuple[Scalar, Scalar]:
     """Torque of the position servos, and what an implicit step adds to the joints' inertia.
 
-    MuJoCo's position actuator, clip(k_p (target - q), ± effort), on a motor whose driver limits its
-    current: full effort up to three quarters of its top speed w, from there a line that the
-    joint's friction d q̇ meets at the top speed,
+    MuJoCo's position actuator, clip(k_p (target - q), ± effort), on a motor with limited current:
+    full effort up to three quarters of its top speed w, from there a line that equals the joint's
+    friction d q̇ at the top speed,
 
         τ ≤ d w + k (w - q̇),   k = (effort - d w) / (w / 4),
 
@@ -67,12 +67,12 @@ def servo(
     square = jnp.asarray(dt * dt, torque.dtype)
     yielding = mul(jnp.where(free, square, 0), hinges.implicit_stiffness)
     torque = jnp.clip(torque, low, high)
-    friction, slope, top = (_cast(x, torque) for x in hinges.motor)
+    friction, gradient, top = (_cast(x, torque) for x in hinges.motor)
     forward = jnp.sign(torque)
     rate, push = forward * speed, jnp.abs(torque)
 
     def line(x: Scalar) -> Scalar:
-        return friction + slope * (top - x)
+        return friction + gradient * (top - x)
 
     # The motor turns its base, too, the other way.
     per_base = dt / _cast(hinges.base_inertia, torque)
@@ -84,7 +84,8 @@ def servo(
     chord = (push - friction) / jnp.where(near, top - rate, 1)
     torque = jnp.where(beyond, forward * line(rate), torque)
     # Of curve and spring, the one that falls faster with the speed at the end of the step.
-    return torque, jnp.maximum(dt * jnp.where(beyond, slope, jnp.where(near, chord, 0)), yielding)
+    implicit = dt * jnp.where(beyond, gradient, jnp.where(near, chord, 0))
+    return torque, jnp.maximum(implicit, yielding)
 
 
 def motor_torque(

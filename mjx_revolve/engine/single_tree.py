@@ -1,6 +1,6 @@
-"""The tree of one robot, level by level, for steps whose tree is known while they are traced.
+"""The tree of one robot, level by level; the tree is static while a step is traced.
 
-Bodies at equal depth are stacked on the first axis, so that one operation moves all of them.
+Bodies at equal depth are stacked on the first axis, so that one operation acts on all of them.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class SingleTree:
         return jnp.concatenate(values) if self.below else jnp.zeros((0, *like.shape), like.dtype)
 
     def stack_saved(self, saved: Any, select: Callable[[Any], Any], like: jax.Array) -> Any:
-        """`[nhinge, lanes]` of what `select` takes; None without hinges."""
+        """`[nhinge, lanes]` of selected saved values; None without hinges."""
         if not self.below:
             return None
 
@@ -133,7 +133,7 @@ class SingleTree:
     def saved_at_lanes(
         self, saved: Any, select: Callable[[Any], Any], which: jax.Array
     ) -> tuple[Any, ...]:
-        """Columns of what `select` takes; what is the same in all lanes as it is."""
+        """Columns of selected saved values; values equal in all lanes are returned unchanged."""
         pick = lambda x: take_lanes(x, which) if np.shape(x)[-1:] not in ((), (1,)) else x  # noqa: E731
         return tuple(jax.tree.map(pick, select(level)) for level in saved)
 
@@ -148,7 +148,7 @@ class SingleTree:
         return groups
 
     def stack_parts(self, saved: Any, select: Callable[[Any], Any]) -> tuple[Any, ...]:
-        """What `select` takes of each level."""
+        """Selected saved values of each level."""
         return tuple(map(select, saved))
 
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:

@@ -1,7 +1,7 @@
-"""Places of modules on the rigid bodies of robots, for sensors at modules.
+"""Sites of sensors at modules: their poses on the rigid bodies of robots.
 
-A place is named "at ID", the module of that name of one robot, or "each TYPE", modules of a type
-wherever there are some, for one robot and for many different ones.
+A site is named "at ID", the module of that name of one robot, or "each TYPE", all modules of a
+type, for one robot and for many different ones.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ from mjx_revolve.numerics.spatial import Mat, Vec, clean
 )
 @dataclass(frozen=True)
 class Sites:
-    """Places on rigid bodies: one on each, `[1 + hinge rows, lanes]`, or a single one, numbers.
+    """Sites on rigid bodies: one on each, `[1 + hinge rows, lanes]`, or a single one, numbers.
 
-    Rigid bodies stand as `Engine.body_motions` has them: the core's, then what each hinge carries.
+    Rigid bodies are in the order of `Engine.body_motions`: the core's, then the one that each hinge
+    moves.
 
     Attributes:
-        there: 1 where there is such a place, else 0.
+        there: 1 where there is such a module, else 0.
         position: in the body's frame, that of `BodyMotion` [m].
         rotation: body from module.
         row: the body of a single place; None where there is one on each.
@@ -77,7 +78,7 @@ class ModuleSites:
             place: "at ID" or "each TYPE".
 
         Returns:
-            The place; of a type that the robot has nothing of, places that are not there.
+            The site; for a type that the robot lacks, `there` is 0 everywhere.
 
         Raises:
             InputError: there is no such module.

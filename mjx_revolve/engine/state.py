@@ -47,8 +47,8 @@ class State(NamedTuple):
             (the root's `[npart, 1, lanes]`, those of the bodies below it: `[npart, nbody, lanes]`
             for each level, or `[rows, npart, 1, lanes]`) [-]. Near the surface
             (`World.near_surface`) shares of what they carry along x, then y, then z. Behind them,
-            of parts whose drag law has a memory, `PartDragLaw.memory` rows of all parts each; empty
-            without added mass and memories.
+            of parts under a drag law with memory, `PartDragLaw.memory` rows of all parts each;
+            empty without added mass and memories.
         clearance: least distance by which boxes of a robot that can meet stay apart, `[lanes]` [m];
             not positive: unknown. Empty where robots differ or have no such boxes.
     """

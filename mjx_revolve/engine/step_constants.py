@@ -1,8 +1,8 @@
 """All numbers that the step needs of robots, one column for each body, part and point.
 
 Read from the assembly and its fluid table, for all bodies at a time; `select_bodies` then takes the
-columns of any bodies as the constants of a `Level`. Each kind of column ends, or for bodies begins,
-with one that stands for nothing: what rows and levels are padded with.
+columns of any bodies as the constants of a `Level`. Each kind of column ends (for bodies: begins)
+with a column without effect, which pads rows and levels.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class StepConstants(NamedTuple):
         part_laws: `[npart]` which of them each part obeys.
         part_body: `[npart]` bodies that carry them, as `Assembly` numbers them.
         point_body: `[npoint]` bodies of the contact points.
-        frame: `[nbody, 3, 3]` body frame from ours, whose z is the hinge.
+        frame: `[nbody, 3, 3]` body frame from the step's own frame, which has z along the hinge.
     """
 
     hinges: Hinges
@@ -92,7 +92,7 @@ def _skews(r: np.ndarray) -> np.ndarray:
 
 
 def _z_frame(axis: np.ndarray) -> np.ndarray:
-    """A rotation whose third column is the axis; a permutation where the axis allows it."""
+    """A rotation with the axis as its third column; a permutation for an axis along x, y or z."""
     axis = axis / np.linalg.norm(axis)
     k = int(np.argmax(np.abs(axis)))
     if abs(abs(axis[k]) - 1) < 1e-12:
@@ -166,7 +166,7 @@ def read_constants(assembly: Assembly) -> StepConstants:
 
 
 def hinge_frames(assembly: Assembly) -> np.ndarray:
-    """`[nbody, 3, 3]` body frame from ours, whose z is the hinge."""
+    """`[nbody, 3, 3]` body frame from the step's own frame, which has z along the hinge."""
     frames = {axis: _z_frame(np.array(axis)) for axis in set(map(tuple, assembly.axis.tolist()))}
     return np.array([frames[axis] for axis in map(tuple, assembly.axis.tolist())])
 
@@ -224,16 +224,16 @@ def motor_line(top: Any, effort: Any, damping: Any) -> tuple[np.ndarray, np.ndar
         damping: of the hinge [N·m·s/rad].
 
     Returns:
-        Torque at the top speed [N·m], slope [N·m·s/rad], top speed [rad/s]; where there is no
+        Torque at the top speed [N·m], gradient -dτ/dω [N·m·s/rad], top speed [rad/s]; without a
         limit, the line lies far above any torque.
     """
     limited = np.isfinite(top) & np.isfinite(effort)
     speed = np.where(limited, top, 1.0)
     friction = np.where(limited, damping * speed, NO_LIMIT)
-    slope = np.maximum(
+    gradient = np.maximum(
         (np.where(limited, effort, 0) - friction) / ((1 - TORQUE_CURVE_KNEE) * speed), 0
     )
-    return friction, np.where(limited, slope, 0.0), speed
+    return friction, np.where(limited, gradient, 0.0), speed
 
 
 def _base_inertias(assembly: Assembly) -> np.ndarray:

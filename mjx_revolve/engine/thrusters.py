@@ -24,8 +24,8 @@ from mjx_revolve.water.thrusters import (
     lagged_command,
 )
 
-# What stands where a robot has fewer thrusters than others.
-_NONE = Thruster(gain=0.0)
+# Padding where a robot has fewer thrusters than others.
+_PADDING = Thruster(gain=0.0)
 
 
 def curve_points(thruster: Thruster | None) -> int:
@@ -48,7 +48,7 @@ def read_thrusters(assembly: Assembly, count: int, points: int = 0) -> Thrusters
     owner = assembly.layout.body[rows]
     rank = counted(np.bincount(owner, minlength=robots))[1]
     disc = np.zeros((count, robots))
-    padded = [[_NONE] * count for _ in range(robots)]
+    padded = [[_PADDING] * count for _ in range(robots)]
     size = 2 * assembly.fluid.half_size[rows]
     for k, part in enumerate(assembly.thruster_part):
         assert part.thruster is not None
@@ -116,9 +116,9 @@ def run_thrusters(
     def cast(x: Any) -> Any:
         return x if isinstance(x, jax.Array) else np.asarray(x, ctrl.dtype)
 
-    asked = jnp.clip(ctrl, cast(thrusters.low), cast(thrusters.high))
-    after = lagged_command(lagged, asked, thrusters.kept)
-    acting = jnp.where(thrusters.delayed, lagged, asked)
+    clipped = jnp.clip(ctrl, cast(thrusters.low), cast(thrusters.high))
+    after = lagged_command(lagged, clipped, thrusters.kept)
+    acting = jnp.where(thrusters.delayed, lagged, clipped)
     push = dead_band_thrust(
         acting,
         *map(cast, (thrusters.backward, thrusters.forward)),

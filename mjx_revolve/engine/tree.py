@@ -69,7 +69,7 @@ class Tree(Protocol):
         """Joint values in the plant's order; `[0, lanes]`, as `like`, without hinges."""
 
     def stack_saved(self, saved: Any, select: Callable[[Any], Any], like: Array) -> Any:
-        """Numbers that `select` takes of what `forward_pass` saved, as from `join_rows`.
+        """Values that `select` takes from those saved by `forward_pass`, in the plant's order.
 
         None without hinges.
         """
@@ -78,7 +78,7 @@ class Tree(Protocol):
         """Some of the robots, for passes that read no constants of theirs."""
 
     def saved_at_lanes(self, saved: Any, select: Callable[[Any], Any], which: Array) -> Any:
-        """For some of the robots, what `select` takes of what a pass saved, as if saved so."""
+        """Values that `select` takes from those saved by a pass, for the lanes `which` only."""
 
     def hinge_positions(self, which: Array) -> Any:
         """Of some of the robots: joint values of the hinges' places in their parents' frames."""
@@ -87,10 +87,10 @@ class Tree(Protocol):
         """`[npart, nbody, lanes]` of each group of parts, as a pass saves them."""
 
     def stack_parts(self, saved: Any, select: Callable[[Any], Any]) -> tuple[Any, ...]:
-        """The inverse of `unstack_parts`, of what `select` takes of values that a pass saved."""
+        """The inverse of `unstack_parts`, for values that `select` takes from those of a pass."""
 
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
-        """`State.submerged` of parts that are wholly under water and have no past."""
+        """`State.submerged` of parts that are wholly under water, with memories of 0."""
 
     def map(self, fun: Callable[..., Any], *xs: Any) -> Any:
         """`fun` (level, a value of each of `xs`) for the bodies below the root, element-wise."""

@@ -2,7 +2,7 @@
 
 Robots of the same modules differ in the numbers of their steps only: coefficients, masses, servos,
 thrusters. Those numbers that differ are arguments of the program, `[..., lanes]`; the others stay
-constants. Any number that a morphology can state is varied so, and laws need know nothing of it.
+constants. Any number of a morphology can be varied in this way, without a change in the laws.
 """
 
 from __future__ import annotations

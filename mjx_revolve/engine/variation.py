@@ -1,8 +1,8 @@
-"""What is not known exactly of water and motors, as factors on the constants of a step.
+"""Uncertain coefficients of water and motors, as factors on the constants of a step.
 
 A law's coefficients are known to some tens of per cent, a motor's speed to ten. The factors are
-traced, so that one compiled program serves all their values; without any, the constants stay what
-they are and fold away.
+traced, so that one compiled program serves all their values; without factors the constants are
+Python numbers and fold away.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mjx_revolve.water.laws import scale_numbers
 
 
 class Variation(NamedTuple):
-    """Factors on what a world and its modules say, `[lanes]` or a number each; 1 changes nothing.
+    """Factors on coefficients of a world and its modules, `[lanes]` or a number each.
 
     Attributes:
         drag: on the coefficients of the faces' drag, and of drag and lift of plates (fins).
@@ -60,18 +60,18 @@ def vary_level(level: Level, variation: Variation) -> Level:
 
 def _vary_hinges(hinges: Hinges, motor: jax.Array) -> Hinges:
     """The line between speed and torque near another top speed; see `columns.motor_line`."""
-    friction, slope, top = hinges.motor
-    limited = np.not_equal(slope, 0) if not isinstance(slope, jax.Array) else slope != 0
+    friction, gradient, top = hinges.motor
+    limited = np.not_equal(gradient, 0) if not isinstance(gradient, jax.Array) else gradient != 0
     if not isinstance(limited, jax.Array) and not np.any(limited):
         return hinges
-    friction, slope, top = (_as(x, motor) for x in (friction, slope, top))
+    friction, gradient, top = (_as(x, motor) for x in (friction, gradient, top))
     effort = _as(hinges.effort[1], motor)
     steeper = jnp.maximum((effort - motor * friction) / ((1 - TORQUE_CURVE_KNEE) * motor * top), 0)
     # Where there is no limit, the line lies far above any torque, and stays there.
     return hinges._replace(
         motor=(
             jnp.where(limited, motor * friction, friction),
-            jnp.where(limited, steeper, slope),
+            jnp.where(limited, steeper, gradient),
             jnp.where(limited, motor * top, top),
         )
     )

@@ -71,7 +71,7 @@ class SelectionConfig(Settings):
     of the worst, if it is better; `nsga2`: by dominance and crowding; `map_elites`: the best of
     each cell of the archive; `random`: nothing is inherited, for comparison."""
     offspring: Annotated[Integer, Ge(1)] | None = None
-    """Children in a generation, λ; as many as `evolution.population_size`, μ, where not given."""
+    """Children in a generation, λ; by default `evolution.population_size`, μ."""
     tournament: Annotated[Integer, Ge(1)] = 2
     """The best of so many drawn individuals becomes a parent."""
     elites: Annotated[Integer, Ge(0)] = 1
@@ -82,7 +82,7 @@ class SelectionConfig(Settings):
     """Maximised, or with a minus before it minimised: `score`, `novelty`, or a measure or
     descriptor by name. `nsga2` takes several, all others one."""
     novelty: TupleOf[str] = ()
-    """Descriptors and measures in whose space `novelty` is the mean distance to neighbours."""
+    """Descriptors and measures: `novelty` is the mean distance to neighbours in their space."""
     neighbours: Annotated[Integer, Ge(1)] = 15
     """Number of neighbours."""
     passport: Literal["required", "made"] = "made"
@@ -126,7 +126,7 @@ class BodiesConfig(Settings):
     """Settings of evolving bodies."""
 
     genotype: Annotated[str, one_of(GENOTYPES), File("code")] = "tree"
-    """What bodies are grown from: a genotype of `docs/evolution.md`, or FILE.py:FUNCTION."""
+    """Representation of bodies: a genotype of `docs/evolution.md`, or FILE.py:FUNCTION."""
     modules: Annotated[TupleOf[str], MinLen(1)] = ("FixedBrick", "ActiveHinge")
     """Types of modules that bodies are grown of, beside the core."""
     core: Annotated[str, MinLen(1)] = "Core"

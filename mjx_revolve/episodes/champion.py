@@ -1,7 +1,6 @@
-"""An episode to look at: of a run's champion, of one of its individuals, or of a morphology.
+"""Episodes for replays, reports and exports: of a champion, an individual, or a morphology.
 
-Replays, reports and exports all start here, so that each shows the same swim: the first of the
-fresh starts on which the champion was judged.
+They all show the same episode: the first of the fresh starts on which the champion was evaluated.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.flow import Water, gust_path
 from mjx_revolve.water.world import load_world
 
-# How long a morphology without a task is shown [s].
+# Duration of the episode of a morphology without a task [s].
 _SECONDS = 10.0
 
 
@@ -53,16 +52,16 @@ class Episode:
     """An episode of one robot.
 
     Attributes:
-        title: a few words to head a picture.
+        title: of pictures.
         robot: the compiled robot; its world is `robot.world`.
-        trajectory: what it did.
-        score: its mean score, or None.
+        trajectory: of the robot.
+        score: mean score, or None.
         score_unit: of the score, e.g. "body lengths/s"; "" without one.
-        water: surface and current along the way, where they are not just the world's.
+        water: surface and current at each row; None: the world's.
         genes: `[G]` or None without a controller.
-        fitness: what the genes were evolved for, or None.
+        fitness: of the run, or None.
         folder: the run folder, or None.
-        starts: over which the score is the mean.
+        starts: number of starts over which the score is the mean.
     """
 
     title: str
@@ -91,14 +90,11 @@ def load_episode(
 
     Args:
         path: a run folder, its `champion` folder, a `genes.yaml`, or a morphology. A morphology is
-            trimmed neutral where it can be, starts 1 m below the surface, and holds its hinges at
-            0.
-        world: of a morphology, by default the lake; None for a champion, which swims in the world
-            that it evolved in.
+            trimmed neutral if possible, starts 1 m below the surface, and holds its hinges at 0.
+        world: of a morphology, by default the lake; None for a champion: its run names its own.
         duration: [s]; by default the task's, or 10.
-        seed: draws another start than the first on which the champion was judged.
-        individual: number of an individual of the run, in place of the champion, where
-            bodies have evolved.
+        seed: draws another start than the first on which the champion was evaluated.
+        individual: number of an individual, in place of the champion, if bodies have evolved.
         modules: of a morphology: a YAML of module types of the user's own (see
             `catalogue.load_modules`); None for a champion: its run names its own.
 
@@ -106,8 +102,8 @@ def load_episode(
         The episode.
 
     Raises:
-        InputError: there is no champion or individual, a file holds something else, or it is to
-            swim in another world or be made of other modules.
+        InputError: there is no champion or individual, a file has another content, or a world or
+            modules are given for a run.
     """
     path = check_path(path)
     if individual is not None:
@@ -129,7 +125,7 @@ def load_episode(
     water = load_world("lake" if world is None else world)
     own = {} if modules is None else load_modules(modules)
     morphology = load_morphology(path, MODULES | own)
-    with suppress(InputError):  # what floats, floats
+    with suppress(InputError):  # a robot that floats stays as it is
         morphology = trim_neutral(morphology, water.density)
     robot = build_robot(morphology, water)
     key = None if seed is None else jax.random.key(seed)
@@ -202,7 +198,7 @@ def champion_number(folder: Path) -> int:
 
 
 def _key(config: Config, seed: int | None) -> jax.Array:
-    """What draws the start: by default the first one on which the champion was judged."""
+    """The key of the start: by default the first one on which the champion was evaluated."""
     return replay_key(config.evolution.seed) if seed is None else jax.random.key(seed)
 
 
@@ -258,7 +254,7 @@ def load_individuals(
         seed: as for `load_episode`.
 
     Returns:
-        Their episodes, up to rounding as `load_episode` has them, with fewer rows.
+        Their episodes, equal to those of `load_episode` up to rounding, with fewer rows.
 
     Raises:
         InputError: as `load_episode`.

@@ -1,8 +1,8 @@
 """Settings of a colony, robots that evolve in one world: `colony` in a configuration.
 
-After Revolve's online evolution (the "triangle of life": Eiben et al. 2013, ECAL), whose numbers
-are the order of magnitude of those here: 10 to 75 robots, meeting within 1 m, 2 to 6 children a
-pair, clinics 2 to 4 m across.
+After Revolve's online evolution (the "triangle of life": Eiben et al. 2013, ECAL), with defaults of
+the same order of magnitude: 10 to 75 robots, mating within 1 m, 2 to 6 children for each pair,
+birth clinics 2 to 4 m across.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ArenaConfig(Settings):
     size: Annotated[Positive, Unit("m")] = 16.0
     """Edge of the square [m]."""
     depth: Annotated[Positive, Unit("m")] = 6.0
-    """Robots whose cores sink below this are lost [m]."""
+    """A robot with its core below this depth is lost [m]."""
     edge: Literal["wrap", "lost"] = "wrap"
     """A robot that leaves the square comes back in on the other side (`wrap`), or is lost."""
 
@@ -47,7 +47,7 @@ class BirthConfig(Settings):
     initial: Annotated[Integer, Ge(1)] = 16
     """Robots at the beginning, all over the arena."""
     least: Annotated[Integer, Ge(0)] = 8
-    """Where fewer robots are alive, random ones without parents are born."""
+    """If fewer robots are alive, random ones without parents are born."""
 
 
 class MatingConfig(Settings):
@@ -56,7 +56,7 @@ class MatingConfig(Settings):
     distance: Annotated[Positive, Unit("m")] = 1.0
     """Between cores, at which two robots meet [m]."""
     likeness: Share = 0.5
-    """The less fit one needs at least this share of the other's fitness [-]."""
+    """Least fitness of the less fit robot, as a share of the other's [-]."""
     adult: Annotated[NonNegative, Unit("s")] = 60.0
     """Age from which robots mate [s]."""
     children: Annotated[Integer, Ge(1)] = 4
@@ -73,7 +73,8 @@ class LifeConfig(Settings):
     path: NonNegative = 1.0
     """Weight of the path's speed [s/m]."""
     limit: Annotated[Positive, Unit("m/s")] = 1.0
-    """A robot that is faster along its path is thrown about, not swimming: fitness 0 [m/s]."""
+    """A robot that is faster along its path is thrown by contacts, not swimming: fitness 0
+    [m/s]."""
     max_age: Annotated[Positive, Unit("s")] = 1800.0
     """Age at which a robot of full fitness dies [s]."""
     full_fitness: Annotated[Positive, Unit("-")] = 0.1
@@ -98,7 +99,7 @@ class EnergyConfig(Settings):
     most: Annotated[NonNegative, Unit("W")] = 0.2
     """Most power that a robot gets [W]."""
     reach: Annotated[Positive, Unit("m")] = 1.0
-    """Distance r beyond which it gets less, as (r/d)² [m]."""
+    """Distance r beyond which the power falls as (r/d)² [m]."""
 
 
 class ColonyConfig(Settings):

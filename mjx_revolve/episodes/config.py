@@ -1,8 +1,8 @@
 """The configuration of a run: a small YAML file, checked before anything expensive starts.
 
-A file names the robot and the world, its controller, its task and how it is evolved. `load_config`
-reads one, applies overrides, checks every value and resolves the paths; `dump_config` writes the
-resolved values back, so that a run folder documents itself.
+A file names robot, world, controller, task and settings of evolution. `load_config` reads it,
+applies overrides, checks every value and resolves the paths; `dump_config` writes the resolved
+values, so that a run folder documents itself.
 """
 
 from __future__ import annotations
@@ -62,8 +62,9 @@ from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
 from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.water.world import World, is_left_out
 
-# What a task cannot do without; `tasks.TASKS` has the tasks themselves.
+# Required settings of each task; `tasks.TASKS` has the tasks themselves.
 TASKS: dict[str, tuple[str, ...]] = {
     "directed_swim": (),
     "speed": (),
@@ -76,14 +77,16 @@ TASKS: dict[str, tuple[str, ...]] = {
     "follow_bed": ("height",),
     "crawl": (),
 }
-# What runs of versions without these settings had: their controllers gave a command at every step,
-# their robots' places were their cores', and their lengths those at rest.
+# Values in effect in runs of versions without these settings: a command at every step, positions of
+# robots at their cores, and lengths at rest.
 OLDER_TASK = {"point": "core", "length": "rest"}
 OLDER: dict[str, dict[str, Any]] = {
     "task": OLDER_TASK,
     "controller": {"rate": None, "between": "hold"},
 }
-# Those that have a target.
+OLDER_DRAG = "faces"
+"""The drag law of runs with none in their folder; newer folders state it (`with_drag`)."""
+# Tasks with a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
 
 
@@ -117,35 +120,36 @@ _Modules = Annotated[str, MinLen(1), words("the path of a YAML, or nothing")]
 
 
 class ControllerConfig(Section):
-    """What turns genes into joint targets."""
+    """Settings of the controller, which maps genes to joint targets."""
 
     type: Annotated[str, one_of(CONTROLLERS), File("code")] = "cpg"
     """`cpg`, `sine`, `feedback`, `mlp`, `rnn`, `sensory_cpg`, `splines`, `brain` (what the
     robot's YAML has under `brain`), or FILE.py:FUNCTION, a function of a plant and this section."""
     rate: Annotated[Positive, Le(1000), Unit("Hz")] | None = 20.0
-    """Commands in a second, as servos and Revolve have them; null: a new one at each of the world's
-    steps, as in runs of versions that had no rate [Hz]."""
+    """Commands in a second, as with real servos and in Revolve; null: a new one at each of the
+    world's steps, as in runs of older versions [Hz]."""
     between: Literal["hold", "ramp"] = "ramp"
-    """What targets do between commands: they `ramp` from the last command to this one, a period
-    late and without jerks, as boards that interpolate do it, or they are held (`hold`). Held ones
-    jerk the servos, and steps of 5 ms are too long for what the jerks are worth."""
+    """Targets between commands: `ramp`: they go linearly from the command before to the last one, a
+    period late and without jerks, as from boards that interpolate; `hold`: they are held. Held
+    targets jerk the servos, and steps of 5 ms are too long to resolve the jerks."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """The fastest oscillation, half of `rate` at most [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0
-    """Of each sine at most, as a fraction of the hinge's range, which clips their sum [-]."""
+    """Largest amplitude of each sine, as a fraction of the hinge's range, which clips their sum
+    [-]."""
     harmonics: Annotated[Integer, Ge(1), Le(8)] = 1
-    """How many sines add up at each hinge; `type: sine` only [-]."""
+    """Number of sines that are added at each hinge; `type: sine` only [-]."""
     gain: Annotated[Positive, Unit("-")] = 2.0
-    """Largest answer to an error of normal size, or to a sensor at the end of its range, as a
+    """Largest response to an error of normal size, or to a sensor at the end of its range, as a
     share of the range; `type: feedback` and `sensory_cpg` [-]."""
     depth: Annotated[NonNegative, Unit("m")] | None = None
-    """Depth that `type: feedback` holds; that of the task's start where none is given [m]."""
+    """Depth that `type: feedback` holds; by default that of the task's start [m]."""
     hidden: Annotated[Integer, Ge(1), Le(64)] = 8
     """Units of the network that all joints share; `type: mlp` and `rnn` [-]."""
     messages: Annotated[Integer, Ge(0), Le(8)] = 2
-    """How many numbers a joint sends to its neighbours; `type: mlp` and `rnn` [-]."""
+    """Number of values that a joint sends to its neighbours; `type: mlp` and `rnn` [-]."""
     points: Annotated[Integer, Ge(3), Le(100)] = 8
-    """Through which each joint's curve goes; `type: splines`, and `brain` where it has them [-]."""
+    """Points of each joint's curve; `type: splines`, and `brain` if it has such curves [-]."""
     sensors: SensorRow | None = None
     """The sensors of controllers, kinds' names or mappings with fields of `Sensor`; by default the
     robot's own `sensors`, or else `sensors.DEFAULT_SENSORS`."""
@@ -173,14 +177,14 @@ class ControllerConfig(Section):
 
 
 class RobustConfig(Settings):
-    """By what factor coefficients may be larger or smaller that are drawn anew for each trial.
+    """Largest factors by which coefficients are multiplied or divided, drawn anew for each trial.
 
-    Uniformly in the factor's logarithm, the same for all individuals.
+    Uniform in the factor's logarithm, the same for all individuals.
     """
 
     drag: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.5
-    """On the faces' drag, and on drag and lift of fins. Hoerner (1965, Fluid-Dynamic Drag) has .80
-    for a cube edge on, 1.17 for a plate, 2.05 for a long square rod; ours is 1.05 [-]."""
+    """On drag, and on drag and lift of fins. Hoerner (1965, Fluid-Dynamic Drag) has .80 for a cube
+    edge on, 1.17 for a plate, 2.05 for a long square rod; ours are 1.05, 1.17 and 1.75 [-]."""
     added_mass: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.35
     """On the water that is carried along. Of a cube .64 to .68 of its volume are measured, where
     Lamb's ellipsoid has .50 [-]."""
@@ -192,81 +196,82 @@ class RobustConfig(Settings):
 
 
 @also(OFF, {"const": True})
-def _read_robust(value: Any) -> Any:
-    """`true` as all usual ranges."""
+def _read_robust(value: object) -> object:
+    """`true` as the default range of each coefficient."""
     return {} if value is True else None if is_off(value) else value
 
 
 class TaskConfig(Section):
-    """What the robot is scored for, and how its episodes start."""
+    """Settings of the task: its score and how its episodes start."""
 
     type: Annotated[str, one_of(TASKS), File("code")]
-    """What is scored: a task, see the table above, or FILE.py:FUNCTION, a function like those."""
+    """A task of the table above, or FILE.py:FUNCTION, a function like those."""
     unit: Literal["body_lengths", "m"] = "body_lengths"
-    """What ways are measured in by tasks whose scores have body lengths in their unit. Where bodies
-    evolve, a body length is a choice of theirs: `m` compares them by what they swim."""
+    """Unit of lengths in scores that are in body lengths. If bodies evolve, so does their length:
+    `m` compares them by the distance in metres."""
     point: Literal["center_of_mass", "core"] = "center_of_mass"
-    """Whose way is scored and measured: the robot's centre of mass, without the water that it
+    """The point of scores and measures: the robot's centre of mass, without the water that it
     holds or carries, or the core's centre, which gains by being shaken. Sensors stay the core's."""
     length: Literal["stretched", "rest"] = "stretched"
-    """What a body length is: of the body stretched out, the longest way through it with its hinges
-    straightened (no fold makes that shorter), or the longest edge of its bounding box at rest."""
+    """The body length: `stretched`: the longest way through the body with its hinges straightened
+    (no fold makes that shorter); `rest`: the longest edge of its bounding box at rest."""
     duration: Annotated[Positive, Le(86_400), Unit("s")] = 10.0
     """Length of an episode, a day at most [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
-    """Time at the start of an episode that does not count; what counts begins with the sample
-    after it, 0.1 s later at most [s]."""
+    """Time at the start of an episode that does not count; scoring begins with the next sample, 0.1
+    s later at most [s]."""
     trials: Annotated[Integer, Ge(1)] = 2
     """Episodes averaged per individual, each from its own start [-]."""
     direction: Annotated[Vector, Unit("-")] = (1.0, 0.0, 0.0)
-    """Where to swim, world frame; the length does not matter [-]."""
+    """Direction to swim in, world frame; its length does not matter [-]."""
     target: Annotated[Vector, Unit("m")] | None = None
-    """Where to go, world frame; `reach_target`, `search` and `escape` need it, or
+    """Position of the target, world frame; `reach_target`, `search` and `escape` require it, or
     `target_distance` [m]."""
     target_distance: Annotated[Positive, Unit("m")] | None = None
-    """How far from the start the target is, at its depth, in a direction drawn for each episode;
-    in place of `target` [m]."""
+    """Distance of the target from the start, at the same depth, in a direction drawn for each
+    episode; in place of `target` [m]."""
     target_spread: Annotated[Positive, Le(math.pi), Unit("rad")] = math.pi
-    """Within which angle of the world's x axis, to both sides, that direction is drawn [rad]."""
+    """Largest angle between that direction and the world's x axis, to both sides [rad]."""
     target_speed: Annotated[NonNegative, Unit("m/s")] = 0.0
-    """How fast the target moves away, level, in a direction drawn for each episode [m/s]."""
+    """Speed of the target, horizontal, in a direction drawn for each episode [m/s]."""
     target_turn: Annotated[Positive, Le(100), Unit("rad/s")] | None = None
-    """Makes the target a pursuer, which swims at the robot with `target_speed` and turns this fast
-    at most; `escape` needs it [rad/s]."""
+    """Makes the target a pursuer, which heads for the robot at `target_speed` and turns at this
+    rate at most; `escape` requires it [rad/s]."""
     sight: Annotated[Positive, Unit("m")] | None = None
-    """The distance up to which the target is sensed, by default any; `search` needs it [m]."""
+    """The distance up to which the target is sensed, by default any; `search` requires it [m]."""
     touch: Annotated[Positive, Unit("m")] = 0.1
-    """How near the target touches the robot's `point`, for `search` and `escape` [m]."""
+    """Distance of the target from the robot's `point` at which they touch, for `search` and
+    `escape` [m]."""
     course_spread: Annotated[Positive, Le(math.pi), Unit("rad")] | None = None
-    """Within which angle of `direction`, seen from above, to both sides, each episode's course is
-    drawn; `follow_course` needs it [rad]."""
+    """Largest angle between each episode's course and `direction`, seen from above, to both sides;
+    `follow_course` requires it [rad]."""
     course_changes: Annotated[Integer, Ge(0), Le(16)] = 0
-    """How often in an episode the course turns at once, at moments drawn between `settle` and
+    """Number of sudden turns of the course in an episode, at times drawn between `settle` and
     `duration` [-]."""
     course_turn: Annotated[Positive, Le(math.pi), Unit("rad")] = math.pi
-    """By how much at most it then turns, to either side [rad]."""
+    """Largest angle of such a turn, to either side [rad]."""
     course_rate: Annotated[NonNegative, Le(10), Unit("rad/s")] = 0.0
-    """How fast at most the course turns all the time; rate and side are drawn for each episode
+    """Largest constant turning rate of the course; rate and side are drawn for each episode
     [rad/s]."""
     horizon: Annotated[Positive, Le(3600), Unit("s")] | None = None
-    """Over which time `speed` and `directed_swim` are foretold, if the robot goes on turning and
-    rising as it does from the first half of the episode to the second, the way being level; none:
-    what the episode itself shows [s]."""
+    """Time over which `speed` and `directed_swim` are extrapolated, if the robot continues to turn
+    and to rise as from the first half of the episode to the second; none: the episode itself is
+    scored [s]."""
     depth: Annotated[NonNegative, Unit("m")] = 2.0
     """Depth of the start below the surface; `crawl` starts on the bed instead, and `follow_bed`
     at `height` above it [m]."""
     height: Annotated[Positive, Unit("m")] | None = None
-    """Of the core at the start, then of the robot's `point`, above the bed; `follow_bed` needs it
-    [m]."""
+    """Height above the bed: of the core at the start, then of the robot's `point`; `follow_bed`
+    requires it [m]."""
     depth_tolerance: Annotated[Positive, Unit("m")] = 0.25
-    """How far from the start depth, or from `height`, still counts as keeping it [m]."""
+    """Largest distance from the start depth, or from `height`, that counts as keeping it [m]."""
     energy_weight: Annotated[NonNegative, Unit("1/J")] = 0.0
     """Score lost per joule of joint work [1/J]."""
     start_tilt: Annotated[NonNegative, Unit("rad")] = 0.1
     """Standard deviation of the start's roll and pitch [rad]."""
     start_attitude: Literal["level", "righted"] = "level"
-    """How the core stands before it is tilted: `level`, or `righted`, as the body comes to rest in
-    deep water, its centre of mass below that of its volume."""
+    """Attitude of the core before the tilt: `level`, or `righted`, the body's equilibrium in deep
+    water, with its centre of mass below that of its volume."""
     start_yaw: Annotated[NonNegative, Unit("rad")] = 0.0
     """Standard deviation of the start's heading [rad]."""
     start_position: Annotated[NonNegative, Unit("m")] = 0.0
@@ -277,7 +282,7 @@ class TaskConfig(Section):
     """`true`, or ranges: coefficients of water and motors are drawn anew in each generation, for
     each trial, the same for all individuals, so that champions do not live on one number."""
     measures: TupleOf[Annotated[str, AfterValidator(_check_measure)]] = ()
-    """What is measured beside what always is, names of `measure_table.MEASURES`."""
+    """Names of further measures, of `measure_table.MEASURES`."""
     params: Annotated[dict[str, Any], File("data")] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 
@@ -325,7 +330,7 @@ class TaskConfig(Section):
 
 
 class EvolutionConfig(Settings):
-    """How genes are searched for."""
+    """Settings of the search over genes."""
 
     strategy: Annotated[str, MinLen(1)] = "CMA_ES"
     """Name of an evosax strategy; `mjx_revolve.evolution.strategies.STRATEGIES` lists them."""
@@ -337,7 +342,7 @@ class EvolutionConfig(Settings):
     checkpoint_every: Annotated[Integer, Ge(1)] = 5
     """Generations between checkpoints."""
     keep_checkpoints: Annotated[Integer, Ge(1)] = 3
-    """How many of the newest checkpoints are kept."""
+    """Number of newest checkpoints that are kept."""
     tensorboard: bool = False
     """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
     passport: bool = True
@@ -348,14 +353,14 @@ class EvolutionConfig(Settings):
 
 @dataclass(frozen=True)
 class _Overrides:
-    """What was typed beside a file; a configuration with it equals one without.
+    """Overrides from the command line, for messages; they do not count in comparisons.
 
     Attributes:
         settings: values by dotted key.
         label: of messages about them.
     """
 
-    settings: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    settings: Mapping[str, object] = field(default_factory=dict, compare=False)
     label: str = field(default="", compare=False)
 
 
@@ -367,7 +372,7 @@ class Config(Settings):
     modules: Annotated[_Modules | None, File("modules")] = None
     """The user's own module types: a YAML, or None."""
     coefficients: Annotated[_Modules | None, File("modules")] = None
-    """What was fitted to a robot that swam, by types of modules: a YAML, or None."""
+    """Coefficients fitted to a real robot, by types of modules: a YAML, or None."""
     allow_overlap: bool = False
     """Whether modules may overlap."""
     trim: Literal["neutral", "none"] = "none"
@@ -409,7 +414,7 @@ class Config(Settings):
         return self
 
     def _check_colony(self) -> None:
-        """Refuses what a colony has no use for."""
+        """Refuses settings that a colony does not use."""
         if self.bodies is None:
             raise ConstraintError("bodies", "how bodies evolve, as there is a colony", "nothing")
         for name, usual in (("learning", LearningConfig()), ("selection", SelectionConfig())):
@@ -432,12 +437,12 @@ class Config(Settings):
         return self._source
 
     def origin(self, place: str) -> str:
-        """What a message about a setting begins with: the option that set it, or the file."""
+        """The beginning of a message about a setting: the option that set it, or the file."""
         typed = sets(self._overrides.settings, place)
         return f"{self._overrides.label} " if typed else f"{self._source}: "
 
     def blame(self, error: InputError) -> InputError:
-        """The same error with its place behind the option that set it, or behind the file."""
+        """The same error, its message prefixed by the option that set the value, or by the file."""
         label, text = self._overrides.label, str(error).removeprefix(f"{self._source}: ")
         if label and text.startswith(f"{label} "):
             return error
@@ -456,7 +461,7 @@ class Config(Settings):
         return tuple(found)
 
     def for_body(self, morphology: str | Path) -> Config:
-        """The same for one body alone, from a morphology's path; only its brain would evolve."""
+        """The configuration for the evolution of one body's brain, given a morphology's path."""
         return self.model_copy(update={"morphology": str(morphology), "bodies": None})
 
     @property
@@ -466,11 +471,11 @@ class Config(Settings):
 
     @property
     def subject(self) -> str:
-        """What is done and where, in words: `directed_swim in lake`."""
+        """Task and world in words: `directed_swim in lake`."""
         return f"{self.task.name} in {Path(self.world_name).stem}"
 
     @property
-    def world_overrides(self) -> dict[str, Any]:
+    def world_overrides(self) -> dict[str, object]:
         """Keyword arguments for `load_world(config.world_name, **config.world_overrides)`."""
         if isinstance(self.world, str):
             return {}
@@ -478,19 +483,19 @@ class Config(Settings):
 
 
 def make_config(
-    data: Mapping[str, Any],
+    data: Mapping[str, object],
     folder: str | Path = ".",
-    overrides: Mapping[str, Any] | Sequence[str] = (),
+    overrides: Mapping[str, object] | Sequence[str] = (),
     source: str = "config",
 ) -> Config:
     """Checks a mapping of settings.
 
     Args:
         data: the settings, nested like the YAML file.
-        folder: what relative paths in `data` start from. Relative paths in overrides start from
-            the current folder, because that is where they are typed.
+        folder: base of relative paths in `data`. Those in overrides are relative to the current
+            folder, as on the command line.
         overrides: see `load_config`.
-        source: what messages call the settings.
+        source: name of the settings in messages.
 
     Returns:
         The checked configuration, its paths absolute.
@@ -515,7 +520,7 @@ def make_config(
     except ValidationError as error:
         problems = find_problems(error, Config, merged)
         at = f"{label} {', '.join(settings)}: "
-        blamed = bool(settings) and _is_valid(data, folder)  # without what was typed
+        blamed = bool(settings) and _is_valid(data, folder)  # valid without the overrides
 
         def before(place: str) -> str:
             return at if blamed and not sets(settings, place) else origin(place)[1]
@@ -525,7 +530,7 @@ def make_config(
     return config
 
 
-def _is_valid(data: Mapping[str, Any], folder: str | Path) -> bool:
+def _is_valid(data: Mapping[str, object], folder: str | Path) -> bool:
     try:
         make_config(data, folder)
     except InputError:
@@ -550,7 +555,7 @@ def _resolve(file: NamedFile, folder: Path, before: str) -> str:
     return file.at(path)
 
 
-def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) -> Config:
+def load_config(path: str | Path, overrides: Mapping[str, object] | Sequence[str] = ()) -> Config:
     """Reads a configuration file.
 
     Args:
@@ -574,17 +579,30 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] =
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
-        data = with_older_values(data)
+        data = with_older_values(data, path.parent)
     return make_config(data, path.parent, overrides, short_path(path))
 
 
-def with_older_values(data: Mapping[str, Any]) -> dict[str, Any]:
+def with_older_values(data: Mapping[str, Any], folder: str | Path) -> dict[str, Any]:
     """A run folder's settings with the values that older versions had where they lack a setting."""
     own = {name: data.get(name) for name in OLDER}
-    return {**data} | {k: {**OLDER[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
+    found = {**data} | {k: {**OLDER[k], **x} for k, x in own.items() if isinstance(x, Mapping)}
+    if "world" in found:
+        found["world"] = with_drag(found["world"], OLDER_DRAG, folder)
+    return found
 
 
-def override_config(config: Config, overrides: Mapping[str, Any] | Sequence[str]) -> Config:
+def with_drag(world: Any, drag: str, folder: str | Path = "") -> Any:
+    """A world's settings with a drag law where neither they nor the world's file state one."""
+    given = {"name": world} if isinstance(world, str) else world
+    if not isinstance(given, Mapping) or "drag" in given or not isinstance(given.get("name"), str):
+        return world
+    beside = Path(folder) / given["name"]
+    left_out = is_left_out(beside if beside.is_file() else given["name"], "drag")
+    return {**given, "drag": drag} if left_out else world
+
+
+def override_config(config: Config, overrides: Mapping[str, object] | Sequence[str]) -> Config:
     """Applies overrides to a configuration that was already checked.
 
     Args:
@@ -618,5 +636,7 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
             return file.text
         return file.at(path.relative_to(root).as_posix())
 
-    data = map_files(copy_plain(config.model_dump()), shorten, Config)
+    data = copy_plain(config.model_dump())
+    data["world"] = with_drag(data["world"], World.drag)
+    data = map_files(data, shorten, Config)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None)

@@ -17,7 +17,7 @@ from mjx_revolve.water.world import load_world
 
 
 def check_episode_files(arguments: argparse.Namespace) -> None:
-    """Reads what `champion.load_episode` will read first.
+    """Checks the files that `champion.load_episode` will read first.
 
     Args:
         arguments: with what `commands.add_episode_arguments` adds.

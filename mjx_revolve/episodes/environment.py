@@ -4,20 +4,19 @@ An `Environment` is two pure functions over environments on the last axis: `star
 `step` holds an action for a control period. Each lane is an episode of its own, with a clock of its
 own, that follows from its seed and the episode's number alone.
 
-**Reward.** The task's score so far, less that of the step before. The score so far is what the task
-would say if from now on nothing moved: rows of the track that are still to come repeat the present
-(no work is done in them, and the water is still). For progress along a direction that is the
-progress of the step; for what a task makes of the track as a whole, users' own tasks too, it is
-what the step has changed of it. It is 0 until the settling time is over. So the rewards of an
-episode add up to its score, the one that evolution sees: a shaping by a potential that begins at 0
-(Ng, Harada and Russell 1999, ICML).
+**Reward.** The difference of the score so far from that of the step before. The score so far is the
+task's score if nothing moved from now on: future rows of the track repeat the present one, without
+work and in still water. For progress along a direction, that is the progress in the step; for any
+other score of a whole track, users' own tasks included, it is the change by the step. It is 0 until
+the settling time is over. So the rewards of an episode add up to the score that evolution uses: a
+shaping by a potential that begins at 0 (Ng, Harada and Russell 1999, ICML).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -59,10 +58,10 @@ class EnvironmentState(NamedTuple):
 
 
 class StepResult(NamedTuple):
-    """What comes of a control step.
+    """The result of a control step.
 
     Attributes:
-        reward: see this module's head.
+        reward: the increase of `score` in the step.
         terminated: whether the rollout blew up; the rewards then add up to `scoring.WORST`.
         truncated: whether the episode's time is over.
         score: so far; the episode's where it is over.
@@ -138,7 +137,7 @@ class Environment:
         return jax.tree.map(lambda x: x[..., 0], draw_starts(task, fitness.world, key, steps))
 
     def _rollout(
-        self, starts: Starts, position: jax.Array, ctrl: jax.Array, clock: Any = None
+        self, starts: Starts, position: jax.Array, ctrl: jax.Array, clock: jax.Array | None = None
     ) -> Rollout:
         """A rollout under constant commands, `clock` timesteps after the start."""
         fitness, signals = self.fitness, self.observer.signals
@@ -164,8 +163,8 @@ class Environment:
             state: of the episodes.
 
         Returns:
-            The state, and numbers between -1 and 1 (see `sensors.Observer`); 0 for what is no
-            number, as in a rollout that blew up.
+            The state, and numbers between -1 and 1 (see `sensors.Observer`); 0 in place of NaN, as
+            in a rollout that blew up.
         """
         plant, episodes = self.fitness.engine.plant, state.episodes
         clock, seen = episodes.rollout.steps, episodes.rollout.controller_state
@@ -177,7 +176,7 @@ class Environment:
         order = np.argsort(plant.source[: plant.num_hinge_rows, 0])
         numbers += [x[row] for row in order for x in found.joint]
         whole = jnp.stack(numbers) if numbers else jnp.zeros((0, *time.shape), time.dtype)
-        # Rounding may leave the end of a range by the last bit.
+        # Rounding may exceed the end of a range by the last bit.
         whole = jnp.where(jnp.isfinite(whole), jnp.clip(whole, -1, 1), 0.0)
         episodes = episodes._replace(rollout=episodes.rollout._replace(controller_state=seen))
         return state._replace(episodes=episodes), whole
@@ -189,11 +188,11 @@ class Environment:
 
         Args:
             state: of the episodes.
-            action: between -1 and 1, in the robot's order: ends of each hinge's range of targets
-                and of each thruster's of commands, held for the period. What is beyond is clipped.
+            action: in the robot's order, held for the period; -1 and 1 are the ends of the range of
+                each hinge's targets and of each thruster's commands. Values beyond are clipped.
 
         Returns:
-            The state, and the result. Episodes that were over go on all the same.
+            The state, and the result. Episodes that were over are stepped, too.
         """
         fitness, episodes, plant = self.fitness, state.episodes, self.fitness.engine.plant
         share = plant.arrange(jnp.clip(action, -1, 1))
@@ -226,7 +225,7 @@ class Environment:
     def begin(
         self, seed: UInt[Array, " lanes"], episode: Int[Array, " lanes"]
     ) -> tuple[EnvironmentState, Float[Array, "k lanes"]]:
-        """Episodes at their starts, and what is observed there; see `start`."""
+        """Episodes at their starts (see `start`), and the observations there."""
         return self.observe(self.start(seed, episode))
 
     def step_and_restart(
@@ -251,13 +250,16 @@ class Environment:
         return state, seen, result, last
 
 
-def choose(mask: Bool[Array, " lanes"], new: Any, old: Any) -> Any:
+T = TypeVar("T")
+
+
+def choose(mask: Bool[Array, " lanes"], new: T, old: T) -> T:
     """Pytrees `[..., lanes]`, the new one where the mask is true."""
     return jax.tree.map(lambda a, b: jnp.where(mask, a, b), new, old)
 
 
 def make_environment(
-    fitness: Fitness, control_rate: float | None = None, sensors: Sequence[Any] | None = None
+    fitness: Fitness, control_rate: float | None = None, sensors: Sequence[object] | None = None
 ) -> Environment:
     """Makes the environment of a fitness.
 
@@ -265,15 +267,15 @@ def make_environment(
         fitness: from `make_fitness`; of its controller only the declared sensors are used.
         control_rate: actions in a second [Hz]; by default the one nearest to 20. Rows of the
             track, which tasks see every 0.1 s or so, hold a whole number of control periods.
-        sensors: as `controller.sensors` would have them; by default these, which only some types of
-            controllers may have, or else the robot's own, or else `sensors.DEFAULT_SENSORS`.
+        sensors: in the form of `controller.sensors`; by default those of the configuration, or else
+            the robot's own, or else `sensors.DEFAULT_SENSORS`.
 
     Returns:
         The environment.
 
     Raises:
-        InputError: such a rate is not possible, a sensor is none, there is nothing to act with, or
-            nothing to see.
+        InputError: such a rate is not possible, a sensor is wrong, or there are no actuators or no
+            sensors.
     """
     config, body = fitness.config, fitness.robot.morphology
     if config.engine != "population":

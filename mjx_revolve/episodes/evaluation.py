@@ -1,8 +1,8 @@
 """Scores of a population: the evaluation behind `Fitness` and `MixedFitness`.
 
-`EpisodeSpec` holds what all episodes of a configuration have in common; its two variants in
-`fitness` add one body, or room for many. An individual's episodes run in lanes of a chunk of fixed
-shape, so its score does not depend on the population around it.
+`EpisodeSpec` holds the common properties of all episodes of a configuration; its two subclasses in
+`fitness` add one body, or a capacity for many. An individual's episodes run in lanes of a chunk of
+fixed shape, so its score does not depend on the population around it.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.courses import course_path
@@ -63,6 +65,8 @@ from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.flow import Water, flow
 from mjx_revolve.water.world import World
 
+B = TypeVar("B")  # bodies: their tables, or () where the specification has one body
+
 
 class Chunk(NamedTuple):
     """A chunk of episodes before their first step.
@@ -101,8 +105,8 @@ class Episodes(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class EpisodeSpec(ABC):
-    """What all episodes of a configuration have in common.
+class EpisodeSpec(ABC, Generic[B]):
+    """The common properties of all episodes of a configuration.
 
     Attributes:
         config: what it was made from.
@@ -117,11 +121,11 @@ class EpisodeSpec(ABC):
     controller: Controller
 
     @abstractmethod
-    def _engine(self, bodies: Any, lanes: int, differentiable: bool) -> Engine:
-        """What steps bodies `[lanes]`."""
+    def _engine(self, bodies: B, lanes: int, differentiable: bool) -> Engine:
+        """The engine for bodies `[lanes]`."""
 
     @abstractmethod
-    def _geometry(self, bodies: Any) -> BodyGeometry:
+    def _geometry(self, bodies: B) -> BodyGeometry:
         """Sizes of bodies, `[lanes]` or one."""
 
     @property
@@ -155,7 +159,7 @@ class EpisodeSpec(ABC):
         return self.num_records * self.record_every
 
     def draw_starts(self, key: jax.Array) -> Starts:
-        """What a key's episodes start from, the same for all bodies."""
+        """The starts of a key's episodes, the same for all bodies."""
         return draw_starts(self.settings, self.world, key, self.num_timesteps)
 
     def precise_starts(self, population: jax.Array, key: jax.Array) -> Starts:
@@ -174,14 +178,14 @@ class EpisodeSpec(ABC):
         center = tuple(jnp.asarray(x, root.dtype) for x in geometry.center)
         return root[:3] + jnp.stack(matvec(quat_to_mat(tuple(root[3:7])), center))
 
-    def check_population(self, population: Any, ranks: tuple[int, ...] = (2,)) -> jax.Array:
+    def check_population(self, population: ArrayLike, ranks: tuple[int, ...] = (2,)) -> jax.Array:
         """A population as an array.
 
         Raises:
             InputError: it has another shape than `[P, num_genes]` (or, of rank 3, `[B, P,
                 num_genes]`), or there are no genes to evolve.
         """
-        shape, count = jnp.shape(population), self.num_genes
+        shape, count = np.shape(population), self.num_genes
         if len(shape) in ranks and shape[-1] == count and 0 not in shape:
             return jnp.asarray(population)
         if count == 0:
@@ -222,7 +226,7 @@ class EpisodeSpec(ABC):
 
     # ------------------------------------------------------------------ scores
 
-    def program(self, population: jax.Array, key: jax.Array) -> Any:
+    def program(self, population: jax.Array, key: jax.Array) -> PyTree:
         """A function of (bodies, population, key) that scores; compiled, unless it is traced."""
         check_key(key)
         return self._score if is_traced(population, key) else self._jitted
@@ -232,14 +236,14 @@ class EpisodeSpec(ABC):
         return self.keep(self._score, "score")
 
     def keep(
-        self, fun: Callable[..., Any], name: str, *more: Any, fast: bool = False
+        self, fun: Callable[..., PyTree], name: str, *more: object, fast: bool = False
     ) -> StoredProgram:
         """A compiled function of this specification, kept on disk unless a user's code is in it.
 
         Args:
             fun: the function.
-            name: tells it from others of this specification.
-            *more: what it depends on besides.
+            name: unique in this specification.
+            *more: further values that it depends on.
             fast: as of `xla.jit`.
         """
         config = self.config
@@ -251,10 +255,10 @@ class EpisodeSpec(ABC):
 
     @property
     @abstractmethod
-    def _bodies_key(self) -> Any:
-        """What programs depend on of the bodies."""
+    def _bodies_key(self) -> object:
+        """The properties of the bodies that compiled programs depend on."""
 
-    def _score(self, bodies: Any, population: jax.Array, key: jax.Array) -> Any:
+    def _score(self, bodies: B, population: jax.Array, key: jax.Array) -> PyTree:
         """Scores and measures `[P]` of a population of one body."""
         individual, trial = list_episodes(len(population), self.settings.trials)
         starts = self.precise_starts(population, key)
@@ -262,11 +266,11 @@ class EpisodeSpec(ABC):
         return average_trials(over_chunks(chunk)(individual, trial), self.settings.trials)
 
     def chunk_scores(
-        self, alike: bool, bodies: Any, population: jax.Array, starts: Starts
+        self, alike: bool, bodies: B, population: jax.Array, starts: Starts
     ) -> Callable[[jax.Array, jax.Array], Scores]:
         """A function of (individuals, their trials) `[lanes]` that scores these episodes."""
         score: Any = partial(self._score_chunk, alike, False)
-        if self.config.engine == "population":  # MJX's step is differentiated as it is
+        if self.config.engine == "population":  # MJX's step is differentiated by JAX itself
             score = differentiate_as(score, partial(self._score_chunk, alike, True))
         return partial(score, bodies, population, starts)
 
@@ -274,7 +278,7 @@ class EpisodeSpec(ABC):
         self,
         alike: bool,
         differentiable: bool,
-        bodies: Any,
+        bodies: B,
         population: jax.Array,
         starts: Starts,
         individual: Int[Array, " lanes"],
@@ -293,7 +297,7 @@ class EpisodeSpec(ABC):
         self,
         alike: bool,
         differentiable: bool,
-        bodies: Any,
+        bodies: B,
         population: jax.Array,
         starts: Starts,
         individual: Int[Array, " lanes"],
@@ -301,8 +305,8 @@ class EpisodeSpec(ABC):
     ) -> Chunk:
         """One chunk of episodes at their starts.
 
-        A chunk picks its own from what all chunks share, so that nothing is kept for each episode
-        of a population but its scores. `alike`: whether all individuals have one body.
+        A chunk selects its own starts and genes from those of all chunks, so that only scores are
+        kept for each episode of a population. `alike`: whether all individuals have one body.
         """
         own = (lambda x: x) if alike else (lambda x: x[..., individual])
         bodies = jax.tree.map(lambda x: own(jnp.asarray(x)), bodies)
@@ -350,10 +354,10 @@ class EpisodeSpec(ABC):
         context: EpisodeContext,
         clock: Int[Array, "..."],
     ) -> tuple[Float[Array, " lanes"], Array]:
-        """Scores of episodes under way, as if from now on nothing moved.
+        """Scores of episodes under way, if nothing moved from now on.
 
         Args:
-            track: rows to come repeat the present, as `scoring.extend_track` has them.
+            track: future rows repeat the present one, as from `scoring.extend_track`.
             position: of the robots at the start, from `start_point`.
             geometry: of the bodies.
             context: of the episodes.
@@ -401,7 +405,7 @@ class EpisodeSpec(ABC):
     def _complete(
         self, track: dict[str, jax.Array], context: EpisodeContext
     ) -> dict[str, jax.Array]:
-        """A track with target and course along the way, if the task asks for them."""
+        """A track with the paths of target and course, if the task records them."""
         interval = self.record_every * self.world.timestep
         time = interval * jnp.arange(1, self.num_records + 1, dtype=track["position"].dtype)
         track = dict(track)
@@ -415,7 +419,7 @@ class EpisodeSpec(ABC):
 
 
 def widen(now: RolloutState) -> RolloutState:
-    """A rollout state whose scalars have lanes."""
+    """A rollout state with its scalars broadcast to lanes."""
     lanes = now.energy.shape
     return jax.tree.map(lambda x: jnp.broadcast_to(x, lanes) if x.ndim == 0 else x, now)
 
@@ -425,7 +429,7 @@ def narrow(now: RolloutState, like: RolloutState) -> RolloutState:
     return jax.tree.map(lambda x, kind: x[..., 0] if kind.ndim == 0 else x, now, like)
 
 
-def as_precise(tree: Any, like: jax.Array) -> Any:
+def as_precise(tree: PyTree, like: jax.Array) -> PyTree:
     """The tree with its floats in the precision of `like`."""
     number = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
     cast = lambda x: x.astype(like.dtype) if number(x) else x  # noqa: E731
@@ -433,7 +437,7 @@ def as_precise(tree: Any, like: jax.Array) -> Any:
 
 
 def task_recorder(engine: Engine, task: Task, world: World) -> Recorder:
-    """Records fields of a `tasks.Track` for a task; a pursuer's place, where there is one."""
+    """The recorder of a task: fields of a `tasks.Track`, and the position of a pursuer, if any."""
 
     def record(now: RolloutState, ctrl: jax.Array, water: Water) -> dict[str, jax.Array]:
         root = engine.root(now.state)

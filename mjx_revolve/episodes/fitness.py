@@ -18,6 +18,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.coefficients import correct_types, load_coefficients
@@ -64,7 +66,7 @@ _TRACE_INTERVAL = 0.02
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fitness(EpisodeSpec):
+class Fitness(EpisodeSpec[tuple[()]]):
     """Scores of a population of one body: `fitness(population, key)`.
 
     Attributes:
@@ -82,19 +84,19 @@ class Fitness(EpisodeSpec):
         what = self.config.subject
         return f"Fitness({what}, {self.robot.morphology!r}, {self.num_genes} genes)"
 
-    def _engine(self, bodies: Any, lanes: int, differentiable: bool) -> Engine:
+    def _engine(self, bodies: tuple[()], lanes: int, differentiable: bool) -> Engine:
         return self.engine
 
-    def _geometry(self, bodies: Any) -> BodyGeometry:
+    def _geometry(self, bodies: tuple[()]) -> BodyGeometry:
         return self.geometry
 
     @property
-    def _bodies_key(self) -> Any:
+    def _bodies_key(self) -> object:
         body = self.robot.morphology
         listening = _listening(self.config, read_modules(self.config), body)
         return body, listening.model_dump_json()
 
-    def __call__(self, population: Any, key: jax.Array) -> jax.Array:
+    def __call__(self, population: ArrayLike, key: jax.Array) -> jax.Array:
         """Scores a population.
 
         Args:
@@ -106,7 +108,9 @@ class Fitness(EpisodeSpec):
         """
         return self.evaluate(population, key)[0]
 
-    def evaluate(self, population: Any, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def evaluate(
+        self, population: ArrayLike, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Scores and measures of a population.
 
         Args:
@@ -126,10 +130,10 @@ class Fitness(EpisodeSpec):
         return found
 
     def bare_controller(self) -> Controller:
-        """The controller as a device runs it: called at its rate, with exact sensors.
+        """The controller for a real device: called at its rate, with readings of real sensors.
 
-        It acts whenever it is called, and holds nothing; what it is given has the noise, the rate
-        and the delay of real sensors. It takes the same genes as the controller in the simulation.
+        It gives a command at each call and simulates no noise, rate or delay of sensors: its inputs
+        have those already. It takes the same genes as the controller in the simulation.
         """
         rate, plant = self.controller.rate, plant_of(self.robot)
         body = self.robot.morphology
@@ -141,7 +145,7 @@ class Fitness(EpisodeSpec):
             plant = plant.at_rate(rate)
         return _find_controller(self.config, settings, plant, body)
 
-    def replay(self, genes: Any, key: jax.Array, trial: int = 0) -> Trajectory:
+    def replay(self, genes: ArrayLike, key: jax.Array, trial: int = 0) -> Trajectory:
         """One episode of one individual, in full.
 
         Args:
@@ -168,7 +172,7 @@ class Fitness(EpisodeSpec):
         """Scores one episode, as evolution does, from its trajectory.
 
         Args:
-            trajectory: from `replay(genes, key)`, whole.
+            trajectory: from `replay(genes, key)`, all rows.
             key: draws its start.
 
         Returns:
@@ -197,10 +201,11 @@ class Fitness(EpisodeSpec):
         """The task and the measures of one lane, compiled once for all champions."""
 
         def run(
-            qpos: Any, qvel: Any, ctrl: Any, command: Any, energy: Any, water: Any, height: Any,
-            context: EpisodeContext, variation: Any, target: Any,
-        ) -> Any:  # fmt: skip
-            # The rows of the episode stand side by side, as if they were a population.
+            qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, command: jax.Array,
+            energy: jax.Array, water: Water, height: jax.Array,
+            context: EpisodeContext, variation: Variation | None, target: PyTree,
+        ) -> PyTree:  # fmt: skip
+            # The rows of the episode are the lanes, like a population.
             engine = with_variation(self.engine, variation)
             state = engine.init(qpos, qvel)
             if command.shape[0] and hasattr(state, "command"):
@@ -245,13 +250,13 @@ class Fitness(EpisodeSpec):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MixedFitness(EpisodeSpec):
+class MixedFitness(EpisodeSpec[PackedBodies]):
     """Scores of different bodies: `fitness(robots, population, key)`.
 
     Attributes:
         capacity: what the bodies must fit.
         touches: whether robots may come near the bed.
-        controller_settings: of the controller, with all sensors that there are.
+        controller_settings: of the controller, with all sensors.
     """
 
     capacity: Capacity
@@ -271,18 +276,18 @@ class MixedFitness(EpisodeSpec):
         return bodies.figure
 
     @property
-    def _bodies_key(self) -> Any:
+    def _bodies_key(self) -> object:
         return self.capacity, self.touches, self.controller_settings.model_dump_json()
 
     def build(self, morphology: Morphology) -> Robot:
-        """Compiles a body for this world, trimmed as the configuration says."""
+        """Compiles a body for this world, trimmed if the configuration says so."""
         return _build(self.config, self.world, morphology)
 
     def controller_of(self, body: Plant | Robot) -> Controller:
-        """The controller of one body alone, whose genes are named after its own joints."""
+        """The controller of one body alone, with genes named after its own joints."""
         return _find_controller(self.config, self.controller_settings, as_plant(body))
 
-    def pad_genes(self, genes: Any, robot: Robot) -> Any:
+    def pad_genes(self, genes: ArrayLike, robot: Robot) -> Any:
         """The genes of one body's own controller as this fitness takes them.
 
         Args:
@@ -304,7 +309,7 @@ class MixedFitness(EpisodeSpec):
         wide[..., indices] = genes
         return wide
 
-    def own_genes(self, genes: Any, robot: Robot) -> Any:
+    def own_genes(self, genes: ArrayLike, robot: Robot) -> Any:
         """The inverse: those of `[..., num_genes]` that a body's own controller takes."""
         genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
         return genes[..., self._indices(robot)]
@@ -313,13 +318,13 @@ class MixedFitness(EpisodeSpec):
         return gene_indices(self.controller_of(robot), self.controller)
 
     def __call__(
-        self, robots: Robot | Sequence[Robot] | PackedBodies, population: Any, key: jax.Array
+        self, robots: Robot | Sequence[Robot] | PackedBodies, population: ArrayLike, key: jax.Array
     ) -> Any:
         """Scores a population; arguments as in `evaluate`."""
         return self.evaluate(robots, population, key)[0]
 
     def evaluate(
-        self, robots: Robot | Sequence[Robot] | PackedBodies, population: Any, key: jax.Array
+        self, robots: Robot | Sequence[Robot] | PackedBodies, population: ArrayLike, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Scores and measures of a population.
 
@@ -354,7 +359,7 @@ class MixedFitness(EpisodeSpec):
         found = self.program(population, key)(bodies, population, key)
         return jax.tree.map(lambda x: x[0], found) if single else found
 
-    def _score(self, bodies: PackedBodies, population: jax.Array, key: jax.Array) -> Any:
+    def _score(self, bodies: PackedBodies, population: jax.Array, key: jax.Array) -> PyTree:
         starts, bodies = self.precise_starts(population, key), as_precise(bodies, population)
         if population.ndim == 2:
             return self._score_different(bodies, population, starts)
@@ -369,18 +374,20 @@ class MixedFitness(EpisodeSpec):
         trials = self.settings.trials
         individual, trial = list_episodes(population.shape[1], trials)
 
-        def run(own: tuple[PackedBodies, jax.Array]) -> Any:
+        def run(own: tuple[PackedBodies, jax.Array]) -> PyTree:
             chunk = self.chunk_scores(True, *own, starts)
             return average_trials(over_chunks(chunk)(individual, trial), trials)
 
         each = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), -1, 0)[..., None], bodies)
         return jax.lax.map(run, (each, population))
 
-    def _score_different(self, bodies: PackedBodies, population: jax.Array, starts: Starts) -> Any:
-        """Scores and measures `[P]` of a population whose bodies differ."""
+    def _score_different(
+        self, bodies: PackedBodies, population: jax.Array, starts: Starts
+    ) -> PyTree:
+        """Scores and measures `[P]` of a population of different bodies."""
         trials = self.settings.trials
         individual, trial = list_episodes(len(population), trials)
-        # A chunk takes as long as its largest body: those of a size share chunks.
+        # A chunk takes as long as its largest body: bodies of equal size share chunks.
         order = jnp.argsort(bodies.count, stable=True).astype(individual.dtype)
         chunk = self.chunk_scores(False, bodies, population, starts)
         scores = average_trials(over_chunks(chunk)(order[individual], trial), trials)
@@ -393,7 +400,7 @@ class MixedFitness(EpisodeSpec):
         return max(n for n in range(1, most + 1) if self.record_every % n == 0)
 
     def replay(
-        self, robots: Sequence[Robot], genes: Sequence[Any], key: jax.Array, trial: int = 0
+        self, robots: Sequence[Robot], genes: Sequence[ArrayLike], key: jax.Array, trial: int = 0
     ) -> list[Trajectory]:
         """One episode of each of many bodies, from the same start.
 
@@ -426,14 +433,16 @@ class MixedFitness(EpisodeSpec):
     def _trace(self) -> Any:
         """A function of (bodies, population, key, trials) that records whole episodes."""
 
-        def run(bodies: PackedBodies, population: jax.Array, key: jax.Array, trial: Any) -> Any:
+        def run(
+            bodies: PackedBodies, population: jax.Array, key: jax.Array, trial: jax.Array
+        ) -> PyTree:
             starts = self.precise_starts(population, key)
 
-            def trace(individual: jax.Array, trial: jax.Array) -> Any:
+            def trace(individual: jax.Array, trial: jax.Array) -> PyTree:
                 chunk = self.prepare(False, False, bodies, population, starts, individual, trial)
                 engine, every = chunk.rollout.engine, self.trace_every
 
-                def record(now: RolloutState, ctrl: jax.Array, water: Water) -> Any:
+                def record(now: RolloutState, ctrl: jax.Array, water: Water) -> PyTree:
                     qpos, qvel = engine.observe(now.state)
                     row = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl, "energy": now.energy,
                            "command": engine.thruster_command(now.state)}  # fmt: skip
@@ -502,7 +511,9 @@ def _own_trajectory(
 # ------------------------------------------------------------------ making them
 
 
-def make_fitness(config: Config | str | Path | Mapping[str, Any], **overrides: Any) -> Fitness:
+def make_fitness(
+    config: Config | str | Path | Mapping[str, object], **overrides: object
+) -> Fitness:
     """Builds the fitness function of a configuration.
 
     Args:
@@ -550,13 +561,13 @@ def fit_body(config: Config, morphology: Morphology) -> Fitness:
 
 
 def make_mixed_fitness(
-    config: Config | str | Path | Mapping[str, Any],
+    config: Config | str | Path | Mapping[str, object],
     examples: Sequence[Morphology],
     hinges: int = 0,
     rows: int = 0,
     kinds: Sequence[ModuleType] = (),
     modules: int = 0,
-    **overrides: Any,
+    **overrides: object,
 ) -> MixedFitness:
     """Builds the fitness function of a configuration for bodies of many kinds.
 
@@ -575,8 +586,8 @@ def make_mixed_fitness(
         The fitness function.
 
     Raises:
-        InputError: the configuration or the world is wrong, or asks for what only bodies of one
-            kind may have; the message says where.
+        InputError: the configuration or the world is wrong, or has a setting that requires bodies
+            of one kind; the message says where.
     """
     config = _read(config, overrides)
     if config.engine != "population":
@@ -590,7 +601,7 @@ def make_mixed_fitness(
     if not robots:
         raise InputError("examples: expected at least one morphology; found none")
     figures = [body_geometry(robot) for robot in robots]
-    if modules:  # what will come is no longer than this, and sinks only if one of its types does
+    if modules:  # no body is longer than this, and one sinks only if one of its types does
         types = {m.kind.name: m.kind for robot in robots for m in robot.morphology.modules}
         types |= {kind.name: kind for kind in kinds}
         longest = modules * max(_diagonal(kind) for kind in types.values())
@@ -599,7 +610,7 @@ def make_mixed_fitness(
         figures.append(figures[0]._replace(length=longest, sinks=sinks))
     reach = max(max_distance(config.task, world, figure) for figure in figures)
     touches = may_touch_bed(task, config.task, world, reach)
-    if config.colony is not None:  # a long life leads anywhere
+    if config.colony is not None:  # in a long life a robot may get anywhere
         touches = world.bed is not None
     shown = [*robots, *_show_kinds(kinds, robots, hinges)]
     _check_alike(config, examples)
@@ -614,9 +625,9 @@ def make_mixed_fitness(
 def _show_kinds(
     kinds: Sequence[ModuleType], robots: Sequence[Robot], hinges: int
 ) -> Iterator[Robot]:
-    """A core with a module of each type that the robots lack, so that there is room for its parts.
+    """Bodies with a module of each type that the robots lack, so that the capacity includes it.
 
-    Those with a hinge are left out where bodies may have none.
+    Types with a hinge are left out if bodies may have none.
     """
     known = {module.kind.name for robot in robots for module in robot.morphology.modules}
     bodies = [robot.morphology for robot in robots]
@@ -638,7 +649,7 @@ def _show_kinds(
 
 
 def _diagonal(kind: ModuleType) -> float:
-    """How long a module can make a body [m]: no less than its boxes, one behind the other."""
+    """An upper bound of the length that a module adds to a body [m]."""
     return sum(float(np.linalg.norm(box.size)) for part in kind.parts for box in part.boxes)
 
 
@@ -650,8 +661,10 @@ def read_modules(config: Config) -> Mapping[str, ModuleType]:
     return correct_types(modules, load_coefficients(config.coefficients), config.coefficients)
 
 
-def _read(config: Any, overrides: dict[str, Any]) -> Config:
-    """A configuration from whatever a user may give."""
+def _read(
+    config: Config | str | Path | Mapping[str, object], overrides: dict[str, object]
+) -> Config:
+    """A configuration from a `Config`, a path or a mapping, with overrides."""
     if isinstance(config, Config):
         if not overrides:
             return config
@@ -662,7 +675,7 @@ def _read(config: Any, overrides: dict[str, Any]) -> Config:
 
 
 def _place(config: Config) -> tuple[World, Task]:
-    """The world and the task, which must suit each other."""
+    """The world and the task, checked for compatibility."""
     try:
         world = load_world(config.world_name, **config.world_overrides)
     except InputError as error:
@@ -693,7 +706,7 @@ def _place(config: Config) -> tuple[World, Task]:
 
 
 def _check_robust(config: Config, world: World) -> None:
-    """Refuses to vary what cannot be varied."""
+    """Refuses `task.robust` for laws with coefficients that cannot be varied."""
     if config.task.robust is None:
         return
     if config.engine != "population":
@@ -704,7 +717,7 @@ def _check_robust(config: Config, world: World) -> None:
     if not find_drag_law(world.drag).varied:
         *most, last = (name for name, law in DRAG_LAWS.items() if law.varied)
         raise InputError(
-            f"{config.source}: task.robust: expected a world whose drag is {', '.join(most)} or "
+            f"{config.source}: task.robust: expected a world with drag {', '.join(most)} or "
             f"{last}, as MuJoCo's laws are not varied; found {world.drag}"
         )
 

@@ -1,7 +1,7 @@
-"""Our water as a pure environment, of one robot: `reset` and `step`, as brax has them.
+"""A pure environment of one robot, with `reset` and `step` as in brax.
 
-Both can be jitted, vmapped and scanned. Under `jax.vmap` the batch becomes the lanes that our step
-is made for; its states are those of one environment each, on the first axis.
+Both can be jitted, vmapped and scanned. Under `jax.vmap` the batch becomes the lanes of our step;
+states have the environments on the first axis.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jaxtyping import PyTree
 
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.environment import Environment, EnvironmentState, make_environment
@@ -23,15 +24,15 @@ from mjx_revolve.episodes.fitness import make_fitness
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class WaterState:
-    """An environment, with the names that brax has.
+    """State of an environment, with brax's names.
 
     Attributes:
         pipeline_state: of the episode.
         obs: `[k]` observation, between -1 and 1.
         reward: of the last step; 0 after `reset`.
         done: 1.0 if the last step ended the episode, else 0.0.
-        metrics: `score`: the task's so far, the episode's when it is over.
-        info: `truncation`: 1.0 if its time ended it; what others keep there stays.
+        metrics: `score`: the task's so far; at the end, the episode's.
+        info: `truncation`: 1.0 if the episode's time is over; entries of wrappers are kept.
     """
 
     pipeline_state: EnvironmentState
@@ -46,24 +47,27 @@ class WaterState:
         return replace(self, **changes)
 
 
-def _to_lanes(tree: Any) -> Any:
+T = TypeVar("T")
+
+
+def _to_lanes(tree: T) -> T:
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
 
 
-def _from_lanes(tree: Any) -> Any:
+def _from_lanes(tree: T) -> T:
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), tree)
 
 
-def _of_one(run: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of lanes as one of a single lane, whose batches become lanes."""
+def _of_one(run: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """A function of lanes as a function of a single lane; `jax.vmap` maps batches to lanes."""
 
     @custom_vmap
-    def single(*given: Any) -> Any:
+    def single(*given: PyTree) -> PyTree:
         lane = jax.tree.map(lambda x: x[..., None], given)
         return jax.tree.map(lambda x: x[..., 0], run(*lane))
 
     @single.def_vmap
-    def batch(size: int, batched: Any, *given: Any) -> Any:
+    def batch(size: int, batched: PyTree, *given: PyTree) -> PyTree:
         whole = jax.tree.map(
             lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *x.shape)),
             given, tuple(batched),
@@ -81,7 +85,7 @@ class FunctionalEnv:
         environment: that it steps.
         observation_size: numbers of an observation; `environment.observation_names` has them.
         action_size: numbers of an action; `environment.action_names` has them.
-        backend: of the physics, as brax asks for it.
+        backend: of the physics; part of brax's interface.
     """
 
     backend = "mjx_revolve"
@@ -92,7 +96,7 @@ class FunctionalEnv:
         self.observation_size = len(environment.observation_names)
         self.action_size = len(environment.action_names)
 
-        def advance(state: Any, action: Any) -> Any:
+        def advance(state: PyTree, action: jax.Array) -> PyTree:
             if auto_reset:
                 return environment.step_and_restart(state, action)[:3]
             moved, result = environment.step(state, action)
@@ -103,7 +107,7 @@ class FunctionalEnv:
 
     @property
     def unwrapped(self) -> FunctionalEnv:
-        """Itself, as brax asks for it."""
+        """The environment itself; part of brax's interface."""
         return self
 
     def reset(self, rng: jax.Array) -> WaterState:
@@ -123,12 +127,12 @@ class FunctionalEnv:
 
 
 def make_functional_env(
-    config: Config | str | Path | Mapping[str, Any],
+    config: Config | str | Path | Mapping[str, object],
     *,
-    sensors: Sequence[Any] | None = None,
+    sensors: Sequence[object] | None = None,
     control_rate: float | None = None,
     auto_reset: bool = False,
-    **overrides: Any,
+    **overrides: object,
 ) -> FunctionalEnv:
     """A pure environment of a configuration: `state = env.reset(key)`, `env.step(state, action)`.
 
@@ -140,14 +144,14 @@ def make_functional_env(
         sensors: as in `make_vector_env`.
         control_rate: as in `make_vector_env` [Hz].
         auto_reset: an episode that is over begins anew in the same step, as the next one of its
-            key; else it goes on unscored, and whoever steps it resets it.
+            key; if false, the caller resets it.
         **overrides: as `make_fitness` takes them.
 
     Returns:
         The environment.
 
     Raises:
-        InputError: the configuration is wrong, or has no one body.
+        InputError: the configuration is wrong, or evolves bodies.
     """
     fitness = make_fitness(config, **overrides)
     return FunctionalEnv(make_environment(fitness, control_rate, sensors), auto_reset)

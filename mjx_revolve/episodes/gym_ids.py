@@ -1,8 +1,8 @@
 """Gymnasium's ids of the shipped tasks: `gymnasium.make("mjx_revolve/LakeSwim-v0")`.
 
-Gymnasium knows no package by itself: `register_envs()` registers them, and so does importing this
-file, which `gymnasium.make("mjx_revolve.episodes.gym_ids:mjx_revolve/LakeSwim-v0")` does. Nothing
-heavy is imported before the first environment is made.
+`register_envs()` registers them with Gymnasium, and so does importing this file, as
+`gymnasium.make("mjx_revolve.episodes.gym_ids:mjx_revolve/LakeSwim-v0")` does. Nothing heavy is
+imported before the first environment is made.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ def register_envs() -> None:
 
 
 def make_env(config: Any, **settings: Any) -> Any:
-    """A single `gymnasium.Env`: an environment of `make_vector_env`, whose arguments it takes.
+    """A single `gymnasium.Env`, with the arguments of `make_vector_env`.
 
-    On a CPU it costs as much as 64 of them. What is over stays over until it is reset; `reset`
-    without a seed goes on to the seed's next episode.
+    On a CPU it costs as much as 64 environments. An episode that is over must be reset; `reset`
+    without a seed begins the seed's next episode.
     """
     from mjx_revolve.episodes.vector_env import make_vector_env
 
@@ -61,7 +61,7 @@ def make_env(config: Any, **settings: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def _make_class() -> type:
-    """The class, whose base is Gymnasium's."""
+    """The subclass of Gymnasium's `Env`, which is imported late."""
     from gymnasium import Env
 
     class WaterEnv(Env):
@@ -80,7 +80,7 @@ def _make_class() -> type:
             super().reset(seed=seed)
             return self.env.reset(seed=seed)[0][0], {}
 
-        def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
             """A control period; `score` in the infos of the last."""
             seen, rewards, terminated, truncated, infos = self.env.step(np.asarray(action)[None])
             info = {"score": float(infos["score"][0])} if infos else {}

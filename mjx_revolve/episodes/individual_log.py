@@ -84,8 +84,8 @@ class LoggedIndividual:
         number: unique in its run.
         parents: their numbers; of two, the first gave the body.
         born: generation of birth.
-        origin: how it came about.
-        score: of its best brain; NaN where every trial failed.
+        origin: the operation that made it.
+        score: of its best brain; NaN if every trial failed.
         features: score, measures and descriptors by name.
         text: its line of JSON, which holds its body and genes, too.
     """

@@ -1,7 +1,7 @@
-"""The measures of an episode by name: what they are called in texts, their units, what they need.
+"""The measures of an episode by name: names in texts, units, and the records that they require.
 
-Their formulas are in `measures.py`; this table is apart from them, so that a configuration can be
-checked without JAX.
+Their formulas are in `measures.py`; the table is separate, so that a configuration can be checked
+without JAX.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 
 class Measure(NamedTuple):
-    """What is said of a measure.
+    """Properties of a measure.
 
     Attributes:
         words: its name in texts.
         unit: of its values; "-" for a pure number.
-        record: what of a track it is made of, of `tasks.RECORDS`; "" for what all tracks have, so
-            that it is always there. Others are there where `task.measures` names them.
+        record: the one of `tasks.RECORDS` that it is computed from; "" for fields of every track.
+            Measures with "" are always computed, others only if `task.measures` names them.
     """
 
     words: str
@@ -51,5 +51,5 @@ MEASURES: dict[str, Measure] = {
 
 
 def records_of(names: Iterable[str]) -> tuple[str, ...]:
-    """What a track has to record for some measures, each once."""
+    """The records that some measures are computed from, each once."""
     return tuple(sorted({MEASURES[name].record for name in names} - {""}))

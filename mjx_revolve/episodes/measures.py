@@ -1,4 +1,4 @@
-"""What is worth knowing of an episode beside its score: `measure_table.MEASURES`, from a track."""
+"""The measures of an episode beside its score (`measure_table.MEASURES`), from a track."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FINER = 8
 # Joints that swing less than this do not move [rad].
 _STILL = 0.01
 # Phases of which less than this is left when they are added up are spread all round.
-_LEAST = 1e-3
+_MIN_BED_SHARE = 1e-3
 # A robot that the bed bears with less than this share of its weight does not touch it.
 _TOUCH = 1e-3
 
@@ -27,8 +27,8 @@ _TOUCH = 1e-3
 def measure(track: Track, names: Iterable[str] = ()) -> dict[str, jax.Array]:
     """Measures an episode.
 
-    Means are over the rows of the track, and differences from row to row, so that what happens
-    between two rows (0.1 s) goes unseen: frequencies up to 5 Hz are told apart.
+    Means are over the rows of the track, and differences from row to row, so that motion between
+    two rows (0.1 s) is not resolved: frequencies up to 5 Hz are distinguished.
 
     Args:
         track: the episode.
@@ -85,7 +85,7 @@ def _through_water(track: Track) -> dict[str, jax.Array]:
 
 
 def _gait(track: Track) -> dict[str, jax.Array]:
-    """How the hinges move together.
+    """Measures of the hinges' coordination.
 
     - `gait_frequency_hz`: where the angles' power spectra, summed over all hinges, are greatest (of
       the record less its mean, under Hann's window; at least two periods in the record). 0 where no
@@ -99,7 +99,7 @@ def _gait(track: Track) -> dict[str, jax.Array]:
     - `joint_amplitude_rad`: √2 times the angles' standard deviation, mean over the hinges: a sine's
       amplitude.
 
-    Hinges that a robot of a batch lacks hold still and so count nothing.
+    Hinges that a robot of a batch lacks have an amplitude of 0 and do not count.
     """
     angle = track.angle
     assert angle is not None
@@ -127,7 +127,7 @@ def _gait(track: Track) -> dict[str, jax.Array]:
     v = jnp.sum(waves * jnp.cos(turn)[:, None], 0)
     whole = jnp.sum(jnp.hypot(u, v), 0)
     left = jnp.hypot(jnp.sum(u, 0), jnp.sum(v, 0)) / jnp.maximum(whole, 1e-9)
-    spread = jnp.sqrt(-2 * jnp.log(jnp.clip(left, _LEAST, 1.0)))
+    spread = jnp.sqrt(-2 * jnp.log(jnp.clip(left, _MIN_BED_SHARE, 1.0)))
     lag = jnp.arctan2(
         jnp.sum(v[:-1] * u[1:] - u[:-1] * v[1:], 0), jnp.sum(u[:-1] * u[1:] + v[:-1] * v[1:], 0)
     )
@@ -142,7 +142,7 @@ def _gait(track: Track) -> dict[str, jax.Array]:
 
 
 def _attitude(track: Track) -> dict[str, jax.Array]:
-    """How the core turns and tilts.
+    """Measures of the core's attitude.
 
     - `turn_rate_rad_s`: turns about the vertical from row to row, summed, over time; positive where
       they are counter-clockwise from above. Each is the twist of swing and twist, < half a turn.
@@ -175,7 +175,7 @@ def _contacts(track: Track) -> dict[str, jax.Array]:
     }
 
 
-# By what they need a track to hold.
+# Measures by the record that they are computed from.
 _MAKERS = {
     "water": _through_water, "joints": _gait, "core": _attitude, "contacts": _contacts,
 }  # fmt: skip

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import yaml
+from jaxtyping import PyTree
 
 from mjx_revolve.control.controller import Controller, StepOutput
 from mjx_revolve.control.readings import SensorReadings
@@ -57,7 +58,7 @@ _OFTEN = 0.99
 
 # What is required. All are choices, with these reasons.
 KEPT = 0.8
-"""Least share of the score that is left over 30 and 120 s: who turns or rises loses all of it."""
+"""Least share of the score over 30 and 120 s: a robot that turns or rises loses all of it."""
 STEP = 0.1
 """Largest change of the score at half and a quarter of the step, as a share of it or of what the
 brain adds to it, whichever is more: half of what two measurements of one real robot differ by."""
@@ -166,7 +167,7 @@ def load_passport(path: Path) -> Passport:
                      for name, row in checks.items()})  # fmt: skip
 
 
-def _read_check(place: str, row: Any) -> Check:
+def _read_check(place: str, row: object) -> Check:
     if not isinstance(row, dict) or not isinstance(row.get("words"), str):
         raise InputError(f"{place}: expected words and a value; found {show(row)}")
 
@@ -335,7 +336,7 @@ def _scores(
     specs = {seconds: spec(seconds) for seconds in times}
     whole = replace(specs[times[-1]], controller=_silenceable(fitness.controller))
 
-    def run(genes: jax.Array, key: jax.Array) -> Any:
+    def run(genes: jax.Array, key: jax.Array) -> PyTree:
         starts = whole.precise_starts(genes, key)
         starts = jax.tree.map(lambda x: x[..., lanes.start], starts)
         starts = starts._replace(variation=jax.tree.map(jnp.asarray, lanes.variation))
@@ -374,10 +375,12 @@ def _score(spec: Fitness, chunk: Chunk, track: dict[str, jax.Array]) -> jax.Arra
 def _silenceable(controller: Controller) -> Controller:
     """A controller with one more gene: 0 keeps joints and thrusters at rest, 1 changes nothing."""
 
-    def decode(genes: jax.Array, plant: Plant) -> Any:
+    def decode(genes: jax.Array, plant: Plant) -> PyTree:
         return controller.decode(genes[:-1], plant), genes[-1]
 
-    def step(parameters: Any, state: Any, time: jax.Array, readings: SensorReadings) -> StepOutput:
+    def step(
+        parameters: PyTree, state: PyTree, time: jax.Array, readings: SensorReadings
+    ) -> StepOutput:
         own, active = parameters
         state, ctrl = controller.step(own, state, time, readings)
         return state, ctrl * active

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.readings import (
@@ -24,13 +24,14 @@ from mjx_revolve.engine.engines import Engine
 from mjx_revolve.engine.interaction import InteractionForces
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.numerics.inertia import BodyMotion
+from mjx_revolve.numerics.spatial import Scalar
 from mjx_revolve.numerics.xla import fuse, fuse_step
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
 
 
 class RolloutState(NamedTuple):
-    """State of a chunk of rollouts; of `advance`, all that one step leaves to the next.
+    """State of a chunk of rollouts between two steps.
 
     Attributes:
         state: of the engine.
@@ -40,8 +41,8 @@ class RolloutState(NamedTuple):
         steps: since the first one; time is exact however long the rollout.
     """
 
-    state: Any
-    controller_state: Any
+    state: PyTree
+    controller_state: PyTree
     memory: SensorMemory
     energy: Float[Array, " lanes"]
     steps: Int[Array, ""]
@@ -68,23 +69,23 @@ class Policy(Protocol):
 
     def __call__(
         self,
-        controller_state: Any,
+        controller_state: PyTree,
         time: Float[Array, "..."],
         readings: SensorReadings,
         ctrl: Float[Array, "n lanes"] | None,
         /,
-    ) -> tuple[Any, Float[Array, "n lanes"]]:
+    ) -> tuple[PyTree, Float[Array, "n lanes"]]:
         """(its state, time [s], readings, the step's open-loop input) → (its state, ctrl)."""
 
 
 class Recorder(Protocol):
-    """Selects what to keep of a rollout."""
+    """Selects the recorded values of a rollout."""
 
-    def __call__(self, now: RolloutState, ctrl: Float[Array, "n lanes"], water: Water, /) -> Any:
+    def __call__(self, now: RolloutState, ctrl: Float[Array, "n lanes"], water: Water, /) -> PyTree:
         """(state after a step, its ctrl, its water) → a pytree of arrays."""
 
 
-def controlled(controller: Controller, parameters: Any) -> Policy:
+def controlled(controller: Controller, parameters: PyTree) -> Policy:
     """The policy of a controller with decoded parameters."""
     return lambda state, time, readings, _: controller.step(parameters, state, time, readings)
 
@@ -95,13 +96,13 @@ def held(ctrl: Float[Array, "n lanes"]) -> Policy:
 
 
 def open_loop(
-    state: Any, time: Float[Array, "..."], readings: SensorReadings, ctrl: Any
-) -> tuple[Any, Float[Array, "n lanes"]]:
+    state: PyTree, time: Float[Array, "..."], readings: SensorReadings, ctrl: PyTree
+) -> tuple[PyTree, Float[Array, "n lanes"]]:
     """The policy of the commands in `StepInputs.ctrl`."""
     return state, ctrl
 
 
-def start_at_rest(engine: Engine, root: Float[Array, "7 lanes"]) -> Any:
+def start_at_rest(engine: Engine, root: Float[Array, "7 lanes"]) -> PyTree:
     """An engine's state at root poses, at rest, hinges at 0."""
     hinges = jnp.zeros((engine.plant.num_hinges, root.shape[-1]), root.dtype)
     qvel = jnp.concatenate([jnp.zeros_like(root[:6]), hinges])
@@ -140,23 +141,23 @@ class Rollout:
     clock: Int[Array, " lanes"] | None = None
     birth: Int[Array, " lanes"] | None = None
 
-    def init(self, state: Any, controller_state: Any = ()) -> RolloutState:
+    def init(self, state: PyTree, controller_state: PyTree = ()) -> RolloutState:
         """The state before the first step, of an engine's state and a policy's."""
         energy = jnp.zeros_like(self.engine.root(state).angular_velocity[0])
         memory = init_memory(self.signals, self.engine, state, self.context)
         return RolloutState(state, controller_state, memory, energy, jnp.zeros((), jnp.int32))
 
-    def _seconds(self, steps: Any, like: Float[Array, " lanes"]) -> Float[Array, "..."]:
+    def _seconds(self, steps: Scalar, like: Float[Array, " lanes"]) -> Float[Array, "..."]:
         return steps.astype(like.dtype) * self.world.timestep
 
-    def water_at(self, steps: Any, now: RolloutState, inputs: StepInputs) -> Water:
+    def water_at(self, steps: Scalar, now: RolloutState, inputs: StepInputs) -> Water:
         """The water a number of steps after `steps` 0, under the inputs of that step."""
         water = self.water if inputs.water is None else inputs.water
         if not self.world.waves:
             return water
         return water._replace(time=water.time + self._episode_time(steps, now))
 
-    def _episode_time(self, steps: Any, now: RolloutState) -> Float[Array, "..."]:
+    def _episode_time(self, steps: Scalar, now: RolloutState) -> Float[Array, "..."]:
         return self._seconds(steps if self.clock is None else self.clock + steps, now.energy)
 
     def read(
@@ -184,7 +185,7 @@ class Rollout:
 
     def act(
         self, now: RolloutState, inputs: StepInputs, forces: InteractionForces = NO_INTERACTION
-    ) -> tuple[Any, Float[Array, "n lanes"], Water, BodyMotion | None]:
+    ) -> tuple[PyTree, Float[Array, "n lanes"], Water, BodyMotion | None]:
         """The first half of a step: controller state, ctrl, water, and motion if remembered."""
         # One pass over the tree serves the readings and what is remembered of them.
         motion = self.engine.body_motions(now.state) if now.memory.past is not None else None
@@ -197,9 +198,9 @@ class Rollout:
     def update(
         self,
         now: RolloutState,
-        state: Any,
+        state: PyTree,
         power: Float[Array, " lanes"],
-        controller_state: Any,
+        controller_state: PyTree,
         ctrl: Float[Array, "n lanes"],
         motion: BodyMotion | None,
     ) -> RolloutState:
@@ -234,7 +235,9 @@ class Rollout:
         state, power = self.engine.step(now.state, ctrl, water, *wrench)
         return self.update(now, state, power, controller_state, ctrl, motion), ctrl
 
-    def record(self, recorder: Recorder, now: RolloutState, ctrl: Any, inputs: StepInputs) -> Any:
+    def record(
+        self, recorder: Recorder, now: RolloutState, ctrl: PyTree, inputs: StepInputs
+    ) -> PyTree:
         """The record after a step with these inputs."""
         return recorder(now, ctrl, self.water_at(now.steps - 1, now, inputs))
 
@@ -246,7 +249,7 @@ class Rollout:
         every: int = 1,
         inputs: StepInputs = NO_INPUTS,
         differentiable: bool = False,
-    ) -> tuple[RolloutState, Any]:
+    ) -> tuple[RolloutState, PyTree]:
         """Steps the rollouts, and records them at equal intervals.
 
         Args:
@@ -255,23 +258,23 @@ class Rollout:
             records: number of records.
             every: steps between them.
             inputs: `[records * every, ...]`.
-            differentiable: whether each step is computed again on the way back, so that memory
-                grows with the state and not with its working.
+            differentiable: whether each step is computed again in the backward pass
+                (checkpointing), so that only states are kept.
 
         Returns:
             The state after the last step, and the records, `[records, ...]` each.
         """
         step: Callable[..., Any] = self.step
-        pack: Callable[[Any], Any]
+        pack: Callable[[PyTree], PyTree]
         pack = unpack = lambda x: x
         # Interaction between robots is not element-wise, so it stays outside of the fused step.
         interaction = self.engine.interaction
-        neighbours: Any = () if interaction is None else interaction.init(now.state)
+        neighbours: PyTree = () if interaction is None else interaction.init(now.state)
 
-        def detect(state: Any, neighbours: Any) -> tuple[InteractionForces, Any]:
+        def detect(state: PyTree, neighbours: PyTree) -> tuple[InteractionForces, PyTree]:
             if interaction is None:
                 return NO_INTERACTION, neighbours
-            found: tuple[InteractionForces, Any] = interaction.detect(state, neighbours)
+            found: tuple[InteractionForces, PyTree] = interaction.detect(state, neighbours)
             return found
 
         if self.engine.elementwise and not differentiable:
@@ -283,13 +286,13 @@ class Rollout:
             if differentiable:
                 step = jax.checkpoint(step, prevent_cse=False)
 
-        def detect_and_step(carry: Any, row: StepInputs) -> tuple[Any, jax.Array]:
+        def detect_and_step(carry: PyTree, row: StepInputs) -> tuple[PyTree, jax.Array]:
             packed, neighbours = carry
             forces, neighbours = detect(unpack(packed).state, neighbours)
             packed, ctrl = step(packed, (row, forces))
             return (packed, neighbours), ctrl
 
-        def block(carry: Any, rows: StepInputs) -> tuple[Any, Any]:
+        def block(carry: PyTree, rows: StepInputs) -> tuple[PyTree, PyTree]:
             packed, neighbours = carry
             begun = unpack(packed)
             begun = pack(begun._replace(energy=jnp.zeros_like(begun.energy)))

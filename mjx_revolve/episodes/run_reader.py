@@ -1,8 +1,8 @@
 """The reader of run folders, whole or not: configuration, metrics, checkpoints, champion.
 
 A folder may lack files, hold damaged ones, or come from another version. Each file has one reader,
-which raises `InputError`; a report notes that and goes on. What writes run folders is
-`evolution.run_folder`.
+which raises `InputError`; a report notes that and goes on. `evolution.run_folder` writes run
+folders.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _CHECKPOINT = re.compile(r"generation_(\d+)\.npz")
 
 
 def find_run(path: str | Path) -> Path:
-    """The run folder that a path means: a run folder, or its `champion` folder.
+    """The run folder of a path: the path itself, or the parent of a `champion` folder.
 
     Raises:
         InputError: it is neither.
@@ -45,7 +45,7 @@ def find_run(path: str | Path) -> Path:
 
 
 def check_runs(names: Sequence[str | Path]) -> None:
-    """Refuses names of which nothing can be read as runs, or as sweeps.
+    """Refuses folders that hold no file of a run or a sweep.
 
     Raises:
         InputError: a folder is missing, or there is nothing of a run in any.
@@ -85,10 +85,10 @@ class RunReader:
 
     @property
     def is_finished(self) -> bool:
-        """Whether its champion was judged on fresh starts."""
+        """Whether its champion was evaluated on fresh starts."""
         return (self.path / "run.json").is_file() and "finished" in self.info
 
-    def load_config(self, **overrides: Any) -> Config:
+    def load_config(self, **overrides: object) -> Config:
         """The configuration, with settings replaced by their dotted names."""
         return load_config(self.path / "config.yaml", overrides)
 
@@ -254,7 +254,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
                 for name in file.files
                 if name.startswith("array:")
             }
-    # Whatever a damaged zip, header or JSON makes the readers raise.
+    # Errors that the readers raise for a damaged zip, header or JSON.
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError,
             NotImplementedError, MemoryError, SyntaxError) as error:  # fmt: skip
         raise DamageError((str(error) or type(error).__name__).splitlines()[0]) from None
@@ -300,7 +300,7 @@ class ChampionRecord:
             )
         return found
 
-    def load_config(self, **overrides: Any) -> Config:
+    def load_config(self, **overrides: object) -> Config:
         """The run's configuration; where bodies have evolved, of the champion's body alone.
 
         Raises:

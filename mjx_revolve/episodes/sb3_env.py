@@ -1,4 +1,4 @@
-"""Our vector environment as Stable-Baselines3 takes it, which has an interface of its own.
+"""The vector environment with Stable-Baselines3's interface.
 
 `stable_baselines3` is an extra, imported when the first environment is made.
 """
@@ -20,7 +20,7 @@ from mjx_revolve.numerics.xla import LANES
 
 @lru_cache(maxsize=1)
 def _make_class() -> type:
-    """The class, whose base is Stable-Baselines3's."""
+    """The subclass of Stable-Baselines3's `VecEnv`, which is imported late."""
     from stable_baselines3.common.vec_env import VecEnv
 
     class WaterVecEnv(VecEnv):
@@ -28,7 +28,7 @@ def _make_class() -> type:
 
         def __init__(self, env: Any) -> None:
             self.env = env
-            self.actions: Any = None
+            self.actions: np.ndarray | None = None
             super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
         def reset(self) -> np.ndarray:
@@ -37,7 +37,7 @@ def _make_class() -> type:
             self._reset_seeds()
             return self.env.reset(seed=seeds)[0]
 
-        def step_async(self, actions: Any) -> None:
+        def step_async(self, actions: np.ndarray) -> None:
             """Keeps the actions of the next step."""
             self.actions = actions
 
@@ -57,27 +57,29 @@ def _make_class() -> type:
             """Lets go of the state."""
             self.env.close()
 
-        def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        def get_attr(self, attr_name: str, indices: object = None) -> list[Any]:
             """An attribute, the same for all of them."""
             return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
-        def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-            """There is no environment by itself to set it of."""
+        def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
+            """Not supported: there are no single environments."""
             raise NotImplementedError
 
-        def env_method(self, method_name: str, *args: Any, indices: Any = None, **kw: Any) -> Any:
-            """There is no environment by itself to call."""
+        def env_method(
+            self, method_name: str, *args: object, indices: object = None, **kw: object
+        ) -> Any:
+            """Not supported: there are no single environments."""
             raise NotImplementedError
 
-        def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-            """None is."""
+        def env_is_wrapped(self, wrapper_class: object, indices: object = None) -> list[bool]:
+            """False for all."""
             return [False] * len(list(self._get_indices(indices)))
 
     return WaterVecEnv
 
 
 def make_sb3_env(
-    config: Config | str | Path | Mapping[str, Any], num_envs: int = LANES, **settings: Any
+    config: Config | str | Path | Mapping[str, object], num_envs: int = LANES, **settings: Any
 ) -> Any:
     """A `VecEnv` of Stable-Baselines3, for its PPO, SAC and others.
 

@@ -24,8 +24,8 @@ from mjx_revolve.water.world import World
 # infinities, and below anything that a task gives.
 WORST = -1e3
 
-# Nothing made of these modules swims or sinks this fast: servos, drag and weight allow a tenth of
-# it. An individual that gets further than this allows has blown up [m/s].
+# No robot of these modules swims or sinks this fast: servos, drag and weight allow a tenth of it.
+# A rollout that gets further than this speed allows counts as blown up [m/s].
 _FASTEST = 3.0
 
 # Recorded rates, which are 0 where nothing moves.
@@ -77,9 +77,9 @@ def first_scored_row(task: TaskConfig, timestep: float) -> int:
 def extend_track(
     track: Mapping[str, jax.Array], rows: Mapping[str, jax.Array], first: Int[Array, "..."]
 ) -> dict[str, jax.Array]:
-    """A track with new rows, the last of which stands in all rows to come.
+    """A track with new rows; all rows after them repeat the last one.
 
-    What still water and resting robots lack (`RATES`) is 0 in the rows to come.
+    Rates (`RATES`), which are 0 for robots at rest in still water, are 0 in the repeated rows.
 
     Args:
         track: `[S, ..., lanes]` each.
@@ -115,8 +115,8 @@ def max_distance(settings: TaskConfig, world: World, geometry: BodyGeometry) -> 
 def may_touch_bed(task: Task, settings: TaskConfig, world: World, reach: float) -> bool:
     """Whether the bed is within `max_distance` of an episode; if not, the step needs no contact.
 
-    That is what a robot at `_FASTEST` covers, plus its fall where the water does not carry it. An
-    individual that outruns it counts as blown up, so nothing can pass through an absent bed unseen.
+    `max_distance` is the way at `_FASTEST`, plus the fall of a robot that sinks. A rollout that
+    gets further counts as blown up, so no robot can pass through a bed that is left out.
     """
     if world.bed is None:
         return False

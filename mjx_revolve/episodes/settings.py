@@ -1,4 +1,4 @@
-"""What all sections of a configuration share: checking, and which of their values name files."""
+"""Base classes of a configuration's sections: checks, and the settings that name files."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from mjx_revolve.water.world import read_world_files
 
 @dataclass(frozen=True)
 class File:
-    """Marks a setting, as metadata of `Annotated`, whose texts are paths of files.
+    """Metadata of `Annotated` for settings that hold paths of files.
 
     Attributes:
-        kind: what the files are. `world` also marks names, and a mapping's `name` and
-            `current_field`; `code` marks names and FILE.py:FUNCTION; `data` marks the user's own
-            parameters, of which only absolute paths of files count.
+        kind: of file. A `world` may also be a name, or a mapping with `name` and `current_field`;
+            `code` is a name or FILE.py:FUNCTION; in `data`, a user's own parameters, only absolute
+            paths of files count.
     """
 
     kind: Literal["morphology", "modules", "world", "code", "data"]
@@ -82,18 +82,18 @@ class NamedFile(NamedTuple):
         return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-Change = Callable[[NamedFile], Any]
+Change = Callable[[NamedFile], object]
 
 
 def map_files(
-    settings: Mapping[str, Any], change: Change, model: type[BaseModel], within: str = ""
+    settings: Mapping[str, object], change: Change, model: type[BaseModel], within: str = ""
 ) -> dict[str, Any]:
     """Replaces the texts of all settings that name files.
 
     Args:
         settings: nested plain values, checked or not; they stay as they are.
-        change: file → what the setting becomes.
-        model: the section whose annotations say which settings name files.
+        change: file → the new value of the setting.
+        model: the section; its annotations mark the settings that name files.
         within: the dotted name of the section, with a dot.
 
     Returns:
@@ -121,7 +121,7 @@ def _is_section(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
-def _map_value(kind: str, place: str, value: Any, change: Change) -> Any:
+def _map_value(kind: str, place: str, value: object, change: Change) -> object:
     if isinstance(value, Mapping):
         paths = {key: f"{place}.{key}" for key in value}
         if kind == "world":
@@ -153,7 +153,7 @@ def _is_path(world: str) -> bool:
 
 
 def copy_files(
-    settings: Mapping[str, Any], model: type[BaseModel]
+    settings: Mapping[str, object], model: type[BaseModel]
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """All files that settings name, so that they can be moved together with the settings.
 
@@ -163,7 +163,7 @@ def copy_files(
 
     Returns:
         The settings with relative paths, below `inputs/`; the contents of the files by these paths.
-        Files keep their names, after which robots and worlds may be called.
+        Files keep their names, as robots and worlds may be named after them.
 
     Raises:
         InputError: a file cannot be read.
@@ -216,12 +216,12 @@ def find_copies(folder: Path) -> dict[str, Path]:
     """
     try:
         listed = json.loads((folder / "run.json").read_bytes()).get("inputs", {})
-    except (OSError, ValueError, AttributeError):  # told where the rest of it is needed
+    except (OSError, ValueError, AttributeError):  # reported by the reader of the other fields
         return {}
     found = {}
     for name, digest in listed.items() if isinstance(listed, dict) else ():
         path = resolve_inside(name, folder)
-        # A missing one is told where it is used.
+        # A missing one is reported where it is used.
         if path.is_file() and hashlib.sha256(read_file(path)).hexdigest() != digest:
             raise InputError(
                 f"{folder / name}: expected the file that the run began with; found it changed"
@@ -242,7 +242,7 @@ def one_of(names: Iterable[str]) -> Any:
 
 
 class Settings(BaseModel):
-    """Checked when it is made, and frozen."""
+    """A frozen section, checked when it is made."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
@@ -255,7 +255,7 @@ class Settings(BaseModel):
 
 
 class Section(Settings):
-    """A section whose `type` is one of ours, or a function in a user's own file."""
+    """A section with a `type`: one of the package's, or a function in a user's own file."""
 
     type: str
 
@@ -269,7 +269,7 @@ class Section(Settings):
         """Whether the type is a function in a user's own file."""
         return parse_user_function(self.type) is not None
 
-    def refuse_params(self, params: Mapping[str, Any]) -> None:
+    def refuse_params(self, params: Mapping[str, object]) -> None:
         """Raises `ConstraintError` for `params` of a type that is one of ours."""
         if params and not self.is_user_code:
             raise ConstraintError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import BoundController, Controller
 from mjx_revolve.control.readings import EpisodeContext
@@ -42,7 +45,7 @@ from mjx_revolve.water.flow import Water, water_of
 )  # fmt: skip
 @dataclass(frozen=True, repr=False)
 class Trajectory:
-    """What a robot did, one row after each step.
+    """Motion of one robot, one row after each step.
 
     Attributes:
         time: `[T]` [s]; the first row is one timestep after the start.
@@ -87,9 +90,9 @@ def _compiled(
     back = np.argsort(own[unvaried.plant.source[:, 0]]).astype(np.int32)
 
     def run(
-        qpos: Any,
-        qvel: Any,
-        drive_input: Any,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        drive_input: PyTree,
         water: Water | None,
         context: EpisodeContext,
         variation: Variation | None,
@@ -113,7 +116,7 @@ def _compiled(
         signals = () if controller is None else controller.signals
         rollout = Rollout(simulator, policy, robot.world, water_of(robot.world), context, signals)
 
-        def record(now: RolloutState, ctrl: jax.Array, water: Water) -> Any:
+        def record(now: RolloutState, ctrl: jax.Array, water: Water) -> PyTree:
             return now.state, ctrl, now.energy, now.memory.pursuer
 
         now = rollout.init(simulator.init(qpos[:, None], qvel[:, None]), controller_state)
@@ -143,11 +146,11 @@ def _compiled(
 
 def simulate(
     robot: Robot,
-    ctrl: Any = None,
+    ctrl: ArrayLike | BoundController | Callable[[jax.Array], ArrayLike] | None = None,
     duration: float | None = None,
     *,
-    qpos: Any = None,
-    qvel: Any = None,
+    qpos: ArrayLike | None = None,
+    qvel: ArrayLike | None = None,
     key: jax.Array | None = None,
     water: Water | None = None,
     engine: str = "population",
@@ -172,8 +175,7 @@ def simulate(
         water: surface and current, by default the world's; each a number or `[T]`, a row for each
             step. It replaces the world's gusts.
         engine: "population" or "mjx".
-        once: whether it is compiled in haste, as little is simulated by it: one is sooner done with
-            a minute or less.
+        once: compile quickly into a slower program; faster in all for a minute or less.
         context: of the sensors, a number each; by default no target, and noise that `key` draws.
         variation: factors on coefficients of water and motors, a number each; by default none.
 
@@ -261,7 +263,7 @@ def _steps(rows: Any, duration: float | None, dt: float) -> int:
     return max(1, round((5.0 if duration is None else duration) / dt))
 
 
-def _array(place: str, value: Any, shape: tuple[int, ...] | None) -> jax.Array:
+def _array(place: str, value: ArrayLike, shape: tuple[int, ...] | None) -> jax.Array:
     try:
         array = jnp.asarray(value, dtype=jnp.result_type(float))
     except (TypeError, ValueError):

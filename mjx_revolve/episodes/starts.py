@@ -1,9 +1,9 @@
-"""What differs from episode to episode: where robots start, and the water around them."""
+"""Random quantities of episodes: start poses, water, targets, courses, coefficients."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.spatial import quat_mul
+from mjx_revolve.numerics.spatial import Vec, quat_mul
 from mjx_revolve.water.flow import Water, gust_path, water_of
 from mjx_revolve.water.world import World
 
@@ -27,10 +27,10 @@ _SEA = 1000.0
 
 
 class Starts(NamedTuple):
-    """What differs between a key's episodes.
+    """Random quantities of a key's episodes.
 
     Attributes:
-        place: drawn around 0 [m]; the task makes a start position of it.
+        place: offset drawn around 0 [m], from which the task makes a start position.
         quat: of the core, world from body (w, x, y, z).
         water: `[trials]`; None where it does not vary.
         gusts: velocity around the episode's current [m/s]; None without.
@@ -52,8 +52,8 @@ class Starts(NamedTuple):
     course: Course | None = None
 
 
-def check_key(key: Any) -> None:
-    """Refuses what `jax.random` does not draw from, such as a bare seed.
+def check_key(key: object) -> None:
+    """Refuses anything but a key of `jax.random`, such as a seed.
 
     Args:
         key: from `jax.random.key`, or one of the older arrays of uint32.
@@ -95,7 +95,7 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
     full = jnp.full((trials,), 0.0, place.dtype)
     water = Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
     if world.waves:
-        # Episodes begin at any moment of the sea.
+        # Episodes begin at a random time of the waves.
         time_key = jax.random.fold_in(key, 2)
         water = water._replace(time=jax.random.uniform(time_key, (trials,), maxval=_SEA))
     water = jax.tree.map(lambda x: jnp.broadcast_to(x, (trials,)), water)
@@ -158,7 +158,7 @@ def episode_context(
     """
     like = position[0]
     wide = lambda x: jnp.full_like(like, x)  # noqa: E731
-    target: Any = None
+    target: Vec | None = None
     if starts.towards is not None:
         target = tuple(position + starts.towards)
     elif task.target is not None:
@@ -206,10 +206,10 @@ def start_pose(
     return jnp.concatenate([position, quat])
 
 
-def _righting(up: Any) -> tuple[Any, ...]:
+def _righting(up: Vec) -> tuple[jax.Array, ...]:
     """The least turn (w, x, y, z) that brings a direction, a unit vector, upright."""
     x, y, z = (jnp.asarray(component) for component in up)
-    # Half way round, where any horizontal axis would do, it is x.
+    # For half a turn any horizontal axis would do; x is used.
     over = jnp.where(z < -1 + 1e-6, 1.0, 0.0)
     w, x, y = (1 - over) * (1 + z), over + (1 - over) * y, -(1 - over) * x
     norm = jnp.sqrt(w * w + x * x + y * y)
@@ -233,7 +233,7 @@ def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Wa
         water: its current is that around which the gusts blow.
 
     Returns:
-        Water whose current and acceleration are `[steps, ...]`.
+        Water with current and acceleration `[steps, ...]`.
     """
     base = water_of(world) if water is None else water
     current = tuple(c + path[:-1, i] for i, c in enumerate(base.current))
@@ -280,7 +280,7 @@ def pick_water(world: World, starts: Starts, trial: int) -> Water | None:
     return gusty_water(world, starts.gusts[..., trial], water)
 
 
-def _euler_quat(roll: Any, pitch: Any, yaw: Any) -> jax.Array:
+def _euler_quat(roll: jax.Array, pitch: jax.Array, yaw: jax.Array) -> jax.Array:
     """`[4, n]` quaternion (w, x, y, z) of roll, then pitch, then yaw [rad]."""
     (cr, sr), (cp, sp), (cy, sy) = ((jnp.cos(x / 2), jnp.sin(x / 2)) for x in (roll, pitch, yaw))
     return jnp.stack(

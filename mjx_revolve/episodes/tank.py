@@ -1,8 +1,8 @@
-"""A tank: a world without end, in which robots come and go and are stepped together.
+"""A tank: a world of unlimited duration, to which robots are added and from which they are removed.
 
-It has a fixed number of places, so that one compiled program serves any number of robots; an empty
-place is stepped along, and no sensor reads it. Several worlds with equally many places may stand
-side by side. Every robot's own time begins when it is added.
+It has a fixed number of slots, called places, so that one compiled program serves any number of
+robots; an empty place is stepped, too, and no sensor reads it. Several worlds with equal numbers of
+places may be stepped together. Every robot's own time begins when it is added.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.engine.batched_trees import make_batched_trees
@@ -55,7 +56,7 @@ class TankTrajectory(NamedTuple):
 
 @dataclass
 class _Slots:
-    """What a tank knows of each of its places, on the last axis."""
+    """Properties of a tank's places, on the last axis."""
 
     genes: np.ndarray
     start: np.ndarray
@@ -91,7 +92,7 @@ class Tank:
         places: of all worlds together.
         worlds: how many stand side by side.
         touch: contact between robots; None: they pass through each other.
-        spheres: room for so many of them in each place; it grows with a robot that needs more.
+        spheres: capacity for spheres of contact in each place; it grows with a robot of more.
         steps: since the beginning.
         robots: `[places]`; None: an empty place.
         state: of the rollout; None before the first `advance`.
@@ -150,7 +151,7 @@ class Tank:
 
     @property
     def tag(self) -> np.ndarray:
-        """`[places]` numbers by which sensors can tell robots apart."""
+        """`[places]` numbers that identify robots to sensors."""
         return self._slots.tag
 
     @property
@@ -172,7 +173,7 @@ class Tank:
     def add(
         self,
         robot: Robot,
-        genes: Any,
+        genes: ArrayLike | None,
         position: Sequence[float],
         quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
         world: int = 0,
@@ -335,7 +336,7 @@ class Tank:
         return PopulationEngine(rows, given.bodies.plant, interaction=meet)
 
     def _rollout(self, given: _Given) -> tuple[Rollout, RolloutState]:
-        """The rollout, and its state as if all robots were put in now."""
+        """The rollout, and its state if all robots were added now."""
         controller, engine = self.mixed.controller, self._engine(given)
         parameters = controller.decode(given.genes, given.bodies.plant)
         target = None if given.target is None else tuple(given.target)
@@ -397,7 +398,7 @@ class Tank:
         return found
 
     def from_arrays(self, arrays: Mapping[str, np.ndarray], robots: Mapping[int, Robot]) -> None:
-        """The inverse, of a tank that was just made; what follows is the same bit for bit.
+        """The inverse of `to_arrays`, for a new tank; later results are equal bit for bit.
 
         Args:
             arrays: from `to_arrays`.
@@ -436,10 +437,10 @@ def make_tank(
     Args:
         mixed: from `make_mixed_fitness`; its world, its controller, and its room for bodies.
         places: of each world.
-        worlds: how many stand side by side.
+        worlds: number of worlds.
         touch: contact between robots; None: they pass through each other.
-        spheres: most that stand for a robot in contact, if it is known; a robot that needs more has
-            the tank compiled anew.
+        spheres: largest number of spheres of a robot for contact, if known; for a robot of more the
+            program is compiled anew.
 
     Returns:
         The tank.

@@ -1,39 +1,38 @@
-"""A rollout that keeps its path, and the way back along it: gradients by what drives it."""
+"""A rollout that records its states, and its backward pass: gradients by controller parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from mjx_revolve.control.readings import NO_INTERACTION
 from mjx_revolve.episodes.rollout import Recorder, Rollout, RolloutState, StepInputs
 from mjx_revolve.numerics.adjoint import fused_back
 from mjx_revolve.numerics.xla import in_one_array, is_wide
 
-Pull = Callable[[Any], tuple[RolloutState, list[jax.Array]]]
+Pull = Callable[[PyTree], tuple[RolloutState, list[jax.Array]]]
 
 
 def advance_taped(
-    make: Callable[[Any], Rollout],
+    make: Callable[[PyTree], Rollout],
     recorder: Recorder,
-    parameters: Any,
+    parameters: PyTree,
     now: RolloutState,
     still: Float[Array, "n lanes"],
     inputs: StepInputs,
     *,
     records: int,
     every: int,
-) -> tuple[RolloutState, Any, Pull]:
-    """`Rollout.advance` with a way back, which may be gone once.
+) -> tuple[RolloutState, PyTree, Pull]:
+    """`Rollout.advance` with a backward pass, which may be called once.
 
-    Each step is kept as its state before, and computed again on the way back. Gradients by the
-    parameters are not gathered in the loop, where they would be arrays as large as the parameters
-    at every step, but from all steps of a record at once: the loop only finds the gradients by the
-    commands and by the controllers' states.
+    The state before each step is kept, and the step computed again in the backward pass. Gradients
+    by the parameters are not summed in the loop, where each step would add arrays as large as the
+    parameters, but over all steps of a record at once: the loop computes only gradients by commands
+    and by controllers' states.
 
     Args:
         make: parameters of the controllers → rollout.
@@ -46,7 +45,7 @@ def advance_taped(
         every: steps between them.
 
     Returns:
-        The state after the last step; the records, `[records, ...]` each; and the way back:
+        The state after the last step; the records, `[records, ...]` each; and the backward pass:
         gradients by the records → (gradients by `now`, gradients by `float_leaves(parameters)`).
     """
     rollout = make(parameters)
@@ -60,16 +59,16 @@ def advance_taped(
         still,
     )
 
-    def renew(block: Any, scalars: Any) -> Any:
+    def renew(block: PyTree, scalars: PyTree) -> PyTree:
         """Packed, without the work so far: that of a record is its own."""
         begun, ctrl = unpack((block, scalars))
         return pack((begun._replace(energy=jnp.zeros_like(begun.energy)), ctrl))
 
-    def keep(block: Any, scalars: Any, rows: StepInputs) -> Any:
+    def keep(block: PyTree, scalars: PyTree, rows: StepInputs) -> PyTree:
         then, ctrl = unpack((block, scalars))
         return rollout.record(recorder, then, ctrl, jax.tree.map(lambda x: x[-1], rows))
 
-    def forth(packed: Any, rows: StepInputs) -> tuple[Any, Any]:
+    def forth(packed: PyTree, rows: StepInputs) -> tuple[PyTree, PyTree]:
         go = lambda packed, row: (ahead(packed, row), packed)  # noqa: E731
         packed, path = jax.lax.scan(go, renew(packed[0], packed[1]), rows, every)
         return packed, (path, packed, keep(packed[0], packed[1], rows))
@@ -78,33 +77,33 @@ def advance_taped(
     values = float_leaves(parameters)
 
     def by_parameters(
-        path: Any, rows: StepInputs, after: jax.Array, offset: jax.Array
+        path: PyTree, rows: StepInputs, after: jax.Array, offset: jax.Array
     ) -> list[jax.Array]:
         """Gradients by the parameters, from those by the controllers' outputs along a path."""
 
-        def act(values: list[jax.Array]) -> Any:
+        def act(values: list[jax.Array]) -> PyTree:
             filled = make(_fill(parameters, values))
 
-            def one(packed: Any, row: StepInputs) -> Any:
+            def one(packed: PyTree, row: StepInputs) -> PyTree:
                 controller_state, ctrl, *_ = filled.act(unpack(packed)[0], row)
                 return wide_leaves(controller_state), ctrl
 
             return jax.vmap(one)(path, rows)
 
-        def states(block: jax.Array, packed: Any) -> list[jax.Array]:
+        def states(block: jax.Array, packed: PyTree) -> list[jax.Array]:
             return wide_leaves(unpack((block, packed[1]))[0].controller_state)
 
         _, pull = jax.vjp(act, values)
         found: list[jax.Array] = pull((jax.vmap(states)(after, path), offset))[0]
         return found
 
-    def pull(by_kept: Any) -> tuple[RolloutState, list[jax.Array]]:
-        def retreat(carried: Any, given: Any) -> tuple[Any, None]:
+    def pull(by_kept: PyTree) -> tuple[RolloutState, list[jax.Array]]:
+        def retreat(carried: PyTree, given: PyTree) -> tuple[PyTree, None]:
             gradient, total = carried
             path, (block, scalars), rows, by_row = given
             gradient = gradient + jax.vjp(lambda x: keep(x, scalars, rows), block)[1](by_row)[0]
 
-            def one(gradient: Any, given: Any) -> Any:
+            def one(gradient: PyTree, given: PyTree) -> PyTree:
                 before, offset = back(gradient, *given)
                 return before, (gradient, offset)
 
@@ -124,21 +123,21 @@ def advance_taped(
     return unpack(end)[0], kept, pull
 
 
-def float_leaves(tree: Any) -> list[jax.Array]:
+def float_leaves(tree: PyTree) -> list[jax.Array]:
     """The leaves that are arrays of floats, in order."""
     return [x for x in jax.tree.leaves(tree) if _is_float(x)]
 
 
-def _is_float(x: Any) -> bool:
+def _is_float(x: PyTree) -> bool:
     return isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def _fill(tree: Any, values: list[jax.Array]) -> Any:
+def _fill(tree: PyTree, values: list[jax.Array]) -> PyTree:
     """The tree with other arrays of floats."""
     given = iter(values)
     return jax.tree.map(lambda x: next(given) if _is_float(x) else x, tree)
 
 
-def wide_leaves(tree: Any) -> list[jax.Array]:
+def wide_leaves(tree: PyTree) -> list[jax.Array]:
     """The leaves that have gradients."""
     return [x for x in jax.tree.leaves(tree) if is_wide(x)]

@@ -1,7 +1,7 @@
-"""Tasks: where episodes start, what is recorded of them, and what they are worth.
+"""Tasks: starts, records and scores of episodes.
 
-A `Task` owns all of that; nothing else asks for its name. A task of one's own stands in a file of
-one's own, as a `Task` or as a plain function that scores: see `find_task`.
+A `Task` owns all properties of a task; no other code depends on its name. A user's own task is a
+`Task`, or a function that scores, in a file of theirs: see `find_task`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.plant import BodyGeometry
+from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.measure_table import records_of
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.user_code import (
@@ -26,15 +27,15 @@ from mjx_revolve.inputs.user_code import (
     parse_user_function,
     short_name,
 )
-from mjx_revolve.numerics.spatial import safe_norm
+from mjx_revolve.numerics.spatial import Scalar, safe_norm
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
-# What a task may have recorded beside the core's position and the energy: see `Track`.
+# Optional records of a track, beside the core's position and the energy: see `Track`.
 RECORDS = ("core", "joints", "contacts", "forces", "water", "target", "course")
-# At so many moments up to the horizon the depth is foretold. A choice.
+# Number of times up to the horizon at which the depth is extrapolated. A choice.
 _MOMENTS = 16
-# Settings of which one must be given, so that there is such a record.
+# For a record: the settings of which one must be given.
 _GIVEN = {"target": ("target", "target_distance"), "course": ("course_spread",)}
 
 
@@ -108,7 +109,7 @@ class Track:
 
 
 def start_at_depth(
-    settings: Any, world: World, figure: BodyGeometry, place: jax.Array
+    settings: TaskConfig, world: World, figure: BodyGeometry, place: jax.Array
 ) -> jax.Array:
     """The core at the task's depth below the still surface.
 
@@ -124,7 +125,9 @@ def start_at_depth(
     return place.at[2].add(world.surface_height - settings.depth)
 
 
-def start_on_bed(settings: Any, world: World, figure: BodyGeometry, place: jax.Array) -> jax.Array:
+def start_on_bed(
+    settings: TaskConfig, world: World, figure: BodyGeometry, place: jax.Array
+) -> jax.Array:
     """The lowest corner 5 mm above the bed, whatever the tilt; arguments of `start_at_depth`."""
     assert world.bed is not None
     below = reach_below(settings, figure)
@@ -132,14 +135,14 @@ def start_on_bed(settings: Any, world: World, figure: BodyGeometry, place: jax.A
 
 
 def start_above_bed(
-    settings: Any, world: World, figure: BodyGeometry, place: jax.Array
+    settings: TaskConfig, world: World, figure: BodyGeometry, place: jax.Array
 ) -> jax.Array:
     """The core at the task's height above the bed; arguments of `start_at_depth`."""
     assert world.bed is not None
     return place.at[2].set(bed_height(world.bed, place[0], place[1]) + settings.height)
 
 
-def reach_below(settings: Any, figure: BodyGeometry) -> Any:
+def reach_below(settings: TaskConfig, figure: BodyGeometry) -> Scalar:
     """How far the rest pose reaches below the core's centre, in any attitude drawn [m].
 
     A tilt of three standard deviations is taken for the largest.
@@ -150,28 +153,28 @@ def reach_below(settings: Any, figure: BodyGeometry) -> Any:
 
 @dataclass(frozen=True)
 class Task:
-    """What episodes are about.
+    """A task.
 
     Attributes:
         score: (track, settings) → `[lanes]` scores, higher is better.
         unit: of the scores.
-        records: what the track holds beside the core's position and the energy, of `RECORDS`.
-        start: where episodes begin, like `start_at_depth`.
+        records: optional fields of the track that the score depends on, of `RECORDS`.
+        start: start position of episodes, like `start_at_depth`.
         on_bed: whether episodes begin on the bed, so that there must be one.
         measure: the measure that reports show beside the score.
-        point: what `Track.position` is the place of, as `task.point` says.
+        point: the point of `Track.position`, as in `task.point`.
     """
 
-    score: Callable[[Track, Any], jax.Array]
+    score: Callable[[Track, TaskConfig], jax.Array]
     unit: str = ""
     records: tuple[str, ...] = ()
-    start: Callable[[Any, World, BodyGeometry, jax.Array], jax.Array] = start_at_depth
+    start: Callable[[TaskConfig, World, BodyGeometry, jax.Array], jax.Array] = start_at_depth
     on_bed: bool = False
     measure: str = "speed_m_s"
     point: str = "core"
 
     def __post_init__(self) -> None:
-        """Checks what a user may have got wrong."""
+        """Checks the fields that users set."""
         for name in self.records:
             if name not in RECORDS:
                 raise InputError(f"records: expected any of {', '.join(RECORDS)}; found {name!r}")
@@ -183,7 +186,7 @@ def _keeping(error: jax.Array, tolerance: float) -> jax.Array:
     return 1 - beyond * beyond * (3 - 2 * beyond)
 
 
-def _keeps_depth(track: Track, settings: Any) -> jax.Array:
+def _keeps_depth(track: Track, settings: TaskConfig) -> jax.Array:
     """`[S - 1, lanes]` share of each interval's progress that counts."""
     middle = (track.position[1:, 2] + track.position[:-1, 2]) / 2
     return _keeping(middle - track.start_height, settings.depth_tolerance)
@@ -196,10 +199,10 @@ def moved_through_water(track: Track) -> jax.Array:
     return jnp.diff(track.position, axis=0) - track.interval * water
 
 
-def directed_swim(track: Track, settings: Any) -> jax.Array:
+def directed_swim(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a direction, over ground, while the robot keeps its depth [body lengths/s].
 
-    With a `horizon`, over that time, if what the robot does went on: see `_foretold`.
+    With a `horizon`, over that time, if the motion is continued: see `_foretold`.
     """
     direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
     moved = jnp.diff(track.position, axis=0)
@@ -211,11 +214,11 @@ def directed_swim(track: Track, settings: Any) -> jax.Array:
     return counted / (track.duration * track.length)
 
 
-def speed(track: Track, settings: Any) -> jax.Array:
+def speed(track: Track, settings: TaskConfig) -> jax.Array:
     """Net horizontal speed through the water while the robot keeps its depth [body lengths/s].
 
-    In any direction; drifting with a current counts nothing. With a `horizon`, net over that time,
-    if what the robot does went on: see `_foretold`.
+    In any direction; drift with a current does not count. With a `horizon`, net over that time, if
+    the motion is continued: see `_foretold`.
     """
     moved = moved_through_water(track)[:, :2]
     if settings.horizon is not None:
@@ -225,11 +228,11 @@ def speed(track: Track, settings: Any) -> jax.Array:
 
 
 def _foretold(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
-    """`[2, lanes]` horizontal net velocity over the horizon, by the episode's halves, at its depth.
+    """`[2, lanes]` horizontal net velocity over the horizon, extrapolated from the track's halves.
 
-    From one half to the next a robot turns by ψ and rises by some height. n halves of the way d,
-    each turned by ψ from the one before, have the net way d sin(nψ/2) / sin(ψ/2), which is turned
-    by (n - 1) ψ/2 from the first: in a circle none [body lengths/s].
+    From one half to the next a robot turns by ψ and rises by some height. n displacements d, each
+    turned by ψ from the one before, have the sum d sin(nψ/2) / sin(ψ/2), turned by (n - 1) ψ/2 from
+    the first: 0 for full circles [body lengths/s].
     """
     half = moved.shape[0] // 2
     first, second = (jnp.sum(x, 0) for x in (moved[:half], moved[-half:]))
@@ -250,7 +253,7 @@ def _foretold(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
     return size * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 
 
-def reach_target(track: Track, settings: Any) -> jax.Array:
+def reach_target(track: Track, settings: TaskConfig) -> jax.Array:
     """How much nearer to the target the robot ends than it began [body lengths]."""
     fixed = None if settings.target is None else np.asarray(settings.target, float)
 
@@ -263,10 +266,10 @@ def reach_target(track: Track, settings: Any) -> jax.Array:
     return (away[0] - away[1]) / track.length
 
 
-def _left_of_way(track: Track, settings: Any) -> jax.Array:
-    """`[S, lanes]` how near the target has been by then, a share of how near it was at first.
+def _left_of_way(track: Track, settings: TaskConfig) -> jax.Array:
+    """`[S, lanes]` least distance to the target so far, as a share of the first distance.
 
-    1 until it comes nearer, 0 from the moment it touches.
+    1 until the robot comes nearer, 0 from the time at which it touches the target.
     """
     assert track.target is not None
     away = safe_norm(tuple(track.position[:, i] - track.target[:, i] for i in range(3)))
@@ -274,52 +277,52 @@ def _left_of_way(track: Track, settings: Any) -> jax.Array:
     return jax.lax.cummin(beyond) / jnp.maximum(beyond[0], 1e-6)
 
 
-def search(track: Track, settings: Any) -> jax.Array:
-    """How much of the way to the target it has behind it, on average over time [of the way].
+def search(track: Track, settings: TaskConfig) -> jax.Array:
+    """The share of the way to the target that is covered, on average over time [of the way].
 
-    At each moment the most so far: what once was near has that to its credit, and what is touched
-    sooner counts longer. 1 would be to touch it at once.
+    At each time the largest share so far: coming near once is enough, and touching the target
+    sooner scores more. 1 would be to touch it at once.
     """
     return 1 - jnp.mean(_left_of_way(track, settings), 0)
 
 
-def escape(track: Track, settings: Any) -> jax.Array:
+def escape(track: Track, settings: TaskConfig) -> jax.Array:
     """The pursuer's least distance so far, on average over time [of the first distance].
 
-    1 is never to let it come nearer than it began. From the moment it touches 0 is counted, and
-    where the robot leaves its depth: to dive away would need no senses.
+    1 if the pursuer never comes nearer than at the start. 0 counts from the time at which it
+    touches the robot, and while the robot is off its depth: diving away would take no sensors.
     """
     keeps = _keeping(track.position[:, 2] - track.start_height, settings.depth_tolerance)
     return jnp.mean(_left_of_way(track, settings) * keeps, 0)
 
 
-def follow_course(track: Track, settings: Any) -> jax.Array:
+def follow_course(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a course that turns, over ground, at its depth [body lengths/s]."""
     assert track.course is not None
     moved = jnp.diff(track.position, axis=0)
-    # Where it turns at once, the mean of before and after counts.
+    # At a sudden turn, the mean of the courses before and after counts.
     course = (track.course[1:] + track.course[:-1]) / 2
     along = jnp.sum(moved * course, 1)
     counted = jnp.sum(along * _keeps_depth(track, settings), 0)
     return counted / (track.duration * track.length)
 
 
-def hold_depth(track: Track, settings: Any) -> jax.Array:
+def hold_depth(track: Track, settings: TaskConfig) -> jax.Array:
     """Minus the root mean square distance from the start's depth [body lengths]."""
     error = (track.position[:, 2] - track.start_height) / track.length
     # The tiny term keeps the gradient finite where the error is 0.
     return -jnp.sqrt(jnp.mean(error * error, 0) + 1e-12)
 
 
-def hold_heading(track: Track, settings: Any) -> jax.Array:
+def hold_heading(track: Track, settings: TaskConfig) -> jax.Array:
     """Minus the root mean square errors of depth and of heading, added up [body lengths + rad].
 
-    Heading is where the core's x axis points, seen from above; it should be the direction's.
+    Heading is the direction of the core's x axis seen from above; its target is `direction`.
     """
     assert track.quat is not None
     w, x, y, z = (track.quat[:, i] for i in range(4))
     ahead, aside = w * w + x * x - y * y - z * z, 2 * (x * y + w * z)
-    # The tiny term: a core that stands upright has no heading, and its angle no gradient.
+    # The tiny term: the heading of a core with x upright is undefined, and so is its gradient.
     level = np.asarray(settings.direction, float)[:2]
     level = level / max(np.linalg.norm(level), 1e-9)
     cosine, sine = float(level[0]), float(level[1])
@@ -334,7 +337,7 @@ def follow_bed(track: Track, settings: Any) -> jax.Array:
     return crawl(replace(track, clearance=height), settings)
 
 
-def crawl(track: Track, settings: Any) -> jax.Array:
+def crawl(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a direction while the core stays near the bed [body lengths/s]."""
     direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
     moved = jnp.diff(track.position, axis=0)
@@ -360,8 +363,8 @@ TASKS: Mapping[str, Task] = {
 """The tasks by their names in configurations."""
 
 
-def find_task(settings: Any, source: str = "config") -> Task:
-    """The task that a configuration names, recording what its `measures` need, too.
+def find_task(settings: TaskConfig, source: str = "config") -> Task:
+    """The task that a configuration names, with the records of its `measures`.
 
     Args:
         settings: a `config.TaskConfig`. Its `type` is a name in `TASKS`, or FILE.py:NAME for one of
@@ -416,7 +419,7 @@ def find_task(settings: Any, source: str = "config") -> Task:
     return task
 
 
-def _score_in_metres(score: Callable, track: Track, settings: Any) -> jax.Array:
+def _score_in_metres(score: Callable, track: Track, settings: TaskConfig) -> jax.Array:
     """The score of a body of length 1 m."""
     return score(replace(track, length=1.0), settings)
 
@@ -429,7 +432,7 @@ def _load_task(name: str, label: str) -> Task:
     return Task(found, units[-1] if units else "")
 
 
-# Unlike numbers, so that an axis taken for another shows.
+# Distinct numbers, so that a confusion of axes causes an error.
 _ROWS, _LANES, _HINGES = 7, 3, 5
 
 

@@ -1,4 +1,4 @@
-"""Our water as a vector environment of Gymnasium, for whatever learns by its interface.
+"""A vector environment of Gymnasium.
 
 `gymnasium` is an extra, `pip install 'gymnasium>=1.1'`, imported when the first environment is
 made. All environments are stepped in one compiled call.
@@ -14,6 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.environment import (
@@ -35,10 +37,10 @@ AUTORESET_MODES = ("NextStep", "SameStep")
 def _next_step(
     environment: Environment, state: EnvironmentState, action: jax.Array
 ) -> tuple[EnvironmentState, jax.Array, StepResult, jax.Array]:
-    """A control period; what was over before it begins anew instead, without a reward.
+    """A control period; episodes that were over before it are restarted instead, without reward.
 
     Returns:
-        The state, `[k, lanes]` observations, what came of it, and the observations again.
+        The state, `[k, lanes]` observations, the result, and the observations again.
     """
     over = state.ended
     moved, outcome = environment.step(state, action)
@@ -56,7 +58,7 @@ def _next_step(
 
 @lru_cache(maxsize=1)
 def _make_class() -> type:
-    """The class, whose base is Gymnasium's."""
+    """The subclass of Gymnasium's `VectorEnv`, which is imported late."""
     from gymnasium.error import ResetNeeded
     from gymnasium.spaces import Box
     from gymnasium.vector import AutoresetMode, VectorEnv
@@ -81,8 +83,8 @@ def _make_class() -> type:
             self.single_action_space = Box(-1.0, 1.0, (done,), np.float32)
             self.observation_space = batch_space(self.single_observation_space, num_envs)
             self.action_space = batch_space(self.single_action_space, num_envs)
-            # Chunks of fixed shape, as those of a fitness: what an environment does depends
-            # neither on how many there are nor on which others there are.
+            # Chunks of fixed shape, as those of a fitness: an environment's results do not
+            # depend on the number or the state of others.
             self._lanes = LANES if on_cpu() else num_envs
             self._chunks = -(-num_envs // self._lanes)
             self._state: EnvironmentState | None = None
@@ -90,17 +92,17 @@ def _make_class() -> type:
             same = mode == "SameStep"
             advance = environment.step_and_restart if same else partial(_next_step, environment)
 
-            def step(state: EnvironmentState, actions: jax.Array) -> Any:
+            def step(state: EnvironmentState, actions: jax.Array) -> PyTree:
                 found = jax.lax.map(lambda given: advance(*given), (state, self._split(actions)))
                 state, seen, outcome, last = found
                 return state, self._join(seen), jax.tree.map(self._join, outcome), self._join(last)
 
-            def begin(seed: jax.Array, episode: jax.Array) -> Any:
+            def begin(seed: jax.Array, episode: jax.Array) -> PyTree:
                 given = self._split(seed), self._split(episode)
                 state, seen = jax.lax.map(lambda given: environment.begin(*given), given)
                 return state, self._join(seen)
 
-            def resume(mask: jax.Array, new: Any, old: Any) -> Any:
+            def resume(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
                 pick = jax.vmap(choose)
                 return pick(self._split(mask), new, old)
 
@@ -115,13 +117,16 @@ def _make_class() -> type:
             return jnp.moveaxis(x.reshape(self._chunks, self._lanes, *x.shape[1:]), 1, -1)
 
         def _join(self, x: jax.Array) -> jax.Array:
-            """The way back."""
+            """The inverse of `_split`."""
             x = jnp.moveaxis(x, -1, 1)
             return x.reshape(-1, *x.shape[2:])[: self.num_envs]
 
         def reset(
-            self, *, seed: Any = None, options: dict[str, Any] | None = None
-        ) -> tuple[np.ndarray, dict[str, Any]]:
+            self,
+            *,
+            seed: int | Sequence[int | None] | None = None,
+            options: dict[str, object] | None = None,
+        ) -> tuple[np.ndarray, dict[str, object]]:
             """Begins episodes.
 
             Args:
@@ -134,7 +139,7 @@ def _make_class() -> type:
                 `[num_envs, k]` observations, and {}.
 
             Raises:
-                InputError: the seed or the mask is none.
+                InputError: the seed or the mask is wrong.
             """
             mask = self._read_mask(options)
             if seed is None and self._state is None:
@@ -156,7 +161,7 @@ def _make_class() -> type:
             self._state, self._seen = state, np.array(seen, np.float32)
             return self._seen.copy(), {}
 
-        def _read_seeds(self, seed: Any) -> np.ndarray:
+        def _read_seeds(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
             found = np.asarray(seed)
             whole = np.issubdtype(found.dtype, np.integer) and found.shape in ((), (self.num_envs,))
             if not whole or not np.all((found >= 0) & (found < 2**32)):
@@ -168,7 +173,7 @@ def _make_class() -> type:
                 found = (int(found) + np.arange(self.num_envs, dtype=np.int64)) % 2**32
             return found.astype(np.uint32)
 
-        def _read_mask(self, options: Mapping[str, Any] | None) -> np.ndarray | None:
+        def _read_mask(self, options: Mapping[str, object] | None) -> np.ndarray | None:
             if not options or "reset_mask" not in options:
                 return None
             mask = np.asarray(options["reset_mask"])
@@ -180,17 +185,17 @@ def _make_class() -> type:
             return mask
 
         def step(
-            self, actions: Any
-        ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+            self, actions: ArrayLike
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, object]]:
             """A control period of all environments.
 
             Args:
                 actions: `[num_envs, n]` between -1 and 1; see `Environment.step`.
 
             Returns:
-                `[num_envs, k]` observations, `[num_envs]` rewards, which blew up (terminated),
-                whose time is over (truncated), and infos: `score` where one of these is true, in
-                `final_info` beside `final_obs` in mode SameStep.
+                `[num_envs, k]` observations, `[num_envs]` rewards, terminated (the rollout blew
+                up), truncated (the episode's time is over), and infos: `score` where one of these
+                is true, in `final_info` beside `final_obs` in mode SameStep.
 
             Raises:
                 InputError: the actions have another shape.
@@ -198,14 +203,14 @@ def _make_class() -> type:
             """
             if self._state is None:
                 raise ResetNeeded("expected a call of reset before step")
-            given = np.asarray(actions, np.float32)
+            given = jnp.asarray(actions, jnp.float32)
             shape = (self.num_envs, len(self.action_names))
             if given.shape != shape:
                 raise InputError(f"actions: expected {list(shape)}; found {list(given.shape)}")
             self._state, seen, outcome, last = self._step(self._state, given)
             self._seen = np.array(seen)
             terminated, truncated = np.array(outcome.terminated), np.array(outcome.truncated)
-            infos: dict[str, Any] = {}
+            infos: dict[str, object] = {}
             over = terminated | truncated
             if over.any():
                 score = np.where(over, np.asarray(outcome.score), 0.0)
@@ -217,7 +222,7 @@ def _make_class() -> type:
             rewards = np.asarray(outcome.reward).astype(np.float64)
             return self._seen.copy(), rewards, terminated, truncated, infos
 
-        def close_extras(self, **kwargs: Any) -> None:
+        def close_extras(self, **kwargs: object) -> None:
             """Lets go of the state."""
             self._state = None
 
@@ -230,39 +235,41 @@ def _make_class() -> type:
 
 
 def make_vector_env(
-    config: Config | str | Path | Mapping[str, Any],
+    config: Config | str | Path | Mapping[str, object],
     num_envs: int = LANES,
     *,
-    sensors: Sequence[Any] | None = None,
+    sensors: Sequence[object] | None = None,
     control_rate: float | None = None,
     autoreset_mode: str = "NextStep",
-    **overrides: Any,
+    **overrides: object,
 ) -> Any:
     """A `gymnasium.vector.VectorEnv` of a configuration: its robot, its water, its task.
 
-    Observations `[num_envs, k]` are what sensors tell, each between -1 and 1: the robot's as a
-    whole, then joint after joint; `observation_names` has them. Actions `[num_envs, n]` between -1
-    and 1 are the ranges of hinges' targets and thrusters' commands, as `action_names` has them.
+    Observations `[num_envs, k]` are outputs of sensors, each between -1 and 1: those of the robot
+    as a whole, then joint after joint, in the order of `observation_names`. Actions `[num_envs, n]`
+    are between -1 and 1, the ends of the range of each hinge's targets and each thruster's
+    commands, in the order of `action_names`.
     Rewards add up to the task's score (see `environment`). An episode is truncated after
     `task.duration`, and terminated if it blows up, which costs `scoring.WORST`. `task.trials` and
     the rest of `controller` do not matter.
 
     Args:
         config: a `Config`, the path of a YAML file, a shipped configuration's name, or a mapping.
-        num_envs: how many environments; on a CPU, multiples of 64 make the most of it.
-        sensors: what is seen, kinds' names or mappings, as in `controller.sensors`; by default
-            these, or else the robot's own, or else `sensors.DEFAULT_SENSORS`.
+        num_envs: number of environments; on a CPU, multiples of 64 are most efficient.
+        sensors: names of kinds or mappings, as in `controller.sensors`; by default those of the
+            configuration, or else the robot's own, or else `sensors.DEFAULT_SENSORS`.
         control_rate: actions in a second [Hz]; by default the possible one nearest to 20.
-        autoreset_mode: `NextStep`, Gymnasium's own: an episode that is over begins anew at the next
-            step, whose action is not used; or `SameStep`: at once, its last observation in infos.
+        autoreset_mode: `NextStep`, Gymnasium's default: an episode that is over restarts at the
+            next step, which ignores the action; or `SameStep`: at once, with its last observation
+            in infos.
         **overrides: as `make_fitness` takes them.
 
     Returns:
         The environments. The same seed gives the same numbers, bit for bit, on one kind of
-        processor; what environment i does depends on its seed and its actions alone.
+        processor; environment i depends on its seed and its actions alone.
 
     Raises:
-        InputError: gymnasium is not installed, the configuration is wrong, or it has no one body.
+        InputError: gymnasium is not installed, the configuration is wrong, or it evolves bodies.
     """
     check_package("make_vector_env", "gymnasium")
     whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)

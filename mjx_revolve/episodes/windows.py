@@ -1,11 +1,11 @@
-"""Gradients of scores by genes through the water, a window of an episode at a time.
+"""Gradients of scores by genes through the simulation, one window of an episode at a time.
 
-What a robot does now follows from what it did, so the gradient of a long episode by its genes is a
-product of very many matrices: it grows without bound where the motion is chaotic, as a closed loop
-of sensors, network and servos easily is. Truncated backpropagation through time (Williams and Peng
-1990, Neural Computation 2) cuts the episode into windows: each begins where the one before it has
-ended, and what came before it is taken as given. A window's gain is the task's score so far, less
-that at its beginning, as of `environment`; so the gains of an episode add up to its score. Short
+The gradient of a long episode by its genes is a product of many Jacobians: it grows without bound
+if the motion is chaotic, as a closed loop of sensors, network and servos easily is. Truncated
+backpropagation through time (Williams and Peng 1990, Neural Computation 2) cuts the episode into
+windows. Each begins where the one before it has ended, and its start state is a constant. A
+window's gain is the increase of the task's score so far, as the reward in `environment`; so the
+gains of an episode add up to its score. Short
 windows of many episodes side by side are also how SHAC learns (Xu et al. 2022, Accelerated policy
 learning with parallel differentiable simulation, ICLR), which adds a critic for what comes after a
 window; there is none here.
@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.episodes.evaluation import Episodes, narrow, task_recorder, widen
@@ -39,12 +40,12 @@ from mjx_revolve.numerics.xla import is_traced, jit, over_chunks
 
 
 class Gradients(NamedTuple):
-    """What comes of a window.
+    """The result of a window.
 
     Attributes:
-        gain: the score so far, less that of the window before. Of a rollout that blows up, what
-            brings the sum to `scoring.WORST`.
-        gradient: of the gain by the individual's genes within the window; 0 where it is no number.
+        gain: the score so far, less that of the window before. For a rollout that blows up, the sum
+            of its gains is `scoring.WORST`.
+        gradient: of the gain by the individual's genes within the window; 0 in place of NaN.
     """
 
     gain: Float[Array, "P trials"]
@@ -77,7 +78,7 @@ class TruncatedBPTT:
         """Length of a window [s]."""
         return self.records * self.fitness.record_every * self.fitness.world.timestep
 
-    def init(self, population: Any, key: jax.Array) -> Episodes:
+    def init(self, population: ArrayLike, key: jax.Array) -> Episodes:
         """Episodes at their starts, those of `fitness(population, key)`.
 
         Args:
@@ -95,10 +96,10 @@ class TruncatedBPTT:
         run = self._init if is_traced(population, key) else self._compiled[0]
         return run(population, key)
 
-    def step(self, population: Any, episodes: Episodes) -> tuple[Gradients, Episodes]:
+    def step(self, population: ArrayLike, episodes: Episodes) -> tuple[Gradients, Episodes]:
         """Advances episodes by a window.
 
-        The genes need not be those of the window before: an optimiser may learn on the way.
+        The genes need not be those of the window before: an optimiser may change them in between.
 
         Args:
             population: `[P, num_genes]`.
@@ -152,7 +153,7 @@ class TruncatedBPTT:
         row = partial(rollout.record, recorder, now, self._still(genes), inputs)
         return fitness.init_episodes(now, starts, root[:3], row)
 
-    def _rollout(self, starts: Starts, position: jax.Array, parameters: Any) -> Rollout:
+    def _rollout(self, starts: Starts, position: jax.Array, parameters: PyTree) -> Rollout:
         controller, engine = self.fitness.controller, self.fitness.engine
         policy = controlled(controller, parameters)
         return self.fitness.make_rollout(engine, policy, controller.signals, starts, position)
@@ -224,7 +225,7 @@ class TruncatedBPTT:
         fitness, every = self.fitness, self.fitness.record_every
         place = fitness.start_point(fitness.geometry, episodes.starts)
 
-        def run(rows: dict[str, jax.Array]) -> Any:
+        def run(rows: dict[str, jax.Array]) -> PyTree:
             track = extend_track(episodes.track, rows, clock // every)
             then = clock + self.records * every
             score, _ = fitness.score_so_far(track, place, fitness.geometry, context, then)
@@ -239,8 +240,8 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> TruncatedBPT
 
     Args:
         fitness: from `make_fitness`.
-        horizon: length of a window [s]; by default the whole episode, whose gradients are then
-            those of the fitness itself.
+        horizon: length of a window [s]; by default the whole episode: gradients are then those of
+            the fitness itself.
 
     Returns:
         An optimiser's source of gradients.

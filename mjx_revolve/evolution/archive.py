@@ -30,8 +30,8 @@ class Archive:
 
     Attributes:
         names: `[D]` of the axes: descriptors and measures.
-        lows: `[D]` where each axis begins, in its own unit.
-        highs: `[D]` where it ends.
+        lows: `[D]` lower end of each axis, in its own unit.
+        highs: `[D]` upper end.
         shape: `[D]` cells along each axis of a grid, the last axis running fastest; empty where
             cells are those of a tessellation.
         centers: `[cells, D]` middles of the cells, in the axes' units.
@@ -99,7 +99,7 @@ def _tessellate(cells: int, axes: int, rng: np.random.Generator) -> np.ndarray:
 def scale_points(archive: Archive, points: np.ndarray) -> np.ndarray:
     """Points `[N, D]` in units of the axes: 0 at their lower, 1 at their upper end.
 
-    What lies outside is moved to the border; what is not finite becomes NaN.
+    Points outside the axes are moved to the border; values that are not finite become NaN.
     """
     points = np.where(np.isfinite(points), points, np.nan)
     inside = np.clip(points, archive.lows, archive.highs)
@@ -138,7 +138,7 @@ def insert(archive: Archive, ids: np.ndarray, scores: np.ndarray, points: np.nda
     """The archive with further individuals, inserted one after the other, the oldest first.
 
     Args:
-        archive: as it was; it stays so.
+        archive: before the insertion; not changed.
         ids: `[N]` from 0 on, unique; lower ones are older.
         scores: `[N]` higher is better. One that is not finite, or not better than that in its cell,
             is not inserted.
@@ -188,7 +188,7 @@ def best(archive: Archive) -> int:
     return int(cells[np.lexsort((archive.ids[cells], -archive.scores[cells]))[0]])
 
 
-# --- to and from elsewhere
+# --- conversion
 
 
 def to_arrays(archive: Archive) -> dict[str, np.ndarray]:
@@ -246,12 +246,12 @@ def to_ribs(archive: Archive, solutions: Sequence[object]) -> Any:
 
     Args:
         archive: the archive.
-        solutions: what stands for each individual, in the order of `rows`; any objects.
+        solutions: any object for each individual, in the order of `rows`.
 
     Returns:
         A `ribs.archives.GridArchive`, or a `CVTArchive`. `ribs` measures distances in the axes' own
-        units, which may be as different as metres and modules, so there each axis runs from 0 to 1.
-        The fields `id` and `descriptors` hold numbers and descriptors as they are here.
+        units, which may differ (metres, modules), so in it each axis runs from 0 to 1. The fields
+        `id` and `descriptors` hold numbers and descriptors in their own units.
 
     Raises:
         InputError: `ribs` is not installed.

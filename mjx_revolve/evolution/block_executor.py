@@ -20,9 +20,10 @@ from mjx_revolve.inputs.errors import InputError
 if TYPE_CHECKING:
     import jax
     import numpy as np
+    from numpy.typing import ArrayLike
 
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.blocks import Block, Scored
+    from mjx_revolve.evolution.blocks import Block, KeyData, Scored
 
 _log = logging.getLogger(__name__)
 AnyWorker = TypeVar("AnyWorker")
@@ -35,8 +36,8 @@ class Executor:
 
     Attributes:
         fitness: this process's own, for replays, and for scores if there are no workers.
-        block: individuals in a block; None: the whole population, whatever its size.
-        folder: where blocks are kept that had to be given up.
+        block: individuals in a block; None: the whole population.
+        folder: for files of failed blocks.
         closed: whether it has ended.
     """
 
@@ -65,11 +66,13 @@ class Executor:
         """How many processes score."""
         return 1
 
-    def __call__(self, population: Any, key: jax.Array) -> np.ndarray:
+    def __call__(self, population: ArrayLike, key: jax.Array) -> np.ndarray:
         """Scores a population: `[P]`; see `evaluate`."""
         return self.evaluate(population, key)[0]
 
-    def evaluate(self, population: Any, key: jax.Array) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def evaluate(
+        self, population: ArrayLike, key: jax.Array
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Scores a population and measures how it moved.
 
         Args:
@@ -100,7 +103,7 @@ class Executor:
         }
 
     def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored]:
-        """Scores blocks of whatever the fitness takes.
+        """Scores blocks of the fitness's arguments.
 
         Args:
             blocks: arguments of `fitness.evaluate` before the key, which can be pickled; the first
@@ -108,8 +111,8 @@ class Executor:
             key: draws the episodes' starts, the same for every individual.
 
         Returns:
-            `[rows]` scores and measures of each. Those of a block that brings down worker after
-            worker are NaN; the log names the file from which it can be scored again.
+            `[rows]` scores and measures of each. Those of a block that makes `Limits.tries` workers
+            fail are NaN; the log names the file from which it can be scored again.
 
         Raises:
             WorkerError: no worker is left, or not one block could be scored; the executor is
@@ -120,7 +123,7 @@ class Executor:
         try:
             return self._score(blocks, key)
         except BaseException:
-            # Interrupted anywhere: what the workers are doing is unknown.
+            # Interrupted anywhere: the state of the workers is unknown.
             self.close()
             raise
 
@@ -129,8 +132,8 @@ class Executor:
 
         return [evaluate_block(self.fitness, block, key) for block in blocks]
 
-    def describe(self) -> dict[str, Any]:
-        """Where scores come from, for `run.json`."""
+    def describe(self) -> dict[str, object]:
+        """The executor's kind and size, for `run.json`."""
         return {"count": self.num_workers, "block": self.block}
 
     def close(self) -> None:
@@ -152,12 +155,13 @@ class Executor:
 class WorkerExecutor(Executor, ABC, Generic[AnyWorker]):
     """An executor with workers: processes that score one block after the other.
 
-    A block is a pure function, so one whose worker was lost is scored again, and gives the same.
-    One that fails `Limits.tries` times is given up.
+    Scoring a block is a pure function: after the loss of its worker it is scored again, with the
+    same result. A block that fails `Limits.tries` times has no scores.
 
     Attributes:
-        job: what the workers score.
-        identity: what they must have in common with this process; see `fingerprints.identify`.
+        job: of the workers.
+        identity: program, precision, robot and world, which must equal the workers'; see
+            `fingerprints.identify`.
     """
 
     def __init__(self, config: Config, job: Job) -> None:
@@ -175,12 +179,12 @@ class WorkerExecutor(Executor, ABC, Generic[AnyWorker]):
         """The workers that can take a block."""
 
     @abstractmethod
-    def send(self, worker: AnyWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+    def send(self, worker: AnyWorker, number: int, block: Block, key: KeyData) -> None:
         """Gives a block to a worker."""
 
     @abstractmethod
     def attend(self) -> list[tuple[int, Scored | str | None]]:
-        """Waits for news, but not for long.
+        """Waits for results, for a short time at most.
 
         Returns:
             Numbers of blocks, with the scores of each, or why it failed, or None: it was not begun.
@@ -223,7 +227,7 @@ class WorkerExecutor(Executor, ABC, Generic[AnyWorker]):
         return [scored[number] for number in range(len(blocks))]
 
     def _keep(self, block: Block, key: jax.Array, reason: str) -> None:
-        """Keeps a block that was given up, and names its file."""
+        """Writes a failed block to a file, and logs its path."""
         from mjx_revolve.evolution.failed_blocks import save_failed_block
 
         path = save_failed_block(self.folder, self.job, block, key)

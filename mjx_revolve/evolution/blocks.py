@@ -1,9 +1,9 @@
-"""Blocks of a population: how it is cut, how one block is scored, and how one crosses a process.
+"""Blocks of a population: splitting, scoring, and sending to another process.
 
-A block is a tuple of what `fitness.evaluate` takes before the key: `(genes,)` where all individuals
-have one body. All blocks of genes have one shape, that of one chunk of `xla.LANES` lanes, so that
-each is one run of the same compiled program wherever it is scored. That is why scores do not
-depend, to the last bit, on the number of workers or on which worker scores what.
+A block is a tuple of the arguments of `fitness.evaluate` before the key: `(genes,)` if all
+individuals have one body. All blocks of genes have one shape, that of one chunk of `xla.LANES`
+lanes, so that each is one run of the same compiled program in any process. So scores are equal to
+the last bit for any number of workers.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.numerics.xla import LANES, on_cpu
 
 Block = tuple[Any, ...]
+KeyData = tuple[np.ndarray, str]  # a random key as `key_as_data` has it
 """The arguments of `fitness.evaluate` before the key; the first has one entry per individual."""
 Scored = tuple[np.ndarray, dict[str, np.ndarray]]
 """`[rows]` scores and measures of a block, float32."""
@@ -31,12 +32,12 @@ def evaluate_block(fitness: Any, block: Block, key: jax.Array) -> Scored:
     }
 
 
-def key_as_data(key: jax.Array) -> tuple[np.ndarray, str]:
+def key_as_data(key: jax.Array) -> KeyData:
     """A key as values that can be sent to another process: numbers, and the kind of key."""
     return np.asarray(jax.random.key_data(key)), str(jax.random.key_impl(key))
 
 
-def key_from_data(data: tuple[np.ndarray, str]) -> jax.Array:
+def key_from_data(data: KeyData) -> jax.Array:
     """The inverse of `key_as_data`."""
     return jax.random.wrap_key_data(jax.numpy.asarray(data[0]), impl=data[1])
 

@@ -1,8 +1,8 @@
-"""Scores of bodies that evolve: morphologies and genes in, scores out, wherever it is computed.
+"""Scores of bodies that evolve: morphologies and genes to scores, in any process.
 
-A worker gets morphologies, compiles them, and evaluates all in one program. Which program that is
-follows from the configuration alone. Where each body tries brains enough to fill most of a chunk at
-a time, a chunk holds one body, which is the faster way; else bodies share chunks.
+A worker receives morphologies, compiles them, and evaluates all in one program, which follows from
+the configuration alone. If each body tries enough brains at a time to fill most of a chunk, a chunk
+holds one body, which is faster; else bodies share chunks.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mjx_revolve.genotypes.genotype import Genotype, Space, cached, make_space
 from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.inputs.errors import InputError
 
-# Random bodies by which it is chosen how many parts a row of the tables holds. A choice.
+# Random bodies from which the number of parts in a row of the tables follows. A choice.
 _EXAMPLES = 64
 # From which share of real individuals on a block is better filled up than shared: a body by itself
 # takes three quarters of the time, or less.
@@ -48,7 +48,7 @@ class BodyFitness:
 
     Attributes:
         config: the configuration.
-        genotype: what bodies are grown from.
+        genotype: of the bodies.
         mixed: the fitness of any bodies within the space.
         brains: the kind of brain.
         seeds: robots that begin the population.
@@ -62,13 +62,13 @@ class BodyFitness:
 
     @property
     def bodies(self) -> BodiesConfig:
-        """How bodies evolve."""
+        """Settings of the evolution of bodies."""
         assert self.config.bodies is not None
         return self.config.bodies
 
     @property
     def num_genes(self) -> int:
-        """Of the largest body."""
+        """Length of the genes of the largest body."""
         return self.mixed.num_genes
 
     @property
@@ -78,7 +78,7 @@ class BodyFitness:
 
     @cached_property
     def block_size(self) -> int | None:
-        """Individuals in a block; None: as many as there are."""
+        """Individuals in a block; None: all."""
         return block_size(self.config.task.trials)
 
     @property
@@ -91,7 +91,7 @@ class BodyFitness:
 
     @cached_property
     def identity(self) -> str:
-        """Beside the settings, scores depend on this: the world and the types of modules."""
+        """Fingerprint of the world and the types of modules, on which scores depend."""
         kinds = [repr(kind) for kind in self.module_types.values()]
         return "\n".join([repr(self.mixed.world), *kinds, *(repr(s.modules) for s in self.seeds)])
 
@@ -192,7 +192,7 @@ def make_body_fitness(config: Config) -> BodyFitness:
 
 
 def _ask_for_measures(config: Config) -> Config:
-    """With all measures recorded that objectives and archive name."""
+    """The configuration, with the measures of objectives and archive added to `task.measures`."""
     bodies = config.bodies
     assert bodies is not None
     named = [name.lstrip("-") for name in (*bodies.selection.objectives, *bodies.selection.novelty)]
@@ -209,7 +209,9 @@ def _examples(genotype: Genotype) -> list[Morphology]:
     return [genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES)]
 
 
-def _load_seed(path: str, modules: Any, config: Config, space: Space) -> Morphology:
+def _load_seed(
+    path: str, modules: Mapping[str, ModuleType], config: Config, space: Space
+) -> Morphology:
     body = load_morphology(path, modules, config.allow_overlap)
     reason = space.refuses(body)
     if reason:

@@ -1,19 +1,20 @@
-"""Brains for bodies that change: their inheritance, and their genes for a controller.
+"""Brains for bodies that evolve: their inheritance, and their genes for a controller.
 
-A brain is a plain value that JSON can hold: genes by name (`joints`), or the weights of a network
-that computes each joint's genes from its position (`cppn`, after Stanley's HyperNEAT, Artificial
-Life 15, 2009). For learning it is a vector of the same length for all bodies, so that one strategy
-serves all.
+A brain is a plain value for JSON: genes by name (`joints`), or the weights of a network that
+computes each joint's genes from its position (`cppn`, after Stanley's HyperNEAT, Artificial Life
+15, 2009). For learning it is a vector of the same length for all bodies, so that one strategy can
+be used for all.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from annotated_types import Len
+from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import Controller, Gene, gene_indices
 from mjx_revolve.engine.plant import Plant
@@ -42,7 +43,7 @@ class GeneLayout(NamedTuple):
 
     Attributes:
         names: `[n]`, after the body's own joints.
-        genes: `[n]` the joint, pair or robot that each belongs to.
+        genes: `[n]` meaning of each: the joint, pair or robot that it controls.
         place: `[n, 3]` position of its joint at rest, of a pair the middle, else 0; core frame [m].
         reach: `[n, 3]` from a pair's earlier joint to the later one, else 0 [m].
         columns: `[n]` its index among the genes for all bodies.
@@ -82,29 +83,32 @@ def gene_layout(own: Controller, common: Controller, plant: Plant) -> GeneLayout
     return GeneLayout(own.gene_names, own.genes, place, reach, columns, common.num_genes)
 
 
-class BrainEncoding(Protocol):
+B = TypeVar("B")  # a brain
+
+
+class BrainEncoding(Protocol[B]):
     """A kind of brain. All randomness comes from the generators that are passed in."""
 
     size: int
     """Length of the vectors."""
 
-    def draw(self, rng: np.random.Generator, layout: GeneLayout) -> Any:
+    def draw(self, rng: np.random.Generator, layout: GeneLayout) -> B:
         """A brain drawn anew."""
 
-    def inherit(self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout) -> Any:
+    def inherit(self, rng: np.random.Generator, parents: Sequence[B], layout: GeneLayout) -> B:
         """A child's brain; its body is the first parent's, but for mutations."""
 
-    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+    def to_vector(self, brain: B, layout: GeneLayout) -> np.ndarray:
         """The brain as a vector `[size]`."""
 
-    def from_vector(self, vector: np.ndarray, layout: GeneLayout) -> Any:
+    def from_vector(self, vector: np.ndarray, layout: GeneLayout) -> B:
         """The inverse of `to_vector`."""
 
     def express(self, vectors: np.ndarray, layout: GeneLayout) -> np.ndarray:
         """Vectors `[..., size]` as genes for all bodies `[..., width]`."""
 
-    def check(self, brain: Any) -> Any:
-        """The brain that a file holds; raises `InputError` where it is none."""
+    def check(self, brain: object) -> B:
+        """The brain in a file; raises `InputError` for anything else."""
 
 
 def make_brain_encoding(settings: BrainsConfig, common: Controller) -> BrainEncoding:
@@ -139,18 +143,18 @@ class NamedGenes:
         return _named(layout, self.settings.std_init * rng.standard_normal(len(layout.names)))
 
     def inherit(
-        self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout
+        self, rng: np.random.Generator, parents: Sequence[dict[str, float]], layout: GeneLayout
     ) -> dict[str, float]:
         """Genes by name, the first parent's first, with noise.
 
-        Those of a copied joint are its original's, those of a new one the nearest joint's that are
-        inherited; where there is none, they are drawn.
+        A copied joint has the genes of its original, a new one those of the nearest joint with
+        inherited genes; if there is none, they are drawn.
         """
         noise = self.settings.mutation * rng.standard_normal(len(layout.names))
         fresh = self.settings.std_init * rng.standard_normal(len(layout.names))
         known: Mapping[str, float] = {k: v for p in reversed(parents) for k, v in p.items()}
-        # A copy has a number behind its original's name; so has what a second parent gives where
-        # the first one has that name, too.
+        # The name of a copy is its original's with a number; so is that of a second parent's module
+        # with a name that the first one has, too.
         copied = {k: v for p in parents for k, v in p.items()}
         found = [known.get(n, copied.get(_COPY.sub("", n))) for n in layout.names]
         have = np.array([value is not None for value in found], bool)
@@ -161,7 +165,7 @@ class NamedGenes:
             values[k] = values[alike[int(np.argmin(away))]] if alike else fresh[k]
         return _named(layout, values + noise)
 
-    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+    def to_vector(self, brain: dict[str, float], layout: GeneLayout) -> np.ndarray:
         """Genes for all bodies, 0 for those that the body lacks."""
         vector = np.zeros(layout.width, np.float32)
         vector[layout.columns] = [brain.get(name, 0.0) for name in layout.names]
@@ -177,12 +181,12 @@ class NamedGenes:
         genes[..., layout.columns] = vectors[..., layout.columns]
         return genes
 
-    def check(self, brain: Any) -> dict[str, float]:
+    def check(self, brain: object) -> dict[str, float]:
         """Genes by name."""
         return read(_NAMED, brain, "brain")
 
 
-def _named(layout: GeneLayout, values: Any) -> dict[str, float]:
+def _named(layout: GeneLayout, values: Iterable[float]) -> dict[str, float]:
     return {n: float(np.float32(x)) for n, x in zip(layout.names, values, strict=True)}
 
 
@@ -234,13 +238,13 @@ class PatternNetwork:
     def draw(self, rng: np.random.Generator, layout: GeneLayout) -> list[float]:
         """Normally distributed weights."""
         weights = rng.standard_normal(self.size)
-        # So that genes, whatever their number of inputs, come out about as wide as drawn ones.
+        # Scaled so that the spread of genes does not depend on the number of inputs.
         weights[self.first : self.second] *= self.settings.std_init / np.sqrt(_HIDDEN / 2)
         weights[self.second :] *= self.settings.std_init
         return _weights(weights)
 
     def inherit(
-        self, rng: np.random.Generator, parents: Sequence[Any], layout: GeneLayout
+        self, rng: np.random.Generator, parents: Sequence[list[float]], layout: GeneLayout
     ) -> list[float]:
         """Each weight is one of the parents', with noise."""
         found = np.array(parents[0])
@@ -248,7 +252,7 @@ class PatternNetwork:
             found = np.where(rng.random(self.size) < 0.5, found, parents[1])
         return _weights(found + self.settings.mutation * rng.standard_normal(self.size))
 
-    def to_vector(self, brain: Any, layout: GeneLayout) -> np.ndarray:
+    def to_vector(self, brain: list[float], layout: GeneLayout) -> np.ndarray:
         """The weights."""
         return np.array(brain, np.float32)
 
@@ -256,12 +260,12 @@ class PatternNetwork:
         """The weights."""
         return _weights(vector)
 
-    def check(self, brain: Any) -> list[float]:
+    def check(self, brain: object) -> list[float]:
         """As many weights as the network has."""
         count = self.size
         weights = Annotated[list[Number], Len(count, count), words(f"{count} weights")]
         return read(weights, brain, "brain")
 
 
-def _weights(values: Any) -> list[float]:
+def _weights(values: ArrayLike) -> list[float]:
     return [float(x) for x in np.asarray(values, np.float32)]

@@ -1,9 +1,9 @@
 """Workers of a Dask cluster, on any number of machines: blocks as tasks.
 
-Dask carries tasks and scores, has TLS, restarts workers that die, and lets them join and leave at
-any time. A worker gets blocks once it has opened the job, which it keeps, and was found to have the
-same program. When one is lost, its blocks are scored again, as on one machine. Each task names its
-worker, so that no block counts the failures of another.
+Dask transports tasks and scores, has TLS, restarts workers that die, and lets them join and leave
+at any time. A worker receives blocks once it has opened the job and its program was found to be the
+same. When a worker is lost, its blocks are scored again, as on one machine. Each task names its
+worker, so that failures are counted for the right block.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ if TYPE_CHECKING:
     import jax
 
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.blocks import Block, Scored
+    from mjx_revolve.evolution.blocks import Block, KeyData, Scored
 
-# Between two looks at the list of workers [s].
+# Time between two checks of the list of workers [s].
 _TICK = 1.0
-# What fetching a block's scores may take [s].
+# Time limit for fetching a block's scores [s].
 _FETCH = 10.0
-# Blocks at a worker: one that it scores, and the next, so that it does not wait for mail.
+# Blocks at a worker: the one in progress, and the next, so that it does not wait for messages.
 _AT_ONCE = 2
 _log = logging.getLogger(__name__)
 
@@ -58,13 +58,13 @@ _log = logging.getLogger(__name__)
 # ------------------------------------------------------------------ in Dask's workers
 
 # XLA's CPU back end can lock up when two threads run programs at once.
-_ALONE = threading.Lock()
+_XLA_LOCK = threading.Lock()
 
 
 @contextlib.contextmanager
 def _watched(seconds: float) -> Iterator[None]:
-    """Nothing else runs meanwhile; a process that hangs ends, and its nanny starts another."""
-    with _ALONE:
+    """Runs one program at a time; ends a process that hangs, which Dask's nanny starts again."""
+    with _XLA_LOCK:
         faulthandler.dump_traceback_later(seconds, exit=True)
         try:
             yield
@@ -77,7 +77,7 @@ def _open(pickled: bytes) -> tuple[Any, deque[float], tempfile.TemporaryDirector
     """The fitness of a job, the times of its last blocks [s], and the folder of its files."""
     os.environ["JAX_PLATFORMS"] = "cpu"  # before JAX is imported
     cache, cores = runtime.prepare_process(), runtime.list_cores()
-    # Any core: so that XLA has one thread, as there is a process for each.
+    # Pinned to any one core, so that XLA has one thread: there is a process for each core.
     runtime.prepare_worker(cores[0] if cores else None, str(cache) if cache else None)
     job: Job = pickle.loads(pickled)
     scratch = tempfile.TemporaryDirectory(prefix=SCRATCH)
@@ -86,11 +86,11 @@ def _open(pickled: bytes) -> tuple[Any, deque[float], tempfile.TemporaryDirector
     return fitness, deque(maxlen=101), scratch
 
 
-def prepare(limits: Limits, pickled: bytes) -> tuple[dict[str, Any], dict[str, str]]:
+def prepare(limits: Limits, pickled: bytes) -> tuple[dict[str, object], dict[str, str]]:
     """Opens a job and compiles its fitness, once per process.
 
     Returns:
-        See `fingerprints.identify`; and what else the last bits of scores may depend on.
+        The result of `fingerprints.identify`, and further values that affect the last bits.
     """
     from mjx_revolve.evolution.fingerprints import identify
 
@@ -99,7 +99,7 @@ def prepare(limits: Limits, pickled: bytes) -> tuple[dict[str, Any], dict[str, s
     return identity, {"CPUs": runtime.cpu_model(), "XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
 
 
-def score(limits: Limits, pickled: bytes, block: Block, key: tuple[Any, str]) -> Scored:
+def score(limits: Limits, pickled: bytes, block: Block, key: KeyData) -> Scored:
     """Scores a block."""
     from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
 
@@ -183,7 +183,7 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
         """How many processes score."""
         return len(self._fit())
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """See `Executor`; workers of a cluster come and go."""
         return {"cluster": self.place, "block": self.block}
 
@@ -198,7 +198,7 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
         """See `WorkerExecutor`; one that has room for two blocks stands there twice."""
         return [w for k in range(self._at_once) for w in self._fit() if len(w.blocks) <= k]
 
-    def send(self, worker: ClusterWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+    def send(self, worker: ClusterWorker, number: int, block: Block, key: KeyData) -> None:
         """See `WorkerExecutor`."""
         worker.blocks.append((number, self._submit(worker.address, score, block, key)))
 
@@ -213,7 +213,7 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
 
     @contextlib.contextmanager
     def _lost_if_closed(self) -> Iterator[None]:
-        """Turns Dask's errors, once it has given the scheduler up, into a `WorkerError`."""
+        """Turns Dask's errors after the loss of the scheduler into a `WorkerError`."""
         try:
             yield
         except Exception:  # of any kind, where the connection breaks
@@ -238,7 +238,7 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
     def _look(self) -> list[tuple[int, Any]]:
         """Finds workers that have joined or left, and the blocks of the latter."""
         self._next_look = time.monotonic() + _TICK
-        while self._client.status == "connecting":  # it gives up after a while
+        while self._client.status == "connecting":  # until its timeout
             time.sleep(0.1)
         there: dict[str, int] | None = None
         with contextlib.suppress(OSError), self._lost_if_closed():
@@ -249,7 +249,7 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
         for address in [address for address in self.workers if address not in there]:
             worker = self.workers.pop(address)
             _log.warning("the worker at %s is gone", address)
-            # Of two, one is innocent: from here on they get one at a time.
+            # One of two blocks may be at fault: from here on they are sent one at a time.
             self._at_once = 1
             how = f"the worker at {address} is gone" if len(worker.blocks) == 1 else None
             news += [(number, how) for number, _ in worker.blocks]

@@ -1,6 +1,6 @@
 """The evolution of bodies with their brains: parents, children, learning, survivors.
 
-All that passes from one generation to the next is a `BodySearch`, a plain value. The random numbers
+The state between two generations is a `BodySearch`, a plain value. The random numbers
 of a generation's k-th child come from (seed, generation, k), and those of its learning from the
 individual's number.
 """
@@ -51,10 +51,10 @@ _COUNTERS = ("generation", "next_number", "trials", "seconds")
 
 @dataclass(frozen=True)
 class BodySearch:
-    """Everything that passes from one generation to the next.
+    """State of a search over bodies between two generations.
 
     Attributes:
-        generation: generations that are done; the first one is random, or of seeds.
+        generation: number of finished generations; the first one is random, or of seeds.
         living: the population, best first.
         elites: those with the best scores of all times, best first, `NUM_ELITES` at most.
         archive: the best of each kind, or None.
@@ -63,7 +63,7 @@ class BodySearch:
         next_number: of the next individual.
         trials: brains that were tried.
         seconds: time spent in generations [s]; not reproducible.
-        offspring: the last generation's individuals; not part of what passes on.
+        offspring: the last generation's individuals; not saved.
     """
 
     generation: int = 0
@@ -78,7 +78,7 @@ class BodySearch:
     offspring: tuple[Individual, ...] = ()
 
 
-class _Asked(NamedTuple):
+class _Proposal(NamedTuple):
     """New individuals, the search that they belong to, and the key of their episodes."""
 
     search: BodySearch
@@ -129,7 +129,7 @@ class BodyEvolution(IndividualEvolution):
 
     # --- ask
 
-    def ask(self, search: BodySearch) -> _Asked:
+    def ask(self, search: BodySearch) -> _Proposal:
         """New individuals, each with the brain of its birth."""
         generation = search.generation + 1
         if search.living and self.selection.type != "random":
@@ -137,7 +137,7 @@ class BodyEvolution(IndividualEvolution):
         else:
             offspring = self._founders(search, generation)
         key = jax.random.fold_in(jax.random.key(self.config.evolution.seed), generation)
-        return _Asked(search, offspring, key)
+        return _Proposal(search, offspring, key)
 
     def _founders(self, search: BodySearch, generation: int) -> list[Individual]:
         """Individuals without parents: random ones, and seeds."""
@@ -181,18 +181,18 @@ class BodyEvolution(IndividualEvolution):
 
     # --- evaluate and tell
 
-    def evaluate(self, asked: _Asked) -> list[Individual]:
+    def evaluate(self, proposal: _Proposal) -> list[Individual]:
         """The individuals with what they have learnt, their scores and measures."""
-        return learn(self.executor, asked.offspring, asked.key)
+        return learn(self.executor, proposal.offspring, proposal.key)
 
-    def tell(self, asked: _Asked, results: list[Individual]) -> Generation:
+    def tell(self, proposal: _Proposal, results: list[Individual]) -> Generation[BodySearch]:
         """The search with survivors, elites and archives brought up to date.
 
         Columns: failed (individuals of which every trial failed), living, living_mean, the best
         new individual's measures, the living's mean of `MEAN_DESCRIPTORS`, coverage and qd_score
         of the archive. Scores are those of the new individuals.
         """
-        search, born = asked.search, results
+        search, born = proposal.search, results
         generation, mu = search.generation + 1, self.config.evolution.population_size
         together = [*search.living, *born]
         new = self._novelty(together, search.novelty_archive)
@@ -274,7 +274,7 @@ class BodyEvolution(IndividualEvolution):
         best = born[int(np.nanargmax(new))]
         return np.concatenate([past, features([best], self.selection.novelty)])
 
-    # --- what a run folder gets
+    # --- files of the run folder
 
     def logs(self, search: BodySearch) -> Mapping[str, Sequence[str]]:
         """The last generation's individuals, and the numbers of the living."""

@@ -1,14 +1,14 @@
-"""A colony: robots in one world that meet, mate, are born, age and die, and the rules of that.
+"""The rules of a colony: robots in one world that meet, mate, are born, age and die.
 
 After Revolve's online evolution (Eiben et al. 2013, "The Triangle of Life", ECAL): robots that meet
-and are about as fit as each other have children, which are born in a clinic after a gestation; how
-long a robot lives follows from its fitness. Here bodies and brains are inherited, and energy may
-come from chargers in the water.
+and have similar fitness have children, which are born in a clinic after a gestation; a robot's life
+span follows from its fitness. Here bodies and brains are inherited, and energy may come from
+chargers in the water.
 
-The world goes on in intervals, which are what a run calls generations. Within one, robots swim and
-touch each other (`episodes.tank`). The rules take effect at its end, in the order of the functions
-here: energy and fitness, deaths, edges, matings, births. They are pure: a colony in, a colony and
-events (plain values for the log) out.
+The world advances in intervals, which are the generations of a run. Within one, robots swim and
+touch each other (`episodes.tank`). The rules are applied at its end, in the order of the functions
+here: energy and fitness, deaths, edges, matings, births. They are pure functions: colony → colony
+and events (plain values for the log).
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Member:
         individual: body, brain and genes; its score is its fitness.
         slot: in the tank.
         born: end of the interval in which it was born [s].
-        track: `[W, 3]` positions of its core, newest last, as if there were no edge [m]: as many as
-            fitness needs.
+        track: `[W, 3]` last positions of its core, newest last, without wrapping at edges [m]; the
+            fitness is computed from them.
         offset: `[3]` from its position within the arena to that of the track [m].
         charge: of its battery [J].
         children: numbers of children by the other parent's number.
@@ -81,18 +81,18 @@ class PendingBirth:
 
 @dataclass(frozen=True, eq=False)
 class Colony:
-    """Everything that passes from one interval to the next.
+    """State of a colony between two intervals.
 
     Attributes:
-        generation: intervals that are done.
+        generation: number of finished intervals.
         members: the robots that are alive, by number.
         pending_births: children to come, in the order of mating.
         elites: the fittest that ever lived as long as fitness is measured, best first.
         next_number: of the next individual.
         tank: arrays of the tank; see `Tank.to_arrays`.
         seconds: time spent [s]; not reproducible.
-        born: in the last interval; not part of what passes on, nor are the two below.
-        died: in the last interval, as they were at its end; see `Rules.measured`.
+        born: in the last interval; not saved, nor are the two below.
+        died: in the last interval, in their state at its end; see `Rules.measured`.
         events: of the last interval.
     """
 
@@ -143,9 +143,9 @@ class Rules(NamedTuple):
         return self.fitness.mixed.world.surface_height
 
     def measured(self, member: Member) -> Individual:
-        """A member's individual, its score NaN until it has lived as long as fitness is measured.
+        """A member's individual, its score NaN until its age is the period of fitness.
 
-        Before, its fitness rests on a shorter time, in which a start or a collision weighs more.
+        Over a shorter time, its start or a collision would have more weight.
         """
         known = len(member.track) >= self.window
         return member.individual if known else replace(member.individual, score=float("nan"))
@@ -170,7 +170,7 @@ def make_rules(fitness: BodyFitness) -> Rules:
     return Rules(colony, fitness, look, looks, window, fitness.config.evolution.population_size)
 
 
-def _event(time: float, name: str, number: int, position: np.ndarray, **facts: Any) -> Event:
+def _event(time: float, name: str, number: int, position: np.ndarray, **facts: object) -> Event:
     """An event as plain values."""
     where = [round(float(x), 3) if np.isfinite(x) else None for x in position]
     return {"time": round(float(time), 6), "event": name, "id": number, "place": where} | facts
@@ -228,12 +228,12 @@ def share_power(distance: np.ndarray, settings: EnergyConfig) -> np.ndarray:
 def age_members(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> Colony:
     """Members an interval later: their tracks, batteries and fitness.
 
-    A battery loses the work of the motors and the idle power, and gets what chargers give.
+    A battery loses the work of the motors and the idle power, and gains the chargers' power.
     """
     energy, members = rules.colony.energy, {}
     for number, member in colony.members.items():
         k = member.slot
-        # The trajectory is within the arena; the track goes on beyond its edges.
+        # The trajectory is within the arena; the track continues beyond its edges.
         fresh = trajectory.position[:, :, k].astype(float) + member.offset
         track = np.concatenate([member.track, fresh])[-rules.window :]
         charge = member.charge
@@ -269,7 +269,7 @@ def _positions(members: Iterable[Member], trajectory: TankTrajectory, rules: Rul
 def remove_dead(
     colony: Colony, trajectory: TankTrajectory, rules: Rules
 ) -> tuple[Colony, list[Event]]:
-    """The colony without the members that have died; `died` has these as they were."""
+    """The colony without the members that have died, which are then in `died`."""
     now, alive, died, events = float(trajectory.time[-1]), {}, [], []
     for number, member in colony.members.items():
         age, individual = now - member.born, rules.measured(member)
@@ -309,7 +309,7 @@ def wrap_edges(colony: Colony, rules: Rules) -> tuple[Colony, np.ndarray]:
     """Brings members that have left the arena back in on the other side.
 
     Returns:
-        The colony, and `[3, slots]` by how much the tank's robots are to be moved [m].
+        The colony, and `[3, slots]` displacements of the tank's robots [m].
     """
     shift, members = np.zeros((3, rules.slots)), dict(colony.members)
     for number, member in colony.members.items():
@@ -469,7 +469,7 @@ def _place(
 
 
 def _express(individual: Individual, fitness: BodyFitness) -> Individual:
-    """A new individual with the genes of its brain: in a colony nothing is learnt."""
+    """A new individual with the genes of its brain; a colony has no learning."""
     layout, brains = fitness.layout(individual.body), fitness.brains
     genes = brains.express(brains.to_vector(individual.brain, layout), layout)[layout.columns]
     return replace(

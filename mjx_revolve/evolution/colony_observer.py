@@ -1,11 +1,9 @@
-"""A colony's life from a checkpoint on, with the poses of all its robots, for pages and films."""
+"""A colony replayed from a checkpoint, with the poses of all its robots, for pages and films."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +11,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.run_reader import RunReader, find_run
 from mjx_revolve.evolution.body_fitness import BodyFitness, make_body_fitness
-from mjx_revolve.evolution.colony import Colony, Member
+from mjx_revolve.evolution.colony import Colony, Event, Member
 from mjx_revolve.evolution.colony_search import ColonyEvolution
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.individuals import Individual
@@ -25,11 +23,11 @@ class ObservedRobot:
     """A robot of a colony, and its poses.
 
     Attributes:
-        individual: as it was at the end.
+        individual: in its last state.
         robot: its body.
         born: time of birth [s].
-        end: time of death [s]; None where it lives on.
-        cause: of its death; "" where it lives on.
+        end: time of death [s]; None if it is alive.
+        cause: of its death; "" if it is alive.
         time: `[T]` of its poses [s].
         qpos: `[T, 7 + num_hinges]` MuJoCo's, world frame; from one row to the next it may have been
             put back into the arena from beyond an edge.
@@ -46,15 +44,15 @@ class ObservedRobot:
 
 def observe_colony(
     config: Config, fitness: BodyFitness, search: Colony, begin: float, duration: float, gap: float
-) -> tuple[list[ObservedRobot], list[Mapping[str, Any]]]:
-    """Lets a colony live on, and keeps the poses of its robots.
+) -> tuple[list[ObservedRobot], list[Event]]:
+    """Advances a colony and records the poses of its robots.
 
     Args:
         config: its settings.
         fitness: of its bodies.
-        search: where it goes on.
-        begin: first time that is kept [s], at the start of the next interval.
-        duration: length of what is kept [s], to the end of an interval.
+        search: the colony at the start.
+        begin: start of the record [s], rounded up to the next interval.
+        duration: length of the record [s], rounded up to the end of an interval.
         gap: approximate time between poses [s].
 
     Returns:
@@ -66,20 +64,20 @@ def observe_colony(
     rows = steps // max(k for k in range(1, wanted + 1) if steps % k == 0)
     members: dict[int, Member] = {}
     poses: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    events: list[Mapping[str, Any]] = []
+    events: list[Event] = []
     while _time_of(fitness, search) < begin - 1e-9:
-        asked = evolution.ask(search)
-        search = evolution.tell(asked, evolution.evaluate(asked)).search
+        proposal = evolution.ask(search)
+        search = evolution.tell(proposal, evolution.evaluate(proposal)).search
     until = _time_of(fitness, search) + duration
     while _time_of(fitness, search) < until - 1e-9:
-        asked = evolution.ask(search)
-        trajectory = evolution.evaluate(asked, rows)
-        search = evolution.tell(asked, trajectory).search
-        for number, member in asked.colony.members.items():
+        proposal = evolution.ask(search)
+        trajectory = evolution.evaluate(proposal, rows)
+        search = evolution.tell(proposal, trajectory).search
+        for number, member in proposal.colony.members.items():
             own = trajectory.qpos[:, : 7 + member.individual.body.num_hinges, member.slot]
             whole = np.isfinite(own).all(1).cumprod().astype(bool)
             poses.setdefault(number, []).append((trajectory.time[whole], own[whole]))
-        members |= asked.colony.members
+        members |= proposal.colony.members
         members |= {n: replace(m, individual=rules.measured(m)) for n, m in search.members.items()}
         members |= {i.number: replace(members[i.number], individual=i) for i in search.died}
         events += search.events
@@ -107,7 +105,7 @@ def observe_colony(
 def open_colony(
     folder: Path, begin: float | None = None
 ) -> tuple[Config, BodyFitness, Colony, float]:
-    """A colony at a checkpoint of its run; the folder stays as it is.
+    """A colony at a checkpoint of its run; the folder is not changed.
 
     Args:
         folder: the run folder.

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,7 +62,7 @@ class ColonyInterval(NamedTuple):
 
 
 class ColonyEvolution(IndividualEvolution):
-    """Lets a colony live; see `generations.Evolution`.
+    """A colony as a search; see `generations.Evolution`.
 
     All randomness follows from the seed and the interval's number.
     """
@@ -84,7 +84,7 @@ class ColonyEvolution(IndividualEvolution):
     def _empty_tank(self) -> None:
         contact = ContactParameters() if self.rules.colony.touch else None
         self.tank = make_tank(self.fitness.mixed, self.rules.slots, touch=contact)
-        # What the tank holds: the `tank` of the colony that is in it; None: it is elsewhere.
+        # The `tank` of the colony that is loaded into the tank; None: another state.
         self._held: Mapping[str, np.ndarray] | None = {}
 
     def start(self) -> Colony:
@@ -107,27 +107,27 @@ class ColonyEvolution(IndividualEvolution):
         self._set_signals(colony)
         return ColonyInterval(colony, rng)
 
-    def evaluate(self, asked: ColonyInterval, rows: int = 1) -> TankTrajectory:
-        """What the robots do in the interval, with so many rows per look."""
+    def evaluate(self, proposal: ColonyInterval, rows: int = 1) -> TankTrajectory:
+        """The robots' motion in the interval; `rows`: rows of it for each of `Rules.looks`."""
         self._held = None
         return self.tank.advance(self.rules.interval, self.rules.look / rows)
 
-    def tell(self, asked: ColonyInterval, results: TankTrajectory) -> Generation:
+    def tell(self, proposal: ColonyInterval, results: TankTrajectory) -> Generation[Colony]:
         """The colony with the rules applied.
 
         Columns: failed, living, living_mean, time [s], births, matings, deaths by cause, expected
         (children to come), mean_age [s], mean_charge [J] where there is energy, the living's mean
         of `MEAN_DESCRIPTORS`. Scores are the fitness of the living, see `Rules.measured`.
         """
-        rules, rng = self.rules, asked.rng
+        rules, rng = self.rules, proposal.rng
         trajectory = _thin(results, len(results.time) // rules.looks)
         now = float(trajectory.time[-1])
-        colony = age_members(asked.colony, trajectory, rules)
+        colony = age_members(proposal.colony, trajectory, rules)
         colony, deaths = remove_dead(colony, trajectory, rules)
         colony, shift = wrap_edges(colony, rules)
         colony, matings = mate(colony, trajectory, rules)
         colony, births = give_birth(colony, now, rules, rng)
-        self._synchronize(asked.colony, colony, shift)
+        self._synchronize(proposal.colony, colony, shift)
         self._held = self.tank.to_arrays()
         living = [self.rules.measured(member) for member in colony.members.values()]
         colony = replace(
@@ -144,7 +144,7 @@ class ColonyEvolution(IndividualEvolution):
         )  # fmt: skip
 
     def _load(self, search: Colony) -> None:
-        """Fills a new tank as it was."""
+        """Restores the tank of a colony."""
         if self._held != {}:
             self._empty_tank()
         if not search.tank:
@@ -202,7 +202,7 @@ class ColonyEvolution(IndividualEvolution):
             columns["mean_charge"] = finite_mean([member.charge for member in members])
         return columns | mean_descriptors(colony.living)
 
-    # --- what a run folder gets
+    # --- files of the run folder
 
     def logs(self, search: Colony) -> Mapping[str, Sequence[str]]:
         """Individuals at birth and again at death (the later line counts), the living, events."""
@@ -221,7 +221,7 @@ class ColonyEvolution(IndividualEvolution):
 
     # --- to and from a checkpoint
 
-    def to_arrays(self, search: Colony) -> dict[str, Any]:
+    def to_arrays(self, search: Colony) -> dict[str, np.ndarray]:
         """A colony as named arrays."""
         # Parents as they were when they mated; of several matings, their bodies and brains are one.
         parents = [parent for pending in search.pending_births for parent in pending.parents]

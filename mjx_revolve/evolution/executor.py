@@ -3,8 +3,8 @@
     with make_executor("configs/lake_swim.yaml") as executor:
         scores, measures = executor.evaluate(population, key)
 
-Imports stand inside functions: `make_executor` sets threads before NumPy and JAX are loaded, and
-workers start while the rest is.
+Imports stand inside functions: `make_executor` sets threads before NumPy and JAX are imported, and
+workers start at the same time.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 
 def choose_workers(config: Config) -> int:
-    """How many workers a run gets on CPUs: one for each core, but none without a block of its own.
+    """Number of workers of a run on CPUs: one for each core, but no more than blocks.
 
-    It needs no JAX.
+    It imports no JAX.
     """
     if config.colony is not None:  # a world is stepped as a whole
         return 1
@@ -55,7 +55,7 @@ def make_executor(
             its name, see `jobs.MakeFitness`. None: the package's own. By default another one has no
             workers.
         cluster: a Dask scheduler's address, or the path of its scheduler file: its workers score.
-        started: from `processes.start_workers`, which are taken if they are as many as asked for.
+        started: from `processes.start_workers`; used if their number is `workers`.
 
     Returns:
         The executor; to be closed, or used in a `with`.

@@ -1,4 +1,4 @@
-"""Blocks that were given up because their workers died: kept in a file, and scored again.
+"""Blocks that failed because their workers died: kept in a file, and scored again.
 
     python -m mjx_revolve.evolution.failed_blocks runs/big/lost/1f0c….npz
 
@@ -84,7 +84,7 @@ def save_failed_block(folder: Path, job: Job, block: Block, key: jax.Array) -> P
 
 
 def score_failed_block(path: str | Path, trust: bool = False) -> Scored:
-    """Scores a block that was kept, in this process: a worker would hide what happens.
+    """Scores a block from its file, in this process, so that errors are seen.
 
     Args:
         path: of the file.

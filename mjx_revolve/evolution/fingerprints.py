@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorboard", "passport")
 """Settings of `evolution` that may change when a run is resumed; others make another run."""
-# Settings that older versions lack, by section: with their default values, or with what those
-# versions had (`config.OLDER`), they are left out of fingerprints, so that older runs can go on.
+# Settings that older versions lack, by section. With their default values, or with the values in
+# effect in those versions (`config.OLDER`), they are left out of fingerprints, so that older runs
+# can be resumed.
 _LATER = {
     "task": (
         "measures", "unit", "target_turn", "sight", "touch",
@@ -40,17 +41,21 @@ def hash_text(*texts: str) -> str:
 
 
 def plain_settings(config: Config) -> dict[str, Any]:
-    """All settings that may not change while a run goes on; a world is always a mapping."""
+    """All settings that may not change within a run; a world is always a mapping."""
+    from mjx_revolve.episodes.config import with_drag
+    from mjx_revolve.water.world import World
+
     data = config.model_dump()
     for key in FREE_SETTINGS:
         del data["evolution"][key]
+    data["world"] = with_drag(data["world"], World.drag)
     if isinstance(data["world"], str):
         data["world"] = {"name": data["world"]}
     return data
 
 
-def settings_hash(config: Config, by_path: bool = False) -> str:
-    """Of all settings that may not change while a run goes on.
+def settings_hash(config: Config, by_path: bool = False, older_drag: bool = False) -> str:
+    """Fingerprint of all settings that may not change within a run.
 
     Files count by their content, not by their path; so do the users' own tasks and controllers.
     The robot and the world have a fingerprint of their own (`model_hash`).
@@ -58,9 +63,11 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     Args:
         config: of the run.
         by_path: whether current fields and data count by their path, as they did in older runs.
+        older_drag: whether the drag law that is left out is that of older runs.
     """
-    from mjx_revolve.episodes.config import OLDER, Config
+    from mjx_revolve.episodes.config import OLDER, OLDER_DRAG, Config
     from mjx_revolve.episodes.settings import map_files
+    from mjx_revolve.water.world import World
 
     def by_content(file: NamedFile) -> str:
         if file.kind == "morphology":
@@ -72,6 +79,8 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     data = plain_settings(config)
     del data["morphology"], data["modules"]
     data["world"]["name"] = Path(data["world"]["name"]).name
+    if data["world"].get("drag") == (OLDER_DRAG if older_drag else World.drag):
+        del data["world"]["drag"]
     data = map_files(data, by_content, Config)
     for section in ("controller", "task"):
         if not data[section]["params"]:  # older runs have none
@@ -101,22 +110,21 @@ def settings_hash(config: Config, by_path: bool = False) -> str:
     return hash_text(_dump(data))
 
 
-def _dump(data: Any) -> str:
+def _dump(data: object) -> str:
     """Nested values as JSON, the same for the same; keys may be other than texts in `params`."""
     return json.dumps(_text_keys(data), sort_keys=True, default=str)
 
 
-def _text_keys(value: Any) -> Any:
+def _text_keys(value: object) -> object:
     if isinstance(value, dict):
         return {str(key): _text_keys(item) for key, item in value.items()}
     return [_text_keys(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def fitness_hash(config: Config) -> str:
-    """Of all settings that a fitness is made of, files by their content.
+    """Fingerprint of all settings that a fitness depends on, files by their content.
 
-    Runs that have it in common can share a fitness. It depends neither on the seed nor on how genes
-    are searched for.
+    Runs of equal fingerprints can share a fitness. Seed and strategy are not part of it.
     """
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.episodes.settings import map_files
@@ -130,7 +138,7 @@ def fitness_hash(config: Config) -> str:
 
 
 def model_hash(fitness: Any) -> str:
-    """Of the compiled robot and the water around it; of nothing for a fitness without a robot."""
+    """Fingerprint of the compiled robot and its water; empty for a fitness without a robot."""
     from mjx_revolve.episodes.fitness import Fitness
     from mjx_revolve.evolution.body_fitness import BodyFitness
 
@@ -148,7 +156,7 @@ def program_versions() -> dict[str, str]:
 
 
 def identify(fitness: Any) -> dict[str, Any]:
-    """What all processes of a run must have in common: program, precision, robot and world."""
+    """Program, precision, robot and world, which must be equal in all processes of a run."""
     import jax
 
     return program_versions() | {

@@ -1,7 +1,7 @@
 """The evolution of one body's genes: ask a strategy for a population, evaluate it, tell the scores.
 
-All that passes from one generation to the next is a `GeneSearch`, a plain value; the random numbers
-of generation `g` come from `fold_in(root key, g)` alone.
+The state between two generations is a `GeneSearch`, a plain value; the random numbers of generation
+`g` come from `fold_in(root key, g)` alone.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from mjx_revolve.evolution.individuals import NUM_ELITES
 from mjx_revolve.evolution.strategies import STD_FLOOR, Strategy, make_strategy
 from mjx_revolve.inputs.errors import InputError
 
-# Up to this many rows, filling the candidates up to a whole population, for which the program is
-# compiled already, is quicker than compiling one for a handful.
+# Up to this many rows, padding the candidates to a whole population, for which the program is
+# compiled already, is quicker than compiling a program for a few rows.
 _FILL_UP_TO = 128
 # A population this narrow (in units of the step-size floor) for this many generations has stalled.
 _STALL_SPREAD = 2.0
@@ -35,10 +35,10 @@ _STALL_GENERATIONS = 10
 
 @dataclass(frozen=True)
 class GeneSearch:
-    """Everything that passes from one generation to the next.
+    """State of a search over genes between two generations.
 
     Attributes:
-        generation: generations that are done.
+        generation: number of finished generations.
         state: the strategy's state.
         elites: `[NUM_ELITES, G]` the best of single generations, best first; `elites[0]` is the
             champion so far.
@@ -47,7 +47,7 @@ class GeneSearch:
         latest: `[G]` the last generation's best.
         evaluations: individuals that were scored.
         stalled: generations for which the population has been too narrow.
-        restarts: how often the strategy was started anew.
+        restarts: number of restarts of the strategy.
         seconds: time spent in generations [s]; not reproducible.
     """
 
@@ -63,8 +63,8 @@ class GeneSearch:
     seconds: float = 0.0
 
 
-class _Asked(NamedTuple):
-    """A population, the search that it belongs to, and the keys to go on with."""
+class _Proposal(NamedTuple):
+    """A population, its search, and the keys of `evaluate` and `tell`."""
 
     search: GeneSearch
     population: np.ndarray
@@ -111,7 +111,7 @@ class GeneEvolution:
             latest=np.zeros(num_genes, np.float32),
         )
 
-    def ask(self, search: GeneSearch) -> _Asked:
+    def ask(self, search: GeneSearch) -> _Proposal:
         """The next population, from a new start where the search has stalled."""
         key = jax.random.fold_in(self.root_key, search.generation + 1)
         key_ask, key_evaluate, key_tell, key_restart = jax.random.split(key, 4)
@@ -121,7 +121,7 @@ class GeneEvolution:
         if not np.isfinite(population).all():
             search = self._restart(search, key_restart)
             population, state = self.strategy.ask(key_ask, search.state)
-        return _Asked(replace(search, state=state), population, key_evaluate, key_tell)
+        return _Proposal(replace(search, state=state), population, key_evaluate, key_tell)
 
     def _restart(self, search: GeneSearch, key: jax.Array) -> GeneSearch:
         """A new start from random genes rather than from the champion's, where it just stalled."""
@@ -130,9 +130,9 @@ class GeneEvolution:
         state = self.strategy.init(key_init, mean)
         return replace(search, state=state, restarts=search.restarts + 1, stalled=0)
 
-    def evaluate(self, asked: _Asked) -> Scored:
+    def evaluate(self, proposal: _Proposal) -> Scored:
         """Scores and measures of the population."""
-        return self._score(asked.population, asked.key_evaluate)
+        return self._score(proposal.population, proposal.key_evaluate)
 
     def _score(self, population: np.ndarray, key: jax.Array) -> Scored:
         scores, measures = self.executor.evaluate(population, key)
@@ -143,14 +143,14 @@ class GeneEvolution:
             )
         return scores, measures
 
-    def tell(self, asked: _Asked, results: Scored) -> Generation:
+    def tell(self, proposal: _Proposal, results: Scored) -> Generation[GeneSearch]:
         """The search with the strategy's state and the elites brought up to date.
 
         Columns: step_size (root mean square over the genes of the population's standard deviation),
         failed (rollouts without a finite score), restarts, the best individual's measures.
         """
-        (scores, measures), population, search = results, asked.population, asked.search
-        state = self.strategy.tell(asked.key_tell, population, scores, search.state)
+        (scores, measures), population, search = results, proposal.population, proposal.search
+        state = self.strategy.tell(proposal.key_tell, population, scores, search.state)
         deviation = float(np.sqrt(np.mean(np.var(population.astype(np.float64), axis=0))))
         narrow = deviation <= _STALL_SPREAD * STD_FLOOR * self.config.std_init
         best = int(np.argmax(np.where(np.isfinite(scores), scores, -np.inf)))
@@ -188,8 +188,8 @@ class GeneEvolution:
     def choose_champion(self, search: GeneSearch) -> Champion:
         """The best of the elites, the last best, the last mean and zero genes on fresh starts.
 
-        Zero genes are where every search begins, a robot that does nothing: where noise has led a
-        search astray, its champion is at least no worse than that.
+        Every search starts at zero genes, a robot that does not move: the champion of a search
+        misled by noise is at least no worse than that.
         """
         candidates = [*search.elites, search.latest]
         origins = [f"best of generation {g}" for g in search.elite_generations]
@@ -198,7 +198,7 @@ class GeneEvolution:
         if mean is not None and np.isfinite(mean).all():
             candidates.append(mean)
             origins.append("mean of the last distribution")
-        # Last, so that of equal ones what has evolved wins.
+        # Last, so that evolved genes win a tie.
         candidates.append(np.zeros(self.executor.num_genes))
         origins.append("zero genes: nothing that evolved is better")
         genes = np.stack(candidates).astype(np.float32)
@@ -263,7 +263,7 @@ def _update_elites(search: GeneSearch, genes: np.ndarray, score: float) -> GeneS
     if not np.isfinite(score):
         return search
     genes = genes.astype(np.float32)
-    # The newcomer stands last, so that of equal scores the older one stays ahead.
+    # The new one is last, so that the older one stays ahead in a tie.
     scores = np.append(search.elite_scores, np.float32(score))
     order = np.argsort(-scores, kind="stable")[:NUM_ELITES]
     generations = np.append(search.elite_generations, np.int32(search.generation + 1))

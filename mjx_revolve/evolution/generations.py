@@ -1,15 +1,15 @@
-"""What all searches share: a generation (ask, evaluate, tell), its row, the champion's choice.
+"""The common part of all searches: a generation (ask, evaluate, tell), its row, the champion.
 
-A search over genes, over bodies, and a colony differ in what they ask for and in what they do with
-the results. The clock, the order of the steps and the columns of `metrics.csv` stand here once.
+A search over genes, a search over bodies, and a colony implement `Evolution`. The clock, the order
+of the steps and the columns of `metrics.csv` are here.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from dataclasses import Field, dataclass, field, replace
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import numpy as np
@@ -24,7 +24,7 @@ Scored = tuple[np.ndarray, dict[str, np.ndarray]]
 # Fresh episodes per candidate to choose the champion. The reported score comes from others
 # (`REPORT_EPISODES`), because the best of several means is biased upwards, too.
 CHOOSE_EPISODES = 8
-# How many of the best are tried where a passport is required. A choice: half a minute each.
+# Number of best candidates for which a passport is made if required. A choice: half a minute each.
 _TRIED = 4
 # A stream of random numbers that no generation uses.
 CHOOSE_STREAM = 2**32 - 1
@@ -38,13 +38,13 @@ class Champion:
         genes: `[G]`; those of the body's own controller.
         score: mean over `REPORT_EPISODES` fresh keys; `FAILED_SCORE` stands for a failed rollout.
             Before the final evaluation: the score in its own generation.
-        origin: where it came from, in words.
+        origin: of its genes, in words.
         std: standard deviation over those keys; NaN before.
         measures: mean of each measure over those keys.
         key: the first of those keys, to replay; None before.
         body: its body, where bodies have evolved.
         individual: its number, where bodies have evolved.
-        passport: what it was tried for; None: it was not.
+        passport: results of its tests; None: it was not tested.
     """
 
     genes: np.ndarray
@@ -58,20 +58,37 @@ class Champion:
     passport: Passport | None = None
 
 
-class Generation(NamedTuple):
+class SearchState(Protocol):
+    """State of any search: a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def generation(self) -> int:
+        """Number of finished generations."""
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in generations [s]."""
+
+
+S = TypeVar("S", bound=SearchState)
+
+
+class Generation(NamedTuple, Generic[S]):
     """A generation's result.
 
     Attributes:
         search: the search after it.
-        scores: `[P]` scores that its row summarises; not finite: failed.
+        scores: `[P]` scores, for statistics in its row; not finite: failed.
         champion: the best score so far.
         columns: further columns of its row, in their order.
         evaluated: individuals that it has scored.
         evaluations: individuals that the search has scored so far.
-        simulated: simulated time [s], where the row tells how many times real time it went; or 0.
+        simulated: simulated time [s], for the column `times_real_time`; 0: no such column.
     """
 
-    search: Any
+    search: S
     scores: np.ndarray
     champion: float
     columns: Mapping[str, float]
@@ -80,47 +97,51 @@ class Generation(NamedTuple):
     simulated: float = 0.0
 
 
-class Evolution(Protocol):
+P = TypeVar("P")  # what is evaluated
+R = TypeVar("R")  # its results
+
+
+class Evolution(Protocol[S, P, R]):
     """A kind of search. Its state is a frozen dataclass with `generation` and `seconds`.
 
-    All that passes from one generation to the next is that value, so a search that is read back
-    from disk continues with the same bits.
+    A search depends on that value alone, so one that is read back from disk continues with the same
+    bits.
     """
 
-    def start(self) -> Any:
+    def start(self) -> S:
         """The search before its first generation."""
 
-    def ask(self, search: Any) -> Any:
-        """What the next generation evaluates."""
+    def ask(self, search: S) -> P:
+        """The individuals of the next generation, to be evaluated."""
 
-    def evaluate(self, asked: Any) -> Any:
+    def evaluate(self, proposal: P) -> R:
         """The results of what `ask` returned."""
 
-    def tell(self, asked: Any, results: Any) -> Generation:
-        """The search with the results taken in."""
+    def tell(self, proposal: P, results: R) -> Generation[S]:
+        """The search after the generation, given its results."""
 
-    def to_arrays(self, search: Any) -> dict[str, Any]:
+    def to_arrays(self, search: S) -> dict[str, np.ndarray]:
         """The search as named arrays, for a checkpoint."""
 
-    def from_arrays(self, arrays: Mapping[str, np.ndarray]) -> Any:
+    def from_arrays(self, arrays: Mapping[str, np.ndarray]) -> S:
         """The inverse of `to_arrays`; raises `InputError` for arrays of another search."""
 
-    def logs(self, search: Any) -> Mapping[str, Sequence[str]]:
+    def logs(self, search: S) -> Mapping[str, Sequence[str]]:
         """Lines that the last generation adds to the run folder's logs, by the file's name."""
 
-    def files(self, search: Any) -> Mapping[str, bytes]:
+    def files(self, search: S) -> Mapping[str, bytes]:
         """Files of the run folder that are written anew with each checkpoint, by name."""
 
-    def best(self, search: Any) -> Champion | None:
+    def best(self, search: S) -> Champion | None:
         """The champion so far, not yet evaluated on fresh starts; None: every rollout failed."""
 
-    def choose_champion(self, search: Any) -> Champion:
+    def choose_champion(self, search: S) -> Champion:
         """The champion of a finished search, evaluated on fresh starts."""
 
 
 def run_generations(
-    evolution: Evolution, generations: int, search: Any = None
-) -> Iterator[tuple[Any, dict[str, float]]]:
+    evolution: Evolution[S, P, R], generations: int, search: S | None = None
+) -> Iterator[tuple[S, dict[str, float]]]:
     """Runs a search, one generation at a time.
 
     Args:
@@ -136,8 +157,8 @@ def run_generations(
     search = evolution.start() if search is None else search
     while search.generation < generations:
         began = time.perf_counter()
-        asked = evolution.ask(search)
-        found = evolution.tell(asked, evolution.evaluate(asked))
+        proposal = evolution.ask(search)
+        found = evolution.tell(proposal, evolution.evaluate(proposal))
         seconds = time.perf_counter() - began
         search = replace(found.search, seconds=search.seconds + seconds)
         row = {

@@ -1,10 +1,10 @@
-"""What co-evolution and colony share: columns and lines about the living, elites, the champion."""
+"""The common part of co-evolution and colony: columns and lines about the living, the champion."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -18,24 +18,40 @@ from mjx_revolve.evolution.individuals import Individual, best_individuals
 from mjx_revolve.evolution.learning import score_brains
 from mjx_revolve.inputs.errors import InputError
 
-# Descriptors whose population mean goes into the metrics.
+# Descriptors with their population mean in the metrics.
 MEAN_DESCRIPTORS = ("num_modules", "num_hinges", "length", "mass", "branching", "limbs", "symmetry")
 
 
+class IndividualSearch(Protocol):
+    """State of a search over individuals."""
+
+    @property
+    def generation(self) -> int:
+        """Number of finished generations."""
+
+    @property
+    def elites(self) -> tuple[Individual, ...]:
+        """The best of all generations, best first."""
+
+    @property
+    def living(self) -> tuple[Individual, ...]:
+        """Individuals that are alive."""
+
+
 class IndividualEvolution:
-    """A search whose state has `elites` and `living`, both individuals."""
+    """A search; its state has `elites` and `living`, both individuals."""
 
     def __init__(self, config: Config, executor: Executor) -> None:
         """Prepares a search with an executor over a `BodyFitness`."""
         self.config, self.executor = config, executor
         self.fitness: BodyFitness = executor.fitness
 
-    def best(self, search: Any) -> Champion | None:
+    def best(self, search: IndividualSearch) -> Champion | None:
         """The first elite; in a colony without any, the fittest of the living."""
         elites = _elites(search)
         return self._champion(elites[0], score=elites[0].score) if elites else None
 
-    def choose_champion(self, search: Any) -> Champion:
+    def choose_champion(self, search: IndividualSearch) -> Champion:
         """The best of the elites on fresh starts, each alone at the configuration's task.
 
         Raises:
@@ -77,7 +93,7 @@ class IndividualEvolution:
         return Champion(genes=genes, origin=origin, body=one.body, individual=one.number, **judged)
 
 
-def _elites(search: Any) -> tuple[Individual, ...]:
+def _elites(search: IndividualSearch) -> tuple[Individual, ...]:
     return search.elites or best_individuals(search.living)
 
 
@@ -93,7 +109,7 @@ def mean_descriptors(living: Sequence[Individual]) -> dict[str, float]:
     return {f"mean_{name}": finite_mean(found) for name, found in values.items()}
 
 
-def living_line(search: Any) -> str:
+def living_line(search: IndividualSearch) -> str:
     """A line of JSON: the numbers of the individuals that are alive after a generation."""
     numbers = [individual.number for individual in search.living]
     return json.dumps({"generation": search.generation, "living": numbers}, separators=(",", ":"))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, make_morphology
 from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.genotypes.genotype import Genotype
@@ -32,13 +33,13 @@ class Individual:
         number: unique in a run; children have larger ones than their parents.
         parents: their numbers; of two, the first gave the body.
         born: generation of birth.
-        origin: how it came about: `random`, `seed NAME`, `mutation`, `crossover`, ...
+        origin: the operation that made it: `random`, `seed NAME`, `mutation`, `crossover`, ...
         genome: of the genotype's kind.
-        body: what the genome develops into, not trimmed.
+        body: that the genome develops into, not trimmed.
         brain: at birth; see `brains.BrainEncoding`.
-        learnt: the best brain that was tried; None before that, and where every trial failed.
-        genes: `learnt` as genes of the body's own controller; None where there is none.
-        score: of `learnt`; NaN where there is none.
+        learnt: the best brain that was tried; None before learning, and if every trial failed.
+        genes: `learnt` as genes of the body's own controller; None without `learnt`.
+        score: of `learnt`; NaN without `learnt`.
         measures: of `learnt`, see `measures`.
         trials: brains that were tried.
     """
@@ -86,10 +87,10 @@ def best_individuals(individuals: Iterable[Individual]) -> tuple[Individual, ...
 # --- to and from files
 
 
-def to_record(individual: Individual, genotype: Genotype) -> dict[str, Any]:
+def to_record(individual: Individual, genotype: Genotype) -> dict[str, object]:
     """An individual as plain values by name, for JSON; floats keep their bits.
 
-    `genome` is None where the body says all.
+    `genome` is None if the body is the genome.
     """
     body = individual.body.to_mapping()
     genome = genotype.to_plain(individual.genome)
@@ -110,7 +111,9 @@ def to_record(individual: Individual, genotype: Genotype) -> dict[str, Any]:
     }
 
 
-def from_record(record: Any, genotype: Genotype, modules: Any, check: Any) -> Individual:
+def from_record(
+    record: Any, genotype: Genotype, modules: Mapping[str, ModuleType], check: Callable[[Any], Any]
+) -> Individual:
     """The inverse of `to_record`.
 
     Args:
@@ -160,7 +163,7 @@ def to_text(individual: Individual, genotype: Genotype) -> str:
     return json.dumps(to_record(individual, genotype), separators=(",", ":"))
 
 
-def to_records(individuals: Iterable[Individual], genotype: Genotype) -> list[dict[str, Any]]:
+def to_records(individuals: Iterable[Individual], genotype: Genotype) -> list[dict[str, object]]:
     """Records of individuals by number, each once; of several states of one, the last counts."""
     known = {individual.number: individual for individual in individuals}
     return [to_record(known[number], genotype) for number in sorted(known)]
@@ -205,7 +208,7 @@ def reading_state(
         raise InputError(f"expected {what}; found {reason}") from None
 
 
-def pack_json(value: Any) -> np.ndarray:
+def pack_json(value: object) -> np.ndarray:
     """Plain values as an array of bytes."""
     return np.frombuffer(json.dumps(value).encode(), np.uint8)
 

@@ -1,7 +1,7 @@
-"""Ctrl-C, SIGTERM and SIGHUP as requests: what is done is saved before one ends the process.
+"""Ctrl-C, SIGTERM and SIGHUP as requests to end: finished work is saved before the process ends.
 
 Python runs signal handlers between two instructions of the main thread, and so not while that is
-inside a compiled program, perhaps for minutes. A thread of its own hears of signals at once.
+inside a compiled program, perhaps for minutes. A separate thread receives signals at once.
 """
 
 from __future__ import annotations
@@ -27,18 +27,17 @@ class Interrupts:
     """Takes the signals while it is entered, in the main thread.
 
     At first a signal ends the process at once, with one line. From `be_patient` on, the first is
-    noted, and what is under way can be finished; the second ends the process, once what was done
-    until then is saved.
+    noted, and the generation in progress can be finished; the second ends the process after saving.
 
     Attributes:
-        signal: the number of the first one that came; None so far.
-        writing: held by whoever writes; nothing ends the process meanwhile.
-        rescue: saves what is not saved yet, before the process is ended. Called in another thread,
-            while `writing` is held.
+        signal: the number of the first signal; None so far.
+        writing: a lock, held while files are written: the process does not end meanwhile.
+        rescue: saves unsaved work before the process ends. Called in another thread, while
+            `writing` is held.
     """
 
     def __init__(self) -> None:
-        """Nothing came yet."""
+        """No signal so far."""
         self.signal: int | None = None
         self.writing = threading.Lock()
         self.rescue: Callable[[], None] = lambda: None
@@ -55,12 +54,12 @@ class Interrupts:
 
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is not threading.main_thread():
-            return self  # whoever owns that decides
+            return self  # its owner handles signals
         ears, mouth = self._ends = socket.socketpair()
         mouth.setblocking(False)
         self._former = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
         for number in _SIGNALS:
-            # nohup has the loss of a terminal ignored, and so do we.
+            # Under nohup, SIGHUP is ignored; it stays so.
             if number != signal.SIGINT and signal.getsignal(number) is signal.SIG_IGN:
                 continue
             self._previous[number] = signal.signal(number, self._note)
@@ -93,11 +92,11 @@ class Interrupts:
                 _say(f"{self._answer}; press Ctrl-C again to quit at once")
 
     def _listen(self, ears: socket.socket) -> None:
-        """Hears of each signal at once, whatever the main thread does."""
+        """Receives each signal at once, in a thread of its own."""
         count = 0
         while came := ears.recv(1):
             number = came[0]
-            if number not in self._previous:  # another's signal is heard here, too
+            if number not in self._previous:  # all signals arrive here, other handlers' included
                 continue
             count += 1
             _leave_lost_terminal()
@@ -108,7 +107,7 @@ class Interrupts:
             self._ask(number)
 
     def _end(self, number: int, words: str) -> NoReturn:
-        """Ends the process; whatever stands on the main thread's stack."""
+        """Ends the process at once, without unwinding the main thread."""
         with self.writing:
             try:
                 self.rescue()
@@ -120,7 +119,7 @@ class Interrupts:
 
     @property
     def exit_code(self) -> int:
-        """What a shell expects of a process that was interrupted; 0 if it was not."""
+        """The exit code, 128 plus the signal's number as in shells; 0 without a signal."""
         return 128 + self.signal if self.signal else 0
 
 
@@ -131,7 +130,7 @@ def _say(words: str) -> None:
 
 
 def _leave_lost_terminal() -> None:
-    """Nothing that is printed to a terminal which is gone may keep a run from being saved."""
+    """Redirects output to /dev/null: an error on a lost terminal must not prevent saving."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):
             if stat.S_ISCHR(os.fstat(descriptor).st_mode) and not os.isatty(descriptor):

@@ -1,4 +1,4 @@
-"""A job: all that a worker, on this machine or another, needs to make a fitness.
+"""A job: the values from which a worker, on this machine or another, makes a fitness.
 
 Imports stand inside functions: a worker's threads are set before NumPy and JAX are loaded.
 """
@@ -32,13 +32,13 @@ class WorkerError(RuntimeError):
 
 @dataclass(frozen=True)
 class Limits:
-    """How long a worker may be silent before it is given up [s] (choices).
+    """Time limits of workers [s] (choices).
 
     Attributes:
         ready: until it has built and compiled its fitness.
         block: for a block, and at least ...
         factor: ... this many times the median of those before it.
-        tries: how often a block is scored before it is given up [-].
+        tries: number of attempts to score a block [-].
     """
 
     ready: float = 900.0
@@ -58,14 +58,14 @@ SCRATCH = "mjx_revolve_"
 
 @dataclass(frozen=True)
 class Job:
-    """All that makes a fitness, as values that can be sent to a process on any machine.
+    """Everything a fitness is made from, as values that can be sent to a process on any machine.
 
     Attributes:
         config: the configuration as JSON.
-        source: what messages call it.
-        files: the files that it names, by the relative paths that it has for them.
+        source: its name in messages.
+        files: the files that it names, by the relative paths in it.
         make_fitness: makes the fitness; pickled by its name.
-        limits: how long to wait.
+        limits: of the workers.
     """
 
     config: str

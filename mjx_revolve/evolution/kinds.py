@@ -1,4 +1,4 @@
-"""The search that a configuration asks for."""
+"""The kind of search of a configuration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mjx_revolve.evolution.generations import Evolution
 
 
 def make_evolution(config: Config, executor: Executor) -> Evolution:
-    """The search over genes or bodies, or the colony, that a configuration asks for.
+    """The search over genes, the search over bodies, or the colony of a configuration.
 
     Raises:
         InputError: a strategy, a selection or a name of a feature is wrong.

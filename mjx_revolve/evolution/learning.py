@@ -1,4 +1,4 @@
-"""Learning: what bodies try between birth and their score, all of them at once.
+"""Learning of brains between birth and score, for all new bodies at once.
 
 Each body's brains are searched by an evosax strategy of its own, around the brain of its birth. The
 score of an individual is that of the best brain it has tried. The result for one body does not
@@ -27,7 +27,7 @@ from mjx_revolve.inputs.errors import InputError
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Brains drawn around the one of birth; a learner with the interface of a `Strategy`."""
+    """Brains drawn around the inherited one; random search with the interface of a `Strategy`."""
 
     count: int
     std: float
@@ -41,8 +41,10 @@ class Perturbation:
         rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
         return state + self.std * rng.standard_normal((self.count, len(state))), state
 
-    def tell(self, key: jax.Array, population: Any, scores: Any, state: np.ndarray) -> np.ndarray:
-        """The same state: nothing is learnt."""
+    def tell(
+        self, key: jax.Array, population: np.ndarray, scores: np.ndarray, state: np.ndarray
+    ) -> np.ndarray:
+        """The same state."""
         return state
 
 
@@ -104,7 +106,7 @@ class _Learner:
 def learn(
     executor: Executor, individuals: Sequence[Individual], key: jax.Array
 ) -> list[Individual]:
-    """Lets individuals learn.
+    """Optimises the brains of individuals.
 
     Args:
         executor: an executor over a `BodyFitness`.
@@ -113,7 +115,7 @@ def learn(
             and turns, so that scores can be compared.
 
     Returns:
-        The individuals with what they have learnt, their scores and measures.
+        The individuals with learnt brains, their scores and measures.
     """
     fitness: BodyFitness = executor.fitness
     settings, brains = fitness.bodies.learning, fitness.brains

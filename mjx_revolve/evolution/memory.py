@@ -14,7 +14,7 @@ from mjx_revolve.episodes.config import Config
 from mjx_revolve.genotypes.genotype import Genotype
 from mjx_revolve.inputs.errors import InputError
 
-# What an individual takes: so many copies of its genes, and so many numbers more (scores, ranks,
+# Memory of an individual: so many copies of its genes, and so many numbers more (scores, ranks,
 # measures), measured with SNES and CMA-ES at 400,000 individuals of 5 and 40 genes, rounded up.
 _COPIES, _MORE = 8, 100
 # Bytes for each pair of individuals; measured.
@@ -68,7 +68,7 @@ def check_memory(config: Config, num_genes: int, genotype: Genotype | None = Non
 
 
 def _check(config: Config, place: str, found: int, need: Callable[[int], int], free: int) -> None:
-    """Refuses a number of individuals that need more than the free memory [bytes]."""
+    """Refuses a number of individuals that take more than the free memory [bytes]."""
     if need(found) > free:
         most = max(0, bisect.bisect_right(range(found), free, key=need) - 1)
         raise InputError(
@@ -80,7 +80,7 @@ def _check(config: Config, place: str, found: int, need: Callable[[int], int], f
 def weigh_bodies(genotype: Genotype) -> int:
     """The memory of a random body with its genome, the mean of a few [bytes]."""
     rng = np.random.default_rng(0)
-    # Whatever is made only once does not count.
+    # Objects that are made only once do not count.
     kept: list[Any] = [genotype.develop(genotype.random(rng)).descriptors]
     ours = not tracemalloc.is_tracing()
     if ours:

@@ -1,4 +1,4 @@
-"""Novelty: how far an individual is from those that it resembles most.
+"""Novelty: the mean distance of an individual to its nearest neighbours.
 
 After Lehman and Stanley, "Abandoning objectives: evolution through the search for novelty alone",
 Evolutionary Computation 19(2), 2011.

@@ -39,14 +39,14 @@ from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.config import Config
-    from mjx_revolve.evolution.blocks import Block, Scored
+    from mjx_revolve.evolution.blocks import Block, KeyData, Scored
 
-# What a worker runs: it finds modules where this process finds them.
+# The program of a worker: it has the same module search path as this process.
 _PROGRAM = (
     "import sys; sys.path[:] = sys.argv[2:]; "
     "from mjx_revolve.evolution.processes import serve; serve(int(sys.argv[1]))"
 )
-# How often the executor looks at the time that workers take [s].
+# Time between two checks of the workers' time limits [s].
 _TICK = 0.25
 # How much of the end of a worker's log is read [bytes].
 _TAIL = 4096
@@ -67,7 +67,7 @@ def serve(descriptor: int) -> NoReturn:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         _work(Connection(descriptor))
-    # JAX's own farewell takes a tenth of a second, and there is nothing to bid farewell to.
+    # JAX's clean-up at exit takes a tenth of a second, and a worker has nothing to clean up.
     sys.stderr.flush()
     os._exit(0)
 
@@ -116,7 +116,7 @@ class LocalWorker:
         core: the core it is pinned to; None: any.
         ready: whether it has opened the job.
         block: the number of the block that it scores; None: it is free.
-        age: how long it has been at that, as far as the executor watched [s].
+        age: time spent on that block, as measured by the executor [s].
     """
 
     def __init__(self, core: int | None, cache: Path | None) -> None:
@@ -143,8 +143,8 @@ class LocalWorker:
             theirs.close()
         self.send((core, str(cache) if cache else None))
 
-    def send(self, message: Any) -> None:
-        """Sends a message; that it has died is found out when its answer is read."""
+    def send(self, message: object) -> None:
+        """Sends a message; the worker's death shows when its answer is read."""
         with contextlib.suppress(OSError):
             self.channel.send(message)
 
@@ -177,9 +177,8 @@ def start_workers(count: int, cache: Path | None) -> list[LocalWorker]:
     """Starts workers, which import what they need and wait for a job.
 
     Args:
-        count: how many. When they are at least as many as there are cores, each is pinned to a
-            core; fewer are left to the system, so that several such runs on one host do not crowd
-            on the same cores.
+        count: number of workers. If there is one for each core, each is pinned to a core; fewer are
+            not pinned, so that several runs on one host do not share the same cores.
         cache: the compilation cache's folder.
 
     Raises:
@@ -226,7 +225,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
             cache: the compilation cache's folder.
         """
         self.workers = workers
-        # Theirs, kept here, as they are killed.
+        # The workers' temporary folder, removed by this process, as workers are killed.
         self._scratch = tempfile.TemporaryDirectory(prefix=SCRATCH)
         self._cache = cache
         self._times: deque[float] = deque(maxlen=101)
@@ -249,7 +248,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         """See `WorkerExecutor`."""
         return [w for w in self.workers if w.ready and w.block is None]
 
-    def send(self, worker: LocalWorker, number: int, block: Block, key: tuple[Any, str]) -> None:
+    def send(self, worker: LocalWorker, number: int, block: Block, key: KeyData) -> None:
         """See `WorkerExecutor`."""
         worker.block, worker.age = number, 0.0
         worker.send((block, key))
@@ -258,7 +257,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         """See `WorkerExecutor`; WorkerError where no worker is left, and none can be started."""
         began = time.monotonic()
         heard = wait([worker.channel for worker in self.workers], _TICK)
-        # Not more, even if this process was itself stopped meanwhile: that is no fault of theirs.
+        # Bounded, as this process may have been stopped (Ctrl-Z) in between.
         waited = min(time.monotonic() - began, 2 * _TICK)
         news: list[tuple[int, Scored | str | None]] = []
         for worker in list(self.workers):
@@ -307,7 +306,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         return [] if worker.block is None else [(worker.block, how)]
 
     def _dismiss(self, worker: LocalWorker, why: str) -> None:
-        """Goes on without a worker, as long as there are others."""
+        """Removes a worker; the executor continues with the others."""
         worker.end()
         self.workers.remove(worker)
         if not self.workers:

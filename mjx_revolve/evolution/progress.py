@@ -15,8 +15,8 @@ from tqdm import tqdm
 # A log gets about this many lines, however long the run, and never stays silent for longer [s].
 _LINES = 60
 _SILENCE = 30.0
-# Of the live line [columns]: the widest one, that of a terminal that does not know its size, the
-# narrowest with a word before the count, and of the bar at least.
+# Widths of the live line [columns]: the largest, the default for a terminal without a size, the
+# smallest with a word before the count, and the smallest of the bar.
 _WIDEST, _USUAL, _WORDY, _BAR = 120, 80, 60, 10
 
 
@@ -25,7 +25,7 @@ class _Line(tqdm):
 
     Attributes:
         figures: in words, the most important first; the last one is left out before the bar is.
-        words: what is under way, shown in place of the figures; "" for none.
+        words: the current activity, shown in place of the figures; "" for none.
     """
 
     monitor_interval = 0  # no thread that redraws bars which have gone silent
@@ -66,7 +66,7 @@ class _Nowhere(io.StringIO):
     """A file that drops the bar, which still estimates the time left."""
 
     def write(self, text: str) -> int:
-        """Forgets it."""
+        """Discards it."""
         return len(text)
 
 
@@ -143,7 +143,7 @@ class Progress:
             self._show(row)
 
     def say(self, words: str) -> None:
-        """Says what is under way when all generations are done."""
+        """Shows the activity after the last generation."""
         with self._forgiving():
             if self._live and not self._leave:
                 self._bar.words = words
@@ -156,7 +156,7 @@ class Progress:
 
     @contextlib.contextmanager
     def _forgiving(self) -> Iterator[None]:
-        """Goes on where the terminal or the pipe is gone: no reason to end a run of days."""
+        """Ignores the loss of the terminal or the pipe: it must not end a run."""
         try:
             yield
         except OSError:
@@ -169,7 +169,7 @@ class Progress:
         self._bar.figures = self._figures(row)
         self._bar.words = ""
         first, self._first = self._first, False
-        if first:  # compiling took most of it: the time left follows from the next ones
+        if first:  # mostly compilation: the time left is estimated from later ones
             self._bar.unpause()
             self._bar.n = self._bar.initial = self._bar.last_print_n = generation
             self._bar.refresh()
@@ -214,7 +214,7 @@ class Progress:
             columns = os.get_terminal_size(self._out.fileno()).columns
         except (OSError, ValueError):
             columns = 0
-        # Some terminals wrap at the last column, and some do not know their size.
+        # Some terminals wrap at the last column, and some report no size.
         return min(columns if columns > 1 else _USUAL, _WIDEST) - 1
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""How an individual comes into being, in generations as in a colony: founders and children."""
+"""New individuals, in generations and in a colony: founders and children."""
 
 from __future__ import annotations
 

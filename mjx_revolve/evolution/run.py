@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import itertools
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -44,7 +45,7 @@ from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.user_code import announce
 from mjx_revolve.numerics import runtime
 
-# What the bits of a run depend on, besides its configuration.
+# Entries of `describe_host` on which the bits of a run depend, besides its configuration.
 _HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
 _RUNS = Path("runs")
 _log = logging.getLogger(__name__)
@@ -78,17 +79,17 @@ class Run:
 
     @property
     def generation(self) -> int:
-        """How many generations are done."""
+        """Number of finished generations."""
         return self.search.generation if self.search else 0
 
     @property
     def unit(self) -> str:
-        """What its generations are called: those of a colony are intervals."""
+        """The word for its generations: "interval" for a colony."""
         return "generation" if self.config.colony is None else "interval"
 
     @property
     def resumption(self) -> str:
-        """Where a resumed run goes on, in words."""
+        """The generation from which a resumed run continues, in words."""
         done = self.generation
         return f"after {self.unit} {done}" if done else "from the start: it has no checkpoint yet"
 
@@ -198,7 +199,8 @@ class Run:
         begun = checkpoint.meta if checkpoint else files.info
         settled = settings_hash(config)
         known = begun.get("settings_hash", settled)  # an older version's run.json has none
-        if known not in (settled, settings_hash(config, by_path=True)):
+        ways = itertools.product((False, True), repeat=2)
+        if known not in {settings_hash(config, *way) for way in ways}:
             raise InputError(
                 f"{label}: expected the config.yaml that it began with; found it changed"
             )
@@ -230,10 +232,10 @@ class Run:
         log: TextIO | None = None,
         label: str = "",
     ) -> Champion | None:
-        """The rest of the run, or as much of it as there is before an interrupt, saved.
+        """Runs and saves the remaining generations, or those before an interrupt.
 
         Args:
-            interrupts: looked at after each generation.
+            interrupts: checked after each generation.
             draw: draws the run's pictures; see `finish`.
             log: gets the progress in plain lines; None: standard output shows it.
             label: of the live line that a terminal has beside the log.
@@ -373,7 +375,7 @@ class Run:
         config = self.config
         say("judging the champion on fresh starts")
         champion = self.evolution.choose_champion(self.search)
-        facts: dict[str, Any] = {
+        facts: dict[str, object] = {
             "score": champion.score,
             "score_std": champion.std,
             "origin": champion.origin,
@@ -419,7 +421,7 @@ class Run:
 
 def _prepare(config: Config, make_executor: MakeExecutor) -> Executor:
     """The executor, once the user's code may run and the population fits into memory."""
-    for file in config.files:  # before workers, whose errors are not seen here, run it
+    for file in config.files:  # before workers run it, as their errors are not seen here
         if file.kind == "code":
             announce(file.text)
     executor = make_executor(config)
@@ -475,7 +477,7 @@ def check_unchanged(old: Config, new: Config, label: str) -> None:
         raise InputError(f"{label}: {found[0]}{more}; only {free} may change")
 
 
-def _differences(old: Any, new: Any, place: str = "") -> list[str]:
+def _differences(old: object, new: object, place: str = "") -> list[str]:
     """Places at which two nested values differ, with both values."""
     if isinstance(old, dict) and isinstance(new, dict):
         return [
@@ -499,8 +501,8 @@ def _portable(settings: Sequence[str], config: Config) -> list[str]:
     return portable
 
 
-def describe_host() -> dict[str, Any]:
-    """What the bits of a run depend on, besides its configuration."""
+def describe_host() -> dict[str, object]:
+    """Program and machine, on which the bits of a run depend besides its configuration."""
     info = runtime.describe_process()
     return {key: info[key] for key in _HOST}
 

@@ -51,7 +51,7 @@ from mjx_revolve.inputs.files import check_path, resolve_inside, with_path, writ
 
 try:
     import fcntl
-except ImportError:  # not on Windows: there, nothing keeps two processes off one folder
+except ImportError:  # not on Windows: there, run folders are not locked
     fcntl = None  # type: ignore[assignment]
 
 LOGS = (INDIVIDUALS, GENERATIONS, EVENTS)
@@ -74,7 +74,7 @@ class RunFolder(RunReader):
 
     # --- plain files ---
 
-    def update_info(self, **changes: Any) -> None:
+    def update_info(self, **changes: object) -> None:
         """Sets entries of `run.json`; None removes one."""
         info = (self.info if (self.path / "run.json").exists() else {}) | changes
         self.write("run.json", _info_text(info))
@@ -97,7 +97,7 @@ class RunFolder(RunReader):
     # --- metrics ---
 
     def append_metrics(self, row: Mapping[str, float]) -> None:
-        """Adds figures by column to `metrics.csv`, whose first line brings the columns."""
+        """Appends a row to `metrics.csv`; the file's first line names the columns."""
         text = io.StringIO()
         writer = csv.writer(text)
         try:
@@ -140,7 +140,11 @@ class RunFolder(RunReader):
     # --- checkpoints ---
 
     def save_checkpoint(
-        self, generation: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], keep: int
+        self,
+        generation: int,
+        arrays: Mapping[str, np.ndarray],
+        meta: Mapping[str, object],
+        keep: int,
     ) -> Path:
         """Saves any arrays but object arrays, and values for JSON; the newest `keep` stay."""
         logs = self._positions()
@@ -186,7 +190,7 @@ class RunFolder(RunReader):
         )
 
     def rewind(self, checkpoint: Checkpoint | None) -> None:
-        """Forgets what came after a checkpoint: metrics, checkpoints, half-written files.
+        """Removes all later than a checkpoint: metrics, checkpoints, half-written files.
 
         Args:
             checkpoint: the checkpoint; None: the run's beginning.
@@ -209,7 +213,7 @@ class RunFolder(RunReader):
     # --- champion ---
 
     def save_champion(
-        self, genes: np.ndarray, body: Morphology | None = None, **facts: Any
+        self, genes: np.ndarray, body: Morphology | None = None, **facts: object
     ) -> None:
         """Writes `champion/genes.yaml`: genes `[G]`, and plain values that go with them.
 
@@ -236,7 +240,7 @@ class RunFolder(RunReader):
         self.close()
 
 
-def _info_text(info: Mapping[str, Any]) -> bytes:
+def _info_text(info: Mapping[str, object]) -> bytes:
     """The text of `run.json`; entries that are None are left out."""
     kept = {key: value for key, value in info.items() if value is not None}
     return (json.dumps(kept, indent=2, ensure_ascii=False) + "\n").encode()
@@ -253,8 +257,8 @@ def _number(value: float) -> str:
     return str(value) if isinstance(value, int | np.integer) else f"{value:.9g}"
 
 
-def _check_meta(meta: Mapping[str, Any]) -> None:
-    """Refuses plain values by which a run could not go on, or would cut files not its own.
+def _check_meta(meta: Mapping[str, object]) -> None:
+    """Refuses plain values with which a run could not be resumed, or would cut other files.
 
     Raises:
         DamageError: they are others.
@@ -320,8 +324,10 @@ def check_new_folder(folder: str | Path, option: str = "--out") -> None:
         raise InputError(f"{option} {folder}: expected a new or empty folder; found a file")
 
 
-def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[RunFolder, Config]:
-    """Makes a run folder and writes down what will run.
+def create_run_folder(
+    folder: str | Path, config: Config, **info: object
+) -> tuple[RunFolder, Config]:
+    """Makes a run folder with configuration and inputs.
 
     Args:
         folder: a new or empty folder.
@@ -346,7 +352,7 @@ def create_run_folder(folder: str | Path, config: Config, **info: Any) -> tuple[
     return run, config
 
 
-def begin_run_folder(folder: str | Path, copies: Mapping[str, bytes], **info: Any) -> RunFolder:
+def begin_run_folder(folder: str | Path, copies: Mapping[str, bytes], **info: object) -> RunFolder:
     """Makes a run folder of any kind, all but its `config.yaml`, which a run writes last.
 
     Args:
@@ -403,7 +409,7 @@ def open_run_folder(folder: str | Path) -> RunFolder:
 
 
 def _check_writable(path: Path, folder: Path) -> None:
-    """Refuses what would have a run write, cut or delete files that are not its own, or hang."""
+    """Refuses links and special files in a folder: a run could harm other files, or hang."""
     with reading(folder):
         real = resolve_inside(path.name, folder)
     if path.name in ("checkpoints", "champion", "inputs"):

@@ -1,8 +1,8 @@
-"""Selection of parents and survivors: tournaments, (μ+λ) and its kin, NSGA-II.
+"""Selection of parents and survivors: tournaments, (μ+λ), (μ,λ) and others, NSGA-II.
 
-Everything follows from one order, `best_first`: by score, or by dominance and crowding where there
-are several objectives. Ties go to the older individual, whatever the order in which individuals are
-given. Nothing here knows what an individual is.
+All schemes use one order, `best_first`: by score, or by dominance and crowding if there are several
+objectives. Ties go to the older individual, for any order of the individuals. Functions take
+objectives and ids only, so that any kind of individual can be selected.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Candidates(NamedTuple):
 
 
 class SelectionScheme(NamedTuple):
-    """A way to choose.
+    """A selection scheme.
 
     Attributes:
         parents: (rng, population, settings, count) → `[count, 2]` indices of parents: two different
@@ -79,7 +79,7 @@ def dominates(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         b: `[..., M]`.
 
     Returns:
-        `[...]` truth values. What has failed dominates nothing, all others dominate it.
+        `[...]` truth values. A failed individual dominates none and is dominated by all others.
     """
     a, b = _valued(a), _valued(b)
     return np.logical_and((a >= b).all(-1), (a > b).any(-1))
@@ -119,8 +119,8 @@ def crowding_distance(objectives: np.ndarray, fronts: np.ndarray) -> np.ndarray:
 
     Returns:
         `[N]` sum over the objectives of the distance between the next lower and the next higher
-        value, over the range within the front; infinite at the ends. Of equal values, those that
-        are named first count as lower. An objective in which a front does not differ adds nothing.
+        value, over the range within the front; infinite at the ends. Of equal values, the first
+        ones count as lower. An objective that is constant within a front adds nothing.
     """
     values, found = _valued(objectives), np.zeros(len(objectives))
     for front in np.unique(fronts):
@@ -146,7 +146,7 @@ def _valued(objectives: np.ndarray) -> np.ndarray:
 def _by_tournament(
     rng: np.random.Generator, population: Candidates, settings: SelectionConfig, count: int
 ) -> np.ndarray:
-    """Twice the best of `tournament` different ones."""
+    """Each parent is the best of `tournament` different individuals."""
     ranking = best_first(population.objectives, population.ids)
     return ranking[_draw(rng, np.argsort(ranking), settings.tournament, count)]
 
@@ -190,7 +190,7 @@ def _comma(found: Candidates, settings: SelectionConfig, mu: int, generation: in
 def _generational(
     found: Candidates, settings: SelectionConfig, mu: int, generation: int
 ) -> np.ndarray:
-    """The best few of the parents, and of the children as many as there is room for."""
+    """The best `elites` of the parents, and the best children in the remaining places."""
     rows = _young(found, settings, generation)
     child = found.is_child[rows]
     elites = _best(found, rows[~child], min(settings.elites, mu))
@@ -201,7 +201,7 @@ def _generational(
 def _best_ever(
     found: Candidates, settings: SelectionConfig, mu: int, generation: int
 ) -> np.ndarray:
-    """The best, of whatever age: where nothing is inherited there is nothing to keep young."""
+    """The best of any age: in random search, which has no inheritance, age does not matter."""
     return _best(found, np.arange(len(found.ids)), mu)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.episodes.bodies_config import LearningConfig
 from mjx_revolve.episodes.config import EvolutionConfig
@@ -24,7 +25,7 @@ from mjx_revolve.inputs.errors import InputError
 
 # SV_CMA_ES and SV_Open_ES evolve several populations side by side, which is another loop.
 _NOT_OFFERED = ("SV_CMA_ES", "SV_Open_ES")
-# Names that people use, beside evosax's. Case, `-` and `_` do not matter anyway.
+# Common names, beside evosax's. Case, `-` and `_` do not matter.
 _OTHER_NAMES = {
     "de": "DifferentialEvolution",
     "ga": "SimpleGA",
@@ -33,7 +34,7 @@ _OTHER_NAMES = {
     "learnedes": "LES",
     "learnedga": "LGA",
 }
-# What a failed rollout scores where no other score of its generation can tell.
+# The score of a failed rollout if no rollout of its generation has a score.
 FAILED_SCORE = -1e6
 # The step size never falls below this fraction of `std_init`: under noisy scores, a smaller step
 # measures only the noise.
@@ -92,6 +93,9 @@ def losses_from_scores(scores: np.ndarray, penalty: float | None = None) -> np.n
     return losses
 
 
+State = dict[str, Any]  # "fresh", and "algorithm": evosax's own
+
+
 @dataclass(frozen=True)
 class Strategy:
     """A strategy with its settings; the state is passed in and handed back.
@@ -114,7 +118,7 @@ class Strategy:
     std_init: float
     population_based: bool
 
-    def init(self, key: jax.Array, mean: Any = None) -> dict[str, Any]:
+    def init(self, key: jax.Array, mean: ArrayLike | None = None) -> State:
         """Starts a search.
 
         Args:
@@ -135,7 +139,7 @@ class Strategy:
         state = self.algorithm.init(key_init, population, jnp.zeros(shape[0]), self.params)
         return _on_host({"fresh": True, "algorithm": state})
 
-    def ask(self, key: jax.Array, state: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
+    def ask(self, key: jax.Array, state: State) -> tuple[np.ndarray, State]:
         """Draws the next population.
 
         Args:
@@ -151,9 +155,9 @@ class Strategy:
         return np.asarray(population), _on_host({"fresh": state["fresh"], "algorithm": algorithm})
 
     def tell(
-        self, key: jax.Array, population: np.ndarray, scores: np.ndarray, state: dict[str, Any]
-    ) -> dict[str, Any]:
-        """Learns from a generation.
+        self, key: jax.Array, population: np.ndarray, scores: np.ndarray, state: State
+    ) -> State:
+        """Updates the state by the scores of a generation.
 
         Args:
             key: for strategies that draw numbers here, too.
@@ -176,16 +180,16 @@ class Strategy:
         state = _on_host({"fresh": False, "algorithm": algorithm})
         return self._floor_std(state)
 
-    def mean(self, state: dict[str, Any]) -> np.ndarray | None:
+    def mean(self, state: State) -> np.ndarray | None:
         """The centre of the distribution, `[G]`; None for a population-based strategy."""
         return None if self.population_based else np.asarray(state["algorithm"].mean)
 
-    def _floor_std(self, state: dict[str, Any]) -> dict[str, Any]:
+    def _floor_std(self, state: State) -> State:
         std = getattr(state["algorithm"], "std", None)
         if std is None or self.population_based:
             return state
         floor = np.float32(STD_FLOOR * self.std_init)
-        # maximum hands NaN on: a broken state stays visible, and the loop restarts it.
+        # np.maximum propagates NaN: a broken state stays visible, and the loop restarts it.
         algorithm = state["algorithm"].replace(std=np.maximum(std, floor).astype(std.dtype))
         return state | {"algorithm": algorithm}
 
@@ -202,7 +206,7 @@ def find_strategy(name: str) -> str:
     """Finds a strategy's evosax name.
 
     Args:
-        name: as the user wrote it; case, `-` and `_` do not matter, and `DE` will do.
+        name: given by the user; case, `-` and `_` do not matter, and `DE` is an alias.
 
     Returns:
         The name in `STRATEGIES`.
@@ -334,7 +338,7 @@ def _make_strategy(
     )
 
 
-def _as_param(key: str, value: Any, default: Any) -> Any:
+def _as_param(key: str, value: object, default: jax.Array) -> jax.Array:
     """A setting with the shape of evosax's default."""
     shape = np.shape(default)
     kind = f"numbers of shape {list(shape)}" if shape else "a finite number"

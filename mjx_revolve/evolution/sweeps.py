@@ -1,12 +1,12 @@
 """Sweeps: many runs, one after the other in one process, so that they share compiled programs.
 
-A start takes as long as many generations even where all is compiled already: imports, tracing,
-reading the cache, in every worker. Runs that differ in their seed, or in how genes are searched
-for, have the same fitness; it is made once, and so are its workers. Scores do not depend on it: an
-executor keeps nothing of the runs before.
+A start takes as long as many generations even if all is compiled already: imports, tracing, reading
+the cache, in every worker. Runs that differ in their seed or their strategy have the same fitness,
+which is made once, with its workers. Scores do not depend on it: an executor keeps no state of
+earlier runs.
 
-The runs lie in one folder: `CASE/seed_K/` is a run folder, `CASE/seed_K.log` its log. Nothing else
-records what is done, so that a sweep can go on after any end.
+The runs are in one folder: `CASE/seed_K/` is a run folder, `CASE/seed_K.log` its log. There is no
+other record of progress, so a sweep can be continued after any end.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A copy of the metrics as TensorBoard's event files.
 
 Written with tensorboardX, which needs neither TensorFlow nor TensorBoard. Its synchronous writer is
-used rather than its SummaryWriter, whose thread does not report a full disk.
+used rather than its SummaryWriter: that one's thread does not report a full disk.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class TensorBoardLog:
         except OSError as error:
             raise with_path(error, self._folder) from None
 
-    def _write(self, **event: Any) -> None:
+    def _write(self, **event: object) -> None:
         from tensorboardX.proto.event_pb2 import Event
 
         with self._naming_folder():

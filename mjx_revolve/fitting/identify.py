@@ -68,7 +68,7 @@ def find_unknown(parameters: Sequence[Parameter], information: np.ndarray) -> li
         elif positive and np.all(v[rows] * v[rows[0]] > 0):
             words = f"{_list(names)} are known only up to a common factor"
         else:
-            words = f"{_list(names)} cannot be told apart"
+            words = f"{_list(names)} cannot be distinguished"
         found.append(Unknown(names, words, v))
     return found
 
@@ -155,7 +155,7 @@ def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
 def motion_problem(
     robot: Robot, motions: Sequence[PlannedMotion], free: Sequence[str], settings: FitSettings
 ) -> FitProblem:
-    """Motions as recordings without measurements: what they would tell, not what they told."""
+    """Motions as recordings without measurements, for the information that they would give."""
     whole = replace(settings, held_out=0.0, window=settings.duration)
     problem = make_problem(robot, [m.recording for m in motions], free, whole)
     for r, motion in enumerate(motions):
@@ -230,7 +230,7 @@ def plan_motions(
     spreads = []
     wanted = settings.motions if count is None else count
     for _ in range(min(wanted, len(motions))):
-        # Each once: what nobody has foreseen shows in different motions rather than in one.
+        # Each once: unforeseen effects show in different motions rather than in one.
         left = [k for k in range(len(motions)) if motions[k] not in chosen]
         best = max(left, key=lambda k: float(np.linalg.slogdet(total + each[k] + prior)[1]))
         total = total + each[best]

@@ -87,7 +87,7 @@ def read_free(names: Sequence[str], robot: Robot) -> list[Parameter]:
 
     Args:
         names: as the user wrote them.
-        robot: with its water, whose laws say what there is.
+        robot: with its water; its laws have the parameters.
 
     Raises:
         InputError: there is no such number, or it would change nothing.

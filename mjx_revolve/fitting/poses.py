@@ -126,7 +126,7 @@ def check_marks(
         mirrored = float(np.median(fit_rigid(model, seen * (1.0, -1.0, 1.0), planar)[2]))
         if mirrored < usual / _BETTER:
             raise InputError(
-                "marks: expected y to the left of x; found them mirrored, as in pictures, whose y "
+                "marks: expected y to the left of x; found them mirrored, as in pictures, where y "
                 "points down (--map mark.NAME.y=COLUMN*-FACTOR)"
             )
     for rows in (np.ones(len(error), bool), error > max(5 * usual, 0.05 * length)):

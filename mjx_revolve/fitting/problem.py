@@ -61,7 +61,7 @@ class FitSettings:
         held_out: share of the recordings, or of each one's end where there are fewer than four,
             that nothing is fitted to.
         iterations: at most.
-        draws: of the prior, at whose best the search begins.
+        draws: of the prior; the search begins at the best of them.
         duration: of a planned motion [s].
         motions: how many are planned.
         rate: of frames in a planned recording [Hz].
@@ -371,7 +371,7 @@ def make_problem(
 
 @lru_cache(maxsize=8)
 def _variants(robot: Robot, names: tuple[str, ...], prescribed: tuple[bool, ...]) -> Variants:
-    """Of a robot whose numbers are free: the same for the same, so that nothing compiles twice."""
+    """Variants of a robot with free parameters; cached, so that nothing compiles twice."""
     parameters = read_free(names, robot)
     tried = [with_values(robot, parameters, np.zeros(len(names)))]
     tried += [with_values(robot, parameters, 0.1 * x) for x in np.eye(len(names))]
@@ -389,7 +389,7 @@ def _held_out(count: int, share: float) -> np.ndarray:
 def _prescribed(
     recordings: Sequence[RobotRecording], hinges: Sequence[str], servos_free: bool
 ) -> set[str]:
-    """Hinges whose measured angles are taken as they are."""
+    """Hinges that move as measured."""
     if servos_free:
         for r in recordings:
             kinds = {n.partition(".")[0] for n in r.signals}

@@ -97,8 +97,8 @@ class Fit:
         unknown: what the recordings do not tell.
         local: (recording, name, value, standard deviation) of what each recording has of its own.
         predictions: of all recordings, those held out first.
-        advice: the motion that would tell most, and the largest of the remaining shares of what
-            was not known before and after it; "" where it was not asked for.
+        advice: the most informative further motion, and the largest of the remaining uncertainties
+            before and after it; "" if none was computed.
     """
 
     problem: FitProblem

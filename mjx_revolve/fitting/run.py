@@ -37,7 +37,7 @@ _FILES = "robot.yaml", "modules.yaml", "recordings.npz"
 
 @dataclass(frozen=True)
 class Request:
-    """What a user asks for.
+    """A user's request of a fit.
 
     Attributes:
         robot: in its water.
@@ -133,7 +133,7 @@ class FitRun:
 
     Attributes:
         folder: its folder, locked.
-        request: what was asked for.
+        request: the user's.
         problem: of it.
         state: of the search; None before its first step.
         model: the problem at the state.

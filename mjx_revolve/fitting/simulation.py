@@ -32,7 +32,7 @@ class Drive:
     Attributes:
         resets: `[K, R]` whether a window begins anew.
         angles: `[hinges, R]` at the start [rad].
-        speeds: likewise [rad/s].
+        speeds: of the same hinges [rad/s].
         ctrl: `[K, N, nu, 2, R]` the robot's own order: as given, and a little later.
         later: `[V]` which variants have the later one.
     """
@@ -83,8 +83,8 @@ def _program(variants: Variants, lanes: int, windows: int, steps: int, every: in
             )
             now = now._replace(state=state)
             start = record(now, None, water)
-            asked = flat(jnp.where(later[:, None], ctrl[:, :, 1, None], ctrl[:, :, 0, None]))
-            inputs = StepInputs(ctrl=asked[:, engine.plant.source[:, 0]])
+            command = flat(jnp.where(later[:, None], ctrl[:, :, 1, None], ctrl[:, :, 0, None]))
+            inputs = StepInputs(ctrl=command[:, engine.plant.source[:, 0]])
             now, records = rollout.advance(now, record, steps // every, every, inputs)
             return now, jnp.concatenate([start[None], records])
 

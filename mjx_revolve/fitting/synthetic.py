@@ -1,4 +1,4 @@
-"""Recordings of robots whose coefficients are known: simulated, and made as bad as real ones."""
+"""Recordings of robots with known coefficients: simulated, with the errors of real recordings."""
 
 from __future__ import annotations
 

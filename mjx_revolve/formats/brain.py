@@ -1,7 +1,7 @@
-"""A controller with its genes as a program: what files for other computers are written from.
+"""A controller with its genes as a program, from which files for other computers are written.
 
 The controller's own step is traced, for one robot and with its parameters as constants, so that
-nothing is translated by hand, and a user's own controller is no different from ours.
+nothing is translated by hand, and users' own controllers are exported in the same way.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import Controller
@@ -40,7 +41,7 @@ READINGS: dict[str, tuple[str, str]] = {
     "work": ("J", "work that servos and propellers have done since the start"),
     "touch": ("N", "force of the bed on the core's rigid body, then on what each hinge carries"),
     "nearest_toward": ("m", "to the nearest other robot x, y, z"),
-    "nearest_tag": ("-", "the number that tells the nearest other robot apart"),
+    "nearest_tag": ("-", "the number that identifies the nearest other robot"),
     "course": ("-", "the direction to keep to x, y, z, of length 1"),
     "seen": ("-", "1 while the target is seen, else 0"),
     "cells": ("N", "force of the bed on the left and the right half"),
@@ -63,10 +64,10 @@ class Signal:
     """An input of a brain.
 
     Attributes:
-        name: a field of `SensorReadings`, behind the module where it is measured at one.
+        name: a field of `SensorReadings`, after the name of the module if it is measured at one.
         unit: of its numbers.
-        words: what it is, and where it is measured.
-        size: how many numbers.
+        words: its meaning, and where it is measured.
+        size: number of values.
         value: number of the input in the program.
     """
 
@@ -83,11 +84,11 @@ class Brain:
 
     Attributes:
         robot: its name.
-        program: what a step computes.
+        program: of a step.
         time: number of the program's input that is the time since the start [s].
         signals: the other inputs.
-        commands: names of what is commanded: hinges [rad], then thrusters [-].
-        num_hinges: how many of them are hinges.
+        commands: names of the actuators: hinges [rad], then thrusters [-].
+        num_hinges: number of hinges.
         low: least of each command.
         high: greatest.
         rate: at which the step is to be called [Hz].
@@ -106,11 +107,11 @@ class Brain:
     sensors: tuple[Sensor, ...]
 
 
-def champion_brain(fitness: Fitness, genes: Any) -> Brain:
-    """The brain of an individual, as its configuration has it.
+def champion_brain(fitness: Fitness, genes: ArrayLike) -> Brain:
+    """The brain of an individual, with the rate and the sensors of its configuration.
 
     Args:
-        fitness: what the genes were evolved for.
+        fitness: of the run.
         genes: `[num_genes]`.
 
     Returns:
@@ -128,7 +129,7 @@ def champion_brain(fitness: Fitness, genes: Any) -> Brain:
 def make_brain(
     robot: Robot,
     controller: Controller,
-    genes: Any,
+    genes: ArrayLike,
     rate: float | None,
     sensors: Sequence[Sensor] = (),
     seen: bool = False,
@@ -140,8 +141,8 @@ def make_brain(
 
     Args:
         robot: from `build_robot`.
-        controller: that acts whenever it is called, and whose sensors are exact (see
-            `Fitness.bare_controller`): noise, rate and delay are the devices' own.
+        controller: with a command at each call and exact sensors (see `Fitness.bare_controller`):
+            real sensors have noise, rate and delay of their own.
         genes: `[num_genes]`.
         rate: at which its step is to be called [Hz]; None: at each of the world's steps.
         sensors: as they were simulated, for the files' comments.
@@ -274,13 +275,13 @@ def _list_readings(
 
 
 def describe_brain(brain: Brain) -> tuple[str, list[str], list[str]]:
-    """What the comments of all files say of a brain.
+    """The text of the comments in all files of a brain.
 
     Args:
         brain: from `make_brain`.
 
     Returns:
-        A title, what to know, and what goes in and out, line by line.
+        A title, notes, and the inputs and outputs, line by line.
     """
     words = [
         f"Call `step` {brain.rate:.6g} times a second, at times k / {brain.rate:.6g} s from 0, and",

@@ -1,7 +1,7 @@
-"""What the code of a brain has in common in all languages: what is stored, what stands in a line.
+"""The common part of a brain's code in all languages: stored arrays and inline expressions.
 
-A value that is used once by an operation on elements is written there, in brackets; what is taken
-from a stored array by a simple index is that array with the index.
+A value that is used once, by an element-wise operation, is written inline, in brackets; elements
+taken from a stored array by a simple index are written as that array with the index.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mjx_revolve.formats.brain_program import (
 )
 
 # Longer expressions get a name; a choice.
-_LONGEST = 100
+_MAX_EXPRESSION = 100
 
 
 class Code(ABC):
@@ -58,7 +58,7 @@ class Code(ABC):
 
     @cached_property
     def _users(self) -> dict[int, list[int]]:
-        """By value, what is made of it."""
+        """For each value, the values that depend on it."""
         found: dict[int, list[int]] = {}
         for number in self.program.live:
             for arg in self.program.values[number].args:
@@ -77,7 +77,7 @@ class Code(ABC):
             len(users) == 1
             and self.program.values[users[0]].size == value.size
             and not self._is_whole(number)
-            and len(text) < _LONGEST
+            and len(text) < _MAX_EXPRESSION
         )
 
     def write(self) -> None:
@@ -107,7 +107,7 @@ class Code(ABC):
         return getattr(ELEMENTWISE[value.op], self.language).format(*args)
 
     def operand(self, number: int) -> str:
-        """A value as it stands in an expression."""
+        """A value in an expression."""
         value = self.program.values[number]
         if number in self._inline:
             return self._inline[number]

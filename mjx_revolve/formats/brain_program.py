@@ -1,9 +1,9 @@
 """A function of JAX as a short list of operations on flat arrays, for files that run without JAX.
 
-The function is traced, its calls are inlined and its constants folded. What moves numbers about
-(slices, reshapes, broadcasts, gathers at constant places) becomes an index, sums and products of
-matrices are written out, and what is left is arithmetic, element by element. The set is closed:
-`ELEMENTWISE` has each operation once, as NumPy and as C99 write it.
+The function is traced, its calls are inlined and its constants folded. Slices, reshapes, broadcasts
+and gathers with constant indices become an index; sums and products of matrices are written out;
+what remains is element-wise arithmetic. The set of operations is closed: `ELEMENTWISE` has each
+once, in the form of NumPy and of C99.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jax.extend import core
+from numpy.typing import ArrayLike
 
 from mjx_revolve.inputs.errors import InputError
 
@@ -80,7 +81,7 @@ ELEMENTWISE: dict[str, Form] = {
 }  # fmt: skip
 """By JAX's name, with `.int` for a form of whole numbers."""
 
-# Of these only reals: what NumPy and C make of whole numbers differs.
+# Of these only reals: NumPy and C differ for integers.
 _REALS_ONLY = ("pow", "clamp")
 _REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
 
@@ -90,7 +91,7 @@ _CALLS = (
     "jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call",
     "custom_vjp_call",
 )  # fmt: skip
-# What moves numbers, and which operands are moved; the others are constant places.
+# Operations that only move elements, with the operands that are moved; others are constant indices.
 _MOVES: dict[str, tuple[int, ...] | None] = {
     "reshape": None, "squeeze": None, "slice": None, "transpose": None,
     "broadcast_in_dim": None, "concatenate": None, "rev": None, "pad": None, "split": None,
@@ -125,7 +126,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Program:
-    """What a step computes.
+    """A step as a list of operations.
 
     Attributes:
         values: each after its arguments.
@@ -172,7 +173,7 @@ class Builder:
             self.values.append(value)
         return number
 
-    def constant(self, data: Any) -> int:
+    def constant(self, data: ArrayLike) -> int:
         """A constant of any shape."""
         flat = np.asarray(data).reshape(-1)
         return self.add(Value(kind_of(flat.dtype), flat.size, "constant", data=flat))
@@ -182,7 +183,7 @@ class Builder:
         return self.add(Value(kind, size, "input", label=label))
 
     def apply(self, name: str, kind: str, *args: int) -> int:
-        """An operation on elements; what adds 0 or multiplies by 1 is left out."""
+        """An element-wise operation; additions of 0 and multiplications by 1 are left out."""
         size = max(self.values[number].size for number in args)
         for k in (0, 1) if name in _NEUTRAL and kind == "real" else ():
             data, other = self.values[args[k]].data, args[1 - k]
@@ -196,9 +197,9 @@ class Builder:
                 return other
         return self.add(Value(kind, size, name, args))
 
-    def take(self, args: Sequence[int], index: Any) -> int:
+    def take(self, args: Sequence[int], index: ArrayLike) -> int:
         """Elements of values that stand one behind the other."""
-        parts = []  # of (value, element), what is itself taken looked through
+        parts = []  # of (value, element), with takes of takes resolved
         for number in args:
             value = self.values[number]
             own = [(number, k) for k in range(value.size)]
@@ -313,7 +314,7 @@ class Builder:
         return f"{name}.int" if kinds[0] == "int" and f"{name}.int" in ELEMENTWISE else name
 
     def _move(self, equation: Any, args: list[int], shapes: list[tuple[int, ...]]) -> list[int]:
-        """What only moves numbers, done to their indices."""
+        """An operation that only moves elements, applied to their indices."""
         name, params = equation.primitive.name, equation.params
         outs = [atom.aval.shape for atom in equation.outvars]
         which = _MOVES[name]
@@ -451,7 +452,7 @@ def split_runs(index: Sequence[int]) -> list[tuple[int, int, int]]:
 
 
 def number_text(x: np.generic, nan: str, infinity: str) -> str:
-    """A number as C and Python read it, to the same bits; what they call what is not finite."""
+    """A number that C and Python read to the same bits; `nan`, `infinity`: names of these."""
     if not isinstance(x, np.floating):
         return str(x).lower() if infinity == "INFINITY" else str(x)
     if not np.isfinite(x):

@@ -28,7 +28,7 @@ _NODE = '''"""{title}
 
 Of what its brain uses, it takes angle, speed and load of the joints from /joint_states
 (sensor_msgs/JointState); up, north, angular_velocity and force from /imu (sensor_msgs/Imu, in the
-core's frame, its orientation that of the core in a frame whose z is up); each other sensor from
+core's frame, its orientation that of the core in a frame with z up); each other sensor from
 /sensors/NAME (std_msgs/Float64MultiArray). It publishes /joint_targets (sensor_msgs/JointState)
 and /thruster_commands (std_msgs/Float64MultiArray).
 

@@ -1,4 +1,4 @@
-"""A robot, and what it did, into files for other programs."""
+"""Export of a robot, its trajectory and its brain to files for other programs."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ def export_robot(
     meshes: str | None = None,
     brain: Brain | None = None,
 ) -> list[tuple[Path, str]]:
-    """Writes a robot, and what it did, for other programs.
+    """Writes a robot, its trajectory and its brain for other programs.
 
     Each file appears whole or not at all; files that are there are replaced.
 
     Args:
         robot: from `build_robot`.
-        files: by format ("mjcf", "urdf", "sdf", "mcap", "controller"), where each goes. URDF and
-            SDF have their meshes in a folder `meshes` beside them, "controller", a Python file,
-            its C and its ROS 2 node.
-        trajectory: what it did; MJCF and SDF start where it starts, and "mcap" cannot do without.
-        meshes: what URDF and SDF call that folder; by default `meshes/`, as seen from the file.
-        brain: from `champion_brain`; "controller" cannot do without.
+        files: path by format ("mjcf", "urdf", "sdf", "mcap", "controller"). URDF and SDF have their
+            meshes in a folder `meshes` beside them, "controller", a Python file, its C files and
+            its ROS 2 node.
+        trajectory: of the robot; MJCF and SDF have its start, and "mcap" requires it.
+        meshes: name of that folder in URDF and SDF; by default `meshes/`, relative to the file.
+        brain: from `champion_brain`; "controller" requires it.
 
     Returns:
-        The files, and what each is, in words.
+        The files, with a description of each.
 
     Raises:
         InputError: there is no trajectory for a bag, nothing of it is finite, the package that

@@ -1,8 +1,8 @@
-"""A robot of rigid links from elsewhere as a robot here: module types and a morphology.
+"""Import of a robot of rigid links: module types and a morphology.
 
 Each link that a hinge moves becomes a module with that hinge, in a frame along its largest box.
-Boxes that are turned against it become modules of their own, fixed to it. A link whose mass is not
-spread evenly over its boxes gets it as four points, which have its mass, centre and inertia.
+Boxes that are turned against it become modules of their own, fixed to it. The mass of a link that
+is not uniform over its boxes becomes four points with the link's mass, centre and inertia.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from mjx_revolve.formats.rigid_links import RigidLink, RigidRobot, Shape, read_r
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import write_atomic
 
-# What has no water and touches nothing, in a box of this edge [m]: a choice, small against a link.
+# Edge of the box of a part without water or contact [m]: a choice, small against a link.
 _SPECK = 1e-4
 _DRY = {"volume": 0.0, "contact": False, "drag": "off", "added_mass": False}
 # Four corners of a cube, no two on one edge: as many points as the inertia of a body needs.
 _CORNERS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
-# Angles of what turns all the way [rad]: a hinge here has a range.
+# Range of a continuous joint [rad], as our hinges have a range.
 _WHOLE = np.pi
 
 
 @dataclass(frozen=True)
 class ImportedRobot:
-    """A robot from elsewhere.
+    """An imported robot.
 
     Attributes:
         morphology: the robot.
         modules: its types of modules, by name.
         files: the mappings that `save` writes: of the morphology and of the types.
-        missing: what was not taken over, in words.
+        missing: properties that were not imported, in words.
     """
 
     morphology: Morphology
@@ -78,7 +78,7 @@ def import_robot(path: str | Path) -> ImportedRobot:
         path: of the file.
 
     Returns:
-        The robot; `missing` names what was not taken over.
+        The robot; `missing` names properties that were not imported.
 
     Raises:
         InputError: the file cannot be read, or holds no such robot; the message says where.

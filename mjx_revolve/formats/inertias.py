@@ -6,21 +6,19 @@ physically consistent inertial parameter identification.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.body.module_types import Part
+from mjx_revolve.engine.assembly import BALLAST_RADIUS
 
-# A link must weigh something; what has no mass of its own gets this [kg].
+# Mass of a link without mass [kg], as a link must have some.
 LEAST = 1e-6
-# Radius of a ballast, as `robot.py` has it [m].
-_BALLAST = 1e-3
 # Share of a thruster's mass that is its propeller: it only makes it spin.
 _ROTOR = 0.05
 
 
-def spread(mass: float, center: Any, square: np.ndarray) -> np.ndarray:
+def spread(mass: float, center: ArrayLike, square: np.ndarray) -> np.ndarray:
     """`[4, 4]` pseudo-inertia of a body; those of bodies in one frame add up.
 
     Args:
@@ -40,7 +38,7 @@ def part_spread(part: Part) -> np.ndarray:
     The mass is spread evenly over the main box; a ballast is a small ball.
     """
     box = spread(part.mass, np.zeros(3), np.diag(np.square(part.boxes[0].size)) / 12)
-    ball = spread(part.ballast_mass, part.ballast_position, _BALLAST**2 / 5 * np.eye(3))
+    ball = spread(part.ballast_mass, part.ballast_position, BALLAST_RADIUS**2 / 5 * np.eye(3))
     return box + ball - (0 if part.thruster is None else propeller(part)[0])
 
 
@@ -57,7 +55,7 @@ def propeller(part: Part) -> tuple[np.ndarray, float]:
 def moments(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass [kg], `[3]` centre [m] and `[3, 3]` inertia about it [kg·m²] of a pseudo-inertia.
 
-    What weighs nothing becomes a small body of `LEAST` at the origin.
+    A body without mass becomes a small one of `LEAST` at the origin.
     """
     if body[3, 3] <= 0:
         body = spread(LEAST, np.zeros(3), 5e-5 * np.eye(3))

@@ -1,8 +1,8 @@
-"""A robot as other programs see it: links, joints and parts, with names that they all accept.
+"""A robot as links, joints and parts in URDF's terms, with names that all programs accept.
 
-The words are URDF's. What is welded together is one link. URDF, ROS topics and SDF take their
-frames from here, so that a transform in a bag fits the link of the same name in a URDF. MuJoCo
-bodies are links one to one.
+Modules that are welded together are one link. URDF, ROS topics and SDF take their frames from here,
+so that a transform in a bag fits the link of the same name in a URDF. Links are MuJoCo's bodies,
+one to one.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.body.solids import part_mesh
+from mjx_revolve.engine.mujoco_model import GREY
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.bed import Bed, bed_height
@@ -26,15 +27,12 @@ from mjx_revolve.water.drag import DRAG_LAWS
 from mjx_revolve.water.laws import BuoyancyLaw, DragLaw, Export
 from mjx_revolve.water.world import World
 
-# The names of ROS (REP 105) for what does not move, for where a robot's odometry starts, and for
-# the robot's main part.
+# The names of ROS (REP 105) for the fixed frame, for the odometry's, and for the robot's main part.
 WORLD, ODOM, BASE = "world", "odom", "base_link"
 
-# Colour of a module whose YAML gives none: that of its geoms in the model.
-_GREY = (0.5, 0.5, 0.5)
 
-# A bed this far below the surface, or nearer, comes along [m]: a robot starts 1 m deep.
-_NEAR = 5.0
+# A bed within this depth below the surface is exported [m]: a robot starts 1 m deep.
+_BED_DEPTH = 5.0
 
 
 @dataclass(frozen=True)
@@ -218,7 +216,7 @@ def inertia_entries(inertia: np.ndarray) -> dict[str, float]:
 
 
 def near_bed(robot: Robot) -> Bed | None:
-    """The bed of a robot's world, where it is near enough to matter.
+    """The bed of a robot's world, if it is near enough to be exported.
 
     Args:
         robot: that starts at the origin.
@@ -230,11 +228,11 @@ def near_bed(robot: Robot) -> Bed | None:
     if bed is None:
         return None
     deep = robot.world.surface_height - float(bed_height(bed, np.float64(0), np.float64(0)))
-    return bed if deep <= _NEAR else None
+    return bed if deep <= _BED_DEPTH else None
 
 
 def missing_flow(world: World) -> list[tuple[object, str]]:
-    """What other simulators' water lacks: whether the world has it, and what it is."""
+    """Flow that other simulators lack: for each kind, whether the world has it, and its name."""
     names = ("shear", "current_field", "gust", "waves", "surface_tension")
     return [(getattr(world, name), f"the world's {name.replace('_', ' ')}") for name in names]
 
@@ -277,7 +275,7 @@ def _place_parts(robot: Robot, taken: set[str]) -> list[PlacedPart]:
                 for k in range(len(part.boxes))
             ),
             mesh=mesh,
-            rgb=module.rgb if module.rgb is not None else _GREY,
+            rgb=module.rgb if module.rgb is not None else GREY,
             position=table.position[row],
             rotation=table.rotation[row],
         )
@@ -316,7 +314,7 @@ def _unique(names: list[str], taken: set[str]) -> list[str]:
 def words_on_laws(
     robot: Robot, export: Callable[[DragLaw | BuoyancyLaw], Export]
 ) -> tuple[list[str], list[str], list[str]]:
-    """What a file's comment says of the laws on a robot's parts.
+    """The text of a file's comment on the laws of a robot's parts.
 
     Args:
         robot: from `build_robot`.

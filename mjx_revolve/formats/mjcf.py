@@ -1,7 +1,7 @@
 """A robot as MJCF that stock MuJoCo opens and simulates without this package.
 
-The model is that of `robot.build_robot`, with the modules' meshes to look at, and with MuJoCo's own
-fluid set as near to our water as it comes; a comment in the file says how near that is.
+The model is that of `robot.build_robot`, with the modules' meshes for display, and with MuJoCo's
+own fluid set as close to our water as possible; a comment in the file lists the differences.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from mjx_revolve.water.buoyancy import find_buoyancy_law
 # Groups that MuJoCo's viewer shows at first are 0 to 2.
 _SEEN, _HIDDEN = 2, 3
 
-# Mass of the bodies at which MuJoCo's water lifts: too little to be felt, enough to divide by [kg].
+# Mass of the bodies for MuJoCo's buoyancy [kg]: negligible, but not zero.
 _FEATHER = 1e-8
 
 _NOTE = """
   {title}, for MuJoCo {version} or newer: start `python -m mujoco.viewer` and drop this file in.
-  The keyframe "start" puts it into the water, whose surface is at z = {surface:g} m.
+  The keyframe "start" puts it into the water; the surface is at z = {surface:g} m.
   Rest pose, masses, inertias, joints, servos and their limits are those it evolved with. What is
   seen are meshes (group {seen}); boxes carry mass and contact (group {hidden}).
 
@@ -57,7 +57,7 @@ def make_mjcf(robot: Robot, start: np.ndarray | None = None) -> str:
     _keep_bed(robot, spec, links)
     _show_meshes(robot, spec, links)
     _light(robot, spec)
-    # What the viewer looks at: the robot, not the bed.
+    # Centre and extent of the viewer's camera: the robot, without the bed.
     spec.stat.center, spec.stat.extent = start[:3], 1.5 * robot.morphology.length
     _lift(robot, spec)
     for link in links[1:]:
@@ -181,14 +181,14 @@ def _lift(robot: Robot, spec: mujoco.MjSpec) -> None:
 
 
 def _limit_speed(joint: mujoco.MjsJoint, link: Link) -> None:
-    """Damping d q̇ + b |q̇| q̇ that meets the servo's effort at its top speed."""
+    """Damping d q̇ + b |q̇| q̇ that equals the servo's effort at its top speed."""
     assert link.joint is not None
     top, damping = link.joint.speed, link.joint.damping
     joint.damping = [damping, max(link.joint.effort - damping * top, 0.0) / top**2, 0.0]
 
 
 def _water(robot: Robot) -> list[tuple[object, str]]:
-    """What may stand for what in MuJoCo's water: whether it does, and in words."""
+    """Substitutes in MuJoCo's water: for each, whether it is used, and a description."""
     lift, drag, _ = words_on_laws(robot, lambda law: law.mjcf)
     return [
         *((_floats(robot).any(), note) for note in lift),
@@ -203,7 +203,7 @@ def _water(robot: Robot) -> list[tuple[object, str]]:
 
 
 def _missing(robot: Robot) -> list[tuple[object, str]]:
-    """What MuJoCo may lack: whether this robot or its world has it, and what it is."""
+    """Properties that MuJoCo lacks: for each, whether robot or world has it, and a description."""
     world, table = robot.world, robot.fluid
     share = world.density * table.carried_mass.mean(-1).sum() / robot.morphology.mass
     return [

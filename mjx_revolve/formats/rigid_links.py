@@ -1,7 +1,8 @@
-"""Rigid links of robots from elsewhere, read from URDF or from MuJoCo's MJCF.
+"""Rigid links of robots, read from URDF or from MuJoCo's MJCF.
 
-Both become the same: links that hinges move, each with its shapes as boxes. What is fixed to a link
-belongs to it. What a robot here cannot have is named in `RigidRobot.missing`.
+The result is the same for both: links that hinges move, each with its shapes as boxes. Links that
+are fixed to another one are merged into it. Unsupported properties are named in
+`RigidRobot.missing`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from mjx_revolve.formats.inertias import spread
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import read_file
 from mjx_revolve.numerics.spatial import quat_to_matrix
+
+Place = tuple[np.ndarray, np.ndarray]  # position [3] [m] and rotation [3, 3]
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class RigidLink:
         limits: `range` [rad], `effort` [N·m] and `speed` [rad/s] of the hinge, where given.
         inertia: `[4, 4]` pseudo-inertia (see `inertias`), link frame.
         solid: shapes that collide.
-        seen: shapes that are looked at.
+        seen: visible shapes.
     """
 
     name: str
@@ -80,16 +83,14 @@ class RigidRobot:
     Attributes:
         name: of the robot.
         links: each after its parent.
-        missing: what was not taken over, in words.
+        missing: properties that were not imported, in words.
     """
 
     name: str
     links: list[RigidLink] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
-    def _add(
-        self, parent: int, place: tuple[np.ndarray, np.ndarray], name: str, hinge: Any
-    ) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+    def _add(self, parent: int, place: Place, name: str, hinge: Any) -> tuple[int, Place]:
         """A link's number, and its place in that one's frame; without a hinge, its parent's."""
         if parent >= 0 and hinge is None:
             return parent, place
@@ -158,8 +159,14 @@ def closed_volume(triangles: np.ndarray) -> tuple[float, np.ndarray] | None:
     return six.sum() / 6, center + triangles.mean((0, 1))
 
 
-def _mesh(triangles: np.ndarray, place: Any, rgb: Any, name: str, missing: list[str]) -> Shape:
-    """The shape of a mesh, whose triangles are in its own frame."""
+def _mesh(
+    triangles: np.ndarray,
+    place: Place,
+    rgb: tuple[float, ...] | None,
+    name: str,
+    missing: list[str],
+) -> Shape:
+    """The shape of a mesh, with triangles in the mesh's own frame."""
     position, rotation = place
     low, high = triangles.min((0, 1)), triangles.max((0, 1))
     size, middle = np.maximum(high - low, 1e-4), (low + high) / 2
@@ -187,7 +194,7 @@ def _numbers(element: Element | None, name: str, count: int, default: str | None
     return found
 
 
-def _origin(element: Element) -> tuple[np.ndarray, np.ndarray]:
+def _origin(element: Element) -> Place:
     """Position and rotation of an element's `<origin>`: about fixed x, then y, then z."""
     origin = element.find("origin")
     roll, pitch, yaw = _numbers(origin, "rpy", 3, "0 0 0")
@@ -198,7 +205,7 @@ def _origin(element: Element) -> tuple[np.ndarray, np.ndarray]:
     return _numbers(origin, "xyz", 3, "0 0 0"), z @ y @ x
 
 
-def _then(first: Any, second: Any) -> tuple[np.ndarray, np.ndarray]:
+def _then(first: Place, second: Place) -> Place:
     """A place in the frame of another place."""
     return first[0] + first[1] @ second[0], first[1] @ second[1]
 
@@ -253,7 +260,7 @@ def _read_urdf(root: Element, path: Path) -> RigidRobot:
     return robot
 
 
-def _inertial(element: Element, place: Any) -> np.ndarray:
+def _inertial(element: Element, place: Place) -> np.ndarray:
     position, rotation = _then(place, _origin(element))
     mass = _numbers(element.find("mass"), "value", 1, None)[0]
     entries = element.find("inertia")
@@ -264,7 +271,9 @@ def _inertial(element: Element, place: Any) -> np.ndarray:
     return _spread(mass, position, rotation, np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]]))
 
 
-def _spread(mass: float, center: Any, rotation: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+def _spread(
+    mass: float, center: np.ndarray, rotation: np.ndarray, inertia: np.ndarray
+) -> np.ndarray:
     """The pseudo-inertia of an inertia about its centre of mass, in turned axes."""
     if mass <= 0:
         return np.zeros((4, 4))
@@ -273,7 +282,12 @@ def _spread(mass: float, center: Any, rotation: np.ndarray, inertia: np.ndarray)
 
 
 def _shape(
-    element: Element, link: str, place: Any, path: Path, colors: dict[str, Any], missing: list[str]
+    element: Element,
+    link: str,
+    place: Place,
+    path: Path,
+    colors: dict[str, Any],
+    missing: list[str],
 ) -> Iterator[Shape]:
     """The shape of a `<collision>` or a `<visual>`; none if it cannot be taken over."""
     geometry = element.find("geometry")
@@ -307,7 +321,7 @@ def _shape(
     yield _box(kind.tag, size, place, rgb)
 
 
-def _box(kind: str, size: np.ndarray, place: Any, rgb: tuple[float, ...] | None) -> Shape:
+def _box(kind: str, size: np.ndarray, place: Place, rgb: tuple[float, ...] | None) -> Shape:
     edges, volume = box_around(kind, size)
     return Shape(edges, place[0], place[1], volume, place[0], rgb)
 
@@ -373,7 +387,7 @@ def _read_mjcf(root: Element, path: Path) -> RigidRobot:
     missing = robot.missing
     missing += [f"the body {model.body(body).name}, another robot" for body in tops if body != top]
     numbers: dict[int, int] = {0: -1}
-    places: dict[int, Any] = {0: (np.zeros(3), np.eye(3))}
+    places: dict[int, Place] = {0: (np.zeros(3), np.eye(3))}
     for body in range(top, model.nbody):
         parent = int(model.body_parentid[body])
         if model.body_rootid[body] != top:
@@ -427,7 +441,7 @@ def _mjcf_hinge(model: mujoco.MjModel, body: int, missing: list[str]) -> tuple[A
 
 
 def _mjcf_shape(
-    model: mujoco.MjModel, geom: int, place: Any, link: RigidLink, missing: list[str]
+    model: mujoco.MjModel, geom: int, place: Place, link: RigidLink, missing: list[str]
 ) -> None:
     """Adds a geom to its link."""
     kind = _GEOM(model.geom_type[geom])

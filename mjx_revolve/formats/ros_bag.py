@@ -1,6 +1,6 @@
 """A rollout as a ROS 2 bag (MCAP), written without ROS.
 
-The package `rosbags` knows ROS 2's message types and encodes them. Frames follow REP 105: `world`
+The package `rosbags` has ROS 2's message types and encodes them. Frames follow REP 105: `world`
 and `odom` are the simulation's world, `base_link` is the core; angles, axes and units follow
 REP 103.
 """
@@ -29,18 +29,18 @@ from mjx_revolve.numerics.spatial import quat_mul, quat_to_matrix
 # Messages per second, unless the simulation steps more slowly [1/s].
 RATE = 100.0
 
-# Topics whose one message reaches those who listen later.
+# Latched topics, with one message that late subscribers receive, too.
 _LATCHED = ("/tf_static", "/robot_description")
 
 
 def write_bag(robot: Robot, trajectory: Trajectory, path: Path) -> None:
-    """Writes what a robot did.
+    """Writes a trajectory.
 
     - `/tf` (`tf2_msgs/TFMessage`): `odom` to `base_link`, and each link from its parent;
     - `/tf_static`: `world` to `odom`, which are the same;
     - `/joint_states` (`sensor_msgs/JointState`): angle [rad], speed [rad/s] and torque of the
       motor [N·m] of each hinge;
-    - `/joint_targets` (`sensor_msgs/JointState`): the angles that the controller asked for [rad];
+    - `/joint_targets` (`sensor_msgs/JointState`): the controller's target angles [rad];
     - `/odom` (`nav_msgs/Odometry`): pose in `odom`, velocities in `base_link`;
     - `/thruster_commands` (`std_msgs/Float64MultiArray`): behind their lag [-], where there are
       thrusters;
@@ -117,7 +117,7 @@ def _write(robot: Robot, trajectory: Trajectory, folder: Path) -> None:
 
 
 def _quality(latched: bool) -> Any:
-    """ROS 2's quality of service: reliable; latched topics reach those who listen later."""
+    """ROS 2's quality of service: reliable; latched topics are transient local."""
     from rosbags import interfaces as ros
 
     forever = ros.QosTime(9223372036, 854775807)
@@ -145,7 +145,7 @@ def _messages(
     qpos, qvel, ctrl = (
         np.asarray(x, np.float64)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
     )
-    # Encoding wants each row in one piece.
+    # The encoder requires contiguous rows.
     angles = np.ascontiguousarray(qpos[:, [joint.qpos for joint in joints]])
     speeds = np.ascontiguousarray(qvel[:, [joint.qvel for joint in joints]])
     targets = np.ascontiguousarray(ctrl[:, [joint.ctrl for joint in joints]])

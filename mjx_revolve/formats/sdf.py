@@ -1,8 +1,8 @@
 """A robot in its water as an SDF world for Gazebo (gz-sim), by Gazebo's own plugins.
 
 Each part of a module is a link of its own, welded to its neighbours, since Gazebo's water acts on
-links: so the drag and the added mass of every part carry over as they are, and buoyancy nearly so.
-A comment in the file says what does not.
+links: so drag and added mass of every part are exported exactly, and buoyancy nearly so. A comment
+in the file lists the differences.
 
 Sources: gz-sim, `src/systems/` `buoyancy`, `hydrodynamics`, `lift_drag`, `thruster` and
 `joint_position_controller`; sdformat, `sdf/1.11` (both as of August 2026).
@@ -11,12 +11,12 @@ Sources: gz-sim, `src/systems/` `buoyancy`, `hydrodynamics`, `lift_drag`, `thrus
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import jax
 import numpy as np
 
+from mjx_revolve.engine.mujoco_model import SAND
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.formats.inertias import moments, part_spread, propeller
 from mjx_revolve.formats.links import (
@@ -48,8 +48,6 @@ _STEP = 0.001
 _THRUST_COEFFICIENT = 0.3
 # Gazebo's names of forces and of velocities, after Fossen.
 _FORCES = "xyzkmn", "UVWPQR"
-# Of a bed, as `robot.py` has it.
-_SAND = (0.76, 0.70, 0.50)
 
 _NOTE = """
   {title} in its water, for Gazebo Harmonic or newer (gz-sim 8, with its default physics, DART):
@@ -111,7 +109,7 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
 # ------------------------------------------------------------------------- elements
 
 
-def _pose(position: Any, rotation: np.ndarray, **relative_to: str) -> Element:
+def _pose(position: Iterable[float], rotation: np.ndarray, **relative_to: str) -> Element:
     return node("pose", [*position, *roll_pitch_yaw(rotation)], **relative_to)
 
 
@@ -171,7 +169,7 @@ def _surroundings(robot: Robot) -> Iterator[Element]:
             node(
                 "link",
                 node("collision", solid, node("surface", rough), name="collision"),
-                node("visual", seen, _material(_SAND), name="visual"),
+                node("visual", seen, _material(SAND), name="visual"),
                 name="bed",
             ),
             name="bed",
@@ -363,7 +361,7 @@ def _thruster(robot: Robot, part: PlacedPart) -> Element:
 
 
 def _water(robot: Robot) -> list[tuple[object, str]]:
-    """What Gazebo's water is made of: whether it is there, and what it does."""
+    """Parts of Gazebo's water: for each, whether it is used, and a description."""
     world, table = robot.world, robot.fluid
     lift, drag, _ = words_on_laws(robot, lambda law: law.sdf)
     return [
@@ -373,13 +371,13 @@ def _water(robot: Robot) -> list[tuple[object, str]]:
             "fluid_added_mass carries the added mass, and the water inside, of each part",
         ),
         *((True, note) for note in drag),
-        (any(world.current), "the drag knows the current"),
+        (any(world.current), "the drag includes the current"),
         (robot.num_thrusters, "Thruster pushes at propellers, which are links of their own"),
     ]
 
 
 def _missing(robot: Robot) -> list[tuple[object, str]]:
-    """What Gazebo's plugins may lack: whether this robot or its world has it, and what it is."""
+    """Properties that Gazebo lacks: for each, whether robot or world has it, and a description."""
     bed = near_bed(robot)
     return [
         (True, "tilt at the surface: Gazebo cuts boxes as if they stood level"),

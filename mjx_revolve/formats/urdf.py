@@ -24,7 +24,7 @@ from mjx_revolve.formats.xml_text import node, to_document
 _NOTE = """
   {title}: {links} links, {joints} hinges, {mass:.6g} kg. SI units; angles are 0 at rest.
   Link names are those of the transforms in the rollout's bag, joint names those of its joint
-  states. URDF knows no water: buoyancy, drag, added mass and thrusters are left out, and the
+  states. URDF has no water: buoyancy, drag, added mass and thrusters are left out, and the
   weight is that in air.
 """
 

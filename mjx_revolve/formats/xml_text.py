@@ -70,10 +70,10 @@ def to_comment(text: str) -> str:
 
 
 def to_list(lines: Iterable[tuple[object, str]]) -> str:
-    """The lines of a comment that are so, each wrapped behind a dash.
+    """The lines of a comment that apply, each wrapped behind a dash.
 
     Args:
-        lines: whether one is so, and its text.
+        lines: whether each applies, and its text.
     """
     return "\n".join(
         textwrap.fill(line, 98, initial_indent="  - ", subsequent_indent="    ")

@@ -2,19 +2,18 @@
 
 CPPNs are those of Stanley (Genetic Programming and Evolvable Machines 8, 2007); variation is that
 of NEAT (Stanley and Miikkulainen, Evolutionary Computation 10, 2002): weights and functions change,
-links come and go, and a node comes to stand in the middle of a link.
+links are added and removed, and a node splits a link.
 
-NEAT numbers innovations, so that crossover can tell which genes of two parents are the same. Here
-the number of a link is the pair of its ends, and that of a node follows from the link that it was
-put into: the same innovation has the same number whoever makes it, without a register that all
-would have to share.
+NEAT numbers innovations, so that crossover can align the genes of two parents. Here the number of a
+link is the pair of its ends, and that of a node follows from the link that it splits: the same
+innovation gets the same number in every genome, without a shared register.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Unit
@@ -47,7 +46,7 @@ FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 # Numbers of nodes fit into a float without loss, and so into JSON everywhere.
 _NUMBERS = 2**53
-# How often two random ends of a new link are drawn before there is none.
+# Draws of two random ends for a new link before the mutation is skipped.
 _LINK_TRIES = 10
 
 
@@ -55,7 +54,7 @@ class Node(NamedTuple):
     """A node between inputs and outputs.
 
     Attributes:
-        number: which it is; inputs have -1, -2, ..., outputs 0, 1, ...
+        number: its innovation number; inputs have -1, -2, ..., outputs 0, 1, ...
         function: a name in `FUNCTIONS`.
     """
 
@@ -78,12 +77,12 @@ class Connection(NamedTuple):
 
 
 class CPPN(NamedTuple):
-    """A network without loops; outputs are the plain sums of what leads to them.
+    """A network without loops; an output is the weighted sum of its incoming links.
 
     Attributes:
-        num_inputs: inputs, one of which is 1 where a bias is wanted.
+        num_inputs: inputs; a constant input of 1 serves as bias.
         num_outputs: outputs.
-        nodes: in an order in which all links lead on.
+        nodes: in topological order.
         links: at most one between two ends.
     """
 
@@ -110,8 +109,8 @@ class CPPN(NamedTuple):
             values[node.number] = FUNCTIONS[node.function](total(node.number))
         return np.stack([total(k) for k in range(self.num_outputs)], axis=1)
 
-    def to_plain(self) -> dict[str, Any]:
-        """The network as JSON holds it, exactly; `read_cppn` reads it."""
+    def to_plain(self) -> dict[str, object]:
+        """The network as plain values for JSON, exactly; `read_cppn` is the inverse."""
         return {
             "num_inputs": self.num_inputs,
             "num_outputs": self.num_outputs,
@@ -122,20 +121,20 @@ class CPPN(NamedTuple):
 
 @checked
 class CPPNSettings:
-    """How networks begin and how they vary.
+    """Settings of initialization, mutation and crossover of networks.
 
     Attributes:
         max_nodes: most nodes between inputs and outputs.
-        first_nodes: how many of them a new network has.
+        first_nodes: number of nodes of a new network.
         std: standard deviation of weights that are drawn anew [-].
         step: standard deviation of a weight's change [-].
-        weights: chance of each weight to change in a mutation.
-        add_node: chance of a node to come to stand in the middle of a link.
-        add_link: chance of a new link.
-        drop_link: chance of a link to go.
-        function: chance of a node's function to be drawn anew.
-        innovations: whether crossover aligns the parents by the numbers of their innovations. If
-            not, each output comes with all that leads to it from either parent.
+        weights: probability of each weight to change in a mutation.
+        add_node: probability of a new node that splits a link.
+        add_link: probability of a new link.
+        drop_link: probability of removing a link.
+        function: probability of drawing a node's function anew.
+        innovations: whether crossover aligns the parents by innovation numbers. If not, each output
+            comes from either parent with the whole subnetwork that leads to it.
 
     Raises:
         InputError: a number is out of range.
@@ -166,10 +165,7 @@ class CPPNSettings:
 def draw_cppn(
     rng: np.random.Generator, num_inputs: int, num_outputs: int, settings: CPPNSettings
 ) -> CPPN:
-    """A random network: all inputs linked to all outputs, and then a few nodes.
-
-    Drawn with `rng`, as the settings say.
-    """
+    """A random network: all inputs linked to all outputs, then `settings.first_nodes` nodes."""
     weights = rng.normal(0.0, settings.std, (num_inputs, num_outputs)).tolist()
     links = [Connection(-1 - i, k, w) for i, row in enumerate(weights) for k, w in enumerate(row)]
     network = CPPN(num_inputs, num_outputs, (), tuple(links))
@@ -179,7 +175,7 @@ def draw_cppn(
 
 
 def mutate_cppn(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
-    """A network that differs a little, at least in one weight."""
+    """A mutant of a network, different at least in one weight."""
     changes = [
         (settings.add_node, _add_node),
         (settings.add_link, _add_link),
@@ -202,7 +198,7 @@ def mutate_cppn(rng: np.random.Generator, network: CPPN, settings: CPPNSettings)
 
 
 def _add_node(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
-    """A node in the middle of a link, which gives way to one of weight 1 and one of its own."""
+    """Splits a link by a node: a link of weight 1 leads to it, one of the old weight from it."""
     if len(network.nodes) >= settings.max_nodes or not network.links:
         return network
     which = int(rng.integers(len(network.links)))
@@ -229,7 +225,7 @@ def _add_node(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -
 
 
 def _number(source: int, target: int, count: int) -> int:
-    """The number of the node that is put into a link, `count` of which are there."""
+    """The innovation number of the node that splits a link for the `count`-th time, from 0."""
     text = f"{source} {target} {count}".encode()
     return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest()) % _NUMBERS
 
@@ -242,7 +238,7 @@ def _add_link(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -
     taken = {(link.source, link.target) for link in network.links}
     for _ in range(_LINK_TRIES):
         i, k = int(rng.integers(len(sources))), int(rng.integers(len(targets)))
-        # A node comes `num_inputs` later among the sources: links lead on.
+        # A node's index among the sources is larger by `num_inputs`; sources come before targets.
         if i - network.num_inputs < k and (sources[i], targets[k]) not in taken:
             link = Connection(sources[i], targets[k], float(rng.normal(0.0, settings.std)))
             return network._replace(links=(*network.links, link))
@@ -250,7 +246,7 @@ def _add_link(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -
 
 
 def _drop_link(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
-    """Without one of its links, and without nodes that then lead nowhere."""
+    """Removes a link, and the nodes that then lead to no output."""
     if not network.links:
         return network
     which = int(rng.integers(len(network.links)))
@@ -259,7 +255,7 @@ def _drop_link(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) 
 
 
 def _part(network: CPPN, outputs: Iterable[int]) -> CPPN:
-    """Some of the outputs, with what leads to them."""
+    """The subnetwork that leads to some of the outputs."""
     needed = {*outputs}
     for node in reversed(network.nodes):
         if any(link.source == node.number and link.target in needed for link in network.links):
@@ -271,7 +267,7 @@ def _part(network: CPPN, outputs: Iterable[int]) -> CPPN:
 
 
 def _change_function(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
-    """With another function in one of its nodes."""
+    """Draws the function of one node anew."""
     if not network.nodes:
         return network
     which = int(rng.integers(len(network.nodes)))
@@ -286,15 +282,16 @@ def _draw_function(rng: np.random.Generator) -> str:
 def cross_cppns(rng: np.random.Generator, a: CPPN, b: CPPN, settings: CPPNSettings) -> CPPN:
     """A child of two networks.
 
-    With innovations: weights and functions of genes that both have come from either; all others are
+    With innovations: matching genes have the weight and function of either parent; all others are
     the first parent's, as NEAT takes them from the fitter one. Without: each output comes from
-    either parent, with all that leads to it; where that is more than `max_nodes`, all from one.
+    either parent with the subnetwork that leads to it; if that exceeds `max_nodes`, all outputs
+    come from one parent.
 
     Args:
-        rng: what all is drawn from.
+        rng: random generator.
         a: the first parent.
         b: the second, with as many inputs and outputs.
-        settings: whether by innovations.
+        settings: `innovations` and `max_nodes`.
 
     Returns:
         The child.
@@ -316,7 +313,7 @@ def cross_cppns(rng: np.random.Generator, a: CPPN, b: CPPN, settings: CPPNSettin
     other = rng.random(a.num_outputs) < 0.5
     one = _part(a, [k for k in range(a.num_outputs) if not other[k]])
     two = _part(b, [k for k in range(a.num_outputs) if other[k]])
-    # Nodes of common descent may have other inputs by now: those of the second get new numbers.
+    # Nodes with equal numbers may have different inputs: those of the second get new numbers.
     new = {node.number: int(rng.integers(a.num_outputs, _NUMBERS)) for node in two.nodes}
     nodes = tuple(node._replace(number=new[node.number]) for node in two.nodes)
     if len(one.nodes) + len(nodes) > settings.max_nodes:
@@ -344,7 +341,7 @@ _Link = Annotated[
 
 @checked
 class _Plain:
-    """A network as JSON holds it."""
+    """A network as plain values for JSON."""
 
     num_inputs: Annotated[Integer, Ge(1)]
     num_outputs: Annotated[Integer, Ge(1)]
@@ -374,7 +371,7 @@ class _Plain:
             raise ConstraintError("links", "one between two ends", "two with the same ends")
 
 
-def read_cppn(plain: Any, place: str = "network") -> CPPN:
+def read_cppn(plain: object, place: str = "network") -> CPPN:
     """A network from what `CPPN.to_plain` made.
 
     Raises:

@@ -1,16 +1,16 @@
-"""Bodies from a CPPN: the network says which module stands at each place, and how it is turned.
+"""Bodies from a CPPN: the network gives the type and the orientation of the module at each slot.
 
-As in revolve2's modular_robot_body_cppn: bodies grow outward from the core, nearest places first,
-up to the largest number of modules. The network is evaluated at every free slot: 1, the position
-of a module there (x, y, z, in steps of one module along the slots' directions, core frame) and its
-distance from the core in modules. Its outputs are a score for no module and for each type, of which
-the highest counts, and the turn in quarters, rounded. What overlaps or exceeds a bound is left out.
+As in revolve2's modular_robot_body_cppn: bodies grow outward from the core, nearest slots first, up
+to the largest number of modules. The network is evaluated at every free slot. Its inputs are 1, the
+position of a module there (x, y, z, in steps of one module along the slots' directions, core frame)
+and its distance from the core in modules. Its outputs are one score for no module and one for each
+type, of which the highest wins, and the orientation in quarter turns, rounded. Modules that overlap
+or exceed a bound are left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -31,15 +31,15 @@ from mjx_revolve.inputs.schema import read
 # 1, x, y, z and the number of modules from the core: how the network numbers them.
 _INPUTS = 5
 _ONE, _DEPTH = -1, -5
-# In a random network the score of no module rises by so much more with each module from the core,
-# and comes to lead at a random distance. A choice: without it, nine in ten bodies fill all the room
-# that there is, as some way out of the core hardly ever ends.
+# In a random network the score of "no module" rises by so much with each module from the core, so
+# that limbs end at a random distance. A choice: without it, nine in ten bodies have the largest
+# number of modules, as some limb hardly ever ends.
 _SLOPE = 3.0
 _DISTANCES = 1.0, 4.0
 
 
-def make_cppn(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
-    """CPPNs over the places of modules; no body can be adopted.
+def make_cppn(space: Space, params: Mapping[str, object], place: str) -> Genotype[CPPN]:
+    """CPPNs over the positions of modules; no body can be converted to a genome.
 
     Args:
         space: of the bodies.
@@ -52,7 +52,7 @@ def make_cppn(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
     settings = read(CPPNSettings, dict(params), f"{place}.params")
     outputs = 2 + len(space.modules)
 
-    def from_plain(plain: Any) -> CPPN:
+    def from_plain(plain: object) -> CPPN:
         network = read_cppn(plain, "genome")
         found = (network.num_inputs, network.num_outputs)
         if found != (_INPUTS, outputs):
@@ -76,7 +76,7 @@ def make_cppn(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
 
 
 def _draw(rng: np.random.Generator, outputs: int, settings: CPPNSettings) -> CPPN:
-    """A random network, biased so that bodies end somewhere."""
+    """A random network, biased so that limbs end."""
     network = draw_cppn(rng, _INPUTS, outputs, settings)
     more = {_ONE: -_SLOPE * float(rng.uniform(*_DISTANCES)), _DEPTH: _SLOPE}
     links = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,47 +14,47 @@ from mjx_revolve.body.tree import Morphology
 from mjx_revolve.inputs.errors import InputError, show
 
 T = TypeVar("T")
+G = TypeVar("G")  # a genome
 
 # Bounds on length and mass are kept up to rounding.
 SLACK = 1 + 1e-9
-# Variations of a parent that are tried before it is left as it is, and random genomes before there
-# are said to be none. Choices: most bounds let every second or third pass.
+# Variations of a parent that are tried before it is returned unchanged, and random genomes before
+# an error. Choices: with most bounds every second or third is in the space.
 TRIES = 50
 _RANDOM_TRIES = 300
 # How many results `cached` keeps: a choice, those of some generations.
 _CACHED = 1000
 
 
-class Genotype(NamedTuple):
+class Genotype(NamedTuple, Generic[G]):
     """A representation of bodies: plain functions of genomes, which are plain values.
 
-    All genomes that they return develop into bodies of the space, and all randomness comes from the
-    generator that they are given. `make_genotype` makes one from functions that need not keep to
-    the space.
+    All genomes that they return develop into bodies in the space, and all randomness comes from the
+    generator argument. `make_genotype` makes one from functions that may leave the space.
 
     Attributes:
         name: in a configuration.
-        random: generator → genome. Raises `InputError` where none of many draws is in the space.
-        mutate: (generator, genome) → genome that differs a little; the genome itself where none of
-            `TRIES` mutants is in the space.
-        cross: (generator, genome, genome) → one child; the first genome itself where none of
-            `TRIES` children is in the space.
-        develop: genome → valid body in the space, without a brain. A module that stays in its place
-            keeps its name.
+        random: generator → genome. Raises `InputError` if none of many draws is in the space.
+        mutate: (generator, genome) → mutant; the genome itself if none of `TRIES` mutants is in the
+            space.
+        cross: (generator, genome, genome) → one child; the first genome itself if none of `TRIES`
+            children is in the space.
+        develop: genome → valid body in the space, without a brain. A module that keeps its position
+            in the tree keeps its name.
         adopt: body → genome that develops into it, but for its brain and path. Raises `InputError`
-            where it is not in the space. None where there is no such genome.
-        to_plain: genome → what JSON can hold, exactly.
-        from_plain: its inverse. Raises `InputError` where it is no such genome.
+            if the body is not in the space. None if bodies cannot be converted.
+        to_plain: genome → plain values for JSON, exactly.
+        from_plain: the inverse of `to_plain`. Raises `InputError` for anything else.
     """
 
     name: str
-    random: Callable[[np.random.Generator], Any]
-    mutate: Callable[[np.random.Generator, Any], Any]
-    cross: Callable[[np.random.Generator, Any, Any], Any]
-    develop: Callable[[Any], Morphology]
-    adopt: Callable[[Morphology], Any] | None
-    to_plain: Callable[[Any], Any]
-    from_plain: Callable[[Any], Any]
+    random: Callable[[np.random.Generator], G]
+    mutate: Callable[[np.random.Generator, G], G]
+    cross: Callable[[np.random.Generator, G, G], G]
+    develop: Callable[[G], Morphology]
+    adopt: Callable[[Morphology], G | None] | None
+    to_plain: Callable[[G], object]
+    from_plain: Callable[[Any], G]
 
 
 def accept_all(body: Morphology) -> bool:
@@ -77,7 +77,7 @@ class Space:
         max_length: longest edge of the bounding box at rest [m]; None: any.
         max_mass: [kg]; None: any.
         max_of: most modules of a type, by its name; of others, any number.
-        accepts: whether a body within these bounds will do.
+        accepts: body → whether it is accepted, for further bounds.
     """
 
     catalogue: Mapping[str, ModuleType]
@@ -98,7 +98,7 @@ class Space:
         return tuple(self.catalogue[name] for name in self.modules)
 
     def refuses(self, body: Morphology) -> str | None:
-        """Why a body is not in the space, "expected X; found Y"; None where it is."""
+        """Why a body is not in the space, "expected X; found Y"; None if it is."""
         strange = next((m.type for m in body.modules if m.type not in self.catalogue), None)
         if strange is not None:
             return f"expected types of modules of the catalogue; found {show(strange)}"
@@ -132,7 +132,7 @@ def make_space(
     Args:
         bodies: settings like `episodes.bodies_config.BodiesConfig`.
         catalogue: all types of modules by name and alias.
-        accepts: whether a body within the settings' bounds will do, such as a capacity.
+        accepts: body → whether it is accepted, for bounds that are no settings, as a capacity.
 
     Returns:
         The space; its types go by their names, not by their aliases.
@@ -188,31 +188,31 @@ def make_genotype(
     name: str,
     place: str,
     *,
-    draw: Callable[[np.random.Generator], Any],
-    mutate: Callable[[np.random.Generator, Any], Any],
-    cross: Callable[[np.random.Generator, Any, Any], Any],
-    develop: Callable[[Any], Morphology],
-    to_plain: Callable[[Any], Any],
-    from_plain: Callable[[Any], Any],
-    adopt: Callable[[Morphology], Any] | None = None,
-) -> Genotype:
-    """A genotype that keeps to the space, from functions that need not.
+    draw: Callable[[np.random.Generator], G],
+    mutate: Callable[[np.random.Generator, G], G | None],
+    cross: Callable[[np.random.Generator, G, G], G | None],
+    develop: Callable[[G], Morphology],
+    to_plain: Callable[[G], object],
+    from_plain: Callable[[Any], G],
+    adopt: Callable[[Morphology], G | None] | None = None,
+) -> Genotype[G]:
+    """A genotype that keeps to the space, from functions that may leave it.
 
     Args:
         space: of the bodies.
         name: in a configuration.
         place: where the bounds were given, for messages.
         draw: generator → any genome.
-        mutate: (generator, genome) → varied genome; None where what it drew cannot be done.
-        cross: (generator, genome, genome) → child; None where that cannot be done.
+        mutate: (generator, genome) → mutant; None if the drawn mutation is impossible.
+        cross: (generator, genome, genome) → child; None if impossible.
         develop: genome → body.
-        to_plain: genome → what JSON can hold.
-        from_plain: its inverse; raises `InputError`.
-        adopt: body in the space → genome that develops into it; None where there is none.
+        to_plain: genome → plain values for JSON.
+        from_plain: the inverse of `to_plain`; raises `InputError`.
+        adopt: body in the space → genome that develops into it; None if there is none.
     """
     develop = cached(develop)
 
-    def random(rng: np.random.Generator) -> Any:
+    def random(rng: np.random.Generator) -> G:
         reason: str | None = None
         for _ in range(_RANDOM_TRIES):
             genome = draw(rng)
@@ -224,10 +224,10 @@ def make_genotype(
             f"that does (the last: {reason})"
         )
 
-    def within(vary: Callable[..., Any]) -> Callable[..., Any]:
+    def within(vary: Callable[..., G | None]) -> Callable[..., G]:
         """The first variation that is in the space, or the first parent."""
 
-        def varied(rng: np.random.Generator, *parents: Any) -> Any:
+        def varied(rng: np.random.Generator, *parents: G) -> G:
             for _ in range(TRIES):
                 child = vary(rng, *parents)
                 if child is not None and space.refuses(develop(child)) is None:
@@ -241,12 +241,12 @@ def make_genotype(
         if reason is not None:
             raise InputError(f"{body.path or body.name}: {reason}")
 
-    def read(plain: Any) -> Any:
+    def read(plain: object) -> G:
         genome = from_plain(plain)
         check(develop(genome))
         return genome
 
-    def adopted(body: Morphology) -> Any:
+    def adopted(body: Morphology) -> G | None:
         assert adopt is not None
         check(body)
         return adopt(replace(body, brain=None, path=None))
@@ -263,15 +263,15 @@ def make_genotype(
     )
 
 
-def cached(function: Callable[[Any], T]) -> Callable[[Any], T]:
-    """The same function with its last results kept, by the identity of its argument.
+def cached(function: Callable[[G], T]) -> Callable[[G], T]:
+    """The same function with its last results cached by the identity of its argument.
 
     Variation develops a genome to see whether it is in the space; evaluation develops it again.
-    Genomes need no hash. They are kept beside the result, so that no other gets their id.
+    Genomes need no hash. They are kept with the result, so that their id is not reused.
     """
-    known: dict[int, tuple[Any, T]] = {}
+    known: dict[int, tuple[G, T]] = {}
 
-    def look_up(value: Any) -> T:
+    def look_up(value: G) -> T:
         if id(value) not in known:
             if len(known) >= _CACHED:
                 known.clear()

@@ -1,4 +1,4 @@
-"""Growth of a body, module after module: what would overlap or exceed a bound is left out."""
+"""Growth of a body, module by module; modules that overlap or exceed a bound are left out."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _HAIR = 1e-9
 
 
 def name_place(kind: ModuleType, path: tuple[int, ...]) -> str:
-    """The name of a module from its type and its slots from the core on, as `ActiveHinge-1-1`.
+    """The name of a module: its type and the slots from the core to it, as `ActiveHinge-1-1`.
 
-    It has no `_`, which marks copies.
+    It has no `_`, which is for suffixes of copies.
     """
     return "-".join((kind.name, *map(str, path)))
 
@@ -30,19 +30,19 @@ def name_place(kind: ModuleType, path: tuple[int, ...]) -> str:
 class Growth:
     """A body that grows from its core.
 
-    It refuses what `find_overlaps` finds, but compares each new module with those that are there in
-    plain numbers, which takes a twentieth of a millisecond.
+    It refuses the same overlaps as `find_overlaps`, but compares each new module with the earlier
+    ones in plain Python numbers, in a twentieth of a millisecond.
 
     Attributes:
-        modules: in the order in which they came.
-        num_hinges: how many of them have one.
+        modules: in the order of attachment.
+        num_hinges: number of modules with a hinge.
     """
 
     def __init__(self, space: Space, seed: Morphology | None = None) -> None:
         """Begins with a core.
 
         Args:
-            space: of the upper bounds; lower ones are left to the caller.
+            space: gives the upper bounds; lower ones are left to the caller.
             seed: gives the core, and reserves the names of its modules; by
                 default it begins with a core of the space's type.
         """
@@ -56,7 +56,7 @@ class Growth:
         self._mass = 0.0
         self._children: list[list[int]] = []
         self._paths: list[tuple[int, ...]] = []
-        # Main boxes, with the module and which of its boxes it is, and all modules' boxes.
+        # All main boxes, each with its module and its index there; and the shapes of all modules.
         self._mains: list[tuple[float, float, float, float, float, float, int, int]] = []
         self._shapes: list[_Shape] = []
         self._low = self._high = [0.0, 0.0, 0.0]
@@ -64,7 +64,7 @@ class Growth:
 
     @property
     def is_full(self) -> bool:
-        """Whether there is room for no further module."""
+        """Whether the body has the largest number of modules."""
         return len(self.modules) >= self._space.max_modules
 
     def has_room(self, kind: ModuleType) -> bool:
@@ -80,7 +80,7 @@ class Growth:
         return next(found, None)
 
     def direction(self, index: int, slot: int) -> list[float]:
-        """Where one of a module's slots looks: a unit vector, core frame."""
+        """Direction of one of a module's slots: a unit vector, core frame."""
         return self._shapes[index].ways[slot]
 
     def attach(
@@ -98,11 +98,11 @@ class Growth:
             slot: one of the parent's slots.
             kind: its type.
             orientation: turn about the direction in which it is attached [deg].
-            like: a module of the seed with its name, colour and params; it then comes behind
-                its siblings, where others come before those of higher slots.
+            like: a module of the seed, of which the new one has name, colour and params; it is then
+                appended to its siblings, while others are inserted in the order of slots.
 
         Returns:
-            Its index; None where it was left out.
+            Its index; None if it was left out.
         """
         space, above = self._space, self.modules[parent]
         if self.is_full or self.child(parent, slot) is not None or not self.has_room(kind):
@@ -131,7 +131,7 @@ class Growth:
         return index
 
     def _free_name(self, kind: ModuleType, path: tuple[int, ...]) -> str:
-        """The name of a place, made different from those of the seed's modules."""
+        """The name from `name_place`, made different from those of the seed's modules."""
         stem = name = name_place(kind, path)
         count = 2
         while name in self._names:
@@ -139,7 +139,7 @@ class Growth:
         return name
 
     def _take(self, module: Module, path: tuple[int, ...], shape: _Shape) -> None:
-        """Adds a module that there is room for."""
+        """Adds a module that was checked."""
         index, place = len(self.modules), module.position.tolist()
         self._mains += [
             (*(a + b for a, b in zip(place, center, strict=True)), *reach, index, k)
@@ -161,7 +161,7 @@ class Growth:
         return low, high
 
     def _hits(self, shape: _Shape, place: list[float], parent: int) -> bool:
-        """Whether a module would overlap with another one than its parent."""
+        """Whether a module would overlap with any other than its parent."""
         for number, (center, (u, v, w)) in enumerate(shape.mains):
             x, y, z = (a + b for a, b in zip(place, center, strict=True))
             for a, b, c, d, e, f, index, k in self._mains:
@@ -171,7 +171,7 @@ class Growth:
                     and abs(z - c) - w - f < -_HAIR
                     and index != parent
                 ):
-                    # Boxes along the core's axes fill what they reach; others need a closer look.
+                    # For boxes along the core's axes that is exact; others need the exact test.
                     other = self._shapes[index]
                     if shape.is_level and other.is_level:
                         return True
@@ -200,14 +200,14 @@ class Growth:
 
 
 class _Shape(NamedTuple):
-    """A module's boxes and slots as they are turned, from its place on.
+    """A module's boxes and slots, rotated to the core's axes, relative to the module's position.
 
     Attributes:
-        mains: of each part's main box, shrunk: its centre and how far it reaches along the core's
-            axes [m].
+        mains: for each part's main box, shrunk: its centre and half extents along the core's axes
+            [m].
         half: `[npart, 3]` their half edges, module frame [m].
         rotation: `[3, 3]` core frame from module frame.
-        is_level: whether the boxes lie along the core's axes.
+        is_level: whether the boxes are parallel to the core's axes.
         low: lowest corner of all boxes, core's axes [m].
         high: highest corner.
         ways: directions of the slots, core's axes.
@@ -237,7 +237,7 @@ class _Same:
 
 @lru_cache(maxsize=4096)
 def _shape(same: _Same, turn: bytes) -> _Shape:
-    """A type's boxes and slots, turned; there are few turns."""
+    """A type's boxes and slots, rotated; cached, as there are few rotations."""
     parts = same.kind.parts
     rotation = frozen(np.frombuffer(turn).reshape(3, 3))
     reach = np.abs(rotation).T

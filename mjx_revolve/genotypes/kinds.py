@@ -23,7 +23,7 @@ from mjx_revolve.inputs.user_code import (
 
 
 def find_genotype(
-    name: str, space: Space, params: Mapping[str, Any], source: str = "config"
+    name: str, space: Space, params: Mapping[str, object], source: str = "config"
 ) -> Genotype:
     """The genotype that a configuration names.
 
@@ -59,7 +59,7 @@ def find_genotype(
 
 
 def _guard(name: str, genotype: Any, space: Space) -> Genotype:
-    """A user's genotype whose errors become one line, whenever they occur."""
+    """A user's genotype, with each error in its functions turned into one line."""
     place = function_place(name)
     if not isinstance(genotype, Genotype):
         raise InputError(f"{place}: expected a Genotype; found {type(genotype).__name__}")

@@ -1,27 +1,27 @@
 """Plasticoding: Revolve's L-system of bodies.
 
 A genome is a grammar with one rule for each letter that stands for a module. The sentence begins as
-the core's letter, C; in each iteration every such letter gives way to its rule. Then the sentence
-is drawn like a turtle: `addr`, `addf` and `addl` say where the next module is mounted, a module's
-letter mounts it there and moves on to it, `mover`, `movef` and `movel` move on to a module that is
-mounted there, and `moveb` moves back the way that was come. On a module with a single slot all
-sides are that slot; where right, front and left of a core are taken, its back comes next. What
-overlaps or exceeds a bound is left out.
+the core's letter, C; in each iteration every such letter is replaced by its rule. Then the sentence
+is interpreted as turtle graphics: `addr`, `addf` and `addl` choose the side for the next module, a
+module's letter mounts it there and moves to it, `mover`, `movef` and `movel` move to the module
+that is mounted at a side, and `moveb` moves back to the parent. On a module with a single slot all
+sides mean that slot; if right, front and left of a core are taken, its back is next. Modules that
+overlap or exceed a bound are left out.
 
 Letters, rules, mutation and crossover are those of Revolve (github.com/ci-group/revolve,
 `pyrevolve/genotype/plasticoding`): random grammars of groups of mounting, module and moving; one
 letter added, deleted, or exchanged with another one of its rule; and rules from either parent. A
 joint's letter has two orientations: AJ1 bends up and down, AJ2 from side to side. Four things
-differ. Brains are evolved beside bodies, so the letters for their edges are missing. Modules that
-overlap are found by their shapes and not on a grid. Sensors count among the modules. And a genome
-may begin with a body of its own, its seed: a module's name with `#` before it is a letter that
-stands for that module of the seed in its place, so that a rule can spell any body out.
+differ. Brains are evolved separately, so the letters for their edges are missing. Overlaps are
+found from the modules' shapes and not on a grid. Sensors count among the modules. And a genome may
+begin with a given body, its seed: `#` and a module's name is a letter for that module of the seed,
+so that a rule can describe any body.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Unit
@@ -50,7 +50,7 @@ MOUNTING = {f"add{side}": slot for side, slot in _SIDES.items()}
 MOVING: dict[str, int | None] = {f"move{side}": slot for side, slot in _SIDES.items()} | {
     "moveb": None
 }
-# Letters of a level and of an upright module. Revolve's are AJ1, AJ2, B, BV and ST.
+# Letters of modules in level and in upright orientation. Revolve's are AJ1, AJ2, B, BV and ST.
 _LETTERS = {
     "ActiveHinge": ("AJ1", "AJ2"),
     "FixedBrick": ("B", "BV"),
@@ -59,16 +59,16 @@ _LETTERS = {
     "Thruster": ("T",),
     "LiftThruster": ("LT", "LTV"),
 }
-# Letters that are read at most while a sentence is made: a choice, a hundred times those of a body.
+# Most letters of a sentence, and read in rules: a choice, a hundred times those of a body.
 _MOST_LETTERS = 3000
 
 
 class Letter(NamedTuple):
-    """What a letter stands for that means a module.
+    """The module that a letter stands for.
 
     Attributes:
         kind: its type.
-        upright: whether it stands across the level in which the core lies.
+        upright: whether it is turned by 90° out of the core's level plane.
     """
 
     kind: ModuleType
@@ -80,8 +80,8 @@ class Grammar(NamedTuple):
 
     Attributes:
         name: of the body.
-        rules: what gives way to what: letters by letter; the core's begins with the core.
-        seed: the body of the modules that letters with a `#` name; None without.
+        rules: replacement by letter; the core's rule begins with the core.
+        seed: the body of the modules that letters with a `#` name; None: there are none.
     """
 
     name: str
@@ -94,16 +94,16 @@ _Rate = Annotated[NonNegative, Unit("-")]
 
 @checked
 class PlasticodingSettings:
-    """How grammars begin, how they grow and how they vary.
+    """Settings of grammars: initialization, development and mutation.
 
     Attributes:
-        iterations: how often letters give way to their rules.
+        iterations: number of times that letters are replaced by their rules.
         groups: most groups of three letters in a rule of a random grammar.
         max_rule: most letters of a rule to which another one may be added.
-        upright: whether bricks, fins and the like may stand upright, too.
-        add: how often a letter is added, relative to the other two mutations.
-        delete: how often one is deleted.
-        swap: how often two are exchanged.
+        upright: whether other modules than joints may be upright, too.
+        add: weight of the mutation that adds a letter, relative to the other two.
+        delete: weight of the mutation that deletes a letter.
+        swap: weight of the mutation that exchanges two letters.
 
     Raises:
         InputError: a number is out of range, or no mutation can be drawn.
@@ -119,12 +119,12 @@ class PlasticodingSettings:
     swap: _Rate = 1.0
 
     def __post_init__(self) -> None:
-        """Checks that something can happen."""
+        """Checks that a mutation has a positive weight."""
         if not any((self.add, self.delete, self.swap)):
             raise ConstraintError("", "a number > 0 among add, delete and swap", "all of them 0")
 
 
-def make_plasticoding(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
+def make_plasticoding(space: Space, params: Mapping[str, object], place: str) -> Genotype[Grammar]:
     """Revolve's L-system: genomes are grammars.
 
     Args:
@@ -162,15 +162,15 @@ def make_plasticoding(space: Space, params: Mapping[str, Any], place: str) -> Ge
 
 
 def make_alphabet(space: Space, upright: bool = True) -> dict[str, Letter]:
-    """The letters that stand for modules, beside the core's.
+    """The letters that stand for modules, without the core's.
 
     Args:
-        space: of the types of modules.
-        upright: whether others than joints have a letter for standing upright, too.
+        space: gives the types of modules.
+        upright: whether other modules than joints have a letter for upright, too.
 
     Returns:
-        Letters by name: Revolve's where it has any, F for a fin, T and LT for the
-        thrusters; types of users' own have their names, with 1 and 2 behind it for joints.
+        Letters by name: Revolve's where it has one, F for a fin, T and LT for the thrusters; for
+        users' types their names, with a suffix 1 or 2 for joints.
     """
     found = {}
     for kind in space.kinds:
@@ -190,7 +190,7 @@ def expand(rules: Mapping[str, tuple[str, ...]], iterations: int) -> Iterator[st
 
     Args:
         rules: letters by letter; a letter without a rule stays.
-        iterations: how often letters give way to their rules, the core's first.
+        iterations: number of times that letters are replaced by their rules, the core's first.
 
     Yields:
         Its letters, until `_MOST_LETTERS` were read in rules and sentence.
@@ -215,12 +215,12 @@ def draw_sentence(
     name: str = "robot",
     seed: Morphology | None = None,
 ) -> Morphology:
-    """The body that a sentence draws.
+    """The body that a sentence describes.
 
     Args:
-        sentence: its letters.
-        letters: what they stand for.
-        space: of the upper bounds.
+        sentence: letters.
+        letters: modules by letter.
+        space: gives the upper bounds.
         name: of the body.
         seed: gives the core, and the modules that letters with a `#` name.
     """
@@ -244,7 +244,7 @@ class _Turtle:
 
     Attributes:
         growth: the body so far.
-        side: the slot at which the next module is mounted; None if it is not.
+        side: the slot at which the next module is mounted; None: it is left out.
     """
 
     def __init__(self, growth: Growth, seed: Morphology | None) -> None:
@@ -259,14 +259,14 @@ class _Turtle:
         self._drawn = {m.name: 0 for m in modules[:1]}
 
     def _slot(self, side: int) -> int | None:
-        """The slot that is meant by a side."""
+        """The slot of a side at the current module."""
         slots = self.growth.modules[self._here].kind.slots
         if len(slots) == 1:
             return next(iter(slots))
         return side if side in slots else None
 
     def move(self, side: int | None) -> None:
-        """To the module at a side; None: back."""
+        """Moves to the module at a side; None: back to the parent."""
         if side is None:
             if self._back:
                 self._here = self._back.pop()
@@ -277,13 +277,13 @@ class _Turtle:
             self._enter(index)
 
     def _enter(self, index: int) -> None:
-        """On to a module, if it can carry any."""
+        """Moves to a module, if it has slots."""
         if self.growth.modules[index].kind.slots:
             self._back.append(self._here)
             self._here = index
 
     def mount(self, letter: Letter) -> None:
-        """A module at the chosen side, or at the back where all sides are taken."""
+        """Mounts a module at the chosen side, or at the back if all sides are taken."""
         if self.side is None:
             return
         slot = self._slot(self.side)
@@ -305,7 +305,7 @@ class _Turtle:
             self._enter(index)
 
     def spell(self, name: str) -> None:
-        """The seed's module in its place, if what carries it is there."""
+        """Adds the seed's module of that name at its slot, if its parent has been added."""
         module, parent = self._seed[name]
         if name not in self._drawn and parent in self._drawn:
             above = self._drawn[parent]
@@ -330,7 +330,7 @@ class _Turtle:
 def _draw_rules(
     rng: np.random.Generator, names: Sequence[str], groups: int
 ) -> dict[str, tuple[str, ...]]:
-    """Random rules: groups of mounting, module and moving, as many in each."""
+    """Random rules: as many groups of (mounting, module, moving) in each."""
     count = int(rng.integers(1, groups + 1))
     kinds = (tuple(MOUNTING), names, tuple(MOVING))
     rules = {}
@@ -343,7 +343,7 @@ def _draw_rules(
 def _mutate(
     rng: np.random.Generator, grammar: Grammar, names: Sequence[str], settings: PlasticodingSettings
 ) -> Grammar | None:
-    """One letter added, deleted or exchanged in a rule that is used; None where that cannot be."""
+    """One letter added, deleted or exchanged in a rule that is used; None if impossible."""
     used = _used(grammar.rules)
     letter = used[int(rng.integers(len(used)))]
     rule = [*grammar.rules[letter]]
@@ -390,14 +390,14 @@ def _cross(rng: np.random.Generator, a: Grammar, b: Grammar) -> Grammar:
 
 @checked
 class _Plain:
-    """A grammar as JSON holds it."""
+    """A grammar as plain values for JSON."""
 
     name: Text
     rules: dict[Text, TupleOf[Text]]
-    seed: dict[Text, Any] | None = None
+    seed: dict[Text, object] | None = None
 
 
-def _to_plain(grammar: Grammar) -> dict[str, Any]:
+def _to_plain(grammar: Grammar) -> dict[str, object]:
     return {
         "name": grammar.name,
         "rules": {letter: list(rule) for letter, rule in grammar.rules.items()},
@@ -405,8 +405,8 @@ def _to_plain(grammar: Grammar) -> dict[str, Any]:
     }
 
 
-def _read(plain: Any, names: Sequence[str], space: Space) -> Grammar:
-    """A grammar that `_to_plain` made plain."""
+def _read(plain: object, names: Sequence[str], space: Space) -> Grammar:
+    """A grammar from plain values, the inverse of `_to_plain`."""
     found = read(_Plain, plain, "genome")
     seed = None
     if found.seed is not None:

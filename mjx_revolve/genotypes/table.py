@@ -1,4 +1,4 @@
-"""The genotypes by name. NumPy is imported when one is made, not when a configuration is read."""
+"""The genotypes by name; NumPy is imported when one is made, not when a configuration is read."""
 
 from __future__ import annotations
 

@@ -6,12 +6,13 @@ joint stay with it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Annotated, Any
+from typing import Annotated, TypeVar
 
 import numpy as np
 from annotated_types import Unit
+from numpy.typing import ArrayLike
 
 from mjx_revolve.body.edits import (
     add_module,
@@ -32,26 +33,28 @@ from mjx_revolve.inputs.schema import ConstraintError, NonNegative, checked, rea
 
 _Rate = Annotated[NonNegative, Unit("-")]
 
+T = TypeVar("T")
+
 
 @checked
 class TreeSettings:
-    """How often each mutation is drawn, relative to the others; one is made at a time.
+    """Relative weights of the mutations; a mutant has one of them.
 
     Attributes:
-        add: a module at a free slot.
-        delete: a module that carries none.
-        prune: a module with all that it carries.
-        duplicate: a subtree, at a free slot.
-        mirror: the mirror image of a limb takes the place of what is at the opposite slot.
-        swap: two subtrees exchange their places.
-        retype: a module becomes one of another type.
-        turn: a module is turned with all that it carries.
+        add: add a module at a free slot.
+        delete: remove a module without children.
+        prune: remove a subtree.
+        duplicate: copy a subtree to a free slot.
+        mirror: put the mirror image of a limb at the opposite slot, in place of the subtree there.
+        swap: exchange two subtrees.
+        retype: give a module another type.
+        turn: turn a module with its subtree.
 
     Raises:
         InputError: a number is negative, or all are 0.
     """
 
-    # Choices: mostly small changes; as much comes as goes.
+    # Choices: mostly small changes; bodies neither grow nor shrink on average.
     add: _Rate = 3.0
     delete: _Rate = 2.0
     prune: _Rate = 0.5
@@ -62,12 +65,12 @@ class TreeSettings:
     turn: _Rate = 1.5
 
     def __post_init__(self) -> None:
-        """Checks that something can happen."""
+        """Checks that a mutation has a positive weight."""
         if not any(getattr(self, field.name) for field in fields(self)):
             raise ConstraintError("", "a number > 0 among the mutations", "all of them 0")
 
 
-def make_tree(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
+def make_tree(space: Space, params: Mapping[str, object], place: str) -> Genotype[Morphology]:
     """The direct genotype: genomes are bodies.
 
     Args:
@@ -101,17 +104,17 @@ def make_tree(space: Space, params: Mapping[str, Any], place: str) -> Genotype:
     )
 
 
-def _try(edit: Callable[..., Morphology | None], *arguments: Any) -> Morphology | None:
-    """An edit; None where it cannot be done."""
+def _try(edit: Callable[..., Morphology | None], *arguments: object) -> Morphology | None:
+    """The result of an edit; None if it is invalid."""
     try:
         return edit(*arguments)
     except InputError:
         return None
 
 
-def _pick(rng: np.random.Generator, things: Any) -> Any:
-    """One of several."""
-    return things[rng.integers(len(things))]
+def _pick(rng: np.random.Generator, things: Sequence[T]) -> T:
+    """A random one of several things."""
+    return things[int(rng.integers(len(things)))]
 
 
 def _turn(rng: np.random.Generator) -> float:
@@ -156,7 +159,7 @@ def _path(body: Morphology, index: int) -> tuple[int, ...]:
 
 
 def _drawn(rng: np.random.Generator, body: Morphology) -> int | None:
-    """A module that is not the core."""
+    """Index of a random module, not the core; None if there is none."""
     return int(rng.integers(1, body.num_modules)) if body.num_modules > 1 else None
 
 
@@ -244,7 +247,7 @@ _MUTATIONS: dict[str, Callable[[Space, np.random.Generator, Morphology], Morphol
 
 
 def _size(body: Morphology, index: int) -> int:
-    """Modules of a subtree."""
+    """Number of modules of a subtree."""
     inside = {index}
     for i in range(index + 1, body.num_modules):
         if body.modules[i].parent not in inside:
@@ -257,15 +260,15 @@ def _size(body: Morphology, index: int) -> int:
 
 
 def opposite_slot(kind: ModuleType, slot: int) -> int | None:
-    """The slot at the other side of a module.
+    """The slot at the opposite side of a module.
 
     Args:
         kind: the module's type.
         slot: one of its slots.
 
     Returns:
-        Its mirror image, in the upright plane in which the module is attached, or of a core across
-        the slot's direction; None where there is none, or where it is the slot itself.
+        The mirror image of the slot in the upright plane through the module's mount direction (for
+        a core, the plane normal to the slot's direction); None if it has none or is its own.
     """
     away = kind.slots[slot].direction if kind.mount is None else _side(kind)
     found = _mirrored_slot(kind, slot, away)
@@ -273,17 +276,17 @@ def opposite_slot(kind: ModuleType, slot: int) -> int | None:
 
 
 def mirror_limb(body: Morphology, index: int) -> Morphology | None:
-    """A body with the mirror image of a subtree in its place; only to be grafted from.
+    """A body with a subtree replaced by its mirror image; only a donor for grafting.
 
-    Seen from where it is attached, the image has left and right exchanged: turns the other way
-    round, and slots at the other side.
+    Left and right are exchanged, as seen from the mount: orientations change sign, and slots are
+    those at the opposite side.
 
     Args:
         body: the robot.
         index: of the subtree's first module, not the core.
 
     Returns:
-        The body, with poses unchanged; None where a slot has no mirror image.
+        The body, with poses not updated; None if a slot has no mirror image.
     """
     modules = list(body.modules)
     for i in range(index, index + _size(body, index)):
@@ -298,20 +301,20 @@ def mirror_limb(body: Morphology, index: int) -> Morphology | None:
 
 
 def _side(kind: ModuleType) -> tuple[float, float, float]:
-    """A module's direction to the right: across the one in which it is attached, and level."""
+    """A module's direction to the right: level, normal to its mount direction."""
     assert kind.mount is not None
     x, y, _ = kind.mount.outward
     return (y, -x, 0.0)
 
 
 def _mirrored_slot(kind: ModuleType, slot: int, away: tuple[float, float, float]) -> int | None:
-    """The slot that lies where another one lies in a mirror; `away` is the mirror's normal."""
+    """The slot at the mirror image of another one; `away` is the mirror plane's normal."""
     normal = np.array(away)
 
-    def image(vector: Any) -> np.ndarray:
+    def image(vector: ArrayLike) -> np.ndarray:
         return np.array(vector) - 2 * (normal @ np.array(vector)) * normal
 
-    def pose(one: Slot, through: Callable[[Any], np.ndarray]) -> np.ndarray:
+    def pose(one: Slot, through: Callable[[ArrayLike], np.ndarray]) -> np.ndarray:
         return np.concatenate([through(one.position), through(one.direction), through(one.up)])
 
     wanted = pose(kind.slots[slot], image)
@@ -333,8 +336,7 @@ def _exchange(
         return None
     taken = _drawn(rng, a)
     if taken is None:
-        parent, slot = _pick(rng, free_slots(a))
-        return graft_subtree(a, parent, slot, b, given)
+        return graft_subtree(a, *_pick(rng, free_slots(a)), b, given)
     if a.num_modules - _size(a, taken) + _size(b, given) > space.max_modules:
         return None
     old = a.modules[taken]

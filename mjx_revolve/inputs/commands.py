@@ -26,7 +26,7 @@ from mjx_revolve.inputs.trust import add_trust_argument, opening
 
 _SEEDS = 2**32  # what JAX's keys take, and a run's configuration
 # A day [s]: its poses already take several GB.
-_LONGEST = 86_400.0
+_LONGEST_EPISODE = 86_400.0
 
 
 def program(name: str, python: str = "python") -> str:
@@ -57,7 +57,7 @@ class Parser(argparse.ArgumentParser):
         self._examples = examples
 
     def format_help(self) -> str:
-        """The help, and the examples as they are."""
+        """The help text, followed by the examples verbatim."""
         lines = [f"  {program(line)}\n" for line in self._examples]
         return super().format_help() + "\nexamples:\n" * bool(lines) + "".join(lines)
 
@@ -67,7 +67,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def read_path(text: str) -> str:
-    """Reads a path, for `add_argument(type=read_path)`: refuses what an unset variable leaves."""
+    """Reads a path, for `add_argument(type=read_path)`; refuses "" (an unset shell variable)."""
     if not text.strip():
         raise argparse.ArgumentTypeError(f"expected a path; found {text!r}")
     try:
@@ -85,8 +85,10 @@ def read_seconds(text: str) -> float:
         value = math.nan
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(f"expected seconds > 0; found {text!r}")
-    if value > _LONGEST:
-        raise argparse.ArgumentTypeError(f"expected at most {_LONGEST:.0f} s; found {text!r}")
+    if value > _LONGEST_EPISODE:
+        raise argparse.ArgumentTypeError(
+            f"expected at most {_LONGEST_EPISODE:.0f} s; found {text!r}"
+        )
     return value
 
 
@@ -122,13 +124,13 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check_run_arguments(arguments: argparse.Namespace) -> None:
-    """Raises `InputError` for both options of `add_run_arguments` at once."""
+    """Raises `InputError` if both `--workers` and `--cluster` are given."""
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--cluster: expected no --workers beside it; found both")
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds what `champion.load_episode` takes: path, duration, seed, individual, world, modules."""
+    """Adds the arguments of `load_episode`: path, duration, seed, individual, world, modules."""
     parser.add_argument(
         "path", type=read_path, help="run folder, genes.yaml, or morphology (YAML or name)"
     )
@@ -149,7 +151,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_colony_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds what names a whole colony instead of an episode: `--colony` and `--time`."""
+    """Adds `--colony` and `--time`, which name a whole colony instead of an episode."""
     parser.add_argument(
         "--colony",
         action="store_true",
@@ -229,7 +231,7 @@ def check_place(path: str | Path, label: str) -> None:
 
 
 def check_absent(path: Path, what: str = "file") -> None:
-    """Raises `InputError` where the user was not asked, and something of theirs would be lost."""
+    """Raises `InputError` if a file exists at a path: a user's file is never overwritten."""
     if path.exists():
         raise InputError(f"{path}: expected no such {what} yet; name it with --out to replace it")
 
@@ -256,7 +258,7 @@ def show_notes() -> Iterator[None]:
 
 
 def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
-    """Runs a command's `main`; errors that are no bug of the package become one line.
+    """Runs a command's `main`; wrong input and refusals of the system become one line on stderr.
 
     Args:
         main: takes the arguments (None: `sys.argv[1:]`) and returns the exit code.

@@ -7,7 +7,7 @@ import signal
 import sys
 from types import FrameType
 
-# Set by `run_command` as long as it can turn a KeyboardInterrupt into a line.
+# True while `run_command` can turn a KeyboardInterrupt into one line.
 running = False
 # Whether Ctrl-C came: compiled code may turn a KeyboardInterrupt into another exception.
 interrupted = False

@@ -13,18 +13,17 @@ import re
 import reprlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 # The longest value, without blanks or in quotes, that a message repeats [characters].
 _MAX_VALUE = 200
-_LONG = re.compile(
+_LONG_VALUE = re.compile(
     rf"(?<![^\s(\[])(['\"])(?:(?!\1).){{{_MAX_VALUE},}}\1(?!\w)|\S{{{2 * _MAX_VALUE},}}"
 )
 # The longest message that is not shortened [characters], and lists of many names in longer ones.
 _MAX_MESSAGE = 400
-_MANY = re.compile(r"(?:[\w.:/-]+, ){9,}")
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 60
+_LONG_LIST = re.compile(r"(?:[\w.:/-]+, ){9,}")
+_SHORT_REPR = reprlib.Repr()
+_SHORT_REPR.maxstring = _SHORT_REPR.maxother = 60
 
 
 def plain(text: str) -> str:
@@ -55,8 +54,8 @@ class InputError(ValueError):
 
     def __init__(self, message: object = "") -> None:
         """Takes the message."""
-        text = _LONG.sub(_cut, plain(str(message)))
-        super().__init__(_MANY.sub(_leave_out, text) if len(text) > _MAX_MESSAGE else text)
+        text = _LONG_VALUE.sub(_cut, plain(str(message)))
+        super().__init__(_LONG_LIST.sub(_leave_out, text) if len(text) > _MAX_MESSAGE else text)
 
 
 class ConstraintError(ValueError):
@@ -76,14 +75,14 @@ class ConstraintError(ValueError):
 
 @functools.cache
 def note(text: str) -> None:
-    """Logs what a user should know of their input although it is not refused: once in a process."""
+    """Logs a remark about accepted input, once per process."""
     logging.getLogger(__name__).warning("%s", plain(text))
 
 
-def show(value: Any) -> str:
+def show(value: object) -> str:
     """A value as a message shows it: short."""
     try:
-        return _SHORT.repr(value)
+        return _SHORT_REPR.repr(value)
     except ValueError:  # Python refuses to print integers of more than 4300 digits
         return "a huge integer"
 

@@ -148,5 +148,5 @@ def sync_folder(folder: Path) -> None:
 
 
 def with_path(error: OSError, path: Path) -> OSError:
-    """The same error with the path that the user knows."""
+    """The same error with the path that the user gave."""
     return OSError(error.errno, error.strerror or str(error), str(path))

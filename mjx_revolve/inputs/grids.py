@@ -20,10 +20,10 @@ from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.overrides import read_overrides
 from mjx_revolve.inputs.yaml_reader import SafeLoader
 
-_LONGEST = 80  # of a case's name, which is that of a folder [characters]
+_MAX_NAME = 80  # of a case's name, which is that of a folder [characters]
 MOST_SEEDS = 10_000
 """Runs of one case at most (a choice)."""
-_MOST = 1000  # cases in a grid; a typing error easily has a million (a choice)
+_MAX_CASES = 1000  # cases in a grid; a typing error easily has a million (a choice)
 
 
 class GridAxis(NamedTuple):
@@ -109,8 +109,8 @@ def combine(axes: Sequence[GridAxis], otherwise: str) -> dict[str, tuple[str, ..
         InputError: there are too many.
     """
     count = math.prod(len(axis.texts) for axis in axes)
-    if count > _MOST:
-        raise InputError(f"--set: expected at most {_MOST} combinations; found {count}")
+    if count > _MAX_CASES:
+        raise InputError(f"--set: expected at most {_MAX_CASES} combinations; found {count}")
     several = [axis for axis in axes if len(axis.texts) > 1]
     leaves = [axis.key.rpartition(".")[2] for axis in several]
     words = [
@@ -123,23 +123,23 @@ def combine(axes: Sequence[GridAxis], otherwise: str) -> dict[str, tuple[str, ..
         differing = [text for axis, text in zip(axes, texts, strict=True) if len(axis.texts) > 1]
         name = "+".join(f"{a}={_short(b)}" for a, b in zip(words, differing, strict=True))
         name = _plain(name or otherwise)
-        if len(name) > _LONGEST or name.casefold() in map(str.casefold, cases):
+        if len(name) > _MAX_NAME or name.casefold() in map(str.casefold, cases):
             digest = hashlib.sha256("\0".join(settings).encode()).hexdigest()[:8]
-            name = f"{name[: _LONGEST - 9]}-{digest}"
+            name = f"{name[: _MAX_NAME - 9]}-{digest}"
         cases[name] = settings
     return cases
 
 
 def _short(text: str) -> str:
-    """A value as a name has it: of a path what the file is called."""
+    """A value as part of a case's name: of a path, the file's name."""
     text = text.strip("'\"")
     path = Path(text)
     return path.stem if path.suffix.lower() in (".yaml", ".yml") else text
 
 
 def _plain(name: str) -> str:
-    """A name that every file system takes, and that no shell and no page reads as something else.
+    """A name without characters that are special in file systems, shells or HTML.
 
-    It begins with a letter or digit, so it is neither hidden nor an option.
+    It begins with a letter or digit, so it is neither a hidden file nor an option.
     """
     return re.sub(r"[^\w.=+-]+", "_", name, flags=re.ASCII).lstrip("_.-+=") or "case"

@@ -20,11 +20,11 @@ def copy_plain(value: Any) -> Any:
     return value
 
 
-def read_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> tuple[dict[str, Any], str]:
+def read_overrides(overrides: Mapping[str, object] | Sequence[str]) -> tuple[dict[str, Any], str]:
     """Values by dotted key, and the label of messages about them.
 
     Args:
-        overrides: a mapping of dotted keys, or texts like `task.duration=5`, whose values are YAML.
+        overrides: a mapping of dotted keys, or texts like `task.duration=5` with a YAML value.
 
     Raises:
         InputError: a text is no `KEY.PATH=VALUE`.
@@ -49,7 +49,7 @@ def read_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> tuple[dict[s
 def merge_override(
     data: dict[str, Any], key: str, value: Any, label: str, named: Sequence[str] = ()
 ) -> None:
-    """Sets one dotted key in place; a mapping is merged into a mapping.
+    """Sets one dotted key of nested mappings, in place; a mapping is merged into a mapping.
 
     Args:
         data: nested mappings.
@@ -83,7 +83,7 @@ def merge_override(
         here[leaf] = copy_plain(value)
 
 
-def sets(overrides: Mapping[str, Any], place: str) -> bool:
+def sets(overrides: Mapping[str, object], place: str) -> bool:
     """Whether overrides, by dotted key, set what is at a dotted place, or something in it."""
     for key, value in overrides.items():
         if f"{key}.".startswith(f"{place}."):

@@ -1,7 +1,7 @@
 """Types of users' values, checked by pydantic with error messages of ours.
 
-A `@checked` class is a frozen dataclass whose values are checked whenever one is made, in code, by
-`dataclasses.replace` or from a mapping in a file::
+A `@checked` class is a frozen dataclass. Its values are checked whenever an instance is made: in
+code, by `dataclasses.replace`, or from a mapping in a file::
 
     @checked
     class Jet:
@@ -21,7 +21,7 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from annotated_types import Ge, Gt, Le, Unit, doc
@@ -46,7 +46,7 @@ from mjx_revolve.inputs.validation_messages import (
 )
 
 T = TypeVar("T")
-F = TypeVar("F", bound=Callable[..., Any])
+F = TypeVar("F", bound=Callable[..., object])
 
 LARGEST = (2.0 - 2.0**-23) * 2.0**127
 """The largest number of float32."""
@@ -110,8 +110,8 @@ Direction = Annotated[Vector, AfterValidator(_unit_vector), Unit("-")]
 """A vector of any length but 0, scaled to 1."""
 
 
-def also(*forms: dict[str, Any]) -> Callable[[F], F]:
-    """States, as JSON Schema, which further forms a function before validation takes."""
+def also(*forms: Mapping[str, object]) -> Callable[[F], F]:
+    """States, as JSON Schema, the further forms that a "before" validator accepts."""
 
     def state(function: F) -> F:
         function.also = forms  # type: ignore[attr-defined]
@@ -120,23 +120,30 @@ def also(*forms: dict[str, Any]) -> Callable[[F], F]:
     return state
 
 
+@also({"type": "integer"})
+def _read_id(value: object) -> object:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Id = Annotated[Text, BeforeValidator(_read_id), words("a name")]
+"""A name, which YAML may give as a number."""
 OFF = {"enum": ["off", False, None]}
-ONE: dict[str, Any] = {}
+ONE: dict[str, object] = {}
 """One of a list's items by itself."""
 
 
-def is_off(value: Any) -> bool:
-    """Whether a value means none: YAML 1.1 reads a bare `off` as False."""
+def is_off(value: object) -> bool:
+    """Whether a value means "off": YAML 1.1 reads a bare `off` as False."""
     return value is None or value is False or (isinstance(value, str) and value == "off")
 
 
 @also({"const": False})
-def _law_name(value: Any) -> Any:
+def _law_name(value: object) -> object:
     return "off" if value is False else value
 
 
 @also(OFF)
-def _or_off(value: Any) -> Any:
+def _or_off(value: object) -> object:
     return None if is_off(value) else value
 
 
@@ -172,7 +179,7 @@ def checked(kind: type[T]) -> type[T]:
             problems = find_problems(error, made, given)
             raise refuse(problems, lambda _: f"{label}{name}: ") from None
 
-    def __getstate__(self: Any) -> dict[str, Any]:  # noqa: N807
+    def __getstate__(self: object) -> dict[str, object]:  # noqa: N807
         """The fields alone, without cached properties."""
         return {name: self.__dict__[name] for name in names}
 
@@ -187,7 +194,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def read(kind: Any, value: Any, place: str = "", context: Any = None) -> Any:
+def read(kind: Any, value: object, place: str = "", context: object = None) -> Any:
     """Reads a user's value as a type.
 
     Args:
@@ -197,7 +204,7 @@ def read(kind: Any, value: Any, place: str = "", context: Any = None) -> Any:
         context: `info.context` of validators.
 
     Raises:
-        InputError: it is something else.
+        InputError: the value is not of that type.
     """
     try:
         return _adapter(kind).validate_python(value, context=context)

@@ -1,6 +1,6 @@
 """Configurations and robots that come with the package, found by their names.
 
-They lie at the top of a checkout, and inside an installed package.
+They are at the top of a checkout, and inside an installed package.
 """
 
 from __future__ import annotations

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import reprlib
-from typing import Any
+from typing import TYPE_CHECKING
 
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 80
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+_SHORT_REPR = reprlib.Repr()
+_SHORT_REPR.maxstring = _SHORT_REPR.maxother = 80
 
 
-def short_repr(value: Any) -> str:
+def short_repr(value: DataclassInstance) -> str:
     """The fields of a dataclass in one line, for `__repr__ = short_repr`.
 
     For example `Trajectory(time [200], qpos [200, 15])`.
@@ -27,8 +30,8 @@ def short_repr(value: Any) -> str:
     return f"{type(value).__name__}({', '.join(parts)})"
 
 
-def _field(name: str, value: Any) -> str:
+def _field(name: str, value: object) -> str:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         text = repr(value)
         return f"{name}={text if len(text) <= 200 else type(value).__name__ + '(...)'}"
-    return f"{name}={_SHORT.repr(value)}"
+    return f"{name}={_SHORT_REPR.repr(value)}"

@@ -1,9 +1,9 @@
 """Audit of files: which of those that a run folder names may be read or run.
 
-A run folder names Python files of its owner's, and may name any file at all. Before a command runs
-or reads such a file, it must be one that this user has used: named in a configuration that they
-gave to `evolve`, or allowed by `--trust`. Both are recorded by content, outside of all run folders,
-so that a folder may be moved and another's is never taken for one's own.
+A run folder names Python files of its owner, and may name any file at all. A command reads or runs
+such a file only if this user has used it before: it was named in a configuration given to `evolve`,
+or allowed by `--trust`. Both are recorded by the files' content, outside of all run folders. So a
+run folder may be moved, and a stranger's files are never taken for the user's own.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Kind = Literal["data", "Python"]
 Hook = Callable[[Path, Kind, bytes], None]
 """Takes a file's path, what it is used as, and its content; raises to refuse it."""
 
-# Of the whole process, so that they hold in all its threads.
+# Global, so that they hold in all threads of the process.
 _hooks: list[Hook] = []
 
 
@@ -73,8 +73,8 @@ def opening(*places: str | Path, trust: bool) -> contextlib.AbstractContextManag
     """Restricts what run folders may name.
 
     Args:
-        places: the folders, or files in them: what lies there may be read, but not run.
-        trust: whether everything is allowed, and recorded.
+        places: the folders, or files in them; all files there may be read, but not run.
+        trust: whether every file is allowed, and recorded as trusted.
     """
     if trust:
         return remembering()
@@ -104,7 +104,7 @@ def opening(*places: str | Path, trust: bool) -> contextlib.AbstractContextManag
 
 
 def remembering() -> contextlib.AbstractContextManager[None]:
-    """Records all files that are used meanwhile as this user's own choice."""
+    """Records all files that are used within the context as trusted by this user."""
     return audited_by(_remember)
 
 
@@ -112,8 +112,8 @@ def opening_config(
     path: str | Path, trust: bool = False
 ) -> contextlib.AbstractContextManager[None]:
     """Trusts the files of a configuration that a user names, unless it is a run folder's."""
-    asks = is_run_config(Path(path)) and not trust
-    return opening(path, trust=False) if asks else remembering()
+    restricted = is_run_config(Path(path)) and not trust
+    return opening(path, trust=False) if restricted else remembering()
 
 
 def is_run_config(path: Path) -> bool:
@@ -137,7 +137,7 @@ def _belongs_to_run(file: Path) -> bool:
 
 
 def _digest(kind: Kind, content: bytes) -> str:
-    """A line of the record. What was read as data is not thereby allowed to run."""
+    """A line of the record; it holds the kind of use, as a file read as data may not be run."""
     return f"{kind} {hashlib.sha256(content).hexdigest()}"
 
 

@@ -1,9 +1,9 @@
 """Users' own tasks, controllers and genotypes: functions in files, named as FILE.py:FUNCTION.
 
-A configuration names them in place of one of the package's (`task: {type: mine/tasks.py:stay}`).
-The file is ordinary Python and may import what is installed. It is run when a fitness is made from
-the configuration, in every process that makes one, so a run folder that holds such a file holds a
-program: it is audited first (`trust.py`).
+A configuration may name them instead of the package's own (`task: {type: mine/tasks.py:stay}`). The
+file is ordinary Python and may import any installed package. It is run in every process that makes
+a fitness from the configuration. A run folder with such a file contains a program; so the file is
+audited first (`trust.py`).
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ import traceback
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.trust import audit
 
+T = TypeVar("T")
+
 # Longest message of another library in ours [characters].
-_LONGEST = 200
+_MAX_MESSAGE = 200
 
 
 class UserFunction(NamedTuple):
@@ -35,7 +37,7 @@ class UserFunction(NamedTuple):
     function: str
 
 
-def parse_user_function(name: Any) -> UserFunction | None:
+def parse_user_function(name: object) -> UserFunction | None:
     """File and function of FILE.py:FUNCTION; None for anything else."""
     if not isinstance(name, str):
         return None
@@ -148,16 +150,16 @@ def explain(error: BaseException, path: str, expected: str) -> str:
         for frame in traceback.extract_tb(error.__traceback__):
             if frame.filename == path:
                 line = frame.lineno
-    if len(message) > _LONGEST:
-        message = message[: _LONGEST - 1] + "…"
+    if len(message) > _MAX_MESSAGE:
+        message = message[: _MAX_MESSAGE - 1] + "…"
     place = f"line {line}: " if line else ""
     what = f"{type(error).__name__}: {message}".rstrip(": ")
     return f"{path}: {place}expected {expected}; found {what}"
 
 
 def call_user_function(
-    name: str, expected: str, function: Callable[..., Any], *arguments: Any
-) -> Any:
+    name: str, expected: str, function: Callable[..., T], *arguments: object
+) -> T:
     """Calls a user's function, or one that it made.
 
     Args:

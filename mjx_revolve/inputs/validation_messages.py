@@ -12,12 +12,15 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from annotated_types import DocInfo, Ge, Gt, Le, Lt, Unit, doc
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
 
 from mjx_revolve.inputs.errors import ConstraintError, InputError, show
 
+Step = str | int  # of a dotted place: a key or an index
+
 
 def refuse(problems: Mapping[str, str], origin: Callable[[str], str] = lambda _: "") -> InputError:
-    """All problems as one error: the first, and how many more there are where.
+    """All problems as one error: the first in full, and the places of the others.
 
     Args:
         problems: by place, from `find_problems`.
@@ -31,11 +34,11 @@ def refuse(problems: Mapping[str, str], origin: Callable[[str], str] = lambda _:
 
 # The longest list of names before a suggestion [characters].
 _MAX_NAMES = 100
-# What pydantic calls a key of a model or of a dataclass that there is no field for.
+# Pydantic's error types for a key that is no field of a model or of a dataclass.
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 
-def find_problems(error: ValidationError, kind: Any, data: Any) -> dict[str, str]:
+def find_problems(error: ValidationError, kind: Any, data: object) -> dict[str, str]:
     """Pydantic's errors as "expected X; found Y" by place, the first of each.
 
     Args:
@@ -53,7 +56,7 @@ def find_problems(error: ValidationError, kind: Any, data: Any) -> dict[str, str
     return problems
 
 
-def _problem(error: Any, kind: Any, data: Any) -> tuple[str, str]:
+def _problem(error: ErrorDetails, kind: Any, data: Any) -> tuple[str, str]:
     """The place of an error, and "expected X; found Y"."""
     steps = list(error["loc"])
     names = list(fields_of(kind))
@@ -89,12 +92,12 @@ def _problem(error: Any, kind: Any, data: Any) -> tuple[str, str]:
     return join(*taken), f"expected {describe(annotation)}; found {text}"
 
 
-def join(*steps: Any) -> str:
+def join(*steps: object) -> str:
     """A dotted place from its steps, without empty ones."""
     return ".".join(str(step) for step in steps if step != "")
 
 
-def _look_up(data: Any, steps: list[Any], otherwise: Any) -> tuple[list[Any], Any]:
+def _look_up(data: Any, steps: list[Step], otherwise: object) -> tuple[list[Step], Any]:
     """The value at a place; the place ends early where a short form stands for the whole."""
     for i, step in enumerate(steps):
         if (
@@ -111,7 +114,7 @@ def _look_up(data: Any, steps: list[Any], otherwise: Any) -> tuple[list[Any], An
 # --- what annotations say, in words ---------------------------------------------------------------
 
 
-def fields_of(kind: Any) -> dict[str, FieldInfo]:
+def fields_of(kind: object) -> dict[str, FieldInfo]:
     """The fields of a checked class or a model by name; empty for other types."""
     return getattr(kind, "model_fields", None) or getattr(kind, "__pydantic_fields__", {})
 
@@ -135,13 +138,13 @@ def _open(annotation: Any) -> tuple[Any, list[Any], bool]:
             return annotation, metadata, optional
 
 
-def _is_union(annotation: Any) -> bool:
+def _is_union(annotation: object) -> bool:
     return get_origin(annotation) in (Union, types.UnionType)
 
 
-def _follow(annotation: Any, steps: Sequence[Any]) -> tuple[list[Any], Any]:
+def _follow(annotation: Any, steps: Sequence[Step]) -> tuple[list[Step], Any]:
     """As many steps as can be followed into a type, and the annotation there."""
-    taken: list[Any] = []
+    taken: list[Step] = []
     for step in steps:
         kind, metadata, _ = _open(annotation)
         fields, arguments = fields_of(kind), get_args(kind)
@@ -161,7 +164,7 @@ def _follow(annotation: Any, steps: Sequence[Any]) -> tuple[list[Any], Any]:
     return taken, annotation
 
 
-def _names(kind: Any, prefix: str = "") -> dict[str, str]:
+def _names(kind: object, prefix: str = "") -> dict[str, str]:
     """All fields' dotted names by their last part."""
     found: dict[str, str] = {}
     for name, field in fields_of(kind).items():
@@ -169,8 +172,8 @@ def _names(kind: Any, prefix: str = "") -> dict[str, str]:
     return found
 
 
-def _suggest(name: str, known: Sequence[str], place: Sequence[Any], root: Any) -> str:
-    """The name the user may have meant: a sibling, or a field from elsewhere."""
+def _suggest(name: str, known: Sequence[str], place: Sequence[Step], root: object) -> str:
+    """The most similar known name: of a sibling, or of a field in another section."""
     for names in ({key: join(*place, key) for key in known}, _names(root)):
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
         if near:
@@ -183,7 +186,7 @@ _COUNTS = {2: "two", 3: "three"}
 _SIGNS = {Gt: "> ", Ge: ">= ", Lt: "< ", Le: "<= "}
 
 
-def describe(annotation: Any) -> str:
+def describe(annotation: object) -> str:
     """The values of a type in words: "a number > 0 and <= 20 [Hz]"."""
     kind, metadata, optional = _open(annotation)
     said = [item.documentation for item in metadata if isinstance(item, DocInfo)]

@@ -1,4 +1,4 @@
-"""YAML without its traps: numbers like `1e-3`, no duplicate keys, no bombs."""
+"""Safe YAML: reads `1e-3` as a number; refuses duplicate keys, deep nesting and huge documents."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mjx_revolve.inputs.trust import audit
 # Revolve's deepest evolved robots stay below 60 levels of YAML; Python's own recursion limit is
 # 1000. A file nested deeper than this is a mistake or an attack.
 _MAX_DEPTH = 200
-# An alias bomb is small in the file and huge when walked; our files need no aliases at all.
+# Nested aliases can make a small file huge ("billion laughs"); our files need no aliases at all.
 _MAX_NODES = 200_000
 # PyYAML reads some 20,000 values in a second; a robot of a thousand modules has as many.
 _MAX_WRITTEN = 100_000
@@ -39,7 +39,7 @@ class SafeLoader(yaml.SafeLoader):
 
     _depth = _count = 0
 
-    def fetch_flow_collection_start(self, token: Any) -> None:
+    def fetch_flow_collection_start(self, token: yaml.Token) -> None:
         """Scans a `[` or a `{`; PyYAML's time grows with the square of how many are open."""
         if self.flow_level > _MAX_DEPTH:
             raise _too_deep()
@@ -63,7 +63,7 @@ class SafeLoader(yaml.SafeLoader):
             return super().construct_object(node, deep)
         except (InputError, yaml.YAMLError, RecursionError):
             raise
-        except Exception as error:  # PyYAML's constructors take their tag's word for it
+        except Exception as error:  # PyYAML's constructors do not check the text against the tag
             kind = node.tag.rpartition(":")[2]
             reason = f": {error}" if isinstance(error, ValueError) else ""
             raise InputError(
@@ -72,7 +72,7 @@ class SafeLoader(yaml.SafeLoader):
             ) from None
 
 
-# YAML 1.1 wants a dot in floats and no sign before it; people write 1e-3 and -.5 and mean it.
+# YAML 1.1 floats need a dot and no sign before it; users write 1e-3 and -.5 for numbers.
 SafeLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(
@@ -113,7 +113,7 @@ for _name in ("binary", "omap", "pairs", "set"):  # bytes, tuples and sets: no f
     SafeLoader.add_constructor(f"tag:yaml.org,2002:{_name}", _refuse_tag)
 
 
-def _check_size(data: Any) -> None:
+def _check_size(data: object) -> None:
     stack, count = [(data, 0)], 0
     while stack:
         item, depth = stack.pop()

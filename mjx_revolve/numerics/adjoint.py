@@ -1,26 +1,28 @@
-"""The way back over a loop of steps, compiled as the way ahead is.
+"""The backward pass (reverse-mode gradient) over a loop of steps, compiled like the forward pass.
 
-JAX's own way back over a scan of population steps is hundreds of small kernels for each step: it
-takes 20 times as long as the way ahead, and XLA minutes to compile. Here the loop ahead keeps the
-carry of each step, one array; a step back computes that step again and differentiates it (
-checkpointing at every step: memory grows with the carry alone), and is cut into small calls like
-the step itself. It takes 3 times as long as the way ahead.
+JAX's own backward pass over a scan of population steps is hundreds of small kernels for each step:
+it takes 20 times as long as the forward pass, and XLA takes minutes to compile it. Here the forward
+loop saves the carry of each step, as one array. A backward step computes that step again and
+differentiates it (checkpointing at every step: only carries are kept), and is cut into small calls
+like the step itself. It takes 3 times as long as the forward pass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from mjx_revolve.numerics.xla import in_fused_calls, in_one_array, is_wide
 
+P = ParamSpec("P")
+R = TypeVar("R")
 
-def differentiate_as(
-    fun: Callable[..., Any], differentiated: Callable[..., Any]
-) -> Callable[..., Any]:
+
+def differentiate_as(fun: Callable[P, R], differentiated: Callable[P, R]) -> Callable[P, R]:
     """`fun`, but differentiated as another form of the same function.
 
     XLA takes minutes over the derivative of one long function, and seconds over many short ones.
@@ -28,37 +30,40 @@ def differentiate_as(
     called = jax.custom_jvp(fun)
 
     @called.defjvp
-    def _differentiate(primals: Any, tangents: Any) -> Any:
+    def _differentiate(primals: PyTree, tangents: PyTree) -> PyTree:
         return jax.jvp(differentiated, primals, tangents)
 
     return called
 
 
 def fused_back(
-    step: Callable[[Any, Any, Any], Any], carry: Any, row: Any, offset: jax.Array
-) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any, Any], tuple[Any, jax.Array]]]:
-    """The steps ahead and back of a loop that is differentiated.
+    step: Callable[[PyTree, PyTree, PyTree], PyTree], carry: PyTree, row: PyTree, offset: jax.Array
+) -> tuple[
+    Callable[[PyTree, PyTree], PyTree], Callable[[PyTree, PyTree, PyTree], tuple[PyTree, jax.Array]]
+]:
+    """The forward and the backward step of a loop that is differentiated.
 
     Args:
         step: (carry, row, offset) → carry; element-wise but for sums over what is broadcast. Of the
             carry's leaves, the wide ones have gradients (see `xla.is_wide`).
-        carry: an example.
-        row: an example; it has no gradient.
-        offset: an example; added to something within the step, for the gradient by it.
+        carry: an example of the carry.
+        row: an example of the loop's input in one step; it has no gradient.
+        offset: an example; added to a value within the step, for the gradient by that value.
 
     Returns:
-        (ahead, back). Ahead: (carry, row) → carry, without an offset. Back: (gradient by the carry
-        after the step, carry before it, row) → (gradient by that one, gradient by the offset).
-        Carries are packed by `xla.in_one_array`, gradients like its first result.
+        (forward, backward). Forward: (carry, row) → carry, without an offset. Backward: (gradient
+        by the carry after the step, carry before it, row) → (gradient by the carry before it,
+        gradient by the offset). Carries are packed by `xla.in_one_array`, gradients like its first
+        result.
     """
     pack, unpack = in_one_array(carry)
     wide = [is_wide(x) for x in jax.tree.leaves(carry)]
     none = jnp.zeros_like(offset)
 
-    def spread(carry: Any) -> list[jax.Array]:
+    def spread(carry: PyTree) -> list[jax.Array]:
         return [x for x, w in zip(jax.tree.leaves(carry), wide, strict=True) if w]
 
-    def back(gradient: Any, carry: Any, row: Any) -> Any:
+    def back(gradient: PyTree, carry: PyTree, row: PyTree) -> PyTree:
         leaves, tree = jax.tree.flatten(carry)
 
         def run(values: list[jax.Array], offset: jax.Array) -> list[jax.Array]:

@@ -1,8 +1,8 @@
-"""Articulated inertias: what a body with all that hangs on it is to its parent.
+"""Articulated-body inertias: the apparent inertia of a subtree at its root.
 
-The three pieces of Featherstone's articulated-body algorithm (2008, Rigid Body Dynamics Algorithms,
-§ 7.3) for hinges along z, free of how the bodies are laid out. Matrices need not be symmetric:
-carried water that turns in the middle of a step makes them otherwise.
+The three parts of Featherstone's articulated-body algorithm (2008, Rigid Body Dynamics Algorithms,
+§ 7.3) for hinges along z, independent of how the bodies are laid out in memory. Matrices need not
+be symmetric: added mass taken at the step's midpoint makes them unsymmetric.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _minus(a: Mat, b: Mat) -> Mat:
 
 
 class JointElimination(NamedTuple):
-    """What setting a hinge free leaves for the way back."""
+    """Results of eliminating a hinge that the pass from the root to the leaves needs."""
 
     row_a: Vec
     row_l: Vec
@@ -93,18 +93,18 @@ def eliminate_joint(
     coriolis: tuple[Vec, Vec],
     symmetric: bool,
 ) -> tuple[Block, tuple[Vec, Vec], JointElimination]:
-    """Articulated inertia and bias of a hinge's body, the hinge (its z axis) set free.
+    """Eliminates a hinge (about z): the articulated inertia and bias that act on the parent.
 
     Args:
-        block: of the body and all that it carries.
-        bias: of the same bodies.
-        inertia: that the hinge adds about its axis: armature and implicit terms [kg·m²].
+        block: articulated inertia of the hinge's body, its descendants included.
+        bias: bias force of the same bodies.
+        inertia: added about the hinge's axis: armature and implicit terms [kg·m²].
         torque: at the hinge [N·m].
         coriolis: velocity times joint velocity.
         symmetric: whether `block` is.
 
     Returns:
-        What the parent feels, and what the way back needs.
+        Inertia and bias for the parent, and what the pass from root to leaves needs.
     """
     column_a = tuple(block.angular[i][2] for i in range(3))
     column_l = tuple(block.back[i][2] for i in range(3))

@@ -1,6 +1,6 @@
 """Distance and penetration depth of turned boxes, by components, by separating axes.
 
-Two convex bodies are apart where their shadows on some axis are; of two boxes, 15 axes decide:
+Two convex bodies are apart where their projections on some axis are; of two boxes, 15 axes decide:
 three face normals of each, and the nine cross products of their edges (Gottschalk, Lin and Manocha
 1996, OBBTree, SIGGRAPH). The largest gap over these axes is, where it is negative, minus the
 penetration depth: the least translation that parts the boxes.
@@ -13,7 +13,7 @@ vectors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +39,8 @@ _PARALLEL = 1e-6
 # The same where the boxes turn within a step: the axis of two edges swings with them, and flips
 # where they become parallel. A choice: 18 degrees.
 _SWINGING = 0.1
-# Sine of the slope below which an edge lies flat on a face [-]: the contact point then moves from
-# the edge's end to its middle. A choice.
+# Sine of the angle between an edge and a face below which the edge lies flat on it [-]: the contact
+# point then moves from the edge's end to its middle. A choice.
 _FLAT = 0.05
 
 
@@ -63,11 +63,11 @@ class BoxPair(NamedTuple):
 
 
 class BoxAxes(NamedTuple):
-    """Shadows of two boxes on the 15 axes.
+    """Projections of two boxes on the 15 axes.
 
     Attributes:
         offset: of the second centre from the first along each axis, with its sign [m].
-        reach: sum of the half shadows of both [m].
+        reach: sum of both boxes' half widths along each axis [m].
     """
 
     offset: tuple[Scalar, ...]
@@ -77,8 +77,8 @@ class BoxAxes(NamedTuple):
         """Gap along each axis [m], negative for an overlap.
 
         Args:
-            side: by default either; else the signs of the offset along each axis which count as
-                apart: a box that has passed through the other is then deep in it.
+            side: the sign of the offset along each axis that counts as apart, so that a box that
+                has passed through the other counts as deep in it; None: either sign.
         """
         xp = namespace(self.offset[0])
         if side is None:
@@ -88,10 +88,10 @@ class BoxAxes(NamedTuple):
 
 
 def box_axes(pair: BoxPair, parallel: float = _PARALLEL) -> BoxAxes:
-    """Shadows of two boxes on the 15 axes: the first's, the second's, then edge by edge.
+    """Projections of two boxes on the 15 axes: the first's, the second's, then edge by edge.
 
-    Edges whose squared sine is below `parallel` have no axis: there the reach is 1e3 m, so that the
-    gap is never the largest.
+    Edges with a squared sine below `parallel` have no axis: their reach is set to 1e3 m, so that
+    their gap is never the largest.
     """
     xp = namespace(pair.offset[0])
     a, b = pair.first_half, pair.second_half
@@ -116,7 +116,7 @@ def box_axes(pair: BoxPair, parallel: float = _PARALLEL) -> BoxAxes:
     return BoxAxes(tuple(offset), tuple(reach))
 
 
-def weight(condition: Any, like: Scalar) -> Scalar:
+def weight(condition: Scalar, like: Scalar) -> Scalar:
     """1 where a condition holds, else 0, of the type of another number."""
     xp = namespace(like)
     return xp.where(condition, 1.0, 0.0).astype(like.dtype)
@@ -195,10 +195,10 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     start = _sum(share, now)
     signed = [x * y for x, y in zip(share, side, strict=True)]
     normal = _axis(turn, signed)
-    # What touches first is what reaches farthest at the end of the step.
+    # The feature that touches first is the one that reaches farthest at the end of the step.
     turn_ahead = turn if ahead is None else _relative(ahead)
     toward = normal if ahead is None else _axis(turn_ahead, signed)
-    # The features that look at each other, seen from the first box.
+    # The features that face each other, in the first box's frame.
     t = matTvec(pair.first, pair.offset)
     back = transpose(turn)
     one, spread = _feature(toward, pair.first_half)
@@ -224,13 +224,13 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
 
 
 def last_of(better: Sequence[Scalar]) -> list[Scalar]:
-    """1 for the last of some things that was better than those before it, 0 for the others.
+    """One-hot weights of the last candidate that was better than all before it.
 
     Args:
-        better: 1 or 0 for each thing but the first.
+        better: 1 or 0 for each candidate but the first.
 
     Returns:
-        For each thing, the first among them.
+        1 or 0 for each candidate, the first included.
     """
     xp = namespace(better[0])
     share, left = [], xp.ones_like(better[0])
@@ -246,7 +246,7 @@ def _sum(weights: Sequence[Scalar], values: Sequence[Scalar]) -> Scalar:
 
 
 def _axis(turn: Mat, share: Sequence[Scalar]) -> Vec:
-    """The sum of the 15 axes, unit vectors in the first box's frame, by such shares."""
+    """The weighted sum of the 15 axes, which are unit vectors in the first box's frame."""
     xp = namespace(turn[0][0])
     found = vadd(tuple(share[:3]), matvec(turn, tuple(share[3:6])))
     for i in range(3):
@@ -275,9 +275,9 @@ def _feature(normal: Vec, half: Vec) -> tuple[Vec, Vec]:
 
 
 def _common(spread: Vec, away: Vec, turn: Mat, other_spread: Vec) -> Vec:
-    """Middle of what two features have in common along the axes of the first's box.
+    """Middle of the overlap of two features, relative to the middle of the first, its box's axes.
 
-    From the middle of the first feature. `away` leads to that of the second, `turn` turns the
+    `away` leads from the middle of the first feature to that of the second, `turn` turns the
     second's axes into the first's, and both spreads are half edges of the features.
     """
     xp = namespace(away[0])
@@ -286,7 +286,7 @@ def _common(spread: Vec, away: Vec, turn: Mat, other_spread: Vec) -> Vec:
         reach = dot(tuple(xp.abs(x) for x in turn[i]), other_spread)
         low = xp.maximum(-spread[i], away[i] - reach)
         high = xp.minimum(spread[i], away[i] + reach)
-        # With nothing in common, the end of the other one: the gap is that at its corner.
+        # Without an overlap, the nearer end of the other feature: the gap is that at its corner.
         found.append(xp.clip(0.5 * (low + high), away[i] - reach, away[i] + reach))
     return tuple(found)
 
@@ -295,7 +295,7 @@ def pair_of(
     center: np.ndarray, rotation: np.ndarray, half: np.ndarray,
     centers: np.ndarray, rotations: np.ndarray, halves: np.ndarray,
 ) -> BoxPair:  # fmt: skip
-    """Pairs of boxes of arrays `[..., 3]` and `[..., 3, 3]`, for `box_gap` and its like.
+    """Pairs of boxes from arrays `[..., 3]` and `[..., 3, 3]`, for `box_gap` and `box_contact`.
 
     Args:
         center: of the first boxes, world frame [m].

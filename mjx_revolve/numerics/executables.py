@@ -1,9 +1,9 @@
-"""Compiled programs kept on disk by what they were made of: a later process does not trace them.
+"""Compiled programs kept on disk under a fingerprint, so that a later process need not trace them.
 
-JAX's compilation cache saves the compiler's time; to ask it, a program must be traced and lowered
-first, which takes seconds here. Commands and their workers keep whole programs besides. A file is
-found by a fingerprint of what its program was made of, our source, the packages, the CPU and the
-arguments' shapes.
+JAX's compilation cache saves the compiler's time only: a look-up needs the traced and lowered
+program, which takes seconds here. So commands and their workers also keep whole executables. The
+fingerprint covers the values that the program was made of, our source, the packages, the CPU and
+the arguments' shapes.
 """
 
 from __future__ import annotations
@@ -21,34 +21,35 @@ from typing import Any
 import jax
 from jax import monitoring
 from jax.experimental import serialize_executable
+from jaxtyping import PyTree
 
 from mjx_revolve.numerics import runtime
 from mjx_revolve.numerics.xla import fuses, jit, on_cpu
 
-# JAX tells of a program that it finds in its cache by this name.
-_HIT = "/jax/compilation_cache/cache_hits"
-# Programs that nobody has read for so long are removed [s].
+# The event that JAX records when it finds a program in its cache.
+_CACHE_HIT = "/jax/compilation_cache/cache_hits"
+# Programs that were not read for so long are removed [s].
 _LIFE = 30 * 86_400
 _log = logging.getLogger(__name__)
 
 
 class StoredProgram:
-    """`xla.jit` of a function, whose executables are kept beside JAX's compilation cache."""
+    """`xla.jit` of a function with its executables kept beside JAX's compilation cache."""
 
-    def __init__(self, fun: Callable[..., Any], made_of: Any, fast: bool = False) -> None:
-        """A program.
+    def __init__(self, fun: Callable[..., PyTree], made_of: object, fast: bool = False) -> None:
+        """Compiles nothing yet.
 
         Args:
-            fun: of pytrees of arrays; its results are tuples and dictionaries of arrays.
-            made_of: all values that it depends on besides its arguments, which can be pickled; None
-                where they cannot all be named: then nothing is kept.
+            fun: takes pytrees of arrays; returns tuples and dictionaries of arrays.
+            made_of: all values besides the arguments that `fun` depends on, picklable; None if they
+                are not all known: then nothing is kept.
             fast: as of `xla.jit`.
         """
         self._jitted = jit(fun, fast=fast)
         self._made_of = made_of, fast
         self._found: dict[Any, Any] = {}
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """Calls it."""
         folder = runtime.program_folder()
         if self._made_of[0] is None or folder is None or not on_cpu():
@@ -62,22 +63,22 @@ class StoredProgram:
         return self._found[tree, shapes](*args)
 
     def cache_size(self) -> int:
-        """How many executables it has, one for each signature of its arguments."""
+        """Number of executables, one for each signature of the arguments."""
         return len(self._found) + self._jitted._cache_size()
 
-    def _name(self, *signature: Any) -> str:
+    def _name(self, *signature: object) -> str:
         config: Any = jax.config
         precision = config.jax_enable_x64, config.jax_default_matmul_precision
         host = runtime.host_key(), precision, fuses(), os.environ.get("XLA_FLAGS")
         return hashlib.sha256(pickle.dumps((self._made_of, signature, host))).hexdigest()[:32]
 
-    def _compile(self, path: Path, args: Any) -> Any:
+    def _compile(self, path: Path, args: PyTree) -> Any:
         with runtime.compile_lock("program", path.name):
             if (found := _load(path, jax.tree.structure((args, {})))) is not None:
                 return found  # another process has compiled it meanwhile
             lowered = self._jitted.lower(*args)
             hits: list[str] = []
-            listen = lambda event, **_: hits.append(event) if event == _HIT else None  # noqa: E731
+            listen = lambda event, **_: hits.append(event) if event == _CACHE_HIT else None  # noqa: E731
             monitoring.register_event_listener(listen)
             try:
                 made = lowered.compile()
@@ -91,7 +92,7 @@ class StoredProgram:
 
 
 def _keep(path: Path, made: Any) -> None:
-    """Writes a program; where that fails, starts are slower and results the same."""
+    """Writes a program; if that fails, later processes start slower, with the same results."""
     beside = path.with_name(f"{path.name}.{os.getpid()}")
     try:
         payload, _, out_tree = serialize_executable.serialize(made)
@@ -109,8 +110,8 @@ def _keep(path: Path, made: Any) -> None:
             beside.unlink(missing_ok=True)
 
 
-def _load(path: Path, tree: Any) -> Any:
-    """The program of a file; None where there is none that is whole."""
+def _load(path: Path, tree: PyTree) -> Any:
+    """The program of a file; None if it is missing or damaged."""
     try:
         data = path.read_bytes()
     except OSError:
@@ -120,9 +121,9 @@ def _load(path: Path, tree: Any) -> Any:
         return None
     try:
         payload, out_tree = pickle.loads(content)
-        with contextlib.suppress(OSError):  # a folder of somebody else
+        with contextlib.suppress(OSError):  # a folder of another user
             os.utime(path)
         return serialize_executable.deserialize_and_load(payload, tree, out_tree)
-    except Exception as error:  # of another machine or version, however that shows
+    except Exception as error:  # made on another machine or by another version
         _log.debug("a kept program is not used: %s", error)
         return None

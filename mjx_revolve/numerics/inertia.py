@@ -90,9 +90,9 @@ def block_of(inertia: SpatialInertia) -> Block:
 
 
 def gyroscope(angular: Vec, linear: Vec) -> Block:
-    """K(h) with K(h) ν = ν ×* h: what a momentum h asks for when its body moves by ν.
+    """K(h) with K(h) ν = ν ×* h: the rate of change of a body-fixed momentum h as its body moves.
 
-    It is antisymmetric: whatever h, that force does no work.
+    It is antisymmetric: for any h that force does no work.
     """
     turned = tuple(tuple(neg(x) for x in row) for row in skew(linear))
     zero = ((0.0, 0.0, 0.0),) * 3
@@ -130,7 +130,7 @@ def apply_inertia(inertia: SpatialInertia, angular_velocity: Vec, velocity: Vec)
 
 
 def add_inertia(a: SpatialInertia, b: SpatialInertia) -> SpatialInertia:
-    """The sum of two."""
+    """The sum of two spatial inertias."""
     return SpatialInertia(
         vadd(a.angular, b.angular),
         tuple(vadd(x, y) for x, y in zip(a.cross, b.cross, strict=True)),
@@ -139,7 +139,7 @@ def add_inertia(a: SpatialInertia, b: SpatialInertia) -> SpatialInertia:
 
 
 def scale_inertia(s: Scalar, a: SpatialInertia) -> SpatialInertia:
-    """One, times a number."""
+    """A spatial inertia times a scalar."""
     return SpatialInertia(
         tuple(mul(s, x) for x in a.angular),
         tuple(tuple(mul(s, x) for x in row) for row in a.cross),
@@ -150,13 +150,13 @@ def scale_inertia(s: Scalar, a: SpatialInertia) -> SpatialInertia:
 def shift_inertia(
     linear: Sym, angular: Sym, position: Vec, cross: Mat | None = None
 ) -> SpatialInertia:
-    """What resists motion at a place, seen from the body's origin.
+    """A 6×6 inertia or damping that is given at a point, shifted to the body's origin.
 
     Args:
-        linear: 3×3 against the place's velocity, body frame.
-        angular: 3×3 against rotation.
-        position: of the place, body frame [m].
-        cross: 3×3 of torque per velocity at the place; by default none.
+        linear: 3×3, force per velocity (or acceleration) of the point, body frame.
+        angular: 3×3, torque per angular velocity (or acceleration).
+        position: of the point, body frame [m].
+        cross: 3×3, torque per velocity (or acceleration) of the point; None: zero.
 
     Returns:
         The 6×6 about the origin: [[A - C [r] - (C [r])ᵀ - [r] L [r], C + [r] L], [·, L]].
@@ -176,17 +176,17 @@ def shift_inertia(
 
 
 def cross_force(angular_velocity: Vec, velocity: Vec, angular: Vec, linear: Vec) -> tuple[Vec, Vec]:
-    """The force cross product (Featherstone's v ×*): rate of change of a momentum seen turning."""
+    """The spatial force cross product v ×* f (Featherstone 2008, § 2.8)."""
     return vadd(cross(angular_velocity, angular), cross(velocity, linear)), cross(
         angular_velocity, linear
     )
 
 
 def sum_parts(x: Scalar, n: int) -> Scalar:
-    """Sum over the first of three axes, written out: XLA cannot reduce inside a called loop.
+    """Sum over the first of three axes, written out: a small call must not contain a reduction.
 
     Args:
-        x: `[n or 1, nbody, lanes]`, or anything smaller that stands for n equal terms.
+        x: `[n or 1, nbody, lanes]`, or a smaller array that stands for n equal terms.
         n: how many terms.
 
     Returns:

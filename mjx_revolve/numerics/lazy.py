@@ -1,8 +1,8 @@
-"""JAX and MuJoCo, imported when something of them is first used: files are read without them.
+"""JAX and MuJoCo, imported on the first use of an attribute: files are read without them.
 
     from mjx_revolve.numerics.lazy import jax, jnp
 
-A configuration names laws of the water, whose files need JAX to compute but not to be listed.
+A configuration names laws of the water; to list and check them takes no JAX, to compute them does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 else:
 
     class _Module(types.ModuleType):
-        """A module by name; what was asked of it once is an attribute of this."""
+        """A module by name; its attributes are looked up once and then kept here."""
 
         def __getattr__(self, name: str) -> Any:
             value = getattr(importlib.import_module(self.__name__), name)

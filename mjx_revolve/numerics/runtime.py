@@ -1,4 +1,4 @@
-"""The process around a run: thread settings, JAX's compilation cache, and what to write down.
+"""The process of a run: thread settings, JAX's compilation cache, and its description.
 
 `prepare_process` comes first in a command's `main`, before NumPy and JAX are loaded; nothing here
 imports them at the top.
@@ -33,8 +33,8 @@ _PACKAGES = (
     "mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "numpy", "scipy",
 )  # fmt: skip
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-# What a worker compiles faster than this is not worth a file [s]. The leader keeps everything: a
-# start runs a hundred small programs, 2 s to compile and .3 s to read back.
+# A worker caches only programs that took longer to compile than this [s]. The main process caches
+# all: at a start it runs a hundred small programs, 2 s to compile and .3 s to read back.
 _WORKER_MIN_COMPILE_TIME = 0.5
 # Individuals stepped together on a CPU: enough to fill vector registers, few enough that the loop's
 # live values stay in the first-level cache (measured: 64 to 256 alike, 16 to 32 slower). It stands
@@ -86,7 +86,7 @@ def find_cache() -> Path | None:
 
 
 def expects_cpu() -> bool:
-    """Whether JAX will find nothing but CPUs, as far as can be told before it is imported."""
+    """Whether JAX will find nothing but CPUs, judged from the environment before its import."""
     if os.environ.get("JAX_PLATFORMS", "cpu") not in ("", "cpu"):
         return False
     return all(importlib.util.find_spec(name) is None for name in ("jax_plugins", "libtpu"))
@@ -102,19 +102,19 @@ def _use_cache(folder: Path | None, min_compile_time: float) -> None:
 
 
 def program_folder() -> Path | None:
-    """Where whole programs are kept (see `executables`); None: nowhere, as outside of commands."""
+    """The folder of whole programs (see `executables`); None outside of commands: none are kept."""
     return _programs
 
 
 def prepare_worker(core: int | None, cache: str | None) -> None:
-    """What `prepare_process` is to a command, this is to a worker process; imports JAX.
+    """Prepares a worker process as `prepare_process` does a command; imports JAX.
 
     Args:
-        core: the only core it is to use, once `pin_process` says so; None: any. XLA makes as many
-            threads as there are cores to use when it starts, so such a worker runs blocks in a
-            single thread. Compiling takes more threads, and cores that are still idle.
-        cache: the compilation cache's folder, as the process that started the worker uses it. That
-            one has removed broken entries; doing so again could hit one that is being written.
+        core: the only core that the worker will use after `pin_process`; None: any. XLA starts one
+            thread for each usable core, so such a worker runs blocks in a single thread. Compiling
+            takes more threads, on cores that are still idle.
+        cache: the compilation cache's folder that the main process uses. The main process has
+            removed broken entries; the worker does not, as an entry may be in writing.
     """
     fix_threads()
     os.environ["JAX_PLATFORMS"] = "cpu"
@@ -132,14 +132,14 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
 
 @contextlib.contextmanager
 def compile_lock(kind: str, fingerprint: str) -> Iterator[None]:
-    """Lets one process of a host in first, and those that come meanwhile when that one is done.
+    """A lock between the processes of a host: one compiles, the others wait for its result.
 
-    The others then read from the compilation cache what it compiled; doing it at the same time
-    would take all of them longer. Without a cache there is no lock.
+    The others then read the compiled program from the compilation cache; compiling it at the same
+    time would take all of them longer. Without a cache there is no lock.
 
     Args:
-        kind: `job`, or `program` within that; so no two processes wait for each other.
-        fingerprint: of what is compiled.
+        kind: `job`, or `program` within a job's lock; two kinds, so that there is no deadlock.
+        fingerprint: of the program.
     """
     import jax
 
@@ -160,7 +160,7 @@ def compile_lock(kind: str, fingerprint: str) -> Iterator[None]:
 
 
 def pin_process(cores: Sequence[int]) -> None:
-    """Keeps all threads of this process to these cores, by number, where the system can."""
+    """Pins all threads of this process to these cores, by number, if the system supports it."""
     if not hasattr(os, "sched_setaffinity"):
         return
     folder = Path("/proc/self/task")
@@ -195,7 +195,7 @@ def _cpuinfo() -> list[str]:
 
 
 def _cpu_hash() -> str:
-    """XLA compiles for the host's instruction set: the same model name and flags, the same code."""
+    """A hash of the CPU's model name and flags, for which XLA generates code."""
     flags = {line for line in _cpuinfo() if line.startswith(("model name", "flags", "Features"))}
     text = "\n".join([platform.machine(), cpu_model(), *sorted(flags)])
     return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -226,8 +226,8 @@ def _is_whole(data: bytes) -> bool:
 def remove_broken_entries(folder: Path) -> list[str]:
     """Removes compilation-cache entries that a killed process left half written.
 
-    JAX warns about such an entry and compiles anew at every start, for ever, because it never
-    overwrites one. Entries that were found whole are not read again.
+    JAX warns about such an entry and compiles anew at every start, because it never overwrites
+    one. Entries that were found whole are not read again.
 
     Args:
         folder: the cache folder.
@@ -250,7 +250,7 @@ def remove_broken_entries(folder: Path) -> list[str]:
             if not _is_whole(entry.read_bytes()):
                 entry.unlink()
                 removed.append(entry.name)
-        except FileNotFoundError:  # another process was faster
+        except FileNotFoundError:  # another process has removed it
             continue
     if newest > checked:
         marker.touch()
@@ -274,7 +274,7 @@ def _git_revision() -> str | None:
 
 
 def cpu_model() -> str:
-    """The host's kind of CPU, in its maker's words."""
+    """The model name of the host's CPU."""
     for line in _cpuinfo():
         if line.startswith("model name"):
             return line.partition(":")[2].strip()
@@ -284,8 +284,8 @@ def cpu_model() -> str:
 def source_hash() -> str:
     """A fingerprint of this package's Python files and worlds: two of one version may differ.
 
-    The same in a checkout and in a wheel that was built from it. The configuration and the robot
-    are compared by what is in them, wherever they are from.
+    The same in a checkout and in a wheel that was built from it. Configuration and robot are not
+    part of it: they are compared by their content.
     """
     digest = hashlib.sha256()
     paths = [*_PACKAGE.rglob("*.py"), *(_PACKAGE / "water" / "worlds").glob("*.yaml")]
@@ -296,13 +296,13 @@ def source_hash() -> str:
 
 @functools.cache
 def host_key() -> tuple[str, ...]:
-    """What a compiled program depends on besides what it computes: source, packages, CPU, cores."""
+    """Source, packages, CPU and cores, on which a compiled program depends."""
     cores = str(_xla_cores or usable_cores())
     return source_hash(), str(_versions()), _cpu_hash(), cores
 
 
 def _versions() -> dict[str, str]:
-    """Of Python, and of the packages that bits depend on."""
+    """Versions of Python and of the packages that affect the bits of results."""
     versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -310,8 +310,8 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def describe_process() -> dict[str, Any]:
-    """What the bits of a run depend on, and its command: for `run.json`. Imports JAX.
+def describe_process() -> dict[str, object]:
+    """The command, and all that the bits of a run depend on: for `run.json`. Imports JAX.
 
     Returns:
         Versions, git revision, arguments, platform, CPU, device and thread settings.

@@ -1,4 +1,4 @@
-"""Vectors and matrices as tuples of arrays, so that a whole population moves in each operation.
+"""Vectors and matrices as tuples of arrays: each operation is on a whole population.
 
 A 3-vector is a tuple of three arrays, a 3×3 matrix a tuple of three rows, a symmetric one the tuple
 (xx, xy, xz, yy, yz, zz). Every component has the population on its last axis. XLA:CPU turns such
@@ -10,6 +10,7 @@ that an axis-aligned robot pays nothing for rotations that it does not have.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -42,8 +43,13 @@ def fold(a: np.ndarray) -> float | np.ndarray:
 
 
 def _as(a: Scalar, like: jax.Array) -> Scalar:
-    """Constants take the dtype of what they meet: NumPy's float64 must not widen float32."""
+    """A constant in the dtype of the other operand: NumPy's float64 must not widen float32."""
     return np.asarray(a, like.dtype) if isinstance(a, np.ndarray | np.generic) else a
+
+
+def is_present(x: Scalar) -> bool:
+    """Whether a number is more than a plain zero; what is traced counts as something."""
+    return isinstance(x, jax.Array) or bool(np.any(x))
 
 
 def mul(a: Scalar, b: Scalar) -> Scalar:
@@ -114,17 +120,17 @@ def cross(a: Vec, b: Vec) -> Vec:
     )
 
 
-def vadd(a: Any, b: Any) -> Any:
+def vadd(a: Iterable[Scalar], b: Iterable[Scalar]) -> Vec:
     """A + b, component by component."""
     return tuple(add(x, y) for x, y in zip(a, b, strict=True))
 
 
-def vsub(a: Any, b: Any) -> Any:
+def vsub(a: Iterable[Scalar], b: Iterable[Scalar]) -> Vec:
     """A - b, component by component."""
     return tuple(sub(x, y) for x, y in zip(a, b, strict=True))
 
 
-def vscale(s: Scalar, a: Any) -> Any:
+def vscale(s: Scalar, a: Iterable[Scalar]) -> Vec:
     """S a, component by component."""
     return tuple(mul(s, x) for x in a)
 
@@ -187,7 +193,7 @@ def safe_norm(a: Vec) -> Scalar:
 def namespace(x: Any) -> Any:
     """The functions for an array: NumPy's for NumPy's own, else JAX's.
 
-    What is computed while a robot is built is computed once; JAX would compile a program for each
+    Building a robot is done in NumPy: it happens once, and JAX would compile a program for each
     operation.
     """
     return np if isinstance(x, np.ndarray) else jnp
@@ -228,7 +234,7 @@ def sincos(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def quat_mul(p: tuple[Scalar, ...], q: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """The product p q of quaternions (w, x, y, z): as turns, q first and then p."""
+    """The product p q of quaternions (w, x, y, z): rotation by q, then by p."""
     (a, b, c, d), (e, f, g, h) = p, q
     return (
         a * e - b * f - c * g - d * h,

@@ -12,12 +12,13 @@ notices if they lose their effect). Results do not depend on them, but for the l
    function takes time that grows with the square of its length: so long steps are cut into several
    functions. The loop over time stays outside: inside, it would be a tenth faster, but LLVM takes
    twice as long. XLA:CPU aborts ("All or none of the slices should have an explicit index") over
-   such a function that has a parameter which nothing in it uses, as a loop of unknown length leaves
-   them: so what no result needs is left out.
+   a function with an unused parameter, and loops of unknown length leave such parameters behind: so
+   operations that no result depends on are left out.
 
 Other layers use `fuse_step`, `fuse` and `materialize`, all identities to JAX: jit, vmap and grad go
-through them. They do nothing on other back ends, nor where the environment variable
-`MJX_REVOLVE_FUSE` is 0: the same results, slower, which tells an error of XLA's from one of ours.
+through them. They do nothing on other back ends, nor with the environment variable
+`MJX_REVOLVE_FUSE=0`: the results are the same, but slower. So an error in XLA can be distinguished
+from one in this package.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, TypeVarTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +34,7 @@ import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import PyTree
 
 from mjx_revolve.numerics.runtime import LANES as LANES
 
@@ -43,8 +45,8 @@ _WORTH = 4
 # Measured (spider, default water, 482 values): in four pieces two cores are done in half of the
 # time that one piece takes, and a step takes as long; in six it takes a sixth longer.
 _PIECE = 120
-# Of one robot, where little is won by that, and where loops of unknown length are common: more
-# pieces leave more parameters that nothing uses once MLIR has folded what leads to them.
+# For one robot. Pieces save little there, and loops of unknown length are common: more pieces leave
+# more parameters that are unused once MLIR has folded the operations that read them.
 _PIECE_OF_ONE = 350
 
 # Operations that cost more than a plain one; views cost nothing.
@@ -64,6 +66,9 @@ _VIEWS = {
 _COST |= dict.fromkeys(_VIEWS, 0)
 _LOOPS = {"cond", "scan", "while"}
 
+Ts = TypeVarTuple("Ts")
+R = TypeVar("R")
+
 
 def on_cpu() -> bool:
     """Whether JAX's default back end is the CPU."""
@@ -79,8 +84,9 @@ def compiler_options(fast: bool = False) -> dict[str, Any] | None:
     """Options for the outermost `jax.jit` of a rollout.
 
     Args:
-        fast: for a program that runs once: compiled in a quarter to a third of the processor time,
-            ten times as slow. Else vectors of 512 bits: 30 % faster on processors with AVX-512.
+        fast: for a program that runs once: compiles in a quarter to a third of the processor time
+            and runs ten times as slow. If false, the program uses vectors of 512 bits, 30 % faster
+            on processors with AVX-512.
     """
     if not on_cpu():
         return None
@@ -89,13 +95,13 @@ def compiler_options(fast: bool = False) -> dict[str, Any] | None:
     return {"xla_cpu_prefer_vector_width": 512}
 
 
-def jit(fun: Callable[..., Any], fast: bool = False, **settings: Any) -> Any:
-    """`jax.jit` with `compiler_options`, which only the outermost jit may have."""
+def jit(fun: Callable[..., PyTree], fast: bool = False, **settings: Any) -> Any:
+    """`jax.jit` with `compiler_options`; JAX accepts those on the outermost jit only."""
     return jax.jit(fun, compiler_options=compiler_options(fast), **settings)
 
 
-def is_traced(*args: Any) -> bool:
-    """Whether arguments are part of a larger program, which has compiler options of its own."""
+def is_traced(*args: PyTree) -> bool:
+    """Whether arguments are traced: they belong to an outer program with its own options."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(args))
 
 
@@ -116,7 +122,7 @@ def _never_inlined(x: jax.Array) -> jax.Array:
 materialize_p.def_impl(lambda x: x)
 materialize_p.def_abstract_eval(lambda x: x)
 batching.defvectorized(materialize_p)
-# What is shared on the way ahead is shared on the way back: derivatives compile 7 times as fast.
+# The gradient of a materialized value is materialized, too: derivatives compile 7 times as fast.
 ad.deflinear2(materialize_p, lambda cotangent, _: (materialize_p.bind(cotangent),))
 mlir.register_lowering(materialize_p, lambda _, x: [x])
 mlir.register_lowering(
@@ -125,32 +131,35 @@ mlir.register_lowering(
 
 
 def materialize(x: jax.Array) -> jax.Array:
-    """`x`, computed by itself and once, however many operations use it.
+    """`x`, computed once in a kernel of its own, however many operations use it.
 
-    For what is broadcast, too: within a loop over the wider array, XLA:CPU would compute it for
-    each element again.
+    Use it also for values that are broadcast: XLA:CPU would compute them again for each element of
+    the wider array.
     """
     return materialize_p.bind(x) if fuses() else x
 
 
-def fuse(fun: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:
-    """A function whose shared values XLA computes once.
+def fuse(fun: Callable[[*Ts], R], inline: bool = False) -> Callable[[*Ts], R]:
+    """The same function, with each intermediate value computed once by XLA.
 
     Args:
         fun: a function of pytrees of arrays; element-wise but for loops, unless `inline`.
-        inline: whether it becomes part of what calls it, instead of one function of its own.
+        inline: compile it into its caller instead of into a function of its own.
 
     Returns:
         The same function.
     """
-    shared = lambda *args: Graph(fun, args)(*args) if fuses() else fun(*args)  # noqa: E731
+
+    def shared(*args: *Ts) -> R:
+        return Graph(fun, args)(*args) if fuses() else fun(*args)
+
     return shared if inline else fuse_call(shared)
 
 
-def fuse_call(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """A function, element-wise but for loops, that XLA:CPU compiles as one."""
+def fuse_call(fun: Callable[[*Ts], R]) -> Callable[[*Ts], R]:
+    """The same function (element-wise but for loops), compiled by XLA:CPU into one call."""
 
-    def called(*args: Any) -> Any:
+    def called(*args: *Ts) -> R:
         return jax.tree.map(
             lambda x: set_xla_metadata(x, inlineable="false", xla_cpu_small_call="true"),
             jax.jit(fun)(*args),
@@ -168,15 +177,15 @@ class _Operation(NamedTuple):
 
 
 class Graph:
-    """A function as a list of operations on numbered values, and which of these are stored.
+    """A traced function as a list of operations on numbered values, some of which are stored.
 
-    Calling it computes the function, stored values behind calls that are not inlined.
+    Calling it evaluates the function, with stored values materialized.
 
     Attributes:
-        size: how many values are stored.
+        size: number of stored values.
     """
 
-    def __init__(self, fun: Callable[..., Any], examples: Any) -> None:
+    def __init__(self, fun: Callable[..., PyTree], examples: PyTree) -> None:
         """Traces `fun` (of pytrees of arrays) on arguments like `examples`."""
         closed, shapes = jax.make_jaxpr(fun, return_shape=True)(*examples)
         self._structure = jax.tree.structure(shapes)
@@ -191,28 +200,30 @@ class Graph:
         self._stored = self._choose()
         self.size = len(self._stored)
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """Computes the function."""
         values = self._constants | dict(zip(self._arguments, jax.tree.leaves(args), strict=True))
         self._compute(self._operations, values)
         return self._finish(values)
 
-    def in_pieces(self, size: int, pack: Callable[[Any], Any], unpack: Callable[..., Any]) -> Any:
-        """The function cut into several, each compiled as one by `fuse_call`.
+    def in_pieces(
+        self, size: int, pack: Callable[[PyTree], PyTree], unpack: Callable[..., PyTree]
+    ) -> Any:
+        """The function cut into pieces, each compiled by `fuse_call`.
 
-        XLA's time for a function grows faster than its length, and several compile at once.
+        XLA's time for a function grows faster than its length, and pieces compile in parallel.
 
         Args:
             size: of a piece, in stored values.
             pack: applied to the results, within the last piece.
-            unpack: makes the function's arguments, within each piece.
+            unpack: maps packed arguments to the function's own, within each piece.
 
         Returns:
-            A function of what `unpack` takes that returns what `pack` gives.
+            A function: packed arguments → packed results.
         """
         count = max(1, round(self.size / size))
         piece: dict[int, int] = {}
-        for op in self._operations:  # what one operation gives stays together
+        for op in self._operations:  # the outputs of one operation stay together
             number = len(piece) * count // max(self.size, 1)
             piece |= {v: number for v in op.outputs if v in self._stored}
         made = {v: k for k, op in enumerate(self._operations) for v in op.outputs}
@@ -221,7 +232,7 @@ class Graph:
         cuts = [self._cut(k, own[k] if k < count - 1 else ends, piece, made) for k in range(count)]
         read = {v for _, inputs in cuts for v in inputs}
 
-        def run(*args: Any) -> Any:
+        def run(*args: PyTree) -> PyTree:
             values: dict[int, Any] = {}
             leaves, tree = jax.tree.flatten(args)
             for number, (operations, inputs) in enumerate(cuts):
@@ -236,7 +247,7 @@ class Graph:
                 )
 
                 def compute(
-                    given: Any, *xs: Any, cut: Any = (operations, inputs, outputs, last, used)
+                    given: PyTree, *xs: Any, cut: Any = (operations, inputs, outputs, last, used)
                 ) -> Any:
                     operations, inputs, outputs, last, used = cut
                     local = self._constants | dict(zip(inputs, xs, strict=True))
@@ -263,7 +274,7 @@ class Graph:
     def _cut(
         self, number: int, wanted: list[int], piece: dict[int, int], made: dict[int, int]
     ) -> tuple[list[_Operation], list[int]]:
-        """Operations of the piece that makes `wanted`, and what it reads of earlier pieces."""
+        """Operations of the piece that computes `wanted`, and its inputs from earlier pieces."""
         needed, inputs, seen, todo = set(), [], set(), list(wanted)
         while todo:
             v = todo.pop()
@@ -282,7 +293,7 @@ class Graph:
         return self._count
 
     def _inline(self, jaxpr: Any, consts: Any, env: dict[Any, Any]) -> list[Any]:
-        """Lists a jaxpr's operations, those of the small jitted functions in it among them."""
+        """Lists a jaxpr's operations, with the bodies of small jitted functions inlined."""
         for v, x in zip(jaxpr.constvars, consts, strict=True):
             env[v] = self._number()
             self._constants[env[v]] = x
@@ -291,7 +302,7 @@ class Graph:
             inputs = [read(v) for v in eqn.invars]
             inner = eqn.params.get("jaxpr") if eqn.primitive.name in ("jit", "pjit") else None
             if inner is not None:
-                # jnp.clip, jnp.where and their like.
+                # jnp.clip, jnp.where and others are jitted functions.
                 inside = dict(zip(inner.jaxpr.invars, inputs, strict=True))
                 outputs = self._inline(inner.jaxpr, inner.consts, inside)
             elif eqn.primitive is materialize_p:
@@ -304,7 +315,7 @@ class Graph:
         return [read(v) for v in jaxpr.outvars]
 
     def _alive(self) -> list[_Operation]:
-        """The operations without those that no result needs."""
+        """The operations that some result depends on."""
         needed = {v for v in self._results if isinstance(v, int)}
         kept = []
         for op in reversed(self._operations):
@@ -314,12 +325,12 @@ class Graph:
         return kept[::-1]
 
     def _choose(self) -> dict[int, bool]:
-        """Values to be stored, in order; False: a loop's, which XLA stores anyway."""
+        """Values to be stored, in order; False for outputs of loops, which XLA stores anyway."""
         uses: dict[int, int] = {}
         for inputs in [*(op.inputs for op in self._operations), self._results]:
             for v in {v for v in inputs if isinstance(v, int)}:
                 uses[v] = uses.get(v, 0) + 1
-        # What it costs to compute a value again from what is already in memory.
+        # The cost of computing a value again from values in memory.
         cost: dict[int, int] = {}
         stored: dict[int, bool] = {}
         for op in self._operations:
@@ -349,19 +360,19 @@ class Graph:
             for v, x in zip(op.outputs, out, strict=True):
                 values[v] = materialize_p.bind(x) if self._stored.get(v) else x
 
-    def _finish(self, values: dict[int, Any]) -> Any:
+    def _finish(self, values: dict[int, Any]) -> PyTree:
         return jax.tree.unflatten(self._structure, [_value(values, v) for v in self._results])
 
 
-def _used_inputs(fun: Callable[..., Any], args: list[Any], wanted: list[bool]) -> list[bool]:
-    """Which arguments of a function the wanted ones of its results depend on."""
+def _used_inputs(fun: Callable[..., PyTree], args: list[Any], wanted: list[bool]) -> list[bool]:
+    """Which arguments of a function its wanted results depend on."""
     jaxpr = jax.make_jaxpr(fun)(*args).jaxpr
     ends = (v for v, w in zip(jaxpr.outvars, wanted, strict=True) if w)
     needed = {v for v in ends if not isinstance(v, core.Literal)}
     for eqn in reversed(jaxpr.eqns):
         if needed.intersection(eqn.outvars):
             needed.update(v for v in eqn.invars if not isinstance(v, core.Literal))
-    # Keys, which have no zero to stand for them, stay.
+    # Random keys are always kept: there is no zero to replace them.
     key = lambda v: jnp.issubdtype(v.aval.dtype, jax.dtypes.extended)  # noqa: E731
     return [v in needed or key(v) for v in jaxpr.invars]
 
@@ -374,7 +385,7 @@ def _value(values: dict[int, Any], v: Any) -> Any:
 
 
 def take_lanes(x: jax.Array, which: jax.Array) -> jax.Array:
-    """`x[..., which]` of numbers that are known to be within bounds, which saves their checks."""
+    """`x[..., which]` without bounds checks: `which` must be within bounds."""
     dims = jax.lax.GatherDimensionNumbers(
         offset_dims=tuple(range(x.ndim - 1)), collapsed_slice_dims=(x.ndim - 1,),
         start_index_map=(x.ndim - 1,),
@@ -383,17 +394,19 @@ def take_lanes(x: jax.Array, which: jax.Array) -> jax.Array:
     return jax.lax.gather(x, which[:, None], dims, (*x.shape[:-1], 1), mode=mode)
 
 
-def fuse_step(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any) -> Any:
+def fuse_step(
+    step: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], carry: PyTree, row: PyTree
+) -> Any:
     """The fastest form of a loop's step over a chunk of a population.
 
-    A step becomes one function, or several if it is long, which a loop of XLA's own calls. The
-    carry travels as one array, because every array that a loop carries costs as much as a call.
+    A step becomes one function, or several if it is long; XLA's loop calls them. The carry is
+    packed into one array, because every array that a loop carries costs as much as a call.
 
     Args:
-        step: (carry, row) → (carry, output); element-wise. The carry's leaves are `[..., lanes]`,
-            floats of one type, or others, which are carried as they are.
-        carry: an example.
-        row: an example.
+        step: (carry, row) → (carry, output); element-wise. The carry's leaves are `[..., lanes]`
+            floats of one type; other leaves are carried unpacked.
+        carry: an example of the carry.
+        row: an example of the loop's input in one step.
 
     Returns:
         (step, pack, unpack): the step on packed carries, and functions between carries and packed
@@ -410,36 +423,36 @@ def fuse_step(step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, row: Any)
     return fused, pack, unpack
 
 
-def _piece_size(examples: Any) -> int:
+def _piece_size(examples: PyTree) -> int:
     lanes = max((x.shape[-1] for x in jax.tree.leaves(examples) if jnp.ndim(x)), default=1)
     return _PIECE if lanes > 1 else _PIECE_OF_ONE
 
 
 def is_wide(x: jax.Array) -> bool:
-    """Whether a leaf of a loop's carry is an array of floats, of one type in all of them."""
+    """Whether a leaf of a loop's carry is an array of floats; these are packed together."""
     return x.ndim > 0 and bool(jnp.issubdtype(x.dtype, jnp.floating))
 
 
-def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+def in_one_array(carry: PyTree) -> tuple[Callable[[PyTree], PyTree], Callable[[PyTree], PyTree]]:
     """Functions that pack what a loop carries.
 
     Args:
-        carry: an example; its leaves are `[..., lanes]`, floats of one type, or others.
+        carry: an example; its leaves are `[..., lanes]` floats of one type, or other values.
 
     Returns:
-        (pack, unpack): between such a carry and `[rows, lanes]` of its wide leaves, one below the
-        other, with the list of the others.
+        (pack, unpack): between a carry and (`[rows, lanes]` of its wide leaves, one below the
+        other; the list of other leaves).
     """
     leaves, tree = jax.tree.flatten(carry)
     wide = [is_wide(x) for x in leaves]
     rows = np.cumsum([0] + [x.size // x.shape[-1] for x, w in zip(leaves, wide, strict=True) if w])
 
-    def pack(carry: Any) -> Any:
+    def pack(carry: PyTree) -> PyTree:
         leaves = jax.tree.leaves(carry)
         blocks = [x.reshape(-1, x.shape[-1]) for x in leaves if is_wide(x)]
         return jnp.concatenate(blocks), [x for x in leaves if not is_wide(x)]
 
-    def unpack(packed: Any) -> Any:
+    def unpack(packed: PyTree) -> PyTree:
         block, others = packed[0], iter(packed[1])
         slices = (block[a:b] for a, b in itertools.pairwise(rows))
         found = [
@@ -452,18 +465,21 @@ def in_one_array(carry: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]
 
 
 def in_fused_calls(
-    fun: Callable[..., Any], examples: Any, pack: Callable[[Any], Any], unpack: Callable[..., Any]
-) -> Callable[..., Any]:
-    """A function of packed arguments and results, as few calls of compiled pieces.
+    fun: Callable[..., PyTree],
+    examples: PyTree,
+    pack: Callable[[PyTree], PyTree],
+    unpack: Callable[..., PyTree],
+) -> Callable[..., PyTree]:
+    """A function of packed arguments and results, as a few calls of compiled pieces.
 
     Args:
         fun: element-wise.
         examples: of its arguments.
         pack: applied to its results.
-        unpack: makes its arguments.
+        unpack: maps packed arguments to the arguments of `fun`.
 
     Returns:
-        A function of what `unpack` takes that returns what `pack` gives.
+        A function: packed arguments → packed results.
     """
     if not fuses():
         return lambda *args: pack(fun(*unpack(*args)))
@@ -471,7 +487,7 @@ def in_fused_calls(
     return found
 
 
-def over_chunks(fun: Callable[..., Any], lanes: int | None = None) -> Callable[..., Any]:
+def over_chunks(fun: Callable[[*Ts], R], lanes: int | None = None) -> Callable[[*Ts], R]:
     """Runs `fun` over the population in chunks of equal shape.
 
     The chunk's shape is fixed and the last one is padded with copies of the first individual, so an
@@ -485,7 +501,7 @@ def over_chunks(fun: Callable[..., Any], lanes: int | None = None) -> Callable[.
         The same function for any population size.
     """
 
-    def chunked(*args: Any) -> Any:
+    def chunked(*args: *Ts) -> R:
         population = jax.tree.leaves(args)[0].shape[-1]
         size = lanes or (LANES if on_cpu() else population)
         count = -(-population // size)

@@ -1,4 +1,4 @@
-"""What a robot did, analysed once and drawn: pictures, films, the viewer's page, reports.
+"""Analysis and display of episodes: pictures, films, the viewer's page, reports.
 
 Public names are those in `__init__.pyi`; the modules are private and may move between releases.
 """

@@ -31,7 +31,7 @@ _MOST_OUTLINES = 3000
 
 
 class _Map(NamedTuple):
-    """What is drawn of an archive.
+    """The content of a picture of an archive.
 
     Attributes:
         archive: the archive.

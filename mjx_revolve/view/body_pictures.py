@@ -37,8 +37,8 @@ from mjx_revolve.view.statistics import quantiles
 SIZE = (240, 180)
 """Width and height of a small picture [pixels]."""
 _MARGIN = 6  # [pixels]
-# A sheet of at most so many, and what each takes [inches].
-_MOST, _COLUMNS, _WIDTH, _HEIGHT, _TOP = 12, 4, 2.2, 2.0, 0.5
+# A sheet: most bodies, columns, and sizes [inches].
+_MAX_SHOWN, _COLUMNS, _WIDTH, _HEIGHT, _TOP = 12, 4, 2.2, 2.0, 0.5
 _PANELS = 8  # most descriptors that are drawn over the generations
 # These first, where they differ; counts of modules of a kind that no body has are left out.
 _FIRST = (
@@ -93,7 +93,7 @@ def plot_best(folder: Path, modules: Mapping[str, ModuleType], title: str = "") 
         InputError: a body cannot be read.
     """
     population, _ = read_population(folder)
-    best = population.alive(population.last)[:_MOST]
+    best = population.alive(population.last)[:_MAX_SHOWN]
     pictures = draw_bodies([life.grow(modules) for life in best])
     rows = max(1, -(-len(best) // _COLUMNS))
     figure = new_figure(_WIDTH * _COLUMNS, _HEIGHT * rows + _TOP, title)

@@ -1,6 +1,6 @@
 """How to build a robot: one page with parts, ballast, assembly in pictures, joints and STL files.
 
-It says what the simulation knows of the robot, and what it does not.
+It lists the properties that the simulation has of the robot, and those that it lacks.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mjx_revolve.view.raster import draw_scene, make_view
 _SIZE, _MARGIN = np.array([420, 315]), 10
 # Viewers stand on the side of the new module: of the core's -y, or of its +y; degrees, choices.
 _BACK, _FRONT, _ABOVE = -58.0, 122.0, 30.0
-# Modules that are there already are drawn so much white, the new one so much orange; choices.
+# Share of white in the colour of modules already in place, of orange in the new one's; choices.
 _PALE, _NEW = 0.72, 0.75
 # Masses or volumes that differ by less than this share are the same; a choice, a scale's error.
 _SAME = 1e-3
@@ -110,7 +110,7 @@ def list_parts(body: Morphology) -> list[list[Module]]:
 
 
 def _describe(kind: ModuleType, part: Part) -> str:
-    """What a part is, and what is in it besides what is printed."""
+    """A description of a part, and of its contents besides the printed shell."""
     words = []
     if part.thruster is not None:
         words.append("thruster, to buy")
@@ -159,7 +159,7 @@ def weigh(robot: Robot) -> Balance:
 
 
 def ballast_words(balance: Balance) -> list[str]:
-    """What makes a robot neutral in its water, and where to put it, sentence by sentence."""
+    """How to make a robot neutral in its water: ballast or floats and their place, by sentence."""
     if not balance.density:
         return ["The world of this robot has no water: nothing is said about ballast."]
     water = f"water of {balance.density:.6g} kg/m³"
@@ -205,7 +205,7 @@ def ballast_words(balance: Balance) -> list[str]:
     return found
 
 
-def joint_rows(robot: Robot) -> list[dict[str, Any]]:
+def joint_rows(robot: Robot) -> list[dict[str, object]]:
     """The hinges in the order of the controller's commands, and how they turn."""
     body, rows = robot.morphology, []
     joints = {link.joint.ctrl: link.joint for link in make_links(robot) if link.joint is not None}
@@ -224,7 +224,7 @@ def joint_rows(robot: Robot) -> list[dict[str, Any]]:
     return rows
 
 
-def _thruster_rows(robot: Robot) -> list[dict[str, Any]]:
+def _thruster_rows(robot: Robot) -> list[dict[str, object]]:
     """The thrusters, behind the hinges in the order of the controller's commands."""
     low, high, place, axis = (x[robot.num_hinges :] for x in read_actuators([robot.morphology]))
     return [
@@ -323,7 +323,7 @@ def _draw(scene: Scene, whole: Scene, view: np.ndarray) -> str:
     return _source(buffer.getvalue(), "image/png")
 
 
-def _stl_files(body: Morphology) -> list[dict[str, Any]]:
+def _stl_files(body: Morphology) -> list[dict[str, object]]:
     """The parts' shapes in millimetres, as downloads."""
     found = []
     for name, mesh in make_meshes(body).items():

@@ -1,4 +1,4 @@
-"""A run's colony, recorded: from a checkpoint it lives on for a while, and all poses are kept."""
+"""A recording of a run's colony: it is replayed from a checkpoint, and all poses are kept."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _CAUSES = {"age": "of age", "energy": "of an empty battery"}
 def record_colony(
     folder: Path, begin: float | None = None, duration: float = DURATION
 ) -> Recording:
-    """Lets a run's colony live on from a checkpoint.
+    """Replays a run's colony from a checkpoint, and records it.
 
-    Up to the run's end the recording is what has happened; from there on, what would have.
+    Up to the run's end the recording equals the run; from there on the colony is continued.
 
     Args:
         folder: the run folder; it stays as it is.
@@ -43,7 +43,7 @@ def record_colony(
     if not observed:
         raise InputError(f"{folder}: expected robots alive from {begin:g} s on; found none")
     start = min(float(one.time[0]) for one in observed) - _GAP
-    # A colony lives on to the end of an interval.
+    # A colony is advanced to the end of an interval.
     end = min(start + duration, max(float(one.time[-1]) for one in observed))
     depth = fitness.mixed.world.surface_height - config.task.depth
     marks = [Mark("clinic", (0.0, 0.0, depth), colony.birth.radius)]

@@ -35,7 +35,7 @@ _CAUSES = {
     "lost": ("#cc79a7", "lost"),
     "failed": ("#d55e00", "failed"),
 }
-_OTHER_CAUSE = ("#3b3b3b", "died of something else")  # that this version does not know
+_OTHER_CAUSE = ("#3b3b3b", "died of something else")  # causes of other versions
 _CHILD, _FOUNDER = "#4a97c9", "#b9d6e8"  # births with and without parents
 _BINS = 60  # of births and deaths along the time axis, at most
 # The largest families have colours of their own.
@@ -224,7 +224,7 @@ def plot_families(history: ColonyHistory, champion: int | None = None, title: st
 
     Args:
         history: of the colony.
-        champion: robot whose line is drawn over the others; None: none.
+        champion: number of a robot, to draw its line over the others; None: none.
         title: a line above the picture.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Pictures of how well evolution went: fitness over generations, and champions' final scores."""
+"""Pictures of the convergence of evolution: fitness over generations, and final scores."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _BODIES = {
 # Curves of runs that differ in length by more than this share a logarithmic axis.
 _LOG_FROM = 5.0
 
-# Cases whose scores have room beside curves, more stand below them; and which legends name.
+# Most cases with scores beside the curves rather than below; and most cases named in legends.
 _MOST_BESIDE, _MOST_NAMED = 20, 10
 
 COLONY_LABEL = "fitness in the colony"

@@ -1,4 +1,4 @@
-"""What the page of an episode receives: its robot's poses, forces, speed, current and target."""
+"""Data for the page of an episode: its robot's poses, forces, speed, current and target."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
@@ -32,14 +33,15 @@ from mjx_revolve.water.flow import Water, water_of
 
 # Poses per second, and how many at most: a long episode gets fewer per second.
 _RATE, _MOST = 50.0, 3000
-# What positions [m], quaternions [-] and hinges [rad] are rounded to: a robot fills the picture.
+# Rounding of positions [m], quaternions [-] and hinges [rad]: invisible when a robot fills the
+# picture.
 _STEPS = (2e-5, 5e-5, 1e-3)
 # Three quarters of a kind's arrows are shorter than the first of these shares of the body's length,
 # and all are shorter than the second; of a small body, than these lengths [m].
 _ARROW, _LONGEST = (0.3, 0.1), (0.65, 0.22)
 _LEFT_OUT = "left out here; python -m mjx_revolve.viewer RUN --individual N has them"
 # Forces below this are rounding [N].
-_NOTHING = 1e-5
+_ROUNDING_FORCE = 1e-5
 
 
 def episode_data(episode: Episode, forces: bool = True) -> Packed:
@@ -129,7 +131,7 @@ def _arrows(episode: Episode, every: int, water: Water) -> Packed:
     for name, arrow in arrows.items():
         force = sum_modules(robot, getattr(found, name))
         size = np.linalg.norm(force, axis=-1)
-        size = size[size > _NOTHING]
+        size = size[size > _ROUNDING_FORCE]
         arrow["force"] = pack_quantized(force)
         if size.size:
             usual, longest = (max(share * length, least) for share, least in (_ARROW, _LONGEST))
@@ -147,6 +149,6 @@ def _no_arrows(why: str | None = None) -> Packed:
     }
 
 
-def _first(value: Any) -> float:
+def _first(value: ArrayLike) -> float:
     """A number, or the first of its rows."""
     return float(np.ravel(np.asarray(value, float))[0])

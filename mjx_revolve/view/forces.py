@@ -1,7 +1,7 @@
-"""What the water does to each part of a robot along a trajectory: for pictures and reports.
+"""Forces of the water on each part of a robot along a trajectory: for pictures and reports.
 
-By the very terms that a step adds up (`pushes.part_forces`). What is left out is no force of its
-own: added and entrained water count as inertia.
+They are the terms that a step adds up (`engine.forces.part_forces`). Added mass and entrained water
+are not among them: they count as inertia.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def module_forces(
     """Buoyancy, drag and thrust on each part along a trajectory.
 
     Args:
-        robot: that made it.
-        trajectory: what it did.
-        every: rows from one that is looked at to the next.
+        robot: of the trajectory.
+        trajectory: of the robot.
+        every: stride of rows.
         water: as given to `simulate`: surface and current, each a number or a row for each step;
             by default the world's, without its gusts.
 
@@ -84,7 +84,7 @@ def module_forces(
     levels = make_single_tree(robot)
 
     def run(qpos: jax.Array, qvel: jax.Array, command: jax.Array, water: Water) -> Any:
-        # The rows of the trajectory stand side by side, as if they were a population.
+        # The rows of the trajectory are the lanes, like a population.
         thrusts: Any = ()
         if robot.num_thrusters:
             still = replace(levels.thrusters, delayed=np.zeros((robot.num_thrusters, 1), bool))

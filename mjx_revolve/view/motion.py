@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.kinematics import mass_centers
 from mjx_revolve.engine.plant import body_geometry
@@ -28,18 +29,18 @@ if TYPE_CHECKING:
 _STAYED = 0.05
 _MOST_POSES = 6
 # Neighbouring poses are at least this far apart [body lengths]; two alone may be closer.
-_APART, _PAIR = 0.55, 0.35
+_POSE_GAP, _PAIR_GAP = 0.55, 0.35
 # A stroke must come back to where it began: correlation with the record one period earlier.
 _REPEATS = 0.7
 # Where strokes do not repeat, what they do to and fro is averaged over this long [s].
 _SECOND = 1.0
 # Closer to the start than this share of the way, energy over distance is noise.
-_NEAR = 0.1
+_MIN_DISTANCE = 0.1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Motion:
-    """What a robot did in an episode, up to the first row that is not finite; T rows.
+    """The motion of a robot in an episode, up to the first row that is not finite; T rows.
 
     Attributes:
         robot: that moved.
@@ -69,7 +70,7 @@ class Motion:
         speed: net, over ground [m/s]; 0 in a single row.
         current: `[T, 3]` velocity of the water where the core is, waves apart, world frame [m/s].
         water_speed: net, through that water [m/s].
-        target: `[3]` where it was to go, world frame [m], or None.
+        target: `[3]` of the task, world frame [m], or None.
         cost: of transport, energy over weight times net distance [-].
         costs: `[T]` the same so far; NaN before it counts, and while the robot is closer than a
             tenth of its way to where it began.
@@ -120,14 +121,14 @@ def analyse_motion(
     """Makes a motion of a trajectory.
 
     Args:
-        robot: that swam.
-        trajectory: what it did. Rows after the first that is not finite are left out.
+        robot: of the trajectory.
+        trajectory: rows after the first that is not finite are left out.
         counted_from: see `Motion`.
         phases: `[T, nhinge]`, see `Motion`.
         water: surface and current, each a number or `[T]`; None: the world's.
         target: see `Motion`.
-        task: whose point distances and speeds are of, and whose body length; None: the core's
-            centre, and the length at rest.
+        task: gives the point of distances and speeds, and the body length; None: the core's centre,
+            and the length at rest.
 
     Returns:
         The motion.
@@ -166,7 +167,7 @@ def analyse_motion(
     drift = current[first:-1].sum(axis=0) * (seconds / max(count - 1 - first, 1))
     # A millimetre bounds the cost where the robot stays, as in `measures.measure`.
     costs = (energy - energy[first]) / (weight * np.maximum(away, 1e-3))
-    far = away > _NEAR * max(float(away[first:].max()), 1e-3)
+    far = away > _MIN_DISTANCE * max(float(away[first:].max()), 1e-3)
     return Motion(
         robot=robot,
         length=length,
@@ -217,9 +218,9 @@ def counted_time(task: TaskConfig, timestep: float) -> float:
     return sample_rows(task, timestep)[0] * timestep * (1 + first_scored_row(task, timestep))
 
 
-def count_finite(values: Any) -> int:
+def count_finite(values: ArrayLike) -> int:
     """How many rows `[T, n]` there are before the first that is not finite."""
-    finite = np.isfinite(values).all(axis=1)
+    finite = np.isfinite(np.asarray(values)).all(axis=1)
     return len(finite) if finite.all() else int(finite.argmin())
 
 
@@ -248,7 +249,7 @@ def choose_poses(time: np.ndarray, path: np.ndarray, length: float) -> list[int]
         rows = nearest_rows(time, np.linspace(time[0], time[-1], count))
         apart = np.linalg.norm(path[rows, None] - path[rows], axis=-1) / length
         apart[np.diag_indices(count)] = np.inf
-        if apart.min() >= (_APART if count > 2 else _PAIR):
+        if apart.min() >= (_POSE_GAP if count > 2 else _PAIR_GAP):
             return rows
     return [len(time) - 1]
 

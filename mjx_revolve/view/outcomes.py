@@ -1,4 +1,4 @@
-"""What the runs of a study have found: figures of champions and populations, ready to compare."""
+"""Results of the runs of a study: figures of champions and populations, ready to compare."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Figures = dict[str, float]
 
 
 class Outcome(NamedTuple):
-    """What a finished evolution has found.
+    """The result of a finished evolution.
 
     Attributes:
         plan: of the evolution.
@@ -33,7 +33,7 @@ class Outcome(NamedTuple):
         population: means over the individuals alive at the end; empty where only
             brains evolve.
         metrics: the columns of `metrics.csv`.
-        body: the champion's; None where nothing is known of it.
+        body: the champion's; None if it could not be read.
         task: the task's type, and "in metres" where its scores are.
         unit: of the scores; "" where it is not known.
         evolved: whether bodies have evolved.
@@ -52,7 +52,7 @@ class Outcome(NamedTuple):
 def find_outcomes(
     plans: Sequence[Plan], add: Callable[[str, Figures], Figures] = lambda case, figures: {}
 ) -> tuple[list[Outcome], list[str]]:
-    """What the finished runs have found, without running any user's code.
+    """The results of the finished runs, without running any user's code.
 
     Args:
         plans: the runs; those that are not finished are left out.

@@ -7,11 +7,12 @@ import hashlib
 import json
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import matrix_to_quat
@@ -31,7 +32,7 @@ _SIGHT = 25.0
 _RADIUS = np.concatenate([[0.0], np.geomspace(0.1, 1500.0, 109)])
 
 
-def pack_floats(values: Any) -> Packed:
+def pack_floats(values: ArrayLike) -> Packed:
     """Packs numbers whole: base64 of little-endian float32."""
     return {"f32": base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()}
 
@@ -98,12 +99,12 @@ class RobotMeshes:
         if number == len(self.shapes):
             mesh = smooth_mesh(corners)
             parts = {"vertices": mesh.vertices, "normals": mesh.vertex_normals}
-            shape = {name: pack_quantized(np.asarray(x)) for name, x in parts.items()}
+            shape: Packed = {name: pack_quantized(np.asarray(x)) for name, x in parts.items()}
             self.shapes.append(shape | {"faces": pack_floats(mesh.faces)})
         return number
 
 
-def _numbers(*vectors: Any) -> list[float]:
+def _numbers(*vectors: Iterable[float]) -> list[float]:
     """Numbers as short as a picture needs them."""
     return [round(float(x), 6) for vector in vectors for x in vector]
 
@@ -223,7 +224,7 @@ def replay_data(
     marks: Sequence[Mark] = (),
     leap: float | None = None,
     begun: float = 0.0,
-) -> dict[str, Any]:
+) -> Packed:
     """What a replay's page receives but for the poses, as plain values for JSON.
 
     Args:

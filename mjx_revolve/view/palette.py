@@ -6,7 +6,6 @@ Colours are red, green and blue from 0 to 1 as a screen shows them. All are choi
 from __future__ import annotations
 
 import math
-from typing import Any
 
 RGB = tuple[float, float, float]
 
@@ -50,7 +49,7 @@ HINGE_AXIS: RGB = (1.0, 0.47, 0.1)  # thin rods in still pictures
 THRUST_AXIS: RGB = (0.13, 0.66, 0.30)  # arrows in still pictures, along a command ahead
 
 
-def page_palette() -> dict[str, Any]:
+def page_palette() -> dict[str, object]:
     """What the scripts and the style of pages use, by name."""
     names = ("WATER_UP", "WATER_AHEAD", "WATER_DOWN", "SKY_LOW", "SKY_HIGH", "SAND", "SUN",
              "TARGET", "CURRENT", "ACCENT", "DUST", "PLACE")  # fmt: skip

@@ -27,7 +27,7 @@ _ROD = (0.0011, 0.025)
 _ARROW = (0.0011, 0.034, 0.0036, 0.010)
 # Edges of a part are sharp where its faces turn by more than this.
 _CREASE = math.radians(35.0)
-_MOST_DRAWN = 500  # types of modules whose meshes are remembered; some 100 kB each
+_MOST_DRAWN = 500  # types of modules with cached meshes; some 100 kB each
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ _DASHES: tuple[str | tuple, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6,
 
 
 class _StyledFigure(Figure):
-    """A figure whose ticks, which matplotlib makes when it draws, have the style, too."""
+    """A figure that is also drawn in the style, as matplotlib makes ticks while drawing."""
 
     @in_style
     def draw(self, renderer: RendererBase) -> None:

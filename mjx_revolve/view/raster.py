@@ -151,7 +151,7 @@ def draw_scene(
 def show_scene(
     axes: Axes, scene: Scene, view: np.ndarray, pixel: float, alpha: float = 1.0, zorder: float = 3
 ) -> None:
-    """Puts a picture of a scene into axes whose units are metres of the view, limits unchanged.
+    """Puts a picture of a scene into axes in metres of the view, limits unchanged.
 
     Args:
         axes: to draw into.

@@ -1,4 +1,4 @@
-"""Robots with their poses over time: what pages and films replay, of an episode or of a colony."""
+"""Robots with their poses over time, for pages and films of an episode or of a colony."""
 
 from __future__ import annotations
 

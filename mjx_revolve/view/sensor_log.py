@@ -1,4 +1,4 @@
-"""Sensor traces: what the sensors gave along an episode, in their units, and the true values."""
+"""Sensor traces: outputs of the sensors along an episode, in their units, and the true values."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.readings import EpisodeContext, SensorReadings
 from mjx_revolve.control.sensors import Observation, Observer, count_samples
 from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.rollout import Rollout, RolloutState, StepInputs, with_variation
 from mjx_revolve.episodes.simulate import Trajectory
@@ -26,10 +28,10 @@ class SensorTrace(NamedTuple):
 
     Attributes:
         sensor: as it is declared.
-        rows: names of the rigid bodies or hinges that it speaks of, "" for the robot as a whole.
+        rows: names of the rigid bodies or hinges that it measures; "" for the robot as a whole.
         given: `[T, parts, rows]` input of the controller before each step, in the sensor's unit.
-        true: `[T, parts, rows]` what was so at that time; infinite where there is no such value,
-            as without a bed.
+        true: `[T, parts, rows]` true value at that time; infinite if there is none, as without a
+            bed.
     """
 
     sensor: Sensor
@@ -47,7 +49,7 @@ class SensorTrace(NamedTuple):
 def trace_sensors(
     fitness: Fitness, trajectory: Trajectory, key: jax.Array, trial: int = 0
 ) -> tuple[SensorTrace, ...]:
-    """What a controller was given in an episode, by its own observer.
+    """The inputs of a controller in an episode, by its own observer.
 
     Args:
         fitness: of one body.
@@ -127,7 +129,9 @@ def _split(
         yield np.concatenate([np.reshape(x, (*x.shape[:2], -1)) for x in columns], 2)
 
 
-def _plain(sensors: Sequence[Sensor], sense: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+def _plain(
+    sensors: Sequence[Sensor], sense: SensorReadings
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """What is true, as an `Observation` has its numbers, in the sensors' units."""
     robot: list[Any] = []
     joint: list[Any] = []
@@ -150,13 +154,15 @@ def _compiled(fitness: Fitness, steps: int) -> Any:
     observer, rate = fitness.controller.observer, fitness.controller.rate
     assert observer is not None
 
-    def run(rows: Any, context: EpisodeContext, variation: Any) -> Any:
+    def run(rows: PyTree, context: EpisodeContext, variation: Variation | None) -> PyTree:
         engine = with_variation(fitness.engine, variation)
         qpos, qvel, ctrl, power, water = rows
         number = jnp.asarray(engine.plant.source[: engine.plant.num_hinge_rows])
         state_at = lambda k: engine.init(qpos[k][:, None], qvel[k][:, None])  # noqa: E731
 
-        def policy(state: Any, time: Any, readings: SensorReadings, ctrl: Any) -> Any:
+        def policy(
+            state: PyTree, time: jax.Array, readings: SensorReadings, ctrl: PyTree
+        ) -> PyTree:
             if rate is not None:
                 time = count_samples(time, rate) / rate
             seen, observed = observer.observe(state[0], time, readings, number)
@@ -166,11 +172,11 @@ def _compiled(fitness: Fitness, steps: int) -> Any:
             engine, policy, fitness.world, water_of(fitness.world), context, observer.signals
         )
 
-        def step(now: RolloutState, k: jax.Array) -> Any:
+        def step(now: RolloutState, k: jax.Array) -> PyTree:
             own = jax.tree.map(lambda x: x[k][None], water)
             inputs = StepInputs(own, engine.plant.arrange(ctrl[k][:, None]))
-            (seen, *found), asked, _, motion = rollout.act(now, inputs)
-            then = rollout.update(now, state_at(k + 1), power[k][None], (seen,), asked, motion)
+            (seen, *found), command, _, motion = rollout.act(now, inputs)
+            then = rollout.update(now, state_at(k + 1), power[k][None], (seen,), command, motion)
             return then, found
 
         state = state_at(0)

@@ -29,13 +29,13 @@ from mjx_revolve.view.sensor_log import SensorTrace
 _POINTS = 700
 # The range of an axis is no narrower than this share of the sensor's, so that noise is not blown up
 # to look like a signal. A choice.
-_LEAST = 0.02
+_MIN_RANGE = 0.02
 # Of strips, so much is cut off at either end of the range, so that one jolt does not pale the
 # rest [%].
 _CUT = 0.5
 # A curve that turns more often than this is shown by its mean and its spread over so many shares of
 # the time: three such curves over one another show nothing else. Choices, for half a page's width.
-_TURNS, _BINS = 150, 200
+_MAX_TURNS, _BINS = 150, 200
 _ROW, _STRIP, _EDGE = 1.12, 0.17, 0.66  # heights: of curves, of a strip's row, around strips [in]
 
 
@@ -116,14 +116,14 @@ def _set_titles(left: Axes, right: Axes, trace: SensorTrace, name: str = "") -> 
 
 
 def _is_dense(trace: SensorTrace) -> bool:
-    """Whether its curves turn too often to be told apart."""
+    """Whether its curves oscillate too often to be drawn."""
     if trace.sensor.rate is not None:
         return False
-    told = trace.given[:, :, 0]
-    change = np.diff(told, axis=0)
+    given = trace.given[:, :, 0]
+    change = np.diff(given, axis=0)
     # A change too small to be seen is no turn.
-    change = np.where(np.abs(change) > 0.01 * np.ptp(told), np.sign(change), 0)
-    return bool((change[1:] * change[:-1] < 0).sum(0).max() > _TURNS)
+    change = np.where(np.abs(change) > 0.01 * np.ptp(given), np.sign(change), 0)
+    return bool((change[1:] * change[:-1] < 0).sum(0).max() > _MAX_TURNS)
 
 
 def _reached_limits(trace: SensorTrace) -> tuple[float, ...]:
@@ -140,22 +140,22 @@ def _draw_curves(axes: Axes, time: np.ndarray, trace: SensorTrace) -> None:
     rows, sensor = thin(len(time), _POINTS), trace.sensor
     style = "default" if sensor.rate is None else "steps-post"
     for k in range(trace.given.shape[1]):
-        told, true, color = trace.given[:, k, 0], trace.true[:, k, 0], COLORS[k]
+        given, true, color = trace.given[:, k, 0], trace.true[:, k, 0], COLORS[k]
         if _is_dense(trace):
-            edges = np.linspace(0, len(told), min(_BINS, len(told)) + 1).astype(int)
-            mean = np.add.reduceat(told, edges[:-1]) / np.diff(edges)
-            low, high = (f.reduceat(told, edges[:-1]) for f in (np.minimum, np.maximum))
+            edges = np.linspace(0, len(given), min(_BINS, len(given)) + 1).astype(int)
+            mean = np.add.reduceat(given, edges[:-1]) / np.diff(edges)
+            low, high = (f.reduceat(given, edges[:-1]) for f in (np.minimum, np.maximum))
             at = time[0] + (time[-1] - time[0]) * (np.arange(len(mean)) + 0.5) / len(mean)
             curve_with_band(axes, at, mean, low, high, color, linewidth=1.1)
             continue
         if not trace.is_exact:
             shown = np.where(np.isfinite(true), true, np.nan)[rows]
             axes.plot(time[rows], shown, color=color, linewidth=3.0, alpha=0.28)
-        axes.plot(time[rows], told[rows], color=color, linewidth=1.1, drawstyle=style)
+        axes.plot(time[rows], given[rows], color=color, linewidth=1.1, drawstyle=style)
     for limit in _reached_limits(trace):
         axes.axhline(limit, color=GREY, linewidth=0.9, linestyle=(0, (1, 2)))
     bottom, top = float(trace.given.min()), float(trace.given.max())
-    span = max(top - bottom, _LEAST * (sensor.limits[1] - sensor.limits[0]))
+    span = max(top - bottom, _MIN_RANGE * (sensor.limits[1] - sensor.limits[0]))
     middle = (bottom + top) / 2
     axes.set(xlim=(time[0], time[-1]), ylim=(middle - 0.58 * span, middle + 0.58 * span))
     axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 2.5, 5, 10]))
@@ -168,7 +168,7 @@ def _draw_strips(figure: SubFigure, time: np.ndarray, trace: SensorTrace) -> Non
     sensor, parts = trace.sensor, trace.given.shape[1]
     grid = figure.subplots(1, parts, sharey=True, squeeze=False)[0]
     low, high = (float(x) for x in np.percentile(trace.given, (_CUT, 100 - _CUT)))
-    least = _LEAST * (sensor.limits[1] - sensor.limits[0])
+    least = _MIN_RANGE * (sensor.limits[1] - sensor.limits[0])
     if low < 0 < high:  # of both signs: white is zero
         high = max(-low, high, least / 2)
         colors, low = "RdBu_r", -high

@@ -1,4 +1,4 @@
-"""What surrounds a robot in a picture: the water's own motion, the bed, and the task's target."""
+"""The surroundings of a robot in pictures: the water's own motion, the bed, the task's target."""
 
 from __future__ import annotations
 

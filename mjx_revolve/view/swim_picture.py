@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
-from scipy.spatial.transform import Rotation
 
+from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.view.motion import Motion, analyse_motion, stroke_rows
 from mjx_revolve.view.motion_plots import WATER, draw_surface
 from mjx_revolve.view.palette import ACCENT, CURRENT, RGB, SAND, TARGET
@@ -48,7 +48,7 @@ _SHORTER = 0.28  # share of the height that the lower of both views has at least
 def pose_scenes(robot: Robot, qpos: np.ndarray) -> list[Scene]:
     """The robot's parts in poses `qpos` `[S, nq]`: a scene for each, world frame [m]."""
     poses, pieces = pose_robot(robot, qpos), make_pieces(robot.morphology)
-    rotation = Rotation.from_quat(poses.quaternion, scalar_first=True).as_matrix()
+    rotation = quat_to_matrix(poses.quaternion)
     mounts = {id(piece): mount_piece(robot, piece) for piece in pieces}
 
     def scene(k: int) -> Scene:

@@ -1,10 +1,10 @@
 """One HTML file that replays robots in any browser: an episode, or a colony.
 
-A file holds everything: meshes, poses, what is known of the water and the forces, three.js, and the
-scripts of `viewer_page/`. It needs no server and nothing from the network. Of a pose it keeps qpos,
-rounded, as the difference from the pose before, which zlib then packs: a pose of the shipped robots
-takes some 18 bytes. Long runs of many robots keep fewer poses, so that a page stays small enough to
-be sent: 64 robots for three hours, two poses a second, take 24 MB.
+A file holds everything: meshes, poses, water, forces, three.js, and the scripts of `viewer_page/`.
+It needs no server and nothing from the network. A pose is stored as qpos, rounded, as the
+difference from the pose before, packed by zlib: a pose of the shipped robots takes some 18 bytes.
+Long runs of many robots keep fewer poses, so that a page stays small enough to be sent: 64 robots
+for three hours, two poses a second, take 24 MB.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,14 +23,14 @@ from mjx_revolve.view.palette import page_palette
 
 if TYPE_CHECKING:
     from mjx_revolve.episodes.champion import Episode
+    from mjx_revolve.view.page_data import Packed
     from mjx_revolve.view.recording import Mark, ReplayRobot
 
 _FILES = Path(__file__).parent / "viewer_page"
-# What positions [m], quaternions [-] and hinges [rad] of many robots are rounded to: less than can
-# be seen. Choices.
+# Rounding of positions [m], quaternions [-] and hinges [rad] of many robots: invisible. Choices.
 _STEPS = (1e-3, 5e-4, 2e-3)
 # A page that a browser opens without a wait, and most mail takes. A choice [bytes].
-_MOST = 24_000_000
+_MAX_BYTES = 24_000_000
 # Poses that are closer than this do not make motion smoother [s].
 _CLOSEST = 0.02
 _TRIES = 12  # at guessing how many poses fit
@@ -38,7 +38,7 @@ _TRIES = 12  # at guessing how many poses fit
 
 @dataclass(frozen=True)
 class PageSummary:
-    """What a page holds.
+    """The contents of a page.
 
     Attributes:
         bytes: its size.
@@ -87,7 +87,7 @@ def write_colony_page(
     marks: Sequence[Mark] = (),
     leap: float | None = None,
     window: tuple[float, float] | None = None,
-    most: int = _MOST,
+    most: int = _MAX_BYTES,
 ) -> PageSummary:
     """Writes the replay of many robots as one HTML file, whole or not at all.
 
@@ -103,7 +103,7 @@ def write_colony_page(
             each robot keeps those that are some time apart.
 
     Returns:
-        What the page holds.
+        The page's contents.
 
     Raises:
         InputError: `path` has another ending, there is no robot, or one of them has poses that do
@@ -132,7 +132,7 @@ def write_colony_page(
     return PageSummary(len(content), poses, gap)
 
 
-def fill_page(template: str, **values: Any) -> str:
+def fill_page(template: str, **values: object) -> str:
     """A page of `viewer_page/`, with all files that it needs inside.
 
     Args:
@@ -174,7 +174,7 @@ def _episode_subtitle(episode: Episode) -> str:
 
 def _fit(
     robots: Sequence[ReplayRobot], window: tuple[float, float] | None, room: int
-) -> tuple[int, float, dict[str, Any]]:
+) -> tuple[int, float, Packed]:
     """As many poses as fit into so many bytes: how many, how far apart [s], and packed."""
     from mjx_revolve.view.page_data import pack_poses
 

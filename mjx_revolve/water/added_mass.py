@@ -30,7 +30,7 @@ COEFFICIENTS = (
     Coefficient(
         "entrained_water",
         "-",
-        "share of the room in the box that the material leaves free, whose water is carried along",
+        "water that moves with the part, as a share of the box's volume without its material",
         0.0,
         high=1.0,
         own_field=True,
@@ -151,7 +151,7 @@ def slam(rate: Scalar, carried: Any, speed: Vec) -> Vec:
     falls. Either way ½ |ṁ_a| v² is lost to the body: entry gives it to the spray, exit to the water
     that is left. So no way in and out of the water makes energy.
 
-    In a step, with E = Σ A_k max(0, s_k - s_k') over the parts k, whose shares were s_k' a step
+    In a step, with E = Σ A_k max(0, s_k - s_k') over the parts k, with shares s_k' a step
     ago, this is (M + Σ A_k s_k) dt ν' = -E ν. What multiplies the old velocity, M + Σ A_k min(s_k,
     s_k'), is never negative and at most the inertia that the step solves with: a slam can stop a
     body but not throw it back, at any step, even where a share jumps from 0 to 1. And what comes

@@ -1,11 +1,11 @@
 """Buoyancy: the submerged fraction of a box, Archimedes' force, surface tension.
 
-A box of half edges h, whose centre is at depth d and which sees the vertical n, is cut by a plane.
+A box of half edges h, its centre at depth d and the vertical n in its frame, is cut by a plane.
 With a_i = h_i |n_i| the mean over the box of max(0, depth) is W(d, a), and everything else is its
 gradient: the submerged fraction ∂W/∂d, its first moment -∂W/∂n. W is a box spline, usually
 written as a sum over the corners of (±) (d ± a₁ ± a₂ ± a₃)⁴ / (192 a₁a₂a₃), which is 0/0 when an
 edge is level and a difference of large numbers long before. Here the longest of the a_i is
-integrated last, over a rectangle whose own integrals are written without differences; so the form
+integrated last, over a rectangle with integrals written without differences; so the form
 is exact at every attitude, in float32 too.
 
 All are pure functions on tuples of arrays (see `spatial`), run under `jit`, `vmap` and `grad` and
@@ -65,7 +65,7 @@ def _back(swap: Any, a: Any, b: Any) -> tuple[Any, Any]:
 
 
 def _rectangle(short: Any, long: Any, scale: Any) -> _Rectangle:
-    """Prepares a rectangle; `scale` is the length whose rounding is its smallest tilt."""
+    """Prepares a rectangle; the rounding error of the length `scale` is its smallest tilt."""
     # A level edge is 0/0. The levels of the cuts are rounded to one unit in the last place of
     # `scale`, so a smaller tilt is not seen in them; in float32, eight units already show.
     floor = scale * float(np.finfo(jnp.result_type(short)).eps)
@@ -180,8 +180,8 @@ def displaced_water(
     """The water that a part displaces: its mass and the first moment of it.
 
     The surface cuts the box where it is. The box's submerged share is that of the part's own
-    volume, whose centre stands as far from the submerged piece's as it does from the box's when all
-    is under water: exact there, and for a part that fills its box. Where the centre of volume is
+    volume; its centre is as far from the submerged piece's as it is from the box's when all is
+    under water: exact there, and for a part that fills its box. Where the centre of volume is
     off the box's by e and the surface cuts the box, force and moment have no potential: a part that
     goes in with e downwards and comes out with e upwards has gained 2 ρ V g |e| on its way round.
 
@@ -307,7 +307,7 @@ def surface_tension(
 # ------------------------------------------------------------------------- the table
 
 _LIFT = (
-    "the bodies whose names end in /lift weigh nothing (10 micrograms) and sit at the centres of "
+    "the bodies with names that end in /lift weigh nothing (10 micrograms), at the centres of "
     "buoyancy; their gravcomp lifts with the weight of the displaced water"
 )
 _BOXES = (

@@ -53,7 +53,7 @@ TODAY: dict[str, Sourced] = {
         "lift × tan α, which a force normal to the plate has, averaged up to the stall",
     ),
     "box_added_mass": Sourced(
-        1.0, "-", "volume of the ellipsoid whose added mass a box has, over the box's own",
+        1.0, "-", "volume of the ellipsoid with a box's added mass, over the box's own",
         "DNV-RP-H103, table A-2",
         "volume and proportions kept: a cube then carries 0.50 of its volume, measured are 0.64 to "
         "0.68; the inscribed ellipsoid would carry 0.26",

@@ -1,4 +1,4 @@
-"""Drag across chains of parts by strips, friction along them, and momentum shed at their ends.
+"""The default drag: across chains of parts by strips, friction along them, wakes of their ends.
 
 The law of EPFL's chains and of FARMS (Taylor 1952 for the form): a strip of a long body that moves
 through the water obliquely is dragged by ½ ρ C_d h |v⊥| v⊥, v⊥ its whole velocity across the body,
@@ -14,11 +14,17 @@ never positive, and for small waves its mean thrust is Lighthill's, ½ m (ẏ² 
 How much of a chain a part is, is a share c: 1 in a row of parts that is five times as long as high,
 falling to 0 where it is 2.5 times as long, times the share of the part's joined ends that its
 neighbours cover. A part by itself is a row of its own: a long one is a rod, which has the drag of a
-chain and sheds nothing at its ends (the source of that knows bodies that swim, with one tail), and
-a compact one has its faces' drag. In between coefficients are interpolated; the strips then stand
-at c of the part's half length, and what that leaves of the drag against turning, 1 - c³ of it,
-stays with the faces: no part is dragged twice. The ends of a row are chain as well, as the C_d of
-chains, which is below that of an endless rod, is a mean over them.
+chain and sheds nothing at its ends (the source of that is for swimming bodies with one tail), and
+a compact one has its faces' drag. In between coefficients are interpolated, and so are the drag of
+the whole velocity across the part and of each component by itself; the strips then stand at c of
+the part's half length, and what that leaves of the drag against turning, 1 - c³ of it, stays with
+the faces: no part is dragged twice. The ends of a row are chain as well, as the C_d of chains,
+which is below that of an endless rod, is a mean over them.
+
+Two strips stand for all, at Gauss's points. They are exact for a part that moves and hardly turns;
+what they miss of a part that turns about its own middle is drag against turning, so that this is
+exact, too. In between force and torque are off by up to a sixth where it moves at most as fast as
+its ends turn, and parts of long chains never do.
 """
 
 from __future__ import annotations
@@ -27,9 +33,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_revolve.numerics.inertia import SpatialInertia, add_inertia, shift_inertia
+from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.lazy import jnp
-from mjx_revolve.numerics.spatial import Scalar, Vec, add, cross, dot, mul, total, vadd, vscale
+from mjx_revolve.numerics.spatial import (
+    Scalar,
+    add,
+    cross,
+    dot,
+    is_present,
+    mul,
+    neg,
+    sub,
+    total,
+    vadd,
+    vscale,
+    vsub,
+)
 from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.face_drag import FACES, face_drag_coefficients
 from mjx_revolve.water.laws import (
@@ -46,15 +65,33 @@ from mjx_revolve.water.laws import (
 if TYPE_CHECKING:
     from mjx_revolve.water.world import World
 
-# Gauss's four points on -1 to 1, and their shares.
-_PLACES, _SHARES = (x.tolist() for x in np.polynomial.legendre.leggauss(4))
+_ZERO = (0.0, 0.0, 0.0)
+# Gauss's two points on -1 to 1, ± this, each with half of the drag.
+_PLACE = 3**-0.5
 _VARIED = ("drag", "density")
 _END_VARIED = ("added_mass", "density")
+_SHAPE = "the robot's shape, which is known"
 # Where the way ahead is less than this share of an end's velocity, its wake stays with it, and no
 # momentum is carried away. A choice: it must be small.
 _AHEAD = 0.1
-# Least Reynolds number at which friction is taken; below it, there is next to none.
+# Least Reynolds number at which friction is taken; below it the damping is that at it. A choice.
 _LEAST_REYNOLDS = 1e3
+# Squared speed that is added where a square root has no derivative at rest [m²/s²].
+_STILL = 1e-18
+
+
+def _fit_friction() -> tuple[float, ...]:
+    """1 / (log10 Re)^b as a cubic in Re^(-1/4), the constant first: a step needs two square roots.
+
+    Within 0.35 % from a Reynolds number of 1e3 to 1e7.
+    """
+    reynolds = np.array([1.3e3, 1e4, 2e5, 6e6])
+    powers = np.vander(reynolds**-0.25, increasing=True)
+    share = np.log10(reynolds) ** -TODAY["friction_exponent"].value
+    return tuple(np.linalg.solve(powers, share).tolist())
+
+
+_FRICTION = _fit_friction()
 
 
 @law_numbers
@@ -62,117 +99,156 @@ class CrossFlowNumbers:
     """Drag of parts of a chain.
 
     Attributes:
-        linear: ρ ½ C_d A of each pair of faces [kg/m].
+        head: ρ ½ C_d A of the faces across the chain's axis [kg/m].
+        faces: 1 - c of ρ ½ C_d A of the side faces, each of which meets its component [kg/m].
+        strips: c of the same, which meet the whole velocity across the chain [kg/m].
         angular: what stays with the faces, against turning about each axis [kg·m²].
-        mixing: c, at the place of the chain's axis, else 0 [-].
-        reach: c times half of the length along that axis, else 0 [m].
-        friction: ρ ½ a S of the side faces, at that axis, else 0 [kg/m].
-        length: along that axis [m].
+        along: unit vector of the chain's axis, outwards where a row ends with the part.
+        reach: place along it of the two strips that stand for all [m].
+        friction: ½ a c S μ / length, S the side faces [kg/s].
+        reynolds: Reynolds number per speed [s/m].
         shed: c_m (π/4) ρ h² across the end of a row, along each axis [kg/m].
-        end: place of that end [m].
-        outward: unit vector from the part to that end.
+        end: place of that end along the axis [m].
     """
 
-    linear: Any = part_field("kg/m", axes="size", varied=_VARIED)
+    head: Any = part_field("kg/m", varied=_VARIED)
+    faces: Any = part_field("kg/m", axes="size", varied=_VARIED)
+    strips: Any = part_field("kg/m", axes="size", varied=_VARIED)
     angular: Any = part_field("kg m2", axes="size", varied=_VARIED)
-    mixing: Any = part_field("-", axes="size", fixed="the robot's shape, which is known")
-    reach: Any = part_field("m", axes="size", fixed="the robot's shape, which is known")
-    friction: Any = part_field("kg/m", axes="size", varied=_VARIED)
-    length: Any = part_field("m", blank=1.0, fixed="the robot's shape, which is known")
+    along: Any = part_field("-", axes="vector", fixed=_SHAPE)
+    reach: Any = part_field("m", fixed=_SHAPE)
+    friction: Any = part_field("kg/s", varied=_VARIED)
+    reynolds: Any = part_field("s/m", blank=1.0, fixed=_SHAPE)
     shed: Any = part_field("kg/m", axes="size", varied=_END_VARIED)
-    end: Any = part_field("m", axes="vector", fixed="the robot's shape, which is known")
-    outward: Any = part_field("-", axes="vector", fixed="the robot's shape, which is known")
+    end: Any = part_field("m", fixed=_SHAPE)
 
 
-def _numbers(parts: PartShapes, world: World) -> CrossFlowNumbers:
+def chain_shares(parts: PartShapes) -> tuple[np.ndarray, np.ndarray]:
+    """`[n, 3]` 1 at the axis of each part's row, else 0, and `[n, 1]` c."""
     size = 2 * parts.half_size
     # A row is as high as the larger of the edges across its axis.
     high = np.stack([np.delete(size, axis, 1).max(1) for axis in range(3)], 1)
     slender = np.clip(2 - high / parts.rows / TODAY["end_slenderness"].value, 0, 1)
     chained = slender * parts.joined
-    along = np.eye(3)[chained.argmax(-1)]
-    share = (along * chained).sum(-1, keepdims=True)
+    # Of what is no chain, the longest axis, which is not across a plate.
+    axis = np.where(chained.any(-1, keepdims=True), chained, size).argmax(-1)
+    along = np.eye(3)[axis]
+    return along, (along * chained).sum(-1, keepdims=True)
+
+
+def split_drag(
+    linear: np.ndarray, along: np.ndarray, share: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ρ ½ C_d A along each axis as `CrossFlowNumbers` has it: head, faces and strips."""
+    side = (1 - along) * linear
+    return (along * linear).sum(-1), (1 - share) * side, share * side
+
+
+def _numbers(parts: PartShapes, world: World) -> CrossFlowNumbers:
+    size, (along, share) = 2 * parts.half_size, chain_shares(parts)
     own, exposed = parts.coefficients["drag_coefficient"], parts.exposed
     cube = TODAY["cube_drag"].value
-    sides, head = TODAY["chain_drag"].value / cube, TODAY["chain_head_drag"].value / cube
-    drag = own * (1 + share * (np.where(along, head, sides) - 1))
+    sides, ahead = TODAY["chain_drag"].value / cube, TODAY["chain_head_drag"].value / cube
+    drag = own * (1 + share * (np.where(along, ahead, sides) - 1))
     linear, _ = face_drag_coefficients(size, parts.silhouette, drag, exposed)
-    # What strips do not have: the ends' own turning, turning about the axis, and the rest of 1.
+    head, faces, strips = split_drag(world.density * linear, along, share)
+    # The ends' own turning, and turning about the axis, stay with the faces, and of the sides
+    # what strips do not have: the rest of c³, and of that what two points miss of ∫ |s| s² ds.
     turning = [
-        face_drag_coefficients(size, parts.silhouette, own, exposed * faces)[1]
-        for faces in (along, 1 - along)
+        face_drag_coefficients(size, parts.silhouette, of, exposed * which)[1]
+        for of, which in ((own, along), (own, 1 - along), (drag, 1 - along))
     ]
-    left = np.where(along, 1.0, 1 - share**3)
+    missed = share**3 * (1 - 4 * _PLACE**3)
+    angular = turning[0] + np.where(along, turning[1], 0)
+    angular += np.where(along, 0, (1 - share**3) * turning[1] + missed * turning[2])
     length = (along * size).sum(-1)
-    ends = parts.ends * along
+    ends = (parts.ends * along).sum(-1)
     # Height across the flow along each axis: the third edge.
     height = np.where(along, 0.0, (size * (1 - along)).sum(-1, keepdims=True) - size)
     shed = TODAY["end_added_mass"].value * np.pi / 4 * world.density * height**2
     # Faces across y and z are side faces of a chain along x: their areas, on two sides each.
-    wet = 2 * ((1 - along) * exposed * parts.silhouette).sum(-1, keepdims=True)
+    wet = 2 * ((1 - along) * exposed * parts.silhouette).sum(-1)
+    rubbing = 0.5 * parts.coefficients["friction"] * share[:, 0] * wet
+    viscous = world.viscosity > 0
     return CrossFlowNumbers(
-        linear=world.density * linear,
-        angular=world.density * (turning[0] + left * turning[1]),
-        mixing=along * share,
-        reach=along * share * size / 2,
-        friction=world.density / 2 * along * share * wet * parts.coefficients["friction"][:, None],
-        length=length,
-        shed=share * np.abs(ends).sum(-1, keepdims=True) * shed,
-        end=ends * size / 2,
-        outward=ends,
+        head=head,
+        faces=faces,
+        strips=strips,
+        angular=world.density * angular,
+        along=along * np.where(ends < 0, -1.0, 1.0)[:, None],
+        reach=_PLACE * share[:, 0] * length / 2,
+        friction=rubbing * world.viscosity / length,
+        reynolds=length * (world.density / world.viscosity if viscous else 1.0),
+        shed=share * np.abs(ends)[:, None] * shed,
+        end=np.abs(ends) * length / 2,
     )
 
 
+def friction_times_reynolds(reynolds: Scalar) -> Scalar:
+    """Re C_f / a of side faces; C_f is that of `_LEAST_REYNOLDS` or more."""
+    root = jnp.sqrt(jnp.sqrt(jnp.maximum(reynolds, _LEAST_REYNOLDS)))
+    found: Scalar
+    found, *rest = _FRICTION
+    for coefficient in rest:
+        found = found * root + coefficient
+    return found * root
+
+
 def friction_share(speed: Scalar, length: Scalar, world: World) -> Scalar:
-    """1 / (log10 Re)^b of side faces of some length [m]: C_f over a."""
+    """C_f / a of side faces of some length [m]: 1 / (log10 Re)^b."""
     scale = mul(length, world.density / max(world.viscosity, 1e-30))
     reynolds = jnp.maximum(mul(speed, scale), _LEAST_REYNOLDS)
-    share: Scalar = 1 / jnp.log10(reynolds) ** TODAY["friction_exponent"].value
+    share: Scalar = friction_times_reynolds(reynolds) / reynolds
     return share
 
 
 def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
-    mixing, force, torque = numbers.mixing, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    damping: SpatialInertia | None = None
-    for place, weight in zip(_PLACES, _SHARES, strict=True):
-        at: Vec = tuple(mul(place, x) for x in numbers.reach)
-        v = vadd(flow.velocity, cross(flow.angular_velocity, at))
-        share = mul(0.5 * weight, flow.submerged)
-        each = []
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            # Across a chain along k, the velocity across j counts, too.
-            square = add(mul(mixing[k], v[j] * v[j]), mul(mixing[j], v[k] * v[k])) + v[i] * v[i]
-            speed = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-            each.append(mul(share, mul(numbers.linear[i], speed)))
-        push = tuple(-d * x for d, x in zip(each, v, strict=True))
-        force, torque = vadd(force, push), vadd(torque, cross(at, push))
-        x, y, z = each
-        own = shift_inertia((x, 0.0, 0.0, y, 0.0, z), (0.0,) * 6, at)
-        damping = own if damping is None else add_inertia(damping, own)
-    rubbed = []
-    for x, area in zip(flow.velocity, numbers.friction, strict=True):
-        share = friction_share(jnp.abs(x), numbers.length, world)
-        rubbed.append(mul(mul(area, share), mul(jnp.abs(x), flow.submerged)))
-    force = vadd(force, tuple(-d * x for d, x in zip(rubbed, flow.velocity, strict=True)))
-    assert damping is not None
-    # What a trailing end sheds.
-    v = vadd(flow.velocity, cross(flow.angular_velocity, numbers.end))
-    ahead = jnp.maximum(-dot(v, numbers.outward), 0)
-    square = ahead * ahead
-    whole = square + _AHEAD**2 * dot(v, v)
-    share = mul(jnp.where(whole > 0, square / jnp.where(whole > 0, whole, 1), 0), flow.submerged)
-    lost = tuple(mul(mul(m, ahead), share) for m in numbers.shed)
-    push = tuple(-d * x for d, x in zip(lost, v, strict=True))
-    thrust = mul(
-        mul(-0.5, share), total(*[mul(m, x * x) for m, x in zip(numbers.shed, v, strict=True)])
+    along, wet = numbers.along, flow.submerged
+    ahead = dot(flow.velocity, along)
+    across = vsub(flow.velocity, vscale(ahead, along))
+    spin = cross(flow.angular_velocity, along)
+    damping, pushes = (0.0, 0.0, 0.0), []
+    for place in (0.5, -0.5):
+        at = vadd(across, vscale(mul(2 * place, numbers.reach), spin))
+        speed = jnp.sqrt(add(_STILL, dot(at, at)))
+        pairs = zip(numbers.faces, numbers.strips, at, strict=True)
+        each = tuple(add(mul(f, jnp.abs(x)), mul(s, speed)) for f, s, x in pairs)
+        pushes.append(tuple(mul(d, x) for d, x in zip(each, at, strict=True)))
+        damping = vadd(damping, each)
+    half = mul(0.5, wet)
+    damping = vscale(half, damping)
+    force = vscale(neg(half), vadd(*pushes))
+    lever = vscale(mul(neg(half), numbers.reach), vsub(*pushes))
+    # How force along each axis falls with turning.
+    second = vscale(mul(numbers.reach, numbers.reach), damping)
+    rubbed = mul(numbers.head, jnp.abs(ahead))
+    if is_present(numbers.friction):
+        reynolds = mul(numbers.reynolds, jnp.abs(ahead))
+        rubbed = add(rubbed, mul(numbers.friction, friction_times_reynolds(reynolds)))
+    rubbed = mul(rubbed, wet)
+    thrust = neg(mul(rubbed, ahead))
+    if any(map(is_present, numbers.shed)):
+        tip = vadd(across, vscale(numbers.end, spin))
+        left = jnp.maximum(neg(ahead), 0)
+        square = left * left
+        whole = square + _AHEAD**2 * (_STILL + ahead * ahead + dot(tip, tip))
+        share = mul(square / whole, wet)
+        lost = tuple(mul(mul(m, left), share) for m in numbers.shed)
+        push = tuple(mul(m, x) for m, x in zip(lost, tip, strict=True))
+        energy = total(*[mul(m, x * x) for m, x in zip(numbers.shed, tip, strict=True)])
+        thrust = sub(thrust, mul(mul(0.5, share), energy))
+        force, damping = vsub(force, push), vadd(damping, lost)
+        lever = vsub(lever, vscale(numbers.end, push))
+        second = vadd(second, vscale(mul(numbers.end, numbers.end), lost))
+    axes = tuple(mul(a, a) for a in along)
+    force = vadd(force, vscale(thrust, along))
+    x, y, z = vadd(damping, vscale(rubbed, axes))
+    # First moments are left out: the damping is still at least half of what it stands for.
+    a, b, c = (
+        add(mul(second[j], axes[k]), mul(second[k], axes[j])) for j, k in ((1, 2), (2, 0), (0, 1))
     )
-    push = vadd(push, vscale(thrust, numbers.outward))
-    force, torque = vadd(force, push), vadd(torque, cross(numbers.end, push))
-    x, y, z = lost
-    damping = add_inertia(damping, shift_inertia((x, 0.0, 0.0, y, 0.0, z), (0.0,) * 6, numbers.end))
-    x, y, z = rubbed
-    damping = add_inertia(damping, shift_inertia((x, 0.0, 0.0, y, 0.0, z), (0.0,) * 6, (0.0,) * 3))
-    return Drag(force, torque, damping)
+    own = SpatialInertia((a, 0.0, 0.0, b, 0.0, c), (_ZERO,) * 3, (x, 0.0, 0.0, y, 0.0, z))
+    return Drag(force, cross(along, lever), own)
 
 
 CROSS_FLOW = PartDragLaw(

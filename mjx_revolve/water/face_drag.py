@@ -1,4 +1,4 @@
-"""Drag on the faces of parts: the default law, quadratic and implicit.
+"""Drag on the faces of parts, quadratic and implicit: by default that of compact ones.
 
 The functions work on many parts and many individuals at once: vectors are tuples of three arrays
 (see `spatial`), numbers of parts are constants that broadcast against them.

@@ -1,4 +1,4 @@
-"""Fins whose lift lags behind their angle, and whose drag follows from their lift.
+"""Fins with lift that lags behind their angle, and drag that follows from their lift.
 
 Of the flow in the plane across the span, u along the chord and w across it, w where thin-airfoil
 theory takes the incidence, at three quarters of the chord. A foil that changes its incidence sheds
@@ -17,8 +17,8 @@ there is no suction, and the force is normal to the plate, C_L tan α. On top co
 the stall, what the fin has across the flow. Lift is across the velocity of the point where it acts,
 and drag never below 0, so the water never works: energy that a wake gives back is left out.
 
-It is stepped exactly for a velocity that holds for the step, knows velocities through the water
-only, and forgets out of the water. Against turning a fin has its faces' drag, as in `lift_drag`.
+It is stepped exactly for a velocity that holds for the step, depends on velocities through the
+water only, and decays out of the water. Against turning a fin has its faces' drag (`lift_drag`).
 """
 
 from __future__ import annotations
@@ -31,8 +31,10 @@ from mjx_revolve.numerics.lazy import jax, jnp
 from mjx_revolve.numerics.spatial import (
     Scalar,
     Vec,
+    add,
     cross,
     dot,
+    is_present,
     mul,
     neg,
     safe_norm,
@@ -78,6 +80,8 @@ class FinWakeNumbers(PlateNumbers):
         induced: 1 / (π e A), A span over chord [-].
         suction: share of the suction of a rounded nose [-].
         friction: 2 a, of both faces [-].
+        camber: tan a0 [-].
+        steepest: tangent up to which a force normal to the plate is taken [-].
         flat: what drag grows by past the stall, up to that of `lift_drag` at 90° [1/rad].
         gradient: how fast the force may fall with velocity, over ρ area |v| [-].
     """
@@ -86,6 +90,8 @@ class FinWakeNumbers(PlateNumbers):
     induced: Any = part_field("-", fixed=_SHAPE)
     suction: Any = part_field("-", fixed="a nose is round or sharp")
     friction: Any = part_field("-", fixed=_BY_AREA)
+    camber: Any = part_field("-", fixed=_BY_AREA)
+    steepest: Any = part_field("-", fixed=_BY_AREA)
     flat: Any = part_field("1/rad", fixed=_BY_AREA)
     gradient: Any = part_field("-", fixed=_BY_AREA)
 
@@ -100,13 +106,16 @@ def _numbers(parts: PartShapes, world: World) -> FinWakeNumbers:
     induced = chord**2 / (np.pi * _EFFICIENCY * np.maximum(plate.area, 1e-30))
     steepest = np.maximum(np.abs(plate.cla), np.abs(plate.cla_stall))
     most = np.abs(plate.cla) * stall
-    own = steepest * (1 + np.tan(np.minimum(stall, _STEEPEST)) + 2 * most * induced)
+    tangent = np.tan(np.minimum(stall, _STEEPEST))
+    own = steepest * (1 + tangent + 2 * most * induced)
     return FinWakeNumbers(
         **vars(plate),
         chord=chord,
         induced=induced,
         suction=parts.coefficients["nose_suction"],
         friction=2 * parts.coefficients["friction"],
+        camber=np.tan(plate.a0),
+        steepest=tangent,
         flat=flat,
         gradient=own + np.maximum(flat, 2 * np.abs(across)),
     )
@@ -144,14 +153,18 @@ def _force(flow: PartFlow, fin: FinWakeNumbers, world: World) -> Drag:
     felt = felt + total(
         0.0, *[a * (z - felt) for (a, _), z in zip(_LAGS, flow.memory, strict=False)]
     )
-    met = wrapped(fin.a0 + jnp.arctan2(down, ahead))
     alpha = wrapped(fin.a0 + jnp.arctan2(felt, ahead))
     cos2_sweep = jnp.where(moving, (safe / jnp.where(moving, safe_norm(v), 1.0)) ** 2, 0.0)
     lift, _, moment = coefficients(alpha, slopes(fin, speed.dtype), cos2_sweep)
-    steepest = jnp.minimum(fin.alpha_stall, _STEEPEST)
-    sharp = lift * jnp.tan(jnp.clip(met, -steepest, steepest))
-    rounded = lift * jnp.sin(met - alpha) + mul(fin.induced, lift * lift)
-    drag = jnp.maximum(sharp + mul(fin.suction, rounded - sharp), 0)
+    # The tangent of the angle at which the flow is met has the period of `wrapped`.
+    level = sub(ahead, mul(fin.camber, down))
+    steep = add(down, mul(fin.camber, ahead)) / jnp.where(jnp.abs(level) > 1e-9, level, 1e-9)
+    sharp = drag = lift * jnp.clip(steep, -fin.steepest, fin.steepest)
+    if is_present(fin.suction):
+        met = wrapped(fin.a0 + jnp.arctan2(down, ahead))
+        rounded = lift * jnp.sin(met - alpha) + mul(fin.induced, lift * lift)
+        drag = sharp + mul(fin.suction, rounded - sharp)
+    drag = jnp.maximum(drag, 0)
     drag = drag + mul(fin.flat, cos2_sweep * jnp.maximum(jnp.abs(alpha) - fin.alpha_stall, 0))
     drag = drag + mul(fin.friction, friction_share(speed, fin.chord, world))
     pressure = mul(mul(mul(0.5, mul(fin.density, fin.area)), flow.submerged), speed)

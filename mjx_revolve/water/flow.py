@@ -73,7 +73,7 @@ def _phase(world: World, wave: Wave, water: Water, x: Scalar, y: Scalar) -> tupl
 
 
 def surface(world: World, water: Water, x: Scalar, y: Scalar) -> tuple[Scalar, Any]:
-    """Height of the surface, and its slope.
+    """Height of the surface, and its gradient.
 
     Args:
         world: with its waves.
@@ -87,13 +87,13 @@ def surface(world: World, water: Water, x: Scalar, y: Scalar) -> tuple[Scalar, A
     waves = _running(world)
     if not waves:
         return water.surface_height, None
-    height, slope = water.surface_height, (0.0, 0.0)
+    height, gradient = water.surface_height, (0.0, 0.0)
     for wave in waves:
         k = wave.wavenumber(world.gravity, world.water_depth)
         sine, cosine = _phase(world, wave, water, x, y)
         height = add(height, mul(wave.amplitude, cosine))
-        slope = vadd(slope, [mul(-wave.amplitude * k * c, sine) for c in _towards(wave)])
-    return height, slope
+        gradient = vadd(gradient, [mul(-wave.amplitude * k * c, sine) for c in _towards(wave)])
+    return height, gradient
 
 
 def flow(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar) -> tuple[Vec, Vec]:
@@ -148,7 +148,7 @@ def shear_flow(shear: Shear, depth: Scalar) -> Vec:
     elif shear.profile == "linear":
         profile = jnp.maximum(1 - share, 0)
     else:
-        # The inner `where` keeps the power's infinite slope at D out of the backward pass.
+        # The inner `where` keeps the power's infinite gradient at D out of the backward pass.
         inside = share < 1
         left = jnp.where(inside, 1 - share, 1)
         profile = jnp.where(inside, left**shear.exponent, 0)
@@ -184,8 +184,8 @@ def _pick(table: np.ndarray, index: jax.Array) -> jax.Array:
 def field_flow(field: CurrentField, x: Scalar, y: Scalar, z: Scalar) -> Vec:
     """Velocity on a grid, interpolated linearly along each axis and held constant beyond its edges.
 
-    Continuous, and exact for velocities that are linear in each coordinate; its slope jumps at the
-    grid's planes. An axis with a single plane does not matter.
+    Continuous, and exact for velocities that are linear in each coordinate; its gradient jumps at
+    the grid's planes. An axis with a single plane does not matter.
 
     Args:
         field: axes, world frame, and velocities.
@@ -310,8 +310,8 @@ def gust_path(gust: Gust, key: jax.Array, steps: int, dt: float, trials: int) ->
 
     u ← u e^(-dt/T) + σ √(1 - e^(-2dt/T)) N(0, 1), begun from its stationary distribution: mean 0,
     standard deviation σ and correlation e^(-t/T), whatever the time step (Gillespie 1996, Physical
-    Review E 54, 2084). Such a path is continuous but has no slope: its steps divided by dt grow as
-    1/√dt, though the momentum that they give does not.
+    Review E 54, 2084). Such a path is continuous but not differentiable: its steps divided by dt
+    grow as 1/√dt, though the momentum that they give does not.
 
     Args:
         gust: σ and T.

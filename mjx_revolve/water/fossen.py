@@ -91,7 +91,7 @@ FOSSEN = PartDragLaw(
     force=_force,
     mjcf=Export(
         "inertia_box",
-        missing="stated damping (fossen), in whose place is that of MuJoCo's inertia box",
+        missing="stated damping (fossen), replaced by that of MuJoCo's inertia box",
     ),
     sdf=Export("fossen", note="Hydrodynamics damps modules that state it with their own numbers"),
 )

@@ -80,7 +80,7 @@ def part_field(
 def law_numbers(kind: type[T]) -> type[T]:
     """Makes a class a frozen dataclass and a pytree; fields that are no `part_field` are static.
 
-    JAX is told of the class with its first value: laws are named in files that are read without it.
+    The class is registered with JAX by its first value: files that name laws are read without JAX.
     """
     made = dataclass(frozen=True)(kind)
     data = list(part_fields(made))
@@ -223,7 +223,7 @@ class PartShapes(Protocol):
 
     @property
     def ends(self) -> np.ndarray:
-        """`[n, 3]` 1 or -1 along an axis at whose end a row of parts ends; else 0."""
+        """`[n, 3]` 1 or -1 along each axis where a row of parts ends with the part; else 0."""
 
     @property
     def rows(self) -> np.ndarray:

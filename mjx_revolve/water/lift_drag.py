@@ -36,6 +36,7 @@ from mjx_revolve.numerics.spatial import (
     Vec,
     cross,
     dot,
+    is_present,
     mul,
     neg,
     safe_norm,
@@ -147,11 +148,6 @@ def wrapped(angle: Scalar) -> Scalar:
     return found
 
 
-def _may_be(x: Any) -> bool:
-    """Whether a number is not plainly zero everywhere; what is traced counts."""
-    return isinstance(x, jax.Array) or bool(np.any(x))
-
-
 def coefficients(
     alpha: Scalar, k: Mapping[str, Any], cos2_sweep: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
@@ -194,7 +190,7 @@ def lift_drag_wrench(
         Force [N] and moment [N·m] about the centre of pressure, in the frame of v.
     """
     density = density if p.density is None else p.density
-    if _may_be(p.radial_symmetry):
+    if is_present(p.radial_symmetry):
         radial = jnp.asarray(p.radial_symmetry, bool)
         # Upward is against the flow across the forward direction.
         along = dot(v, forward)
@@ -225,7 +221,7 @@ def lift_drag_wrench(
         pressure * speed_in_plane * (c_lift * up - c_drag * along)
         for up, along in zip(lift_direction, plane, strict=True)
     )
-    if not (_may_be(k["cma"]) or _may_be(k["cma_stall"])):
+    if not (is_present(k["cma"]) or is_present(k["cma_stall"])):
         return force, (0.0, 0.0, 0.0)
     return force, vscale(pressure * speed_in_plane * speed_in_plane * c_moment, n)
 
@@ -296,6 +292,6 @@ LIFT_DRAG = PartDragLaw(
     sdf=Export(
         "lift_drag",
         note="LiftDrag lifts and drags the fins",
-        missing="the current at the fins: Gazebo's LiftDrag knows the wind only",
+        missing="the current at the fins: Gazebo's LiftDrag has the wind only",
     ),
 )

@@ -211,7 +211,7 @@ def ellipsoid(v: Vec, w: Vec, k: EllipsoidNumbers, carried: bool) -> tuple[Vec, 
     return force, torque
 
 
-_INSTEAD = "in whose place is the drag of the modules' faces"
+_INSTEAD = "replaced by the drag of the modules' faces"
 
 INERTIA_BOX = BodyDragLaw(
     name="inertia_box",

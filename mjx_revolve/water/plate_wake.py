@@ -2,8 +2,8 @@
 
 A plate that swings meets the vortices that it has shed a moment ago, and is dragged by several
 times its steady drag: C_d = A / KC + B across a flow that oscillates, KC = U T / b the
-Keulegan-Carpenter number (Ikeda's fit, ITTC). A step knows neither amplitude nor period, so each
-plate keeps four numbers of how its middle moved along its normal, v its velocity there through the
+Keulegan-Carpenter number (Ikeda's fit, ITTC). Amplitude and period are not known in a step, so each
+plate keeps four numbers of its middle's motion along its normal, v its velocity there through the
 water and τ a time (the filters are a choice; no simulator that was read has such a memory):
 
     v̄' = (v - v̄) / τ          its mean velocity
@@ -37,7 +37,7 @@ import numpy as np
 from mjx_revolve.numerics.lazy import jnp
 from mjx_revolve.numerics.spatial import Scalar, dot, mul
 from mjx_revolve.water.coefficients import TODAY
-from mjx_revolve.water.cross_flow import CROSS_FLOW, CrossFlowNumbers
+from mjx_revolve.water.cross_flow import CROSS_FLOW, CrossFlowNumbers, chain_shares, split_drag
 from mjx_revolve.water.face_drag import FACES
 from mjx_revolve.water.laws import Drag, PartDragLaw, PartFlow, PartShapes, law_numbers, part_field
 
@@ -81,8 +81,11 @@ def _numbers(parts: PartShapes, world: World) -> PlateWakeNumbers:
     square, slope = TODAY["plate_drag"].value, TODAY["plate_drag_slope"].value
     steady = np.minimum(square + slope * (length / width - 1), _LONG) / TODAY["cube_drag"].value
     plate = FACES.numbers(parts, world).linear * steady[..., None]
-    share = normal * thin[..., None]
-    own = {**vars(chain), "linear": chain.linear + share * (plate - chain.linear)}
+    along, share = chain_shares(parts)
+    linear = along * chain.head[:, None] + chain.faces + chain.strips
+    linear += normal * thin[..., None] * (plate - linear)
+    names = ("head", "faces", "strips")
+    own = vars(chain) | dict(zip(names, split_drag(linear, along, share), strict=True))
     return PlateWakeNumbers(**own, normal=normal, thin=thin, width=width)
 
 
@@ -100,11 +103,12 @@ def _factor(flow: PartFlow, numbers: PlateWakeNumbers) -> Scalar:
 def _force(flow: PartFlow, numbers: PlateWakeNumbers, world: World) -> Drag:
     if flow.memory:
         factor = _factor(flow, numbers)
-        linear = tuple(
-            mul(c, 1 + mul(n, factor - 1))
-            for c, n in zip(numbers.linear, numbers.normal, strict=True)
+        more = tuple(1 + mul(n, factor - 1) for n in numbers.normal)
+        numbers = replace(
+            numbers,
+            faces=tuple(map(mul, numbers.faces, more)),
+            strips=tuple(map(mul, numbers.strips, more)),
         )
-        numbers = replace(numbers, linear=linear)
     return CROSS_FLOW.force(flow, numbers, world)
 
 

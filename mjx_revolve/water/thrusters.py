@@ -116,9 +116,9 @@ def interpolated_thrust(command: Any, commands: Sequence[Any], thrusts: Sequence
     result = _like(thrusts[0], command) + 0 * command
     for k in range(len(commands) - 1):
         left, right = commands[k], commands[k + 1]
-        slope = _like((thrusts[k + 1] - thrusts[k]) / (right - left), command)
+        gradient = _like((thrusts[k + 1] - thrusts[k]) / (right - left), command)
         left, right = _like(left, command), _like(right, command)
-        result = result + slope * (clip(command, left, right) - left)
+        result = result + gradient * (clip(command, left, right) - left)
     return result
 
 
@@ -139,7 +139,7 @@ def ideal_power(thrust: Scalar, disc: Any, density: float) -> Scalar:
     pushes = 2 * density * disc
     inverse = xp.where(pushes > 0, 1 / xp.sqrt(xp.where(pushes > 0, pushes, 1.0)), 0.0)
     size = jnp.abs(thrust)
-    # The tiny term keeps the slope finite at rest.
+    # The tiny term keeps the gradient finite at rest.
     return size * jnp.sqrt(size + 1e-12) * _like(inverse, size)
 
 

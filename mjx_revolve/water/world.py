@@ -135,7 +135,8 @@ class World:
         current: velocity of the water, world frame [m/s], length 3.
         bed: the ground, or None.
         buoyancy: name of a buoyancy law.
-        drag: name of a drag law.
+        drag: name of a drag law. `cross_flow` has those of chains, thin plates and fins in it, and
+            that of faces for compact parts; `faces` has that for all.
         coefficients: of laws, by name, for modules that give none of their own.
         added_mass: whether the water that a module carries along is part of its inertia.
         near_surface: whether that water follows the draught of what floats, and is less close to
@@ -167,7 +168,7 @@ class World:
         words("'off', a height in metres or a mapping with kind"),
     ] = None
     buoyancy: Annotated[BuoyancyName, words(buoyancy_names())] = "partial"
-    drag: Annotated[DragName, words(drag_names())] = "faces"
+    drag: Annotated[DragName, words(drag_names())] = "cross_flow"
     coefficients: Coefficients = ()
     added_mass: Boolean = True
     near_surface: Boolean = False
@@ -229,15 +230,7 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         InputError: no such world, an unknown field, or a value out of range; the message names
             the file and the field.
     """
-    shipped = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
-    if not isinstance(name, str | Path):
-        raise InputError(f"world: expected a name or a path; found {show(name)}")
-    check_path(name)
-    path = _FOLDER / f"{name}.yaml" if str(name) in shipped else Path(name)
-    if not path.exists() and path.suffix not in (".yaml", ".yml"):
-        raise InputError(
-            f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
-        )
+    path = _find_world(name)
     data = load_yaml(path)
     with reading(path):
         if not isinstance(data, dict):
@@ -256,6 +249,29 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     with reading(f"world {world.name}"):
         world = read(World, fields | {"current_field": world.current_field} | overrides)
     return _note_of_density(world)
+
+
+def _find_world(name: str | Path) -> Path:
+    """The file of a world."""
+    shipped = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
+    if not isinstance(name, str | Path):
+        raise InputError(f"world: expected a name or a path; found {show(name)}")
+    check_path(name)
+    path = _FOLDER / f"{name}.yaml" if str(name) in shipped else Path(name)
+    if not path.exists() and path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
+        )
+    return path
+
+
+def is_left_out(name: str | Path, field: str) -> bool:
+    """Whether the file of a world leaves a field at its default; false where it cannot be read."""
+    try:
+        data = load_yaml(_find_world(name))
+    except InputError:
+        return False
+    return isinstance(data, dict) and field not in data
 
 
 def _note_of_density(world: World) -> World:

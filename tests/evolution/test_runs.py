@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+import yaml
 from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_revolve.body.catalogue import load_modules
@@ -157,6 +158,31 @@ def test_older_runs_keep_the_core_and_the_length_at_rest(tmp_path, config):
     assert (found.task.point, found.task.length) == ("core", "rest")
     assert settings_hash(found) == settings_hash(older) != settings_hash(config)
     assert config.task.point == "center_of_mass"  # a user's file without them is a new one
+
+
+def test_older_runs_keep_the_drag_of_faces(tmp_path, config):
+    """Their config.yaml states no drag law; that of a new run does, whatever its world's file."""
+    pond = tmp_path / "pond.yaml"
+    pond.write_text("drag: ellipsoid\n")
+    for name, change, stated, law in (
+        ("new", {}, "cross_flow", "cross_flow"),
+        ("older", {"world.drag": "faces"}, None, "faces"),
+        ("own", {"world": str(pond)}, None, "ellipsoid"),
+    ):
+        made = override_config(config, change)
+        run, _ = runs.create_run_folder(tmp_path / name, made)
+        began = settings_hash(made)
+        text = yaml.safe_load((run.path / "config.yaml").read_text())
+        if name == "older":  # as it was written then
+            assert text["world"].pop("drag") == "faces"
+            began = settings_hash(config)
+        elif stated:
+            assert text["world"]["drag"] == stated
+        (run.path / "config.yaml").write_text(yaml.safe_dump(text))
+        run.close()
+        found = run.load_config()
+        assert load_world(found.world_name, **found.world_overrides).drag == law
+        assert began == settings_hash(found, older_drag=name == "older")
 
 
 def test_a_robot_that_nothing_moves_does_not_evolve():

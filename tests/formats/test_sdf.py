@@ -14,6 +14,7 @@ from mjx_revolve.formats.export import export_robot
 from mjx_revolve.formats.links import make_links, rest_pose
 from mjx_revolve.formats.sdf import make_sdf
 from mjx_revolve.numerics.spatial import quat_to_matrix
+from mjx_revolve.water.drag import DRAG_LAWS
 from mjx_revolve.water.face_drag import FACES
 from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.world import load_world
@@ -128,7 +129,7 @@ def test_sdf_has_the_water_of_each_part(robot):
             values = [float(added.findtext(tag)) for tag in ("xx", "yy", "zz", "pp", "qq", "rr")]
             carried = [*table.carried_mass[k], *table.carried_inertia[k]]
             np.testing.assert_allclose(values, density * np.array(carried), rtol=1e-9)
-            if table.drag[k] == "lift_drag":
+            if DRAG_LAWS[table.drag[k]].sdf.stand_in == "lift_drag":
                 assert float(fins[part.name].findtext("area")) == pytest.approx(plates.area[k])
                 assert float(fins[part.name].findtext("air_density")) == density
                 continue

@@ -157,7 +157,7 @@ def test_a_plate_in_pieces_is_one_plate():
     halves = [numbers_of(PLATE_WAKE, robot, k) for k in range(2)]
     for half in halves:
         assert float(half.width) == float(whole.width) == 0.1
-        assert float(half.linear[0]) == pytest.approx(float(whole.linear[0]) / 2)
+        assert float(half.faces[0]) == pytest.approx(float(whole.faces[0]) / 2)
 
 
 # ------------------------------------------------------------------------- fins

@@ -52,7 +52,7 @@ def test_the_thesis_worlds(name):
     assert water.gravity == 9.81
     assert water.surface_height == 0.0
     assert water.current == (0.0, 0.0, 0.0)
-    assert (water.buoyancy, water.drag, water.added_mass) == ("partial", "faces", True)
+    assert (water.buoyancy, water.drag, water.added_mass) == ("partial", "cross_flow", True)
     assert (water.shear, water.current_field, water.gust, water.waves) == (None, None, None, ())
     assert (water.water_depth, water.surface_tension) == (None, None)
     if name == "lake":

@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 # Angle of view, upright [rad].
 FOVY = math.radians(40.0)
 # The camera's path is smoothed over this long, less where the robot would leave the frame [s].
-_CALM = (1.0, 0.6, 0.35, 0.2, 0.1, 0.05)
+_SMOOTHING = (1.0, 0.6, 0.35, 0.2, 0.1, 0.05)
 # How far the robot may get from where the camera looks, in its own radii.
 _STRAY = 0.6
 # Share of the frame's smaller half that robot and its to and fro fill at most.
@@ -30,7 +30,7 @@ _HIGH, _LEVEL = math.radians(17.0), math.radians(5.0)
 # How far the robot moves towards the viewer, not straight across [rad].
 _TOWARDS = math.radians(24.0)
 # The bed is near within so many distances of the camera from the robot.
-_NEAR = 4.0
+_NEAR_BED = 4.0
 # How far above the robot's middle the camera looks, in shares of what it sees upright.
 _HEADROOM = 0.07
 # The steepest that a camera in the air looks down, and one in the water may have to [rad].
@@ -41,12 +41,12 @@ _AIR = 0.16
 # [rad/s], and over how long their middle is averaged [s].
 _DOWN, _ROUND, _DRIFT = math.radians(45.0), math.radians(3.0), 4.0
 # The share of them within the disc that fills the frame, and the least that it is across [m].
-_MOST, _LEAST = 0.75, 1.0
+_DISC_SHARE, _MIN_DISC = 0.75, 1.0
 # The camera's distance in radii of that disc, and how far before its middle the camera looks, in
 # distances: the near edge, seen larger, then is as far below the frame's middle as the far one
 # above, 19.5 degrees by tan a = sin 45 / (2.2 - cos 45) and tan b = sin 45 / (2.2 + cos 45).
-_WIDE, _BEFORE = 2.2, 0.13
-# A robot whose middle is less deep than this for most of the time is filmed from the air [radii].
+_DISC_DISTANCE, _AIM_BEFORE = 2.2, 0.13
+# A robot is filmed from the air if its middle is less deep than this most of the time [radii].
 _AFLOAT = 0.8
 
 
@@ -118,7 +118,7 @@ def plan_shots(
     """
     largest = float(radius.max())
     step = float(time[1] - time[0]) if len(time) > 1 else 1.0
-    for calm in (*_CALM, 0.0):
+    for calm in (*_SMOOTHING, 0.0):
         target = _smooth(center, calm / step) if calm else center
         stray = float(np.linalg.norm(target - center, axis=1).max())
         if stray <= _STRAY * largest:
@@ -133,7 +133,9 @@ def plan_shots(
     above = bool(np.median(depth) < _AFLOAT * largest)
     margin = _AIR * distance
     # Whether the bed is close below for half of the time.
-    near = bed is not None and np.median(center[:, 2] - bed(*center[:, :2].T)) < _NEAR * distance
+    near = (
+        bed is not None and np.median(center[:, 2] - bed(*center[:, :2].T)) < _NEAR_BED * distance
+    )
     elevation = _HIGH if above or near else _LEVEL
     low: Any = surface + waves + margin if above else -np.inf
     high = np.inf if above else surface - waves - 0.5 * margin
@@ -146,7 +148,7 @@ def plan_shots(
             low = np.maximum(low, target[:, 2] + rise / share)
     # In a gap too narrow for both, rather through the surface than through the bed.
     height = np.maximum(np.minimum(target[:, 2] + distance * math.sin(elevation), high), low)
-    height = _smooth(height[:, None], _CALM[2] / step)[:, 0]
+    height = _smooth(height[:, None], _SMOOTHING[2] / step)[:, 0]
     height = np.maximum(np.minimum(height, high), low)
     rise = height - target[:, 2]
     reach = np.maximum(distance, np.abs(rise) / math.sin(_STEEP))
@@ -192,9 +194,9 @@ def plan_circle(
     rows = np.maximum.accumulate(np.where(some, np.arange(len(time)), 0))
     target = _smooth(middle[rows], _DRIFT / step)
     away = np.linalg.norm((there - target)[..., :2], axis=-1)[alive]
-    half = (float(np.quantile(away, _MOST)) if away.size else 0.0) + reach
+    half = (float(np.quantile(away, _DISC_SHARE)) if away.size else 0.0) + reach
     # A frame that is less wide than high has to be farther off.
-    distance = max(half, _LEAST / 2) * _WIDE * max(1.0, 1.3 / aspect)
+    distance = max(half, _MIN_DISC / 2) * _DISC_DISTANCE * max(1.0, 1.3 / aspect)
     margin = _AIR * distance
     height = target[:, 2] + distance * math.sin(_DOWN)
     low, high = surface + waves + margin, surface - waves - margin
@@ -205,7 +207,7 @@ def plan_circle(
     foot = target[:, :2] + distance * math.cos(_DOWN) * around
     if bed is not None:
         height = np.maximum(height, bed(*foot.T) + margin)
-    target = target + _BEFORE * distance * np.c_[around, np.zeros(len(time))]
+    target = target + _AIM_BEFORE * distance * np.c_[around, np.zeros(len(time))]
     return Shots(np.c_[foot, height], target, above, distance)
 
 

@@ -20,8 +20,8 @@ from mjx_revolve.view.surroundings import bed_at, target_of, water_at, water_vel
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World
 
-# From the air, the ripples around many robots are so much smaller than the camera's distance would
-# have them. In the water the haze would be thicker by as much. A choice.
+# Factor by which ripples around many robots, seen from the air, are smaller than by the camera's
+# distance; and by which the haze in the water is thinner. A choice.
 _FINE = 2.5
 
 

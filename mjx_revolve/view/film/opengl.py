@@ -18,7 +18,7 @@ from typing import Any
 
 from mjx_revolve.inputs.errors import InputError
 
-# What makes a context, by the name that MUJOCO_GL has for it, in the order of trying.
+# Code that makes a context, by its name in MUJOCO_GL, in the order of trying.
 _WAYS = {
     "linux": ("egl", "osmesa", "glfw"),
     "darwin": ("cgl", "glfw"),
@@ -31,7 +31,7 @@ context = importlib.import_module("mujoco." + sys.argv[1]).GLContext(64, 64)
 context.make_current()
 mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontScale.mjFONTSCALE_100)
 """
-_PATIENCE = 60  # s for one try
+_TIMEOUT = 60  # s for one try
 
 
 def find_opengl() -> str:
@@ -58,10 +58,10 @@ def find_opengl() -> str:
     for way in ways:
         if _works(way):
             return way
-    asked = f" by MUJOCO_GL={wish}" if wish in ways else ""
+    chosen = f" by MUJOCO_GL={wish}" if wish in ways else ""
     hint = ": apt-get install libegl1 libgl1-mesa-dri" if system == "linux" else ""
     raise InputError(
-        f"OpenGL: expected one of {', '.join(ways)} to draw with{asked}; found none that works "
+        f"OpenGL: expected one of {', '.join(ways)} to draw with{chosen}; found none that works "
         f"(install one{hint})"
     )
 
@@ -98,7 +98,7 @@ def open_window(option: str, model: Any, data: Any, **more: Any) -> Iterator[Any
     """MuJoCo's viewer without its side panels.
 
     Args:
-        option: that asked for it.
+        option: of the command line, for the message.
         model: MuJoCo's.
         data: its state.
         more: arguments of `mujoco.viewer.launch_passive`.
@@ -142,7 +142,7 @@ def _works(way: str) -> bool:
             [sys.executable, "-P", "-c", _PROBE, way],
             env=environment,
             capture_output=True,
-            timeout=_PATIENCE,
+            timeout=_TIMEOUT,
             check=False,
         )
     except (OSError, subprocess.SubprocessError):

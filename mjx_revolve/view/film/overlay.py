@@ -1,7 +1,6 @@
-"""What is laid over a film's frames: motes in the water, marks, and words.
+"""The overlay of a film's frames: motes in the water, marks, and words.
 
-Motes and marks show that robots move; the words say what is shown, how long, how fast, how deep,
-and how large things are.
+Motes and marks make motion visible; the words are title, time, speed, depth and a scale.
 """
 
 from __future__ import annotations
@@ -117,7 +116,7 @@ def _make_rings(film: Film, notes: ColonyNotes) -> _Dots:
     distance = film.shots.distance
 
     def draw(picture: np.ndarray, depth: np.ndarray, frame: int) -> None:
-        def ring(middle: Any, radius: float, alpha: float, color: RGB) -> None:
+        def ring(middle: np.ndarray | RGB, radius: float, alpha: float, color: RGB) -> None:
             count = max(12, round(2 * math.pi * radius / (_SPACE * distance)))
             angle = 2 * np.pi * np.arange(count) / count
             points = middle + radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)

@@ -1,42 +1,41 @@
-"""What water does to light: a picture of bare things becomes one of things in the water.
+"""Shading of rendered frames as under water.
 
-MuJoCo draws bodies and the bed as if in clear air, with the distance of every pixel. Here the water
-comes in between: it swallows red first and scatters blue, light comes from above in shafts and in
-moving bright lines, and the surface is seen from below or from above, with the world's waves and
-small ripples of its own. Pure JAX, one compiled function for a frame. Distances are measured by the
-camera's from the robot, so that small and large robots are seen equally well: it is for looking at,
-and no model of visibility.
+MuJoCo draws bodies and the bed in clear air, with the distance of every pixel. This adds the water:
+it absorbs red first and scatters blue, light comes from above in shafts and caustics, and the
+surface is seen from below or from above, with the world's waves and small ripples. Pure JAX, one
+compiled function for a frame. Distances are relative to the camera's distance from the robot, so
+that small and large robots are seen equally well: it is no physical model of visibility.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.numerics.spatial import sincos
+from mjx_revolve.numerics.spatial import Scalar, Vec, sincos
 from mjx_revolve.view.film.camera import FOVY
 from mjx_revolve.view.film.stage import BACKGROUND
 from mjx_revolve.view.palette import SKY_HIGH, SKY_LOW, SUN, WATER_AHEAD, WATER_DOWN, WATER_UP
 from mjx_revolve.water.flow import Water, surface
 from mjx_revolve.water.world import World
 
-# What is lost along the camera's distance from the robot, red, green and blue [-].
+# Share of light absorbed along the camera's distance from the robot, red, green and blue [-].
 _LOSS = np.array([0.40, 0.19, 0.15])
 # What daylight loses with depth [1/m], as in clear lakes, and the least that is left: pictures from
 # the bottom would be black.
 _FADING = np.array([0.14, 0.040, 0.028])
-_LEAST = np.array([0.30, 0.52, 0.60])
+_LEAST_LIGHT = np.array([0.30, 0.52, 0.60])
 _BODY = np.array([0.03, 0.29, 0.37])  # of water that is looked into from above
 _SKY, _ZENITH, _SUN = np.array(SKY_LOW), np.array(SKY_HIGH), np.array(SUN)
 _WINDOW = np.array([0.74, 0.95, 1.0])  # the sky through the surface, from below
 _SHINE = np.array([0.62, 0.95, 1.0])  # of shafts of light
 _INDEX = 1.333  # of refraction
-# Ripples: wavelength in camera distances, direction [rad], slope [-], phase [rad].
+# Ripples: wavelength in camera distances, direction [rad], steepness [-], phase [rad].
 _RIPPLES = (
     (0.83, 0.3, 0.050, 0.0), (0.57, 1.4, 0.050, 1.9), (0.41, -0.8, 0.050, 4.0),
     (0.29, 2.3, 0.045, 2.2), (0.21, 0.9, 0.045, 5.1), (0.155, -1.9, 0.040, 0.7),
@@ -54,7 +53,7 @@ Shader = Callable[..., jax.Array]
 
 
 class _View(NamedTuple):
-    """What a camera looks at, and through."""
+    """A camera, the world and the water of a frame."""
 
     world: World
     origin: tuple[float, float]  # x and y in the world of the place from which all is counted [m]
@@ -63,17 +62,17 @@ class _View(NamedTuple):
     position: jax.Array  # [3] of the camera [m]
     ray: jax.Array  # [height, width, 3] unit vectors
 
-    def along(self, s: Any) -> tuple[Any, Any, Any]:
+    def along(self, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """x, y and z of the points at distances along the rays [m]."""
         x, y, z = (self.position[i] + s * self.ray[..., i] for i in range(3))
         return x, y, z
 
-    def depth(self, z: Any) -> Any:
+    def depth(self, z: jax.Array) -> jax.Array:
         """Below the still surface [m]."""
         return self.water.surface_height - z
 
     @property
-    def own_light(self) -> Any:
+    def own_light(self) -> jax.Array:
         """Daylight where the camera is."""
         return daylight(self.depth(self.position[2]))
 
@@ -85,7 +84,7 @@ def make_shader(
     above: bool,
     origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Shader:
-    """Compiles what the world's water does to pictures.
+    """Compiles the shader of a world's water.
 
     Args:
         world: surface, waves, gravity.
@@ -125,7 +124,7 @@ def make_shader(
     return shader
 
 
-def _soften(color: Any, depth: Any) -> Any:
+def _soften(color: jax.Array, depth: jax.Array) -> jax.Array:
     """Mixes pixels with their neighbours across hard edges on one face: MuJoCo's shadows."""
     sides = [jnp.roll(color, step, axis) for axis in (0, 1) for step in (1, -1)]
     depths = [jnp.roll(depth, step, axis) for axis in (0, 1) for step in (1, -1)]
@@ -142,19 +141,19 @@ def _soften(color: Any, depth: Any) -> Any:
     return color + share * (mean - color)
 
 
-def _to_light(color: Any) -> Any:
-    """Screen colours to light, that adds up; a square is close to sRGB's curve and quick."""
-    return color * color
+def _to_light(color: jax.Array | np.ndarray) -> jax.Array:
+    """Screen colours to linear light; a square is close to sRGB's curve and quick."""
+    return jnp.square(color)
 
 
-def _to_screen(light: Any) -> Any:
-    """Light to screen colours; what is too bright fades to white rather than to a stain."""
+def _to_screen(light: jax.Array) -> jax.Array:
+    """Linear light to screen colours; too bright colours fade to white."""
     light = jnp.maximum(light, 0.0)
     over = jnp.maximum(light - 1.0, 0.0).mean(-1, keepdims=True)
     return jnp.sqrt(jnp.clip(light + 0.5 * over, 0.0, 1.0))
 
 
-def open_water(up: Any) -> Any:
+def open_water(up: jax.Array) -> jax.Array:
     """Light of water without end, `[..., 3]`, by the sine of the angle at which one looks up."""
     up = jnp.asarray(up)[..., None]
     rising = 1 - jnp.exp(-1.6 * jnp.maximum(up, 0.0))
@@ -163,13 +162,13 @@ def open_water(up: Any) -> Any:
     return ahead + (top - ahead) * rising + (low - ahead) * falling
 
 
-def daylight(depth: Any) -> Any:
+def daylight(depth: jax.Array) -> jax.Array:
     """Share of the light that reaches a depth below the surface [m], `[..., 3]`; 1 above it."""
     left = jnp.exp(-_FADING * jnp.maximum(jnp.asarray(depth), 0.0)[..., None])
-    return _LEAST + (1 - _LEAST) * left
+    return _LEAST_LIGHT + (1 - _LEAST_LIGHT) * left
 
 
-def transmission(path: Any, distance: float) -> Any:
+def transmission(path: jax.Array, distance: float) -> jax.Array:
     """Share of light, `[..., 3]`, that passes through water of a length [m].
 
     Less of it is lost close to the camera than Beer and Lambert would have it, so that the robot
@@ -181,9 +180,11 @@ def transmission(path: Any, distance: float) -> Any:
     return jnp.exp(-_LOSS * (0.27 * path + beyond)[..., None])
 
 
-def _ripples(distance: float, gravity: float, time: Any, x: Any, y: Any) -> tuple[Any, ...]:
-    """Slopes of the ripples, and the second derivatives xx, xy, yy of their height."""
-    total: list[Any] = [0.0] * 5
+def _ripples(
+    distance: float, gravity: float, time: jax.Array, x: jax.Array, y: jax.Array
+) -> tuple[Vec, Vec]:
+    """Gradient of the ripples, and the second derivatives xx, xy, yy of their height."""
+    total: list[Scalar] = [0.0] * 5
     for share, angle, steep, phase in _RIPPLES:
         k = 2 * math.pi / (share * distance)
         # They run as waves do, but no faster than the eye can follow around a small robot.
@@ -196,7 +197,9 @@ def _ripples(distance: float, gravity: float, time: Any, x: Any, y: Any) -> tupl
     return tuple(total[:2]), tuple(total[2:])
 
 
-def bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> Any:
+def bright_lines(
+    distance: float, gravity: float, time: jax.Array, x: jax.Array, y: jax.Array
+) -> jax.Array:
     """Brightness, about 1 on average, of sunlight that ripples have gathered into lines.
 
     Rays that a surface of height h bends land at x + f ∇h, so light is denser by 1 / |det(1 + f
@@ -208,23 +211,23 @@ def bright_lines(distance: float, gravity: float, time: Any, x: Any, y: Any) -> 
     return jnp.minimum(1.0 / (jnp.abs(density) + 0.22), 4.0) * 0.95
 
 
-def _meet_surface(view: _View, most: float) -> tuple[Any, Any]:
-    """Distance at which rays meet the surface, infinite beyond `most`, and its slope there."""
+def _meet_surface(view: _View, most: float) -> tuple[jax.Array, Vec]:
+    """Distance at which rays meet the surface, infinite beyond `most`, and its gradient there."""
     world, water = view.world, view.water
     still, up = view.depth(view.position[2]), view.ray[..., 2]
     towards = up * still > 0
     safe = jnp.where(towards, up, 1.0)
     s = jnp.clip(still / safe, 0.0, most)
-    slope: Any = (0.0, 0.0)
+    gradient: Vec = (0.0, 0.0)
     if any(wave.amplitude > 0 for wave in world.waves):
         for _ in range(3):
             x, y, _ = view.along(s)
-            height, slope = surface(world, water, x + view.origin[0], y + view.origin[1])
+            height, gradient = surface(world, water, x + view.origin[0], y + view.origin[1])
             s = jnp.clip((height - view.position[2]) / safe, 0.0, most)
-    return jnp.where(towards & (s < most), s, jnp.inf), slope
+    return jnp.where(towards & (s < most), s, jnp.inf), gradient
 
 
-def _surface_normal(view: _View, near: Any, slope: Any, rough: float) -> Any:
+def _surface_normal(view: _View, near: jax.Array, gradient: Vec, rough: float) -> jax.Array:
     """Upward unit normal of the surface at distances along the rays, with waves and ripples.
 
     Both are left out where a pixel covers more than they are long, or they would glitter.
@@ -238,12 +241,12 @@ def _surface_normal(view: _View, near: Any, slope: Any, rough: float) -> Any:
     ripples = rough / (1 + (12 * covers / distance) ** 2)
     x, y, _ = view.along(near)
     fine, _ = _ripples(distance, world.gravity, view.water.time, x, y)
-    dx, dy = (waves * slope[i] + ripples * fine[i] for i in (0, 1))
+    dx, dy = (waves * gradient[i] + ripples * fine[i] for i in (0, 1))
     size = jax.lax.rsqrt(1 + dx * dx + dy * dy)
     return jnp.stack([-dx * size, -dy * size, size], axis=-1)
 
 
-def _facing_up(view: _View, far: Any) -> Any:
+def _facing_up(view: _View, far: jax.Array) -> jax.Array:
     """How far the faces that are seen look up, from the distances of neighbouring pixels."""
     place = jnp.minimum(far, 1e3)[..., None] * view.ray
     right = jnp.diff(place, axis=1, append=place[:, -1:])
@@ -252,19 +255,21 @@ def _facing_up(view: _View, far: Any) -> Any:
     return normal[..., 2] * jax.lax.rsqrt((normal**2).sum(-1) + 1e-20)
 
 
-def _step(value: Any, low: float, high: float) -> Any:
+def _step(value: jax.Array, low: float, high: float) -> jax.Array:
     """0 below low, 1 above high, smooth between."""
     value = jnp.clip((value - low) / (high - low), 0.0, 1.0)
     return value * value * (3 - 2 * value)
 
 
-def _under_sun(view: _View, x: Any, y: Any, depth: Any) -> tuple[Any, Any]:
-    """Where the sunlight came through the surface that falls on points at a depth."""
+def _under_sun(
+    view: _View, x: jax.Array, y: jax.Array, depth: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Where the sunlight on points at a depth has entered through the surface."""
     return x + depth * SUN[0] / SUN[2], y + depth * SUN[1] / SUN[2]
 
 
-def _sunlit(view: _View, far: Any) -> Any:
-    """Light that falls on things under water, next to that which MuJoCo lit them with."""
+def _sunlit(view: _View, far: jax.Array) -> jax.Array:
+    """Light on objects under water, relative to MuJoCo's own lighting."""
     x, y, z = view.along(jnp.minimum(far, 1e3))
     depth = view.depth(z)
     through = _under_sun(view, x, y, depth)
@@ -274,12 +279,12 @@ def _sunlit(view: _View, far: Any) -> Any:
     return daylight(depth) * (1 + share * (lines - 1))[..., None]
 
 
-def _in_water(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
-    """What a camera in the water sees, and how clearly it sees the edges of things."""
+def _in_water(view: _View, scene: jax.Array, far: jax.Array) -> tuple[jax.Array, float]:
+    """Colours seen by a camera in the water, and the visibility of edges."""
     ahead = open_water(view.ray[..., 2]) * view.own_light
-    s, slope = _meet_surface(view, _HORIZON * view.distance)
+    s, gradient = _meet_surface(view, _HORIZON * view.distance)
     backdrop = jax.lax.cond(
-        jnp.isfinite(s).any(), lambda: _ceiling(view, s, slope, ahead), lambda: ahead
+        jnp.isfinite(s).any(), lambda: _ceiling(view, s, gradient, ahead), lambda: ahead
     )
     through = transmission(jnp.minimum(far, s), view.distance)
     things = scene * _sunlit(view, far) * through + ahead * (1 - through)
@@ -287,10 +292,10 @@ def _in_water(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
     return picture + _shafts(view, jnp.minimum(far, s)) * view.own_light, 1.0
 
 
-def _ceiling(view: _View, s: Any, slope: Any, ahead: Any) -> Any:
+def _ceiling(view: _View, s: jax.Array, gradient: Vec, ahead: jax.Array) -> jax.Array:
     """The surface from below: a bright window where light gets in, elsewhere a mirror."""
     near = jnp.minimum(s, _HORIZON * view.distance)
-    normal = _surface_normal(view, near, slope, 1.6)
+    normal = _surface_normal(view, near, gradient, 1.6)
     cosine = jnp.clip((view.ray * normal).sum(-1), 0.0, 1.0)
     # Snell: above 1 the ray cannot leave the water. The window's rim is softer than true ones.
     outside = 1 - _INDEX**2 * (1 - cosine**2)
@@ -303,19 +308,19 @@ def _ceiling(view: _View, s: Any, slope: Any, ahead: Any) -> Any:
     return jnp.where(jnp.isfinite(s)[..., None], seen * through + ahead * (1 - through), ahead)
 
 
-def _shafts(view: _View, far: Any) -> Any:
+def _shafts(view: _View, far: jax.Array) -> jax.Array:
     """Light that the water scatters out of the sun's beams, on a coarse grid of rays."""
     half, distance = _COARSE // 2, view.distance
     some = view._replace(ray=view.ray[half::_COARSE, half::_COARSE])
     reach = jnp.minimum(far[half::_COARSE, half::_COARSE], 6 * distance)
-    total: Any = 0.0
+    total: Scalar = 0.0
     for j in range(_SAMPLES):
         s = reach * (j + 0.5) / _SAMPLES
         x, y, z = some.along(s)
         depth = view.depth(z)
         x, y = _under_sun(view, x, y, depth)
         # Wide and slow: what is left of the lines after a way through the water.
-        beam: Any = 0.0
+        beam: Scalar = 0.0
         for k, angle, rate in _BEAMS:
             turn = k / distance * (math.cos(angle) * x + math.sin(angle) * y)
             beam = beam + jnp.sin(turn + rate * view.water.time + 1.7 * k)
@@ -326,18 +331,18 @@ def _shafts(view: _View, far: Any) -> Any:
     return _SHAFTS * fine[..., None] * _to_light(_SHINE)
 
 
-def _sky(up: Any) -> Any:
+def _sky(up: jax.Array) -> jax.Array:
     """The sky, by the sine of the angle at which one looks up."""
     low, high = _to_light(_SKY), _to_light(_ZENITH)
     return low + (high - low) * (1 - jnp.exp(-3.0 * jnp.clip(up, 0.0, 1.0)))[..., None]
 
 
-def _from_air(view: _View, scene: Any, far: Any) -> tuple[Any, Any]:
-    """What a camera in the air sees, and how clearly it sees the edges of things."""
+def _from_air(view: _View, scene: jax.Array, far: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Colours seen by a camera in the air, and the visibility of edges."""
     distance, most = view.distance, 400 * view.distance
-    s, slope = _meet_surface(view, most)
+    s, gradient = _meet_surface(view, most)
     near = jnp.minimum(s, most)
-    normal = _surface_normal(view, near, slope, 1.0)
+    normal = _surface_normal(view, near, gradient, 1.0)
     cosine = jnp.clip(-(view.ray * normal).sum(-1), 0.0, 1.0)
     mirrored = view.ray + 2 * cosine[..., None] * normal
     # Schlick's approximation of what a surface mirrors.

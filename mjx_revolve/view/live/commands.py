@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Annotated, Any
+from typing import Annotated
 
 from annotated_types import Ge, Le, Unit
 
@@ -11,9 +11,9 @@ from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import Boolean, Integer, Number, Pair, Triple, checked, read
 
 # Bounds, choices: how far from the middle robots are dropped [m], the fastest current [m/s].
-_FAR, _DEEP, _FAST = 500.0, 500.0, 3.0
-_Level = Annotated[Number, Ge(-_FAR), Le(_FAR), Unit("m")]
-_Speed = Annotated[Number, Ge(-_FAST), Le(_FAST), Unit("m/s")]
+_MAX_DISTANCE, _MAX_DEPTH, _MAX_SPEED = 500.0, 500.0, 3.0
+_Level = Annotated[Number, Ge(-_MAX_DISTANCE), Le(_MAX_DISTANCE), Unit("m")]
+_Speed = Annotated[Number, Ge(-_MAX_SPEED), Le(_MAX_SPEED), Unit("m/s")]
 
 
 @checked
@@ -29,7 +29,7 @@ class Drop:
 
     entry: Annotated[Integer, Ge(0)]
     place: Pair[_Level] | None = None
-    depth: Annotated[Number, Ge(-2.0), Le(_DEEP), Unit("m")] = 1.0
+    depth: Annotated[Number, Ge(-2.0), Le(_MAX_DEPTH), Unit("m")] = 1.0
     heading: Annotated[Number, Ge(-360.0), Le(360.0), Unit("deg")] | None = None
 
 
@@ -83,13 +83,13 @@ class Reset:
 
 
 Command = Drop | Remove | Current | Pause | Rate | Reset
-_COMMANDS: dict[str, Any] = {
+_COMMANDS: dict[str, type] = {
     "drop": Drop, "remove": Remove, "current": Current, "pause": Pause, "rate": Rate,
     "reset": Reset,
 }  # fmt: skip
 
 
-def read_command(data: Any) -> Command:
+def read_command(data: object) -> Command:
     """Reads what a page has posted.
 
     Args:

@@ -26,7 +26,7 @@ from mjx_revolve.view.live.simulation import CatalogueEntry
 from mjx_revolve.view.population import rank
 from mjx_revolve.water.world import World, load_world
 
-# The configuration whose water and controller are used by default.
+# The configuration with the default water and controller.
 _USUAL = "lake_swim"
 _FIRST = "spider"  # of the shipped robots
 # Robots live on, and may come to a bed that they could not reach in an episode [s]. A choice.
@@ -179,9 +179,9 @@ def _read_config(path: str) -> Config:
 
 
 def _bodies(config: Config, water: World, path: Path, group: str = "") -> list[_Draft]:
-    """A morphology whose genes are drawn, and one that keeps still."""
+    """A morphology with random genes, and the same without a controller."""
     morphology = load_morphology(path, read_modules(config), config.allow_overlap)
-    with suppress(InputError):  # what floats, floats
+    with suppress(InputError):  # a robot that floats stays as it is
         morphology = trim_neutral(morphology, water.density)
     name = path.stem
     group = group or name

@@ -15,18 +15,18 @@ from concurrent.futures import TimeoutError as NotYet
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, NoReturn
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.live.commands import read_command
 from mjx_revolve.view.live.simulation import LiveSimulation
 
 HOST = "127.0.0.1"
-_LONGEST = 4096  # of what is posted [bytes]
+_MAX_CONTENT = 4096  # of what is posted [bytes]
 # Connections at once, of which a browser opens six at most; and how long one of them may be silent,
 # or leave unread what is sent to it [s]. Choices.
-_MOST, _SILENT = 32, 20.0
-_PATIENCE = 1.5  # for an answer; what takes longer is announced on the page [s]
+_MAX_CONNECTIONS, _MAX_SILENCE = 32, 20.0
+_ANSWER_TIMEOUT = 1.5  # for an answer; the page shows that a longer one is under way [s]
 _BEAT = 0.5  # from one state event to the next, at least [s]
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -54,7 +54,7 @@ class LiveServer(ThreadingHTTPServer):
         self.simulation, self.page = simulation, page.encode()
         self.token = secrets.token_urlsafe(16)
         self.closing = threading.Event()
-        self._room = threading.Semaphore(_MOST)
+        self._room = threading.Semaphore(_MAX_CONNECTIONS)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answers in a thread of its own, as long as there are not too many."""
@@ -74,7 +74,7 @@ class LiveServer(ThreadingHTTPServer):
 
     @property
     def origins(self) -> tuple[str, ...]:
-        """What a browser calls us."""
+        """The server's addresses in a browser's `Origin` header."""
         port = self.server_address[1]
         return tuple(f"http://{name}:{port}" for name in (HOST, "localhost"))
 
@@ -90,16 +90,16 @@ class LiveServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: LiveServer
     protocol_version = "HTTP/1.1"
-    timeout = _SILENT
+    timeout = _MAX_SILENCE
     server_version, sys_version = "mjx_revolve", ""
 
-    def log_message(self, format: str, *args: Any) -> None:
+    def log_message(self, format: str, *args: object) -> None:
         """Logs no requests."""
 
     def do_GET(self) -> None:
         place = self._place()
         if place == "" and not self.path.endswith("/"):
-            # What the page asks for is beside it.
+            # The page's files are beside it.
             there = f"/{self.server.token}/"
             self._send(b"", "text/plain", HTTPStatus.PERMANENT_REDIRECT, Location=there)
         elif place == "":
@@ -112,9 +112,11 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         length = self.headers.get("Content-Length", "")
         size = int(length) if length.isascii() and length.isdigit() and len(length) < 9 else -1
-        if not 0 <= size <= _LONGEST:
+        if not 0 <= size <= _MAX_CONTENT:
             self.close_connection = True
-            self._refuse(HTTPStatus.BAD_REQUEST, f"expected at most {_LONGEST} bytes; found others")
+            self._refuse(
+                HTTPStatus.BAD_REQUEST, f"expected at most {_MAX_CONTENT} bytes; found others"
+            )
             return
         text = self.rfile.read(size)
         if self._place() != "command":
@@ -132,7 +134,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             command = read_command(_read_json(text))
-            answer = self.server.simulation.ask(command).result(_PATIENCE)
+            answer = self.server.simulation.ask(command).result(_ANSWER_TIMEOUT)
         except NotYet:
             self._send(b'{"ok":true,"later":true}', "application/json", HTTPStatus.ACCEPTED)
         except InputError as error:
@@ -200,5 +202,5 @@ def _read_json(text: bytes) -> Any:
         raise InputError(f"expected JSON; found none: {reason}") from None
 
 
-def _refuse_constant(name: str) -> Any:
+def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no number of JSON")

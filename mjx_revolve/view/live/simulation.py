@@ -1,8 +1,8 @@
 """A world that runs in real time, and the commands that change it.
 
-One thread alone touches the world, the one that calls `LiveSimulation.run`: two computations of XLA
-at once in one process may wait for each other for ever. Other threads queue commands
-(`LiveSimulation.ask`) and read events (`LiveSimulation.listen`).
+Only the thread that calls `LiveSimulation.run` uses the world: two computations of XLA at once in
+one process may deadlock. Other threads queue commands (`LiveSimulation.ask`) and read events
+(`LiveSimulation.listen`).
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 # are done within a tenth of a second, and between two poses motion is straight [s].
 SLICE, EVERY = 0.1, 0.05
 # Time that is lost beyond this is not made up for [s].
-_LATE = 0.3
+_MAX_LAG = 0.3
 # A slice that takes longer than this must be compiling [s].
-_LONG = 1.0
+_COMPILING = 1.0
 _REPORT = 0.5  # from one event of the world's state to the next [s]
-_IDLE = 0.2  # from one look at the queue to the next, where there is nothing to do [s]
+_IDLE_INTERVAL = 0.2  # time between two checks of the queue, if there is nothing to do [s]
 _BACKLOG = 100  # events that a listener may be behind; then it is dropped
 _SPREAD = 0.6  # robots are dropped so far apart, in shares of their two lengths
 
@@ -112,7 +112,7 @@ class LiveSimulation:
         """Prepares a simulation.
 
         Args:
-            tank: nothing else touches it from now on.
+            tank: used by nothing else from now on.
             world: of the tank.
             catalogue: robots that may be dropped.
             first: robots in the water at the beginning.
@@ -129,7 +129,7 @@ class LiveSimulation:
         self._speed = 0.0  # the rate that is kept up [-]
         self._slice_since: float | None = None  # when the present slice began
         self._stopped = threading.Event()
-        self._commands: queue.Queue[tuple[Command, Future[Any]]] = queue.Queue()
+        self._commands: queue.Queue[tuple[Command, Future[int | None]]] = queue.Queue()
         self._listeners: list[queue.Queue[str | None]] = []
         self._lock = threading.Lock()
         self._count = 0  # of all robots that were ever dropped
@@ -138,7 +138,7 @@ class LiveSimulation:
 
     # ------------------------------------------------------------------ from any thread
 
-    def ask(self, command: Command) -> Future[Any]:
+    def ask(self, command: Command) -> Future[int | None]:
         """Queues a command.
 
         Args:
@@ -147,7 +147,7 @@ class LiveSimulation:
         Returns:
             Of a `Drop` the robot's key, of others None; or an `InputError`.
         """
-        future: Future[Any] = Future()
+        future: Future[int | None] = Future()
         self._commands.put((command, future))
         return future
 
@@ -185,7 +185,7 @@ class LiveSimulation:
         """How long the present slice has been taking; 0 where that is not long [s]."""
         since = self._slice_since
         took = 0.0 if since is None else time.monotonic() - since
-        return took if took > _LONG else 0.0
+        return took if took > _COMPILING else 0.0
 
     def poses_at(self, moment: float) -> dict[int, np.ndarray]:
         """Poses by key at a moment not long ago [s], between those that are known."""
@@ -240,14 +240,14 @@ class LiveSimulation:
             now = time.monotonic()
             resting = self.paused or (self._waits and not self._listeners)
             if resting or due > now:
-                self._answer(_IDLE if resting else due - now)
+                self._answer(_IDLE_INTERVAL if resting else due - now)
                 if resting:
                     due = last = time.monotonic()
                 continue
             self._step()
             now = time.monotonic()
             real = SLICE / self.rate
-            due = max(due + real, now - _LATE)
+            due = max(due + real, now - _MAX_LAG)
             # A mean over the last second or so.
             speed = SLICE / max(now - last, 1e-6) if now - last > 1.05 * real else self.rate
             self._speed += min(1.0, max(now - last, real)) * (speed - self._speed)
@@ -380,7 +380,7 @@ class LiveSimulation:
             for listener in list(self._listeners):
                 try:
                     listener.put_nowait(text)
-                except queue.Full:  # it sleeps; its page will connect again
+                except queue.Full:  # its page is suspended, and will connect again
                     self._listeners.remove(listener)
                     with suppress(queue.Empty):
                         listener.get_nowait()
@@ -411,7 +411,7 @@ class LiveSimulation:
         )
 
 
-def _poses_event(times: Any, rows: dict[int, np.ndarray]) -> str:
+def _poses_event(times: Iterable[float], rows: dict[int, np.ndarray]) -> str:
     """Poses `[T, width]` by key, at times `[T]` [s]."""
     numbers = np.concatenate([x.ravel() for x in rows.values()]) if rows else np.zeros(0)
     return _event(
@@ -425,6 +425,6 @@ def _poses_event(times: Any, rows: dict[int, np.ndarray]) -> str:
     )
 
 
-def _event(name: str, data: Any) -> str:
+def _event(name: str, data: object) -> str:
     """A server-sent event."""
     return f"event: {name}\ndata: {json.dumps(data, separators=(',', ':'), allow_nan=False)}\n\n"

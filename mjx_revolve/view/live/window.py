@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from concurrent.futures import Future
 from typing import Any
 
 import mujoco
@@ -73,7 +74,7 @@ class KeyBindings:
         }
         return commands.get(key)
 
-    def _done(self, future: Any) -> None:
+    def _done(self, future: Future[int | None]) -> None:
         if error := future.exception():
             self._error = time.monotonic(), str(error)
 

@@ -197,7 +197,7 @@ def fill_archive(record: RunRecord) -> archives.Archive | None:
 def _draw_archive(
     record: RunRecord, archive: archives.Archive, elites: Sequence[LoggedIndividual], at: Path
 ) -> bytes:
-    """The map as SVG whose cells are links: to pages, or to cards on the same page."""
+    """The map as SVG with links in its cells: to pages, or to cards on the same page."""
     links = {
         life.number: _page(record, life, at) or f"#{anchor(record, life.number)}" for life in elites
     }
@@ -211,7 +211,7 @@ def anchor(record: RunRecord, number: int) -> str:
 
 
 def choose_individuals(record: RunRecord, which: str | Sequence[int]) -> list[int]:
-    """Numbers of the individuals whose pages an option names.
+    """Numbers of the individuals that an option names.
 
     Args:
         record: the run.

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.plant import plant_of
@@ -21,8 +22,8 @@ from mjx_revolve.view.report.record import RunRecord, number
 from mjx_revolve.view.sensor_log import SensorTrace, trace_sensors
 from mjx_revolve.view.surroundings import target_at_last
 
-# A replay further than this from the recorded mean is another swim: standard deviations over the
-# fresh starts, and a share of the score itself where those hardly differ.
+# A replay with a score further than this from the recorded mean counts as another episode: standard
+# deviations over the fresh starts, and a share of the score itself if those hardly differ.
 _DEVIATIONS, _SHARE = 5.0, 0.05
 
 
@@ -47,8 +48,8 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
     """Simulates a run's champion.
 
     Args:
-        record: the run; what differs from what it recorded is added to its problems.
-        fitness: of its configuration, whatever the seed.
+        record: the run; differences from the recorded score are added to its problems.
+        fitness: of its configuration, with any seed.
 
     Returns:
         The first of the fresh starts on which the champion was judged.
@@ -88,7 +89,7 @@ def has_phases(fitness: Fitness) -> bool:
 
 
 def _compare(record: RunRecord, score: float) -> None:
-    """Notes a replay that is not the swim that the run recorded."""
+    """Notes a replay with another score than the run recorded."""
     mean, std = (number(record.champion.get(name)) for name in ("score", "score_std"))
     if mean is None or std is None or record.stand_in or not record.is_finished:
         return
@@ -118,7 +119,7 @@ def cpg_phases(fitness: Fitness, genes: np.ndarray, steps: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def _oscillators(fitness: Fitness, steps: int) -> Any:
+def _oscillators(fitness: Fitness, steps: int) -> PyTree:
     """The states of all oscillators, `[steps, nhinge]` each, from genes."""
     plant = plant_of(fitness.robot)
     # Its oscillators at all times, not only when it commands.
@@ -126,10 +127,10 @@ def _oscillators(fitness: Fitness, steps: int) -> Any:
     controller = find_controller(plant, settings)
     blind: Any = None  # oscillators sense nothing
 
-    def run(genes: jax.Array) -> Any:
+    def run(genes: jax.Array) -> PyTree:
         parameters = controller.decode(genes[:, None], plant)
 
-        def step(state: Any, time: jax.Array) -> tuple[Any, Any]:
+        def step(state: PyTree, time: jax.Array) -> tuple[PyTree, PyTree]:
             state, _ = controller.step(parameters, state, time, blind)
             return state, (state[0][:, 0], state[1][:, 0])
 

@@ -1,4 +1,4 @@
-"""What can be read of a run folder, whole or not: the beginning of every report.
+"""The reader of run folders for reports, whole or not.
 
 A folder may lack files, hold damaged ones, or come from another version. Everything is read that
 can be read, and everything else is named.
@@ -32,7 +32,7 @@ from mjx_revolve.view.report.record import RunRecord
 # Read one way or another, and shown; none of them may be a link to a file elsewhere.
 _FILES = ("config.yaml", "run.json", "metrics.csv", "champion/genes.yaml",
           "champion/morphology.yaml", INDIVIDUALS, GENERATIONS, EVENTS)  # fmt: skip
-# Packages on whose versions a replay depends.
+# Packages with versions that affect a replay.
 _PACKAGES = ("mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax")
 
 
@@ -92,7 +92,7 @@ def read_runs(names: Sequence[str]) -> tuple[list[RunRecord], list[str]]:
         try:
             record = read_run(name)
         except InputError as error:
-            if not Path(name).is_dir():  # a slip of the finger rather than a damaged run
+            if not Path(name).is_dir():  # a misspelt name rather than a damaged run
                 raise
             lost.append(str(error))
             continue
@@ -118,10 +118,10 @@ def _read_info(record: RunRecord) -> None:
 
 
 def _split_unknown(
-    data: Mapping[str, Any], model: type[BaseModel] = Config, prefix: str = ""
-) -> tuple[dict[str, Any], list[str]]:
-    """Settings that this version knows, and the names of all others."""
-    known: dict[str, Any] = {}
+    data: Mapping[str, object], model: type[BaseModel] = Config, prefix: str = ""
+) -> tuple[dict[str, object], list[str]]:
+    """Settings of this version, and the names of all others."""
+    known: dict[str, object] = {}
     unknown: list[str] = []
     for key, value in data.items():
         if key not in model.model_fields:
@@ -154,7 +154,7 @@ def _read_config(record: RunRecord) -> None:
         names = ", ".join(unknown)
         record.note("version", f"config.yaml: this version does not know {names}; read without")
     try:
-        known = with_older_values(locate_files(known, find_copies(record.folder)))
+        known = with_older_values(locate_files(known, find_copies(record.folder)), record.folder)
         record.config = make_config(known, record.folder, source=str(path))
     except InputError as error:
         spare = record.folder / "champion" / "morphology.yaml"
@@ -222,7 +222,7 @@ def _read_population(record: RunRecord) -> None:
 
 
 def _read_champion(record: RunRecord) -> None:
-    """The champion; where there is none, the best that a checkpoint remembers."""
+    """The champion; if there is none, the best individual of a checkpoint."""
     elite, origin = _read_checkpoints(record)
     best = record.population.best() if record.population is not None else None
     if best is not None:

@@ -16,7 +16,7 @@ from mjx_revolve.view.report.record import RunRecord, number
 
 # Settings that do not make it another configuration: they only say how it is kept.
 _KEEPING = ("checkpoint_every", "keep_checkpoints", "tensorboard")
-# What groups are named by where it tells them apart, the most telling first; then all others.
+# Settings that name groups, if they differ, in this order; then all others.
 _DISTINGUISHING = (
     "morphology", "task.type", "world.name", "controller.type", "evolution.strategy",
     "evolution.population_size", "evolution.generations",
@@ -168,7 +168,7 @@ def group_runs(records: Sequence[RunRecord]) -> list[RunGroup]:
 
 
 def _identity(record: RunRecord) -> Path | int:
-    """The seed, by which runs of a group are told apart, or else the folder."""
+    """The identity of a run in its group: its seed, or else its folder."""
     return record.folder if record.seed is None else record.seed
 
 
@@ -186,7 +186,7 @@ def _differences(settings: Sequence[Mapping[str, object]]) -> dict[str, list[obj
 def _names(
     groups: Sequence[Sequence[RunRecord]], settings: Sequence[dict[str, object]]
 ) -> list[str]:
-    """Short names that tell the groups apart: the fewest settings that do, or the file's name."""
+    """Short unique names of groups: the fewest settings that differ, or the file's name."""
     differ = _differences([flat for flat in settings if flat])
     first = [key for key in _DISTINGUISHING if key in differ]
     chosen: list[tuple[str, ...]] = [()] * len(groups)

@@ -40,7 +40,7 @@ from mjx_revolve.view.sensor_plots import plot_sensors
 from mjx_revolve.view.statistics import COVERAGE
 from mjx_revolve.view.swim_picture import draw_motion
 
-GENERATOR = "mjx_revolve.report"  # tells our pages from others
+GENERATOR = "mjx_revolve.report"  # identifies pages of this package
 
 
 def _make_templates() -> jinja2.Environment:
@@ -220,7 +220,7 @@ def _replay(
             try:
                 if record.population is not None:
                     fitness = fit_body(record.config, _champions_body(record, record.config))
-                # The seed is all that differs within a group, and the fitness does not know it.
+                # Runs of a group differ in their seed only, and a fitness does not depend on it.
                 fitness = make_fitness(record.config) if fitness is None else fitness
                 known = record.info.get("model_hash")
                 alike = record.population is not None or not isinstance(known, str)

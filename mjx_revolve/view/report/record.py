@@ -49,7 +49,7 @@ class Problem:
 
 @dataclass
 class RunRecord:
-    """What could be read of a run.
+    """A run as far as it could be read.
 
     Attributes:
         folder: the run folder.
@@ -91,7 +91,7 @@ class RunRecord:
 
     @contextmanager
     def noting_damage(self) -> Iterator[None]:
-        """What cannot be read in here is a problem rather than the end."""
+        """Turns errors of readers within the context into problems."""
         try:
             yield
         except UntrustedError as error:
@@ -144,14 +144,14 @@ class RunRecord:
 
     @property
     def fitness(self) -> str:
-        """What evolution goes by, with its unit: in a colony not what its champion's score is."""
+        """Name and unit of the fitness; in a colony it differs from its champion's score."""
         if self.history is not None:
             return COLONY_LABEL
         return f"fitness ({self.unit})" if self.unit else "fitness"
 
     @property
     def round(self) -> str:
-        """What its generations are called, one of them."""
+        """The word for a generation: "interval" in a colony."""
         return "generation" if self.history is None else "interval"
 
     @property
@@ -183,7 +183,7 @@ class RunRecord:
         return f"{self.label}: {self.state}: {'; '.join(p.text for p in self.problems)}"
 
 
-def number(value: Any) -> float | None:
+def number(value: object) -> float | None:
     """A finite number as a float; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None

@@ -19,7 +19,7 @@ from mjx_revolve.view.report.groups import RunGroup, differences
 from mjx_revolve.view.report.record import RunRecord, number
 from mjx_revolve.view.statistics import difference, interval
 
-_NONE = "–"
+_NO_VALUE = "–"
 # Stands behind the number of a champion that fails its passport.
 _FAILS = "✗"
 Cell = str | int
@@ -29,7 +29,7 @@ Cell = str | int
 def format_number(value: float | None, digits: int = 3) -> str:
     """A number to so many digits, with a true minus; `–` where there is none."""
     if value is None or not np.isfinite(value):
-        return _NONE
+        return _NO_VALUE
     return f"{value:.{digits}g}".replace("-", "−")
 
 
@@ -41,7 +41,7 @@ def _measure(record: RunRecord, name: str) -> float | None:
 def _score(record: RunRecord) -> str:
     score, std = (number(record.champion.get(key)) for key in ("score", "score_std"))
     if score is None or not record.is_finished:
-        return _NONE
+        return _NO_VALUE
     failed = record.passport is not None and record.passport.failed
     spread = "" if std is None else f" ± {format_number(std, 2)}"
     return format_number(score) + spread + (f" {_FAILS}" if failed else "")
@@ -157,7 +157,7 @@ def _task_table(members: Sequence[tuple[int, RunGroup]]) -> TaskTable:
     rows: list[list[Cell]] = []
     for index, group in members:
         scores = group.scores()
-        less = _NONE if group is first else str(difference(scores, first.scores()))
+        less = _NO_VALUE if group is first else str(difference(scores, first.scores()))
         measures = [[_measure(r, name) for r in group.records if r.is_finished] for name in known]
         rows.append([
             index, group.name, len(scores), str(interval(scores)),
@@ -174,7 +174,7 @@ def different_settings(groups: Sequence[RunGroup]) -> list[list[object]]:
     if not all(group.settings for group in groups):
         return []
     found = differences(groups).items()
-    return [[key, *(_NONE if value is None else value for value in row)] for key, row in found]
+    return [[key, *(_NO_VALUE if value is None else value for value in row)] for key, row in found]
 
 
 def runs_table(groups: Sequence[RunGroup]) -> tuple[list[str], list[list[Cell]]]:
@@ -191,11 +191,11 @@ def runs_table(groups: Sequence[RunGroup]) -> tuple[list[str], list[list[Cell]]]
         planned = record.setting("evolution.generations")
         short = isinstance(planned, int) and planned != record.generations
         rows.append([
-            k, record.label, _NONE if record.seed is None else record.seed,
+            k, record.label, _NO_VALUE if record.seed is None else record.seed,
             f"{record.generations} of {planned}" if short else record.generations, _score(record),
             *(format_number(_measure(record, name)) for name in known),
-            _NONE if seconds is None else f"{seconds / 60:.1f}",
-            str(record.stand_in or record.champion.get("origin", _NONE))[:60],
+            _NO_VALUE if seconds is None else f"{seconds / 60:.1f}",
+            str(record.stand_in or record.champion.get("origin", _NO_VALUE))[:60],
             record.state or "whole",
         ])  # fmt: skip
     return header, rows
@@ -243,7 +243,7 @@ def _edges(size: Iterable[float], digits: int = 3) -> str:
 def list_descriptors(morphology: Morphology) -> list[list[str]]:
     """Rows of a robot's descriptors: name, value, unit."""
     return [
-        [name.replace("_", " "), format_number(value, 4), UNITS[name].replace("-", _NONE)]
+        [name.replace("_", " "), format_number(value, 4), UNITS[name].replace("-", _NO_VALUE)]
         for name, value in morphology.descriptors.items()
     ]
 

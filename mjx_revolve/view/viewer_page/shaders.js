@@ -1,6 +1,6 @@
 // Shaders. World frame with z up, metres; colours are linear until `finish`.
 //
-// What the physics knows is drawn as it is: the surface stands where the world's waves put it, dust
+// Quantities of the simulation are drawn as they are: the surface has the height of the world's waves, dust
 // drifts with the current and circles with the waves. Ripples (normals only), caustics, shafts of
 // light and haze are decoration: they give scale and depth and say nothing about the simulation.
 
