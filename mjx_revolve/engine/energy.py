@@ -147,9 +147,9 @@ def _powers(
         roots, moved = zip(*motions, strict=True)
         found = [_on_bodies(tree.world, tree.root, roots, water, thrusts)]
         below = zip(*moved, before.angle, before.speed, end.speed, targets, strict=True)
-        for level, (first, second, *hinge) in zip(tree.below, below, strict=True):
+        for level, (first, second, angle, *speeds, target) in zip(tree.below, below, strict=True):
             found.append(_on_bodies(tree.world, level, (first[0], second[0]), water, thrusts))
-            found.append(_at_hinges(level, *hinge, dt))
+            found.append(_at_hinges(level, angle, (speeds[0], speeds[1]), target, dt))
         sums: dict[str, jax.Array] = {}
         for name, x in (item for each in found for item in each.items()):
             bodies = np.shape(x)[0] if np.ndim(x) else 1
@@ -214,13 +214,14 @@ def _on_bodies(
 
 
 def _at_hinges(
-    level: Level, angle: Scalar, before: Scalar, after: Scalar, target: Scalar, dt: float
+    level: Level, angle: Scalar, speeds: tuple[Scalar, Scalar], target: Scalar, dt: float
 ) -> dict[str, Scalar]:
     """Of servos, friction and end stops, `[nbody, lanes]` each [J, W].
 
-    `before`, `after`: speeds at the step's ends.
+    `speeds`: at the step's beginning and at its end.
     """
-    hinges, mean = level.hinges, (before + after) / 2
+    hinges, (before, after) = level.hinges, speeds
+    mean = (before + after) / 2
     assert hinges is not None
     servo = motor_torque(hinges, angle, after, target, dt) * mean
     stop, _ = end_stop(hinges, angle, after, dt)
