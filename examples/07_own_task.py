@@ -21,7 +21,8 @@ task = Task(circle, "1/s")  # `records=("joints",)` would add joint angles to th
 if __name__ == "__main__":
     import jax
 
-    fitness = make_fitness("lake_swim", **{"task.type": f"{__file__}:task", "task.duration": 4.0})
+    own = {"task.type": f"{__file__}:task", "task.duration": 4.0, "task.horizon": None}
+    fitness = make_fitness("lake_swim", **own)
     genes = np.random.default_rng(0).normal(0, 0.5, (64, fitness.num_genes))
     scores, measures = fitness.evaluate(genes, jax.random.key(0))
     print(f"best of 64 random gaits: {scores.max():.3f} turns/s; measures: {', '.join(measures)}")

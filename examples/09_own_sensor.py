@@ -9,7 +9,7 @@ settings = {
     "task.duration": 4.0,
     "task.trials": 1,
     "controller.type": "mlp",
-    "controller.harmonics": 1,  # of the sines that this replaces
+    "controller.gain": 2.0,  # the default: that of the oscillators that this replaces is another
     "controller.hidden": 8,
     "controller.sensors": [
         {"type": "angle"},

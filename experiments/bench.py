@@ -343,7 +343,7 @@ def start(row: Row, threads: int) -> Result:
         "case": row.engine,
         "physics": row.physics,
         "robot": str(ROOT / "morphologies" / f"{row.robot}.yaml"),
-        "config": str(ROOT / "configs" / "lake_swim.yaml"),
+        "config": str(ROOT / "experiments" / "sine_swim.yaml"),
         "population": max(1, row.population // len(cores)),
         "threads": threads,
         "limits": row.limits,

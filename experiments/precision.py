@@ -75,7 +75,7 @@ class Case:
     name: str
     robot: str
     settings: dict[str, Any]
-    config: str = "lake_swim"
+    config: str = "experiments/sine_swim"
     beside: bool = False
     mjx: bool = False
     steps: tuple[float, ...] = (0.025, 0.01, 0.005, 0.0025)
@@ -192,7 +192,7 @@ class Ours:
             "controller.rate": float(_RATE), "task.duration": self.duration, "task.settle": 0.0,
             "task.start_tilt": 0.0, "world.timestep": step,
         }  # fmt: skip
-        config = load_config(str(ROOT / "configs" / f"{case.config}.yaml"), overrides=overrides)
+        config = load_config(str(ROOT / f"{case.config}.yaml"), overrides=overrides)
         if case.robot:
             return make_fitness(config), ()
         mixed = make_mixed_fitness(config, self.bodies, hinges=16)

@@ -1,7 +1,7 @@
 """What a champion's speed owes to each law of the water, and how far it hangs on uncertain numbers.
 
 ``python -m experiments.sensitivity RUN [--out DIR]``, with RUN the finished run of a task that has
-a direction, such as `configs/lake_swim.yaml`. The same gait swims with each law switched off or
+a direction, such as `experiments/sine_swim.yaml`. The same gait swims with each law switched off or
 replaced, and in MuJoCo C with both of its own fluid laws; then with coefficients, motors and starts
 varied by what is not known of them. `docs/sensitivity.md` discusses the result.
 """
@@ -421,7 +421,7 @@ def results_of(
 def main(argv: list[str] | None = None) -> int:
     """Swims all cases, prints the tables, writes `sensitivity.png`."""
     parser = make_parser("sensitivity", "What each law is worth, and what is uncertain.")
-    parser.add_argument("run", metavar="RUN", help="folder of a run of configs/lake_swim.yaml")
+    parser.add_argument("run", metavar="RUN", help="folder of a run of experiments/sine_swim.yaml")
     parser.add_argument(
         "--robust", metavar="RUN", help="folder of the same with task.robust=true, to stand beside"
     )

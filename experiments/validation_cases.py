@@ -35,7 +35,7 @@ from mjx_revolve.water.plates import LiftDrag
 from mjx_revolve.water.world import load_world
 
 RHO, G = 999.1026, 9.81
-# A champion of configs/lake_swim.yaml, seed 0, rounded: a spider that swims.
+# A champion of experiments/sine_swim.yaml, seed 0, rounded: a spider that swims.
 SWIMMER = (
     0.14, 1.48, 0.26, 2.48, -1.6, 0.09, 1.6, 2.47, -1.7, -1.22, -1.65, -0.71, -0.54, 2.73, 0.24,
     1.56, 2.98, 4.73, 0.55, -3.75, 2.09, 2.15, 0.63, -0.22, 3.42, -1.49, 1.45, -3.6, -0.67, 0.03,
@@ -518,10 +518,10 @@ def gradients() -> Result:
 
 
 def converging() -> Result:
-    """Where a swimming spider is after 10 s, at the step of configs/lake_swim.yaml and at half."""
+    """Where a swimming spider is after 10 s, at the step of sine_swim.yaml and at half."""
     from mjx_revolve import make_fitness
 
-    ends, path = {}, ROOT / "configs" / "lake_swim.yaml"
+    ends, path = {}, ROOT / "experiments" / "sine_swim.yaml"
     with jax.enable_x64(True):
         for step in (0.005, 0.0025):
             fitness = make_fitness(path, **{"world.timestep": step})

@@ -77,7 +77,7 @@ class PopulationEngine:
         """The state after a step, and the power of servos and ideal propellers [W]."""
         tree = self._tree
         dt = tree.world.timestep
-        targets, command, thrusts, pumped = _actuate(self.tree, state, ctrl)
+        targets, command, thrusts, pumped = actuate(self.tree, state, ctrl)
         # The whole step is seen from the uniform current: there, no current is left.
         relative = state._replace(velocity=vsub(state.velocity, water.current))
         qacc, power, submerged, clearance = accelerate(
@@ -144,10 +144,10 @@ class PopulationEngine:
         self, state: State, ctrl: Float[Array, "n lanes"], water: Water
     ) -> tuple[Vec, Vec]:
         """Force of the bed and of the water on whole robots; see `forces.external_force`."""
-        return forces.external_force(self._tree, state, water, _actuate(self.tree, state, ctrl)[2])
+        return forces.external_force(self._tree, state, water, actuate(self.tree, state, ctrl)[2])
 
 
-def _actuate(tree: Tree, state: State, ctrl: jax.Array) -> tuple[Any, Any, Any, Scalar]:
+def actuate(tree: Tree, state: State, ctrl: jax.Array) -> tuple[Any, Any, Any, Scalar]:
     """Targets of the servos, then the thrusters' commands, thrusts and power."""
     count = tree.thrusters.count
     hinges = ctrl.shape[0] - count
@@ -244,7 +244,7 @@ def acceleration(
     """
     state = init(tree, qpos, qvel)._replace(qacc_prev=(), submerged=())
     # As in mj_forward, a command has not passed the thruster's lag yet.
-    targets, _, thrusts, _ = _actuate(tree, state, ctrl)
+    targets, _, thrusts, _ = actuate(tree, state, ctrl)
     relative = state._replace(velocity=vsub(state.velocity, water.current))
     (linear, angular, hinges), *_ = accelerate(tree, relative, targets, water, thrusts, 0.0)
     rotation = quat_to_mat(state.quat)

@@ -88,7 +88,9 @@ def servo(
     return torque, jnp.maximum(implicit, yielding)
 
 
-def motor_torque(hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar) -> Scalar:
+def motor_torque(
+    hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar, dt: float = 0.0
+) -> Scalar:
     """Torque of the motors now, not what an implicit step makes of it, without joints' friction.
 
     Args:
@@ -96,11 +98,12 @@ def motor_torque(hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar) -
         angle: `[nbody, lanes]` [rad].
         speed: of the joints [rad/s].
         target: of the servos [rad].
+        dt: since the angle was so, for what is taken at the end of a step [s].
 
     Returns:
         The torque [N·m].
     """
-    torque, _ = servo(hinges, angle, speed, target, 0.0, 1.0, 0.0)
+    torque, _ = servo(hinges, angle, speed, target, dt, 1.0, 0.0)
     # Beyond the top speed that torque brakes; a motor has no more than its effort.
     return jnp.clip(torque, *(_cast(x, torque) for x in hinges.effort))
 

@@ -235,20 +235,23 @@ class EpisodeSpec(ABC, Generic[B]):
     def _jitted(self) -> Any:
         return self.keep(self._score, "score")
 
-    def keep(self, fun: Callable[..., PyTree], name: str, *more: object) -> StoredProgram:
+    def keep(
+        self, fun: Callable[..., PyTree], name: str, *more: object, fast: bool = False
+    ) -> StoredProgram:
         """A compiled function of this specification, kept on disk unless a user's code is in it.
 
         Args:
             fun: the function.
             name: unique in this specification.
             *more: further values that it depends on.
+            fast: as of `xla.jit`.
         """
         config = self.config
         if config.task.is_user_code or config.controller.is_user_code:
-            return StoredProgram(fun, None)
+            return StoredProgram(fun, None, fast)
         settings = config.task.model_dump_json(), config.controller.model_dump_json()
         made_of = name, settings, config.engine, self.world, self._bodies_key, more
-        return StoredProgram(fun, made_of)
+        return StoredProgram(fun, made_of, fast)
 
     @property
     @abstractmethod

@@ -36,22 +36,23 @@ _log = logging.getLogger(__name__)
 class StoredProgram:
     """`xla.jit` of a function with its executables kept beside JAX's compilation cache."""
 
-    def __init__(self, fun: Callable[..., PyTree], made_of: object) -> None:
+    def __init__(self, fun: Callable[..., PyTree], made_of: object, fast: bool = False) -> None:
         """Compiles nothing yet.
 
         Args:
             fun: takes pytrees of arrays; returns tuples and dictionaries of arrays.
             made_of: all values besides the arguments that `fun` depends on, picklable; None if they
                 are not all known: then nothing is kept.
+            fast: as of `xla.jit`.
         """
-        self._jitted = jit(fun)
-        self._made_of = made_of
+        self._jitted = jit(fun, fast=fast)
+        self._made_of = made_of, fast
         self._found: dict[Any, Any] = {}
 
     def __call__(self, *args: PyTree) -> PyTree:
         """Calls it."""
         folder = runtime.program_folder()
-        if self._made_of is None or folder is None or not on_cpu():
+        if self._made_of[0] is None or folder is None or not on_cpu():
             return self._jitted(*args)
         args = jax.tree.map(jax.numpy.asarray, args)
         leaves, tree = jax.tree.flatten((args, {}))

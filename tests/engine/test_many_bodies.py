@@ -250,7 +250,7 @@ def test_a_trajectory_is_that_of_the_body_alone():
 @pytest.fixture(scope="module")
 def config():
     return load_config(
-        ROOT / "configs" / "lake_swim.yaml",
+        ROOT / "experiments" / "sine_swim.yaml",
         overrides={"task.duration": 1.0, "task.settle": 0.2, "trim": "none"},
     )
 
