@@ -56,6 +56,6 @@ def test_what_a_user_prints_is_short():
     assert len(repr(body)) < 100 and len(repr(trajectory)) < 200
     fitness = repr(make_fitness(config))
     assert fitness.startswith("Fitness(directed_swim in lake, Morphology('spider'")
-    assert fitness.endswith(", 99 genes)")
+    assert fitness.endswith(", 195 genes)")
     mixed = repr(make_mixed_fitness("smoke", [body]))
     assert mixed.startswith("MixedFitness(") and len(mixed) < 100
