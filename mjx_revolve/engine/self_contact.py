@@ -119,7 +119,9 @@ def contact_acceleration(
     wanted = (clearance < 0) & (meetings.count > 0)
     size = min(_ROBOTS, lanes)
     most = -(-lanes // size)
-    start = jnp.zeros((rows, lanes), dtype), clearance
+    # One array: XLA:CPU aborts over a loop of which a part is not used, as a clearance that a caller
+    # leaves out of its results would be.
+    start = jnp.concatenate([jnp.zeros((rows, lanes), dtype), clearance[None]])
 
     def look() -> Any:
         room = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
@@ -131,21 +133,21 @@ def contact_acceleration(
             bodies, make_respond = look_at(which)
             table = _find_contacts(meetings, which, real, bodies, dt)
 
-            def resolve(total: jax.Array) -> jax.Array:
+            def resolve() -> jax.Array:
                 contacts = _Contacts(table, len(bodies.now.position[0]), dt)
-                return _put(total, contacts.solve(make_respond(), rows), which, real)
+                return contacts.solve(make_respond(), rows)
 
             touches = table.need[0] > 0
             for j in range(1, _MOST):
                 touches = touches | (table.need[j] > 0)
-            total, left = found
-            total = jax.lax.cond(any_lane(touches), resolve, lambda x: x, total)
-            return total, _put(left[None], table.clear[None], which, real)[0]
+            none = jnp.zeros((rows, size), dtype)
+            solved = jax.lax.cond(any_lane(touches), resolve, lambda: none)
+            return _put(found, jnp.concatenate([solved, table.clear[None]]), which, real)
 
         return _repeat(-(-count // size), most, visit, start, steady)
 
-    found: tuple[jax.Array, jax.Array] = jax.lax.cond(any_lane(wanted), fuse(look), lambda: start)
-    return found
+    found: jax.Array = jax.lax.cond(any_lane(wanted), fuse(look), lambda: start)
+    return found[:-1], found[-1]
 
 
 def _put(into: jax.Array, columns: jax.Array, which: jax.Array, real: jax.Array) -> jax.Array:

@@ -296,7 +296,9 @@ def test_scores_are_those_of_each_body_alone(config, fitness, tmp_path):
     # Nor on whether they all happen to have its body.
     snakes = fitness([robots[1]] * 5, swapped.at[1:].set(0.0), key)
     assert np.asarray(snakes)[0] == np.asarray(scores)[1]
-    assert np.asarray(fitness([robots[1]], swapped[:1], key))[0] == np.asarray(scores)[1]
+    # One individual by itself is another program, in which XLA may round the score otherwise.
+    lonely = np.asarray(fitness([robots[1]], swapped[:1], key))[0]
+    assert lonely == pytest.approx(np.asarray(scores)[1], rel=3e-7)
 
 
 @pytest.mark.long
