@@ -57,8 +57,7 @@ class Assembly:
         effort: `[nbody]` largest torque of the servo [N·m].
         speed: `[nbody]` its top speed [rad/s].
         damping: `[nbody]` friction of the hinge [N·m·s/rad].
-        stiffness: `[nbody]` of the servo's spring that MuJoCo's Euler step takes [N·m/rad].
-        implicit_stiffness: `[nbody]` the rest of it, which only an implicit step takes [N·m/rad].
+        stiffness: `[nbody]` of the servo [N·m/rad].
         fluid: tables of the parts.
         thruster_row: `[nthruster]` their parts.
     """
@@ -84,7 +83,6 @@ class Assembly:
     speed: np.ndarray
     damping: np.ndarray
     stiffness: np.ndarray
-    implicit_stiffness: np.ndarray
     fluid: FluidTable
     thruster_row: np.ndarray
 
@@ -195,10 +193,6 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
     speed = np.array([1.0 if h is None else h.speed for h in hinges])
     axis = np.array([(0.0, 0.0, 1.0) if h is None else h.axis for h in hinges])
     damping = FRICTION * effort / speed
-    whole = effort / FULL_TORQUE_ERROR
-    explicit = np.minimum(
-        whole, _most_stiffness(mass, center, inertia, axis, damping, world.timestep)
-    )
     pushing = np.array([part.thruster is not None for part in layout.parts])[layout.kind]
     return Assembly(
         morphologies=tuple(morphologies),
@@ -219,8 +213,10 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
         effort=effort,
         speed=speed,
         damping=damping,
-        stiffness=explicit,
-        implicit_stiffness=whole - explicit,
+        stiffness=np.minimum(
+            effort / FULL_TORQUE_ERROR,
+            _most_stiffness(mass, center, inertia, axis, damping, world.timestep),
+        ),
         fluid=make_fluid_table(layout, carrier, place, turn, world),
         thruster_row=np.flatnonzero(pushing),
     )
@@ -274,12 +270,12 @@ def _most_stiffness(
     damping: np.ndarray,
     dt: float,
 ) -> np.ndarray:
-    """`[nbody]` the stiffest springs of servos that an explicit step of the limb takes.
+    """`[nbody]` the stiffest servos that suit the limb that they move and the time step.
 
     MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d implicitly;
-    it is well damped while k dt² is at most 1.7 (I + d dt). Only hinges that carry next to nothing
-    have stiffer servos.
+    it is well damped while k dt² is at most 1.5 (I + d dt). Only hinges that carry next to nothing
+    are touched.
     """
     about = np.sum(axis * turned(inertia + _steiner(mass, center), axis), 1)
-    most: np.ndarray = 1.7 * (about / dt**2 + damping / dt)
+    most: np.ndarray = 1.5 * (about / dt**2 + damping / dt)
     return most

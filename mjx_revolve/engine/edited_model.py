@@ -85,16 +85,11 @@ def edited_constants(
         return filled(old[0], new[:, 0]), filled(old[1], new[:, 1])
 
     ours = constants.hinges
-    stiffness = filled(ours.stiffness, -model.actuator_biasprm[act, 1])
     hinges = ours._replace(
         armature=filled(ours.armature, model.dof_armature[dof]),
         damping=filled(ours.damping, model.dof_damping[dof]),
         gain=filled(ours.gain, model.actuator_gainprm[act, 0]),
-        stiffness=stiffness,
-        # An edited servo is as stiff as the model says.
-        implicit_stiffness=np.where(
-            stiffness == ours.stiffness, np.asarray(ours.implicit_stiffness, float), 0.0
-        ),
+        stiffness=filled(ours.stiffness, -model.actuator_biasprm[act, 1]),
         servo_damping=filled(ours.servo_damping, -model.actuator_biasprm[act, 2]),
         effort=pair(ours.effort, effort),
         target=pair(ours.target, target),
