@@ -135,14 +135,14 @@ def main(argv: list[str] | None = None) -> int:
     seeds: set[int] = set()
     for name in arguments.robots.split(","):
         path = folder / f"{name}.jsonl"
-        lines = path.read_text().splitlines() if path.exists() else []
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         rows = [json.loads(line) for line in lines]
         done = {row["seed"] for row in rows}
         for seed in range(arguments.cases):
             if seed in done:
                 continue
             rows.append(_case(name, seed))
-            with path.open("a") as file:
+            with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(rows[-1]) + "\n")
             words = ", ".join(f"{v['name']} {v['value']:.4g} ({v['true']:.4g})"
                               for v in rows[-1]["values"])  # fmt: skip

@@ -102,8 +102,8 @@ def energy_balance(
         variation: factors on coefficients, a number each; None for none.
 
     Returns:
-        The balance; None where it cannot be had from a trajectory: in water whose velocity varies
-        in space, which has energy of its own to give, and with drag laws that have a memory.
+        The balance; None where it cannot be had from a trajectory: in water with a velocity that
+        varies in space, which has energy of its own to give, and with drag laws that have a memory.
     """
     tree = make_single_tree(robot)
     if not is_uniform(tree.world) or any(p.laws.memory for level in tree.all for p in level.parts):

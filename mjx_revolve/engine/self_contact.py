@@ -119,8 +119,8 @@ def contact_acceleration(
     wanted = (clearance < 0) & (meetings.count > 0)
     size = min(_ROBOTS, lanes)
     most = -(-lanes // size)
-    # One array: XLA:CPU aborts over a loop of which a part is not used, as a clearance that a caller
-    # leaves out of its results would be.
+    # One array: XLA:CPU aborts over a loop of which a part is not used, as the clearance would be
+    # where a caller returns positions only.
     start = jnp.concatenate([jnp.zeros((rows, lanes), dtype), clearance[None]])
 
     def look() -> Any:

@@ -177,7 +177,8 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
     """Angles at which hinges end: their range, less where their own neighbours would meet.
 
     Neighbours are the parts of the rigid body that carries the hinge and of the one that it
-    carries, but for those of one module and those that overlap at rest by more than `REST_OVERLAP`.
+    carries, but for those of one module and those that overlap or touch at rest: boxes that stand
+    end to end at a hinge, as in models of chains, stand for shapes that let it turn.
 
     Args:
         assembly: of a robot, or of several.
@@ -199,7 +200,7 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
     pairs = pairs[near]
     if not len(pairs):
         return stops
-    pairs = pairs[part_gaps(assembly, pairs) > -REST_OVERLAP]
+    pairs = pairs[part_gaps(assembly, pairs) > REST_OVERLAP]
     hinge = body[pairs[:, 1]]
 
     axis, origin, up = assembly.axis[hinge], assembly.position[hinge], assembly.rotation[hinge]

@@ -420,7 +420,7 @@ def _energy(
     fitness: Fitness, trajectory: Trajectory, key: jax.Array
 ) -> Iterator[tuple[str, Check]]:
     """Whether what the motors give in one episode, drawn by the key, is found again."""
-    if fitness.config.engine != "population":  # whose forces the balance is made of
+    if fitness.config.engine != "population":  # the balance is made of its forces
         return
     water, variation = fitness.water(key) or water_of(fitness.world), fitness.variation(key)
     rows = trajectory.qpos, trajectory.qvel, trajectory.ctrl, trajectory.command

@@ -392,7 +392,7 @@ class Estimate:
 
     Attributes:
         offsets: `[P]` of the free numbers from the priors' medians.
-        ends: `[P, 2]` of their intervals, likewise.
+        ends: `[P, 2]` of their intervals, from the same medians.
         covariance: `[P, P]` of them.
         information: `[P, P]` what the data alone say, windows' and recordings' own numbers unknown.
         local: `[R, L]`, and

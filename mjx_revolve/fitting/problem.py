@@ -38,8 +38,8 @@ from mjx_revolve.inputs.schema import Integer, Number, checked
 _RECORD = 0.01
 # Steps of the differences by which derivatives are found. A servo reaches its limit at one step of
 # time or at the next one, so that motions jump a little as numbers grow: over a ten-thousandth such
-# a jump may pass for a slope. Free numbers are changed both ways by some hundredths, or a fifth of
-# what is not known of them; what is left of curvature is a ten-thousandth. Choices.
+# a jump may pass for a gradient. Free numbers are changed both ways by some hundredths, or a fifth
+# of what is not known of them; what is left of curvature is a ten-thousandth. Choices.
 _STEP, _FREE_STEP, _FREE_SHARE = 1e-3, 0.02, 0.2
 # The search begins with windows that are so many times shorter: a robot that tumbles for seconds
 # leads a search that begins far from its numbers astray. A choice.

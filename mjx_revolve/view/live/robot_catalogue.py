@@ -97,7 +97,9 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
     named = [(path, _kind(path)) for path in paths]
     sources = [path for path, kind in named if kind != "body"]
     config = _read_config(sources[0] if sources else _USUAL)
-    changes: dict[str, Any] = {"engine": "population", "task.duration": _WHILE}
+    changes: dict[str, Any] = {
+        "engine": "population", "task.duration": _WHILE, "task.horizon": None
+    }  # fmt: skip
     config = override_config(config, changes | ({} if world is None else {"world": world}))
     water = load_world(config.world_name, **config.world_overrides)
     drafts: list[_Draft] = []
