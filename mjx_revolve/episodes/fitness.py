@@ -56,7 +56,7 @@ from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import Starts, episode_context, pick_water
 from mjx_revolve.episodes.tasks import Task, find_task
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.xla import over_chunks
+from mjx_revolve.numerics.xla import materialize, over_chunks
 from mjx_revolve.water.drag import DRAG_LAWS, find_drag_law
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World, load_world
@@ -273,7 +273,9 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         return PopulationEngine(trees, bodies.plant)
 
     def _geometry(self, bodies: PackedBodies) -> BodyGeometry:
-        return bodies.figure
+        # In kernels of its own: of one individual, XLA:CPU would take the reciprocal of a length that
+        # is the same in all lanes, and round its score otherwise than beside others.
+        return jax.tree.map(materialize, bodies.figure)
 
     @property
     def _bodies_key(self) -> object:
