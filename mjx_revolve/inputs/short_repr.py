@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 _SHORT_REPR = reprlib.Repr()
 _SHORT_REPR.maxstring = _SHORT_REPR.maxother = 80
+_SHORT_REPR.maxtuple = 4
 
 
 def short_repr(value: DataclassInstance) -> str:

@@ -52,7 +52,7 @@ def test_what_a_user_prints_is_short():
     config = load_config("lake_swim")
     things = (body, water, robot, config, trajectory, episode, analyse_motion(robot, trajectory))
     assert {type(x).__name__: len(repr(x)) for x in things if len(repr(x)) > 900} == {}
-    assert len(repr(robot.fluid)) < 2100 and len(repr(robot.assembly)) < 2500
+    assert len(repr(robot.fluid)) < 2000 and len(repr(robot.assembly)) < 2500
     assert len(repr(body)) < 100 and len(repr(trajectory)) < 200
     fitness = repr(make_fitness(config))
     assert fitness.startswith("Fitness(directed_swim in lake, Morphology('spider'")
