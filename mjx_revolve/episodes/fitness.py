@@ -273,8 +273,8 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         return PopulationEngine(trees, bodies.plant)
 
     def _geometry(self, bodies: PackedBodies) -> BodyGeometry:
-        # In kernels of its own: of one individual, XLA:CPU would take the reciprocal of a length that
-        # is the same in all lanes, and round its score otherwise than beside others.
+        # In kernels of its own: of one individual, XLA:CPU would take the reciprocal of a length
+        # that is the same in all lanes, and round its score otherwise than beside others.
         return jax.tree.map(materialize, bodies.figure)
 
     @property
