@@ -217,6 +217,14 @@ def test_the_page_of_a_run(run, capsys):
     assert run_command(viewer.main, [str(run), "--time", "3"]) == 2
 
 
+def test_a_colony_begins_before_its_first_checkpoint(tmp_path):
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(SETTINGS))
+    _, _, search, begin = open_colony(tmp_path, 1.0)
+    assert begin == 1.0 and not search.members and search.generation == 0
+    with pytest.raises(InputError, match="expected a checkpoint that is whole; found none"):
+        open_colony(tmp_path)
+
+
 def test_other_runs_have_no_colony(tmp_path):
     plain = {"morphology": "spider", "world": "lake", "task": {"type": "speed"}}
     (tmp_path / "config.yaml").write_text(json.dumps(plain))

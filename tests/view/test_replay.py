@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import yaml
 from PIL import Image
 
 from laboratory import ROOT, WATER, body, world
@@ -512,23 +511,6 @@ def test_current_and_target_are_shown():
 
 # --- colonies -----------------------------------------------------------------------------------
 
-SETTINGS = {
-    "trim": "neutral",
-    "world": {"name": "empty_underwater", "bed": False, "drag": "ellipsoid", "timestep": 0.0125},
-    "controller": {"type": "sine"},
-    "task": {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 1, "depth": 1.0},
-    "bodies": {"max_modules": 4, "max_hinges": 1, "brains": {"inheritance": "darwinian"}},
-    "colony": {
-        "interval": 1.0,
-        "look": 0.5,
-        "arena": {"size": 2.5, "depth": 3.0},
-        "birth": {"radius": 1.0, "initial": 3, "least": 3},
-        "life": {"window": 1.0},
-    },
-    "evolution": {"population_size": 4, "generations": 1, "checkpoint_every": 1, "seed": 3},
-}
-
-
 @pytest.fixture(scope="module")
 def colony(spider):
     """One stays; one is put to the other side at 1 s; one is born at 1 s and dies at 2 s."""
@@ -631,19 +613,23 @@ def test_what_is_no_film_of_a_colony(arguments, words, capsys):
 
 
 @pytest.mark.slow
-def test_the_command_films_a_colony(way, tmp_path, capsys):
+def test_the_command_films_a_colony(colony, way, tmp_path, monkeypatch, capsys):
+    """Its recording is that of the page, see `test_colony_pictures`."""
+    asked = []
+    monkeypatch.setattr(
+        "mjx_revolve.view.colony.record_colony", lambda *given: asked.append(given) or colony
+    )
     run = tmp_path / "run"
     run.mkdir()
-    (run / "config.yaml").write_text(
-        yaml.safe_dump(SETTINGS)
-    )  # all that a colony's beginning needs
-    arguments = [str(run), "--colony", "--time", "1", "--duration", "2"]
+    (run / "config.yaml").touch()
+    arguments = [str(run), "--colony", "--time", "1", "--duration", "3"]
     arguments += ["--size", "160x120", "--fps", "5"]
     assert replay.main(arguments) == 0
-    assert "robots, 160 x 120" in capsys.readouterr().out
+    assert asked == [(run, 1.0, 3.0)]
+    assert "3 s, 3 robots, 160 x 120" in capsys.readouterr().out
     with av.open(str(run / "colony.mp4")) as file:
         stream = file.streams.video[0]
-        assert sum(1 for _ in file.decode(stream)) == 10
+        assert sum(1 for _ in file.decode(stream)) == 15
         assert (stream.width, stream.height) == SIZE
 
 
