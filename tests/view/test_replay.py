@@ -511,6 +511,7 @@ def test_current_and_target_are_shown():
 
 # --- colonies -----------------------------------------------------------------------------------
 
+
 @pytest.fixture(scope="module")
 def colony(spider):
     """One stays; one is put to the other side at 1 s; one is born at 1 s and dies at 2 s."""
