@@ -61,8 +61,12 @@ def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
     episode = load_episode("run")
     key = replay_key(0)
     champion = next(one for one in lived if one.genes == tuple(map(float, episode.genes)))
-    [(scores, _)] = score(executor, champion, key)
-    assert episode.fitness.judge(episode.trajectory, key)[0] == pytest.approx(scores[0], abs=1e-4)
+    [(scores, measures)] = score(executor, champion, key)
+    judged, found = episode.fitness.judge(episode.trajectory, key)
+    assert judged == pytest.approx(scores[0], abs=1e-4)
+    assert found.keys() == measures.keys()
+    for name, value in measures.items():
+        assert found[name] == pytest.approx(float(value[0]), rel=1e-3, abs=1e-4), name
 
 
 def score(executor, one, key):

@@ -296,14 +296,6 @@ def test_the_replay_scores_as_evolution_did(lab, copy):
     assert "the simulator has changed since, or files of the run have" in record.warning
 
 
-@pytest.mark.slow
-def test_judging_is_what_evolution_does(lab):
-    scores, measures = lab["fitness"].evaluate(GENES[None], replay_key(0))
-    assert lab["score"] == pytest.approx(float(scores[0]), rel=1e-4)
-    for name, value in measures.items():
-        assert lab["measures"][name] == pytest.approx(float(value[0]), rel=1e-3), name
-
-
 def test_genes_of_another_controller_are_refused(lab, copy):
     (copy / "champion" / "genes.yaml").write_text("genes: [1.0, 2.0]")
     with pytest.raises(InputError, match=r"genes: expected 3, as config.yaml has it; found 2"):
@@ -559,6 +551,8 @@ def test_text_is_escaped():
 
 @pytest.mark.slow
 def test_a_page_about_one_run(copy, quick, capsys):
+    earlier = f'<meta name="generator" content="{report_page.GENERATOR}">'
+    (copy / "report.html").write_text(earlier)  # its own page is replaced
     assert run_main("run") == 0
     captured = capsys.readouterr()
     assert captured.out.startswith("report: run/report.html (")
@@ -575,7 +569,7 @@ def test_a_page_about_one_run(copy, quick, capsys):
     assert len(page.images) == 6  # fitness, swim, way, joints, phases, energy
     assert "Not everything could be read" not in page.text
     assert len(text) < 2e6
-    assert run_main("run") == 0  # its own page is replaced
+    assert "✗" not in text  # there is no passport that it could fail
 
 
 @pytest.mark.slow
@@ -596,8 +590,6 @@ def test_a_champion_that_fails_its_passport_is_marked(copy, quick, capsys):
     path.write_text("checks: {a: 3}")
     record = read_run(copy)
     assert "expected words and a value; found 3" in record.problems[0].text
-    path.unlink()
-    assert run_main(copy) == 0 and "✗" not in (copy / "report.html").read_text()
 
 
 def test_the_command_prints_and_writes_a_passport(copy, monkeypatch, capsys):
@@ -642,9 +634,9 @@ def test_a_page_about_several_runs(lab, copy, quick, capsys):
 
 @pytest.mark.slow
 def test_every_champion_may_be_shown(lab, copy, quick):
-    runs_of = [lab["folder"] / f"s{seed}" for seed in range(3)]
+    runs_of = [lab["folder"] / f"s{seed}" for seed in range(2)]
     assert run_main(*runs_of, "--every-champion", "--out", "all.html") == 0
-    assert len(Page((copy.parent / "all.html").read_text()).images) == 3 + 3 * 5
+    assert len(Page((copy.parent / "all.html").read_text()).images) == 3 + 2 * 5
 
 
 def test_a_page_about_what_is_left(copy, quick, capsys):
@@ -697,12 +689,12 @@ def test_wrong_commands(copy, argv, message, capsys):
     assert (copy / "report.html").read_text() == "mine"
 
 
-@pytest.mark.slow
 def test_a_full_disk_is_one_line(copy, quick, capsys, monkeypatch):
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     monkeypatch.setattr(report, "write_atomic", full)
+    monkeypatch.setattr(report_page, "make_report", lambda *_: "a page")
     assert run_main("run", "--out", "page.html") == 1
     assert capsys.readouterr().err == "error: page.html: No space left on device\n"
 
