@@ -16,6 +16,7 @@ from laboratory import ROOT
 
 # What examples of other people's libraries need.
 LIBRARIES = ("gymnasium", "stable_baselines3", "ribs", "qdax")
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 

@@ -169,23 +169,6 @@ def make_troubled(config):
     return TroubledToy()
 
 
-class Weights:
-    """Bodies that are told apart: scores depend on what each of them weighs."""
-
-    num_genes = 2
-
-    def example_block(self):
-        return [1.0, 1.0], np.zeros((2, 2), np.float32)
-
-    def evaluate(self, weights, genes, key):
-        scores = jnp.asarray(weights) * jnp.sum(genes, 1) + jax.random.normal(key)
-        return scores, {"weight": jnp.asarray(weights)}
-
-
-def make_weights(config):
-    return Weights()
-
-
 def make_broken(config):
     """Can be built by the leader only."""
     if os.environ.get("TOY_LEADER") != str(os.getpid()):

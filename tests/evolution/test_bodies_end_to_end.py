@@ -39,6 +39,7 @@ def quick_compiles(monkeypatch):
 def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
     """Scores are those of each individual alone, to the bit, and the champion can be replayed."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda run, champion: None)
     (tmp_path / "small.yaml").write_text(json.dumps(CONFIG))
     argv = ["small.yaml", "--out", "run", "--workers", "1"]
     assert run_command(command.main, argv) == 0

@@ -117,28 +117,28 @@ def genes_of(fitness, size=0.7):
 
 def record(fitness, genes):
     """Readings of an episode and commands, robot's order, one row for each command of the brain."""
-    controller, engine = fitness.controller, fitness.engine
+    controller, engine, world = fitness.controller, fitness.engine, fitness.world
     key = jax.random.key(1)
-    parameters = controller.decode(jnp.asarray(genes)[:, None], engine.plant)
 
-    def policy(state, time, readings, _):
-        own, ctrl = controller.step(parameters, state[0], time, readings)
-        return (own, readings), ctrl
+    @jax.jit
+    def run(genes):
+        parameters = controller.decode(genes[:, None], engine.plant)
 
-    context = jax.tree.map(lambda x: jnp.asarray(x)[None], fitness.context(key))
-    world = fitness.world
-    rollout = Rollout(engine, policy, world, water_of(world), context, controller.signals)
-    start = fitness.starts(key)[0][:, :1]
-    state = engine.init(start, jnp.zeros((len(start) - 1, 1), start.dtype))
-    own = controller.init(parameters)
-    blank = rollout.read(rollout.init(state, own))[2]
-    begun = rollout.init(state, (own, jax.tree.map(jnp.zeros_like, blank)))
-    run = jax.jit(
-        lambda begun: rollout.advance(
-            begun, lambda now, ctrl, water: (now.controller_state[1], ctrl), fitness.num_timesteps
-        )[1]
-    )
-    readings, ctrl = jax.tree.map(np.asarray, run(begun))
+        def policy(state, time, readings, _):
+            own, ctrl = controller.step(parameters, state[0], time, readings)
+            return (own, readings), ctrl
+
+        context = jax.tree.map(lambda x: jnp.asarray(x)[None], fitness.context(key))
+        rollout = Rollout(engine, policy, world, water_of(world), context, controller.signals)
+        start = fitness.starts(key)[0][:, :1]
+        state = engine.init(start, jnp.zeros((len(start) - 1, 1), start.dtype))
+        own = controller.init(parameters)
+        blank = rollout.read(rollout.init(state, own))[2]
+        begun = rollout.init(state, (own, jax.tree.map(jnp.zeros_like, blank)))
+        keep = lambda now, ctrl, water: (now.controller_state[1], ctrl)  # noqa: E731
+        return rollout.advance(begun, keep, fitness.num_timesteps)[1]
+
+    readings, ctrl = jax.tree.map(np.asarray, run(genes))
     rows = due(fitness)
     ctrl = ctrl[..., 0][:, np.argsort(np.asarray(engine.plant.source)[:, 0])]
     return [jax.tree.map(lambda x, k=k: x[k], readings) for k in rows], ctrl[rows]
@@ -266,10 +266,16 @@ def test_in_double_precision_they_agree_to_rounding(kind, tmp_path, monkeypatch)
         genes, controller = genes_of(fitness).astype(np.float64), fitness.bare_controller()
         brain = champion_brain(fitness, genes)
         plant = plant_of(fitness.robot).at_rate(20.0)
-        parameters = controller.decode(jnp.asarray(genes)[:, None], plant)
-        blank = readings_at_rest(plant, 1, controller.signals)._replace(seen=jnp.ones(1, bool))
+
+        @jax.jit
+        def begin(genes):
+            parameters = controller.decode(genes[:, None], plant)
+            blank = readings_at_rest(plant, 1, controller.signals)
+            return parameters, controller.init(parameters), blank._replace(seen=jnp.ones(1, bool))
+
+        parameters, state, blank = begin(genes)
         draw, rows, expected = np.random.default_rng(5), [], []
-        state, step = controller.init(parameters), jax.jit(controller.step)
+        step = jax.jit(controller.step)
 
         def any_of(x, present=False):
             if x.dtype == bool:

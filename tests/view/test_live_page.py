@@ -390,8 +390,13 @@ def test_the_stock_of_a_run(tmp_path):
     assert catalogue.mixed.capacity.hinges >= 8
 
 
-def test_the_stock_of_configurations_and_bodies(tmp_path):
-    catalogue = load_catalogue(["snake", "lake_swim"], "empty_underwater")
+@pytest.fixture(scope="module")
+def catalogue():
+    """Of a body and a configuration, with all shipped bodies: that takes seconds."""
+    return load_catalogue(["snake", "lake_swim"], "empty_underwater")
+
+
+def test_the_stock_of_configurations_and_bodies(catalogue):
     names = [entry.name for entry in catalogue.entries]
     assert names[:3] == ["snake, a brain by chance", "snake, still", "spider, a brain by chance"]
     assert len(set(names)) == len(names)
@@ -462,8 +467,10 @@ def test_mistakes_end_in_one_line(monkeypatch, capsys, argv, said):
     assert error.startswith(f"error: {said}") and error.count("\n") == 1
 
 
-def test_a_port_that_is_taken(entries, served, monkeypatch, capsys):
+def test_a_port_that_is_taken(catalogue, served, monkeypatch, capsys):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    known = "mjx_revolve.view.live.robot_catalogue.load_catalogue"
+    monkeypatch.setattr(known, lambda *_: catalogue)
     port = str(served.server_address[1])
     assert run_command(live.main, ["snake", "--port", port]) == 1
     assert f"port {port}: " in capsys.readouterr().err
