@@ -29,7 +29,7 @@ def check_episode_files(arguments: argparse.Namespace) -> None:
         path = check_path(arguments.path)
         if path.is_dir():
             refuse_world(arguments.world, arguments.modules)
-            if arguments.individual is None and not getattr(arguments, "colony", False):
+            if arguments.individual is None and not arguments.colony:
                 _check_champion(RunReader(path).load_champion())
             return
         path = find_shipped(path, "morphologies")

@@ -147,6 +147,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         "--modules", type=read_path, metavar="MY.yaml",
         help="of a morphology: module types of your own (a run's are in its folder)",
     )  # fmt: skip
+    parser.set_defaults(colony=False)
     add_trust_argument(parser)
 
 

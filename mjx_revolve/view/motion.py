@@ -148,7 +148,7 @@ def analyse_motion(
     if task is not None and task.length == "stretched":
         length = body_geometry(robot).stretched
     weight = robot.morphology.mass * max(robot.world.gravity, 1e-9)
-    own = getattr(trajectory, "surface_height", None)  # what has none is in the world's water
+    own = trajectory.surface_height
     surface = np.full(count, robot.world.surface_height) if own is None else np.array(own)[:count]
     path, period = qpos[:, :3], stroke_period(time, qpos[:, 7:])
     net = path[-1, :2] - path[0, :2]

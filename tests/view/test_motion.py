@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mjx_revolve.episodes.config import TaskConfig
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.motion import (
     analyse_motion,
@@ -33,8 +33,8 @@ HEADING = 0.6
 
 def episode(robot, time, qpos, **columns):
     """A trajectory of a robot that is not told anything and needs no power."""
-    still = {"ctrl": np.zeros((len(time), robot.mj_model.nu)), "power": 0 * time, "command": None}
-    return SimpleNamespace(time=time, qpos=qpos, **still | columns)
+    still = {"ctrl": np.zeros((len(time), robot.mj_model.nu)), "power": 0 * time}
+    return Trajectory(time, qpos, qvel=None, xpos=None, **still | columns)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import matplotlib.image
 import mujoco
@@ -14,6 +13,7 @@ import pytest
 
 from laboratory import WATER, body, world
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.plots import figure_png
 from mjx_revolve.view.swim_picture import plot_swim, pose_scenes
@@ -36,7 +36,7 @@ def swim(robot, heading=0.0, depth=1.0, speed=SPEED):
 
 def trajectory(robot, time, qpos):
     ctrl = np.zeros((len(time), robot.mj_model.nu))
-    return SimpleNamespace(time=time, qpos=qpos, ctrl=ctrl, power=0 * time, command=None)
+    return Trajectory(time, qpos, qvel=None, xpos=None, ctrl=ctrl, power=0 * time)
 
 
 def draw(robot, trajectory):
@@ -192,9 +192,9 @@ def test_a_single_row_is_a_portrait(elbow):
 
 def test_another_robots_trajectory_is_refused(elbow):
     message = r"trajectory.qpos: expected \[300, 9\] \[T, nq\]; found \[300, 7\]"
-    wrong = SimpleNamespace(**{**vars(swim(elbow)), "qpos": np.zeros((300, 7))})
+    wrong = replace(swim(elbow), qpos=np.zeros((300, 7)))
     with pytest.raises(InputError, match=message):
         plot_swim(elbow, wrong)
-    wrong.qpos = np.full((300, 9), np.nan)
+    wrong = replace(wrong, qpos=np.full((300, 9), np.nan))
     with pytest.raises(InputError, match="expected finite numbers in its first row; found none"):
         plot_swim(elbow, wrong)
