@@ -71,10 +71,11 @@ def test_the_shipped_smoke_run_leaves_all_that_the_readme_promises(smoke):
 
 @pytest.mark.slow
 def test_a_stopped_run_resumed_equals_one_never_stopped(smoke, tmp_path):
-    """In processes of their own, which find the first one's programs in the cache."""
-    parts = tmp_path / "parts"
-    command("evolve", "configs/smoke.yaml", "--out", parts, "--set", "evolution.generations=2")
-    command("evolve", "--resume", parts, "--set", "evolution.generations=3")
+    """In processes without workers, which find the first one's programs in the cache."""
+    parts, alone = tmp_path / "parts", ("--workers", 1)
+    short = ("--set", "evolution.generations=2")
+    command("evolve", "configs/smoke.yaml", "--out", parts, *short, *alone)
+    command("evolve", "--resume", parts, "--set", "evolution.generations=3", *alone)
     assert metrics(parts) == metrics(smoke)
     np.testing.assert_array_equal(champion(parts), champion(smoke))
 
