@@ -144,6 +144,11 @@ def test_wrong_populations_are_refused(fitness):
         fitness(jnp.zeros((3, 4)), 1)
 
 
+def test_a_crawler_needs_a_bed(settings):
+    with pytest.raises(InputError, match="task.type: crawl expected a world with a bed; found"):
+        make_fitness(settings, **{"task.type": "crawl", "world": {"name": "lake", "bed": False}})
+
+
 def track(x, z=None, clearance=1.0, start=0.0, drift=0.0):
     """One individual that moves along x in steps of 1 s, in water that does, too [m/s]."""
     x = np.asarray(x, np.float32)
