@@ -66,7 +66,9 @@ def test_a_servo_is_as_stiff_at_every_step(timestep):
     """
     robot = build_robot(body("centipede"), load_world("lake", timestep=timestep))
     assembly = robot.assembly
-    assert assembly.stiffness[2:] == pytest.approx(assembly.effort[2:] / FULL_TORQUE_ERROR, rel=1e-12)
+    assert assembly.stiffness[2:] == pytest.approx(
+        assembly.effort[2:] / FULL_TORQUE_ERROR, rel=1e-12
+    )
     assert (assembly.implicit_stiffness[2:].max() > 0) == (timestep >= 0.005)
     for level in make_single_tree(robot, contact=False).below:
         hinges = level.hinges
