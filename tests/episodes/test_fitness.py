@@ -145,7 +145,7 @@ def test_wrong_populations_are_refused(fitness):
 
 
 def test_a_crawler_needs_a_bed(settings):
-    with pytest.raises(InputError, match="task.type: crawl expected a world with a bed; found"):
+    with pytest.raises(InputError, match=r"task\.type: crawl expected a world with a bed; found"):
         make_fitness(settings, **{"task.type": "crawl", "world": {"name": "lake", "bed": False}})
 
 
