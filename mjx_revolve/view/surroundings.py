@@ -82,10 +82,11 @@ def is_moving(current: np.ndarray) -> bool:
 
 def target_of(task: TaskConfig | None, trajectory: Trajectory) -> np.ndarray | None:
     """`[S, 3]` the target at each row of a trajectory, world frame [m]; None without one."""
-    found = trajectory.target
-    if found is None and task is not None and task.target is not None:
-        found = np.tile(np.asarray(task.target, float), (len(trajectory.time), 1))
-    return None if found is None else np.asarray(found, float)
+    if trajectory.target is not None:
+        return np.asarray(trajectory.target, float)
+    if task is None or task.target is None:
+        return None
+    return np.tile(np.asarray(task.target, float), (len(trajectory.time), 1))
 
 
 def target_at_last(task: TaskConfig | None, trajectory: Trajectory) -> np.ndarray | None:
