@@ -64,7 +64,8 @@ class FitSettings:
     """How a fit goes about it.
 
     Attributes:
-        window: length of a window [s].
+        window: length of a window [s]; those in which the motion is far from linear across what
+            is not known are cut.
         held_out: share of the recordings, or of each one's end where there are fewer than four,
             that nothing is fitted to.
         iterations: at most.
