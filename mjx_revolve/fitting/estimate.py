@@ -369,10 +369,10 @@ def _find_bent(problem: FitProblem, state: FitState, model: Model) -> np.ndarray
                 square = np.nansum(square, 1) * channel.fitted
                 own = np.bincount(where, square, len(bent))
                 bent[:, r] = np.maximum(bent[:, r], own)
-    return _halves(resets, bent > _BENT, problem.short)
+    return middles(resets, bent > _BENT, problem.short)
 
 
-def _halves(resets: np.ndarray, chosen: np.ndarray, short: np.ndarray) -> np.ndarray:
+def middles(resets: np.ndarray, chosen: np.ndarray, short: np.ndarray) -> np.ndarray:
     """`[K, R]` the middles of chosen windows of several pieces, where short ones may begin."""
     found = np.zeros(resets.shape, bool)
     for k, r in zip(*np.nonzero(chosen & resets), strict=True):
