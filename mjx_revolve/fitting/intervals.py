@@ -185,7 +185,7 @@ class _Profile:
         """Looks for where the cost has grown by quantile² / 2; yields points, is sent residuals.
 
         The end is bracketed and interpolated. At each place the others are brought to rest first,
-        by Newton's steps with the slopes at the best point.
+        by Newton's steps with the derivatives at the best point.
 
         Returns:
             The end, an offset of number k.
