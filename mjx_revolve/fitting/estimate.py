@@ -1,9 +1,8 @@
-"""The search for coefficients, and how sure they are: Levenberg-Marquardt, priors, Fisher's matrix.
+"""The search for coefficients: Levenberg-Marquardt, priors, Fisher's matrix.
 
 Residuals are weighted by the noise that is estimated on the way; single wild frames count less
 (Huber 1964). Windows' beginnings are eliminated one by one (Schur complements), so that cost grows
-with the length of a recording and not with its cube. Intervals are by profile likelihood, with the
-noise's own correlation in time.
+with the length of a recording and not with its cube.
 """
 
 from __future__ import annotations
@@ -12,27 +11,25 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
 
 from mjx_revolve.fitting.problem import NOISE, START, FitProblem, Point
 
-LEVEL = 0.95
-"""Of intervals."""
 # Residuals of more than so many standard deviations count less (Huber's 1.345 for pure noise costs
 # 5 % of the information; frames that a tracker lost lie far beyond 3). A choice.
 _HUBER = 3.0
 # The search ends when a step is below this share of each number's own uncertainty [-].
 _TOLERANCE = 0.02
-# With fewer measurements of a kind, their noise is what is usual: a wrong model would else pass for
-# noise; intervals are widened by what is left (Birge 1932). A choice.
-_FEW = 30
+FEW = 30
+"""With fewer measurements of a kind, their noise is what is usual: a wrong model would else pass
+for noise; intervals are widened by what is left (Birge 1932). A choice."""
 _LEAST_NOISE = 0.02  # of `NOISE`: no recording is better, and what was simulated has none at all
 # With short windows the search need not arrive, and makes so many steps at most. Choices.
 _SHORT_STEPS, _SHORT_TOLERANCE = 20, 0.1
+# A window is cut in two where, two standard deviations of some number away, its motion differs from
+# a linear one by so much of the cost, half a square of standard deviations. A choice: from there a
+# step or two of Newton's lead back to the least cost, and from beyond, they may lead anywhere.
+_BENT, _AWAY = 20.0, 2.0
 _LARGEST_STEP = 1.0  # in a logarithm, or in units of the prior
-# Rounds in which ends of intervals are looked for at most, by how much an end may move in one, and
-# by how much the last one moves them. Choices.
-_ROUNDS, _ROUND_FACTOR, _ROUND_TOLERANCE = 6, 2.0, 0.02
 
 
 class System(NamedTuple):
@@ -177,14 +174,15 @@ def step(problem: FitProblem, state: FitState, system: System) -> tuple[Point, f
     move = np.linalg.solve(damped, slope)
     limit = max(1.0, float(np.abs(move[:count]).max(initial=0.0)) / _LARGEST_STEP)
     move = move / limit
-    reached = _reached(problem, point, system, move, state.damping)
+    reached = reach(problem, point, system, move, state.damping)
     return reached, float(np.abs(move / spread)[:count].max(initial=0.0))
 
 
-def _reached(
-    problem: FitProblem, point: Point, system: System, move: np.ndarray, damping: np.ndarray
-) -> Point:
-    """Where a `[G]` move of the common numbers leads, windows' beginnings with it."""
+def reach(
+    problem: FitProblem, point: Point, system: System, move: np.ndarray, damping: np.ndarray,
+    share: float = 1.0,
+) -> Point:  # fmt: skip
+    """Where a `[G]` move of the common numbers leads, and a share of the windows' beginnings'."""
     count = len(problem.parameters)
     free = np.array(
         [p.bound(x) for p, x in zip(problem.parameters, point.free + move[:count], strict=True)]
@@ -192,7 +190,7 @@ def _reached(
     starts = point.starts.copy()
     for k, r, block, coupling, pull in system.starts:
         own = block + damping[k, r] * np.diag(np.diag(block))
-        starts[k, :, r] += np.linalg.solve(own, pull - coupling @ move)
+        starts[k, :, r] += share * np.linalg.solve(own, pull - coupling @ move)
     local = point.local + move[count:].reshape(point.local.shape)
     return Point(free, local, starts)
 
@@ -209,28 +207,12 @@ def estimate_noise(problem: FitProblem, values: list[np.ndarray], used: float) -
         x = np.concatenate(each)
         x = x[np.isfinite(x)]
         sigma = NOISE[kind]
-        if len(x) >= _FEW:
+        if len(x) >= FEW:
             # Clipped where Huber's weights begin, again and again.
             sigma = float(np.sqrt(np.mean(x**2)))
             for _ in range(8):
                 sigma = float(np.sqrt(np.mean(np.minimum(x**2, (_HUBER * sigma) ** 2))))
         found[kind] = max(sigma / np.sqrt(share), _LEAST_NOISE * NOISE[kind])
-    return found
-
-
-def _widened(
-    problem: FitProblem, values: list[np.ndarray], noise: dict[str, float]
-) -> dict[str, float]:
-    """The noise, of kinds with few measurements at least what is left of them."""
-    found = dict(noise)
-    for kind in noise:
-        pairs = zip(problem.channels, values, strict=True)
-        many = [left[c.fitted].ravel() for c, left in pairs if c.kind == kind]
-        x = np.concatenate(many)
-        x = x[np.isfinite(x)]
-        if 0 < len(x) < _FEW:
-            degrees = max(len(x) - len(problem.parameters), 1)
-            found[kind] = max(noise[kind], float(np.sqrt(np.sum(x**2) / degrees)))
     return found
 
 
@@ -352,10 +334,63 @@ def _costs(problem: FitProblem, points: list[Point], noise: dict[str, float]) ->
     return found
 
 
+def _find_bent(problem: FitProblem, state: FitState, model: Model) -> np.ndarray:
+    """`[K, R]` where windows are to begin anew, as the motion before is too far from linear."""
+    count, resets = len(problem.parameters), problem.drive.resets
+    system = normal_equations(problem, model, state.point, state.noise)
+    matrix = system.matrix.copy()
+    matrix[:count, :count] += prior_matrix(problem)
+    covariance = np.linalg.inv(matrix)
+    at_rest = system._replace(starts=[(*x[:4], 0 * x[4]) for x in system.starts])
+    points = []
+    for k in range(count):
+        move = _AWAY * covariance[:, k] / np.sqrt(covariance[k, k])
+        # The commands' clock is the first point's.
+        move[count:] = np.where(np.tile([n == "clock" for n in problem.local], len(resets[0])),
+                                0.0, move[count:])  # fmt: skip
+        points += [reach(problem, state.point, at_rest, x, 0.0 * resets) for x in (move, -move)]
+    bent = np.zeros(resets.shape)
+    room = problem.lanes
+    for first in range(0, len(points), room):
+        some = points[first : first + room]
+        left = problem.residuals(problem.simulate(some))
+        for channel, values, slopes, off in zip(
+            problem.channels, model.values, model.slopes, left, strict=True
+        ):
+            r = channel.recording
+            where = problem.window_of(r, channel.time)
+            for i, point in enumerate(some):
+                starts = (point.starts - state.point.starts)[where, :, r]
+                common = np.concatenate([point.free - state.point.free,
+                                         (point.local - state.point.local)[r]])  # fmt: skip
+                moved = np.concatenate([np.tile(common, (len(where), 1)), starts], 1)
+                linear = values + np.einsum("ndj,nj->nd", slopes, moved)
+                square = ((off[i] - linear) / state.noise[channel.kind]) ** 2 / 2
+                square = np.nansum(square, 1) * channel.fitted
+                own = np.bincount(where, square, len(bent))
+                bent[:, r] = np.maximum(bent[:, r], own)
+    return middles(resets, bent > _BENT, problem.short)
+
+
+def middles(resets: np.ndarray, chosen: np.ndarray, short: np.ndarray) -> np.ndarray:
+    """`[K, R]` the middles of chosen windows of several pieces, where short ones may begin."""
+    found = np.zeros(resets.shape, bool)
+    for k, r in zip(*np.nonzero(chosen & resets), strict=True):
+        later = np.flatnonzero(resets[k + 1 :, r] | ~short[k + 1 :, r])
+        length = int(later[0]) + 1 if len(later) else len(resets) - int(k)
+        if length > 1:
+            found[k + length // 2, r] = True
+    return found
+
+
 def advance(problem: FitProblem, state: FitState, model: Model) -> tuple[FitState, Model]:
     """One step of the search; the damping grows until a step lowers the cost."""
     if not state.inflated and state.moved < _TOLERANCE:
-        state = replace(state, inflated=True, damping=0 * state.damping, common=0.0)
+        cut = _find_bent(problem, state, model)
+        state = replace(state, inflated=not cut.any(), damping=0 * state.damping, common=0.0)
+        if cut.any():
+            problem.drive.resets[cut] = True
+            model = linearize(problem, state.point)
     system = normal_equations(problem, model, state.point, state.noise)
     plain = estimate_noise(problem, model.values, numbers_used(problem, system))
     # What errs together counts once: the prior then holds where the model errs, and not the frames.
@@ -384,131 +419,3 @@ def advance(problem: FitProblem, state: FitState, model: Model) -> tuple[FitStat
         common = 10 * state.common if state.common else 1e-2
         state = replace(state, damping=damping, common=common)
     return replace(state, iteration=state.iteration + 1, moved=0.0), model
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a fit has found.
-
-    Attributes:
-        offsets: `[P]` of the free numbers from the priors' medians.
-        ends: `[P, 2]` of their intervals, from the same medians.
-        covariance: `[P, P]` of them.
-        information: `[P, P]` what the data alone say, windows' and recordings' own numbers unknown.
-        local: `[R, L]`, and
-        local_spread: `[R, L]` their standard deviations.
-        noise: standard deviations by kind.
-        inflation: of variances, by correlation in time, by kind.
-    """
-
-    offsets: np.ndarray
-    ends: np.ndarray
-    covariance: np.ndarray
-    information: np.ndarray
-    local: np.ndarray
-    local_spread: np.ndarray
-    noise: dict[str, float]
-    inflation: dict[str, float]
-
-    def interval(self, problem: FitProblem, k: int) -> tuple[float, float, float]:
-        """Value, lower and upper end of a free number."""
-        low, high = self.ends[k]
-        middle, low, high = (problem.parameters[k].value(x) for x in (self.offsets[k], low, high))
-        return middle, low, high
-
-
-def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
-    """Values and their covariance at the end of a search."""
-    count = len(problem.parameters)
-    inflation = correlation(problem, model.values)
-    noise = _widened(problem, model.values, state.noise)
-    system = normal_equations(problem, model, state.point, noise)
-    whole = system.matrix.copy()
-    whole[:count, :count] += prior_matrix(problem)
-    covariance = np.linalg.inv(whole)
-    rest = system.matrix[count:, count:]
-    across = system.matrix[:count, count:]
-    alone = system.matrix[:count, :count]
-    if len(rest):
-        alone = alone - across @ np.linalg.solve(rest, across.T)
-    rows = sum(
-        np.isfinite(left[channel.fitted]).sum() / inflation[channel.kind]
-        for channel, left in zip(problem.channels, model.values, strict=True)
-    )
-    # Few data say little of their own noise; the priors bound what that can do.
-    degrees = max(float(rows) - numbers_used(problem, system), 4.0)
-    quantile = float(student.ppf((1 + LEVEL) / 2, degrees))
-    return Estimate(
-        state.point.free,
-        _profile(problem, state.point, model, system, noise, quantile),
-        covariance[:count, :count],
-        (alone + alone.T) / 2,
-        state.point.local,
-        np.sqrt(np.diag(covariance)[count:]).reshape(state.point.local.shape),
-        {kind: sigma / np.sqrt(inflation[kind]) for kind, sigma in state.noise.items()},
-        inflation,
-    )
-
-
-def _profile(
-    problem: FitProblem, best: Point, model: Model, system: System, noise: dict[str, float],
-    quantile: float,
-) -> np.ndarray:  # fmt: skip
-    """`[P, 2]` ends of intervals by profile likelihood (Venzon and Moolgavkar 1988), offsets.
-
-    A number's end is where the cost, least by all other numbers, has grown by quantile² / 2. All
-    ends are looked for at once, in lanes: each round moves a number to where its cost would have
-    grown so much if it grew as a square, and the others by the slopes at the best point.
-
-    Args:
-        problem: that was solved.
-        best: its solution.
-        model: the problem there.
-        system: normal equations there.
-        noise: standard deviations by kind, with correlation.
-        quantile: standard deviations from a number to its end if all were linear.
-    """
-    count, clock = len(problem.parameters), [n == "clock" for n in problem.local]
-    prior = np.zeros_like(system.matrix)
-    prior[:count, :count] = prior_matrix(problem)
-    still = np.zeros(problem.drive.resets.shape)
-    windows, rest = costs_of(problem, best, model.values, noise)
-    least = float(windows.sum()) + rest
-    covariance = np.linalg.inv(system.matrix + prior)
-    ways = [(k, side) for k in range(count) for side in (-1.0, 1.0)]
-    points = []
-    for k, side in ways:
-        move = covariance[:, k] * side * quantile / np.sqrt(covariance[k, k])
-        centred = system._replace(starts=[(*x[:4], 0 * x[4]) for x in system.starts])
-        points.append(_reached(problem, best, centred, move, still))
-    for _ in range(_ROUNDS):
-        tracks = problem.simulate(points)
-        left = problem.residuals(tracks)
-        moved = 0.0
-        for i, (k, _) in enumerate(ways):
-            values = [x[i] for x in left]
-            for c, channel in enumerate(problem.channels):
-                # All of them are simulated with the commands at the best point's clock.
-                late = (points[i].local - best.local)[channel.recording] * clock
-                own = model.slopes[c][..., count : count + len(clock)]
-                values[c] = values[c] + np.where(late, own * late, 0.0).sum(-1)
-            windows, rest = costs_of(problem, points[i], values, noise)
-            grown = max(float(windows.sum()) + rest - least, 1e-9)
-            factor = quantile / np.sqrt(2 * grown)
-            factor = min(max(factor, 1 / _ROUND_FACTOR), _ROUND_FACTOR)
-            moved = max(moved, abs(factor - 1))
-            there = replace(model, values=values)
-            now = normal_equations(problem, there, points[i], noise)
-            slope = now.slope.copy()
-            slope[:count] -= prior[:count, :count] @ points[i].free
-            move = np.zeros(len(slope))
-            move[k] = (factor - 1) * (points[i].free[k] - best.free[k])
-            others = np.arange(len(slope)) != k
-            matrix = now.matrix + prior
-            pull = slope[others] - matrix[others, k] * move[k]
-            move[others] = np.linalg.solve(matrix[np.ix_(others, others)], pull)
-            points[i] = _reached(problem, points[i], now, move, still)
-        if moved < _ROUND_TOLERANCE:
-            break
-    ends = np.array([p.free[k] for p, (k, _) in zip(points, ways, strict=True)])
-    return np.sort(ends.reshape(count, 2), 1)

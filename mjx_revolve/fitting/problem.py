@@ -64,7 +64,8 @@ class FitSettings:
     """How a fit goes about it.
 
     Attributes:
-        window: length of a window [s].
+        window: length of a window [s]; those in which the motion is far from linear across what
+            is not known are cut.
         held_out: share of the recordings, or of each one's end where there are fewer than four,
             that nothing is fitted to.
         iterations: at most.
@@ -342,6 +343,8 @@ def make_problem(
     servos_free = any(p.name.startswith("servo") for p in parameters)
     prescribed = _prescribed(recordings, hinges, servos_free)
     views = [_View(robot, r, hinges) for r in recordings]
+    for view in views:
+        view.check_frames(settings.window)
     begin = np.array([v.begin for v in views])
     end = np.array([v.end for v in views])
     held = _held_out(len(recordings), settings.held_out)
@@ -520,6 +523,16 @@ class _View:
         self.heading = self.quat
         # Without attitude, nothing says how to begin again.
         self.loose = self.quat is None
+
+    def check_frames(self, window: float) -> None:
+        """Refuses a recording of which a window has no two frames."""
+        usual = float(np.median(np.diff(self.time))) if len(self.time) > 2 else 0.0
+        if 2 * usual > window:
+            raise InputError(
+                f"{self.recording.name}: expected frames less than {window / 2:.3g} s apart, half "
+                f"a window; found {usual:.3g} s: milliseconds? (--map time=COLUMN*0.001; or longer "
+                f"windows, --set window={4 * usual:.3g})"
+            )
 
     def _fit_marks(self) -> None:
         """Poses from marks, where the core's own are not recorded."""

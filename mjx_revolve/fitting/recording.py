@@ -33,6 +33,8 @@ _SENSED = tuple(f"{kind}.{axis}" for kind in ("gyro", "accel") for axis in "xyz"
 _SOURCE = re.compile(r"^(?P<column>.*?)(?:\*(?P<factor>[-+0-9.eE]+))?$")
 # Faster than any robot of modules swims [body lengths/s]; wrong units are beyond it. A choice.
 _FASTEST = 30.0
+# And turns so fast [rad/s]: twice a second, noise of frames with it; degrees are beyond. A choice.
+_FASTEST_TURN = 4 * math.pi
 # A gap is longer than so many usual frames; one of two is a dropped frame. A choice.
 _GAP = 2.5
 
@@ -139,6 +141,10 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
             signals = _read_csv(path, rest, robot)
         signals, marks = _name_marks(signals, marks, robot)
         signals, notes = _check_signals(signals, robot)
+    silent = [m.name for m in robot.morphology.modules if m.kind.hinge or m.kind.is_thruster]
+    silent = [n for n in silent if not {f"command.{n}", f"angle.{n}"} & set(signals)]
+    if silent:
+        notes.append(f"no commands of {', '.join(silent)}: taken to be 0")
     return RobotRecording(path.stem, signals, marks, tuple(notes))
 
 
@@ -167,6 +173,8 @@ def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str,
     if not rows:
         raise InputError("expected a line of column names and rows of numbers; found an empty file")
     header = [cell.strip() for cell in rows[0]]
+    if len(header) == 1 and ";" in header[0]:
+        raise InputError("expected columns with commas between them; found semicolons")
     if len(rows) < 3:
         raise InputError(f"expected rows of numbers below the names; found {len(rows) - 1}")
     values = np.full((len(rows) - 1, len(header)), np.nan)
@@ -233,6 +241,9 @@ def _name_columns(
         if name == "time":
             raise InputError(f"--map time: expected a column; found the number {source}")
     modules = [m.name for m in robot.morphology.modules]
+    twice = [column for column in header if header.count(column) > 1]
+    if twice:
+        raise InputError(f"column {twice[0]}: expected each name once; found it twice")
     for k, column in enumerate(header):
         plain, factor = _unit(column)
         plain = {"t": "time"}.get(plain, plain)
@@ -443,8 +454,15 @@ def _check_signals(
                 f"qw, qx, qy, qz: expected unit quaternions; found length {length:.3g}"
             )
     for name in ("roll", "pitch", "yaw"):
-        if name in signals and np.ptp(np.diff(signals[name].value, prepend=0)) > 20 * math.pi:
-            raise InputError(f"{name}: expected radians; found steps of more: degrees? (_deg)")
+        if name in signals and len(signals[name].time) > 2:
+            time, angle = signals[name]
+            # Between quantiles: angles that are wrapped jump now and then.
+            rate = float(np.quantile(np.abs(np.diff(angle) / np.diff(time)), 0.75))
+            if rate > _FASTEST_TURN:
+                raise InputError(
+                    f"{name}: expected radians; found steps of {rate:.3g} a second: degrees? "
+                    f"(--map {name}=COLUMN*0.01745, or a column that ends in _deg)"
+                )
     _check_motion(signals, robot)
     return signals, _gaps({n: signals[n] for n in seen})
 

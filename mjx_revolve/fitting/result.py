@@ -12,17 +12,9 @@ import yaml
 
 from mjx_revolve.body.params import multiply_factors
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.fitting.estimate import (
-    LEVEL,
-    Estimate,
-    FitState,
-    Model,
-    advance,
-    begin,
-    estimate,
-    linearize,
-)
+from mjx_revolve.fitting.estimate import FitState, Model, advance, begin, linearize
 from mjx_revolve.fitting.identify import Unknown, find_unknown, is_found, plan_motions
+from mjx_revolve.fitting.intervals import LEVEL, Estimate, estimate
 from mjx_revolve.fitting.parameters import with_values
 from mjx_revolve.fitting.problem import FitProblem, FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording

@@ -207,6 +207,7 @@ class FitRun:
         arrays, meta = checkpoint.arrays, checkpoint.meta
         self.folder.rewind(checkpoint)
         self.problem.roots[:] = arrays["roots"]
+        self.problem.drive.resets[:] = arrays["resets"]
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
         names = ("common", "generation", "cost", "moved", "inflated")
         rest = (meta[name] for name in names)
@@ -218,7 +219,8 @@ class FitRun:
         assert state is not None
         point = state.point
         arrays = {"free": point.free, "local": point.local, "starts": point.starts,
-                  "damping": state.damping, "roots": self.problem.roots}  # fmt: skip
+                  "damping": state.damping, "roots": self.problem.roots,
+                  "resets": self.problem.drive.resets}  # fmt: skip
         meta = {"noise": state.noise, "common": state.common, "cost": state.cost,
                 "moved": min(state.moved, 1e30), "inflated": state.inflated}  # fmt: skip
         self.folder.save_checkpoint(state.iteration, arrays, meta, 2)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from mjx_revolve.fitting.estimate import LEVEL
+from mjx_revolve.fitting.intervals import LEVEL
 from mjx_revolve.fitting.problem import LOCAL_UNITS
 from mjx_revolve.fitting.result import Fit, Prediction
 from mjx_revolve.view.plots import BLUE, GREY, INK, ORANGE, WIDE, in_style, new_figure, thin
