@@ -33,6 +33,7 @@ from mjx_revolve.numerics.boxes import (
     BoxPair,
     box_contact,
     dot,
+    last_of,
     mat_t_vec,
     matvec,
     weight,
@@ -520,7 +521,7 @@ class _Contacts:
             for k in range(1, _MOST):
                 better.append(weight(missing[k] > worst, worst))
                 worst = jnp.maximum(worst, missing[k])
-            chosen = jnp.stack(_last_of(better)) * wanting
+            chosen = jnp.stack(last_of(better)) * wanting
             change = respond(self._spread(chosen))
             own = self._gather(change.bodies) + _SOFTNESS * chosen
             columns = (1 - chosen[:, None]) * columns + chosen[:, None] * own
@@ -551,15 +552,6 @@ class _Contacts:
 
 def _diagonal(columns: jax.Array) -> jax.Array:
     return jnp.stack([columns[k, k] for k in range(_MOST)])
-
-
-def _last_of(better: list[jax.Array]) -> list[jax.Array]:
-    """1 for the last of some things that was better than those before it, 0 for the others."""
-    share, left = [], jnp.ones_like(better[0])
-    for x in reversed(better):
-        share.append(left * x)
-        left = left * (1 - x)
-    return [left, *reversed(share)]
 
 
 def _sum(xs: list[jax.Array]) -> jax.Array:
