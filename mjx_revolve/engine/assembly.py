@@ -58,6 +58,8 @@ class Assembly:
         speed: `[nbody]` its top speed [rad/s].
         damping: `[nbody]` friction of the hinge [N·m·s/rad].
         stiffness: `[nbody]` of the servo [N·m/rad].
+        implicit_stiffness: `[nbody]` the part of it that is too stiff for an explicit step of the
+            limb [N·m/rad].
         fluid: tables of the parts.
         thruster_row: `[nthruster]` their parts.
     """
@@ -83,6 +85,7 @@ class Assembly:
     speed: np.ndarray
     damping: np.ndarray
     stiffness: np.ndarray
+    implicit_stiffness: np.ndarray
     fluid: FluidTable
     thruster_row: np.ndarray
 
@@ -193,6 +196,8 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
     speed = np.array([1.0 if h is None else h.speed for h in hinges])
     axis = np.array([(0.0, 0.0, 1.0) if h is None else h.axis for h in hinges])
     damping = FRICTION * effort / speed
+    stiffness = effort / FULL_TORQUE_ERROR
+    most = _most_explicit_stiffness(mass, center, inertia, axis, damping, world.timestep)
     pushing = np.array([part.thruster is not None for part in layout.parts])[layout.kind]
     return Assembly(
         morphologies=tuple(morphologies),
@@ -213,10 +218,8 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
         effort=effort,
         speed=speed,
         damping=damping,
-        stiffness=np.minimum(
-            effort / FULL_TORQUE_ERROR,
-            _most_stiffness(mass, center, inertia, axis, damping, world.timestep),
-        ),
+        stiffness=stiffness,
+        implicit_stiffness=np.maximum(stiffness - most, 0.0),
         fluid=make_fluid_table(layout, carrier, place, turn, world),
         thruster_row=np.flatnonzero(pushing),
     )
@@ -262,7 +265,7 @@ def _steiner(mass: np.ndarray, arm: np.ndarray) -> np.ndarray:
     return about
 
 
-def _most_stiffness(
+def _most_explicit_stiffness(
     mass: np.ndarray,
     center: np.ndarray,
     inertia: np.ndarray,
@@ -270,12 +273,12 @@ def _most_stiffness(
     damping: np.ndarray,
     dt: float,
 ) -> np.ndarray:
-    """`[nbody]` the stiffest servos that suit the limb that they move and the time step.
+    """`[nbody]` the stiffest springs of servos that an explicit step of the limb takes.
 
     MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d implicitly;
-    it is well damped while k dt² is at most 1.5 (I + d dt). Only hinges that carry next to nothing
-    are touched.
+    it is well damped while k dt² is at most 1.7 (I + d dt). Only hinges that carry next to nothing
+    have stiffer servos.
     """
     about = np.sum(axis * turned(inertia + _steiner(mass, center), axis), 1)
-    most: np.ndarray = 1.5 * (about / dt**2 + damping / dt)
+    most: np.ndarray = 1.7 * (about / dt**2 + damping / dt)
     return most

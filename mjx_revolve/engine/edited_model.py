@@ -85,11 +85,16 @@ def edited_constants(
         return filled(old[0], new[:, 0]), filled(old[1], new[:, 1])
 
     ours = constants.hinges
+    stiffness = filled(ours.stiffness, -model.actuator_biasprm[act, 1])
+    # Where a part of the spring was implicit, the limb takes no more of an explicit one.
+    implicit = np.asarray(ours.implicit_stiffness, float)
+    explicit = np.asarray(ours.stiffness, float) - implicit
     hinges = ours._replace(
         armature=filled(ours.armature, model.dof_armature[dof]),
         damping=filled(ours.damping, model.dof_damping[dof]),
         gain=filled(ours.gain, model.actuator_gainprm[act, 0]),
-        stiffness=filled(ours.stiffness, -model.actuator_biasprm[act, 1]),
+        stiffness=stiffness,
+        implicit_stiffness=np.where(implicit > 0, np.maximum(stiffness - explicit, 0.0), 0.0),
         servo_damping=filled(ours.servo_damping, -model.actuator_biasprm[act, 2]),
         effort=pair(ours.effort, effort),
         target=pair(ours.target, target),

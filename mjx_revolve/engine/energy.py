@@ -223,7 +223,7 @@ def _at_hinges(
     hinges, (before, after) = level.hinges, speeds
     mean = (before + after) / 2
     assert hinges is not None
-    servo = motor_torque(hinges, angle, after, target) * mean
+    servo = motor_torque(hinges, angle, after, target, dt) * mean
     stop, _ = end_stop(hinges, angle, after, dt)
     return {
         "kinetic_before": 0.5 * hinges.armature * before**2,

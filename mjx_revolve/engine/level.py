@@ -71,6 +71,8 @@ class Hinges(NamedTuple):
         damping: passive [N·m·s/rad].
         gain: of the servo, per target angle [N·m/rad].
         stiffness: of the servo, per joint angle [N·m/rad].
+        implicit_stiffness: the part of it that acts on the angle at the end of the step
+            [N·m/rad].
         servo_damping: of the servo, per joint speed [N·m·s/rad].
         effort: torque limits of the servo, low and high [N·m].
         target: limits of the servo's target, low and high [rad].
@@ -92,6 +94,7 @@ class Hinges(NamedTuple):
     damping: Scalar
     gain: Scalar
     stiffness: Scalar
+    implicit_stiffness: Scalar
     servo_damping: Scalar
     effort: tuple[Scalar, Scalar]
     target: tuple[Scalar, Scalar]

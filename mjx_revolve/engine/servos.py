@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.level import Hinges
-from mjx_revolve.numerics.spatial import Scalar, mul, sub
+from mjx_revolve.numerics.spatial import Scalar, add, mul, sub
 
 # Ratio of the end stops' damper to their spring [s]. A choice: a leg arrives over-damped.
 STOP_TIME = 0.005
@@ -40,7 +40,9 @@ def servo(
     top speed within one step, so the curve is taken at the speed at the end of the step: on the
     line, the line itself; below it, where the step may lead onto it, the chord from here to the
     top speed, which lies below the curve, so that no push, however the hinges are coupled, drives
-    a hinge past its top speed; elsewhere the push is constant.
+    a hinge past its top speed; elsewhere the push is constant. Of a spring that is too stiff for an
+    explicit step of the limb, a part acts on the angle at the end of the step instead, linearly
+    implicit.
 
     Args:
         hinges: their numbers.
@@ -56,8 +58,13 @@ def servo(
     """
     target = jnp.clip(target, _cast(hinges.target[0], target), _cast(hinges.target[1], target))
     torque = sub(mul(hinges.gain, target), mul(hinges.stiffness, angle))
-    torque = sub(torque, mul(hinges.servo_damping, speed))
+    damping = add(hinges.servo_damping, mul(dt, hinges.implicit_stiffness))
+    torque = sub(torque, mul(damping, speed))
     low, high = (_cast(x, torque) for x in hinges.effort)
+    # At its limit, torque does not depend on the angle.
+    free = (torque > low) & (torque < high)
+    square = jnp.asarray(dt * dt, torque.dtype)
+    yielding = mul(jnp.where(free, square, 0), hinges.implicit_stiffness)
     torque = jnp.clip(torque, low, high)
     friction, gradient, top = (_cast(x, torque) for x in hinges.motor)
     forward = jnp.sign(torque)
@@ -68,16 +75,21 @@ def servo(
 
     # The motor turns its base, too, the other way.
     per_base = dt / _cast(hinges.base_inertia, torque)
-    gain = dt * (push + jnp.maximum(forward * load, 0)) / inertia + per_base * push
+    foreseen = (push + jnp.maximum(forward * load, 0)) / add(inertia, yielding)
+    gain = dt * foreseen + per_base * push
     beyond = line(rate) < push
     # A push that friction outweighs needs no limit, and has no chord at the top speed itself.
     near = (line(rate + _MARGIN * gain) < push) & ~beyond & (push > friction)
     chord = (push - friction) / jnp.where(near, top - rate, 1)
     torque = jnp.where(beyond, forward * line(rate), torque)
-    return torque, dt * jnp.where(beyond, gradient, jnp.where(near, chord, 0))
+    # Of curve and spring, the one that falls faster with the speed at the end of the step.
+    implicit = dt * jnp.where(beyond, gradient, jnp.where(near, chord, 0))
+    return torque, jnp.maximum(implicit, yielding)
 
 
-def motor_torque(hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar) -> Scalar:
+def motor_torque(
+    hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar, dt: float = 0.0
+) -> Scalar:
     """Torque of the motors now, not what an implicit step makes of it, without joints' friction.
 
     Args:
@@ -85,11 +97,12 @@ def motor_torque(hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar) -
         angle: `[nbody, lanes]` [rad].
         speed: of the joints [rad/s].
         target: of the servos [rad].
+        dt: since the angle was so, for what is taken at the end of a step [s].
 
     Returns:
         The torque [N·m].
     """
-    torque, _ = servo(hinges, angle, speed, target, 0.0, 1.0, 0.0)
+    torque, _ = servo(hinges, angle, speed, target, dt, 1.0, 0.0)
     # Beyond the top speed that torque brakes; a motor has no more than its effort.
     return jnp.clip(torque, *(_cast(x, torque) for x in hinges.effort))
 

@@ -203,6 +203,7 @@ def _read_hinges(assembly: Assembly, frame: np.ndarray) -> Hinges:
         damping=column(damping, 0.0),
         gain=column(assembly.stiffness, 0.0),
         stiffness=column(assembly.stiffness, 0.0),
+        implicit_stiffness=column(assembly.implicit_stiffness, 0.0),
         servo_damping=zero,
         effort=(column(-effort, 0.0), column(effort, 0.0)),
         target=limits,

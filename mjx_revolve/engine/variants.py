@@ -112,6 +112,7 @@ def _tree(robot: Robot, prescribed: np.ndarray) -> SingleTree:
             damping=put(hinges.damping, none),
             gain=put(hinges.gain, stiffness),
             stiffness=put(hinges.stiffness, stiffness),
+            implicit_stiffness=put(hinges.implicit_stiffness, none),
             servo_damping=put(hinges.servo_damping, 2 * _DRIVEN_INERTIA * rate),
             effort=put(hinges.effort, free),
             target=put(hinges.target, free),

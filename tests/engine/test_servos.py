@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import elbow_robot, world
+from laboratory import body, elbow_robot, world
 from mjx_revolve.body.morphology import trim_neutral
+from mjx_revolve.engine.assembly import FULL_TORQUE_ERROR
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.population import PopulationEngine
@@ -56,6 +57,31 @@ def test_below_the_knee_the_servo_is_mujocos(hinges):
     assert np.asarray(torque) == pytest.approx(gain * np.asarray(target), rel=1e-5)
     assert np.abs(torque).max() < effort
     assert (inertia == 0).all()
+
+
+@pytest.mark.parametrize("timestep", [0.0025, 0.005, 0.01, 0.02])
+def test_a_servo_is_as_stiff_at_every_step(timestep):
+    """Without speed, torque is the stiffness times the error, up to the effort; the step adds dt²
+    times the implicit part of the stiffness to the inertia.
+    """
+    robot = build_robot(body("centipede"), load_world("lake", timestep=timestep))
+    assembly = robot.assembly
+    assert assembly.stiffness[2:] == pytest.approx(
+        assembly.effort[2:] / FULL_TORQUE_ERROR, rel=1e-12
+    )
+    assert (assembly.implicit_stiffness[2:].max() > 0) == (timestep >= 0.005)
+    for level in make_single_tree(robot, contact=False).below:
+        hinges = level.hinges
+        still = jnp.zeros((level.count, 2), jnp.float32)
+        target = still + jnp.asarray([0.02, 0.2])
+        torque, inertia = servo(hinges, still, still, target, timestep, still + 1e-4, still)
+        effort = np.broadcast_to(hinges.effort[1], (level.count, 1))[:, 0]
+        stiffness = effort / FULL_TORQUE_ERROR
+        assert np.asarray(torque) == pytest.approx(
+            np.stack([stiffness * 0.02, effort], 1), rel=1e-5
+        )
+        rest = np.broadcast_to(hinges.implicit_stiffness, (level.count, 1))[:, 0]
+        assert (np.asarray(inertia)[:, 0] >= timestep**2 * rest * (1 - 1e-6)).all()
 
 
 @pytest.mark.slow
