@@ -4,8 +4,8 @@
 
 Bodies of `random_bodies` beat all their hinges with sines of random amplitude and frequency, up to
 faster than the servos turn, in open water. The overlap is that of `self_overlap`, exact, at every
-step, and not what the contact itself measures. What was found so far is written after each thousand
-bodies; ``--results`` writes ``docs/results``, too.
+step, and not what the contact itself measures. What was found so far is written after some
+hundred bodies; ``--results`` writes ``docs/results``, too.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mjx_revolve.water.world import World
 
 # Bodies that are stepped together, those between two reports, and the depth beyond which an overlap
 # counts [m].
-_CHUNK, _POPULATION, _DEEP = 64, 1000, 3e-3
+_CHUNK, _POPULATION, _DEEP = 64, 500, 3e-3
 
 
 def random_gaits(robot: Robot, lanes: int, steps: int, seed: int = 0) -> np.ndarray:

@@ -197,11 +197,13 @@ class _Factors(NamedTuple):
     symmetric: bool
 
 
-def _look_at(tree: Tree, factors: _Factors, steps: Any, which: jax.Array) -> Robots:
-    """Some of the robots, of which hinges turn by `steps` in the step."""
+def _look_at(
+    tree: Tree, factors: _Factors, steps: Any, hurry: Any, drift: jax.Array, which: jax.Array
+) -> Robots:
+    """Some of the robots; see there."""
     few, places = tree.at_lanes(which), tree.hinge_positions(which)
     turns = tree.saved_at_lanes(factors.moved, lambda moved: moved[1], which)
-    own = jax.tree.map(lambda x: take_lanes(x, which), steps)
+    own, faster = jax.tree.map(lambda x: take_lanes(x, which), (steps, hurry))
     like = jnp.zeros(len(which), jax.tree.leaves(own)[0].dtype)
 
     def gather(_: Level, children: Any, *own: Any) -> Any:
@@ -215,6 +217,8 @@ def _look_at(tree: Tree, factors: _Factors, steps: Any, which: jax.Array) -> Rob
 
     return Robots(
         steps=few.join_rows(own, like),
+        hurry=few.join_rows(faster, like),
+        drift=take_lanes(drift, which),
         pose=lambda steps: body_frames(few, turns, places, few.split_rows(steps), like),
         carried=carried,
         make_respond=lambda: _make_respond(tree, factors, which, turns, places),
@@ -275,11 +279,13 @@ def _with_contact(
     """
     like = state.position[0]
     steps = jax.tree.map(lambda v, a: dt * (v + dt * a), state.speed, qacc[2])
-    ways = tree.join_rows(tree.map(_sweep, steps), like)
+    sweep = lambda steps: tree.join_rows(tree.map(_sweep, steps), like)  # noqa: E731
+    ways, drifts = sweep(steps), dt**2 * sweep(qacc[2])
+    drift = total(*[drifts[k] for k in range(len(drifts))])
     found, clearance = contact_acceleration(
         tree.meetings(like),
         state.clearance - total(*[ways[k] for k in range(len(ways))]),
-        lambda which: _look_at(tree, factors, steps, which),
+        lambda which: _look_at(tree, factors, steps, qacc[2], drift, which),
         6 + len(ways),
         dt,
     )

@@ -78,6 +78,8 @@ class Robots(NamedTuple):
 
     Attributes:
         steps: `[nhinge, lanes]` by which hinges turn in the step without contact [rad].
+        hurry: `[nhinge, lanes]` their accelerations in it [rad/s²].
+        drift: `[lanes]` by how much boxes may near each other by these [m].
         pose: what hinges turn by → `kinematics.body_frames`.
         carried: sums of values `[1 + nhinge, lanes]` of bodies over all that each hinge carries,
             `[nhinge, lanes]`.
@@ -85,6 +87,8 @@ class Robots(NamedTuple):
     """
 
     steps: jax.Array
+    hurry: jax.Array
+    drift: jax.Array
     pose: Callable[[jax.Array], tuple[BodyFrames, BodyFrames]]
     carried: Callable[[list[jax.Array]], list[jax.Array]]
     make_respond: Callable[[], Respond]
@@ -141,8 +145,9 @@ def _settle(
 ) -> tuple[jax.Array, jax.Array]:
     """Accelerations of some robots by their contacts, and the clearance without them.
 
-    In rounds: where contacts turn a robot's hinges much, others are found at the end of the step
-    that it makes then, and join those that push.
+    In rounds: contacts are first looked for where bodies would be at unchanged speeds, which is
+    where they stay if they press; where they end up elsewhere, further ones are looked for there,
+    and join those that push.
     """
     size, steps = len(which), robots.steps
     zeros = lambda *shape: jnp.zeros((*shape, size), steps.dtype)  # noqa: E731
@@ -156,17 +161,17 @@ def _settle(
 
     def look_again(now: Any) -> Any:
         contacts, clear, moving, first = now
-        change = contacts.acceleration()
-        frames = robots.pose(steps + dt**2 * change[6:])
+        change = contacts.acceleration()[6:] - first * robots.hurry
+        frames = robots.pose(steps + dt**2 * change)
         kept = weight(contacts.force > 0, clear)
         table = _find_contacts(meetings, which, moving > 0, frames, kept, dt)
-        touches = moving < 0
+        touches, near = moving < 0, -first * robots.drift / dt**2
         for k in range(_MOST):
-            touches = touches | ((table.need[k] > 0) & (table.need[k] < _KEPT))
+            touches = touches | ((table.need[k] > near) & (table.need[k] < _KEPT))
 
         def resolve() -> Any:
-            found = contacts.join(table, frames[1], robots, change[6:], dt)
-            turned = jnp.abs(found.acceleration()[6:] - change[6:])
+            found = contacts.join(table, frames[1], robots, change, dt)
+            turned = jnp.abs(found.acceleration()[6:] - change)
             most = turned[0]
             for k in range(1, len(turned)):
                 most = jnp.maximum(most, turned[k])
@@ -175,7 +180,8 @@ def _settle(
         found, moving = jax.lax.cond(
             any_lane(touches), resolve, lambda: (contacts, jnp.zeros_like(moving))
         )
-        return found, first * table.clear + (1 - first) * clear, moving, jnp.zeros_like(first)
+        clear = first * (table.clear - robots.drift) + (1 - first) * clear
+        return found, clear, moving, jnp.zeros_like(first)
 
     def step(_: Any, now: Any) -> Any:
         return jax.lax.cond(any_lane(now[2] > 0), look_again, lambda x: x, now)
@@ -491,7 +497,7 @@ class _Contacts(NamedTuple):
     ) -> _Contacts:
         """Those that push, with those of a table in the other places, solved.
 
-        `change` are the accelerations of the hinges by the contacts so far.
+        `change` are the accelerations by which hinges end where the table's contacts are.
         """
         numbers = table.rest[:_MOST]
         number = jnp.arange(len(ahead.position[0]), dtype=numbers.dtype)[:, None]
