@@ -126,7 +126,7 @@ def contact_acceleration(
 
     def look() -> Any:
         room = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
-        listed, count = _append(wanted, jnp.arange(lanes, dtype=jnp.int32), room, steady)
+        listed, count = append_true(wanted, jnp.arange(lanes, dtype=jnp.int32), room, steady)
 
         def visit(k: Any, found: Any) -> Any:
             which = jax.lax.dynamic_slice(listed, (k * size,), (size,))
@@ -219,8 +219,11 @@ def _repeat(count: Any, most: int, body: Any, carry: Any, steady: bool) -> Any:
     return _loop(most, step, carry)
 
 
-def _append(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> Any:
-    """A list with room for one more, and its length, with the values `[n]` where flags are set."""
+def append_true(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> Any:
+    """A list with room for one more, and its length, with the values `[n]` where flags are set.
+
+    `steady` loops have a known length, so that they have derivatives.
+    """
 
     def write(k: Any, found: Any) -> Any:
         new = jax.lax.dynamic_slice(values, (k,), (1,))
@@ -322,7 +325,7 @@ def _find_contacts(
         apart = jnp.where(given & ~near, jnp.sqrt(square) - reach, _FAR)
         for k in range(0, width, size):
             clear = jnp.minimum(clear, apart[k : k + size])
-        return block + 1, _append(near, number, listed, steady), clear
+        return block + 1, append_true(near, number, listed, steady), clear
 
     def examine(listed: Any, table: ContactTable) -> ContactTable:
         """The contacts of listed pairs join those of each robot; the weakest give way."""
