@@ -4,12 +4,13 @@
 
 Bodies of `random_bodies` beat all their hinges with sines of random amplitude and frequency, up to
 faster than the servos turn, in open water. The overlap is that of `self_overlap`, exact, at every
-step, and not what the contact itself measures. ``--results`` writes ``docs/results``, too.
+step, and not what the contact itself measures. What was found so far is written after some
+hundred bodies; ``--results`` writes ``docs/results``, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -26,11 +27,14 @@ from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.episodes.rollout import Rollout, StepInputs, open_loop
 from mjx_revolve.inputs.commands import read_seconds, run_command, whole
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import xla
 from mjx_revolve.water.flow import water_of
+from mjx_revolve.water.world import World
 
-# Bodies that are stepped together, and the depth beyond which an overlap counts [m].
-_CHUNK, _DEEP = 64, 3e-3
+# Bodies that are stepped together, those between two reports, and the depth beyond which an overlap
+# counts [m].
+_CHUNK, _POPULATION, _DEEP = 64, 500, 3e-3
 
 
 def random_gaits(robot: Robot, lanes: int, steps: int, seed: int = 0) -> np.ndarray:
@@ -60,59 +64,84 @@ def make_march(world: Any, capacity: Capacity, steps: int) -> Any:
     return run
 
 
-def deepest_overlaps(robots: Sequence[Robot], seconds: float, seed: int) -> np.ndarray:
-    """Deepest overlap of each robot under a gait of its own [m]; infinite where it blows up."""
-    world, capacity = robots[0].world, fit_capacity(robots)
-    steps, found = round(seconds / world.timestep), []
-    march = xla.jit(make_march(world, capacity, steps))
-    for start in range(0, len(robots), _CHUNK):
-        some = list(robots[start : start + _CHUNK])
-        padded = some + some[:1] * (_CHUNK - len(some))
-        ctrl = np.zeros((steps, capacity.hinges, _CHUNK), np.float32)
-        for k, robot in enumerate(some):
-            ctrl[:, : robot.num_hinges, k] = random_gaits(robot, 1, steps, seed + start + k)[..., 0]
-        qpos = np.asarray(march(pack_bodies(padded, capacity), ctrl), np.float64)
-        for k, robot in enumerate(some):
-            own = qpos[:, : 7 + robot.num_hinges, k]
-            sound = np.isfinite(own).all()
-            found.append(self_overlap(robot, own).depth.max() if sound else np.inf)
-    return np.array(found)
+class _March:
+    """Robots under gaits of their own, by a program that is compiled anew only for larger ones."""
+
+    def __init__(self, world: World, seconds: float) -> None:
+        self.world, self.steps = world, round(seconds / world.timestep)
+        self.seen: list[Robot] = []
+        self.capacity: Capacity | None = None
+        self.run: Any = None
+
+    def deepest_overlaps(self, robots: Sequence[Robot], seeds: Sequence[int]) -> list[float]:
+        """Of each robot [m]; infinite where it blows up."""
+        self.seen += robots
+        try:
+            if self.capacity is None:
+                raise InputError("none yet")
+            pack_bodies(robots, self.capacity)
+        except InputError:
+            self.capacity = fit_capacity(self.seen)
+            self.run = xla.jit(make_march(self.world, self.capacity, self.steps))
+        found = []
+        for start in range(0, len(robots), _CHUNK):
+            some = list(robots[start : start + _CHUNK])
+            padded = some + some[:1] * (_CHUNK - len(some))
+            ctrl = np.zeros((self.steps, self.capacity.hinges, _CHUNK), np.float32)
+            for k, robot in enumerate(some):
+                gait = random_gaits(robot, 1, self.steps, seeds[start + k])
+                ctrl[:, : robot.num_hinges, k] = gait[..., 0]
+            bodies = pack_bodies(padded, self.capacity)
+            qpos = np.asarray(self.run(bodies, ctrl), np.float64)
+            for k, robot in enumerate(some):
+                own = qpos[:, : 7 + robot.num_hinges, k]
+                sound = np.isfinite(own).all()
+                found.append(float(self_overlap(robot, own).depth.max()) if sound else np.inf)
+        return found
 
 
-def study(bodies: int, seconds: float, timestep: float, seed: int = 0) -> dict[str, Any]:
-    """What so many random bodies do, those that cannot meet themselves left out."""
+def study(bodies: int, seconds: float, timestep: float, seed: int = 0) -> Iterator[dict[str, Any]]:
+    """What random bodies do, those that cannot meet themselves left out, after each population."""
     world = load_world("lake", bed=None, self_contact=True, timestep=timestep)
-    draws = range(seed, seed + bodies)
-    every = [build_robot(random_body(k, 4 + k % 9, 6), world) for k in draws]
-    robots = [robot for robot in every if len(robot.assembly.meeting_pairs)]
-    depth = deepest_overlaps(robots, seconds, seed) if robots else np.zeros(0)
-    finite = depth[np.isfinite(depth)]
-    return {
-        "timestep_ms": 1000 * timestep,
-        "bodies": bodies,
-        "bodies_that_can_meet": len(robots),
-        "not_finite": int(len(depth) - len(finite)),
-        "touch": int(np.sum(finite > 0)),
-        "beyond_3_mm": int(np.sum(finite > _DEEP)),
-        "deepest_mm": round(1000 * abs(float(finite.max(initial=0))), 2),
-    }
+    march, depths = _March(world, seconds), []
+    for first in range(seed, seed + bodies, _POPULATION):
+        draws = range(first, min(first + _POPULATION, seed + bodies))
+        every = [(k, build_robot(random_body(k, 4 + k % 9, 6), world)) for k in draws]
+        met = [(k, robot) for k, robot in every if len(robot.assembly.meeting_pairs)]
+        if met:
+            depths += march.deepest_overlaps([robot for _, robot in met], [k for k, _ in met])
+        depth = np.array(depths)
+        finite = depth[np.isfinite(depth)]
+        yield {
+            "timestep_ms": round(1000 * timestep),
+            "bodies": draws.stop - seed,
+            "bodies_that_can_meet": len(depth),
+            "not_finite": int(len(depth) - len(finite)),
+            "touch": int(np.sum(finite > 0)),
+            "beyond_1_mm": int(np.sum(finite > 1e-3)),
+            "beyond_3_mm": int(np.sum(finite > _DEEP)),
+            "deepest_mm": round(1000 * float(finite.max(initial=0)), 2),
+        }
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line."""
     parser = make_parser("self_contact", "Random bodies under random gaits: how deep they overlap.")
-    parser.add_argument("--bodies", type=whole(1), default=2000, help="how many (default: 2000)")
+    parser.add_argument(
+        "--bodies", type=whole(1), default=10000, help="how many (default: 10000); a fifth at 20 ms"
+    )
     parser.add_argument(
         "--seconds", type=read_seconds, default=2.0, help="of each gait (default: 2)"
     )
     options = parser.parse_args(argv)
-    folder, numbers = make_folder(options.out, "self_contact"), []
-    for timestep in (0.005, 0.02):
-        numbers.append(study(options.bodies, options.seconds, timestep))
-        print(numbers[-1], flush=True)
-    found = {"seconds": options.seconds, "steps": numbers}
-    for place in [folder, RESULTS] if options.results else [folder]:
-        print(f"Wrote {write_results('self_contact', found, [0], place)}")
+    folder, steps = make_folder(options.out, "self_contact"), {}
+    for timestep, bodies in ((0.02, -(-options.bodies // 5)), (0.005, options.bodies)):
+        for found in study(bodies, options.seconds, timestep):
+            print(found, flush=True)
+            steps[timestep] = found
+            numbers = {"seconds": options.seconds, "steps": [steps[k] for k in sorted(steps)]}
+            for place in [folder, RESULTS] if options.results else [folder]:
+                write_results("self_contact", numbers, [0], place)
     return 0
 
 

@@ -293,7 +293,8 @@ def fit_capacity(
         InputError: there are no robots.
     """
     assembly = assemble_all(robots)
-    columns, world = read_constants(assembly), robots[0].world
+    meeting = _list_pairs(robots)
+    columns, world = read_constants(assembly, meeting), robots[0].world
     carries = columns.parts.carried is not None
     sizes = _sizes(assembly, columns)
     types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
@@ -306,7 +307,6 @@ def fit_capacity(
     slots = 1 + int(order.slot.max(initial=0))
     thrusters = int(sizes.thrusters.max())
     points, root_points = _count_points(assembly, order) if near else (0, 0)
-    meeting = _list_pairs(robots)
     shells, root_shells = _count_shells(assembly, order, meeting)
     more = bool(modules or hinges or rows or kinds) and world.self_contact
     if more:
@@ -639,10 +639,10 @@ def pack_bodies(
     place = {key: k for k, key in enumerate(unique)}
     pick = np.array([place[id(robot)] for robot in robots], int)
     assembly = assemble_all(list(unique.values()))
-    columns = read_constants(assembly)
+    pairs = _list_pairs(list(unique.values()))
+    columns = read_constants(assembly, pairs)
     order = order_rows(assembly, columns, capacity.groups)
     _check_fit(assembly, columns, order, capacity)
-    pairs = _list_pairs(list(unique.values()))
     _check_shells(assembly, order, pairs, capacity)
     root, level, met = _pick_rows(assembly, columns, capacity, order, pairs)
     names = [str(body.name) for body in assembly.morphologies]

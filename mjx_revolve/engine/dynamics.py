@@ -9,7 +9,6 @@ Spatial quantities are (angular, linear), in each body's own frame, about its ow
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,9 +19,8 @@ from mjx_revolve.engine.hydrodynamics import ExternalForces, PreviousStep, water
 from mjx_revolve.engine.kinematics import body_frames, forward_kinematics
 from mjx_revolve.engine.level import Hinges, Level
 from mjx_revolve.engine.self_contact import (
-    Acceleration,
-    Bodies,
     Respond,
+    Robots,
     contact_acceleration,
 )
 from mjx_revolve.engine.servos import end_stop, servo
@@ -184,7 +182,7 @@ def accelerate(
 
 
 class _Factors(NamedTuple):
-    """What the articulated-body algorithm leaves, by which further forces act at once.
+    """What the articulated-body algorithm leaves, by which further torques act at once.
 
     Attributes:
         moved: motion and rotation of the bodies below the root, parent from child.
@@ -200,37 +198,48 @@ class _Factors(NamedTuple):
 
 
 def _look_at(
-    tree: Tree, factors: _Factors, steps: Any, which: jax.Array
-) -> tuple[Bodies, Callable[[], Respond]]:
-    """Some robots: their bodies' poses; what makes their response to further forces.
-
-    `steps` are the angles by which hinges turn in the step.
-    """
+    tree: Tree, factors: _Factors, steps: Any, hurry: Any, drift: jax.Array, which: jax.Array
+) -> Robots:
+    """Some of the robots; see there."""
     few, places = tree.at_lanes(which), tree.hinge_positions(which)
     turns = tree.saved_at_lanes(factors.moved, lambda moved: moved[1], which)
-    own = jax.tree.map(lambda x: take_lanes(x, which), steps)
+    own, faster = jax.tree.map(lambda x: take_lanes(x, which), (steps, hurry))
     like = jnp.zeros(len(which), jax.tree.leaves(own)[0].dtype)
-    bodies = Bodies(*body_frames(few, turns, places, own, like))
-    return bodies, lambda: _make_respond(tree, factors, which, turns, places)
+
+    def gather(_: Level, children: Any, *own: Any) -> Any:
+        found = own if children is None else vadd(own, children)
+        return found, found, ()
+
+    def carried(values: list[jax.Array]) -> list[jax.Array]:
+        zero, below = (0.0,) * len(values), [few.split_rows(x[1:]) for x in values]
+        _, sums, _ = few.backward_pass(gather, (zero, ()), *below)
+        return list(few.stack_saved(sums, lambda x: x, like))
+
+    return Robots(
+        steps=few.join_rows(own, like),
+        hurry=few.join_rows(faster, like),
+        drift=take_lanes(drift, which),
+        pose=lambda steps: body_frames(few, turns, places, few.split_rows(steps), like),
+        carried=carried,
+        make_respond=lambda: _make_respond(tree, factors, which, turns, places),
+    )
 
 
 def _make_respond(
     tree: Tree, factors: _Factors, which: jax.Array, turns: Any, places: Any
 ) -> Respond:
-    """For some of the robots, what further forces on their bodies add to all accelerations."""
+    """For some of the robots, what further torques of their hinges add to all accelerations."""
     lanes, symmetric = len(which), factors.symmetric
     own = lambda x: take_lanes(x, which) if jnp.shape(x)[-1:] not in ((), (1,)) else x  # noqa: E731
     block: Block = jax.tree.map(own, factors.root)
     saved = tree.saved_at_lanes(factors.saved, lambda saved: (saved[0][:3], saved[2]), which)
     few = tree.at_lanes(which)
 
-    def collect(_: Level, children: Any, turn: Any, place: Any, saved: Any, *wrench: Any) -> Any:
+    def collect(_: Level, children: Any, turn: Any, place: Any, saved: Any, torque: Any) -> Any:
         """Bias forces, as the parents feel them."""
-        bias = tuple(map(neg, wrench))
-        if children is not None:
-            bias = vadd(bias, children)
+        bias = (0.0,) * 6 if children is None else children
         (row_a, row_l, inverse), column = saved
-        rest = neg(bias[2])
+        rest = sub(torque, bias[2])
         pushed = mul(inverse, rest)
         column = column or (row_a, row_l)
         torque = vadd(bias[:3], vscale(pushed, column[0]))
@@ -246,24 +255,17 @@ def _make_respond(
         b = matTvec(turn, vadd(linear, cross(angular, place)))
         (row_a, row_l, inverse), _ = saved
         hinge = mul(inverse, sub(sub(rest, dot(row_a, a)), dot(row_l, b)))
-        own = (a[0], a[1], add(a[2], hinge)), b
-        return own, (hinge, own)
+        return ((a[0], a[1], add(a[2], hinge)), b), hinge
 
-    def respond(wrench: tuple[jax.Array, ...]) -> Acceleration:
-        like = wrench[0][0]
-        below = [few.split_rows(x[1:]) for x in wrench]
-        gathered, rests, _ = few.backward_pass(
-            collect, ((0.0,) * 6, ()), turns, places, saved, *below
+    def respond(torque: jax.Array) -> jax.Array:
+        bias, rests, _ = few.backward_pass(
+            collect, ((0.0,) * 6, ()), turns, places, saved, few.split_rows(torque)
         )
-        bias = vsub(gathered, tuple(x[:1] for x in wrench))
-        root = solve_root(block, (bias[:3], bias[3:]), symmetric)
-        found = few.forward_pass(accelerate_joint, root, turns, places, saved, rests)
-        lane = lambda x: jnp.broadcast_to(jnp.asarray(x, like.dtype), (1, lanes))  # noqa: E731
-        angular, linear = (tuple(map(lane, x)) for x in root)
-        hinges, own = few.stack_saved(found, lambda x: x, like)
-        pairs = zip((*angular, *linear), (*own[0], *own[1]), strict=True)
-        bodies = tuple(jnp.concatenate(pair) for pair in pairs)
-        return Acceleration(bodies, jnp.concatenate([*linear, *angular, hinges]))
+        angular, linear = root = solve_root(block, (bias[:3], bias[3:]), symmetric)
+        hinges = few.forward_pass(accelerate_joint, root, turns, places, saved, rests)
+        like = torque[0]
+        wide = [jnp.broadcast_to(x, (1, lanes)) for x in (*linear, *angular)]
+        return jnp.concatenate([*wide, few.join_rows(hinges, like)])
 
     return respond
 
@@ -277,11 +279,13 @@ def _with_contact(
     """
     like = state.position[0]
     steps = jax.tree.map(lambda v, a: dt * (v + dt * a), state.speed, qacc[2])
-    ways = tree.join_rows(tree.map(_sweep, steps), like)
+    sweep = lambda steps: tree.join_rows(tree.map(_sweep, steps), like)  # noqa: E731
+    ways, drifts = sweep(steps), dt**2 * sweep(qacc[2])
+    drift = total(*[drifts[k] for k in range(len(drifts))])
     found, clearance = contact_acceleration(
         tree.meetings(like),
         state.clearance - total(*[ways[k] for k in range(len(ways))]),
-        lambda which: _look_at(tree, factors, steps, which),
+        lambda which: _look_at(tree, factors, steps, qacc[2], drift, which),
         6 + len(ways),
         dt,
     )

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from mjx_revolve.engine.batched_trees import BatchedTrees
 from mjx_revolve.engine.contact import CREEP_SPEED, DAMPER_DEPTH
 from mjx_revolve.engine.kinematics import body_motions
+from mjx_revolve.engine.self_contact import append_true
 from mjx_revolve.engine.spheres import Spheres
 from mjx_revolve.engine.state import State
 from mjx_revolve.numerics.spatial import (
@@ -32,7 +33,7 @@ from mjx_revolve.numerics.spatial import (
     vscale,
     vsub,
 )
-from mjx_revolve.numerics.xla import fuse
+from mjx_revolve.numerics.xla import fuse, take_lanes
 
 # Gap [m] within which pairs of spheres are listed, and within which robots count as close. A
 # swimmer moves half of the first in some tens of milliseconds. Choices, measured to be about the
@@ -552,7 +553,13 @@ class _Contact:
                 return jnp.minimum(gap, jnp.min(found))
 
             def append() -> Any:
-                row, column, count = _list_true(close.reshape(-1, self.size), _FOUND)
+                flags = close.reshape(-1)
+                empty = jnp.zeros(len(flags) + 1, jnp.int32), jnp.int32(0)
+                every = jnp.arange(len(flags), dtype=jnp.int32)
+                listed, count = append_true(flags, every, empty, False)
+                # Past the end of the flags there are no pairs, and past the list's none is read.
+                listed = jnp.pad(listed, (0, max(0, _FOUND - len(listed))))[:_FOUND]
+                row, column = listed // self.size, listed % self.size
                 k = row // self.size
                 a, b = one[k] * self.size + row % self.size, other[k] * self.size + column
                 room = jnp.minimum(jnp.minimum(count, _FOUND), self.room - total)
@@ -572,7 +579,9 @@ class _Contact:
             after(jnp.int32(-1)), neighbours.first, neighbours.second, jnp.int32(0),
             jnp.bool_(True), jnp.full_like(neighbours.gap, jnp.inf),
         )  # fmt: skip
-        _, first, second, total, whole, gap = jax.lax.while_loop(lambda x: x[0] < end, block, carry)
+        # A list with a skin that has no room is not used.
+        wanted = lambda x: (x[0] < end) & (x[4] | (skin == 0))  # noqa: E731
+        _, first, second, total, whole, gap = jax.lax.while_loop(wanted, block, carry)
         return neighbours._replace(first=first, second=second, pairs=total, gap=gap), whole
 
     # --- forces
@@ -593,20 +602,20 @@ class _Contact:
         each = jnp.arange(self.radius.size, dtype=jnp.int32)
         columns = self.radius.size * jnp.arange(len(values), dtype=jnp.int32)[:, None]
 
-        def run(step: Callable[[jax.Array, Any], Any], carry: Any) -> Any:
-            """Over the list, some at a time."""
+        def run(step: Callable[[jax.Array, Any], Any], carry: Any, pairs: jax.Array) -> Any:
+            """Over a list of so many pairs, some at a time."""
 
             def body(state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
                 return state[0] + _PUSHED, step(*state)
 
             start = jnp.int32(0), carry
-            return jax.lax.while_loop(lambda x: x[0] < neighbours.pairs, body, start)[1]
+            return jax.lax.while_loop(lambda x: x[0] < pairs, body, start)[1]
 
         def part(x: jax.Array, start: jax.Array) -> jax.Array:
             return jax.lax.dynamic_slice(x, (start,), (_PUSHED,))
 
-        def sides(start: jax.Array) -> Any:
-            which = [part(x, start) for x in (neighbours.first, neighbours.second)]
+        def sides(pairs: Sequence[jax.Array], start: jax.Array) -> Any:
+            which = [part(x, start) for x in pairs]
             own = [self.frame_of[x] for x in which]
             found = [
                 _side(table[frame + columns], self.numbers[:, x])
@@ -622,7 +631,7 @@ class _Contact:
         def look(start: jax.Array, found: Any) -> Any:
             """Pairs that touch by the end of the step, and the number of each body's."""
             flags, counts = found
-            (one, other), own = sides(start)
+            (one, other), own = sides(listed, start)
             real = start + jnp.arange(_PUSHED, dtype=jnp.int32) < neighbours.pairs
             touching = real & (_depth(one, other) + self.dt * _closing(one, other) > 0)
             number = jnp.tile(touching.astype(counts.dtype), 2)[None]
@@ -630,41 +639,44 @@ class _Contact:
             counts = jax.lax.cond(some, lambda: counts + spread(own, number), lambda: counts)
             return jax.lax.dynamic_update_slice(flags, touching, (start,)), counts
 
+        listed = neighbours.first, neighbours.second
         room = neighbours.first.shape[0] + _PUSHED
-        touching, counts = run(look, (jnp.zeros(room, bool), nothing[:1]))
+        blank = jnp.zeros(room, bool), nothing[:1]
+        touching, counts = run(look, blank, neighbours.pairs)
+        # Sweeps go over those that touch alone: in a crowd most of the list does not.
+        empty = jnp.zeros(room + 1, jnp.int32), jnp.int32(0)
+        order, pairs = append_true(touching, jnp.arange(room, dtype=jnp.int32), empty, False)
+        met = [take_lanes(x, jnp.minimum(order, len(x) - 1)) for x in listed]
 
         def sweep(now: Any) -> Any:
             """All contacts once, each with the velocities that the last sweep left."""
             count, forces, felt, _ = now
 
             def push(start: jax.Array, found: Any) -> Any:
-                flags = part(touching, start)
+                flags = start + jnp.arange(_PUSHED, dtype=jnp.int32) < pairs
+                forces, total, most = found
+                both, own = sides(met, start)
+                both = [
+                    side._replace(contacts=jnp.maximum(counts[0, k], 1))
+                    for side, k in zip(both, own, strict=True)
+                ]
+                old = jax.lax.dynamic_slice(forces, (jnp.int32(0), start), (4, _PUSHED))
+                on = [tuple(felt[:, k]) for k in own]
+                new, wrenches, change = _collide(self.parameters, both, on, old, self.dt)
+                wide = jnp.concatenate([jnp.stack(x) for x in wrenches], 1)
+                wide = jnp.where(jnp.tile(flags, 2), wide, 0)
+                new = jnp.where(flags, new, 0)
+                forces = jax.lax.dynamic_update_slice(forces, new, (jnp.int32(0), start))
+                most = jnp.maximum(most, jnp.max(jnp.where(flags, change, 0)))
+                return forces, total + spread(own, wide), most
 
-                def collide() -> Any:
-                    forces, total, most = found
-                    both, own = sides(start)
-                    both = [
-                        side._replace(contacts=jnp.maximum(counts[0, k], 1))
-                        for side, k in zip(both, own, strict=True)
-                    ]
-                    old = jax.lax.dynamic_slice(forces, (jnp.int32(0), start), (4, _PUSHED))
-                    on = [tuple(felt[:, k]) for k in own]
-                    new, wrenches, change = _collide(self.parameters, both, on, old, self.dt)
-                    wide = jnp.concatenate([jnp.stack(x) for x in wrenches], 1)
-                    wide = jnp.where(jnp.tile(flags, 2), wide, 0)
-                    new = jnp.where(flags, new, 0)
-                    forces = jax.lax.dynamic_update_slice(forces, new, (jnp.int32(0), start))
-                    most = jnp.maximum(most, jnp.max(jnp.where(flags, change, 0)))
-                    return forces, total + spread(own, wide), most
-
-                return jax.lax.cond(jnp.any(flags), collide, lambda: found)
-
-            return count + 1, *run(push, (forces, nothing, jnp.zeros_like(nothing[0, 0])))
+            none = forces, nothing, jnp.zeros_like(nothing[0, 0])
+            return count + 1, *run(push, none, pairs)
 
         def wanted(now: Any) -> jax.Array:
             return (now[0] < _SWEEPS) & (now[3] > _ENOUGH)
 
-        some = jnp.where(jnp.any(touching), jnp.inf, 0).astype(nothing.dtype)
+        some = jnp.where(pairs > 0, jnp.inf, 0).astype(nothing.dtype)
         start = jnp.int32(0), jnp.zeros((4, room), nothing.dtype), nothing, some
         total: jax.Array = jax.lax.while_loop(wanted, sweep, start)[2]
         return total
@@ -687,21 +699,3 @@ def _side(frame: jax.Array, numbers: jax.Array) -> _Side:
         x[7],
         tuple(x[8:14]),
     )
-
-
-def _list_true(flags: jax.Array, most: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The places of true flags `[n, m]`, row by row, at most so many.
-
-    Returns:
-        `[most]` rows and columns, int32, of which the first ones are valid; and the number of true
-        flags.
-    """
-    counts = jnp.sum(flags, 1, dtype=jnp.int32)
-    ends = jnp.cumsum(counts)
-    slot = jnp.arange(most, dtype=jnp.int32)
-    row = jnp.sum(ends[None] <= slot[:, None], 1, dtype=jnp.int32)
-    row = jnp.minimum(row, len(counts) - 1)
-    rank = slot - (ends[row] - counts[row])
-    seen = jnp.cumsum(flags[row].astype(jnp.int32), 1)
-    column = jnp.sum(seen <= rank[:, None], 1, dtype=jnp.int32)
-    return row, jnp.minimum(column, flags.shape[1] - 1), ends[-1]

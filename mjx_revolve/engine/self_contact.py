@@ -10,9 +10,10 @@ without contact, n its normal, λ ≥ 0 the forces along the normals and W = J M
 
 Gaps are those of the boxes themselves, exactly (`numerics.boxes`). W is that of the articulated
 bodies with all that is implicit in the step: forces go through the factors that the step has
-already computed, backward and forward. They act in pairs at one point, so that momentum is kept to
-rounding, and they stop what they meet and never push it apart: contact takes energy. What overlaps
-already is parted no faster than it was approached.
+already computed, backward and forward. J is that at the end of the step, as gaps are: within 20 ms
+hinges turn by 6 degrees and contacts slide by millimetres. Forces act as torques of the hinges, so
+that momentum is kept to rounding, and they stop what they meet and never push it apart: contact
+takes energy. What overlaps already is parted no faster than it was approached.
 
 Contact has no friction: modules are smooth and wet, they meet at low speed, and what evolution must
 not find are bodies that pass through themselves; a second and third direction would cost three
@@ -33,11 +34,11 @@ from mjx_revolve.numerics.boxes import (
     BoxPair,
     box_contact,
     dot,
-    mat_t_vec,
+    last_of,
     matvec,
     weight,
 )
-from mjx_revolve.numerics.spatial import Scalar, cross
+from mjx_revolve.numerics.spatial import cross
 from mjx_revolve.numerics.xla import fuse, materialize, take_lanes
 
 # Contacts of one robot at a time. A choice: few robots have more.
@@ -51,52 +52,52 @@ _ROOM = 256
 _WORD = 32
 # The clearance of robots without boxes that can meet [m].
 _FAR = 1e3
-# What no contact needs [m/s²].
-_NONE = -1e9
+# What no contact needs, and what stands for the need of those that push already [m/s²].
+_NONE, _KEPT = -1e9, 1e9
 # Overlap that is tolerated [m], the share of the rest that is removed in a step, and the top speed
 # of that [m/s]. Choices.
 _SLOP, _SHARE, _TOP = 5e-4, 1.0, 1.0
+# Rounds in which contacts are looked for, and by how much those of one round must turn a hinge for
+# a further one [rad]. Choices: half a degree moves the end of a limb by a millimetre.
+_ROUNDS, _TURN = 3, 0.01
 # Sweeps over the forces of several contacts, and the error at which they end [m]. Choices: one
 # sweep is exact for one contact.
 _SWEEPS, _ENOUGH = 30, 2e-5
 # Added to the inverse mass of a contact [1/kg], so that what is wedged between two modules has
 # finite forces. A choice: as if 50 kg gave way, where modules have some tens of grams.
-_SOFTNESS = 0.02
+_SOFTNESS = 0.002
 
 
-class Bodies(NamedTuple):
-    """Rigid bodies of robots, as `kinematics.body_frames` returns them.
-
-    Attributes:
-        now: their poses.
-        ahead: at the end of the step without contact.
-    """
-
-    now: BodyFrames
-    ahead: BodyFrames
+# Torques of hinges `[nhinge, lanes]` [N·m] → accelerations `[6 + nhinge, lanes]` of the root, first
+# linear, and of the hinges.
+Respond = Callable[[jax.Array], jax.Array]
 
 
-class Acceleration(NamedTuple):
-    """What forces do to robots.
+class Robots(NamedTuple):
+    """Some of the robots.
 
     Attributes:
-        bodies: angular and linear acceleration of all bodies, own frames, six of `[nbody, lanes]`.
-        robot: `[6 + nhinge, lanes]` of the root, linear and angular, and of the hinges.
+        steps: `[nhinge, lanes]` by which hinges turn in the step without contact [rad].
+        hurry: `[nhinge, lanes]` their accelerations in it [rad/s²].
+        drift: `[lanes]` by how much boxes may near each other by these [m].
+        pose: what hinges turn by → `kinematics.body_frames`.
+        carried: sums of values `[1 + nhinge, lanes]` of bodies over all that each hinge carries,
+            `[nhinge, lanes]`.
+        make_respond: what makes their response to torques.
     """
 
-    bodies: tuple[Scalar, ...]
-    robot: jax.Array
-
-
-# Torques [N·m] and forces [N] about the bodies' origins, own frames, six of `[nbody, lanes]` →
-# accelerations.
-Respond = Callable[[tuple[jax.Array, ...]], Acceleration]
+    steps: jax.Array
+    hurry: jax.Array
+    drift: jax.Array
+    pose: Callable[[jax.Array], tuple[BodyFrames, BodyFrames]]
+    carried: Callable[[list[jax.Array]], list[jax.Array]]
+    make_respond: Callable[[], Respond]
 
 
 def contact_acceleration(
     meetings: Meetings,
     clearance: jax.Array,
-    look_at: Callable[[jax.Array], tuple[Bodies, Callable[[], Respond]]],
+    look_at: Callable[[jax.Array], Robots],
     rows: int,
     dt: float,
 ) -> tuple[jax.Array, jax.Array]:
@@ -108,12 +109,12 @@ def contact_acceleration(
         meetings: which boxes can meet.
         clearance: `[lanes]` least distance by which boxes stay apart at the end of the step [m];
             negative where that is not known.
-        look_at: which lanes, int32 → their bodies, and what makes their responses to forces.
-        rows: of `Acceleration.robot`.
+        look_at: which lanes, int32 → the robots in them.
+        rows: of a response.
         dt: of the step [s].
 
     Returns:
-        As `Acceleration.robot`; and the clearance as it is known then.
+        As a response; and the clearance as it is known then.
     """
     lanes, dtype, steady = len(clearance), clearance.dtype, meetings.steady
     wanted = (clearance < 0) & (meetings.count > 0)
@@ -125,29 +126,69 @@ def contact_acceleration(
 
     def look() -> Any:
         room = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
-        listed, count = _append(wanted, jnp.arange(lanes, dtype=jnp.int32), room, steady)
+        listed, count = append_true(wanted, jnp.arange(lanes, dtype=jnp.int32), room, steady)
 
         def visit(k: Any, found: Any) -> Any:
             which = jax.lax.dynamic_slice(listed, (k * size,), (size,))
             real = k * size + jnp.arange(size, dtype=jnp.int32) < count
-            bodies, make_respond = look_at(which)
-            table = _find_contacts(meetings, which, real, bodies, dt)
-
-            def resolve() -> jax.Array:
-                contacts = _Contacts(table, len(bodies.now.position[0]), dt)
-                return contacts.solve(make_respond(), rows)
-
-            touches = table.need[0] > 0
-            for j in range(1, _MOST):
-                touches = touches | (table.need[j] > 0)
-            none = jnp.zeros((rows, size), dtype)
-            solved = jax.lax.cond(any_lane(touches), resolve, lambda: none)
-            return _put(found, jnp.concatenate([solved, table.clear[None]]), which, real)
+            solved, clear = _settle(meetings, which, real, look_at(which), rows, dt)
+            return _put(found, jnp.concatenate([solved, clear[None]]), which, real)
 
         return _repeat(-(-count // size), most, visit, start, steady)
 
     found: jax.Array = jax.lax.cond(any_lane(wanted), fuse(look), lambda: start)
     return found[:-1], found[-1]
+
+
+def _settle(
+    meetings: Meetings, which: jax.Array, real: jax.Array, robots: Robots, rows: int, dt: float
+) -> tuple[jax.Array, jax.Array]:
+    """Accelerations of some robots by their contacts, and the clearance without them.
+
+    In rounds: contacts are first looked for where bodies would be at unchanged speeds, which is
+    where they stay if they press; where they end up elsewhere, further ones are looked for there,
+    and join those that push.
+    """
+    size, steps = len(which), robots.steps
+    zeros = lambda *shape: jnp.zeros((*shape, size), steps.dtype)  # noqa: E731
+    none = _Contacts(
+        zeros(_MOST),
+        zeros(len(steps), _MOST),
+        zeros(_MOST, _MOST),
+        zeros(_MOST, rows),
+        zeros(_MOST),
+    )
+
+    def look_again(now: Any) -> Any:
+        contacts, clear, moving, first = now
+        change = contacts.acceleration()[6:] - first * robots.hurry
+        frames = robots.pose(steps + dt**2 * change)
+        kept = weight(contacts.force > 0, clear)
+        table = _find_contacts(meetings, which, moving > 0, frames, kept, dt)
+        touches, near = moving < 0, -first * robots.drift / dt**2
+        for k in range(_MOST):
+            touches = touches | ((table.need[k] > near) & (table.need[k] < _KEPT))
+
+        def resolve() -> Any:
+            found = contacts.join(table, frames[1], robots, change, dt)
+            turned = jnp.abs(found.acceleration()[6:] - change)
+            most = turned[0]
+            for k in range(1, len(turned)):
+                most = jnp.maximum(most, turned[k])
+            return found, weight(dt**2 * most > _TURN, clear)
+
+        found, moving = jax.lax.cond(
+            any_lane(touches), resolve, lambda: (contacts, jnp.zeros_like(moving))
+        )
+        clear = first * (table.clear - robots.drift) + (1 - first) * clear
+        return found, clear, moving, jnp.zeros_like(first)
+
+    def step(_: Any, now: Any) -> Any:
+        return jax.lax.cond(any_lane(now[2] > 0), look_again, lambda x: x, now)
+
+    start = none, zeros(), weight(real, steps), jnp.ones_like(steps[0])
+    contacts, clear, *_ = _loop(_ROUNDS, step, start)
+    return contacts.acceleration(), clear
 
 
 def _put(into: jax.Array, columns: jax.Array, which: jax.Array, real: jax.Array) -> jax.Array:
@@ -178,8 +219,11 @@ def _repeat(count: Any, most: int, body: Any, carry: Any, steady: bool) -> Any:
     return _loop(most, step, carry)
 
 
-def _append(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> Any:
-    """A list with room for one more, and its length, with the values `[n]` where flags are set."""
+def append_true(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> Any:
+    """A list with room for one more, and its length, with the values `[n]` where flags are set.
+
+    `steady` loops have a known length, so that they have derivatives.
+    """
 
     def write(k: Any, found: Any) -> Any:
         new = jax.lax.dynamic_slice(values, (k,), (1,))
@@ -229,14 +273,22 @@ def any_lane(found: jax.Array) -> jax.Array:
 
 
 def _find_contacts(
-    meetings: Meetings, which: jax.Array, real: jax.Array, bodies: Bodies, dt: float
+    meetings: Meetings,
+    which: jax.Array,
+    real: jax.Array,
+    poses: tuple[BodyFrames, BodyFrames],
+    kept: jax.Array,
+    dt: float,
 ) -> ContactTable:
-    """Contacts of some robots: pairs with bounding spheres that overlap at the end of the step."""
-    size, dtype, steady = len(which), bodies.now.position[0].dtype, meetings.steady
+    """Contacts of some robots: pairs with bounding spheres that overlap at the end of the step.
+
+    None take the places `[_MOST, lanes]` that are 1 in `kept`.
+    """
+    size, dtype, steady = len(which), kept.dtype, meetings.steady
     npair, lanes = meetings.first.shape
     width = size * max(1, _SPHERES // size)
     most = -(-npair * size // width)
-    numbers = [jnp.asarray(x, dtype).reshape(-1) for x in jax.tree.leaves(bodies)]
+    numbers = [jnp.asarray(x, dtype).reshape(-1) for x in jax.tree.leaves(poses)]
     frames, shapes = materialize(jnp.stack(numbers)), meetings.shapes
     pick = lambda x, k: materialize(take_lanes(x, k))  # noqa: E731
     body = jnp.asarray(meetings.body, jnp.int32)
@@ -273,7 +325,7 @@ def _find_contacts(
         apart = jnp.where(given & ~near, jnp.sqrt(square) - reach, _FAR)
         for k in range(0, width, size):
             clear = jnp.minimum(clear, apart[k : k + size])
-        return block + 1, _append(near, number, listed, steady), clear
+        return block + 1, append_true(near, number, listed, steady), clear
 
     def examine(listed: Any, table: ContactTable) -> ContactTable:
         """The contacts of listed pairs join those of each robot; the weakest give way."""
@@ -297,7 +349,7 @@ def _find_contacts(
 
     clear = jnp.full(size, _FAR, dtype)
     table = ContactTable(
-        jnp.full((_MOST, size), _NONE, dtype), jnp.zeros((_MOST + 1, 14, size), dtype), clear
+        _NONE + (_KEPT - _NONE) * kept, jnp.zeros((_MOST + 1, 8, size), dtype), clear
     )
     room = most * width if steady else min(most * width, _ROOM)
     start = jnp.zeros(room + max(width, _PAIRS), jnp.int32), jnp.int32(0)
@@ -330,8 +382,8 @@ class ContactTable(NamedTuple):
     Attributes:
         need: `[_MOST, lanes]` the acceleration along the normal that each needs [m/s²]; not
             positive where boxes stay apart unless other contacts push them together.
-        rest: `[_MOST + 1, 14, lanes]` the numbers of both bodies, and torque and force of a unit
-            force on each, own frames; the last contact is none.
+        rest: `[_MOST + 1, 8, lanes]` the numbers of both bodies, the normal and the point at the
+            end of the step, root's frame [-, m]; the last contact is none.
         clear: `[lanes]` how far at least boxes are apart at the step's end [m].
     """
 
@@ -356,62 +408,35 @@ class _Given(NamedTuple):
     lane: jax.Array
 
 
-class _Side(NamedTuple):
-    """One box of each pair and its body, `[3, n]` and `[3, 3, n]`.
-
-    Attributes:
-        pose: rotation and position of the body, now and at the end of the step.
-        half: half edges of the box [m].
-        boxes: its rotation and centre at both times.
-    """
-
-    pose: tuple[tuple[jax.Array, jax.Array], ...]
-    half: jax.Array
-    boxes: tuple[tuple[jax.Array, jax.Array], ...]
-
-    @staticmethod
-    def of(frames: jax.Array, shape: jax.Array) -> _Side:
-        """Of the numbers of `Bodies` and of `Boxes`, one below the other."""
-        mat = lambda x: x.reshape(3, 3, x.shape[-1])  # noqa: E731
-        pose = tuple((mat(frames[k : k + 9]), frames[k + 9 : k + 12]) for k in (0, 12))
-        boxes = []
-        for turn, position in pose:
-            own = turn
-            if len(shape) > 6:
-                other = mat(shape[3:12])
-                own = sum(turn[:, k][:, None] * other[k][None] for k in range(3))
-            boxes.append((own, position + matvec(turn, shape[:3])))
-        return _Side(pose, shape[-3:], tuple(boxes))
+def _placed(frames: jax.Array, shape: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+    """Rotation and centre of boxes now and ahead, from numbers of `Bodies` and of `Boxes`."""
+    mat, found = lambda x: x.reshape(3, 3, x.shape[-1]), []
+    for k in (0, 12):
+        turn, position = mat(frames[k : k + 9]), frames[k + 9 : k + 12]
+        own = turn
+        if len(shape) > 6:
+            other = mat(shape[3:12])
+            own = sum(turn[:, k][:, None] * other[k][None] for k in range(3))
+        found.append((own, position + matvec(turn, shape[:3])))
+    return found
 
 
 def _measure(given: tuple[tuple[jax.Array, jax.Array], ...], dt: float) -> Any:
-    """What pairs need, their gaps, and torque and force on both; see `ContactTable`."""
+    """What pairs need, their gaps, normals and points; see `ContactTable`."""
 
     def compute(given: Any) -> Any:
-        sides = [_Side.of(*x) for x in given]
-        one, other = sides
+        halves = [shape[-3:] for _, shape in given]
+        boxes = list(zip(*(_placed(*x) for x in given), strict=True))
         pair, later = (
-            BoxPair(second[1] - first[1], first[0], second[0], one.half, other.half)
-            for first, second in zip(one.boxes, other.boxes, strict=True)
+            BoxPair(other[1] - one[1], one[0], other[0], *halves) for one, other in boxes
         )
         contact = box_contact(pair, later)
         closing = jnp.maximum(contact.start - contact.gap, 0)
         parted = jnp.clip(-_SHARE * (contact.start + _SLOP), 0, dt * _TOP)
         target = jnp.minimum(contact.start, 0) + jnp.minimum(parted, closing)
         need = (target - contact.gap) / dt**2
-        point = one.boxes[0][1] + contact.point
-        ends, units = [], []
-        for side, sign in zip(sides, (-1.0, 1.0), strict=True):
-            (turn, position), (turned, moved) = side.pose
-            arm = mat_t_vec(turn, point - position)
-            # Where the point ends that is fixed to the body.
-            ends.append(moved + matvec(turned, arm))
-            push = sign * mat_t_vec(turn, contact.normal)
-            units += [*cross(tuple(arm), tuple(push)), *push]
-        speed = dot(contact.normal, ends[1] - ends[0]) / dt
-        # Normals turn within the step; so that no work is done, boxes part no faster than they met.
-        need = jnp.minimum(need, 2 * jnp.maximum(-speed, 0) / dt)
-        return need, contact.gap, *units
+        point = boxes[1][0][1] + contact.point
+        return need, contact.gap, *contact.normal, *point
 
     return fuse(compute)(given)
 
@@ -431,7 +456,7 @@ def _insert(
             slot, least = jnp.where(weaker, k, slot), jnp.where(weaker, needs[k], least)
         slot = slot.astype(jnp.int32)
         most = jnp.maximum(need[j], least).reshape(1, 1)
-        new = jax.lax.dynamic_slice(rest, (zero, j), (14, 1))[None]
+        new = jax.lax.dynamic_slice(rest, (zero, j), (8, 1))[None]
         clear = jnp.minimum(table.clear[own], gap[j]).reshape(1)
         # What is not read is written where it stands; what is too weak, behind the others.
         place = jnp.where(need[j] > least, slot, _MOST), zero, own
@@ -447,40 +472,61 @@ def _insert(
 # ------------------------------------------------------------------ forces
 
 
-class _Contacts:
-    """Contacts of some robots, `[_MOST, lanes]` each.
+class _Contacts(NamedTuple):
+    """Contacts of some robots.
 
     Attributes:
-        need: acceleration along the normal that each needs [m/s²]; not positive: no contact.
-        numbers: `[_MOST, 14, lanes]` numbers of the two bodies, torque and force of a unit force.
+        need: `[_MOST, lanes]` acceleration along the normal by all contacts that each needs
+            [m/s²]; not positive: no contact.
+        levers: `[nhinge, _MOST, lanes]` how fast a hinge's turning parts the boxes at the end of
+            the step [m/rad]: a unit force along the normal is such a torque at the hinge.
+        columns: `[_MOST, _MOST, lanes]` of W, of the contacts that take part.
+        moved: `[_MOST, rows, lanes]` the responses to unit forces of these.
+        force: `[_MOST, lanes]` [N].
     """
 
-    def __init__(self, table: ContactTable, count: int, dt: float) -> None:
-        self.count, self.dt, self.need = count, dt, table.need
-        self.numbers = table.rest[:_MOST]
-        lane = jnp.arange(table.need.shape[-1], dtype=jnp.int32)
-        sides = jnp.swapaxes(self.numbers, 0, 1)
-        self._places = [(x.astype(jnp.int32) * len(lane) + lane).reshape(-1) for x in sides[:2]]
-        self._units = [materialize(x.reshape(6, -1)) for x in (sides[2:8], sides[8:])]
+    need: jax.Array
+    levers: jax.Array
+    columns: jax.Array
+    moved: jax.Array
+    force: jax.Array
 
-    def _spread(self, chosen: jax.Array) -> tuple[jax.Array, ...]:
-        """Torque and force on all bodies of unit forces, `[nbody, lanes]` each; one of a lane."""
-        own = materialize(_sum([chosen[k] * self.numbers[k] for k in range(_MOST)]))
-        number = jnp.arange(self.count, dtype=own.dtype)[:, None]
-        here = [weight(number == own[side], own) for side in range(2)]
-        return tuple(here[0] * own[2 + k] + here[1] * own[8 + k] for k in range(6))
+    def acceleration(self) -> jax.Array:
+        """By all contacts, a response."""
+        return _sum([self.force[k] * self.moved[k] for k in range(_MOST)])
 
-    def _gather(self, acceleration: tuple[jax.Array, ...]) -> jax.Array:
-        """Acceleration of the contacts along their normals `[_MOST, lanes]`."""
-        joined = materialize(jnp.stack([x.reshape(-1) for x in acceleration]))
+    def join(
+        self, table: ContactTable, ahead: BodyFrames, robots: Robots, change: jax.Array, dt: float
+    ) -> _Contacts:
+        """Those that push, with those of a table in the other places, solved.
+
+        `change` are the accelerations by which hinges end where the table's contacts are.
+        """
+        numbers = table.rest[:_MOST]
+        number = jnp.arange(len(ahead.position[0]), dtype=numbers.dtype)[:, None]
+        ends = lambda x: weight(number == x[1], x) - weight(number == x[0], x)  # noqa: E731
+        signs = robots.carried([ends(numbers[k]) for k in range(_MOST)])
+        axis = tuple(row[2][1:] for row in ahead.rotation)
         found = []
-        for place, unit in zip(self._places, self._units, strict=True):
-            felt = unit * take_lanes(joined, place)
-            found += [felt[k] for k in range(6)]
-        return _sum(found).reshape(self.need.shape)
+        for k in range(_MOST):
+            normal, point = numbers[k, 2:5], numbers[k, 5:8]
+            arm = tuple(x - p[1:] for x, p in zip(point, ahead.position, strict=True))
+            found.append(signs[k] * dot(axis, cross(arm, tuple(normal))))
+        kept = weight(self.force > 0, self.force)
+        levers = materialize(kept * self.levers + (1 - kept) * jnp.stack(found, 1))
+        every = [levers[k] for k in range(len(levers))]
+        along = lambda hinges: _sum([hinges[k] * x for k, x in enumerate(every)])  # noqa: E731
+        # Contact does no work: boxes part no faster than they met.
+        most = 2 * jnp.maximum(-along(robots.steps), 0) / dt**2
+        need = kept * self.need + (1 - kept) * jnp.minimum(table.need + along(change), most)
+        moved = kept[:, None] * self.moved
+        columns = _sum([moved[:, 6 + k][:, None] * x for k, x in enumerate(every)])
+        columns = kept[:, None] * (columns + _SOFTNESS * _unit(self.force))
+        contacts = _Contacts(need, levers, columns, moved, kept * self.force)
+        return contacts.solve(robots.make_respond(), dt)
 
-    def solve(self, respond: Respond, rows: int) -> jax.Array:
-        """The accelerations by all contacts, `Acceleration.robot` of so many rows.
+    def solve(self, respond: Respond, dt: float) -> _Contacts:
+        """With the forces of all contacts.
 
         Contacts take part one after the other, the one that misses most first: a column of W is
         the response to its unit force. Those that take part are solved by projected Gauss-Seidel
@@ -489,6 +535,7 @@ class _Contacts:
         energy. A robot that is done stays as it is, whatever its neighbours in the batch need.
         """
         lanes = self.need.shape[-1]
+        levers = [self.levers[k] for k in range(len(self.levers))]
 
         def sweep(columns: jax.Array, inverse: jax.Array, now: Any) -> Any:
             old, moving = now
@@ -499,7 +546,7 @@ class _Contacts:
                 force.append(old[k] + moving * change)
                 missing = missing - columns[k] * (moving * change)
                 most = jnp.maximum(most, moving * jnp.abs(change) * columns[k, k])
-            return jnp.stack(force), moving * weight(most * self.dt**2 > _ENOUGH, most)
+            return jnp.stack(force), moving * weight(most * dt**2 > _ENOUGH, most)
 
         def settle(force: jax.Array, columns: jax.Array, moving: jax.Array) -> jax.Array:
             diagonal = _diagonal(columns)
@@ -520,25 +567,26 @@ class _Contacts:
             for k in range(1, _MOST):
                 better.append(weight(missing[k] > worst, worst))
                 worst = jnp.maximum(worst, missing[k])
-            chosen = jnp.stack(_last_of(better)) * wanting
-            change = respond(self._spread(chosen))
-            own = self._gather(change.bodies) + _SOFTNESS * chosen
+            chosen = jnp.stack(last_of(better)) * wanting
+            torque = [_sum([chosen[k] * x[k] for k in range(_MOST)]) for x in levers]
+            change = respond(jnp.stack(torque))
+            own = _sum([change[6 + k] * x for k, x in enumerate(levers)]) + _SOFTNESS * chosen
             columns = (1 - chosen[:, None]) * columns + chosen[:, None] * own
-            moved = (1 - chosen[:, None]) * moved + chosen[:, None] * change.robot
+            moved = (1 - chosen[:, None]) * moved + chosen[:, None] * change
             force = settle(force, columns, wanting)
-            return force, columns, moved, *self._missing(force, columns)
+            return force, columns, moved, *self._missing(force, columns, dt)
 
         def step(_: Any, now: Any) -> Any:
             return jax.lax.cond(any_lane(now[-1] > 0), fuse(join, inline=True), lambda x: x, now)
 
-        force = jnp.zeros_like(self.need)
-        columns = jnp.zeros((_MOST, *force.shape), force.dtype)
-        moved = jnp.zeros((_MOST, rows, lanes), force.dtype)
-        start = force, columns, moved, *self._missing(force, columns)
-        force, _, moved, *_ = _loop(_MOST, step, start)
-        return _sum([force[k] * moved[k] for k in range(_MOST)])
+        missing = self._missing(self.force, self.columns, dt)
+        start = self.force, self.columns, self.moved, *missing
+        force, columns, moved, *_ = _loop(_MOST, step, start)
+        return self._replace(force=force, columns=columns, moved=moved)
 
-    def _missing(self, force: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _missing(
+        self, force: jax.Array, columns: jax.Array, dt: float
+    ) -> tuple[jax.Array, jax.Array]:
         """What contacts miss that do not take part [m/s²]; `[lanes]` 1 where any misses much."""
         missing = self.need - _sum([columns[j] * force[j] for j in range(_MOST)])
         taken = weight(_diagonal(columns) > 0, force)
@@ -546,20 +594,17 @@ class _Contacts:
         worst = missing[0]
         for k in range(1, _MOST):
             worst = jnp.maximum(worst, missing[k])
-        return missing, weight(worst * self.dt**2 > _ENOUGH, worst)
+        return missing, weight(worst * dt**2 > _ENOUGH, worst)
+
+
+def _unit(like: jax.Array) -> jax.Array:
+    """The unit matrix, `[_MOST, _MOST, 1]`."""
+    place = jnp.arange(_MOST, dtype=jnp.int32)
+    return weight(place[:, None, None] == place[None, :, None], like)
 
 
 def _diagonal(columns: jax.Array) -> jax.Array:
     return jnp.stack([columns[k, k] for k in range(_MOST)])
-
-
-def _last_of(better: list[jax.Array]) -> list[jax.Array]:
-    """1 for the last of some things that was better than those before it, 0 for the others."""
-    share, left = [], jnp.ones_like(better[0])
-    for x in reversed(better):
-        share.append(left * x)
-        left = left * (1 - x)
-    return [left, *reversed(share)]
 
 
 def _sum(xs: list[jax.Array]) -> jax.Array:

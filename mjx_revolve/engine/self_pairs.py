@@ -235,41 +235,38 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
     return stops
 
 
-def hinge_levers(assembly: Assembly) -> Float[np.ndarray, " nbody"]:
-    """How far boxes of a robot can move, one seen from another, for each radian of a hinge.
+def hinge_levers(
+    assembly: Assembly, pairs: Int[np.ndarray, "pairs 2"]
+) -> Float[np.ndarray, " nbody"]:
+    """How far parts of pairs can move, one seen from the other, for each radian of a hinge.
 
-    The farthest that any box reaches from the hinge on the side of it where they reach less far, as
-    if all hinges on the way could stretch: an upper bound, in every pose.
+    The farthest that a part reaches from a hinge between the two, on the side of it where they
+    reach less far, as if all hinges on the way could stretch: an upper bound, in every pose.
 
     Args:
         assembly: of a robot, or of several.
+        pairs: rows of its fluid table.
 
     Returns:
-        Of each body's hinge [m]; 0 of roots.
+        Of each body's hinge [m]; 0 where it stands between no pair.
     """
-    table, parent, place = assembly.fluid, assembly.parent, assembly.position
+    table, parent, place = assembly.fluid, assembly.parent.tolist(), assembly.position
     center = place[table.body] + turned(assembly.rotation[table.body], table.position)
     radius = np.linalg.norm(table.half_size, axis=1)
-    order = np.argsort(table.body, kind="stable")
-    down, up = np.zeros(len(parent)), np.zeros(len(parent))
-
-    def reach(at: np.ndarray, part: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(center[part] - place[at], axis=1) + radius[part]
-
-    np.maximum.at(down, table.body[order], reach(table.body[order], order))
-    link = np.linalg.norm(place - place[parent], axis=1)
-    hinged = np.flatnonzero(parent)
-    for body in hinged[::-1]:  # children come after their parents
-        down[parent[body]] = max(down[parent[body]], link[body] + down[body])
-    # On the other side: the carrying body's own boxes, its other children, and what carries it.
-    which, part = pairs_within(parent[hinged], table.body[order])
-    np.maximum.at(up, hinged[which], reach(hinged[which], order[part]))
-    family = hinged[np.argsort(parent[hinged], kind="stable")]
-    which, other = pairs_within(parent[hinged], parent[family])
-    which, other = hinged[which], family[other]
-    beyond = np.linalg.norm(place[other] - place[which], axis=1) + down[other]
-    np.maximum.at(up, which, np.where(which == other, 0, beyond))
-    for body in hinged:
-        if parent[parent[body]]:
-            up[body] = max(up[body], link[body] + up[parent[body]])
-    return np.where(parent > 0, np.minimum(down, up), 0.0)
+    found = np.zeros(len(parent))
+    for part in pairs:
+        ways: list[list[int]] = [[], []]
+        for way, body in zip(ways, table.body[part].tolist(), strict=True):
+            while parent[body]:
+                way.append(body)
+                body = parent[body]
+        one, other = ways
+        while one and other and one[-1] == other[-1]:
+            one.pop(), other.pop()
+        hinges = [*one, *reversed(other)]
+        # Neighbours on the way belong to one rigid body, at a fixed distance.
+        points = np.concatenate([center[part[:1]], place[hinges], center[part[1:]]])
+        along = np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))
+        reach = np.minimum(radius[part[0]] + along, radius[part[1]] + along[-1] - along)
+        found[hinges] = np.maximum(found[hinges], reach[:-1])
+    return found

@@ -232,7 +232,7 @@ def make_single_tree(robot: Robot, contact: bool = True) -> SingleTree:
         The tree.
     """
     assembly = robot.assembly
-    columns = read_constants(assembly)
+    columns = read_constants(assembly, assembly.meeting_pairs)
     if robot.edited_model is not None:
         columns = edited_constants(columns, robot.edited_model, robot.servos)
     parent = assembly.parent.tolist()

@@ -50,6 +50,7 @@ LIMIT_OVERSHOOT = 0.008
 TORQUE_CURVE_KNEE = 0.75
 # A hinge of this inertia does not move [kg·m²]: so overflow rows and padding are held.
 IMMOBILE_INERTIA = 1e30
+_NO_PAIRS = np.zeros((0, 2), int)
 # Stands for infinity where arithmetic must stay finite.
 NO_LIMIT = 1e30
 
@@ -128,11 +129,12 @@ def _end(x: Any, blank: Any) -> np.ndarray:
 # ------------------------------------------------------------------ reading
 
 
-def read_constants(assembly: Assembly) -> StepConstants:
+def read_constants(assembly: Assembly, pairs: np.ndarray = _NO_PAIRS) -> StepConstants:
     """Reads the columns of a robot, or of several one behind the other.
 
     Args:
         assembly: of the robots.
+        pairs: `[pairs, 2]` parts of one robot that can meet, rows of the fluid table.
 
     Returns:
         The columns.
@@ -153,7 +155,7 @@ def read_constants(assembly: Assembly) -> StepConstants:
     laws = sorted(set(each))
     number = {law: k for k, law in enumerate(laws)}
     return StepConstants(
-        hinges=_read_hinges(assembly, frame),
+        hinges=_read_hinges(assembly, frame, pairs),
         bodies=_read_bodies(assembly, frame),
         parts=_read_parts(assembly, frame),
         points=points,
@@ -171,7 +173,7 @@ def hinge_frames(assembly: Assembly) -> np.ndarray:
     return np.array([frames[axis] for axis in map(tuple, assembly.axis.tolist())])
 
 
-def _read_hinges(assembly: Assembly, frame: np.ndarray) -> Hinges:
+def _read_hinges(assembly: Assembly, frame: np.ndarray, pairs: np.ndarray) -> Hinges:
     position, rotation = assembly.from_parents()
     up = frame[assembly.parent].swapaxes(1, 2)
     # At rest, ours of the child seen from ours of the parent.
@@ -211,7 +213,7 @@ def _read_hinges(assembly: Assembly, frame: np.ndarray) -> Hinges:
         stop=column(effort / LIMIT_OVERSHOOT, 0.0),
         motor=(column(motor[0], NO_LIMIT), column(motor[1], 0.0), column(motor[2], 1.0)),
         base_inertia=column(_base_inertias(assembly), 1.0),
-        lever=hinge_levers(assembly) if assembly.world.self_contact else zero,
+        lever=hinge_levers(assembly, pairs),
     )
 
 

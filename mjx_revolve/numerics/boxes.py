@@ -186,7 +186,7 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
             boxes that would pass through each other within the step do not.
 
     Returns:
-        The contact; normal and point are now's.
+        The contact; normal and point are those ahead.
     """
     xp = namespace(pair.offset[0])
     axes = box_axes(pair, _PARALLEL if ahead is None else _SWINGING)
@@ -198,21 +198,19 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
         parting = [weight(n >= least, n) for n in now]
         later = box_axes(ahead).gaps(side)
         score = tuple(w * x - 1e3 * (1 - w) for w, x in zip(parting, later, strict=True))
-    turn = _relative(pair)
     face, crossing = _largest(score[:2]), _largest(score[2:])
     edges = weight(crossing > face + _FACES_FIRST, face)
     best = face + edges * (crossing - face)
-    share = _first_of(score, face, crossing, edges)
+    share = [(1 - edges) * x for x in _largest_of(score[:2])]
+    share += [edges * x for x in _largest_of(score[2:])]
     start = sum(s[k] * x[k] for s, x in zip(share, now, strict=True) for k in range(3))
-    signed = [x * y for x, y in zip(share, side, strict=True)]
-    normal = _axis(turn, signed)
-    # The feature that touches first is the one that reaches farthest at the end of the step.
-    turn_ahead = turn if ahead is None else _relative(ahead)
-    toward = normal if ahead is None else _axis(turn_ahead, signed)
+    pair = pair if ahead is None else ahead
+    turn = _relative(pair)
+    normal = _axis(turn, [x * y for x, y in zip(share, side, strict=True)])
     # The features that look at each other, seen from the first box.
     t = mat_t_vec(pair.first, pair.offset)
-    one, spread = _feature(toward, pair.first_half)
-    other, other_spread = _feature(-mat_t_vec(turn_ahead, toward), pair.second_half)
+    one, spread = _feature(normal, pair.first_half)
+    other, other_spread = _feature(-mat_t_vec(turn, normal), pair.second_half)
     away = t + matvec(turn, other) - one
     size, back = xp.abs(turn), mat_t_vec(turn, away)
     on_first = _common(spread, away, matvec(size, other_spread))
@@ -232,20 +230,34 @@ def box_contact(pair: BoxPair, ahead: BoxPair | None = None) -> BoxContact:
     return BoxContact(best, start, matvec(pair.first, normal), matvec(pair.first, one + point))
 
 
-def _first_of(
-    score: Sequence[Scalar], face: Scalar, crossing: Scalar, edges: Scalar
-) -> list[Scalar]:
-    """1 for the first axis of the best kind with the best score, 0 for all others, by groups."""
-    found, left = [], 1 - edges
-    for k, group in enumerate(score):
-        left = edges if k == 2 else left
-        best = weight(group >= (face if k < 2 else crossing), group)
-        rows = []
-        for x in best:
-            rows.append(left * x)
-            left = left * (1 - x)
-        found.append(_stacked(rows))
-    return found
+def _largest_of(groups: Sequence[Scalar]) -> list[Scalar]:
+    """1 for an axis with the largest number of some groups, 0 for all others.
+
+    Numbers are compared with each other, never with their maximum: XLA may compute it with other
+    last bits than the numbers themselves, and then no axis would be it.
+    """
+    best, better = groups[0], []
+    xp = namespace(best)
+    for x in groups[1:]:
+        better.append(weight(x > best, x))
+        best = xp.maximum(best, x)
+    second = weight(best[1] > best[0], best)
+    third = weight(best[2] > xp.maximum(best[0], best[1]), best)
+    row = _stacked(last_of([second, third]))
+    return [x * row for x in last_of(better)]
+
+
+def last_of(better: Sequence[Scalar]) -> list[Scalar]:
+    """1 for the last of some things that was better than those before it, 0 for the others.
+
+    Args:
+        better: 1 or 0 for each of them but the first.
+    """
+    share, left = [], 1.0
+    for x in reversed(better):
+        share.append(left * x)
+        left = left * (1 - x)
+    return [left, *reversed(share)]
 
 
 def _axis(turn: Scalar, share: Sequence[Scalar]) -> Scalar:

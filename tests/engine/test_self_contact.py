@@ -87,11 +87,12 @@ def momentum(robot, qpos, qvel):
 def test_servos_at_full_torque_press_less_than_2_mm(timestep):
     robot = jaw(timestep=timestep)
     qpos, qvel = open_jaw(robot)
-    _, qpos, qvel, _ = march(robot, 2.0, qpos, qvel, INWARDS)
+    qpos = march(robot, 2.0, qpos, qvel, INWARDS)[1]
     deep = depths(robot, qpos)
     assert deep.max() < 2e-3
     assert np.abs(qpos[-1, 7:] - INWARDS).max() > 0.05  # they do press
-    assert np.abs(qvel[-1, 6:]).max() < 0.02
+    # At 20 ms the end stop that one arm is pressed against lets go in every other step.
+    assert np.ptp(qpos[-20:, 7:], 0).max() < 1e-3
 
 
 def test_without_self_contact_arms_pass_through_each_other():
@@ -309,10 +310,7 @@ def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):
             for k, robot in enumerate(robots)
         ]
     )
-    # Measured, 144 gaits: 1.8 mm at most; at 20 ms, 4.2 % beyond 3 mm and 5.7 mm at most.
-    share, most = (0.99, 3e-3) if timestep < 0.01 else (0.95, 1e-2)
-    assert np.mean(deep < 3e-3) >= share
-    assert deep.max() < most
+    assert deep.max() < 3e-3
     assert np.median(deep) < 1e-3
 
 
