@@ -7,6 +7,7 @@ compared step by step. `Tree` traverses the robots, `dynamics` has their acceler
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -37,6 +38,7 @@ from mjx_revolve.numerics.spatial import (
     vadd,
     vsub,
 )
+from mjx_revolve.numerics.xla import fuse_outermost
 from mjx_revolve.water.flow import Water
 
 
@@ -75,6 +77,11 @@ class PopulationEngine:
         self, state: State, ctrl: Float[Array, "n lanes"], water: Water, wrench: Any = ()
     ) -> tuple[State, Float[Array, " lanes"]]:
         """The state after a step, and the power of servos and ideal propellers [W]."""
+        return fuse_outermost(self._step, state, ctrl, water, wrench)
+
+    def _step(
+        self, state: State, ctrl: jax.Array, water: Water, wrench: Any
+    ) -> tuple[State, jax.Array]:
         tree = self._tree
         dt = tree.world.timestep
         targets, command, thrusts, pumped = actuate(self.tree, state, ctrl)
@@ -242,6 +249,12 @@ def acceleration(
         `[nv, lanes]` qacc: root linear, world frame [m/s²], root angular, body frame [rad/s²],
         hinges [rad/s²].
     """
+    return fuse_outermost(partial(_acceleration, tree), qpos, qvel, ctrl, water)
+
+
+def _acceleration(
+    tree: Tree, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, water: Water
+) -> jax.Array:
     state = init(tree, qpos, qvel)._replace(qacc_prev=(), submerged=())
     # As in mj_forward, a command has not passed the thruster's lag yet.
     targets, _, thrusts, _ = actuate(tree, state, ctrl)

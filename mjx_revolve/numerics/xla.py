@@ -15,10 +15,10 @@ notices if they lose their effect). Results do not depend on them, but for the l
    a function with an unused parameter, and loops of unknown length leave such parameters behind: so
    operations that no result depends on are left out.
 
-Other layers use `fuse_step`, `fuse` and `materialize`, all identities to JAX: jit, vmap and grad go
-through them. They do nothing on other back ends, nor with the environment variable
-`MJX_REVOLVE_FUSE=0`: the results are the same, but slower. So an error in XLA can be distinguished
-from one in this package.
+Other layers use `fuse_step`, `fuse`, `fuse_outermost` and `materialize`, all identities to JAX:
+jit, vmap and grad go through them. They do nothing on other back ends, nor with the environment
+variable `MJX_REVOLVE_FUSE=0`: the results are the same, but slower. So an error in XLA can be
+distinguished from one in this package.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
+from contextvars import ContextVar
 from typing import Any, NamedTuple, TypeVar, TypeVarTuple
 
 import jax
@@ -65,6 +66,9 @@ _VIEWS = {
 
 _COST |= dict.fromkeys(_VIEWS, 0)
 _LOOPS = {"cond", "scan", "while"}
+
+# Whether a function is traced that is fused as a whole.
+_fusing: ContextVar[bool] = ContextVar("_fusing", default=False)
 
 Ts = TypeVarTuple("Ts")
 R = TypeVar("R")
@@ -156,6 +160,32 @@ def fuse(fun: Callable[[*Ts], R], inline: bool = False) -> Callable[[*Ts], R]:
     return shared if inline else fuse_call(shared)
 
 
+def fuse_outermost(fun: Callable[[*Ts], R], *args: *Ts) -> R:
+    """`fun(*args)`, fused into its caller unless that is fused as a whole.
+
+    For functions that users compile by a `jax.jit` of their own, and that our loops contain:
+    without it XLA:CPU takes minutes for one step of a robot.
+
+    Args:
+        fun: a function of pytrees of arrays.
+        *args: its arguments.
+
+    Returns:
+        Its result.
+    """
+    if _fusing.get() or not is_traced(*args):
+        return fun(*args)
+    # Numbers stay numbers: what they make 0 or 1 is left out.
+    leaves, tree = jax.tree.flatten(args)
+    arrays = [k for k, x in enumerate(leaves) if isinstance(x, jax.Array)]
+
+    def of_arrays(*xs: jax.Array) -> R:
+        given = dict(zip(arrays, xs, strict=True))
+        return fun(*jax.tree.unflatten(tree, [given.get(k, x) for k, x in enumerate(leaves)]))
+
+    return fuse(of_arrays, inline=True)(*(leaves[k] for k in arrays))
+
+
 def fuse_call(fun: Callable[[*Ts], R]) -> Callable[[*Ts], R]:
     """The same function (element-wise but for loops), compiled by XLA:CPU into one call."""
 
@@ -187,7 +217,11 @@ class Graph:
 
     def __init__(self, fun: Callable[..., PyTree], examples: PyTree) -> None:
         """Traces `fun` (of pytrees of arrays) on arguments like `examples`."""
-        closed, shapes = jax.make_jaxpr(fun, return_shape=True)(*examples)
+        within = _fusing.set(True)
+        try:
+            closed, shapes = jax.make_jaxpr(fun, return_shape=True)(*examples)
+        finally:
+            _fusing.reset(within)
         self._structure = jax.tree.structure(shapes)
         self._operations: list[_Operation] = []
         self._constants: dict[int, Any] = {}

@@ -12,7 +12,14 @@ import pytest
 
 from mjx_revolve.numerics import xla
 from mjx_revolve.numerics.adjoint import differentiate_as
-from mjx_revolve.numerics.xla import fuse, fuse_step, materialize, on_cpu, over_chunks
+from mjx_revolve.numerics.xla import (
+    fuse,
+    fuse_outermost,
+    fuse_step,
+    materialize,
+    on_cpu,
+    over_chunks,
+)
 
 LANES = jnp.linspace(-1, 1, 64, dtype=jnp.float32)
 
@@ -121,6 +128,23 @@ def test_a_materialized_value_is_stored_though_it_is_used_once():
     marked = lambda x, y: materialize(jnp.tanh(x))[None] * y  # noqa: E731
     assert (xla.Graph(plain, (x, y)).size, xla.Graph(marked, (x, y)).size) == (0, 1)
     assert np.array_equal(xla.Graph(marked, (x, y))(x, y), plain(x, y))
+
+
+@pytest.mark.skipif(not on_cpu(), reason="the annotations are for CPUs")
+def test_a_function_is_fused_once_whatever_its_caller_does():
+    """By itself it is fused, with its numbers as they are; within a fused function it is not."""
+    seen = []
+
+    def scaled(x, factor):
+        seen.append(factor)
+        return step(factor * x)
+
+    alone = jax.make_jaxpr(lambda x: fuse_outermost(scaled, x, 2.0))(LANES)
+    within = jax.make_jaxpr(fuse(lambda x: fuse_outermost(scaled, x, 2.0), inline=True))(LANES)
+    plainly = jax.make_jaxpr(fuse(lambda x: scaled(x, 2.0), inline=True))(LANES)
+    assert "materialize" in str(alone) and str(within) == str(plainly)
+    assert set(map(type, seen)) == {float}
+    assert (fuse_outermost(scaled, LANES, 2.0) == step(2.0 * LANES)).all()
 
 
 def test_a_materialized_value_has_batches_and_gradients():
