@@ -88,8 +88,9 @@ def swim_randomly(names: Sequence[str]) -> Iterator[Page]:
             with contextlib.suppress(InputError):  # what floats, floats
                 body = trim_neutral(body, water.density)
         bodies.append(body)
+    sines = {"controller.type": "sine", "trim": "none"}
     fitness = make_mixed_fitness(
-        "fish_swim", bodies, **{"task.duration": SECONDS, "task.start_tilt": 0.0}
+        "smoke", bodies, **sines, **{"task.duration": SECONDS, "task.start_tilt": 0.0}
     )
     robots = [fitness.build(body) for body in bodies]
     draw = np.random.default_rng(0)

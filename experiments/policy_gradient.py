@@ -36,8 +36,9 @@ from mjx_revolve.water.flow import water_of
 
 CONFIG = "fish_swim"
 SENSORS = ("tilt", "compass", "gyro", "flow", "climb", "angle", "speed")
-# The fish swims along y, and nothing is lost on the time in which it need not.
-CHANGES = {"task.settle": 0.5, "task.duration": 5.0}
+# The fish swims along y, and nothing is lost on the time in which it need not. Rewards are the way
+# itself, in one water.
+CHANGES = {"task.settle": 0.5, "task.duration": 5.0, "task.horizon": None, "task.robust": None}
 
 
 @dataclass(frozen=True)
