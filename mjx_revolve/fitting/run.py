@@ -207,7 +207,8 @@ class FitRun:
         arrays, meta = checkpoint.arrays, checkpoint.meta
         self.folder.rewind(checkpoint)
         self.problem.roots[:] = arrays["roots"]
-        self.problem.drive.resets[:] = arrays["resets"]
+        resets = self.problem.drive.resets
+        resets[:] = arrays.get("resets", resets)  # folders of older versions have no cut windows
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
         names = ("common", "generation", "cost", "moved", "inflated")
         rest = (meta[name] for name in names)
