@@ -1,10 +1,11 @@
 """What the shipped configurations come to: score, passport, time and memory of each.
 
-``python -m experiments.shipped [--only NAME,...] [--results]``
+``python -m experiments.shipped [--only NAME,...] [--seeds N] [--results]``
 
 Each evolves by the command, as it is shipped, with a compilation cache of its own that is empty:
-what somebody sees who does it for the first time. With `--results` each
-has its `docs/results/NAME.json`.
+what somebody sees who does it for the first time. Further seeds find the programs of the first
+one. With `--results` each has its `docs/results/NAME.json`: all of the first seed, the score and
+what the passport fails of each.
 """
 
 from __future__ import annotations
@@ -15,25 +16,29 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.common import ROOT, make_folder, make_parser, write_results
+from experiments.common import ROOT, as_numbers, make_folder, make_parser, write_results
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.run_reader import RunReader
-from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.view.statistics import interval
 
 NAMES = tuple(path.stem for path in sorted((ROOT / "configs").glob("*.yaml")))
 
 
-def evolve(name: str, folder: Path) -> dict[str, Any]:
+def evolve(name: str, folder: Path, seed: int, cache: Path) -> dict[str, Any]:
     """Evolves a configuration, and reads what it came to.
 
     Args:
         name: of a file in `configs/`.
         folder: for the run; what is there is removed.
+        seed: of the run.
+        cache: for compiled programs.
 
     Returns:
         The numbers: times [s] by the clock and of all processors, the largest process's memory,
@@ -46,9 +51,9 @@ def evolve(name: str, folder: Path) -> dict[str, Any]:
     load, began = os.getloadavg()[0], time.monotonic()
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-m", "mjx_revolve.evolve", name, "--out", str(folder)]
-    place = {"JAX_COMPILATION_CACHE_DIR": str(folder.with_name(f"{name}_cache"))}
+    command += ["--seed", str(seed)]
+    place = {"JAX_COMPILATION_CACHE_DIR": str(cache)}
     done = subprocess.run(command, cwd=ROOT, env=os.environ | place, stdout=subprocess.DEVNULL)
-    shutil.rmtree(place["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
     if done.returncode:
         raise InputError(f"{name}: expected exit code 0 of evolve; found {done.returncode}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -67,11 +72,43 @@ def evolve(name: str, folder: Path) -> dict[str, Any]:
     }
 
 
+def over_seeds(runs: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+    """What the seeds of a configuration come to.
+
+    Args:
+        runs: by seed, as `evolve` reads each.
+
+    Returns:
+        The interval of their scores, how many passports pass, and a row for each seed with the
+        checks that fail; None without a passport.
+    """
+    rows = [
+        {
+            "seed": seed,
+            "score": run["score"],
+            "score_std": run["score_std"],
+            "cpu_s": run["cpu_s"],
+            "failed": run["passport"]
+            and [key for key, x in run["passport"]["checks"].items() if not x.get("passed", True)],
+        }
+        for seed, run in runs.items()
+    ]
+    return {
+        "score": as_numbers(interval([row["score"] for row in rows])),
+        "passed": sum(row["failed"] == [] for row in rows),
+        "size": len(rows),
+        "runs": rows,
+    }
+
+
 def main(argv: list[str] | None = None) -> int:
     """Evolves them one after the other."""
     parser = make_parser("shipped", "What the shipped configurations come to.")
     parser.add_argument(
         "--only", default=",".join(NAMES), metavar="NAME,...", help="(default: all)"
+    )
+    parser.add_argument(
+        "--seeds", type=whole(1), default=1, metavar="N", help="runs of each (default: 1)"
     )
     options = parser.parse_args(argv)
     names = options.only.split(",")
@@ -79,11 +116,17 @@ def main(argv: list[str] | None = None) -> int:
         raise InputError(f"--only: expected any of {', '.join(NAMES)}; found {unknown[0]}")
     folder = make_folder(options.out, "shipped").resolve()
     for name in names:
-        numbers = evolve(name, folder / name)
-        seed = load_config(name).evolution.seed
-        print(f"{name}: {numbers['cpu_s']:.0f} s of CPU time", flush=True)
+        first = load_config(name).evolution.seed
+        runs: dict[int, dict[str, Any]] = {}
+        cache = folder / f"{name}_cache"
+        shutil.rmtree(cache, ignore_errors=True)
+        for seed in range(first, first + options.seeds):
+            at = folder / (name if seed == first else f"{name}_{seed}")
+            runs[seed] = evolve(name, at, seed, cache)
+            print(f"{name}, seed {seed}: {runs[seed]['cpu_s']:.0f} s of CPU time", flush=True)
+        shutil.rmtree(cache, ignore_errors=True)
         if options.results:
-            write_results(name, numbers, [seed])
+            write_results(name, runs[first] | {"over_seeds": over_seeds(runs)}, list(runs))
     return 0
 
 

@@ -405,6 +405,39 @@ def test_only_gaits_that_sense_nothing_can_be_played_to_mujoco(tmp_path):
         sensitivity.read_champion(tmp_path)
 
 
+# ------------------------------------------------------------------ shipped configurations
+
+
+def test_seeds_come_to_an_interval_and_a_count_of_passports(tmp_path, monkeypatch):
+    calls, written = [], {}
+
+    def evolve(name, folder, seed, cache):
+        calls.append((folder.name, seed, cache.name))
+        check = {"words": "", "value": 1.0}
+        checks = {"a": check | {"passed": True}, "b": check | {"passed": seed != 1}, "c": check}
+        passport = {"passed": seed != 1, "checks": checks} if seed < 3 else None
+        return {"score": 1.0 + seed, "score_std": 0.0, "cpu_s": 2.0, "passport": passport}
+
+    def write(name, numbers, seeds):
+        written[name] = (numbers, seeds)
+
+    monkeypatch.setattr(shipped, "evolve", evolve)
+    monkeypatch.setattr(shipped, "write_results", write)
+    options = ["--only", "fish_swim", "--seeds", "4", "--results", "--out", str(tmp_path)]
+    assert shipped.main(options) == 0
+    assert calls == [
+        ("fish_swim", 0, "fish_swim_cache"),
+        *((f"fish_swim_{seed}", seed, "fish_swim_cache") for seed in (1, 2, 3)),
+    ]
+    numbers, seeds = written["fish_swim"]
+    assert seeds == [0, 1, 2, 3] and numbers["score"] == 1.0  # as it was with one seed
+    found = numbers["over_seeds"]
+    assert [row["failed"] for row in found["runs"]] == [[], ["b"], [], None]
+    assert (found["passed"], found["size"], found["score"]["mean"]) == (2, 4, 2.5)
+    # Student's t(0.975, 3) = 3.182, the standard deviation of 1, 2, 3, 4 is 1.291
+    assert found["score"]["half"] == pytest.approx(3.182 * 1.291 / 2, rel=1e-3)
+
+
 # ------------------------------------------------------------------ policy gradient
 
 
