@@ -79,8 +79,8 @@ def over_seeds(runs: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
         runs: by seed, as `evolve` reads each.
 
     Returns:
-        The interval of their scores, how many passports pass, and a row for each seed with the
-        checks that fail; None without a passport.
+        The interval of their scores, how many passports pass, what others fail in words, and a row
+        for each seed with the checks that fail; None without a passport.
     """
     rows = [
         {
@@ -97,6 +97,10 @@ def over_seeds(runs: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
         "score": as_numbers(interval([row["score"] for row in rows])),
         "passed": sum(row["failed"] == [] for row in rows),
         "size": len(rows),
+        "failed": "; ".join(
+            f"seed {row['seed']}: {', '.join(row['failed'])}" for row in rows if row["failed"]
+        )
+        or None,
         "runs": rows,
     }
 

@@ -434,6 +434,7 @@ def test_seeds_come_to_an_interval_and_a_count_of_passports(tmp_path, monkeypatc
     found = numbers["over_seeds"]
     assert [row["failed"] for row in found["runs"]] == [[], ["b"], [], None]
     assert (found["passed"], found["size"], found["score"]["mean"]) == (2, 4, 2.5)
+    assert found["failed"] == "seed 1: b"
     # Student's t(0.975, 3) = 3.182, the standard deviation of 1, 2, 3, 4 is 1.291
     assert found["score"]["half"] == pytest.approx(3.182 * 1.291 / 2, rel=1e-3)
 
