@@ -23,6 +23,7 @@ times as much.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -177,17 +178,13 @@ def _settle(
         frames = robots.pose(steps + dt**2 * change)
         kept = weight(contacts.force > 0, clear)
         table = _find_contacts(meetings, which, moving > 0, frames, kept, dt, halves)
-        touches, near = moving < 0, -first * robots.drift / dt**2
-        for k in range(_MOST):
-            touches = touches | ((table.need[k] > near) & (table.need[k] < _KEPT))
+        near = -first * robots.drift / dt**2
+        touches = _largest(weight((table.need > near) & (table.need < _KEPT), kept)) > 0
 
         def resolve() -> Any:
             found = contacts.join(table, frames[1], robots, change, dt)
-            turned = jnp.abs(found.acceleration()[6:] - change)
-            most = turned[0]
-            for k in range(1, len(turned)):
-                most = jnp.maximum(most, turned[k])
-            return found, weight(dt**2 * most > _TURN, clear)
+            turned = _largest(jnp.abs(found.acceleration()[6:] - change))
+            return found, weight(dt**2 * turned > _TURN, clear)
 
         found, moving = jax.lax.cond(
             any_lane(touches), resolve, lambda: (contacts, jnp.zeros_like(moving))
@@ -637,9 +634,7 @@ class _Contacts(NamedTuple):
         missing = self.need - _sum([columns[j] * force[j] for j in range(_MOST)])
         taken = weight(_diagonal(columns) > 0, force)
         missing = (1 - taken) * missing + taken * _NONE
-        worst = missing[0]
-        for k in range(1, _MOST):
-            worst = jnp.maximum(worst, missing[k])
+        worst = _largest(missing)
         return missing, weight(worst * dt**2 > _ENOUGH, worst)
 
 
@@ -655,7 +650,9 @@ def _diagonal(columns: jax.Array) -> jax.Array:
 
 def _sum(xs: list[jax.Array]) -> jax.Array:
     """Written out, as a fused step has no reductions."""
-    total = xs[0]
-    for x in xs[1:]:
-        total = total + x
-    return total
+    return reduce(jnp.add, xs)
+
+
+def _largest(rows: jax.Array) -> jax.Array:
+    """The largest over the first axis, written out, too."""
+    return reduce(jnp.maximum, [rows[k] for k in range(len(rows))])
