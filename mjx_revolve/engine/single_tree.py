@@ -116,7 +116,13 @@ class SingleTree:
 
     def join_rows(self, values: Sequence[jax.Array], like: jax.Array) -> jax.Array:
         """`[nhinge, lanes]` in the order of the levels."""
-        return jnp.concatenate(values) if self.below else jnp.zeros((0, *like.shape), like.dtype)
+        if not self.below:
+            return jnp.zeros((0, *like.shape), like.dtype)
+        # What is 0 for a whole level may be a plain number.
+        pairs = zip(values, self.below, strict=True)
+        return jnp.concatenate(
+            [jnp.broadcast_to(x, (level.count, *like.shape)) for x, level in pairs]
+        )
 
     def stack_saved(self, saved: Any, select: Callable[[Any], Any], like: jax.Array) -> Any:
         """`[nhinge, lanes]` of selected saved values; None without hinges."""

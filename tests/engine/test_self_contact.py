@@ -342,6 +342,22 @@ def test_contacts_are_mujocos():
     assert seen > 5
 
 
+def test_a_level_of_hinges_that_bring_nothing_together_is_no_exception():
+    """Beside arms that meet: a tail of hinges alone, whose levels' reaches are 0 throughout."""
+    two = fork(3, 1).to_mapping()["body"]
+    tail = {"type": "ActiveHinge"}
+    for _ in range(3):
+        tail = {"type": "ActiveHinge", "orientation": 90, "children": {1: tail}}
+    two["children"][0] = tail
+    robot = build_robot(make_morphology(two, name="tail"), water())
+    engine = make_population_engine(robot)
+    assert [np.any(level.hinges.lever) for level in engine.tree.below] == [True, *[False] * 3]
+    start = engine.init(*map(jnp.asarray, at_rest(robot, 2, -2.0)))
+    ctrl = jnp.zeros((robot.num_hinges, 2))
+    step = lambda s, c: engine.step(s, c, water_of(robot.world))[0]  # noqa: E731
+    assert jax.eval_shape(step, start, ctrl).clearance.shape == (2,)
+
+
 @pytest.mark.slow
 def test_pairs_that_can_never_meet_cost_nothing():
     """A spider's and a fish's step is, operation by operation, the one without self-contact."""
