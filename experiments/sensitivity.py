@@ -44,6 +44,7 @@ OURS: Mapping[str, Mapping[str, Any]] = {
     "ours, all laws": {},
     "no added mass": {"world.added_mass": False},
     "no drag": {"world.drag": "off"},
+    "drag: faces": {"world.drag": "faces"},
     "drag: lift_drag": {"world.drag": "lift_drag"},
     "drag: ellipsoid": {"world.drag": "ellipsoid"},
     "drag: inertia_box": {"world.drag": "inertia_box"},
