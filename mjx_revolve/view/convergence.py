@@ -18,7 +18,6 @@ from mjx_revolve.view.plots import (
     GREY,
     LABELS,
     ORANGE,
-    PALE,
     WIDE,
     curve_with_band,
     in_style,
@@ -31,7 +30,7 @@ from mjx_revolve.view.plots import (
     style_of,
     whole_numbers,
 )
-from mjx_revolve.view.statistics import FEWEST, interval, mean_and_half, quantiles
+from mjx_revolve.view.statistics import FEWEST, interval, mean_and_half
 
 if TYPE_CHECKING:
     from mjx_revolve.view.report.groups import RunGroup
@@ -254,43 +253,6 @@ def draw_scores(
     axes.set_xticks(range(len(groups)), [name.replace("_", "\n") for name in groups])
     axes.set_xlim(-0.5, len(groups) - 0.5)
     axes.grid(False, axis="x")
-
-
-@in_style
-def plot_seeds(group: RunGroup) -> Figure:
-    """Draws how the runs of one configuration went.
-
-    Args:
-        group: at least one run with metrics.
-
-    Returns:
-        The figure: best so far on the left, the middle of the population on the right; over the
-        seeds the best, the median and the quartiles, as far as all runs reach, and each run as a
-        thin line as far as it goes.
-    """
-    figure = new_figure(WIDE, 3.9)
-    middle = "median" if all("median" in r.metrics for r in group.shown) else "mean"
-    both = figure.subplots(1, 2, sharex=True)
-    for axes, column, words in zip(
-        both, ("champion", middle), ("best so far", f"population's {middle}"), strict=True
-    ):
-        curves = [r.metrics[column] for r in group.shown if column in r.metrics]
-        for record in group.shown:
-            if column in record.metrics:
-                x = record.metrics["generation"]
-                axes.plot(x, record.metrics[column], color=PALE, linewidth=0.7, zorder=1)
-        x, values = group.curve(column)
-        if len(x) and np.isfinite(values).any():
-            low, median, high, best = quantiles(values, (0.25, 0.5, 0.75, 1.0))
-            curve_with_band(axes, x, median, low, high, BLUE, label="median", band="quartiles")
-            axes.plot(x, best, color=ORANGE, label="best")
-            axes.plot([], [], color=PALE, linewidth=0.9, label="each run")
-        axes.set(xlabel=group.shown[0].round, ylabel=group.shown[0].fitness)
-        axes.set_title(f"{words}, over {len(group.shown)} seeds")
-        whole_numbers(axes)
-        limit_to_most(axes, curves, curves)
-    legend_outside(figure, both[0], 4)
-    return figure
 
 
 def plot_comparison(groups: Sequence[RunGroup], numbers: Mapping[str, int]) -> Figure:

@@ -16,7 +16,6 @@ from mjx_revolve.view.motion import (
     Motion,
     last_strokes,
     last_swings,
-    mean_frequency,
     mean_rate,
     rms,
     speed_over,
@@ -248,37 +247,6 @@ def plot_thrusters(motion: Motion) -> Figure:
     names = _names(motion, motion.robot.thrusters)
     pair = ("command", motion.commands[first:]), ("behind its lag", motion.lagged[first:])
     return _plot_pairs(motion.time[first:], names, *pair, "command (–)", words, 1.3)
-
-
-@in_style
-def plot_phases(motion: Motion) -> Figure:
-    """Draws the phase of each oscillator of a CPG over time, and its mean frequency.
-
-    `motion.phases` must be there.
-    """
-    assert motion.phases is not None
-    rows, words = _strokes(motion)
-    names = _names(motion, motion.robot.servos)
-    places = range(len(names))
-    figure = new_figure(WIDE, 1.5 + 0.24 * len(names))
-    left, right = figure.subplots(1, 2, width_ratios=(3.2, 1.0))
-    time = motion.time[rows]
-    image = left.imshow(
-        np.mod(motion.phases[rows].T, 2 * np.pi), aspect="auto", cmap="twilight", vmin=0,
-        vmax=2 * np.pi, extent=(time[0], time[-1], len(names) - 0.5, -0.5),
-    )  # fmt: skip
-    left.grid(False)
-    left.set_yticks(places, names)
-    left.set(xlabel="time (s)", title=f"phase of each oscillator, {words}")
-    bar = color_bar(figure, image, "phase (rad)", ax=left, pad=0.015, aspect=25)
-    bar.set_ticks(list(np.pi / 2 * np.arange(5)), labels=["0", "π/2", "π", "3π/2", "2π"])
-    right.barh(places, mean_frequency(motion.time, motion.phases), color=BLUE, height=0.6)
-    right.set_yticks(places, [""] * len(names))
-    right.set(ylim=(len(names) - 0.5, -0.5), xlabel="mean frequency (Hz)", title="turns per second")
-    right.xaxis.set_major_locator(MaxNLocator(nbins=5))
-    right.axvline(0, color=GREY, linewidth=0.8)
-    right.grid(False, axis="y")
-    return figure
 
 
 @in_style

@@ -86,7 +86,7 @@ def plot_swim(
     Raises:
         InputError: the trajectory is another robot's, or has no finite row.
     """
-    return draw_motion(analyse_motion(robot, trajectory, counted_from, None, water, target, task))
+    return draw_motion(analyse_motion(robot, trajectory, counted_from, water, target, task))
 
 
 @in_style

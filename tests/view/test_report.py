@@ -27,7 +27,7 @@ from mjx_revolve.view import convergence, motion_plots, plots
 from mjx_revolve.view.report import page as report_page
 from mjx_revolve.view.report import repeat as report_repeat
 from mjx_revolve.view.report import tables
-from mjx_revolve.view.report.champion import cpg_phases, replay_champion
+from mjx_revolve.view.report.champion import replay_champion
 from mjx_revolve.view.report.data import read_run
 from mjx_revolve.view.report.groups import differences, group_runs
 from mjx_revolve.view.statistics import interval
@@ -149,17 +149,11 @@ def test_seeds_are_grouped_and_configurations_told_apart(lab, tmp_path):
 
 
 @pytest.mark.slow
-def test_curves_go_as_far_as_all_runs_do(lab, tmp_path):
+def test_of_runs_that_are_not_finished_the_furthest_counts(lab, tmp_path):
     config = make_config(lab["config"].model_dump(), "/", ["evolution.generations=9"], "swim.yaml")
     for seed, generations in enumerate((9, 4, 7)):
         make_run(tmp_path / f"{seed}", config, lab["fitness"], seed, generations, finished=False)
-    lines = (tmp_path / "0" / "metrics.csv").read_text().splitlines(True)
-    (tmp_path / "0" / "metrics.csv").write_text("".join(lines[:2] + lines[3:]))  # without the 2nd
     (group,) = group_runs([read_run(tmp_path / f"{seed}") for seed in range(3)])
-    x, values = group.curve("champion")
-    assert x.tolist() == [1, 3, 4]
-    assert np.allclose(values, [[row(g, seed)["champion"] for g in x] for seed in range(3)])
-    assert np.isnan(group.curve("no_such_column")[1]).all()
     assert group.scores() == []
     assert group.best().seed == 0  # the furthest, where nothing was judged
 
@@ -227,8 +221,6 @@ def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
     assert record.info or record.settings
     assert record.genes is not None
     if "metrics" in text and record.metrics:  # whatever is left makes pictures
-        (group,) = group_runs([record])
-        assert plots.figure_svg(convergence.plot_seeds(group)).startswith(b"<?xml")
         assert plots.figure_svg(convergence.plot_fitness(record.metrics)).startswith(b"<?xml")
 
 
@@ -302,23 +294,6 @@ def test_genes_of_another_controller_are_refused(lab, copy):
         replay_champion(read_run(copy), lab["fitness"])
 
 
-def test_phases_of_oscillators_without_neighbours_turn_evenly(lab):
-    fitness = lab["fitness"]
-    genes = np.float32([0.9, -0.6, 0.0])
-    phases = np.unwrap(cpg_phases(fitness, genes, 100), axis=0)
-    seconds = fitness.robot.world.timestep * np.arange(1, 101)
-    assert np.allclose(phases, 2 * np.pi * np.sin(genes[:2]) * seconds[:, None], atol=1e-4)
-    trajectory = fitness.replay(genes, replay_key(0))
-    low, high = fitness.robot.mj_model.actuator_ctrlrange.T
-    # Commands are due every tenth step, of the phases then, and targets go there in ten steps.
-    due = np.concatenate([np.zeros((1, 2)), phases[9:99:10]])
-    commands = (low + high) / 2 + (high - low) / 2 * np.tanh(np.sin(due))
-    before = np.concatenate([commands[:1], commands[:-1]])
-    way = np.tile(np.arange(10) / 10, 10)[:, None]
-    expected = before.repeat(10, axis=0) + way * (commands - before).repeat(10, axis=0)
-    assert np.allclose(trajectory.ctrl[:100], expected, atol=1e-4)
-
-
 # --- pictures ---
 
 
@@ -350,10 +325,7 @@ def test_power_adds_up(lab):
     assert final == pytest.approx(replay.measures["cost_of_transport"], rel=0.01)
 
 
-def test_phases_and_thrusters(lab):
-    phases = axes_of(motion_plots.plot_phases(lab["replay"].motion))
-    assert phases[0].images[0].get_array().shape == (2, 200)
-    assert phases[0].images[0].get_cmap().name == "twilight"  # a circle: 0 and 2π look the same
+def test_thrusters():
     from types import SimpleNamespace
 
     time = np.arange(400) * 0.01
@@ -380,7 +352,8 @@ def test_comparison_of_very_different_lengths(lab, tmp_path):
     left, right = axes_of(convergence.plot_comparison(groups, styles))
     assert left.get_xscale() == "log"
     # Each seed, then their mean.
-    assert np.allclose(left.lines[3].get_ydata(), np.mean(groups[0].curve("champion")[1], axis=0))
+    curves = [record.metrics["champion"] for record in groups[0].records]
+    assert np.allclose(left.lines[3].get_ydata(), np.mean(curves, axis=0))
     assert [tick.get_text() for tick in right.get_xticklabels()] == ["A", "B"]
     (same,) = group_runs(made[:3])
     left, _ = axes_of(convergence.plot_comparison([same], {same.name: 0}))
@@ -399,7 +372,6 @@ def test_searches_in_which_everything_fails_make_pictures(lab, tmp_path):
     for records in ([one], [other], [one, other]):
         groups = group_runs(records)
         axes_of(convergence.plot_comparison(groups, {group.name: 0 for group in groups}))
-        axes_of(convergence.plot_seeds(groups[0]))
         axes_of(convergence.plot_fitness(records[-1].metrics))
 
 
@@ -566,7 +538,7 @@ def test_a_page_about_one_run(copy, quick, capsys):
     # One seed is one seed, and what is spread is said.
     assert "One seed: with another, evolution ends elsewhere" in text
     assert "mean ± standard deviation over 16 fresh starts" in text
-    assert len(page.images) == 6  # fitness, swim, way, joints, phases, energy
+    assert len(page.images) == 5  # fitness, swim, way, joints, energy
     assert "Not everything could be read" not in page.text
     assert len(text) < 2e6
     assert "✗" not in text  # there is no passport that it could fail
@@ -628,7 +600,7 @@ def test_a_page_about_several_runs(lab, copy, quick, capsys):
     assert str(interval([lab["score"]] * 3)) in page.words
     assert "Champions side by side" in page.words
     assert any("95 % confidence" in words for words in page.words)
-    assert len(page.images) == 3 + 5
+    assert len(page.images) == 2 + 4
     assert not any("One seed" in words for words in page.words)
 
 
@@ -636,7 +608,7 @@ def test_a_page_about_several_runs(lab, copy, quick, capsys):
 def test_every_champion_may_be_shown(lab, copy, quick):
     runs_of = [lab["folder"] / f"s{seed}" for seed in range(2)]
     assert run_main(*runs_of, "--every-champion", "--out", "all.html") == 0
-    assert len(Page((copy.parent / "all.html").read_text()).images) == 3 + 2 * 5
+    assert len(Page((copy.parent / "all.html").read_text()).images) == 2 + 2 * 4
 
 
 def test_a_page_about_what_is_left(copy, quick, capsys):

@@ -279,7 +279,6 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
     drawn = {
         "way": motion_plots.plot_path(motion.time, motion.path, float(motion.surface[0])),
         "joints": motion_plots.plot_joints(motion) if robot.num_hinges else None,
-        "phases": None if motion.phases is None else motion_plots.plot_phases(motion),
         "thrusters": motion_plots.plot_thrusters(motion) if robot.num_thrusters else None,
         "energy": motion_plots.plot_energy(motion),
         # Readings are of the moment before each step.
@@ -338,9 +337,8 @@ def _convergence(groups: Sequence[RunGroup]) -> str:
         if sum(bool(group.shown) for group in members) > 1 or len(members[0].shown) > 1:
             comparisons.append(svg_source(convergence.plot_comparison(members, styles)))
     entries = []
-    for group in shown:
-        record, several = group.shown[0], len(group.shown) > 1
-        label = record.fitness
+    for group in (group for group in shown if len(group.shown) == 1):
+        record = group.shown[0]
         quartiles = "lower_quartile" in record.metrics
         entries.append({
             "name": group.name,
@@ -349,8 +347,7 @@ def _convergence(groups: Sequence[RunGroup]) -> str:
             "below": "how far the search spreads" if record.population is None
             else "how full the archive is, or how large the living are",
             "band": "quartiles" if quartiles else "mean and standard deviation",
-            "seeds": svg_source(convergence.plot_seeds(group)) if several else None,
-            "fitness": None if several else svg_source(_plot_fitness(record, label)),
+            "fitness": svg_source(_plot_fitness(record, record.fitness)),
             "colony": record.history is not None,
         })  # fmt: skip
     return sections.convergence(comparisons, entries)
