@@ -379,14 +379,6 @@ def test_a_body_that_cannot_be_read_has_no_picture(run, still):
     assert page.count('alt="Body of individual 0"') == 0 and "<b>#0</b>" in page
 
 
-def test_best_individual_stands_in_for_a_lost_champion(run):
-    (run / "champion/genes.yaml").unlink()
-    record = read_run(run)
-    assert record.stand_in == "best individual in individuals.jsonl, number 5"
-    assert record.individual == 5 and record.genes.shape == (10,)
-    assert report_page._champions_body(record, record.config).num_hinges == 3
-
-
 # --- commands ---
 
 

