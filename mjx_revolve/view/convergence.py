@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from mjx_revolve.view.plots import (
     BLUE,
@@ -143,13 +143,9 @@ def plot_fitness(metrics: Metrics, title: str = "", label: str = "fitness") -> F
         right.set_ylabel("step size\n(gene units)", fontsize=9)
         if np.all(metrics["step_size"] > 0):
             right.set_yscale("log")
-            right.tick_params(which="minor", labelsize=8)
-            # Few decades need more numbers than the powers of ten, but not so many that they meet.
-            decades = float(np.ptp(np.log10(metrics["step_size"])))
-            digits = "123456789" if decades < 0.4 else "1235" if decades < 1.2 else "1"
-            plain = FuncFormatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in digits else "")
-            right.yaxis.set_major_formatter(plain)
-            right.yaxis.set_minor_formatter(plain)
+            right.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            right.yaxis.set_major_formatter("{x:g}")
+            right.yaxis.set_minor_locator(NullLocator())
     elif bodies:
         right.plot(x, metrics[bodies[0]], color=GREY, marker=dot)
         right.set_ylabel(_BODIES[bodies[0]], fontsize=9)

@@ -432,32 +432,14 @@ def test_modules_are_counted_and_weighed():
     assert '<td class="left">absolute size</td>' in page
 
 
-def test_the_commands_give_the_same_settings(lab, copy):
+def test_the_command_gives_the_same_settings(copy):
     record = read_run(copy)
-    (own_words, own), (words, started) = report_repeat.repeat_commands(record)
-    assert (own_words, words) == ("from this run folder", "as it was started")
-    for command in (own, started):
-        assert command.startswith("python -m mjx_revolve.evolve ")
-        arguments = evolve._parser().parse_args(command.split()[3:])
-        seed = [] if arguments.seed is None else [f"evolution.seed={arguments.seed}"]
-        config = load_config(arguments.config, [*arguments.settings, *seed])
-        assert settings_hash(config) == settings_hash(record.config)
-    assert "--seed 0 --set controller.max_frequency=1.0" in started
-
-
-def test_a_command_that_no_longer_fits_is_not_shown(lab, copy):
-    source = copy.parent / "swim.yaml"
-    shutil.copy(lab["folder"] / "elbow.yaml", copy.parent)
-    shutil.copy(lab["folder"] / "swim.yaml", source)
-    runs.RunFolder(copy).update_info(config_file=str(source))
-    commands = report_repeat.repeat_commands(read_run(copy))
-    assert commands[1][1].startswith("python -m mjx_revolve.evolve swim.yaml --seed 0 ")
-    edit(source, '"duration": 1.0', '"duration": 2.0')
-    assert len(report_repeat.repeat_commands(read_run(copy))) == 1
-    source.unlink()
-    assert len(report_repeat.repeat_commands(read_run(copy))) == 1
+    command = report_repeat.repeat_command(record)
+    assert command.startswith("python -m mjx_revolve.evolve ")
+    arguments = evolve._parser().parse_args(command.split()[3:])
+    assert settings_hash(load_config(arguments.config)) == settings_hash(record.config)
     runs.RunFolder(copy).update_info(xla_flags="--a --b", threads={"OPENBLAS_NUM_THREADS": "2"})
-    ((_, command),) = report_repeat.repeat_commands(read_run(copy))
+    command = report_repeat.repeat_command(read_run(copy))
     assert command.startswith("OPENBLAS_NUM_THREADS=2 XLA_FLAGS='--a --b' python -m ")
 
 

@@ -35,7 +35,7 @@ from mjx_revolve.view.report.bodies import anchor, inline_svg, show_population, 
 from mjx_revolve.view.report.champion import ChampionReplay, replay_champion
 from mjx_revolve.view.report.groups import RunGroup, group_runs
 from mjx_revolve.view.report.record import RunRecord
-from mjx_revolve.view.report.repeat import environment, repeat_commands, sources
+from mjx_revolve.view.report.repeat import environment, repeat_command, sources
 from mjx_revolve.view.sensor_plots import plot_sensors
 from mjx_revolve.view.statistics import COVERAGE
 from mjx_revolve.view.swim_picture import draw_motion
@@ -394,7 +394,7 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
 def _repeat(records: Sequence[RunRecord]) -> str:
     """Commands, versions and sources that repeat the runs."""
     return sections.repeat([
-        {"label": record.label, "seed": record.seed, "commands": repeat_commands(record),
+        {"label": record.label, "seed": record.seed, "command": repeat_command(record),
          "environment": environment(record), "sources": sources(record)}
         for record in records
     ])  # fmt: skip
