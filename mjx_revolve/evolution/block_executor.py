@@ -108,7 +108,7 @@ class Executor:
 
         Returns:
             `[rows]` scores and measures of each. Those of a block that makes `Limits.tries` workers
-            fail are NaN; the log names the file from which it can be scored again.
+            fail are NaN; the log has the reason.
 
         Raises:
             WorkerError: no worker is left, or not one block could be scored; the executor is

@@ -397,13 +397,6 @@ def test_letters_never_run_out(index, text):
     assert set(plots.style_of(index)) == {"color", "linestyle"}
 
 
-def test_side_views_look_across_the_way():
-    time = np.arange(100) * 0.05
-    path = np.stack([0 * time, 0.2 * time, 0 * time - 1], axis=-1)
-    figure = motion_plots.plot_path(time, path)
-    assert figure.axes[1].get_xlabel() == "y (m)"
-
-
 def test_pictures_are_the_same_bytes_twice():
     table = {"generation": np.arange(1.0, 4), "best": np.arange(3.0)}
     first, second = (plots.figure_svg(convergence.plot_fitness(table)) for _ in range(2))
@@ -595,7 +588,6 @@ def test_a_page_about_what_is_left(copy, quick, capsys):
     for name in ("a", "b", "c", "d"):
         shutil.copytree(copy, name)
     (copy.parent / "a" / "config.yaml").write_text("a: {")
-    (copy.parent / "a" / "swim.png").write_bytes(plots.figure_png(plots.new_figure(1, 1)))
     shutil.rmtree("b/champion")
     shutil.rmtree("b/checkpoints")
     (copy.parent / "c" / "metrics.csv").unlink()
@@ -614,7 +606,6 @@ def test_a_page_about_what_is_left(copy, quick, capsys):
     for words in ("Not everything could be read", "a", "b", "c", "Nothing could be read of"):
         assert words in page.words
     assert "found 1" in page.text  # c: one gene where three are expected
-    assert any(source.startswith("data:image/png") for source in page.images)  # a's own picture
 
 
 @pytest.mark.parametrize(

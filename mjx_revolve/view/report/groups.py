@@ -108,8 +108,7 @@ def _settings(record: RunRecord) -> dict[str, object]:
         if isinstance(value, str) and value.endswith((".yaml", ".yml")):
             path = record.folder / value
             text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-            named = record.settings.get(key, value)  # another file may stand in for a lost one
-            flat[key] = f"{Path(str(named)).stem} {hash_text(text)[:6]}"
+            flat[key] = f"{Path(value).stem} {hash_text(text)[:6]}"
     for key in ("task.type", "controller.type"):
         value = flat.get(key)
         if isinstance(value, str) and parse_user_function(value):

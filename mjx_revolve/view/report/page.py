@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import datetime
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -83,8 +83,7 @@ def make_report(
     """
     groups = group_runs(records)
     replays, robots = _replay(groups)
-    full = list(_in_full(groups, every_champion, RunGroup.best))
-    champions = _in_full(groups, every_champion, lambda group: _best_replayed(group, replays))
+    full = list(_in_full(groups, every_champion))
     single = len(records) == 1
     content = [
         ("results", "Results", _results(groups)),
@@ -95,7 +94,7 @@ def make_report(
           for key, words, record in full if record.population is not None),
         ("champions", "Champions side by side", _side_by_side(groups, replays)),
         *((f"champion-{key}", f"Champion{words}", _champion(record, replays.get(record.folder)))
-          for key, words, record in champions),
+          for key, words, record in full),
         ("robot", "Robot", _robots(robots)),
         ("runs", "Runs", "" if single else sections.runs(*tables.runs_table(groups))),
         ("repeat", "Repeat it", _repeat([r for group in groups for r in group.records])),
@@ -122,12 +121,10 @@ def _title(groups: Sequence[RunGroup], robots: Sequence[tuple[str, Morphology]])
     return f"{robot}{first.task.replace('_', ' ') or 'evolution'} ({Path(first.label).name})"
 
 
-def _in_full(
-    groups: Sequence[RunGroup], every: bool, best_of: Callable[[RunGroup], RunRecord]
-) -> Iterator[tuple[str, str, RunRecord]]:
+def _in_full(groups: Sequence[RunGroup], every: bool) -> Iterator[tuple[str, str, RunRecord]]:
     """Runs that are shown in full: a key, words that headings add, and the run."""
     for k, group in enumerate(groups):
-        best = best_of(group)
+        best = group.best()
         for record in group.records if every else [best]:
             words = f" of {letter(k)}, {group.name}" if len(groups) > 1 else ""
             if len(group.records) > 1:
@@ -235,8 +232,6 @@ def _replay(
                 record.note("damaged", f"no replay: {error}")
         if fitness is not None:
             robots.append((group.name, fitness.robot.morphology))
-        else:
-            robots += _robot_alone(group)
     return replays, robots
 
 
@@ -247,30 +242,10 @@ def _champions_body(record: RunRecord, config: Config) -> Morphology:
     return body if number is None else replace(body, name=f"individual {number}")
 
 
-def _robot_alone(group: RunGroup) -> list[tuple[str, Morphology]]:
-    """The body that a run left behind, where its configuration cannot be used."""
-    for record in group.records:
-        path = record.folder / "champion" / "morphology.yaml"
-        if path.is_file():
-            try:
-                return [(group.name, load_morphology(path, allow_overlap=True))]
-            except InputError as error:
-                record.note("damaged", str(error))
-    return []
-
-
-def _best_replayed(group: RunGroup, replays: Mapping[Path, ChampionReplay]) -> RunRecord:
-    """The best run; another seed's rather than one without a replay."""
-    best = group.best()
-    if best.folder in replays:
-        return best
-    return next((r for r in group.records if r.folder in replays), best)
-
-
 def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
-    """A champion; without a replay, the pictures that its run left behind."""
+    """A champion; nothing without a replay."""
     if replay is None:
-        return _saved_pictures(record)
+        return ""
     motion, robot = replay.motion, replay.motion.robot
     drawn = {
         "way": motion_plots.plot_path(motion.time, motion.path, float(motion.surface[0])),
@@ -289,17 +264,6 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
         origin if isinstance(origin, str) else "", tables.measures_table(record, replay),
         record.passport.rows if record.passport is not None else [], pictures,
     )  # fmt: skip
-
-
-def _saved_pictures(record: RunRecord) -> str:
-    """Pictures that a run left behind, where its champion cannot be replayed."""
-    found = []
-    for name in ("swim.png", "trajectory.png"):
-        path = record.folder / name
-        data = path.read_bytes() if path.is_file() else b""
-        if data.startswith(b"\x89PNG") and data.rstrip().endswith(b"IEND\xaeB`\x82"):
-            found.append((name, _source(data, "png")))
-    return sections.saved_pictures(found)
 
 
 def _source(data: bytes, kind: str) -> str:
