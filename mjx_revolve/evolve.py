@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import shlex
 import sys
 from collections.abc import Callable
@@ -159,7 +158,7 @@ def _lead(
         print(f"error: {describe_refusal(error)}", file=sys.stderr)
         if saved := run.folder.checkpoints():
             last = f"the last checkpoint, {short_path(saved[0])}, is intact"
-            print(f"{last}; {_remedy(error)}, then\n{_resume_hint(run)}", file=sys.stderr)
+            print(f"{last}\n{_resume_hint(run)}", file=sys.stderr)
         return 1
     finally:
         run.close()
@@ -250,15 +249,6 @@ def _search_name(config: Config) -> str:
     selection, learning = config.bodies.selection, config.bodies.learning
     learns = f", {learning.trials} trials a life" if learning.trials > 1 else ""
     return f"{selection.type}{learns},"
-
-
-def _remedy(error: OSError) -> str:
-    """What helps where the system refused a file."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "make room"
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return "allow writing"
-    return "mend that"
 
 
 def _resume_hint(run: Run) -> str:

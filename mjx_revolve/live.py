@@ -9,10 +9,11 @@ import os
 import sys
 import threading
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from mjx_revolve.inputs.commands import Parser, program, read_path, run_command, whole
-from mjx_revolve.inputs.errors import InputError, plain
+from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def main(argv: list[str] | None = None) -> int:
         0.
 
     Raises:
-        InputError: an argument or a file is wrong, or there is no screen for `--mujoco`.
+        InputError: an argument or a file is wrong.
         OSError: the port is taken.
     """
     parser = Parser(
@@ -59,15 +60,8 @@ def main(argv: list[str] | None = None) -> int:
         "--robots", type=whole(1, 64), default=_MAX_ROBOTS, metavar="N",
         help="for how many there is room; more are slower (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument(
-        "--mujoco", action="store_true", help="MuJoCo's viewer besides the page; needs a screen"
-    )
     add_trust_argument(parser)
     arguments = parser.parse_args(argv)
-    if arguments.mujoco:
-        from mjx_revolve.view.film.opengl import check_screen
-
-        check_screen("--mujoco", "without it there is a page for a browser, which needs none")
     from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()
@@ -85,7 +79,6 @@ def main(argv: list[str] | None = None) -> int:
             make_tank(catalogue.mixed, room, spheres=catalogue.spheres),
             catalogue.world,
             catalogue.entries,
-            waits=not arguments.mujoco,
         )
         try:
             server = LiveServer(simulation, live_page(catalogue, room), arguments.port)
@@ -96,7 +89,7 @@ def main(argv: list[str] | None = None) -> int:
         print(plain(server.address))
         print("open it in a browser on this machine; Ctrl-C ends it", flush=True)
         try:
-            _watch(simulation, arguments.mujoco)
+            _watch(simulation)
         finally:
             simulation.stop()
             server.closing.set()
@@ -106,7 +99,7 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def _watch(simulation: LiveSimulation, window: bool) -> None:
+def _watch(simulation: LiveSimulation) -> None:
     """Runs the world in a thread of its own, until it ends or is interrupted."""
     wrong: list[BaseException] = []
 
@@ -118,26 +111,15 @@ def _watch(simulation: LiveSimulation, window: bool) -> None:
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
-    try:
-        if window:
-            from mjx_revolve.view.live.window import show_window
-
-            show_window(simulation)
-            simulation.stop()
+    with suppress(KeyboardInterrupt):
         while thread.is_alive():
             time.sleep(0.1)
-    except KeyboardInterrupt:
-        pass
-    except InputError as error:  # no screen, after all
-        wrong.append(error)
     simulation.stop()
     thread.join(_STOP_TIMEOUT)
     if thread.is_alive():
         # XLA compiles, and cannot be stopped; nothing is left that would be lost.
-        said, code = (f"error: {wrong[0]}", 2) if wrong else ("ended", 0)
-        print(said, file=sys.stderr if wrong else sys.stdout, flush=True)
-        sys.stderr.flush()
-        os._exit(code)
+        print("ended", flush=True)
+        os._exit(0)
     if wrong:
         raise wrong[0]
 

@@ -32,7 +32,7 @@ from mjx_revolve.inputs.commands import (
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.packages import check_package
-from mjx_revolve.view.film.opengl import check_screen, find_opengl
+from mjx_revolve.view.film.opengl import find_opengl
 
 if TYPE_CHECKING:
     from mjx_revolve.view.film.film import Film
@@ -43,7 +43,6 @@ _USUAL, _WIDE = (640, 480), (960, 540)  # pixels; the robots of a colony are sma
 _MOST_FPS = 120
 _MOST_ANCESTORS = 30
 _EACH = 5.0  # of each in a film of ancestors, where no duration is given [s]
-_VIEW_FPS = 60  # in MuJoCo's viewer
 
 
 def _parser() -> Parser:
@@ -90,7 +89,6 @@ def _parser() -> Parser:
     parser.add_argument(
         "--html", action="store_true", help="only the page for a browser; needs no OpenGL"
     )
-    parser.add_argument("--view", action="store_true", help="show it in MuJoCo's viewer instead")
     return parser
 
 
@@ -158,26 +156,22 @@ def main(argv: list[str] | None = None) -> int:
         OSError: a file cannot be written.
     """
     arguments = _parser().parse_args(argv)
-    path, out, view = Path(arguments.path), arguments.out, arguments.view
+    path, out = Path(arguments.path), arguments.out
     kinds = (".html",) if arguments.html else _KINDS
     if arguments.ancestors is not None:
         kinds = (".mp4", ".gif")
-        if view or arguments.html:
-            raise InputError("--ancestors: expected neither --view nor --html: it makes a film")
+        if arguments.html:
+            raise InputError("--ancestors: expected no --html: it makes a film")
     if arguments.colony:
         kinds = (".mp4", ".gif")
-        if view or arguments.html or arguments.ancestors is not None:
-            raise InputError("--colony: expected none of --view, --html, --ancestors; found one")
+        if arguments.html or arguments.ancestors is not None:
+            raise InputError("--colony: expected neither --html nor --ancestors; found one")
     arguments.size = arguments.size or (_WIDE if arguments.colony else _USUAL)
     paths = (
         None if out is None else _named_paths(out, kinds, "colony" if arguments.colony else "swim")
     )
     folder = _run_folder(path)
-    if view:
-        if out is not None or arguments.html:
-            raise InputError("--view: expected neither --out nor --html: it writes nothing")
-        check_screen()
-    elif paths is None and folder is not None:
+    if paths is None and folder is not None:
         name = individual_name(arguments.individual) or "swim"
         if arguments.ancestors is not None:
             name, kinds = f"{name}-ancestors".removeprefix("swim-"), kinds[:1]
@@ -186,7 +180,7 @@ def main(argv: list[str] | None = None) -> int:
         paths = _paths_in(folder, name, kinds)
     check_episode_path(path)
     check_colony_arguments(arguments)
-    if ".mp4" in (kinds if paths is None else paths) and not view:
+    if ".mp4" in (kinds if paths is None else paths):
         check_package("MP4", "av")
     from mjx_revolve.numerics.runtime import fix_threads, prepare_process
 
@@ -195,7 +189,7 @@ def main(argv: list[str] | None = None) -> int:
 
     check_episode_files(arguments)
     # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
-    films = not view and set(kinds if paths is None else paths) != {".html"}
+    films = set(kinds if paths is None else paths) != {".html"}
     opengl = find_opengl() if films else ""
 
     prepare_process()
@@ -211,21 +205,17 @@ def main(argv: list[str] | None = None) -> int:
         made = []
         if paths is None:
             name = Path(f"{episode.robot.morphology.name}.").name[:-1]  # it may lead elsewhere
-            paths = {} if view else _paths_in(Path(), name, kinds)
+            paths = _paths_in(Path(), name, kinds)
             for file in paths.values():
                 check_absent(file)
-        if view or films:
+        if films:
             from mjx_revolve.view.film.film import make_film
 
-            made = [make_film(episode, arguments.size, _VIEW_FPS if view else arguments.fps)]
+            made = [make_film(episode, arguments.size, arguments.fps)]
     paths = paths or {}
     for film in made:
         _warn(film)
-    if view:
-        from mjx_revolve.view.film.draw import show_film
-
-        show_film(made[0])
-    elif made:
+    if made:
         from mjx_revolve.view.film.video import write_film
 
         write_film(made, opengl, paths.get(".mp4"), paths.get(".gif"))

@@ -6,11 +6,9 @@ Imports stand inside functions: workers start while NumPy and JAX are loaded.
 from __future__ import annotations
 
 import logging
-import tempfile
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -37,7 +35,6 @@ class Executor:
     Attributes:
         fitness: this process's own, for replays, and for scores if there are no workers.
         block: individuals in a block; None: the whole population.
-        folder: for files of failed blocks.
         closed: whether it has ended.
     """
 
@@ -48,7 +45,6 @@ class Executor:
         """Makes an executor of a fitness; see `jobs.MakeFitness`."""
         self.fitness = fitness
         self.block = block
-        self.folder = Path(tempfile.gettempdir()) / "mjx_revolve"
         self.closed = False
 
     @property
@@ -112,7 +108,7 @@ class Executor:
 
         Returns:
             `[rows]` scores and measures of each. Those of a block that makes `Limits.tries` workers
-            fail are NaN; the log names the file from which it can be scored again.
+            fail are NaN; the log has the reason.
 
         Raises:
             WorkerError: no worker is left, or not one block could be scored; the executor is
@@ -221,17 +217,8 @@ class WorkerExecutor(Executor, ABC, Generic[AnyWorker]):
             raise WorkerError(f"expected scores; every block failed: {lost[0]}")
         names = next(iter(scored.values()))[1]
         for number, reason in sorted(lost.items()):
-            self._keep(blocks[number], key, reason)
             nothing = np.full(len(blocks[number][0]), np.nan, np.float32)
+            _log.warning("%d individuals count as failed, because their workers do (%s)",
+                         len(nothing), reason)  # fmt: skip
             scored[number] = nothing, dict.fromkeys(names, nothing)
         return [scored[number] for number in range(len(blocks))]
-
-    def _keep(self, block: Block, key: jax.Array, reason: str) -> None:
-        """Writes a failed block to a file, and logs its path."""
-        from mjx_revolve.evolution.failed_blocks import save_failed_block
-
-        path = save_failed_block(self.folder, self.job, block, key)
-        _log.warning(
-            "%d individuals count as failed, because their workers do (%s); to see why: "
-            "python -m mjx_revolve.evolution.failed_blocks %s", len(block[0]), reason, path,
-        )  # fmt: skip

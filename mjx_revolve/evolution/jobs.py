@@ -126,10 +126,8 @@ def open_job(job: Job, scratch: str | Path) -> Any:
     from mjx_revolve.episodes.settings import locate_files
 
     places = {}
-    for number, (name, content) in enumerate(job.files):
-        # Older blocks that were given up have absolute paths.
-        own = f"{number}/{Path(name).name}" if Path(name).is_absolute() else name
-        places[name] = Path(scratch) / own
+    for name, content in job.files:
+        places[name] = Path(scratch) / name
         write_atomic(places[name], content)
     settings = locate_files(json.loads(job.config), places)
     return job.make_fitness(make_config(settings, "/", source=job.source))

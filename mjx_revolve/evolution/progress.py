@@ -15,16 +15,16 @@ from tqdm import tqdm
 # A log gets about this many lines, however long the run, and never stays silent for longer [s].
 _LINES = 60
 _SILENCE = 30.0
-# Widths of the live line [columns]: the largest, the default for a terminal without a size, the
-# smallest with a word before the count, and the smallest of the bar.
-_WIDEST, _USUAL, _WORDY, _BAR = 120, 80, 60, 10
+# Widths of the live line [columns]: the largest, the default for a terminal without a size, and the
+# smallest of the bar.
+_WIDEST, _USUAL, _BAR = 120, 80, 10
 
 
 class _Line(tqdm):
-    """tqdm's clock and screen, with a line that leaves out what there is no room for.
+    """tqdm's clock and screen, with a line that leaves out figures for which there is no room.
 
     Attributes:
-        figures: in words, the most important first; the last one is left out before the bar is.
+        figures: in words, the most important first.
         words: the current activity, shown in place of the figures; "" for none.
     """
 
@@ -34,32 +34,19 @@ class _Line(tqdm):
 
     def __str__(self) -> str:
         """The line; without a bar, and with everything, where it has no width."""
-        facts, width = self.format_dict, self.ncols or 0
+        facts, width = self.format_dict, self.ncols
         done, total, rate = facts["n"], facts["total"], facts["rate"]
         rate = rate or (done - facts["initial"]) / (facts["elapsed"] or 1)
-        head = f"{done}/{total}".ljust(2 * len(str(total)) + 1 if width else 0)
-        if not width or width >= _WORDY:
-            head = f"{(width and self.desc) or self.unit} {head}"
-        if self.words:
-            return "  ".join((head, self.words))[: width or None]
         left = self.format_interval((total - done) / rate) if rate else "?"
-        end = f"left {left:>{5 if width else 0}}"
-        if not width:
-            return "  ".join((head, *self.figures, end))
-        *figures, last = self.figures
-        shown, bar = [head], width - len(head) - len(end) - 4
-        for text in figures:
-            if len(text) > bar:
-                return "  ".join((*shown, end))[:width]
-            shown.append(text)
-            bar -= len(text) + 2
-        if bar - len(last) - 2 >= _BAR:
-            shown.append(last)
-            bar -= len(last) + 2
-        if bar >= _BAR:
-            drawn = {"ncols": bar, "ascii": facts["ascii"], "bar_format": "{bar}"}
-            shown.insert(1, self.format_meter(done, total, 1.0, **drawn))
-        return "  ".join((*shown, end))[:width]
+        parts = [f"{(width and self.desc) or self.unit} {done}/{total}"]
+        parts += [self.words] if self.words else [*self.figures, f"left {left}"]
+        while width and len(parts) > 3 and len("  ".join(parts)) + 2 + _BAR > width:
+            del parts[-2]
+        room = (width or 0) - len("  ".join(parts)) - 2
+        if room >= _BAR and not self.words:
+            drawn = {"ncols": room, "ascii": facts["ascii"], "bar_format": "{bar}"}
+            parts.insert(1, self.format_meter(done, total, 1.0, **drawn))
+        return "  ".join(parts)[:width]
 
 
 class _Nowhere(io.StringIO):
@@ -125,7 +112,6 @@ class Progress:
             ncols=self._columns(), unit=unit, desc=label, leave=self._leave,
             position=0, nrows=24,  # on a terminal without a height tqdm draws nothing
         )  # fmt: skip
-        self._widths: dict[str, int] = {}
         self._stride = choose_stride(total)
         self._written = time.monotonic()
         self._first = True
@@ -190,7 +176,7 @@ class Progress:
         self._written = time.monotonic()
 
     def _figures(self, row: Mapping[str, float]) -> list[str]:
-        """What is shown of a row; the live line's figures keep their places as they grow."""
+        """What is shown of a row."""
         figures = {"best": f"{row['best']:.4g}", "mean": f"{row['mean']:.4g}"}
         rate = row["evaluations_per_second"]
         speed = "evaluations/s", f"{rate:.0f}" if rate >= 1000 else f"{rate:.4g}"
@@ -199,12 +185,7 @@ class Progress:
             speed = "times real time", f"{row['times_real_time']:.3g}"
         if row.get("failed", 0) > 0:
             figures["failed"] = f"{row['failed']:.0f}"
-        shown = []
-        for name, value in (*figures.items(), speed):
-            if self._live:
-                self._widths[name] = max(len(value), self._widths.get(name, 0))
-            shown.append(f"{name} {value:<{self._widths.get(name, 0)}}")
-        return shown
+        return [f"{name} {value}" for name, value in (*figures.items(), speed)]
 
     def _columns(self) -> int | None:
         """The width of the live line; plain ones have any."""

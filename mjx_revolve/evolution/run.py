@@ -267,7 +267,6 @@ class Run:
             resumption = {"time": timestamp(), "generation": self.generation, "argv": sys.argv}
             resumed = [*files.info.get("resumed", []), resumption]
             files.update_info(resumed=resumed, finished=None, champion=None)
-        self.executor.folder = files.path / "lost"
         files.update_info(workers=self.executor.describe())
         # Where the body is the same for all, it is there from the start.
         if isinstance(self.executor.fitness, Fitness):
@@ -433,8 +432,7 @@ def _prepare(config: Config, make_executor: MakeExecutor) -> Executor:
             f"{config.source}: morphology: expected a robot with hinges or thrusters, as its "
             f"controller is to evolve; found none in {name}"
         )
-    genotype = fitness.genotype if isinstance(fitness, BodyFitness) else None
-    check_memory(config, executor.num_genes, genotype)
+    check_memory(config, executor.num_genes)
     return executor
 
 

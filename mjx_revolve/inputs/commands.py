@@ -21,7 +21,6 @@ from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import SWEEP, check_path
 from mjx_revolve.inputs.packages import check_mujoco
 from mjx_revolve.inputs.shipped import list_shipped
-from mjx_revolve.inputs.terminal import spell_unencodable
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 
 _SEEDS = 2**32  # what JAX's keys take, and a run's configuration
@@ -269,7 +268,10 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         The exit code: `main`'s; 2 if the input is wrong (`InputError`), 1 if the system refused
         something (a full disk, too little memory), 130 when interrupted.
     """
-    spell_unencodable()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a test's or a notebook's has none
+            # Without UTF-8, Python would end at the first `±` of a result that took hours.
+            stream.reconfigure(errors="backslashreplace")
     early_sigint.running = True
     try:
         with show_notes():

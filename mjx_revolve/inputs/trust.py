@@ -126,7 +126,7 @@ def _root_of(place: Path) -> Path:
     base = place if place.is_dir() else place.parent
     base = base.resolve()
     # Any other folder's parent may hold a configuration that has nothing to do with it.
-    inner = base.name in ("champion", "lost") and not (base / "config.yaml").is_file()
+    inner = base.name == "champion" and not (base / "config.yaml").is_file()
     return base.parent if inner and (base.parent / "config.yaml").is_file() else base
 
 

@@ -1,31 +1,26 @@
 """Pictures of an archive: the filled cells and their scores.
 
-Two axes make a map. Three or four axes of a grid make maps within a map: one of the first two axes
-for each cell of the others. All others are drawn in parallel coordinates: each individual is a line
-from axis to axis.
+Two axes make a map. More are drawn in parallel coordinates: each individual is a line from axis to
+axis.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection, PatchCollection, PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from scipy.spatial import Voronoi
 
 from mjx_revolve.evolution.archive import Archive, best, filled, scale_points
 from mjx_revolve.view.plots import ORANGE, WIDE, color_bar, in_style, label_of, new_figure
 
 _INK, _FRAME, _LINE = "#333333", "#9aa5ad", "#e3e8eb"
-_GAP = 0.7  # between the maps within a map [cells]
-_MOST_NUMBERS = 8  # along an edge of a map of maps
 # More cells than this have no outlines, which would hide their colours.
 _MOST_OUTLINES = 3000
 
@@ -78,18 +73,12 @@ def plot_archive(
     if cells.size:
         colors.set_norm(Normalize(archive.scores[cells].min(), archive.scores[cells].max()))
     addresses = [(links or {}).get(number) for number in archive.ids.tolist()]
-    dimensions = len(archive.names)
-    if dimensions == 2:
-        size, draw = (7.2, 5.4), _draw_map
-    elif dimensions <= 4 and archive.shape:
-        size, draw = (WIDE, 4.0 if dimensions == 3 else 6.6), _draw_nested
-    else:
-        size, draw = (WIDE, 4.6), _draw_parallel
-    figure = new_figure(*size, title)
+    is_map = len(archive.names) == 2
+    figure = new_figure(*((7.2, 5.4) if is_map else (WIDE, 4.6)), title)
     axes = figure.add_subplot()
     axes.grid(False)
     axes.tick_params(length=3)
-    draw(axes, _Map(archive, colors, marked, addresses))
+    (_draw_map if is_map else _draw_parallel)(axes, _Map(archive, colors, marked, addresses))
     count = f"{cells.size} of {len(archive.ids)} cells"
     if cells.size:
         color_bar(figure, colors, label, ax=figure.axes, aspect=30, pad=0.015, shrink=0.9)
@@ -148,51 +137,7 @@ def voronoi_cells(centers: np.ndarray) -> list[np.ndarray]:
     return [diagram.vertices[region] for region in regions]
 
 
-# --- three or four --------------------------------------------------------------------------------
-
-
-def _draw_nested(axes: Axes, shown: _Map) -> None:
-    """A map of the first two axes for each cell of the third, and of the fourth if there is one."""
-    archive, cells = shown.archive, filled(shown.archive)
-    shape = (*archive.shape, 1)[:4]
-    inner, outer = np.array(shape[:2]), np.array(shape[2:])
-    step = inner + _GAP
-    where = np.stack(np.unravel_index(np.arange(len(archive.ids)), shape), axis=1)
-    corners = where[:, :2] + where[:, 2:] * step
-    squares = [Rectangle(corner, 1.0, 1.0) for corner in corners[cells].tolist()]
-    axes.add_collection(PatchCollection(
-        squares, facecolors=shown.colors.to_rgba(archive.scores[cells]), edgecolors="none",
-        urls=[shown.links[cell] for cell in cells],
-    ))  # fmt: skip
-    maps = (np.indices(shape[2:]).reshape(2, -1).T * step).tolist()
-    frames = [Rectangle(corner, *inner.tolist()) for corner in maps]
-    axes.add_collection(
-        PatchCollection(frames, facecolors="none", edgecolors=_FRAME, linewidths=0.6)
-    )
-    right, top = outer * step - _GAP / 2
-    axes.axis((-_GAP / 2, right, -_GAP / 2, top))
-    axes.spines[:].set_visible(False)
-    # Below and at the left the axes of each map; above and at the right those of the maps.
-    names = [label_of(name) for name in archive.names]
-    ends = [[f"{x:g}" for x in pair] for pair in zip(archive.lows, archive.highs, strict=True)]
-    axes.set_xticks([0, shape[0]], ends[0])
-    axes.set_yticks([0, shape[1]], ends[1])
-    axes.set(xlabel=f"in each map: {names[0]}", ylabel=f"in each map: {names[1]}")
-    for k in range(len(names) - 2):
-        edges = np.linspace(archive.lows[2 + k], archive.highs[2 + k], shape[2 + k] + 1)
-        texts = [f"{low:.3g} … {high:.3g}" for low, high in itertools.pairwise(edges)]
-        middles = np.arange(shape[2 + k]) * step[k] + inner[k] / 2
-        every = -(-len(texts) // _MOST_NUMBERS)
-        far = axes.secondary_yaxis("right") if k else axes.secondary_xaxis("top")
-        (far.set_yticks if k else far.set_xticks)(middles[::every], texts[::every])
-        (far.set_ylabel if k else far.set_xlabel)(names[2 + k])
-        far.tick_params(labelsize=8, length=0)
-        far.spines[:].set_visible(False)
-    if shown.marked >= 0:
-        shown.star(axes, corners[shown.marked] + 0.5)
-
-
-# --- any number -----------------------------------------------------------------------------------
+# --- more axes -----------------------------------------------------------------------------------
 
 
 def _draw_parallel(axes: Axes, shown: _Map) -> None:

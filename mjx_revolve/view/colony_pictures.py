@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mjx_revolve.episodes.colony_config import ColonyConfig
 from mjx_revolve.view.colony_history import ColonyHistory, Lifespan
-from mjx_revolve.view.convergence import COLONY_LABEL, scale_time
+from mjx_revolve.view.convergence import scale_time
 from mjx_revolve.view.plots import (
     BLUE,
     COLORS,
@@ -60,7 +58,6 @@ def plot_history(
     """All pictures of a colony by name; see the functions of this module."""
     figures = {
         "population": plot_population(history, room, title),
-        "lives": plot_lives(history, title),
         "families": plot_families(history, champion, title),
     }
     return figures if colony is None else figures | {"arena": plot_arena(history, colony, title)}
@@ -140,79 +137,11 @@ def _limit_time(axes: Axes, history: ColonyHistory, scale: float) -> None:
     axes.set_xlim(-0.012 * end, 1.012 * end)
 
 
-# --- lives ----------------------------------------------------------------------------------------
-
-
-@in_style
-def plot_lives(history: ColonyHistory, title: str = "") -> Figure:
-    """Draws the lives of all robots of a colony, one line each.
-
-    Args:
-        history: of the colony.
-        title: a line above the picture.
-
-    Returns:
-        The figure: on the left a line from birth to death for each robot, the first one lowest,
-        coloured by its last fitness, a dot where it died of something else than age; on the right
-        their ages at death.
-    """
-    scale, words = scale_time(history.end)
-    spans = list(history.spans.values())
-    figure = new_figure(WIDE, 6.4, title)
-    left, right = figure.subplots(1, 2, width_ratios=(3.4, 1.0))
-    scores = np.ma.masked_invalid([span.score for span in spans])
-    known = scores.compressed()
-    lines = _lifelines(spans, scale, 260.0)
-    # Grey: not known, as of the living where a run was stopped. A few scores far above all others
-    # would leave no colours for the rest.
-    most = float(np.quantile(known, 0.98)) if known.size else 1.0
-    lines.set(cmap=colormaps["viridis"].with_extremes(bad=_REST), norm=Normalize(0.0, most, True))
-    lines.set_array(scores)
-    left.add_collection(lines)
-    styles = cause_styles([span.cause for span in spans if span.cause != "age"])
-    for cause, (color, label) in styles.items():
-        places = [(s.end / scale, k) for k, s in enumerate(spans) if s.cause == cause]
-        left.plot(*np.transpose(places), "o", color=color, markersize=3.2, markeredgewidth=0,
-                  label=label, zorder=3)  # fmt: skip
-    if styles:
-        left.legend(loc="upper left", bbox_to_anchor=(0.02, 0.82), borderaxespad=0.2,
-                    handletextpad=0.2)  # fmt: skip
-    left.set(xlabel=words, ylabel="robots, in the order of birth")
-    left.set_ylim(-0.02 * len(spans) - 1, 1.02 * len(spans))
-    _limit_time(left, history, scale)
-    left.yaxis.set_major_locator(MaxNLocator(integer=True))
-    left.grid(False, axis="y")
-    # The upper left corner is empty: late births are at the right.
-    inset = left.inset_axes((0.03, 0.93, 0.42, 0.022))
-    color_bar(figure, lines, f"last {COLONY_LABEL}", cax=inset, orientation="horizontal",
-              extend="max")  # fmt: skip
-    _draw_ages(right, spans)
-    return figure
-
-
 def _lifelines(spans: Sequence[Lifespan], scale: float, room: float) -> LineCollection:
     """A line for each life, the k-th at height k; as thick as `room` [points] allows."""
     lines = [[(span.born / scale, k), (span.end / scale, k)] for k, span in enumerate(spans)]
     width = float(np.clip(room / max(len(spans), 1), _THIN, _THICK))
     return LineCollection(lines, linewidths=width, capstyle="butt")
-
-
-def _draw_ages(axes: Axes, spans: Sequence[Lifespan]) -> None:
-    """Ages at death by cause, and of the living so far."""
-    oldest = max((span.age for span in spans), default=0.0)
-    scale, words = scale_time(oldest)
-    edges = np.linspace(0, oldest / scale or 1.0, 19)
-    styles = {**cause_styles([span.cause for span in spans]), "": (BLUE, "alive in the end")}
-    ages = {name: [s.age / scale for s in spans if s.cause == name] for name in styles}
-    shown = [name for name in styles if ages[name]]
-    if shown:
-        axes.hist([ages[name] for name in shown], bins=edges.tolist(), stacked=True, rwidth=0.88,
-                  orientation="horizontal", color=[styles[name][0] for name in shown],
-                  label=[styles[name][1] for name in shown])  # fmt: skip
-        axes.legend(loc="lower left", bbox_to_anchor=(-0.05, 1.0), borderaxespad=0.1,
-                    handlelength=1.1)  # fmt: skip
-    axes.set(xlabel="robots", ylabel=words.replace("time", "age"), ylim=(0, edges[-1]))
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=4))
 
 
 # --- families -------------------------------------------------------------------------------------

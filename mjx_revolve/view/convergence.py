@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from mjx_revolve.view.plots import (
     BLUE,
@@ -18,7 +18,6 @@ from mjx_revolve.view.plots import (
     GREY,
     LABELS,
     ORANGE,
-    PALE,
     WIDE,
     curve_with_band,
     in_style,
@@ -31,7 +30,7 @@ from mjx_revolve.view.plots import (
     style_of,
     whole_numbers,
 )
-from mjx_revolve.view.statistics import FEWEST, interval, mean_and_half, quantiles
+from mjx_revolve.view.statistics import FEWEST, interval, mean_and_half
 
 if TYPE_CHECKING:
     from mjx_revolve.view.report.groups import RunGroup
@@ -144,13 +143,9 @@ def plot_fitness(metrics: Metrics, title: str = "", label: str = "fitness") -> F
         right.set_ylabel("step size\n(gene units)", fontsize=9)
         if np.all(metrics["step_size"] > 0):
             right.set_yscale("log")
-            right.tick_params(which="minor", labelsize=8)
-            # Few decades need more numbers than the powers of ten, but not so many that they meet.
-            decades = float(np.ptp(np.log10(metrics["step_size"])))
-            digits = "123456789" if decades < 0.4 else "1235" if decades < 1.2 else "1"
-            plain = FuncFormatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in digits else "")
-            right.yaxis.set_major_formatter(plain)
-            right.yaxis.set_minor_formatter(plain)
+            right.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            right.yaxis.set_major_formatter("{x:g}")
+            right.yaxis.set_minor_locator(NullLocator())
     elif bodies:
         right.plot(x, metrics[bodies[0]], color=GREY, marker=dot)
         right.set_ylabel(_BODIES[bodies[0]], fontsize=9)
@@ -254,43 +249,6 @@ def draw_scores(
     axes.set_xticks(range(len(groups)), [name.replace("_", "\n") for name in groups])
     axes.set_xlim(-0.5, len(groups) - 0.5)
     axes.grid(False, axis="x")
-
-
-@in_style
-def plot_seeds(group: RunGroup) -> Figure:
-    """Draws how the runs of one configuration went.
-
-    Args:
-        group: at least one run with metrics.
-
-    Returns:
-        The figure: best so far on the left, the middle of the population on the right; over the
-        seeds the best, the median and the quartiles, as far as all runs reach, and each run as a
-        thin line as far as it goes.
-    """
-    figure = new_figure(WIDE, 3.9)
-    middle = "median" if all("median" in r.metrics for r in group.shown) else "mean"
-    both = figure.subplots(1, 2, sharex=True)
-    for axes, column, words in zip(
-        both, ("champion", middle), ("best so far", f"population's {middle}"), strict=True
-    ):
-        curves = [r.metrics[column] for r in group.shown if column in r.metrics]
-        for record in group.shown:
-            if column in record.metrics:
-                x = record.metrics["generation"]
-                axes.plot(x, record.metrics[column], color=PALE, linewidth=0.7, zorder=1)
-        x, values = group.curve(column)
-        if len(x) and np.isfinite(values).any():
-            low, median, high, best = quantiles(values, (0.25, 0.5, 0.75, 1.0))
-            curve_with_band(axes, x, median, low, high, BLUE, label="median", band="quartiles")
-            axes.plot(x, best, color=ORANGE, label="best")
-            axes.plot([], [], color=PALE, linewidth=0.9, label="each run")
-        axes.set(xlabel=group.shown[0].round, ylabel=group.shown[0].fitness)
-        axes.set_title(f"{words}, over {len(group.shown)} seeds")
-        whole_numbers(axes)
-        limit_to_most(axes, curves, curves)
-    legend_outside(figure, both[0], 4)
-    return figure
 
 
 def plot_comparison(groups: Sequence[RunGroup], numbers: Mapping[str, int]) -> Figure:

@@ -57,8 +57,6 @@ class Motion:
         poses: rows along the way at which poses do not overlap, see `choose_poses`.
         angles: `[T, nhinge]` of the joints in the order of the servos [rad].
         targets: `[T, nhinge]` that the controller sets them [rad].
-        phases: `[T, nhinge]` of a CPG's oscillators in the same order [rad]: 0 when the joint's
-            target passes the middle of its range upwards, π/2 at its largest; None for others.
         commands: `[T, nthruster]` of the thrusters [-].
         lagged: `[T, nthruster]` what is left of the commands behind the thrusters' lag [-].
         power: `[T]` at the servos, summed without sign, and what ideal propellers need [W].
@@ -90,7 +88,6 @@ class Motion:
     poses: list[int]
     angles: np.ndarray
     targets: np.ndarray
-    phases: np.ndarray | None
     commands: np.ndarray
     lagged: np.ndarray
     power: np.ndarray
@@ -113,7 +110,6 @@ def analyse_motion(
     robot: Robot,
     trajectory: Trajectory,
     counted_from: float = 0.0,
-    phases: np.ndarray | None = None,
     water: Water | None = None,
     target: np.ndarray | None = None,
     task: TaskConfig | None = None,
@@ -124,7 +120,6 @@ def analyse_motion(
         robot: of the trajectory.
         trajectory: rows after the first that is not finite are left out.
         counted_from: see `Motion`.
-        phases: `[T, nhinge]`, see `Motion`.
         water: surface and current, each a number or `[T]`; None: the world's.
         target: see `Motion`.
         task: gives the point of distances and speeds, and the body length; None: the core's centre,
@@ -183,7 +178,6 @@ def analyse_motion(
         poses=choose_poses(time, path, length),
         angles=qpos[:, robot.mj_model.jnt_qposadr[joints]],
         targets=ctrl[:, list(robot.servos)],
-        phases=None if phases is None else phases[:count],
         commands=ctrl[:, list(robot.thrusters)],
         lagged=np.asarray(lagged, float)[:count],
         power=power,
@@ -258,12 +252,6 @@ def stroke_rows(time: np.ndarray, period: float | None, count: int) -> list[int]
     """Rows of times `[T]` [s] at `count` equal times in the last stroke, or in the last second."""
     span = min(period or _SECOND, float(time[-1] - time[0]))
     return nearest_rows(time, time[-1] - span + span * np.arange(count) / count)
-
-
-def mean_frequency(time: np.ndarray, phases: np.ndarray) -> np.ndarray:
-    """Turns per second `[n]` of phases `[T, n]` [rad]; negative where one turns backwards [Hz]."""
-    turned = np.unwrap(phases, axis=0)
-    return (turned[-1] - turned[0]) / (2 * np.pi * max(float(time[-1] - time[0]), 1e-9))
 
 
 def stroke_period(time: np.ndarray, angles: np.ndarray) -> float | None:

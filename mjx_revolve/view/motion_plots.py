@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -16,7 +15,6 @@ from mjx_revolve.view.motion import (
     Motion,
     last_strokes,
     last_swings,
-    mean_frequency,
     mean_rate,
     rms,
     speed_over,
@@ -46,7 +44,6 @@ from mjx_revolve.view.statistics import FEWEST, mean_and_half
 if TYPE_CHECKING:
     from mjx_revolve.episodes.simulate import Trajectory
 
-WATER, _SURFACE = "#eaf3f9", "#2f7fb5"
 # Joints are shown over this many strokes, or all the time where there are none.
 _STROKES = 6.0
 _SWINGS = 12.0  # of a thruster's command that one picture shows
@@ -59,11 +56,6 @@ def plot_trajectory(trajectory: Trajectory, surface_height: float = 0.0, title: 
     """Draws the core's path of a trajectory, see `plot_path`."""
     time, path = np.asarray(trajectory.time, float), np.asarray(trajectory.xpos, float)[:, 1]
     return plot_path(time, path, surface_height, title)
-
-
-def side_axis(path: np.ndarray) -> int:
-    """The horizontal axis, 0 or 1, along which a path `[..., 3]` extends more."""
-    return int(np.argmax(np.ptp(path.reshape(-1, 3)[:, :2], axis=0)))
 
 
 @in_style
@@ -79,32 +71,28 @@ def plot_path(
         title: a line above the picture.
 
     Returns:
-        The figure: paths from above and from the side, coloured by time, in one scale, and depth
-        and speed over time.
+        The figure: the path from above, coloured by time, and depth and speed over time.
     """
-    figure = new_figure(WIDE, 6.6, title)
-    (above, side), (depth, speed) = figure.subplots(2, 2, height_ratios=(1.7, 1.0))
-    rows, ahead = thin(len(path), 300), side_axis(path)
-    for axes, (i, j), words in ((above, (0, 1), "from above"), (side, (ahead, 2), "from the side")):
-        points = path[rows][:, [i, j]]
-        line = LineCollection(list(np.stack([points[:-1], points[1:]], axis=1)), cmap="viridis",
-                              linewidth=2.2, capstyle="round")  # fmt: skip
-        line.set_array(time[rows][:-1])
-        axes.add_collection(line)
-        axes.plot(*points[0], "o", color="white", markeredgecolor=DEEP, markersize=8,
-                  markeredgewidth=1.8, label="start", zorder=5)  # fmt: skip
-        axes.plot(*points[-1], "s", color=ORANGE, markeredgecolor="white", markersize=8,
-                  label="end", zorder=5)  # fmt: skip
-        axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", aspect="equal")
-        axes.set_title(words, loc="center", color=GREY)
-        axes.locator_params(nbins=6)
-        # The same frame on both axes, at least 0.2 m wide: small wiggles stay small.
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        half = 0.57 * max(*np.ptp(path[:, [i, j]], axis=0), 0.2)
-        axes.axis((middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half))
-    draw_surface(side, surface_height)
-    color_bar(figure, line, "time (s)", ax=[above, side], shrink=0.85, aspect=30, pad=0.015)
-    above.legend(loc="best", fontsize=8, frameon=True, framealpha=0.85, edgecolor="none")
+    figure = new_figure(WIDE, 3.5, title)
+    above, depth, speed = figure.subplots(1, 3, width_ratios=(1.5, 1.0, 1.0))
+    rows = thin(len(path), 300)
+    points = path[rows, :2]
+    line = LineCollection(list(np.stack([points[:-1], points[1:]], axis=1)), cmap="viridis",
+                          linewidth=2.2, capstyle="round")  # fmt: skip
+    line.set_array(time[rows][:-1])
+    above.add_collection(line)
+    above.plot(*points[0], "o", color="white", markeredgecolor=DEEP, markersize=8,
+               markeredgewidth=1.8, label="start", zorder=5)  # fmt: skip
+    above.plot(*points[-1], "s", color=ORANGE, markeredgecolor="white", markersize=8, label="end",
+               zorder=5)  # fmt: skip
+    above.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    above.locator_params(nbins=6)
+    # At least 0.2 m wide: small wiggles stay small.
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    half = 0.57 * max(*np.ptp(path[:, :2], axis=0), 0.2)
+    above.axis((middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half))
+    color_bar(figure, line, "time (s)", ax=above, shrink=0.85, aspect=30, pad=0.015)
+    legend_above(above)
 
     rows = thin(len(time))
     depths = surface_height - path[:, 2]
@@ -125,20 +113,6 @@ def plot_path(
     return figure
 
 
-def draw_surface(axes: Axes, height: float) -> None:
-    """Tints the water of a side view, and draws its surface where that is in the frame."""
-    low, high = axes.get_ylim()
-    if low < height < high:
-        axes.axhspan(low, height, color=WATER, zorder=0)
-        axes.axhline(height, color="#4aa3df", linewidth=1.6, zorder=1)
-        axes.text(0.985, height, "water surface", color=_SURFACE, fontsize=8, ha="right",
-                  va="bottom", transform=axes.get_yaxis_transform())  # fmt: skip
-    elif height >= high:
-        axes.set_facecolor(WATER)
-        axes.text(0.985, 0.98, f"water surface at z = {height:g} m ↑", color=_SURFACE, fontsize=8,
-                  ha="right", va="top", transform=axes.transAxes)  # fmt: skip
-
-
 @in_style
 def plot_champions(groups: Sequence[tuple[str, int, Sequence[Motion]]]) -> Figure:
     """Draws the champions of several runs beside each other.
@@ -154,7 +128,8 @@ def plot_champions(groups: Sequence[tuple[str, int, Sequence[Motion]]]) -> Figur
     above, side, away = figure.subplots(1, 3)
     longest = max((m.path for *_, motions in groups for m in motions),
                   key=lambda path: float(np.ptp(path[:, :2], axis=0).max()))  # fmt: skip
-    views = ((above, 0, 1, "from above"), (side, side_axis(longest), 2, "from the side"))
+    ahead = int(np.ptp(longest[:, :2], axis=0).argmax())  # the axis along which it goes further
+    views = ((above, 0, 1, "from above"), (side, ahead, 2, "from the side"))
     for name, number, motions in groups:
         style = style_of(number)
         curves = []
@@ -248,37 +223,6 @@ def plot_thrusters(motion: Motion) -> Figure:
     names = _names(motion, motion.robot.thrusters)
     pair = ("command", motion.commands[first:]), ("behind its lag", motion.lagged[first:])
     return _plot_pairs(motion.time[first:], names, *pair, "command (–)", words, 1.3)
-
-
-@in_style
-def plot_phases(motion: Motion) -> Figure:
-    """Draws the phase of each oscillator of a CPG over time, and its mean frequency.
-
-    `motion.phases` must be there.
-    """
-    assert motion.phases is not None
-    rows, words = _strokes(motion)
-    names = _names(motion, motion.robot.servos)
-    places = range(len(names))
-    figure = new_figure(WIDE, 1.5 + 0.24 * len(names))
-    left, right = figure.subplots(1, 2, width_ratios=(3.2, 1.0))
-    time = motion.time[rows]
-    image = left.imshow(
-        np.mod(motion.phases[rows].T, 2 * np.pi), aspect="auto", cmap="twilight", vmin=0,
-        vmax=2 * np.pi, extent=(time[0], time[-1], len(names) - 0.5, -0.5),
-    )  # fmt: skip
-    left.grid(False)
-    left.set_yticks(places, names)
-    left.set(xlabel="time (s)", title=f"phase of each oscillator, {words}")
-    bar = color_bar(figure, image, "phase (rad)", ax=left, pad=0.015, aspect=25)
-    bar.set_ticks(list(np.pi / 2 * np.arange(5)), labels=["0", "π/2", "π", "3π/2", "2π"])
-    right.barh(places, mean_frequency(motion.time, motion.phases), color=BLUE, height=0.6)
-    right.set_yticks(places, [""] * len(names))
-    right.set(ylim=(len(names) - 0.5, -0.5), xlabel="mean frequency (Hz)", title="turns per second")
-    right.xaxis.set_major_locator(MaxNLocator(nbins=5))
-    right.axvline(0, color=GREY, linewidth=0.8)
-    right.grid(False, axis="y")
-    return figure
 
 
 @in_style

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from matplotlib.transforms import Affine2D
-from scipy.ndimage import gaussian_filter
 
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import check_name, write_atomic
-from mjx_revolve.view.pieces import Scene, rest_scene
+from mjx_revolve.view.pieces import rest_scene
 from mjx_revolve.view.plots import figure_png, in_style, new_figure
-from mjx_revolve.view.raster import REST_VIEW, depth_buffer, make_view, show_scene
+from mjx_revolve.view.raster import REST_VIEW, make_view, show_scene
 
 _DPI = 130
 _INCHES = (13.0, 7.4)
-_INK, _FAINT = "#3a4250", "#c9ced6"
-_BLUR = 0.01  # of the shadow's edge [m]
+_INK = "#3a4250"
 
 
 def draw_morphology(morphology: Morphology, path: str | Path) -> None:
@@ -71,8 +66,8 @@ def _compose(morphology: Morphology) -> Figure:
     room = np.array([8.3, height - 0.75])
     axes = figure.add_axes((0.1 / width, 0.1 / height, room[0] / width, room[1] / height))
     axes.set_axis_off()
-    corners = _draw_floor(axes, scene, low, high)
-    unit = float((np.ptp(corners, axis=0) / room).max()) * 1.02  # metres per inch
+    corners = scene.corners.reshape(-1, 3) @ REST_VIEW[:2].T
+    unit = float((np.ptp(corners, axis=0) / room).max()) * 1.1  # metres per inch
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     (left, bottom), (right, top) = middle - unit * room / 2, middle + unit * room / 2
     axes.axis((left, right, bottom, top))
@@ -104,49 +99,3 @@ def _compose(morphology: Morphology) -> Figure:
             axis.set_major_locator(MaxNLocator(nbins=count, steps=[1, 2, 5, 10]))
         show_scene(axes, scene, view, unit / _DPI)
     return figure
-
-
-def _draw_floor(axes: Axes, scene: Scene, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Draws a grid below the bounds `low` to `high` [m], with a shadow and the axes' names.
-
-    Returns:
-        The corners of what was drawn, in the view: `[n, 2]` [m].
-    """
-    size = float((high - low).max())
-    ticks = MaxNLocator(nbins=10, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, size)
-    step, ground = float(ticks[1] - ticks[0]), float(low[2]) - 0.02 * size
-    xs, ys = (
-        step * np.arange(math.floor(low[k] / step - 0.3), math.ceil(high[k] / step + 0.3) + 1)
-        for k in (0, 1)
-    )
-    flat = np.eye(3)  # the plane in the view
-    flat[:2, :2], flat[:2, 2] = REST_VIEW[:2, :2], REST_VIEW[:2, 2] * ground
-    plane = Affine2D(flat) + axes.transData
-    corners = [(xs[0], ys[0]), (xs[-1], ys[0]), (xs[-1], ys[-1]), (xs[0], ys[-1])]
-    axes.fill(*np.transpose(corners), color="#f4f6f9", zorder=0, transform=plane)
-    axes.vlines(xs, ys[0], ys[-1], color=_FAINT, linewidth=0.6, zorder=1, transform=plane)
-    axes.hlines(ys, xs[0], xs[-1], color=_FAINT, linewidth=0.6, zorder=1, transform=plane)
-    away = 0.05 * size
-    for words, place in (
-        (f"x, grid of {step:g} m", ((xs[0] + xs[-1]) / 2, ys[0] - away)),
-        ("y", (xs[-1] + away, (ys[0] + ys[-1]) / 2)),
-    ):
-        axes.text(*place, words, color=_INK, ha="center", va="center", transform=plane)
-    _draw_shadow(axes, scene, plane)
-    outer = [*corners, (xs[-1] + 2 * away, ys[0] - 2 * away)]
-    points = [(x, y, ground) for x, y in outer] + [(x, y, high[2]) for x, y in corners]
-    return np.array(points) @ REST_VIEW[:2].T
-
-
-def _draw_shadow(axes: Axes, scene: Scene, plane: Any) -> None:
-    """Draws the soft shadow of light from straight above in a plane of x and y."""
-    points = scene.corners[..., :2].reshape(-1, 2)
-    low, high = points.min(axis=0) - 4 * _BLUR, points.max(axis=0) + 4 * _BLUR
-    pixel = float((high - low).max()) / 300
-    columns, rows = np.ceil((high - low) / pixel).astype(int)
-    depth, _ = depth_buffer(scene.corners, low, pixel, (rows, columns))
-    image = np.zeros((rows, columns, 4))
-    image[..., 3] = 0.28 * gaussian_filter(np.isfinite(depth).astype(float), _BLUR / pixel)
-    right, top = low + pixel * np.array([columns, rows])
-    axes.imshow(image, extent=(low[0], right, low[1], top), origin="lower", zorder=2,
-                interpolation="bilinear", transform=plane)  # fmt: skip

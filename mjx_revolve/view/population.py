@@ -79,16 +79,13 @@ def read_population(folder: Path) -> tuple[Population, list[str]]:
         folder: the run folder.
 
     Returns:
-        The population, and a line about each thing that is wrong. Where the living are not known,
-        those born in a generation count.
+        The population, and a line about each thing that is wrong.
     """
     lives, problems = read_individuals(folder)
     living, more = read_generations(folder)
     problems += more
     if lives and not living:
-        problems.append("generations.jsonl names none: the newborn stand in for the living")
-        for life in lives.values():
-            living[life.born] = (*living.get(life.born, ()), life.number)
+        problems.append("generations.jsonl names none: which were alive is not known")
     lost = {number for numbers in living.values() for number in numbers} - set(lives)
     if lost:
         problems.append(f"individuals.jsonl lacks {len(lost)} of the living")

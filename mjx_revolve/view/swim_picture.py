@@ -20,7 +20,6 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
 from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.view.motion import Motion, analyse_motion, stroke_rows
-from mjx_revolve.view.motion_plots import WATER, draw_surface
 from mjx_revolve.view.palette import ACCENT, CURRENT, RGB, SAND, TARGET
 from mjx_revolve.view.pieces import Piece, Scene, make_pieces, mount_piece, place_pieces
 from mjx_revolve.view.plots import INK, in_style, new_figure
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 _INCHES, _DPI = (16.0, 9.0), 100
 _LEFT, _RIGHT, _TOP, _GAP = 0.95, 0.3, 0.74, 0.14  # free margins of the page [inches]
 _STRIP, _SNAPSHOTS = 2.0, 6  # height [inches] and number of the snapshots of a stroke
-_SOFT = "#4d6675"
+_SOFT, _WATER, _SURFACE = "#4d6675", "#eaf3f9", "#2f7fb5"
 _FLOW: RGB = (0.5 * CURRENT[0], 0.5 * CURRENT[1], 0.5 * CURRENT[2])  # darker, on pale water
 _RIM = [withStroke(linewidth=2.5, foreground=(1, 1, 1, 0.7))]  # around words on any ground
 # The surface and the bed are shown where they are at most this far away [body lengths].
@@ -86,7 +85,7 @@ def plot_swim(
     Raises:
         InputError: the trajectory is another robot's, or has no finite row.
     """
-    return draw_motion(analyse_motion(robot, trajectory, counted_from, None, water, target, task))
+    return draw_motion(analyse_motion(robot, trajectory, counted_from, water, target, task))
 
 
 @in_style
@@ -183,7 +182,7 @@ def _draw_way(figure: Figure, motion: Motion, bottom: float) -> None:
         axes.axis((x0, x1, y0, y1))
         axes.xaxis.set_major_locator(MaxNLocator(nbins=int(0.8 * wide), steps=[1, 2, 5, 10]))
         axes.yaxis.set_major_locator(MaxNLocator(nbins=max(3, int(tall)), steps=[1, 2, 5, 10]))
-        axes.set_facecolor(WATER)
+        axes.set_facecolor(_WATER)
         axes.grid(color="white", linewidth=1.0)
         axes.tick_params(labelsize=12)
         fades = np.linspace(0.45, 1.0, len(scenes)) if len(scenes) > 1 else [1.0]
@@ -213,8 +212,10 @@ def _draw_way(figure: Figure, motion: Motion, bottom: float) -> None:
     for axes, words in ((above, "from above"), (beside, "from the side")):
         axes.text(0.99, 0.03, words, transform=axes.transAxes, color=_SOFT, ha="right")
     if heights[1] >= 0.0:
-        beside.set_facecolor("white")
-        draw_surface(beside, 0.0)
+        beside.axhspan(0.0, beside.get_ylim()[1], color="white", zorder=0)
+        beside.axhline(0.0, color=_SURFACE, linewidth=1.6, zorder=1)
+        beside.text(0.985, 0.0, "water surface", color=_SURFACE, fontsize=8, ha="right",
+                    va="bottom", transform=beside.get_yaxis_transform())  # fmt: skip
     if bed is not None:
         beside.fill_between(*bed, beside.get_ylim()[0], color=SAND, zorder=1)
     _label_poses(beside, motion, scenes, side, 0.5 * unit)
@@ -339,7 +340,7 @@ def _draw_stroke(figure: Figure, motion: Motion) -> None:
     middle, half = (low + high) / 2, unit * box / 2
     for k, (row, scene) in enumerate(zip(rows, scenes, strict=True)):
         axes = _axes_at(figure, _RIGHT + k * (box[0] + _GAP), 0.25, *box)
-        axes.set(xticks=[], yticks=[], facecolor=WATER)
+        axes.set(xticks=[], yticks=[], facecolor=_WATER)
         axes.spines[:].set_visible(False)
         axes.axis((middle[0] - half[0], middle[0] + half[0],
                    middle[1] - half[1], middle[1] + half[1]))  # fmt: skip

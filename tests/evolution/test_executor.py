@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import pickle
 import re
 import signal
 import subprocess
@@ -22,18 +21,15 @@ import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.evolution import failed_blocks as lost
 from mjx_revolve.evolution import jobs
 from mjx_revolve.evolution import run_folder as runs
-from mjx_revolve.evolution.blocks import block_size, evaluate_block, split_blocks
+from mjx_revolve.evolution.blocks import block_size, split_blocks
 from mjx_revolve.evolution.executor import Executor, make_executor
-from mjx_revolve.evolution.failed_blocks import save_failed_block, score_failed_block
 from mjx_revolve.evolution.gene_search import GeneEvolution
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.jobs import Limits, WorkerError, make_job, open_job
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world
 from toys import contents, wait_for
@@ -293,7 +289,6 @@ def troubled(tmp_path_factory):
         patch.setenv("TOY_TROUBLE", str(folder / "order"))
         patch.setattr(jobs, "LIMITS", Limits(block=15.0, tries=2))
         with make_executor(toy_config(folder), 2, toys.make_troubled) as executor:
-            executor.folder = folder / "lost"
             executor(np.zeros((12, 5)), KEY)
             yield executor, folder / "order"
 
@@ -348,58 +343,8 @@ def test_a_block_that_kills_scores_worst_and_is_named(troubled, caplog):
     assert scores[rest].tobytes() == alone[rest].tobytes()
     said = [record.getMessage() for record in caplog.records]
     assert said[:-1] == 2 * ["a worker is replaced (killed by SIGKILL)"]
-    path = re.fullmatch(
-        r"4 individuals count as failed, because their workers do \(killed by SIGKILL\); to see "
-        r"why: python -m mjx_revolve.evolution.failed_blocks (.+)", said[-1],
-    )[1]  # fmt: skip
-    assert Path(path).parent == executor.folder
-    done = subprocess.run(
-        [sys.executable, "-m", "mjx_revolve.evolution.failed_blocks", path, "--trust"], cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}", "TOY_TROUBLE": "no"},
-    )  # fmt: skip
-    assert done.returncode == -signal.SIGKILL
-
-
-def test_a_lost_block_can_be_scored_again(tmp_path):
-    job = make_job(toy_config(tmp_path), toys.make_toy)
-    block = (np.random.default_rng(0).normal(size=(4, 5)).astype(np.float32),)
-    path = save_failed_block(tmp_path / "lost", job, block, KEY)
-    scores, _ = score_failed_block(path, trust=True)
-    assert scores.tobytes() == Executor(toys.Toy(), 4)(block[0], KEY).tobytes()
-    with pytest.raises(UntrustedError, match=r"make: expected .*; found 'toys:make_toy'"):
-        score_failed_block(path)
-
-
-class Spell:
-    """What does something when it is unpickled."""
-
-    def __reduce__(self):
-        return Path.touch, (Path("was run"),)
-
-
-def test_a_strangers_block_runs_nothing(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("a.pickle").write_bytes(pickle.dumps(Spell()))
-    Path("b.npz").write_bytes(b"PK")
-    np.savez("c.npz", kept=np.array([Spell()], object))
-    np.savez("d.npz", kept=np.frombuffer(b"[]", np.uint8))
-    for name in ("a.pickle", "b.npz", "c.npz", "d.npz", "none.npz"):
-        assert run_command(lost.main, [name, "--trust"]) == 2
-        err = capsys.readouterr().err
-        assert err.startswith(f"error: {name}: expected ") and err.count("\n") == 1
-    assert not Path("was run").exists()
-
-
-def test_a_lost_block_of_bodies_can_be_scored_again(tmp_path):
-    config = load_config(toys.write_bodies_config(tmp_path / "bodies.yaml"))
-    fitness = toys.make_toy_bodies(config)
-    rng = np.random.default_rng(0)
-    bodies = [fitness.genotype.develop(fitness.genotype.random(rng)) for _ in range(3)]
-    genes = rng.normal(size=(8, fitness.num_genes)).astype(np.float32)
-    block = (genes, np.array([0, 1, 2, 0, 1, 2, 0, 0], np.int32), bodies)
-    path = save_failed_block(tmp_path / "lost", make_job(config, toys.make_toy_bodies), block, KEY)
-    scores, _ = score_failed_block(path, trust=True)
-    assert scores.tobytes() == evaluate_block(fitness, block, KEY)[0].tobytes()
+    reason = "because their workers do (killed by SIGKILL)"
+    assert said[-1] == f"4 individuals count as failed, {reason}"
 
 
 @pytest.mark.slow

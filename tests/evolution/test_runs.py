@@ -541,20 +541,14 @@ def test_fitness_plot(generations):
 
 def test_trajectory_plot():
     figure = plot_trajectory(swim(depth=2.0), surface_height=0.0)
-    above, side, depth, speed, _ = figure.axes
+    above, depth, speed, _ = figure.axes
     assert (above.get_xlabel(), above.get_ylabel()) == ("x (m)", "y (m)")
-    assert (side.get_xlabel(), side.get_ylabel()) == ("x (m)", "z (m)")
-    assert above.get_aspect() == side.get_aspect() == 1.0
+    assert above.get_aspect() == 1.0
     assert np.allclose(depth.lines[0].get_ydata(), 2.0)
     # Over one second the wiggle and the edges hardly count: 0.1 m/s along x, up to 0.05 along y.
     smooth = speed.lines[1].get_ydata()
     assert smooth.min() >= 0.1 and smooth.max() < np.hypot(0.1, 0.05) + 1e-6
     assert figure_png(figure).startswith(b"\x89PNG")
-
-
-def test_trajectory_plot_shows_a_near_surface():
-    side = plot_trajectory(swim(depth=0.1), surface_height=0.0).axes[1]
-    assert any(text.get_text() == "water surface" for text in side.texts)
 
 
 def test_trajectory_plot_of_almost_nothing():

@@ -87,31 +87,6 @@ def testvoronoi_cells_fill_the_square():
     assert all(Path(p).contains_point(c) for p, c in zip(polygons, centers, strict=True))
 
 
-@pytest.mark.parametrize("count", [3, 4])
-def test_maps_within_a_map(count):
-    found = archive(count)
-    figure = plot_archive(found)
-    axes = figure.axes[0]
-    cells, frames = axes.collections
-    assert len(cells.get_paths()) == len(filled(found)) > 8
-    assert len(frames.get_paths()) == 4 * (2 if count == 4 else 1)
-    best = int(np.nanargmax(found.scores))
-    places = np.unravel_index(best, found.shape)
-    # In cells of the small maps, which are 3 by 2 and .7 apart.
-    x, y = places[0] + places[2] * 3.7, places[1] + (places[3] * 2.7 if count == 4 else 0)
-    assert star(figure) == pytest.approx([x + 0.5, y + 0.5])
-    corner = cells.get_paths()[filled(found).tolist().index(best)].get_extents()
-    assert (corner.x0, corner.y0, corner.x1, corner.y1) == pytest.approx((x, y, x + 1, y + 1))
-    norm = Normalize(np.nanmin(found.scores), np.nanmax(found.scores))
-    expected = VIRIDIS(norm(found.scores[filled(found)]))
-    assert cells.get_facecolors() == pytest.approx(expected)
-    outer = axes.child_axes
-    assert [text.get_text() for text in outer[0].get_xticklabels()] == [
-        "0 … 0.25", "0.25 … 0.5", "0.5 … 0.75", "0.75 … 1",
-    ]  # fmt: skip
-    assert len(outer) == count - 2
-
-
 @pytest.mark.parametrize(("count", "kind"), [(5, "grid"), (3, "cvt")])
 def test_a_line_for_each_individual(count, kind):
     found = archive(count, kind)

@@ -174,10 +174,10 @@ def test_of_a_long_line_those_stay_who_gained_most(tmp_path):
     assert pick_evenly([4], 3) == [4] and pick_evenly([], 3) == []
 
 
-def test_without_generations_the_new_born_stand_in(run):
+def test_without_generations_the_living_are_not_known(run):
     (run / "generations.jsonl").unlink()
     population, (problem,) = read_population(run)
-    assert population.living == {1: (0, 1, 2), 2: (3, 4), 3: (5,)}
+    assert population.living == {} and population.best().number == 5
     assert problem.startswith("generations.jsonl names none")
     (run / "generations.jsonl").write_text('{"generation":1,"living":[0,8,9]}\n')
     assert read_population(run)[1] == ["individuals.jsonl lacks 2 of the living"]
@@ -377,14 +377,6 @@ def test_a_body_that_cannot_be_read_has_no_picture(run, still):
     page = report_page.make_report([record])
     assert "individual 0: " in record.warning and "Wheel" in record.warning
     assert page.count('alt="Body of individual 0"') == 0 and "<b>#0</b>" in page
-
-
-def test_best_individual_stands_in_for_a_lost_champion(run):
-    (run / "champion/genes.yaml").unlink()
-    record = read_run(run)
-    assert record.stand_in == "best individual in individuals.jsonl, number 5"
-    assert record.individual == 5 and record.genes.shape == (10,)
-    assert report_page._champions_body(record, record.config).num_hinges == 3
 
 
 # --- commands ---

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import yaml
-from matplotlib.collections import LineCollection
 
 from laboratory import QUICK
 from mjx_revolve import report, viewer
@@ -16,7 +15,7 @@ from mjx_revolve.evolve import main
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.colony_history import make_history
-from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives, plot_population
+from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_population
 from mjx_revolve.view.convergence import plot_colony, scale_time
 from mjx_revolve.view.plots import figure_png
 from mjx_revolve.view.population import trace_line
@@ -100,14 +99,6 @@ def test_births_and_deaths_add_up(history):
     assert top.lines[0].get_ydata().max() == 4
 
 
-def test_every_life_is_a_line(history):
-    lines = [c for c in plot_lives(history).axes[0].collections if isinstance(c, LineCollection)]
-    rows = [tuple(map(tuple, segment)) for segment in lines[0].get_segments()]
-    born = [0, 0, 20, 40, 40]
-    assert [row[0] for row in rows] == [(t, k) for k, t in enumerate(born)]
-    assert [row[1][0] for row in rows] == [30, 60, 60, 50, 60]
-
-
 def test_families_stand_together(history):
     """Down the tree: 0, its child 2 and grandchild 3, then the others; the champion's line."""
     top, low = plot_families(history, champion=3).axes
@@ -121,8 +112,11 @@ def test_empty_and_odd_histories_are_drawn():
     """Nobody was born, or in one moment only: no picture complains."""
     colony = ColonyConfig(energy=EnergyConfig(chargers=((1, 0, -2),)))
     for history in (make_history([], {}, 0.0), make_history(EVENTS[:1], {}, 0.0)):
-        for figure in (plot_population(history), plot_lives(history), plot_families(history),
-                       plot_arena(history, colony)):  # fmt: skip
+        for figure in (
+            plot_population(history),
+            plot_families(history),
+            plot_arena(history, colony),
+        ):
             assert figure_png(figure).startswith(b"\x89PNG")
 
 
@@ -173,7 +167,7 @@ def run(tmp_path_factory):
 
 @pytest.mark.long
 def test_a_run_leaves_its_pictures(run):
-    for name in ("fitness", "population", "lives", "families", "arena", "bodies"):
+    for name in ("fitness", "population", "families", "arena", "bodies"):
         assert (run / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -28,8 +28,6 @@ from mjx_revolve.view.live.page import live_page
 from mjx_revolve.view.live.robot_catalogue import load_catalogue
 from mjx_revolve.view.live.server import LiveServer
 from mjx_revolve.view.live.simulation import CatalogueEntry, LiveSimulation
-from mjx_revolve.view.live.window import KeyBindings, LiveScene
-from mjx_revolve.view.poses import pose_robot
 from mjx_revolve.water.world import load_world
 from standin import SPEED, StandIn
 
@@ -454,14 +452,10 @@ def test_ctrl_c_ends_it(monkeypatch, capsys):
         (["nosuch"], "nosuch: expected a run folder, a configuration or a morphology"),
         (["--port", "70000"], "--port: expected a whole number from 0 to 65535; found '70000'"),
         (["--robots", "0"], "--robots: expected a whole number from 1 to 64; found '0'"),
-        (["--mujoco"], "--mujoco: expected a screen; found neither DISPLAY nor WAYLAND_DISPLAY"),
     ],
 )
 def test_mistakes_end_in_one_line(monkeypatch, capsys, argv, said):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("sys.platform", "linux")
     assert run_command(live.main, argv) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"error: {said}") and error.count("\n") == 1
@@ -474,62 +468,6 @@ def test_a_port_that_is_taken(catalogue, served, monkeypatch, capsys):
     port = str(served.server_address[1])
     assert run_command(live.main, ["snake", "--port", port]) == 1
     assert f"port {port}: " in capsys.readouterr().err
-
-
-# --------------------------------------------------------------------- MuJoCo's viewer
-
-
-def test_the_scene_has_everybody_where_they_are(entries):
-    """One model of all: bodies where each robot's own model has them."""
-    with Running(entries, first=(Drop(0), Drop(1, (3.0, 0.0)))) as running:
-        running.hear("poses")
-        running.ask(Pause(True))
-        simulation = running.simulation
-        scene = LiveScene(simulation)
-        poses = simulation.poses_at(simulation.time)
-        scene.pose(poses)
-        import mujoco
-
-        mujoco.mj_kinematics(scene.model, scene.data)
-        assert scene.keys == (0, 1)
-        for one in simulation.robots:
-            expected = pose_robot(one.robot, poses[one.key][None].astype(float))
-            for k in range(1, one.robot.mj_model.nbody):
-                name = f"{one.key}/{one.robot.mj_model.body(k).name}"
-                assert scene.data.body(name).xpos == pytest.approx(
-                    expected.position[0, k], abs=1e-9
-                )
-        early, middle, late = (
-            simulation.poses_at(simulation.time - ago)[0] for ago in (0.05, 0.025, 0.0)
-        )
-        assert middle[:3] == pytest.approx((early[:3] + late[:3]) / 2, abs=1e-6)
-
-
-def test_keys_of_the_window(entries):
-    with Running(entries) as running:
-        running.hear("poses")
-        simulation, hands = running.simulation, KeyBindings(running.simulation)
-
-        def press(key):
-            hands.press(key)
-            running.ask(Rate(1.0))  # commands are done in turn
-
-        press(ord("."))
-        assert "snake, swims" in hands.words()[1]
-        press(257)
-        assert [one.name for one in simulation.robots] == ["spider", "snake"]
-        press(262)
-        press(265)
-        assert simulation.current == pytest.approx((0.05, 0.05, 0.0))
-        press(261)
-        assert [one.name for one in simulation.robots] == ["spider"]
-        press(ord(" "))
-        assert simulation.paused and "(paused)" in hands.words()[1]
-        for _ in range(4):
-            press(257)
-        assert "tank: expected a free place" in hands.words()[1]
-        press(268)
-        assert len(simulation.robots) == 1 and not simulation.paused
 
 
 # --------------------------------------------------------------------- the true tank

@@ -30,13 +30,7 @@ from mjx_revolve.view.film.draw import draw_frames, draw_shaded
 from mjx_revolve.view.film.film import make_colony_film, make_film
 from mjx_revolve.view.film.stage import BACKGROUND, build_stage, make_sand
 from mjx_revolve.view.film.video import gif_stride, make_gif, write_mp4
-from mjx_revolve.view.film.waterlight import (
-    bright_lines,
-    daylight,
-    make_shader,
-    open_water,
-    transmission,
-)
+from mjx_revolve.view.film.waterlight import daylight, make_shader, open_water, transmission
 from mjx_revolve.view.pieces import smooth_mesh
 from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
 from mjx_revolve.view.swim_picture import pose_scenes
@@ -217,10 +211,11 @@ def test_stage_stands_as_the_robot_does(name):
 
 @pytest.mark.slow
 def test_stage_counts_from_its_origin(spider):
-    model = build_stage({0: spider}, spider.world, origin=(380.0, 20.0, -10.0), sight=5.0)
+    world = load_world("lake", bed={"kind": "flat", "height": -12.0})
+    model = build_stage({0: spider}, world, origin=(380.0, 20.0, -10.0), sight=5.0)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    assert data.geom_xpos[model.geom("surface").id] == pytest.approx([0, 0, 10])
+    assert data.geom_xpos[model.geom("sand").id] == pytest.approx([0, 0, -2], abs=0.01)
 
 
 def test_a_world_without_a_bed_has_none(spider):
@@ -267,13 +262,6 @@ def test_light_comes_from_above():
     assert np.asarray(daylight(0.0)) == pytest.approx([1, 1, 1])
     assert (np.diff(np.asarray(daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
     assert (np.diff(np.asarray(open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
-
-
-def test_bright_lines_only_move_light_about():
-    x, y = np.meshgrid(np.linspace(0, 20, 200), np.linspace(0, 20, 200))
-    lines = np.asarray(bright_lines(1.0, 9.81, 0.7, x, y))
-    assert lines.mean() == pytest.approx(1.0, abs=0.2)
-    assert lines.min() > 0 and lines.std() > 0.1
 
 
 @lru_cache
@@ -602,7 +590,7 @@ def test_the_dead_are_not_drawn(colony, way):
     ("arguments", "words"),
     [
         ([str(ROOT / "morphologies" / "fish.yaml"), "--colony"], "run folder of a colony"),
-        (["run", "--colony", "--view"], "--colony: expected none of --view, --html, --ancestors"),
+        (["run", "--colony", "--html"], "--colony: expected neither --html nor --ancestors"),
         (["run", "--colony", "--out", "a.html"], "ends in .mp4 or .gif, with a film of several"),
         ([str(ROOT / "morphologies" / "fish.yaml"), "--time", "3"], "--time: expected --colony"),
         ([str(ROOT), "--colony", "--seed", "1"], "--seed: expected none with --colony"),
@@ -731,7 +719,6 @@ def test_the_user_s_opengl_is_the_only_one_tried(monkeypatch):
         (("--fps", "0"), "--fps: expected a whole number from 1 to 120; found '0'"),
         (("--duration", "0"), "--duration: expected seconds > 0; found '0'"),
         (("--html", "--out", "x.mp4"), "with --html"),
-        (("--view", "--out", "x.mp4"), "--view: expected neither"),
     ],
 )
 def test_wrong_options(words, message, tmp_path, capsys):
@@ -756,19 +743,6 @@ def test_a_place_that_cannot_be_written(command, way, tmp_path, capsys):
         assert error.startswith("error: ") and error.count("\n") == 1 and message in error
     assert command(str(source), "--html", "--out", str(tmp_path / "v0.2")) == 0
     assert [path.name for path in (tmp_path / "v0.2").iterdir()] == ["viewer.html"]
-
-
-@pytest.mark.skipif(not os.sys.platform.startswith("linux"), reason="Linux's screens")
-def test_view_without_a_screen_is_one_line(command, tmp_path, capsys, monkeypatch):
-    source = tmp_path / "spider.yaml"
-    source.touch()
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    assert command(str(source), "--view") == 2
-    assert "found neither DISPLAY nor WAYLAND_DISPLAY" in capsys.readouterr().err
-    monkeypatch.setenv("DISPLAY", ":987")
-    assert command(str(source), "--view") == 2
-    assert capsys.readouterr().err.startswith("error: --view: expected a screen")
 
 
 @pytest.mark.slow

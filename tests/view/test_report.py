@@ -27,7 +27,7 @@ from mjx_revolve.view import convergence, motion_plots, plots
 from mjx_revolve.view.report import page as report_page
 from mjx_revolve.view.report import repeat as report_repeat
 from mjx_revolve.view.report import tables
-from mjx_revolve.view.report.champion import cpg_phases, replay_champion
+from mjx_revolve.view.report.champion import replay_champion
 from mjx_revolve.view.report.data import read_run
 from mjx_revolve.view.report.groups import differences, group_runs
 from mjx_revolve.view.statistics import interval
@@ -149,17 +149,11 @@ def test_seeds_are_grouped_and_configurations_told_apart(lab, tmp_path):
 
 
 @pytest.mark.slow
-def test_curves_go_as_far_as_all_runs_do(lab, tmp_path):
+def test_of_runs_that_are_not_finished_the_furthest_counts(lab, tmp_path):
     config = make_config(lab["config"].model_dump(), "/", ["evolution.generations=9"], "swim.yaml")
     for seed, generations in enumerate((9, 4, 7)):
         make_run(tmp_path / f"{seed}", config, lab["fitness"], seed, generations, finished=False)
-    lines = (tmp_path / "0" / "metrics.csv").read_text().splitlines(True)
-    (tmp_path / "0" / "metrics.csv").write_text("".join(lines[:2] + lines[3:]))  # without the 2nd
     (group,) = group_runs([read_run(tmp_path / f"{seed}") for seed in range(3)])
-    x, values = group.curve("champion")
-    assert x.tolist() == [1, 3, 4]
-    assert np.allclose(values, [[row(g, seed)["champion"] for g in x] for seed in range(3)])
-    assert np.isnan(group.curve("no_such_column")[1]).all()
     assert group.scores() == []
     assert group.best().seed == 0  # the furthest, where nothing was judged
 
@@ -202,15 +196,13 @@ DAMAGES = [
     (lambda run: cut(run / "run.json"), "damaged", "run.json: expected JSON; found"),
     (lambda run: (run / "config.yaml").unlink(), "incomplete", "config.yaml is missing"),
     (lambda run: edit(run / "config.yaml", "trials: 1", "trials: 1\n  trails: 2"),
-     "of another version", "this version does not know task.trails; read without"),
+     "of another version", "task.trails: expected one of "),
     (lambda run: made_by(run, "mjx_revolve", "99.1"),
      "of another version", "made with newer mjx_revolve 99.1 (here "),
     (lambda run: (run / "inputs" / "elbow.yaml").unlink(), "incomplete",
-     "inputs/elbow.yaml is missing: champion/morphology.yaml stands in for it"),
+     "morphology: expected a file; found none at inputs/elbow.yaml"),
     (lambda run: (run / "champion" / "genes.yaml").unlink(), "incomplete",
-     "the champion shown is the best individual in checkpoints/generation_000006.npz"),
-    (lambda run: cut(run / "checkpoints" / "generation_000006.npz"), "damaged",
-     "checkpoints/generation_000006.npz: File is not a zip file"),
+     "champion/genes.yaml is missing"),
     (lambda run: edit(run / "run.json", '"finished"', '"began"'), "not finished",
      "stopped or still running after 6 of 6 generations"),
 ]  # fmt: skip
@@ -225,10 +217,8 @@ def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
     assert text in record.warning, record.warning
     assert str(copy) not in "; ".join(problem.text for problem in record.problems)
     assert record.info or record.settings
-    assert record.genes is not None
+    assert record.genes is not None or "genes" in text
     if "metrics" in text and record.metrics:  # whatever is left makes pictures
-        (group,) = group_runs([record])
-        assert plots.figure_svg(convergence.plot_seeds(group)).startswith(b"<?xml")
         assert plots.figure_svg(convergence.plot_fitness(record.metrics)).startswith(b"<?xml")
 
 
@@ -302,23 +292,6 @@ def test_genes_of_another_controller_are_refused(lab, copy):
         replay_champion(read_run(copy), lab["fitness"])
 
 
-def test_phases_of_oscillators_without_neighbours_turn_evenly(lab):
-    fitness = lab["fitness"]
-    genes = np.float32([0.9, -0.6, 0.0])
-    phases = np.unwrap(cpg_phases(fitness, genes, 100), axis=0)
-    seconds = fitness.robot.world.timestep * np.arange(1, 101)
-    assert np.allclose(phases, 2 * np.pi * np.sin(genes[:2]) * seconds[:, None], atol=1e-4)
-    trajectory = fitness.replay(genes, replay_key(0))
-    low, high = fitness.robot.mj_model.actuator_ctrlrange.T
-    # Commands are due every tenth step, of the phases then, and targets go there in ten steps.
-    due = np.concatenate([np.zeros((1, 2)), phases[9:99:10]])
-    commands = (low + high) / 2 + (high - low) / 2 * np.tanh(np.sin(due))
-    before = np.concatenate([commands[:1], commands[:-1]])
-    way = np.tile(np.arange(10) / 10, 10)[:, None]
-    expected = before.repeat(10, axis=0) + way * (commands - before).repeat(10, axis=0)
-    assert np.allclose(trajectory.ctrl[:100], expected, atol=1e-4)
-
-
 # --- pictures ---
 
 
@@ -350,10 +323,7 @@ def test_power_adds_up(lab):
     assert final == pytest.approx(replay.measures["cost_of_transport"], rel=0.01)
 
 
-def test_phases_and_thrusters(lab):
-    phases = axes_of(motion_plots.plot_phases(lab["replay"].motion))
-    assert phases[0].images[0].get_array().shape == (2, 200)
-    assert phases[0].images[0].get_cmap().name == "twilight"  # a circle: 0 and 2π look the same
+def test_thrusters():
     from types import SimpleNamespace
 
     time = np.arange(400) * 0.01
@@ -380,7 +350,8 @@ def test_comparison_of_very_different_lengths(lab, tmp_path):
     left, right = axes_of(convergence.plot_comparison(groups, styles))
     assert left.get_xscale() == "log"
     # Each seed, then their mean.
-    assert np.allclose(left.lines[3].get_ydata(), np.mean(groups[0].curve("champion")[1], axis=0))
+    curves = [record.metrics["champion"] for record in groups[0].records]
+    assert np.allclose(left.lines[3].get_ydata(), np.mean(curves, axis=0))
     assert [tick.get_text() for tick in right.get_xticklabels()] == ["A", "B"]
     (same,) = group_runs(made[:3])
     left, _ = axes_of(convergence.plot_comparison([same], {same.name: 0}))
@@ -399,7 +370,6 @@ def test_searches_in_which_everything_fails_make_pictures(lab, tmp_path):
     for records in ([one], [other], [one, other]):
         groups = group_runs(records)
         axes_of(convergence.plot_comparison(groups, {group.name: 0 for group in groups}))
-        axes_of(convergence.plot_seeds(groups[0]))
         axes_of(convergence.plot_fitness(records[-1].metrics))
 
 
@@ -425,13 +395,6 @@ def test_champions_start_at_one_place(lab):
 def test_letters_never_run_out(index, text):
     assert plots.letter(index) == text
     assert set(plots.style_of(index)) == {"color", "linestyle"}
-
-
-def test_side_views_look_across_the_way():
-    time = np.arange(100) * 0.05
-    path = np.stack([0 * time, 0.2 * time, 0 * time - 1], axis=-1)
-    figure = motion_plots.plot_path(time, path)
-    assert figure.axes[1].get_xlabel() == "y (m)"
 
 
 def test_pictures_are_the_same_bytes_twice():
@@ -462,32 +425,14 @@ def test_modules_are_counted_and_weighed():
     assert '<td class="left">absolute size</td>' in page
 
 
-def test_the_commands_give_the_same_settings(lab, copy):
+def test_the_command_gives_the_same_settings(copy):
     record = read_run(copy)
-    (own_words, own), (words, started) = report_repeat.repeat_commands(record)
-    assert (own_words, words) == ("from this run folder", "as it was started")
-    for command in (own, started):
-        assert command.startswith("python -m mjx_revolve.evolve ")
-        arguments = evolve._parser().parse_args(command.split()[3:])
-        seed = [] if arguments.seed is None else [f"evolution.seed={arguments.seed}"]
-        config = load_config(arguments.config, [*arguments.settings, *seed])
-        assert settings_hash(config) == settings_hash(record.config)
-    assert "--seed 0 --set controller.max_frequency=1.0" in started
-
-
-def test_a_command_that_no_longer_fits_is_not_shown(lab, copy):
-    source = copy.parent / "swim.yaml"
-    shutil.copy(lab["folder"] / "elbow.yaml", copy.parent)
-    shutil.copy(lab["folder"] / "swim.yaml", source)
-    runs.RunFolder(copy).update_info(config_file=str(source))
-    commands = report_repeat.repeat_commands(read_run(copy))
-    assert commands[1][1].startswith("python -m mjx_revolve.evolve swim.yaml --seed 0 ")
-    edit(source, '"duration": 1.0', '"duration": 2.0')
-    assert len(report_repeat.repeat_commands(read_run(copy))) == 1
-    source.unlink()
-    assert len(report_repeat.repeat_commands(read_run(copy))) == 1
+    command = report_repeat.repeat_command(record)
+    assert command.startswith("python -m mjx_revolve.evolve ")
+    arguments = evolve._parser().parse_args(command.split()[3:])
+    assert settings_hash(load_config(arguments.config)) == settings_hash(record.config)
     runs.RunFolder(copy).update_info(xla_flags="--a --b", threads={"OPENBLAS_NUM_THREADS": "2"})
-    ((_, command),) = report_repeat.repeat_commands(read_run(copy))
+    command = report_repeat.repeat_command(read_run(copy))
     assert command.startswith("OPENBLAS_NUM_THREADS=2 XLA_FLAGS='--a --b' python -m ")
 
 
@@ -566,7 +511,7 @@ def test_a_page_about_one_run(copy, quick, capsys):
     # One seed is one seed, and what is spread is said.
     assert "One seed: with another, evolution ends elsewhere" in text
     assert "mean ± standard deviation over 16 fresh starts" in text
-    assert len(page.images) == 6  # fitness, swim, way, joints, phases, energy
+    assert len(page.images) == 5  # fitness, swim, way, joints, energy
     assert "Not everything could be read" not in page.text
     assert len(text) < 2e6
     assert "✗" not in text  # there is no passport that it could fail
@@ -628,7 +573,7 @@ def test_a_page_about_several_runs(lab, copy, quick, capsys):
     assert str(interval([lab["score"]] * 3)) in page.words
     assert "Champions side by side" in page.words
     assert any("95 % confidence" in words for words in page.words)
-    assert len(page.images) == 3 + 5
+    assert len(page.images) == 2 + 4
     assert not any("One seed" in words for words in page.words)
 
 
@@ -636,14 +581,13 @@ def test_a_page_about_several_runs(lab, copy, quick, capsys):
 def test_every_champion_may_be_shown(lab, copy, quick):
     runs_of = [lab["folder"] / f"s{seed}" for seed in range(2)]
     assert run_main(*runs_of, "--every-champion", "--out", "all.html") == 0
-    assert len(Page((copy.parent / "all.html").read_text()).images) == 3 + 2 * 5
+    assert len(Page((copy.parent / "all.html").read_text()).images) == 2 + 2 * 4
 
 
 def test_a_page_about_what_is_left(copy, quick, capsys):
     for name in ("a", "b", "c", "d"):
         shutil.copytree(copy, name)
     (copy.parent / "a" / "config.yaml").write_text("a: {")
-    (copy.parent / "a" / "swim.png").write_bytes(plots.figure_png(plots.new_figure(1, 1)))
     shutil.rmtree("b/champion")
     shutil.rmtree("b/checkpoints")
     (copy.parent / "c" / "metrics.csv").unlink()
@@ -662,7 +606,6 @@ def test_a_page_about_what_is_left(copy, quick, capsys):
     for words in ("Not everything could be read", "a", "b", "c", "Nothing could be read of"):
         assert words in page.words
     assert "found 1" in page.text  # c: one gene where three are expected
-    assert any(source.startswith("data:image/png") for source in page.images)  # a's own picture
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A film's pictures: as arrays, one frame after the other, or in MuJoCo's own window.
+"""A film's pictures: as arrays, one frame after the other.
 
 MuJoCo's renderer gives colours and their distances; `mujoco.Renderer` would draw twice for both.
 Frames come one by one, so that a long film needs no more memory than a short one.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import math
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -19,16 +18,15 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.view.film.film import Film
-from mjx_revolve.view.film.opengl import open_window
 from mjx_revolve.view.film.overlay import make_overlay
-from mjx_revolve.view.film.stage import SURFACE, build_stage, robot_qpos
+from mjx_revolve.view.film.stage import build_stage, robot_qpos
 from mjx_revolve.view.film.waterlight import make_shader
 from mjx_revolve.view.palette import SUN
 
 # Range of sight, in distances of the camera from the robot.
 _SIGHT = 9.0
-# The bed, and what a user adds in the viewer.
-_MOST_GEOMS = 4000
+# Room for decoration, beside the model's geoms.
+_MOST_GEOMS = 100
 # A group of geoms that is not drawn.
 _HIDDEN = 5
 # The sky is a cube about so large, in shares of the far plane's distance; nothing else is that far.
@@ -59,7 +57,7 @@ def draw_shaded(film: Film, way: str) -> Iterator[tuple[Any, np.ndarray, int]]:
     Yields:
         `[height, width, 3]` uint8, depths along the view `[height, width]` [m], the frame's number.
     """
-    model, shots, origin = _stage_of(film, plain=True), film.shots, film.origin
+    model, shots, origin = _stage_of(film), film.shots, film.origin
     shade = make_shader(
         film.world, film.size, shots.distance / film.fine, shots.above, origin.tolist()
     )
@@ -88,12 +86,12 @@ def draw_shaded(film: Film, way: str) -> Iterator[tuple[Any, np.ndarray, int]]:
             yield waiting
 
 
-def _stage_of(film: Film, plain: bool) -> mujoco.MjModel:
+def _stage_of(film: Film) -> mujoco.MjModel:
     """What is drawn of a film's robots and the world around them."""
     distance, off = film.shots.distance, film.center - film.origin
     reach = float(np.linalg.norm(off[:, :2], axis=1).max()) + distance
     robots = {k: one.robot for k, one in enumerate(film.robots)}
-    return build_stage(robots, film.world, film.size, film.origin, reach, _SIGHT * distance, plain)
+    return build_stage(robots, film.world, film.size, film.origin, reach, _SIGHT * distance)
 
 
 def _aim(camera: mujoco.MjvCamera, film: Film, frame: int) -> None:
@@ -132,7 +130,6 @@ def _arrange(
     mujoco.mj_camlight(model, data)
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
     _aim(camera, film, frame)
-    option.geomgroup[SURFACE] = 0
     mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
     # The shadow map is spread around the sun's own place: close to the robot it is fine.
     sun = film.center[frame] - film.origin + 4.0 * film.shots.distance * np.array(SUN)
@@ -182,30 +179,3 @@ def _open_painter(model: mujoco.MjModel, size: tuple[int, int], way: str) -> Ite
         # EGL's clean-up may find its library gone already when Python ends.
         with suppress(Exception):
             opengl.free()
-
-
-def show_film(film: Film) -> None:
-    """Plays a film over and over in MuJoCo's viewer, until its window is closed.
-
-    Args:
-        film: from `make_film`.
-
-    Raises:
-        InputError: there is no screen with OpenGL.
-    """
-    model, target = _stage_of(film, plain=False), film.shots.target
-    data = mujoco.MjData(model)
-    with open_window("--view", model, data) as window:
-        with window.lock():
-            _aim(window.cam, film, 0)
-        begun, last = time.monotonic(), 0
-        while window.is_running():
-            frame = int((time.monotonic() - begun) * film.fps) % len(film.time)
-            with window.lock():
-                _pose(model, data, film, frame)
-                # The user may turn the camera; it goes along with the robot.
-                window.cam.lookat[:] += target[frame] - target[last]
-                mujoco.mj_forward(model, data)
-            last = frame
-            window.sync()
-            time.sleep(0.5 / film.fps)

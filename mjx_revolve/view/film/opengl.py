@@ -1,4 +1,4 @@
-"""Finds an OpenGL that works, with a screen or without, and whether there is a screen.
+"""Finds an OpenGL that works, with a screen or without.
 
 MuJoCo chooses OpenGL when it is imported, by the environment variable MUJOCO_GL, and then has no
 second try. Here each way of making a context is tried in a process of its own, where a driver that
@@ -10,11 +10,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
 
 from mjx_revolve.inputs.errors import InputError
 
@@ -64,67 +59,6 @@ def find_opengl() -> str:
         f"OpenGL: expected one of {', '.join(ways)} to draw with{chosen}; found none that works "
         f"(install one{hint})"
     )
-
-
-def check_screen(
-    option: str = "--view", hint: str = "without --view a film is written, which needs none"
-) -> None:
-    """Refuses an option that needs a screen where there is none.
-
-    Args:
-        option: that needs a screen.
-        hint: what to do without one.
-
-    Raises:
-        InputError: there is no screen.
-    """
-    if sys.platform.startswith("linux") and not _has_display():
-        raise InputError(
-            f"{option}: expected a screen; found neither DISPLAY nor WAYLAND_DISPLAY set ({hint})"
-        )
-    # MuJoCo's viewer would end the process with a complaint of its own.
-    import glfw
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        if not glfw.init():
-            raise InputError(
-                f"{option}: expected a screen; found none that lets us open a window ({hint})"
-            )
-
-
-@contextmanager
-def open_window(option: str, model: Any, data: Any, **more: Any) -> Iterator[Any]:
-    """MuJoCo's viewer without its side panels.
-
-    Args:
-        option: of the command line, for the message.
-        model: MuJoCo's.
-        data: its state.
-        more: arguments of `mujoco.viewer.launch_passive`.
-
-    Yields:
-        The window's handle.
-
-    Raises:
-        InputError: there is no screen with OpenGL.
-    """
-    import mujoco.viewer
-
-    before = set(threading.enumerate())
-    try:
-        window = mujoco.viewer.launch_passive(
-            model, data, show_left_ui=False, show_right_ui=False, **more
-        )
-    except Exception as error:  # GLFW's, X's and macOS's reasons come in many kinds
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise InputError(f"{option}: expected a screen with OpenGL; found: {reason}") from None
-    with window:
-        yield window
-    # The viewer's thread must be through with GLFW before Python ends, and GLFW with it.
-    for thread in set(threading.enumerate()) - before:
-        if "_launch" in thread.name:
-            thread.join(timeout=10.0)
 
 
 def _has_display() -> bool:

@@ -1,4 +1,4 @@
-"""Robots as they are drawn: meshes, the bed, light and haze, in a MuJoCo model of their own.
+"""Robots as they are drawn: meshes, the bed and light, in a MuJoCo model of their own.
 
 The model has the bodies and joints of each `robot.mj_model`, so the same qpos poses them, but
 meshes in place of the boxes that the physics weighs. Nothing touches: it is for `draw` alone.
@@ -19,14 +19,14 @@ from scipy.ndimage import gaussian_filter
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import matrix_to_quat
 from mjx_revolve.view.film.camera import FOVY
-from mjx_revolve.view.palette import SAND, SUN, WATER_AHEAD, WATER_DOWN, WATER_UP
+from mjx_revolve.view.palette import SAND, SUN
 from mjx_revolve.view.pieces import make_pieces, mount_piece, smooth_mesh
 from mjx_revolve.view.surroundings import bed_rings
 from mjx_revolve.water.world import World
 
-# What is hidden of the model by default in MuJoCo's viewer is drawn in none of these groups.
-MODULES, SURFACE, _WEIGHTS = 0, 1, 4
-# What is drawn offscreen where nothing is: a colour of water, for the edges of things mix with it.
+# Groups of geoms: those that are drawn, and one of those that MuJoCo hides by default.
+MODULES, _WEIGHTS = 0, 4
+# What is drawn where nothing is: a colour of water, for the edges of things mix with it.
 BACKGROUND = (36 / 255, 110 / 255, 146 / 255)
 
 # The bed is drawn on rings around the middle of the way; its texture repeats after a tile.
@@ -41,7 +41,6 @@ def build_stage(
     origin: ArrayLike = (0.0, 0.0, 0.0),
     way: float = 1.0,
     sight: float = 10.0,
-    plain: bool = False,
 ) -> mujoco.MjModel:
     """Builds what is drawn of robots and the world around them.
 
@@ -53,7 +52,6 @@ def build_stage(
             Far from its origin OpenGL has too few digits for small robots.
         way: how far from there robots get [m].
         sight: range of sight through the water [m].
-        plain: whether the background has one colour, for a film that paints the water itself.
 
     Returns:
         The model; names of robot k begin with `k/`, its free joint is `k/root` (see `robot_qpos`).
@@ -69,17 +67,7 @@ def build_stage(
         spec.attach(_dressed(robot), prefix=f"{number}/", frame=frame)
     place = np.asarray(origin, float)
     _add_bed(spec, world, place, way, sight)
-    # The still surface is for MuJoCo's viewer; films draw their own, which moves.
-    spec.add_material(name="surface", specular=0.9, shininess=0.9, rgba=[0.55, 0.85, 0.95, 0.22])
-    spec.worldbody.add_geom(
-        name="surface",
-        type=mujoco.mjtGeom.mjGEOM_BOX,  # a plane is invisible from below
-        size=[way + 4.0 * sight, way + 4.0 * sight, 5e-4],
-        pos=[0.0, 0.0, world.surface_height - place[2]],
-        material="surface",
-        group=SURFACE,
-    )
-    _add_light(spec, size, way, sight, plain)
+    _add_light(spec, size, way, sight)
     for geom in spec.geoms:  # nothing touches anything
         geom.contype = geom.conaffinity = 0
     return spec.compile()
@@ -216,10 +204,8 @@ def make_sand(texels: int) -> np.ndarray:
     return np.round(255 * np.clip(color, 0.0, 1.0)).astype(np.uint8)
 
 
-def _add_light(
-    spec: mujoco.MjSpec, size: tuple[int, int], way: float, sight: float, plain: bool
-) -> None:
-    """Light from above, haze, and how finely things are drawn."""
+def _add_light(spec: mujoco.MjSpec, size: tuple[int, int], way: float, sight: float) -> None:
+    """Light from above, and how finely things are drawn."""
     spec.worldbody.add_light(
         name="sun",
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
@@ -233,9 +219,9 @@ def _add_light(
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=BACKGROUND if plain else WATER_UP,
-        rgb2=BACKGROUND if plain else WATER_DOWN,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=BACKGROUND,
+        rgb2=BACKGROUND,  # of the lowest face
         width=256,
         height=256,
     )
@@ -250,8 +236,5 @@ def _add_light(
     fine.shadowsize, fine.offsamples = 2048, 4
     # Nothing is drawn in the last part of what lies before the far plane, but for the sky.
     visual.map.znear, visual.map.zfar = 0.02, 20.0 * (way + sight)
-    visual.map.fogstart, visual.map.fogend = 0.15 * sight, 1.5 * sight
     # Within this radius of the light's target things cast shadows.
     visual.map.shadowclip = sight / 6.0
-    visual.rgba.fog = [*WATER_AHEAD, 1.0]
-    visual.rgba.haze = [*WATER_AHEAD, 1.0]

@@ -1,1 +1,1 @@
-"""A running world to look at and to play with: the page and its server, and MuJoCo's viewer."""
+"""A running world to look at and to play with: the page and its server."""

@@ -13,7 +13,6 @@ import math
 import queue
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -26,7 +25,6 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.live.commands import Command, Current, Drop, Pause, Rate, Remove, Reset
 from mjx_revolve.view.page_data import RobotMeshes, pack_waves
-from mjx_revolve.view.recording import interpolate_poses
 from mjx_revolve.view.surroundings import bed_at
 from mjx_revolve.water.world import World
 
@@ -107,7 +105,6 @@ class LiveSimulation:
         world: World,
         catalogue: Sequence[CatalogueEntry],
         first: Sequence[Drop] = (Drop(0),),
-        waits: bool = True,
     ) -> None:
         """Prepares a simulation.
 
@@ -116,16 +113,13 @@ class LiveSimulation:
             world: of the tank.
             catalogue: robots that may be dropped.
             first: robots in the water at the beginning.
-            waits: whether time stands still while there is no listener.
         """
         self.world, self.catalogue, self.meshes = world, catalogue, RobotMeshes()
         self.robots: tuple[LiveRobot, ...] = ()
         self.qpos: dict[int, np.ndarray] = {}
         self.time, self.paused, self.rate = 0.0, False, 1.0
         self.current: tuple[float, float, float] = world.current
-        self._tank, self._first, self._waits = tank, first, waits
-        # The last poses of all, oldest first: time [s] and qpos by key.
-        self._recent: deque[tuple[float, dict[int, np.ndarray]]] = deque(maxlen=8)
+        self._tank, self._first = tank, first
         self._speed = 0.0  # the rate that is kept up [-]
         self._slice_since: float | None = None  # when the present slice began
         self._stopped = threading.Event()
@@ -187,16 +181,6 @@ class LiveSimulation:
         took = 0.0 if since is None else time.monotonic() - since
         return took if took > _COMPILING else 0.0
 
-    def poses_at(self, moment: float) -> dict[int, np.ndarray]:
-        """Poses by key at a moment not long ago [s], between those that are known."""
-        recent, found = list(self._recent), dict(self.qpos)
-        for key in found:
-            rows = [(when, poses[key]) for when, poses in recent if key in poses]
-            if rows:
-                times, qpos = map(np.array, zip(*rows, strict=True))
-                found[key] = interpolate_poses(times, qpos, np.array([moment]))[0]
-        return found
-
     def state_event(self) -> str:
         """The event with the state that all pages show."""
         moving = replace(self.world, current=self.current)
@@ -238,7 +222,7 @@ class LiveSimulation:
         due = last = reported = time.monotonic()
         while not self.ended:
             now = time.monotonic()
-            resting = self.paused or (self._waits and not self._listeners)
+            resting = self.paused or not self._listeners
             if resting or due > now:
                 self._answer(_IDLE_INTERVAL if resting else due - now)
                 if resting:
@@ -284,8 +268,6 @@ class LiveSimulation:
                 self._remove(one)
                 self.publish(_event("note", f"{one.name} has blown up, and was taken out"))
         self.qpos = {key: poses[-1] for key, poses in rows.items()}
-        for k, moment in enumerate(times):
-            self._recent.append((float(moment), {key: poses[k] for key, poses in rows.items()}))
         self.publish(_poses_event(times, rows))
         if waited:
             self.publish(self.state_event())

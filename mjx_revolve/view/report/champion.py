@@ -1,18 +1,12 @@
-"""A replay of a run's champion: one episode, its score and measures, its oscillators."""
+"""A replay of a run's champion: one episode, its score and measures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
-from mjx_revolve.control.kinds import find_controller
-from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory
@@ -73,25 +67,19 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
     if count < len(trajectory.qpos):
         record.note("changed", f"the replay blows up after {float(trajectory.time[count]):.3g} s")
     _compare(record, score)
-    phases = cpg_phases(fitness, record.genes, count) if has_phases(fitness) else None
     begin = counted_time(fitness.config.task, fitness.robot.world.timestep)
     motion = analyse_motion(
-        fitness.robot, trajectory, begin, phases, fitness.water(key),
+        fitness.robot, trajectory, begin, fitness.water(key),
         target_at_last(fitness.config.task, trajectory), fitness.config.task,
     )  # fmt: skip
     finite = jax.tree.map(lambda x: x[:count], trajectory)
     return ChampionReplay(motion, score, measures, trace_sensors(fitness, finite, key))
 
 
-def has_phases(fitness: Fitness) -> bool:
-    """Whether the joints are driven by oscillators that have phases."""
-    return fitness.config.controller.type == "cpg" and fitness.robot.num_hinges > 0
-
-
 def _compare(record: RunRecord, score: float) -> None:
     """Notes a replay with another score than the run recorded."""
     mean, std = (number(record.champion.get(name)) for name in ("score", "score_std"))
-    if mean is None or std is None or record.stand_in or not record.is_finished:
+    if mean is None or std is None or not record.is_finished:
         return
     allowed = max(_DEVIATIONS * std, _SHARE * abs(mean))
     if not abs(score - mean) <= allowed:
@@ -100,41 +88,3 @@ def _compare(record: RunRecord, score: float) -> None:
             f"the replay scores {score:.3g}, but the run recorded {mean:.3g} ± {std:.2g}: the "
             "simulator has changed since, or files of the run have",
         )
-
-
-def cpg_phases(fitness: Fitness, genes: np.ndarray, steps: int) -> np.ndarray:
-    """Phases of the oscillators, which a trajectory does not hold.
-
-    Args:
-        fitness: its controller is a CPG.
-        genes: `[G]`.
-        steps: how many.
-
-    Returns:
-        `[steps, nhinge]` atan2(x, y) of each oscillator, hinges in the order of the servos [rad]:
-        0 when the joint's target passes the middle of its range upwards, π/2 at its largest.
-    """
-    x, y = _oscillators(fitness, steps)(genes)
-    return np.arctan2(np.asarray(x), np.asarray(y))
-
-
-@lru_cache(maxsize=8)
-def _oscillators(fitness: Fitness, steps: int) -> PyTree:
-    """The states of all oscillators, `[steps, nhinge]` each, from genes."""
-    plant = plant_of(fitness.robot)
-    # Its oscillators at all times, not only when it commands.
-    settings = fitness.config.controller.model_copy(update={"rate": None})
-    controller = find_controller(plant, settings)
-    blind: Any = None  # oscillators sense nothing
-
-    def run(genes: jax.Array) -> PyTree:
-        parameters = controller.decode(genes[:, None], plant)
-
-        def step(state: PyTree, time: jax.Array) -> tuple[PyTree, PyTree]:
-            state, _ = controller.step(parameters, state, time, blind)
-            return state, (state[0][:, 0], state[1][:, 0])
-
-        times = plant.timestep * jnp.arange(steps, dtype=genes.dtype)
-        return jax.lax.scan(step, controller.init(parameters), times)[1]
-
-    return jax.jit(run)

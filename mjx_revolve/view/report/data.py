@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 import mjx_revolve
-from mjx_revolve.episodes.config import Config, make_config, with_older_values
+from mjx_revolve.episodes.config import make_config, with_older_values
 from mjx_revolve.episodes.individual_log import EVENTS, GENERATIONS, INDIVIDUALS
 from mjx_revolve.episodes.passport import PASSPORT, load_passport
 from mjx_revolve.episodes.run_reader import RunReader, find_run, generation_of, read_metrics
@@ -117,25 +116,6 @@ def _read_info(record: RunRecord) -> None:
 # --- the configuration ----------------------------------------------------------------------------
 
 
-def _split_unknown(
-    data: Mapping[str, object], model: type[BaseModel] = Config, prefix: str = ""
-) -> tuple[dict[str, object], list[str]]:
-    """Settings of this version, and the names of all others."""
-    known: dict[str, object] = {}
-    unknown: list[str] = []
-    for key, value in data.items():
-        if key not in model.model_fields:
-            unknown.append(f"{prefix}{key}")
-            continue
-        inner = model.model_fields[key].annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel) and isinstance(value, Mapping):
-            known[key], more = _split_unknown(value, inner, f"{prefix}{key}.")
-            unknown += more
-        else:
-            known[key] = value
-    return known, unknown
-
-
 def _read_config(record: RunRecord) -> None:
     path = record.folder / "config.yaml"
     if not path.is_file():
@@ -149,23 +129,13 @@ def _read_config(record: RunRecord) -> None:
         record.settings = data
     if not record.settings:
         return
-    known, unknown = _split_unknown(data)
-    if unknown:
-        names = ", ".join(unknown)
-        record.note("version", f"config.yaml: this version does not know {names}; read without")
     try:
-        known = with_older_values(locate_files(known, find_copies(record.folder)), record.folder)
+        known = with_older_values(locate_files(data, find_copies(record.folder)), record.folder)
         record.config = make_config(known, record.folder, source=str(path))
     except InputError as error:
-        spare = record.folder / "champion" / "morphology.yaml"
-        if "morphology: expected a file; found none" not in str(error) or not spare.is_file():
-            record.note("missing" if "found none" in str(error) else "damaged", str(error))
-            return
-        record.note("missing", f"{known['morphology']} is missing: champion/morphology.yaml "
-                    "stands in for it")  # fmt: skip
-        with record.noting_damage():
-            spared = {**known, "morphology": str(spare), "trim": "none"}
-            record.config = make_config(spared, record.folder, source=str(path))
+        kinds = {"found none": "missing", "unknown key": "version"}
+        kind = next((kind for words, kind in kinds.items() if words in str(error)), "damaged")
+        record.note(kind, str(error))
 
 
 # --- the metrics ----------------------------------------------------------------------------------
@@ -222,12 +192,7 @@ def _read_population(record: RunRecord) -> None:
 
 
 def _read_champion(record: RunRecord) -> None:
-    """The champion; if there is none, the best individual of a checkpoint."""
-    elite, origin = _read_checkpoints(record)
-    best = record.population.best() if record.population is not None else None
-    if best is not None:
-        with record.noting_damage():
-            elite, origin = best.genes, f"{INDIVIDUALS}, number {best.number}"
+    """The champion, and its passport."""
     run = RunReader(record.folder)
     if run.champion_path is None:
         record.note("missing", "champion/genes.yaml is missing")
@@ -243,38 +208,8 @@ def _read_champion(record: RunRecord) -> None:
     judged = record.info.get("champion")
     if isinstance(judged, dict):  # the same facts, and there even where genes.yaml is not
         record.champion = record.champion | judged
-    if record.genes is None and elite is not None:
-        record.genes = elite
-        record.stand_in = f"best individual in {origin}"
-        if best is not None:
-            record.champion["individual"] = best.number
-        record.note("missing", f"the champion shown is the {record.stand_in}")
-
-
-def _read_checkpoints(record: RunRecord) -> tuple[np.ndarray | None, str]:
-    """The best individual of the newest checkpoint that is whole; every damaged one is named.
-
-    Where bodies evolve, none: genes alone are of no use.
-    """
-    run = RunReader(record.folder)
-    best: tuple[np.ndarray | None, str] = (None, "")
-    damaged: dict[str, str] = {}
-    for checkpoint in run.readable_checkpoints(damaged):
-        name, arrays = checkpoint.path.name, checkpoint.arrays
-        if record.population is not None:
-            continue
-        elites, scores = (arrays.get(key, np.zeros(0)) for key in ("elites", "elite_scores"))
-        if elites.dtype.kind != "f" or elites.ndim != 2 or scores.shape != elites.shape[:1]:
-            damaged[name] = f"elites: expected genes; found {elites.dtype} {elites.shape}"
-            continue
-        whole = np.isfinite(scores[:1]).all() and np.isfinite(elites[:1]).all()
-        if best[0] is None and len(elites) and whole:
-            best = np.asarray(elites[0], np.float32), f"checkpoints/{name}"
-    for name, error in damaged.items():
-        record.note("damaged", f"checkpoints/{name}: {error}")
     if not run.checkpoints():
         record.note("missing", "checkpoints/ has none: the run cannot be resumed")
-    return best
 
 
 # --- whether it is whole --------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -60,22 +59,6 @@ class RunGroup:
         """The last generation that every run of the group has reached."""
         return min((record.generations for record in self.shown), default=0)
 
-    def curve(self, column: str) -> tuple[np.ndarray, np.ndarray]:
-        """A column of all runs, as far as all of them reach; NaN in a run that lacks it.
-
-        Returns:
-            `[T]` generations and `[n, T]` values, a row for each run.
-        """
-        if not self.shown:
-            return np.zeros(0), np.zeros((0, 0))
-        tables = [record.metrics for record in self.shown]
-        x = reduce(np.intersect1d, [table["generation"] for table in tables])
-        return x, np.array([
-            table[column][np.isin(table["generation"], x)]
-            if column in table else np.full(len(x), np.nan)
-            for table in tables
-        ])  # fmt: skip
-
     def scores(self) -> list[float]:
         """Scores of the champions that were judged on fresh starts."""
         found = [number(r.champion.get("score")) for r in self.records if r.is_finished]
@@ -125,8 +108,7 @@ def _settings(record: RunRecord) -> dict[str, object]:
         if isinstance(value, str) and value.endswith((".yaml", ".yml")):
             path = record.folder / value
             text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-            named = record.settings.get(key, value)  # another file may stand in for a lost one
-            flat[key] = f"{Path(str(named)).stem} {hash_text(text)[:6]}"
+            flat[key] = f"{Path(value).stem} {hash_text(text)[:6]}"
     for key in ("task.type", "controller.type"):
         value = flat.get(key)
         if isinstance(value, str) and parse_user_function(value):

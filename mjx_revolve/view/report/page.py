@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import datetime
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -35,7 +35,7 @@ from mjx_revolve.view.report.bodies import anchor, inline_svg, show_population, 
 from mjx_revolve.view.report.champion import ChampionReplay, replay_champion
 from mjx_revolve.view.report.groups import RunGroup, group_runs
 from mjx_revolve.view.report.record import RunRecord
-from mjx_revolve.view.report.repeat import environment, repeat_commands, sources
+from mjx_revolve.view.report.repeat import environment, repeat_command, sources
 from mjx_revolve.view.sensor_plots import plot_sensors
 from mjx_revolve.view.statistics import COVERAGE
 from mjx_revolve.view.swim_picture import draw_motion
@@ -83,8 +83,7 @@ def make_report(
     """
     groups = group_runs(records)
     replays, robots = _replay(groups)
-    full = list(_in_full(groups, every_champion, RunGroup.best))
-    champions = _in_full(groups, every_champion, lambda group: _best_replayed(group, replays))
+    full = list(_in_full(groups, every_champion))
     single = len(records) == 1
     content = [
         ("results", "Results", _results(groups)),
@@ -95,7 +94,7 @@ def make_report(
           for key, words, record in full if record.population is not None),
         ("champions", "Champions side by side", _side_by_side(groups, replays)),
         *((f"champion-{key}", f"Champion{words}", _champion(record, replays.get(record.folder)))
-          for key, words, record in champions),
+          for key, words, record in full),
         ("robot", "Robot", _robots(robots)),
         ("runs", "Runs", "" if single else sections.runs(*tables.runs_table(groups))),
         ("repeat", "Repeat it", _repeat([r for group in groups for r in group.records])),
@@ -122,12 +121,10 @@ def _title(groups: Sequence[RunGroup], robots: Sequence[tuple[str, Morphology]])
     return f"{robot}{first.task.replace('_', ' ') or 'evolution'} ({Path(first.label).name})"
 
 
-def _in_full(
-    groups: Sequence[RunGroup], every: bool, best_of: Callable[[RunGroup], RunRecord]
-) -> Iterator[tuple[str, str, RunRecord]]:
+def _in_full(groups: Sequence[RunGroup], every: bool) -> Iterator[tuple[str, str, RunRecord]]:
     """Runs that are shown in full: a key, words that headings add, and the run."""
     for k, group in enumerate(groups):
-        best = best_of(group)
+        best = group.best()
         for record in group.records if every else [best]:
             words = f" of {letter(k)}, {group.name}" if len(groups) > 1 else ""
             if len(group.records) > 1:
@@ -235,51 +232,24 @@ def _replay(
                 record.note("damaged", f"no replay: {error}")
         if fitness is not None:
             robots.append((group.name, fitness.robot.morphology))
-        else:
-            robots += _robot_alone(group)
     return replays, robots
 
 
 def _champions_body(record: RunRecord, config: Config) -> Morphology:
     """The body of a champion, not trimmed."""
-    modules, path = read_modules(config), record.folder / "champion" / "morphology.yaml"
-    number = record.individual
-    if record.population is not None and record.stand_in and number is not None:
-        body = record.population.lives[number].grow(modules)
-    else:
-        body = load_morphology(path, modules, allow_overlap=True)
+    path, number = record.folder / "champion" / "morphology.yaml", record.individual
+    body = load_morphology(path, read_modules(config), allow_overlap=True)
     return body if number is None else replace(body, name=f"individual {number}")
 
 
-def _robot_alone(group: RunGroup) -> list[tuple[str, Morphology]]:
-    """The body that a run left behind, where its configuration cannot be used."""
-    for record in group.records:
-        path = record.folder / "champion" / "morphology.yaml"
-        if path.is_file():
-            try:
-                return [(group.name, load_morphology(path, allow_overlap=True))]
-            except InputError as error:
-                record.note("damaged", str(error))
-    return []
-
-
-def _best_replayed(group: RunGroup, replays: Mapping[Path, ChampionReplay]) -> RunRecord:
-    """The best run; another seed's rather than one without a replay."""
-    best = group.best()
-    if best.folder in replays:
-        return best
-    return next((r for r in group.records if r.folder in replays), best)
-
-
 def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
-    """A champion; without a replay, the pictures that its run left behind."""
+    """A champion; nothing without a replay."""
     if replay is None:
-        return _saved_pictures(record)
+        return ""
     motion, robot = replay.motion, replay.motion.robot
     drawn = {
         "way": motion_plots.plot_path(motion.time, motion.path, float(motion.surface[0])),
         "joints": motion_plots.plot_joints(motion) if robot.num_hinges else None,
-        "phases": None if motion.phases is None else motion_plots.plot_phases(motion),
         "thrusters": motion_plots.plot_thrusters(motion) if robot.num_thrusters else None,
         "energy": motion_plots.plot_energy(motion),
         # Readings are of the moment before each step.
@@ -288,23 +258,12 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
     }  # fmt: skip
     pictures = {name: figure and svg_source(figure) for name, figure in drawn.items()}
     pictures["swim"] = _source(figure_jpeg(draw_motion(motion)), "jpeg")
-    origin = record.stand_in or record.champion.get("origin")
+    origin = record.champion.get("origin")
     return sections.champion(
         robot.morphology.title, float(motion.time[-1]), motion.counted_from,
         origin if isinstance(origin, str) else "", tables.measures_table(record, replay),
         record.passport.rows if record.passport is not None else [], pictures,
     )  # fmt: skip
-
-
-def _saved_pictures(record: RunRecord) -> str:
-    """Pictures that a run left behind, where its champion cannot be replayed."""
-    found = []
-    for name in ("swim.png", "trajectory.png"):
-        path = record.folder / name
-        data = path.read_bytes() if path.is_file() else b""
-        if data.startswith(b"\x89PNG") and data.rstrip().endswith(b"IEND\xaeB`\x82"):
-            found.append((name, _source(data, "png")))
-    return sections.saved_pictures(found)
 
 
 def _source(data: bytes, kind: str) -> str:
@@ -338,9 +297,8 @@ def _convergence(groups: Sequence[RunGroup]) -> str:
         if sum(bool(group.shown) for group in members) > 1 or len(members[0].shown) > 1:
             comparisons.append(svg_source(convergence.plot_comparison(members, styles)))
     entries = []
-    for group in shown:
-        record, several = group.shown[0], len(group.shown) > 1
-        label = record.fitness
+    for group in (group for group in shown if len(group.shown) == 1):
+        record = group.shown[0]
         quartiles = "lower_quartile" in record.metrics
         entries.append({
             "name": group.name,
@@ -349,8 +307,7 @@ def _convergence(groups: Sequence[RunGroup]) -> str:
             "below": "how far the search spreads" if record.population is None
             else "how full the archive is, or how large the living are",
             "band": "quartiles" if quartiles else "mean and standard deviation",
-            "seeds": svg_source(convergence.plot_seeds(group)) if several else None,
-            "fitness": None if several else svg_source(_plot_fitness(record, label)),
+            "fitness": svg_source(_plot_fitness(record, record.fitness)),
             "colony": record.history is not None,
         })  # fmt: skip
     return sections.convergence(comparisons, entries)
@@ -401,7 +358,7 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
 def _repeat(records: Sequence[RunRecord]) -> str:
     """Commands, versions and sources that repeat the runs."""
     return sections.repeat([
-        {"label": record.label, "seed": record.seed, "commands": repeat_commands(record),
+        {"label": record.label, "seed": record.seed, "command": repeat_command(record),
          "environment": environment(record), "sources": sources(record)}
         for record in records
     ])  # fmt: skip

@@ -63,7 +63,6 @@ class RunRecord:
         history: their births, matings and deaths, in a colony; else None.
         champion: facts about it: score, score_std, origin, final, measures, individual.
         passport: what it was tried for; None without one.
-        stand_in: where the genes are from, if they are not the champion's own.
         problems: what is missing, damaged or otherwise notable.
     """
 
@@ -78,7 +77,6 @@ class RunRecord:
     history: ColonyHistory | None = None
     champion: dict[str, Any] = field(default_factory=dict)
     passport: Passport | None = None
-    stand_in: str = ""
     problems: list[Problem] = field(default_factory=list)
 
     def note(self, kind: str, text: str) -> None:

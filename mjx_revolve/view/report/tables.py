@@ -195,7 +195,7 @@ def runs_table(groups: Sequence[RunGroup]) -> tuple[list[str], list[list[Cell]]]
             f"{record.generations} of {planned}" if short else record.generations, _score(record),
             *(format_number(_measure(record, name)) for name in known),
             _NO_VALUE if seconds is None else f"{seconds / 60:.1f}",
-            str(record.stand_in or record.champion.get("origin", _NO_VALUE))[:60],
+            str(record.champion.get("origin", _NO_VALUE))[:60],
             record.state or "whole",
         ])  # fmt: skip
     return header, rows
