@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 import pytest
 
-from experiments.meshes import mesh_volume
 from exports import NAMES, angles_of, forward, lake_robot, odd_episode
 from laboratory import body
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.formats.export import export_robot
-from mjx_revolve.formats.links import make_links, make_meshes, rest_pose, roll_pitch_yaw
+from mjx_revolve.formats.links import make_links, rest_pose, roll_pitch_yaw
 from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
@@ -52,13 +50,6 @@ def test_names_are_plain_and_told_apart():
     assert [link.name for link in links] == ["base_link", "arm_1_link", "arm_1_link_2"]
     assert [link.joint.name for link in links[1:]] == ["arm_1", "arm_1_2"]
     assert all(name.replace("_", "").isalnum() for name in names)
-
-
-def test_meshes_have_the_parts_volume(robot):
-    meshes = make_meshes(robot.morphology)
-    for link in make_links(robot):
-        for part in link.parts:
-            assert mesh_volume(meshes[part.mesh]) == pytest.approx(part.part.volume, rel=1e-6)
 
 
 @pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-7])
@@ -133,15 +124,6 @@ def test_mjcf_keeps_hinges_below_their_top_speed():
         mujoco.mj_forward(model, data)
         expected = np.full(8, -sign * link.joint.effort)
         np.testing.assert_allclose(data.qfrc_damper[6:], expected, rtol=1e-5)
-
-
-def test_mjcf_starts_below_the_surface_and_looks_like_the_robot():
-    model = load_mjcf(lake_robot("spider"))
-    assert model.key("start").qpos[2] == pytest.approx(-1.0)
-    geom = model.geom("core_core/mesh")
-    np.testing.assert_allclose(geom.rgba, [0.1, 0.2, 0.45, 1.0])
-    assert int(geom.group[0]) == 2 and int(model.geom("core/core").group[0]) == 3
-    assert model.hfield_nrow.size == 0  # the lake's bed is far down
 
 
 def test_mjcf_and_sdf_start_where_the_rollout_does(tmp_path):
@@ -244,14 +226,3 @@ def test_urdf_is_the_same_robot_to_yourdfpy(robot, tmp_path):
     for module in robot.morphology.modules:
         if module.rgb is not None:
             assert any(np.allclose(rgba[:3], module.rgb) for rgba in colors.values())
-
-
-def test_urdf_names_meshes_as_asked(tmp_path):
-    export_robot(
-        odd_episode().robot, {"urdf": tmp_path / "a.urdf"}, meshes="package://mine/meshes/"
-    )
-    root = ElementTree.parse(tmp_path / "a.urdf").getroot()
-    files = {mesh.get("filename") for mesh in root.iter("mesh")}
-    assert "package://mine/meshes/core_core.stl" in files
-    for file in files:
-        assert (tmp_path / "meshes" / Path(file).name).is_file()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 from types import SimpleNamespace
 
 import mujoco
@@ -174,12 +173,3 @@ def test_bag_ends_where_numbers_do(episode, tmp_path):
     qpos[:] = np.nan
     with pytest.raises(InputError, match="rollout: expected finite poses"):
         write_bag(episode.robot, broken, tmp_path / "a.mcap")
-
-
-def test_bags_metadata_names_its_file(file_path):
-    """`ros2 bag play rollout.mcap` reads these from the file itself."""
-    reader = pytest.importorskip("mcap.reader", reason="the package mcap reads bags")
-    with open(file_path, "rb") as file:
-        records = list(reader.make_reader(file).iter_metadata())
-    text = json.dumps(records[0].metadata)
-    assert "rollout.mcap" in text and records[0].name == "rosbag2"
