@@ -86,8 +86,8 @@ ROBOTS = (_ARM, _ELBOW, ROBOT)
 FREE = re.compile(r"^brain\b|\bparams\.foo$")
 
 
-@fuzz(60)
-@given(mutants(*ROBOTS))
+@fuzz(80)
+@given(mutants(*ROBOTS) | wrecks(*(text.encode() for text in ROBOTS)))
 @example(Mutant(b"{body: {type: Core}, brain: &a !!omap [b: *a]}"))
 @example(Mutant(b"{body: {type: Core, params: {mas: 0.2}}}", "body.params.mas"))
 @example(Mutant(b'{id: "a\\0", body: {type: Core}}'))
@@ -103,15 +103,6 @@ def test_morphologies(folder, mutant):
     assert body.mass > 0
     body.save(path)
     assert load_morphology(path) == body
-
-
-@fuzz(30)
-@given(wrecks(*(text.encode() for text in ROBOTS)))
-def test_damaged_morphologies(folder, wreck):
-    keep(folder, "robot.yaml", wreck)
-    body = read_file(lambda: load_morphology("robot.yaml"), folder, "robot.yaml")
-    code = run_main(inspect.main, ["robot.yaml"], folder, "robot.yaml")
-    assert (code == 2) == refused(body)
 
 
 # --- module catalogues ----------------------------------------------------------------------------
@@ -151,8 +142,8 @@ modules:
 OWN = "body: {type: Heart, children: {1: {type: Flipper, children: {1: {type: Tail}}}}}"
 
 
-@fuzz(40)
-@given(mutants(CATALOGUE))
+@fuzz(50)
+@given(mutants(CATALOGUE) | wrecks(CATALOGUE.encode()))
 def test_catalogues(folder, mutant):
     keep(folder, "modules.yaml", mutant)
     (folder / "own.yaml").write_text(OWN)
@@ -167,15 +158,6 @@ def test_catalogues(folder, mutant):
     assert known, mutant.strange
     check_finite([dataclasses.asdict(kind) for kind in kinds.values()])
     assert all(kind.mass >= 0 for kind in kinds.values())
-
-
-@fuzz(15)
-@given(wrecks(CATALOGUE.encode()))
-def test_damaged_catalogues(folder, wreck):
-    keep(folder, "modules.yaml", wreck)
-    kinds = read_file(lambda: load_modules("modules.yaml"), folder, "modules.yaml")
-    code = run_main(inspect.main, ["spider", "--modules", "modules.yaml"], folder, "modules.yaml")
-    assert (code == 2) == refused(kinds)
 
 
 # --- worlds ---------------------------------------------------------------------------------------
@@ -248,8 +230,10 @@ def make_toy(config):
     return toys.make_toy_bodies(config) if config.bodies else toys.Quadratic()
 
 
-@fuzz(40)
-@given(mutants(*CONFIGS))
+@fuzz(50)
+@given(mutants(*CONFIGS) | wrecks(*(text.encode() for text in CONFIGS)))
+@example(Mutant(b"[" * 5000 + b"}"))
+@example(Mutant(b"- " * 5000))
 @example(Mutant(b"{morphology: auv.yaml, world: [1], task: {type: speed}}"))
 @example(Mutant(b"{morphology: auv.yaml, world: {name: lake, 1: 2}, task: {type: speed}}"))
 @example(
@@ -281,15 +265,6 @@ def test_configurations(folder, mutant):
     check_finite({k: v for k, v in config.model_dump().items() if k != "world"})
     (folder / "again.yaml").write_text(dump_config(config, folder))
     assert load_config(folder / "again.yaml").model_dump() == config.model_dump()
-
-
-@fuzz(20)
-@given(wrecks(*(text.encode() for text in CONFIGS)))
-@example(Mutant(b"[" * 5000 + b"}"))
-@example(Mutant(b"- " * 5000))
-def test_damaged_configurations(folder, wreck):
-    keep(folder, "config.yaml", wreck)
-    read_file(lambda: load_config("config.yaml"), folder, "config.yaml")
 
 
 # --- brains ---------------------------------------------------------------------------------------

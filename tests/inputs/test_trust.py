@@ -212,15 +212,6 @@ def test_a_robots_name_leads_nowhere(tmp_path, monkeypatch):
     assert str(viewer._usual_path(None, "viewer", "../../out")) == "out.html"
 
 
-@pytest.mark.parametrize("name", ["a\0b", "\ud800", "\x1b[2J", "\u202e"])
-def test_ids_are_printable(tmp_path, name):
-    from mjx_revolve.body.morphology import make_morphology
-
-    for data in ({"id": name, "body": {"type": "Core"}}, {"body": {"id": name, "type": "Core"}}):
-        with pytest.raises(InputError, match="id: expected printable characters; found"):
-            make_morphology(data)
-
-
 def test_messages_are_one_line_and_cut():
     long = "x" * 5000
     message = str(InputError(f"a.yaml: expected a name; found '{long} {long}'\nand\x1b[2J {long}"))
