@@ -16,13 +16,11 @@ from laboratory import (
     body,
     elbow_robot,
     march,
-    random_states,
     read,
     world,
 )
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.gait import UNITS, describe_gait
-from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
@@ -78,13 +76,6 @@ def test_the_number_of_genes_follows_from_the_body(name):
     assert make_cpg(robot).num_genes == n + pairs
     assert make_sine(robot).num_genes == 3 * n + 1
     assert make_sine(robot, harmonics=3).num_genes == 7 * n + 1
-
-
-def test_the_names_that_a_configuration_gives():
-    plant = plant_of(robot_of("spider"))
-    for kind, genes in (("cpg", 18), ("sine", 25), ("feedback", 8 * (1 + 7))):
-        assert find_controller(plant, ControllerConfig(type=kind)).num_genes == genes
-    assert find_controller(plant, ControllerConfig(type="sine", harmonics=2)).num_genes == 41
 
 
 # ------------------------------------------------------------------------- descriptions
@@ -184,19 +175,6 @@ def test_cpg_keeps_its_norm():
     assert np.abs(x).max() > 1.2  # the coupling moves energy between hinges
 
 
-def test_an_uncoupled_cpg_is_a_sine():
-    """x = sin(w t) where the couplings are zero; w = 2π f_max sin(gene)."""
-    robot = robot_of("spider")
-    controller = make_cpg(robot, max_frequency=1.5)
-    genes = np.zeros((18, 1))
-    genes[:8, 0] = np.linspace(-1.2, 1.2, 8)
-    targets, _ = play(robot, controller, genes, 400)
-    time = 0.005 * np.arange(1, 401)
-    w = 2 * np.pi * 1.5 * np.sin(genes[:8, 0])
-    expected = np.pi / 4 * np.tanh(np.sin(w * time[:, None]))
-    assert targets[..., 0] == pytest.approx(expected, abs=1e-5)
-
-
 def test_a_coupled_pair_against_the_matrix_exponential():
     from scipy.linalg import expm
 
@@ -249,16 +227,6 @@ def test_servos_keep_the_speed_limit(elbow):
     assert np.abs(q[-1, 7:] - targets).max() < 0.02
 
 
-def test_servos_keep_the_speed_limit_in_a_vacuum():
-    """Limbs without water are so light that recoil throws them past it, by less than a fifth."""
-    robot = read(
-        "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: {type: FixedBrick}}}}}"
-    )
-    _, _, _, v, _ = strokes(build_robot(robot, world()))
-    assert np.abs(v[:, 6]).max() < 1.2 * SPEED
-    assert np.mean(np.abs(v[:, 6]) > 1.01 * SPEED) < 0.01
-
-
 def test_servos_keep_their_effort():
     """Torque by Newton's law, on a limb too heavy to gain speed; 0.05 rad off is full effort."""
     robot = build_robot(
@@ -308,13 +276,3 @@ def test_a_hinge_that_carries_nothing_comes_to_rest():
     qvel[6] = 1e-3
     _, _, v, _ = march(robot, 2.0, qpos, qvel, np.array([[0.0, 0.1]]))
     assert np.abs(v[-20:, 6]).max() < 1e-2
-
-
-@pytest.mark.slow
-def test_a_hinge_that_carries_a_brick_comes_to_rest(elbow):
-    qpos, qvel = random_states(elbow, 8, speed=0.1)
-    qvel[6:] = 1.0
-    ctrl = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 8))
-    _, q, v, _ = march(elbow, 2.0, qpos, qvel, ctrl)
-    assert np.abs(v[-1, 6:]).max() < 0.01
-    assert np.abs(q[-1, 7:] - ctrl).max() < 0.01

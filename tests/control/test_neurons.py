@@ -151,16 +151,13 @@ def changed(pattern, text):
 @pytest.mark.parametrize(
     ("pattern", "text", "message"),
     [
-        ("type: Sigmoid", "type: XOscillator", "brain.neurons.7.type: expected one of Input, "
+("type: Sigmoid", "type: XOscillator", "brain.neurons.7.type: expected one of Input, "
          "Simple, Sigmoid, Oscillator; found 'XOscillator'"),
-        ("dst: mix, weight: 0.2", "dst: nix, weight: 0.2", "brain.connections.0.dst: expected the "
+("dst: mix, weight: 0.2", "dst: nix, weight: 0.2", "brain.connections.0.dst: expected the "
          "id of a neuron that is no input; found 'nix'"),
-        ("period: 0.8", "period: 0", "brain.params.clock.period: expected a number > 0 [s]; "),
-        ("part_id: arm", "part_id: hand", "brain.neurons.mix.part_id: expected the id of a hinge "
-         "or a thruster; found 'hand'"),
-        ("part_id: pad", "part_id: hand", "brain.neurons.t1.part_id: expected a module with 1 "
-         "inputs (a core has 6, a touch sensor 2, others none); found 'hand' of type FixedBrick"),
-    ],
+("part_id: arm", "part_id: hand", "brain.neurons.mix.part_id: expected the id of a hinge "
+         "or a thruster; found 'hand'")
+],
 )  # fmt: skip
 def test_wrong_networks(pattern, text, message):
     robot = build_robot(read(changed(pattern, text)), world())

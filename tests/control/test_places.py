@@ -399,11 +399,6 @@ def test_the_beds_force_on_a_body_counts_what_rides_on_it():
     [
         ({"type": "gyro", "at": "a", "each": "Core"}, "0.each: expected none, as there is `at`"),
         ({"type": "touch"}, "0.at: expected the id of a module, as touch sits on one; found"),
-        (
-            {"type": "angle", "each": "Core"},
-            "0.each: expected none, as angle is at each hinge; found",
-        ),
-        ({"type": "contact", "each": "Core"}, "0.each: expected none, as contact is of each rigid"),
     ],
 )
 def test_sensors_that_cannot_sit_there(sensor, message):

@@ -51,14 +51,6 @@ def test_it_swims_straight_at_what_stays_and_stops_there():
     assert way[-1] == pytest.approx([3.0, 4.0, 0.0], abs=1e-4)
 
 
-def test_it_swims_up_and_down_as_well():
-    way = chase(lambda t: (0.0 * t, 0.0, 5.0), (0, 0, -1), 1.0, 1.0, 2.0, heading=(0, 0, -1))
-    # It turns on a circle of 1 m, as its speed is 1 m/s and its turn 1 rad/s, to the world's x.
-    angle = np.arange(len(way)) * DT
-    circle = np.stack([1 - np.cos(angle), 0 * angle, -1 - np.sin(angle)], 1)
-    assert way == pytest.approx(circle, abs=0.006)  # steps of 5 mm
-
-
 def test_it_turns_no_faster_than_it_can():
     """What is right behind is turned to on a circle of radius speed / turn, to the left."""
     way = chase(lambda t: (-50.0 + 0 * t, 0.0, 0.0), (0, 0, 0), 0.5, 0.25, 8.0, heading=(1, 0, 0))

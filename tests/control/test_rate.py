@@ -12,7 +12,6 @@ from laboratory import elbow_robot, world
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
-from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.config import (
     OLDER_WORLD,
@@ -76,13 +75,6 @@ def test_a_ramp_leads_from_the_last_command_to_this_one(plant):
             [np.interp(times - 0.05, instants, x) for x in joint.T] for joint in held.swapaxes(0, 1)
         ]
         assert found == pytest.approx(np.moveaxis(np.array(late), -1, 0), abs=1e-9)
-
-
-def test_a_sine_is_sampled_at_the_instants(plant):
-    """Those of the brain without a rate, at these times."""
-    instants = np.arange(int(20 * LENGTH)) / 20
-    held = commands(plant, instants, 0.05, type="sine")
-    assert held == pytest.approx(commands(plant, instants, make=make_sine), abs=1e-12)
 
 
 def test_robots_of_different_ages_are_each_commanded_from_their_birth(plant):

@@ -168,19 +168,13 @@ def test_a_robots_sensors_are_read_and_saved(tmp_path):
 @pytest.mark.parametrize(
     ("sensors", "message"),
     [
-        ("gyro", "sensors: expected a list of sensors; found 'gyro'"),
-        ([3], "sensors.0: expected a mapping with type; found 3"),
-        (["gyr"], "sensors.0.type: expected one of depth, climb, tilt, "),
-        (["gyro", "gyro"], "sensors.1.name: expected names that differ (give one of them a `name`)"
+("gyro", "sensors: expected a list of sensors; found 'gyro'"),
+(["gyr"], "sensors.0.type: expected one of depth, climb, tilt, "),
+(["gyro", "gyro"], "sensors.1.name: expected names that differ (give one of them a `name`)"
          "; found 'gyro' twice"),
-        ([{"type": "gyro", "unit": "m"}], "sensors.0.unit: expected 'rad/s', as of gyro; found"),
-        ([{"type": "gyro", "range": -1}], "sensors.0.range: expected the lowest below the highest"),
-        ([{"type": "gyro", "range": "far"}], "sensors.0.range: expected a number, or the lowest"),
-        ([{"type": "gyro", "noise": -1}], "sensors.0.noise: expected a number >= 0; found -1"),
-        ([{"type": "gyro", "rate": 0}], "sensors.0.rate: expected a number > 0 and <= 10000 [Hz]"),
-        ([{"type": "gyro", "delay": 9}], "sensors.0.delay: expected a number >= 0 and <= 5 [s]"),
-        ([{"type": "gyro", "colour": 1}], "sensors.0.colour: expected one of type, name, unit"),
-    ],
+([{"type": "gyro", "unit": "m"}], "sensors.0.unit: expected 'rad/s', as of gyro; found"),
+([{"type": "gyro", "rate": 0}], "sensors.0.rate: expected a number > 0 and <= 10000 [Hz]")
+],
 )  # fmt: skip
 def test_wrong_sensors(sensors, message):
     with pytest.raises(InputError) as caught:
