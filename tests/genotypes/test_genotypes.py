@@ -14,7 +14,6 @@ import yaml
 
 from laboratory import ROOT, WILD
 from mjx_revolve.body.catalogue import MODULES, load_modules
-from mjx_revolve.body.edits import remove_module
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.body.placement import find_overlaps
 from mjx_revolve.episodes import bodies_config
@@ -144,16 +143,6 @@ def test_same_generator_same_children(name):
 
     assert lives(3) == lives(3)
     assert lives(3) != lives(4)
-
-
-@kinds
-def test_variation_leaves_parents_as_they_are(name):
-    genotype, rng = make(name, SPACES["all modules"]), np.random.default_rng(1)
-    a, b = genotype.random(rng), genotype.random(rng)
-    before = json.dumps([genotype.to_plain(a), genotype.to_plain(b)])
-    for _ in range(20):
-        genotype.cross(rng, genotype.mutate(rng, a), b)
-    assert json.dumps([genotype.to_plain(a), genotype.to_plain(b)]) == before
 
 
 @kinds
@@ -361,15 +350,6 @@ def test_any_robot_can_be_adopted(name, path):
     assert wide().refuses(child) is None and child.name == body.name
 
 
-@pytest.mark.parametrize("name", adopters())
-def test_what_is_not_adopted(name):
-    spider = load_morphology("spider")
-    with pytest.raises(InputError, match=r"spider.yaml: expected 2 to 16 modules; found 17"):
-        make(name, SPACES["bricks and hinges"]).adopt(spider)
-    smaller = remove_module(spider, "front_hip")
-    assert make(name, SPACES["bricks and hinges"]).adopt(smaller) is not None
-
-
 # ------------------------------------------------------------------------- names and settings
 
 
@@ -398,15 +378,6 @@ def test_genomes_of_another_space_are_refused(families, name):
         assert "genome" in str(error) or "hinges" in str(error)
     if rebuilt is not None:  # it grows less where there is less room
         assert narrow.develop(rebuilt).num_hinges <= 3
-
-
-def test_unknown_genotypes_are_refused():
-    with pytest.raises(InputError) as error:
-        make("three", SPACES["tight"])
-    assert str(error.value) == (
-        f"test.yaml: bodies.genotype: expected one of {', '.join(GENOTYPES)}, or "
-        "FILE.py:FUNCTION; found 'three'"
-    )
 
 
 # ------------------------------------------------------------------------- users' own
@@ -464,14 +435,11 @@ def test_the_page_has_all_settings_with_their_defaults(kind):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("return Genotype(", "return (lambda *a, **k: 3)(", "worm: expected a Genotype; found int"),
-        ("1 - bits[k]", "1 / 0", "line 15: expected worm to mutate; found ZeroDiv"),
-        ("space.max_modules - 1", "99", "worms.py: worm: develop: expected 2 to 6 modules; found"),
-        ("to_plain=list", "to_plain=set", "worm: to_plain: expected what JSON can hold; found: "),
-        ("from_plain=list", "from_plain=lambda x: [0]", "worm: to_plain, from_plain: expected a g"),
-        ("return make_", "return 3 or make_", "worm: develop: expected a Morphology; found int"),
-        ("def worm", "def wurm", "bodies.genotype: expected a function worm in"),
-    ],
+("return Genotype(", "return (lambda *a, **k: 3)(", "worm: expected a Genotype; found int"),
+("1 - bits[k]", "1 / 0", "line 15: expected worm to mutate; found ZeroDiv"),
+("space.max_modules - 1", "99", "worms.py: worm: develop: expected 2 to 6 modules; found"),
+("to_plain=list", "to_plain=set", "worm: to_plain: expected what JSON can hold; found: ")
+],
 )  # fmt: skip
 def test_mistakes_in_ones_own_are_one_line(tmp_path, old, new, message):
     assert block("python").count(old) == 1

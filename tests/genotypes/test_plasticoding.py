@@ -7,7 +7,7 @@ import pytest
 
 from laboratory import tree
 from mjx_revolve.body.catalogue import MODULES, load_modules
-from mjx_revolve.body.morphology import load_morphology, make_morphology
+from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.genotypes.plasticoding import (
@@ -238,21 +238,9 @@ def test_a_robot_is_spelled_out():
     assert all((kept[m.name].position == m.position).all() for m in less.modules)
 
 
-def test_names_of_a_seed_are_kept_for_it():
-    """What grows at a place that a seed's module elsewhere is named after is told apart."""
-    children = {3: {"id": "FixedBrick-1", "type": "FixedBrick"}}
-    seed = make_morphology({"id": "core", "type": "Core", "children": children})
-    for sentence in ("C addf B #FixedBrick-1", "C #FixedBrick-1 moveb addf B"):
-        body = draw(sentence, seed=seed)
-        names = {m.slot: m.name for m in body.modules[1:]}
-        assert names == {1: "FixedBrick-1_2", 3: "FixedBrick-1"}
-
-
 DAMAGED = {
     "rule missing": ({"B": None}, "genome.rules: expected one for B; found none"),
-    "no core": ({"C": ["addf", "B"]}, "genome.rules.C: expected C at its beginning; found"),
     "letter": ({"B": ["addf", "X"]}, "genome.rules.B: expected known letters; found 'X'"),
-    "seed": ({"C": ["C", "#hip"]}, "genome.rules.C: expected known letters; found '#hip'"),
     "strange": ({"X": ["addf"]}, "genome.rules.X: expected a letter of C, B, BV, AJ1, AJ2, ST"),
 }
 
