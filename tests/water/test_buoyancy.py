@@ -295,70 +295,6 @@ def test_gradients_are_finite_everywhere(x64):
                 assert not np.any(by_up)
 
 
-def test_lanes_parts_and_vmap_agree():
-    """`[npart, nbody, lanes]` with a table of sizes, or one state at a time."""
-    draw = np.random.default_rng(4)
-    up = attitudes(24, 8).T.reshape(3, 2, 3, 4)
-    depth = draw.uniform(-0.1, 0.1, (2, 3, 4))
-    half = draw.uniform(0.02, 0.08, (3, 2, 3, 1))
-    with jax.enable_x64(True):
-        share, moment = jax.jit(lambda u, d: cut_box(tuple(u), d, tuple(half)))(up, depth)
-        flat = np.broadcast_to(half, up.shape).reshape(3, -1).T
-        one = jax.vmap(lambda u, d, h: cut_box(tuple(u), d, tuple(h)))
-        each, moments = one(up.reshape(3, -1).T, depth.ravel(), flat)
-    assert np.asarray(share).ravel() == pytest.approx(np.asarray(each), abs=1e-15)
-    assert np.stack(moment).reshape(3, -1) == pytest.approx(np.stack(moments), abs=1e-15)
-
-
-@pytest.mark.parametrize("name", ["cube", "TouchSensor-sensor"])
-def test_force_and_moment_come_from_one_potential(name):
-    """∂share/∂n = -∂moment/∂d and ∂moment_i/∂n_j = ∂moment_j/∂n_i: nothing to gain in a cycle."""
-    half, n = BOXES[name], 60
-    up = attitudes(n, 5)
-    depth = np.random.default_rng(2).uniform(-0.9, 0.9, n) * (np.abs(up) @ half)
-
-    def first(state):
-        share, moment = cut_box((state[1], state[2], state[3]), state[0], tuple(half))
-        return jnp.stack([share, *(-m for m in moment)])
-
-    with jax.enable_x64(True):
-        second = np.asarray(jax.jit(jax.vmap(jax.jacfwd(first)))(np.column_stack([depth, up])))
-    # Rounding only, at attitudes as near to level as the generator makes them.
-    scale = np.abs(second).max((1, 2))[:, None, None]
-    assert np.all(np.abs(second - second.transpose(0, 2, 1)) < 1e-7 * scale)
-
-
-def test_level_draft_is_exact():
-    # A level box is under water by what its draft says, to rounding.
-    half = np.array([0.3, 0.2, 0.1])
-    depth = np.linspace(-0.07, 0.07, 15)
-    share, moment = cut(np.tile([0.0, 0.0, 1.0], (15, 1)), depth, half)
-    assert share == pytest.approx(0.5 + depth / 0.2, abs=1e-12)
-    assert moment[:, :2] == pytest.approx(0.0, abs=1e-15)
-
-
-@pytest.mark.parametrize("half", [(0.0445, 0.0445, 0.0225), (0.1, 0.05, 0.02), (0.2, 0.3, 0.3)])
-@pytest.mark.parametrize("angle", [1e-3, 0.02, 0.1])
-def test_righting_moment_of_a_level_box(half, angle):
-    """The wall-sided formula, exact until an edge dips in.
-
-    y_B = BM tan φ, z_B = KB + ½ BM tan² φ.
-    """
-    half, depth = np.array(half), 0.1 * half[2]
-    draft = half[2] + depth
-    metacentric = (2 * half[1]) ** 2 / (12 * draft)
-    center = [
-        0.0,
-        -metacentric * np.tan(angle),
-        draft / 2 - half[2] + metacentric * np.tan(angle) ** 2 / 2,
-    ]
-    up = np.array([0.0, np.sin(angle), np.cos(angle)])
-    share, moment = cut(up[None], [depth * np.cos(angle)], half)
-    assert share[0] == pytest.approx(draft / (2 * half[2]), rel=1e-12)
-    torque, exact = np.cross(moment[0] / share[0], up)[0], np.cross(center, up)[0]
-    assert torque == pytest.approx(exact, rel=1e-9)
-
-
 def test_archimedes_and_the_lever_of_the_centre_of_volume():
     up = (0.0, 0.6, 0.8)
     force, torque = buoyancy(up, 0.5, (0.0, 0.0, -0.01), 2e-4, (0.003, 0.0, 0.01), WATER * G)
@@ -366,9 +302,6 @@ def test_archimedes_and_the_lever_of_the_centre_of_volume():
     assert np.array(force, float) == pytest.approx(lift * np.array(up))
     arm = np.array([0.003, 0.0, 0.01]) + np.array([0.0, 0.0, -0.01]) / 0.5
     assert np.array(torque, float) == pytest.approx(np.cross(arm, lift * np.array(up)))
-
-
-# ------------------------------------------------------------------------- falling
 
 
 # ------------------------------------------------------------------------- hovering and floating

@@ -136,8 +136,6 @@ def test_coefficients_may_differ_from_axis_to_axis():
         ("drag_coefficient: [1, 2]", "a number >= 0, or three, one for each axis; found .1, 2"),
         ("fossen: {added_mass: [1, 2]}", "expected six numbers, or six rows of six"),
         ("fossen: {added_mass: [1, 1, 1, 1, 1, -1]}", "a matrix without negative eigenvalues"),
-        ("fossen: {quadratic_damping: 3}", "six numbers >= 0"),
-        ("fossen: {damping: 3}", "damping"),
     ],
 )
 def test_what_is_no_such_matrix_is_refused(params, text):

@@ -100,7 +100,7 @@ def tilted(lanes, height):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dt", [0.02, 0.01, 0.005, 0.002])
+@pytest.mark.parametrize("dt", [0.02, 0.005])
 def test_a_box_that_bobs_and_tumbles_gains_no_energy(dt):
     """Relative density .6, no drag, for a minute: kinetic and potential energy never exceed the
     start's, at any of the usual steps; weight and buoyancy are vertical, and no lane is driven far.
@@ -215,24 +215,6 @@ def test_a_plate_slams_as_von_karman_has_it():
         assert np.all(np.diff(-v[:, 2, 0]) < 1e-15)  # it only slows down
     assert error[1] < 0.06
     assert error[0] / error[1] == pytest.approx(2.0, abs=0.4)
-
-
-@pytest.mark.slow
-def test_impulse_is_kept_when_a_tilted_box_enters():
-    """Linear and angular, of body and water, whatever turns on the way: first order in the step."""
-    moved = []
-    for dt in (0.002, 0.001, 0.0005):
-        robot = box_robot(tuple(SIZE), 0.6, world(added_mass=True, buoyancy="partial", timestep=dt))
-        qpos, qvel = random_states(robot, 12, seed=7, speed=0.3)
-        qpos[:3], qvel[2] = np.array([0.1, -0.2, 0.125])[:, None], -1.0
-        _, q, v, _ = march(robot, 0.6, qpos, qvel, every=round(0.2 / dt))
-        assert wetness(qpos.T)[0].max() == 0
-        assert wetness(lanes_last(q)[-1])[0].min() == 1
-        first, last = (ledger(robot, *state)[2] for state in ((qpos.T, qvel.T), (q[-1].T, v[-1].T)))
-        scale = np.linalg.norm(first[:, :3], axis=1) * np.array([[1]] * 3 + [[0.2]] * 3)
-        moved.append(np.max(np.abs(last - first) / scale.T))
-    assert moved[-1] < 0.01
-    assert moved[1] / moved[2] == pytest.approx(2.0, abs=0.5)
 
 
 def test_what_leaves_the_water_keeps_its_velocity():

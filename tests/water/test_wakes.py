@@ -108,7 +108,7 @@ def test_a_steady_plate_has_the_drag_of_its_aspect_ratio(plate):
     assert -ends[0] / (0.5 * WATER.density) == pytest.approx(1.98, rel=1e-6)
 
 
-@pytest.mark.parametrize("number", [4.0, 10.0, 40.0])
+@pytest.mark.parametrize("number", [4.0, 40.0])
 def test_a_swinging_plate_has_the_drag_of_ikedas_fit_and_its_work(number, plate):
     """C_d and work per cycle over KC, at another speed and size than in `experiments.measured`."""
     period, dt = 0.8, 0.002
@@ -163,7 +163,7 @@ def test_a_plate_in_pieces_is_one_plate():
 # ------------------------------------------------------------------------- fins
 
 
-@pytest.mark.parametrize("frequency", [0.1, 0.5, 1.5])
+@pytest.mark.parametrize("frequency", [0.1, 1.5])
 def test_a_fins_lift_lags_as_theodorsens_function_says(frequency, fin):
     """In small heave, lift over the quasi-steady one is C(k), k = ω c / 2 U, within 3 %."""
     speed, chord = 0.5, float(fin.chord)
