@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import OURS, ROOT, WILD, body, box_robot, face_drag, read, world
-from mjx_revolve.body.catalogue import MODULES, load_modules
+from laboratory import OURS, WILD, body, box_robot, face_drag, read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.engines import make_engine
@@ -170,12 +169,6 @@ def test_every_morphology_builds(path):
     assert corners.max(0) == pytest.approx(high, abs=1e-9)
 
 
-def test_the_wild_robots_are_there_or_known_to_be_absent():
-    if not WILD:
-        pytest.skip(f"no third-party robots at {ROOT.parent / 'shared' / 'revolve_robots'}")
-    assert len(WILD) >= 5
-
-
 def test_fluid_table_of_the_catalogue():
     """Drag of a lone core: all faces meet the water; of a hinge's joined faces, none do."""
     robot = build_robot(body("core"), world(drag="faces", added_mass=True))
@@ -253,34 +246,6 @@ def test_world_options_reach_the_model():
     assert robot.qpos0.tolist() == [0, 0, 0, 1, 0, 0, 0]
     robot.qpos0[2] = 7.0  # a copy
     assert robot.qpos0[2] == 0.0
-
-
-def test_overrides_and_own_modules_reach_the_model(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("""
-modules:
-  Float:
-    mount: -x
-    parts:
-      - {name: foam, size: [0.04, 0.06, 0.02], mass: 0.01, center_of_volume: [0, 0, 0.002]}
-""")
-    text = """
-body:
-  type: Core
-  params: {mass: 0.12, electronics_volume: 3.0e-5}
-  children:
-    2: {id: foam, type: Float}
-"""
-    file = tmp_path / "boat.yaml"
-    file.write_text(text)
-    robot = build_robot(load_morphology(file, MODULES | load_modules(path)), world())
-    fluid = robot.fluid
-    assert robot.mj_model.nbody == 2
-    assert fluid.mass == pytest.approx([0.12, 0.01])
-    assert fluid.volume == pytest.approx([5.054e-5 + 3e-5, 0.04 * 0.06 * 0.02])
-    assert fluid.center_of_volume[1] == pytest.approx([0, 0, 0.002])
-    # Outward along +x: the foam's centre is half its length beyond the core's face.
-    assert fluid.position[1] == pytest.approx([0.0445 + 0.02, 0, 0], abs=1e-9)
 
 
 def test_a_body_that_mujoco_refuses_is_an_input_error():

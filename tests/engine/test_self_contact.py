@@ -161,37 +161,6 @@ def test_contact_keeps_momentum_and_takes_energy():
         assert taken < momentum(robot, qpos[:, k], alone[:, k])[1]
 
 
-@pytest.mark.slow
-def test_energy_never_rises_without_motors():
-    robot = limp(jaw(**EMPTY))
-    draw = np.random.default_rng(1)
-    qpos, qvel = at_rest(robot, 16)
-    qvel[6:] = 3 * np.sign(INWARDS) * draw.uniform(0.5, 1, (2, 16))
-    _, qpos, qvel, _ = march(robot, 0.5, qpos, qvel)
-    assert 0 < depths(robot, qpos).max() < 2e-3
-    energy = np.array(
-        [[momentum(robot, q[:, k], v[:, k])[1] for k in range(16)]
-         for q, v in zip(qpos, qvel, strict=True)]
-    )  # fmt: skip
-    # Semi-implicit Euler itself gives and takes some of a turning robot's energy.
-    assert np.diff(energy, axis=0).max() < 2e-3 * energy.max()
-    assert np.all(energy[-1] < 0.9 * energy[0])
-
-
-@pytest.mark.slow
-def test_mirror_images():
-    robot = jaw(timestep=0.01)
-    qpos, qvel = open_jaw(robot, 2)
-    qpos[7:, 1] = -qpos[:6:-1, 0]
-    ctrl = INWARDS + 0.3 * random_gaits(robot, 1, 150)
-    ctrl = np.concatenate([ctrl, -ctrl[:, ::-1]], -1)
-    _, qpos, _, _ = march(robot, 1.5, qpos, qvel, ctrl)
-    assert depths(robot, qpos).max(0).min() > 0
-    np.testing.assert_allclose(qpos[:, 7, 0], -qpos[:, 8, 1], atol=1e-9)
-    np.testing.assert_allclose(qpos[:, 0, 0], -qpos[:, 0, 1], atol=1e-9)
-    np.testing.assert_allclose(qpos[:, 1:3, 0], qpos[:, 1:3, 1], atol=1e-9)
-
-
 def march_batch(robots, capacity, lanes, ctrl, steps):
     """`[steps, nq, robots * lanes]` of different bodies side by side, in float64."""
     run = jax.jit(make_march(robots[0].world, capacity, steps))

@@ -94,12 +94,6 @@ def test_a_propeller_turns_its_robot_the_other_way(ratio):
     assert qacc[3:] == pytest.approx(-ratio * 0.5 * axis / inertia, rel=1e-9)
 
 
-def test_thrust_off_the_centre_turns_too():
-    robot = driven(world(), gain=0.5, position=(0.0, 0.03, 0.0))
-    qacc = accelerate(robot, *at_rest(robot, 1, -5.0), np.ones((1, 1)))[:, 0]
-    assert qacc[5] == pytest.approx(-0.5 * 0.03 / (NEUTRAL * 0.1**2 / 6), rel=1e-9)
-
-
 def test_out_of_the_water_there_is_nothing_to_push():
     """In the air it falls, and neither flies nor spins; half in it, it has half of its thrust."""
     robot, share = driven(world(**WATER), gain=0.5, torque_ratio=0.02), np.array([0.0, 0.5, 1.0])
@@ -218,12 +212,3 @@ def test_the_fish_swims_ahead_and_halving_the_step_changes_little():
         assert up.min() > 0.95
         assert np.abs(found.qpos[:, 2] + 2.0).max() < 0.05
     assert np.linalg.norm(ends[1][:3] - ends[0][:3]) < 0.02 * ends[0][1]
-
-
-@pytest.mark.slow
-def test_a_fish_that_does_not_move_stays_where_it_is():
-    """Neutral and trimmed: a centimetre and a degree in 5 s."""
-    robot = build_robot(body("fish"), world(**WATER))
-    found = simulate(robot, None, 5.0, qpos=robot.start_qpos(2.0))
-    assert np.abs(found.qpos[-1, :3] - np.array([0, 0, -2.0])).max() < 0.01
-    assert np.abs(found.qpos[-1, 4:7]).max() < 0.01
