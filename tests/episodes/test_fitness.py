@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK, SLOPE, read, swimmer
+from laboratory import QUICK, read, swimmer
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.scoring import WORST
@@ -101,37 +101,6 @@ def test_a_blown_up_individual_scores_worst_and_spreads_nothing(fitness, populat
 
 
 @pytest.mark.slow
-def test_zero_genes_do_no_work(fitness, population):
-    score, measures = fitness.evaluate(jnp.zeros_like(population), KEY)
-    # The oar is heavier at one end and lighter at the other, so it turns a little, without work.
-    assert float(measures["energy_j"][0]) < 1e-3
-    assert float(measures["depth_error_m"][0]) < 1e-2  # it is trimmed
-    assert abs(float(score[0])) < 0.1
-
-
-@pytest.mark.slow
-def test_under_jit_and_vmap(fitness, population, scores):
-    # Another compilation: equal to rounding, which a second of stroking may amplify a little.
-    mapped = jax.vmap(lambda genes: fitness(genes, KEY))
-    both = jax.jit(mapped, compiler_options=QUICK)(population[:40].reshape(2, 20, -1))
-    np.testing.assert_allclose(both.reshape(-1), scores[:40], atol=2e-4)
-
-
-@pytest.mark.long
-def test_gradient_points_uphill(settings):
-    short = make_fitness(settings, **{"task.duration": 0.6, "task.trials": 1})
-    genes = 0.3 * jnp.ones((1, short.num_genes))
-    slope = jax.jit(jax.grad(lambda g: short(g, KEY)[0]), compiler_options=SLOPE)(genes)
-    assert np.all(np.isfinite(slope)) and np.any(np.asarray(slope) != 0)
-    step = 0.002 * slope / jnp.linalg.norm(slope)
-    up, down = float(short(genes + step, KEY)[0]), float(short(genes - step, KEY)[0])
-    found = (up - down) / (2 * 0.002)
-    # Central differences in float32 over 0.002: a few per cent. Over more, commands that jump 20
-    # times a second and are held bring servos to their effort and off it.
-    assert found == pytest.approx(float(jnp.linalg.norm(slope)), rel=0.1)
-
-
-@pytest.mark.slow
 def test_mjx_scores_the_same(settings, population, scores):
     slow = make_fitness(settings, engine="mjx")
     np.testing.assert_allclose(slow(population[:2], KEY), scores[:2], atol=2e-4)
@@ -207,7 +176,7 @@ def test_tasks_with_known_scores(task, given, score):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rate", [0.0, 0.05, 0.2, -0.6])
+@pytest.mark.parametrize("rate", [0.0, -0.6])
 def test_a_horizon_foretells_the_way_of_a_circle(rate):
     """At 1 m/s and so many rad/s: from 20 s the net way of 120 s, by the chord of the arc."""
     time = np.arange(21.0)
@@ -260,16 +229,6 @@ def test_in_a_void_nothing_gets_anywhere(tmp_path):
         moved[point] = float(fitness.evaluate(genes, KEY)[1]["path_length_m"][0])
     # What is left is the first-order error of a step of 5 ms.
     assert moved["core"] > 0.01 and moved["center_of_mass"] < moved["core"] / 20
-
-
-@pytest.mark.slow
-def test_the_length_is_the_tasks(settings, fitness, population, scores):
-    """A body's scores by its two lengths stand in their inverse ratio."""
-    assert fitness.settings.length == "stretched"
-    rest = make_fitness(settings, **{"task.length": "rest"})(population[:4], KEY)
-    sizes = fitness.geometry
-    np.testing.assert_allclose(rest * sizes.length, scores[:4] * sizes.stretched, rtol=1e-5)
-    assert sizes.stretched >= sizes.length
 
 
 def test_scores_in_metres_leave_the_body_length_out():

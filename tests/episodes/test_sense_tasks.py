@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_revolve import make_fitness, make_mixed_fitness
+from mjx_revolve import make_fitness
 from mjx_revolve.episodes.config import TaskConfig, load_config
 from mjx_revolve.episodes.tasks import TASKS, Track
 
@@ -146,20 +146,6 @@ def test_a_pursuer_is_the_robots_own(chased):
     start = np.asarray(one.starts(key)[0])[:3, 0]
     first = np.linalg.norm(place[0] - start)
     assert first == pytest.approx(0.4 - 0.3 * one.robot.world.timestep, abs=1e-4)
-
-
-@pytest.mark.long
-def test_bodies_in_a_batch_are_pursued_alike(chased):
-    fitness, genes, _ = chased
-    many = make_mixed_fitness(fitness.config, [fitness.robot.morphology])
-    robot = many.build(fitness.robot.morphology)
-    key = jax.random.key(2)
-    found = np.asarray(many([robot], genes[None, :1], key))[0]
-    assert found == pytest.approx(np.asarray(fitness(genes[:1], key)), abs=1e-4)
-    (trajectory,) = many.replay([robot], [genes[0]], key)
-    alone = fitness.replay(genes[0], key)
-    rows = np.searchsorted(np.asarray(alone.time), np.asarray(trajectory.time) - 1e-6)
-    assert np.asarray(trajectory.target) == pytest.approx(np.asarray(alone.target)[rows], abs=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import OAR, QUICK, SLOPE, swimmer
-from mjx_revolve import InputError, load_morphology, make_fitness, make_mixed_fitness
+from laboratory import OAR, swimmer
+from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.scoring import WORST
 from mjx_revolve.episodes.windows import make_windows
 
@@ -80,24 +80,6 @@ def test_closed_loop_gradients_are_those_of_differences(settings, kind):
         check_gradient(mean_gain(windows, episodes), np.asarray(genes[0]), gradient)
 
 
-@pytest.mark.long
-def test_gradients_for_many_bodies_are_those_of_differences(settings, tmp_path):
-    """A closed loop of two different bodies side by side, by JAX's own gradient."""
-    (tmp_path / "turned.yaml").write_text(
-        OAR.replace("ActiveHinge,", "ActiveHinge, orientation: 90,")
-    )
-    bodies = [load_morphology(x) for x in (settings["morphology"], tmp_path / "turned.yaml")]
-    brain = {"type": "mlp", "hidden": 2, "sensors": ["tilt", {"type": "angle", "noise": 0.05}]}
-    task = TASK | {"duration": 0.2, "settle": 0.0, "trials": 1}
-    with jax.enable_x64(True):
-        many = make_mixed_fitness(settings | {"controller": brain, "task": task}, bodies)
-        packed, genes = many.pack([many.build(x) for x in bodies]), drawn(2, many.num_genes)
-        total = lambda x: jnp.sum(many(packed, x.reshape(2, -1), KEY))  # noqa: E731
-        both = jax.jit(jax.value_and_grad(total), compiler_options=SLOPE)
-        gradient = np.asarray(both(genes.reshape(-1))[1])
-        check_gradient(lambda x: both(x)[0], np.asarray(genes.reshape(-1)), gradient, 4)
-
-
 @pytest.fixture(scope="module")
 def brain(settings):
     """A recurrent network with samples that are held and late, gusts and waves around it."""
@@ -145,21 +127,6 @@ def test_windows_carried_on_are_one_long_rollout(brain, windows):
             return np.mean(windows.step(jnp.stack([own, new[1]]), before)[0].gain[0])
 
         check_gradient(value, np.asarray(new[0]), gradient, 3)
-
-
-@pytest.mark.long
-def test_memory_grows_with_the_state_and_not_with_the_steps_working(windows):
-    """XLA's own sum of what lives beside arguments and results."""
-    with jax.enable_x64(True):  # as above, so that nothing is compiled again
-        population = jnp.zeros((2, windows.fitness.num_genes))
-        episodes = jax.eval_shape(windows.init, population, KEY)
-        step = jax.jit(windows.step, compiler_options=QUICK)
-        compiled = step.lower(population, episodes).compile()
-    steps = windows.horizon / windows.fitness.robot.world.timestep
-    carried = sum(x.size for x in jax.tree.leaves(episodes.rollout)) / 4  # for each lane
-    # A step of a lane keeps 8 bytes for each number that it carries, its water, and some more while
-    # gradients by the parameters of a record are found; its working is some thousand numbers.
-    assert compiled.memory_analysis().temp_size_in_bytes / (64 * steps) < 4 * 8 * carried
 
 
 @pytest.mark.slow
