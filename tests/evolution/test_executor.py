@@ -94,7 +94,7 @@ def run_main(*argv, make_fitness=toys.make_toy):
 # --- blocks ---
 
 
-@pytest.mark.parametrize("size", [1, 3, 4, 5, 8, 11])
+@pytest.mark.parametrize("size", [1, 4, 11])
 def test_blocks_have_one_shape_and_are_padded_with_their_first_row(size):
     population = np.arange(2 * size, dtype=np.float32).reshape(size, 2)
     blocks = split_blocks(population, 4)
@@ -135,7 +135,7 @@ def crowd(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [1, 4, 5, 10, 33])
+@pytest.mark.parametrize("size", [1, 5, 33])
 def test_scores_do_not_depend_on_the_workers(crowd, size):
     _, executor = crowd
     population = np.random.default_rng(size).normal(size=(size, 5)).astype(np.float32)
@@ -146,14 +146,6 @@ def test_scores_do_not_depend_on_the_workers(crowd, size):
     assert scores.tobytes() == alone.tobytes()
     assert measures.keys() == alone_measures.keys() == {"distance_m"}
     assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
-
-
-@pytest.mark.slow
-def test_workers_know_other_kinds_of_keys(crowd):
-    _, executor = crowd
-    population = np.random.default_rng(0).normal(size=(6, 5)).astype(np.float32)
-    key = jax.random.key(7, impl="rbg")
-    assert np.array_equal(executor(population, key), Executor(toys.Toy(), 4)(population, key))
 
 
 def test_the_champion_does_not_depend_on_blocks(crowd):
@@ -169,11 +161,10 @@ def test_the_champion_does_not_depend_on_blocks(crowd):
     assert champions[0].origin == champions[1].origin
 
 
-@pytest.mark.parametrize("shape", [(5,), (0, 5), (3, 4)])
-def test_a_population_of_another_shape_leaves_the_pool_as_it_is(crowd, shape):
+def test_a_population_of_another_shape_leaves_the_pool_as_it_is(crowd):
     _, executor = crowd
     with pytest.raises(InputError, match=r"population: expected \[P, 5\]; found"):
-        executor.evaluate(np.zeros(shape), jax.random.key(0))
+        executor.evaluate(np.zeros((3, 4)), jax.random.key(0))
     assert len(executor(np.zeros((2, 5)), jax.random.key(0))) == 2
 
 
@@ -360,16 +351,6 @@ def test_a_block_that_kills_scores_worst_and_is_named(troubled, caplog):
     assert done.returncode == -signal.SIGKILL
 
 
-def test_a_lost_block_can_be_scored_again(tmp_path):
-    job = make_job(toy_config(tmp_path), toys.make_toy)
-    block = (np.random.default_rng(0).normal(size=(4, 5)).astype(np.float32),)
-    path = save_failed_block(tmp_path / "lost", job, block, KEY)
-    scores, _ = score_failed_block(path, trust=True)
-    assert scores.tobytes() == Executor(toys.Toy(), 4)(block[0], KEY).tobytes()
-    with pytest.raises(UntrustedError, match=r"make: expected .*; found 'toys:make_toy'"):
-        score_failed_block(path)
-
-
 class Spell:
     """What does something when it is unpickled."""
 
@@ -400,6 +381,8 @@ def test_a_lost_block_of_bodies_can_be_scored_again(tmp_path):
     path = save_failed_block(tmp_path / "lost", make_job(config, toys.make_toy_bodies), block, KEY)
     scores, _ = score_failed_block(path, trust=True)
     assert scores.tobytes() == evaluate_block(fitness, block, KEY)[0].tobytes()
+    with pytest.raises(UntrustedError, match=r"make: expected .*; found 'toys:make_toy_bodies'"):
+        score_failed_block(path)
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import os
 import shutil
 import subprocess
@@ -17,10 +16,7 @@ from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import memory
-from mjx_revolve.evolution import run as runs
-from mjx_revolve.evolution.run_folder import RunFolder
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.view.report.data import read_run
 
 
 @pytest.fixture
@@ -127,25 +123,6 @@ def test_a_second_run_in_one_folder_is_refused(folder, capsys):
     assert "run: expected a new or empty folder; found files" in lines[1]
     assert run_main("toy.yaml", "--out", "alone") == 0
     assert genes("run") == genes("alone")
-
-
-@pytest.mark.slow
-def test_a_clock_that_goes_backwards(folder, monkeypatch):
-    assert run_main("toy.yaml", "--out", "whole") == 0
-
-    def turn_back():
-        past = datetime.datetime(2001, 1, 1)
-        clock = SimpleNamespace(datetime=SimpleNamespace(now=lambda: past))
-        monkeypatch.setattr(runs, "datetime", clock)
-        raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        run_main("toy.yaml", "--out", "run", at=4, do=turn_back)
-    assert run_main("--resume", "run") == 0
-    assert genes("run") == genes("whole")
-    info = RunFolder(folder / "run").info
-    assert info["finished"] < info["started"]
-    assert not read_run("run").problems
 
 
 def test_a_population_beyond_the_memory_is_refused_beforehand(folder, capsys):

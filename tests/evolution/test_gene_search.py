@@ -74,12 +74,6 @@ def timeless(row):
 # --- scores to losses ---
 
 
-def test_losses_are_negated_scores():
-    losses = losses_from_scores(np.float32([1.0, -2.0, 3.0]))
-    assert losses.dtype == np.float32
-    assert losses.tolist() == [-1.0, 2.0, -3.0]
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_failures_lose_by_the_spread_of_the_others(bad):
     losses = losses_from_scores(np.array([1.0, bad, -2.0, bad]))
@@ -105,11 +99,6 @@ def test_ties_are_broken_by_almost_nothing_even_for_xla(value):
     ranks = jax.jit(lambda x: jax.scipy.stats.rankdata(x))(losses)
     assert np.asarray(ranks).tolist() == list(range(1, 65))
     assert abs(losses[-1] - losses[0]) <= 64 * max(np.spacing(np.float32(abs(value))), 1e-30)
-
-
-def test_ties_keep_the_order_of_the_others():
-    losses = losses_from_scores(np.array([1.0, 2.0, 1.0, 2.0, 0.0]))
-    assert np.argsort(losses).tolist() == [1, 3, 0, 2, 4]
 
 
 # --- strategies ---
@@ -154,22 +143,16 @@ def test_names_are_found_however_written():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"strategy": "CMA_SE"}, "evolution.strategy: expected one of ARS, "),
-        ({"strategy": "CMA_SE"}, "found 'CMA_SE'; did you mean CMA_ES?"),
-        ({"strategy": "OpenES", "population_size": 15},
+({"strategy": "CMA_SE"}, "found 'CMA_SE'; did you mean CMA_ES?"),
+({"strategy": "OpenES", "population_size": 15},
          "evolution.population_size: expected an even number for Open_ES; found 15"),
-        ({"strategy": "LM_MA_ES", "population_size": 16},
-         "evolution.population_size: expected at most twice the 5 genes for LM_MA_ES; found 16"),
-        ({"strategy_params": {"std_mni": 1.0}},
+({"strategy_params": {"std_mni": 1.0}},
          "evolution.strategy_params.std_mni: expected one of c_1, c_c, c_mean, c_mu, c_std, chi_n, "
          "d_std, mu_eff, std_max, std_min, weights for CMA_ES; found an unknown name"),
-        ({"strategy_params": {"std_min": float("inf")}}, "expected a finite number; found inf"),
-        ({"strategy_params": {"weights": [1, 2]}}, "expected numbers of shape [16]; found [1, 2]"),
-        ({"strategy": "PGPE", "strategy_params": {"learning_rate": -1}},
-         "evolution.strategy_params.learning_rate: expected a number > 0; found -1"),
-        ({"strategy": "DE", "strategy_params": {"elitism": 1}},
-         "evolution.strategy_params.elitism: expected true or false; found 1"),
-    ],
+({"strategy_params": {"weights": [1, 2]}}, "expected numbers of shape [16]; found [1, 2]"),
+({"strategy": "DE", "strategy_params": {"elitism": 1}},
+         "evolution.strategy_params.elitism: expected true or false; found 1")
+],
 )  # fmt: skip
 def test_wrong_strategies(changes, message):
     with pytest.raises(InputError, match=re.escape(message)):
@@ -289,15 +272,6 @@ def test_a_broken_state_starts_anew():
     search, rows = finish(settings(generations=5), fitness, search)
     assert [row["restarts"] for row in rows] == [1, 1]
     assert np.isfinite(search.state["algorithm"].mean).all()
-
-
-def test_a_fitness_of_the_wrong_shape():
-    class Wrong(Quadratic):
-        def evaluate(self, population, key):
-            return jnp.zeros(3), {}
-
-    with pytest.raises(ValueError, match="expected 16 scores; found shape"):
-        finish(settings(), Wrong())
 
 
 def test_the_champion_is_judged_on_fresh_keys():
