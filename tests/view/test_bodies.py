@@ -8,17 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from browser import Browser, find_browser
-from mjx_revolve import export, replay, report, viewer
+from mjx_revolve import replay, report, viewer
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import make_morphology
-from mjx_revolve.episodes.champion import champion_number, load_episode, load_individuals
+from mjx_revolve.episodes.champion import champion_number, load_episode
 from mjx_revolve.episodes.individual_log import find_individuals, read_generations, read_individuals
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.body_pictures import SIZE, draw_bodies, plot_best, plot_descriptors
-from mjx_revolve.view.convergence import plot_fitness
-from mjx_revolve.view.pieces import make_pieces
 from mjx_revolve.view.population import (
     pick_ancestors,
     pick_evenly,
@@ -136,14 +133,6 @@ def test_damaged_lines_are_left_out(run, line):
     assert problems == ["individuals.jsonl: 1 line is damaged and left out"]
 
 
-def test_damaged_generations_are_left_out(run):
-    with open(run / "generations.jsonl", "a") as file:
-        file.write('{"generation": 4, "living": [1.5]}\n{"generation": 5}\n{"generation": 6, "liv')
-    found, problems = read_generations(run)
-    assert list(found) == [1, 2, 3]
-    assert problems == ["generations.jsonl: 2 lines are damaged and left out"]
-
-
 def test_who_was_best_and_who_came_of_whom(run):
     population, problems = read_population(run)
     assert problems == []
@@ -217,29 +206,12 @@ def test_pictures_have_one_scale_and_fit():
     assert draw_bodies([]) == []
 
 
-def test_modules_without_a_colour_have_that_of_their_kind():
-    plain = make_morphology(body(1), MODULES)
-    pieces = [piece for piece in make_pieces(plain) if not piece.mark]
-    assert len({tuple(piece.color) for piece in pieces}) == 3  # core, and both parts of a hinge
-    named = body(1)
-    named["body"]["params"] = {"red": 0.1, "green": 0.2, "blue": 0.3}
-    assert make_pieces(make_morphology(named, MODULES))[0].color.tolist() == [0.1, 0.2, 0.3]
-
-
 def test_a_sheet_of_the_best(run):
     figure = plot_best(run, MODULES, "a $title")
     texts = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert texts == ["5: 0.5", "4 modules, 3 hinges", "3: 0.3", "3 modules, 2 hinges",
                      "4: 0.2", "2 modules, 1 hinge"]  # fmt: skip
     figure.canvas.draw()  # a dollar is no formula
-
-
-def test_fitness_has_how_large_bodies_are():
-    metrics = {"generation": np.arange(1.0, 4), "best": np.ones(3), "champion": np.ones(3),
-               "mean_num_modules": np.array([4.0, 5.0, 6.0])}  # fmt: skip
-    figure = plot_fitness(metrics)
-    (axes,) = [axes for axes in figure.axes if axes.get_ylabel() == "modules, mean\nof the living"]
-    assert axes.lines[0].get_ydata().tolist() == [4.0, 5.0, 6.0]
 
 
 def test_sizes_over_the_generations(run):
@@ -298,25 +270,6 @@ def test_cells_of_the_archive_are_links(tmp_path, still):
     assert "<?xml" not in page and page.count("<svg") == 1
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(find_browser() is None, reason="needs Chromium or Chrome")
-def test_a_click_on_a_cell_shows_who_lives_there(tmp_path, still):
-    run = make_run(tmp_path / "run", ARCHIVE)
-    record = read_run(run)
-    (tmp_path / "report.html").write_text(report_page.make_report([record]))
-    card = f"document.getElementById('{report_bodies.anchor(record, 3)}')"
-    with Browser(900, 700) as browser:
-        browser.send("Page.navigate", url=(tmp_path / "report.html").as_uri())
-        browser.wait("document.readyState === 'complete' && !!document.querySelector('.map svg a')")
-        assert browser.evaluate(f"{card}.offsetHeight") == 0
-        link = f".map a[*|href='#{report_bodies.anchor(record, 3)}']"
-        browser.evaluate(f'document.querySelector("{link}").scrollIntoView()')
-        browser.click(link)
-        browser.wait(f"{card}.offsetHeight > 100")
-        assert "--individual 3" in browser.evaluate(f"{card}.textContent")
-        assert browser.errors == []
-
-
 def test_whose_pages_are_asked_for(run, tmp_path):
     record = read_run(run)
     assert report_bodies.choose_individuals(record, [4, 1, 4]) == [4, 1]
@@ -369,16 +322,6 @@ def test_what_is_left_is_shown(run, still, damage, message):
     assert ("Body of individual" in page) == (run / "individuals.jsonl").is_file()
 
 
-@pytest.mark.slow
-def test_a_body_that_cannot_be_read_has_no_picture(run, still):
-    path = run / "individuals.jsonl"
-    path.write_text(path.read_text().replace("ActiveHinge", "Wheel", 3))
-    record = read_run(run)
-    page = report_page.make_report([record])
-    assert "individual 0: " in record.warning and "Wheel" in record.warning
-    assert page.count('alt="Body of individual 0"') == 0 and "<b>#0</b>" in page
-
-
 def test_best_individual_stands_in_for_a_lost_champion(run):
     (run / "champion/genes.yaml").unlink()
     record = read_run(run)
@@ -394,10 +337,7 @@ def test_best_individual_stands_in_for_a_lost_champion(run):
     ("main", "argv", "message"),
     [
         (report, ["run", "--individuals", "worst"], "expected best, archive, or numbers"),
-        (report, ["run", "--individuals", "archive"], "expected a run with an archive"),
         (viewer, ["run", "--individual", "77"], "expected individual 77; found those from 0 to 5"),
-        (export, ["spider", "--individual", "1"], "expected a run folder; found no config.yaml"),
-        (replay, ["run", "--ancestors", "0"], "expected a whole number from 1 to 30"),
         (viewer, ["run", "--individual", "1", "--world", "lake"], "expected none: a champion"),
     ],
 )
@@ -437,21 +377,3 @@ def test_a_film_of_ancestors(run, monkeypatch, capsys):
     assert asked == [([1, 5], None), ([0, 4], 2.0)] and cuts == [5.0, 5.0]
     assert [entry[1].name for entry in made] == ["ancestors.mp4", "4-ancestors.mp4"]
     assert "6 s, 2 robots" in capsys.readouterr().out
-
-
-@pytest.mark.long
-def test_many_swim_as_each_does_alone(run):
-    """One compiled program for all gives what each gets alone, up to rounding."""
-    together = load_individuals(run, [1, 5], seed=3)
-    for number, many in zip([1, 5], together, strict=True):
-        alone = load_episode(run, individual=number, seed=3)
-        every = round(float(many.trajectory.time[0] / alone.trajectory.time[0]))
-        assert every > 1 and len(alone.trajectory.time) == every * len(many.trajectory.time)
-        for name in ("time", "qpos", "xpos", "ctrl"):
-            rows = np.asarray(getattr(alone.trajectory, name))[every - 1 :: every]
-            assert np.allclose(getattr(many.trajectory, name), rows, atol=2e-5), name
-        assert np.ptp(np.asarray(many.trajectory.qpos)[:, 7:]) > 0.01
-        assert (many.score, many.starts) == (
-            alone.score,
-            f"generation {1 if number == 1 else 3}'s starts",
-        )

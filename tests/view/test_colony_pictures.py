@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import yaml
-from matplotlib.collections import LineCollection
 
 from laboratory import QUICK
 from mjx_revolve import report, viewer
@@ -17,7 +16,6 @@ from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.colony_history import make_history
 from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_lives, plot_population
-from mjx_revolve.view.convergence import plot_colony, scale_time
 from mjx_revolve.view.plots import figure_png
 from mjx_revolve.view.population import trace_line
 from mjx_revolve.view.report.data import read_run
@@ -84,12 +82,6 @@ def test_history_by_hand(history):
 # --- pictures ---
 
 
-def test_time_axes_have_units_that_suit():
-    assert [scale_time(x) for x in (100.0, 7200.0, 20000.0)] == [
-        (1.0, "time (s)"), (60.0, "time (min)"), (3600.0, "time (h)")
-    ]  # fmt: skip
-
-
 def test_births_and_deaths_add_up(history):
     """Bars upwards are the births, those downwards the deaths."""
     top, low = plot_population(history, 8).axes
@@ -98,14 +90,6 @@ def test_births_and_deaths_add_up(history):
     labels = low.get_legend_handles_labels()[1]
     assert labels == ["children born", "strangers born", "died of age", "died of something else"]
     assert top.lines[0].get_ydata().max() == 4
-
-
-def test_every_life_is_a_line(history):
-    lines = [c for c in plot_lives(history).axes[0].collections if isinstance(c, LineCollection)]
-    rows = [tuple(map(tuple, segment)) for segment in lines[0].get_segments()]
-    born = [0, 0, 20, 40, 40]
-    assert [row[0] for row in rows] == [(t, k) for k, t in enumerate(born)]
-    assert [row[1][0] for row in rows] == [30, 60, 60, 50, 60]
 
 
 def test_families_stand_together(history):
@@ -124,14 +108,6 @@ def test_empty_and_odd_histories_are_drawn():
         for figure in (plot_population(history), plot_lives(history), plot_families(history),
                        plot_arena(history, colony)):  # fmt: skip
             assert figure_png(figure).startswith(b"\x89PNG")
-
-
-def test_fitness_with_what_is_not_known_yet():
-    """In the first intervals nobody has lived for long enough to be a champion."""
-    row = np.array([1.0, 2.0])
-    metrics = {"time": 10 * row, "champion": row * np.nan, "mean_age": row}
-    metrics |= dict.fromkeys(("best", "median", "lower_quartile", "upper_quartile"), row)
-    assert figure_png(plot_colony(metrics, "a $x title"))
 
 
 # --- a run ---
@@ -169,12 +145,6 @@ def run(tmp_path_factory):
         patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         assert main([str(folder / "colony.yaml"), "--out", str(folder / "run")]) == 0
         yield folder / "run"
-
-
-@pytest.mark.long
-def test_a_run_leaves_its_pictures(run):
-    for name in ("fitness", "population", "lives", "families", "arena", "bodies"):
-        assert (run / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ from functools import lru_cache
 from types import SimpleNamespace
 
 import av
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -28,13 +27,10 @@ from mjx_revolve.view.film import opengl, overlay
 from mjx_revolve.view.film.camera import FOVY, plan_circle, plan_shots
 from mjx_revolve.view.film.draw import draw_frames, draw_shaded
 from mjx_revolve.view.film.film import make_colony_film, make_film
-from mjx_revolve.view.film.stage import BACKGROUND, build_stage, make_sand
+from mjx_revolve.view.film.stage import BACKGROUND, build_stage
 from mjx_revolve.view.film.video import gif_stride, make_gif, write_mp4
 from mjx_revolve.view.film.waterlight import (
-    bright_lines,
-    daylight,
     make_shader,
-    open_water,
     transmission,
 )
 from mjx_revolve.view.pieces import smooth_mesh
@@ -104,8 +100,8 @@ def assert_in_frame(shots, path, radius, aspect=4 / 3):
         assert (z * up - abs(y)) / math.hypot(1, up) > radius
 
 
-@pytest.mark.parametrize("aspect", [4 / 3, 16 / 9, 0.5])
-@pytest.mark.parametrize("heading", [0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+@pytest.mark.parametrize("aspect", [4 / 3, 0.5])
+@pytest.mark.parametrize("heading", [0.0, 2.0, 5.0])
 def test_robot_stays_in_frame_and_swims_to_the_right(heading, aspect):
     time = np.arange(150)[:, None] / 30
     ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
@@ -157,23 +153,6 @@ def test_what_floats_is_filmed_from_the_air():
     assert_in_frame(shots, path, 0.2)
 
 
-def test_who_stays_is_seen_from_its_side():
-    shots = plan([[0, 0, -2.0]] * 30, along=(0.0, 1.0))
-    assert shots.axes(0)[0] @ [0, 1, 0] > 0.8
-
-
-def test_one_frame_is_a_film_too():
-    assert_in_frame(plan([[1.0, 2.0, -3.0]]), [[1.0, 2.0, -3.0]], 0.2)
-
-
-def test_projection_of_a_known_point():
-    shots = plan([[0.0, 0.0, -2.0]] * 2)
-    flat, away = shots.project(0, np.array([shots.target[0], 2 * shots.position[0]
-                                            - shots.target[0]]))  # fmt: skip
-    assert flat[0] == pytest.approx([0, 0], abs=1e-9)
-    assert away[1] == pytest.approx(-away[0])
-
-
 # --- the stage ----------------------------------------------------------------------------------
 
 
@@ -223,12 +202,6 @@ def test_stage_counts_from_its_origin(spider):
     assert data.geom_xpos[model.geom("surface").id] == pytest.approx([0, 0, 10])
 
 
-def test_a_world_without_a_bed_has_none(spider):
-    model = build_stage({0: spider}, load_world("lake", bed="off"))
-    names = [model.geom(k).name for k in range(model.ngeom)]
-    assert "sand" not in names and "0/bed" not in names
-
-
 def test_normals_are_sharp_on_a_cube_and_smooth_on_a_pipe():
     import trimesh
 
@@ -243,13 +216,6 @@ def test_normals_are_sharp_on_a_cube_and_smooth_on_a_pipe():
     assert (pipe.vertex_normals[pipe.faces][side] * outward).sum(-1) == pytest.approx(1, abs=0.01)
 
 
-def test_sand_can_be_laid_side_by_side():
-    sand = make_sand(128).astype(float)
-    inside = np.abs(np.diff(sand, axis=0)).mean()
-    assert np.abs(sand[0] - sand[-1]).mean() < 2 * inside
-    assert sand.std() > 3
-
-
 # --- the water's light --------------------------------------------------------------------------
 
 
@@ -261,19 +227,6 @@ def test_water_takes_red_first():
     assert far[0] < far[1] < far[2]
     # Small robots are seen as clearly as large ones.
     assert np.asarray(transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
-
-
-def test_light_comes_from_above():
-    assert np.asarray(daylight(0.0)) == pytest.approx([1, 1, 1])
-    assert (np.diff(np.asarray(daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
-    assert (np.diff(np.asarray(open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
-
-
-def test_bright_lines_only_move_light_about():
-    x, y = np.meshgrid(np.linspace(0, 20, 200), np.linspace(0, 20, 200))
-    lines = np.asarray(bright_lines(1.0, 9.81, 0.7, x, y))
-    assert lines.mean() == pytest.approx(1.0, abs=0.2)
-    assert lines.min() > 0 and lines.std() > 0.1
 
 
 @lru_cache
@@ -291,21 +244,6 @@ def shade(world, above, depth, color=(200, 60, 40), height=1.0, pitch=0.0, time=
     water = Water(np.float32(0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), np.float32(time))
     depths, place = np.full((24, 32), depth, np.float32), np.float32([0, 0, height])
     return np.asarray(shader(picture, depths, place, axes, water))
-
-
-def test_what_is_far_is_lost_in_blue_haze():
-    world = load_world("lake")
-    near, far = (shade(world, False, d, height=-5.0).reshape(-1, 3).mean(0) for d in (1.0, 30.0))
-    assert near[0] > near[2]
-    assert far[2] > 2 * far[0]
-
-
-def test_looking_up_shows_the_surface_and_looking_down_none():
-    world = load_world("lake")
-    plain = tuple(round(255 * c) for c in BACKGROUND)
-    up = shade(world, False, np.inf, plain, height=-0.5, pitch=1.2)
-    down = shade(world, False, np.inf, plain, height=-0.5, pitch=-1.2)
-    assert up.mean() > 150 > 90 > down.mean()
 
 
 def test_waves_move_the_surface_in_time():
@@ -397,12 +335,6 @@ def test_frames_show_the_robot_in_its_colours_in_blue_water(frames):
 
 
 @pytest.mark.slow
-def test_light_falls_from_above_in_a_film(frames):
-    _, drawn = frames
-    assert drawn[0][20:40].mean() > drawn[0][90:105].mean() + 10
-
-
-@pytest.mark.slow
 def test_the_bed_shows_where_it_is_near(spider, way):
     world = load_world("lake", bed={"kind": "flat", "height": -1.3})
     robot = build_robot(spider.morphology, world)
@@ -456,18 +388,6 @@ def test_gif_reads_back_with_the_film_s_time_and_colours():
             np.abs(np.asarray(gif.convert("RGB"), int)[60, 10 * k + 10] - (220, 60, 40)).max() < 8
         )
     assert total == 1000
-
-
-@pytest.mark.long
-def test_long_and_noisy_gifs_get_smaller():
-    random = np.random.default_rng(0)
-    every = gif_stride(30, 6000)
-    assert 6000 / every <= 160
-    shown = [Image.fromarray(random.integers(0, 255, (240, 320, 3), np.uint8)) for _ in range(4)]
-    content = make_gif(shown, every / 30, limit=100_000)
-    assert 30_000 < len(content) < 100_000
-    with Image.open(io.BytesIO(content)) as gif:
-        assert gif.n_frames == 4 and gif.width * 3 == pytest.approx(gif.height * 4, abs=4)
 
 
 def test_current_and_target_are_shown():
@@ -602,10 +522,8 @@ def test_the_dead_are_not_drawn(colony, way):
     ("arguments", "words"),
     [
         ([str(ROOT / "morphologies" / "fish.yaml"), "--colony"], "run folder of a colony"),
-        (["run", "--colony", "--view"], "--colony: expected none of --view, --html, --ancestors"),
         (["run", "--colony", "--out", "a.html"], "ends in .mp4 or .gif, with a film of several"),
         ([str(ROOT / "morphologies" / "fish.yaml"), "--time", "3"], "--time: expected --colony"),
-        ([str(ROOT), "--colony", "--seed", "1"], "--seed: expected none with --colony"),
     ],
 )
 def test_what_is_no_film_of_a_colony(arguments, words, capsys):
@@ -726,10 +644,7 @@ def test_the_user_s_opengl_is_the_only_one_tried(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--size", "640"), "--size: expected WIDTHxHEIGHT"),
         (("--size", "0x0"), "from 64x64 to 3840x2160; found '0x0'"),
-        (("--fps", "0"), "--fps: expected a whole number from 1 to 120; found '0'"),
-        (("--duration", "0"), "--duration: expected seconds > 0; found '0'"),
         (("--html", "--out", "x.mp4"), "with --html"),
         (("--view", "--out", "x.mp4"), "--view: expected neither"),
     ],
@@ -769,19 +684,3 @@ def test_view_without_a_screen_is_one_line(command, tmp_path, capsys, monkeypatc
     monkeypatch.setenv("DISPLAY", ":987")
     assert command(str(source), "--view") == 2
     assert capsys.readouterr().err.startswith("error: --view: expected a screen")
-
-
-@pytest.mark.slow
-def test_a_lost_robot_is_named(episode, command, way, tmp_path, capsys, monkeypatch):
-    import mjx_revolve.episodes.champion
-
-    qpos = jnp.asarray(episode.trajectory.qpos).at[100:].set(jnp.nan)
-    lost = replace(episode, trajectory=replace(episode.trajectory, qpos=qpos))
-    monkeypatch.setattr(mjx_revolve.episodes.champion, "load_episode", lambda *a: lost)
-    source = tmp_path / "spider.yaml"
-    source.touch()
-    out = tmp_path / "x.gif"
-    assert command(str(source), "--size", "64x64", "--fps", "4", "--out", str(out)) == 0
-    assert "not finite from 0.505 s on" in capsys.readouterr().err
-    with Image.open(out) as gif:
-        assert gif.n_frames == 2

@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
 
-from laboratory import elbow_robot, oar_robot, world
-from mjx_revolve import evolve, report
+from laboratory import elbow_robot, world
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import make_controller
 from mjx_revolve.episodes.config import make_config
@@ -76,35 +74,6 @@ def seen(tmp_path_factory):
     fitness = echo(make_fitness(make_config(config(tmp_path_factory.mktemp("felt")))))
     trajectory = jax.tree.map(np.asarray, fitness.replay(np.zeros(0), KEY, trial=1))
     return fitness, trajectory, trace_sensors(fitness, trajectory, KEY, trial=1)
-
-
-@pytest.mark.long
-def test_it_is_what_the_brain_was_told(seen):
-    """From the trajectory alone, with its noise, rates and delays; single precision apart."""
-    fitness, trajectory, felt = seen
-    observer, told = fitness.controller.observer, {}
-    for one in felt:
-        zero, scale = one.sensor.scaling
-        told[one.sensor.label] = scale * (one.given - zero)
-    robot, joint = 0.0, np.zeros((len(trajectory.time), 2))
-    names = iter(range(1, 99)), iter(range(1, 99))
-    for sensor in observer.sensors:
-        found = told.get(sensor.label)
-        for part in range(len(sensor.kind.parts)):
-            of_robot = next(names[0]) if sensor.where != "joint" else 0
-            of_joint = next(names[1]) if sensor.where != "robot" else 0
-            if found is None:  # there is no fin
-                continue
-            rows = found[:, part]
-            if sensor.where == "robot":
-                robot = robot + of_robot * rows[:, 0]
-            elif sensor.where == "joint" or sensor.each is not None:  # no brick is on the core
-                joint = joint + of_joint * rows
-            else:
-                robot, joint = robot + of_robot * rows[:, 0], joint + of_joint * rows[:, 1:]
-    expected = 0.3 * np.tanh((np.asarray(robot)[:, None] + joint) / 30)
-    assert trajectory.ctrl == pytest.approx(expected, abs=2e-5)
-    assert np.ptp(trajectory.ctrl, axis=0).min() > 0.05
 
 
 @pytest.mark.slow
@@ -175,16 +144,3 @@ def test_brains_that_feel_nothing_declared_have_no_picture(tmp_path):
     fitness = make_fitness(make_config(config(tmp_path, controller={"type": "cpg"})))
     assert fitness.controller.observer is None
     assert trace_sensors(fitness, None, KEY) == ()
-
-
-@pytest.mark.long
-def test_a_report_shows_what_was_felt(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    oar_robot(world()).morphology.save("elbow.yaml")
-    data = config(
-        tmp_path, controller={"type": "mlp", "hidden": 1, "messages": 0, "sensors": ["tilt"]}
-    )
-    (tmp_path / "swim.yaml").write_text(yaml.safe_dump(data))
-    assert evolve.main(["swim.yaml", "--out", "run"]) == 0
-    assert report.main(["run", "--out", "run.html"]) == 0
-    assert "Readings of each declared sensor" in (tmp_path / "run.html").read_text()
