@@ -48,16 +48,12 @@ def test_shipped_files_name_their_schema_and_fit_it(path, schemas):
     ("kind", "data"),
     [
         ("config", {"world": "lake"}),
-        ("config", {"world": "lake", "task": {"type": "fly"}}),
         ("config", {"world": "lake", "task": {"type": "speed", "duratoin": 3}}),
         ("world", {"density": "heavy"}),
-        ("world", {"drag": "tubes"}),
         ("world", {"waves": {"amplitude": "high"}}),
-        ("morphology", {"id": "x"}),
         ("morphology", {"body": {"type": "Core", "children": {0: {"orientation": 0}}}}),
         ("morphology", {"body": {"type": "Core", "params": {"mass": -1}}}),
         ("modules", {"modules": {"A": {"mount": "up", "parts": [{"size": [1, 1, 1], "mass": 1}]}}}),
-        ("modules", {"modules": {"A": {"mount": "-x", "parts": [{"mass": 1}]}}}),
         ("sweep", {"config": "x.yaml", "seeds": 0}),
     ],
 )
