@@ -4,8 +4,6 @@ No driver and no package is needed, only a Chromium or Chrome on the path. Each 
 that ends in a zero byte (`--remote-debugging-pipe`).
 """
 
-from __future__ import annotations
-
 import base64
 import fcntl
 import io
@@ -18,6 +16,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pytest
@@ -100,7 +99,7 @@ class Browser:
             self.send(f"{domain}.enable")
         self.resize(width, height)
 
-    def __enter__(self) -> Browser:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,7 +1,5 @@
 """Fixtures that several files share; whatever compiles is made once for the whole session."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import os

@@ -1,7 +1,5 @@
 """The study of tasks that need senses: what is compared, and what its table says."""
 
-from __future__ import annotations
-
 import csv
 
 import pytest

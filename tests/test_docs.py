@@ -1,7 +1,5 @@
 """The documentation as HTML: made without complaint, with a page for each module and each text."""
 
-from __future__ import annotations
-
 import ast
 import builtins
 import collections
@@ -44,8 +42,6 @@ def test_every_public_name_has_a_docstring(name):
         ):
             assert (value.__doc__ or "").strip(), key
 
-
-# ------------------------------------------------------------------ texts and the code
 
 PACKAGE = ROOT / "mjx_revolve"
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -324,9 +320,6 @@ def test_no_two_public_classes_have_one_name():
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes[node.name].append(str(path.relative_to(PACKAGE)))
     assert {name: files for name, files in homes.items() if len(files) > 1} == {}
-
-
-# ------------------------------------------------------------------ pages
 
 
 def run_script(name, *arguments):

@@ -1,7 +1,5 @@
 """The command line with the real robot: what a new user types, and what comes out."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 import subprocess

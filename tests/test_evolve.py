@@ -28,8 +28,6 @@ from toys import DroppedError, Quadratic, contents, dropping
 
 save_pictures = results.save_pictures
 
-# --- the command line ---
-
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
@@ -262,9 +260,6 @@ def test_a_full_disk_costs_one_generation(folder, capsys, monkeypatch):
     monkeypatch.setattr(runs, "write_atomic", write)
     assert run_main("--resume", "part") == 0
     assert contents(folder / "part") == contents(folder / "whole")
-
-
-# --- TensorBoard ---
 
 
 def events(folder):

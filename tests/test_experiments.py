@@ -45,9 +45,6 @@ def readings():
     }
 
 
-# ------------------------------------------------------------------ falling spider
-
-
 def test_the_closed_forms_height_and_time_are_inverse():
     form = closed_form("water", 9.81, SHARE)
     assert form.wet == pytest.approx(0.60648, abs=1e-4)
@@ -101,9 +98,6 @@ def test_on_the_simulators_clock_the_data_are_the_closed_form(readings):
     assert abs(water.drop_short - 0.25) > 10 * abs(water.drop - 0.25)
 
 
-# ------------------------------------------------------------------ options
-
-
 @pytest.mark.parametrize(
     ("main", "arguments", "message"),
     [
@@ -120,9 +114,6 @@ def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, caps
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
     assert message in captured.err
-
-
-# ------------------------------------------------------------------ benchmark
 
 
 def _result(name, rates, population=2048, peak=2.0**20):
@@ -170,9 +161,6 @@ def test_every_row_of_the_benchmark_can_be_made():
             assert (ROOT / "morphologies" / f"{row.robot}.yaml").is_file()
 
 
-# ------------------------------------------------------------------ optimisers
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", optimisers.OPTIMISERS)
 def test_each_library_maximises(name):
@@ -193,9 +181,6 @@ def test_a_step_along_the_gradient_never_lowers_the_score():
     assert step == pytest.approx(0.025) and after == hill(step) > hill(0.0)
     assert optimisers.line_search(lambda step: -step, 0.0) == (0.0, 0.0)
     assert optimisers.line_search(lambda step: float("nan"), 0.5) == (0.0, 0.5)
-
-
-# ---------------------------------------------------------------------- validation
 
 
 def test_the_quick_validation_passes_and_keeps_its_table(tmp_path, monkeypatch, capsys):
@@ -219,9 +204,6 @@ def test_a_case_outside_its_tolerance_fails_the_validation(tmp_path, monkeypatch
     assert "FAILS" in (tmp_path / "out" / "validation.csv").read_text(encoding="utf-8")
 
 
-# ------------------------------------------------------------------ sensitivity
-
-
 def test_the_tables_and_the_picture_of_sensitivity():
     swim = sensitivity.Swim(np.array([0.05, 0.07]), np.array([0.1, -0.3]))
     rows = sensitivity.table(
@@ -241,9 +223,6 @@ def test_the_tables_and_the_picture_of_sensitivity():
         assert numbers["draws"][1][f"{prefix}kept"] == pytest.approx(0.051 / 0.06)
 
 
-# ------------------------------------------------------------------ policy gradient
-
-
 def test_advantages_by_hand():
     """Two environments; the first one's episode is over after the second of three steps."""
     settings = policy_gradient.Settings(discount=0.5, trace=0.5)
@@ -257,9 +236,6 @@ def test_advantages_by_hand():
     # the later one's advantage.
     assert found[:, 1].tolist() == [0.5 + 0.25 * 3.0, 2.0 + 0.25 * 4.0, 4.0]
     assert found[:, 0].tolist() == [0.5 + 0.25 * 1.0, 1.0, 4.0]
-
-
-# ------------------------------------------------------------------ learning by gradients
 
 
 def test_a_gradient_is_no_longer_than_the_median_of_its_individuals():

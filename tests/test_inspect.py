@@ -1,7 +1,5 @@
 """The command line that shows a morphology, and its picture."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -127,9 +125,6 @@ def test_centres_of_mass_and_volume_are_shown(spider, capsys):
     assert (_value(out, "thrusters"), _value(out, "fins"), _value(out, "hinges")) == (0, 3, 3)
 
 
-# --- the picture --------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
     from matplotlib.image import imread
@@ -175,9 +170,6 @@ def test_what_is_nearer_hides_what_is_farther():
         assert np.isin(index[10:30, 10:30], (near, near + 1)).all()
     depth, _ = depth_buffer(low[:, ::-1], np.zeros(2), 0.1, (40, 40))
     assert not np.isfinite(depth).any()  # faces that look away are not drawn
-
-
-# --- refusals -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

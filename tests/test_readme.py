@@ -5,8 +5,6 @@ imports exists, every command is one of ours, and its configurations, robots and
 accepted. Slow: the README's programs run, one after the other, as somebody who types them would.
 """
 
-from __future__ import annotations
-
 import ast
 import builtins
 import importlib

@@ -1,7 +1,5 @@
 """The comparison with revolve2: the same brains and robots, and what its script reads and says."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

@@ -18,8 +18,6 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.outcomes import Outcome, by_case
 from toys import CLOCK, make_toy_bodies
 
-# ------------------------------------------------------------------ runs
-
 TINY = [
     f"--set={setting}"
     for setting in (
@@ -130,9 +128,6 @@ def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path, started, monk
     monkeypatch.undo()
 
 
-# ------------------------------------------------------------------ what is compared
-
-
 def test_environments_are_what_they_are_called():
     plans = {
         name: Plan(name, 3, ROOT, studies.BASE, case.settings).config
@@ -169,9 +164,6 @@ def test_budgets_are_equal(settings):
             configs["random_search"].task,
             "neutral",
         )
-
-
-# ------------------------------------------------------------------ reports
 
 
 def outcomes(values):

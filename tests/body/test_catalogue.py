@@ -1,7 +1,5 @@
 """The catalogue against the tabulated values; box geometry; users' own types; refusals."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -26,8 +24,6 @@ from mjx_revolve.body.catalogue import (
 )
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.inputs.errors import InputError
-
-# ------------------------------------------------------------------------- the catalogue
 
 # type, part, box [m], box volume [m³] as printed, mesh volume [m³], mass [kg]
 TABLE = [
@@ -94,9 +90,6 @@ def test_the_fin_is_a_plate_of_abs_with_lift():
     assert (p.cda * angle).mean() == pytest.approx((p.cla * angle * np.tan(angle)).mean(), rel=0.01)
 
 
-# ------------------------------------------------------------------- masses, volumes, centres
-
-
 def test_ballast_moves_the_centres_of_mass_and_volume():
     part = Part(
         "p",
@@ -124,9 +117,6 @@ def test_ballast_moves_the_centres_of_mass_and_volume():
 def test_what_weighs_or_displaces_nothing_has_its_centres_in_the_middle():
     part = Part("p", (Box((1, 1, 1)),), mass=0.0, volume=0.0)
     assert part.center_of_mass == part.displaced_center == (0.0, 0.0, 0.0)
-
-
-# ------------------------------------------------------------------------- box geometry
 
 
 def test_faces_of_a_single_box_are_its_faces():
@@ -193,8 +183,6 @@ def test_edge_against_edge_needs_the_cross_products():
         assert hit.tolist() == [expected]
 
 
-# ------------------------------------------------------------------------- refusals in code
-
 PART = Part("p", (Box((1, 1, 1)),), 1.0, 1.0)
 HINGE = Hinge((0, 1, 0), (0, 0, 0), (-1, 1), 1.0, 1.0)
 LINE = Thruster(curve="interpolated", commands=(-1, 0, 1), thrusts=(-1, 0, 2))
@@ -239,8 +227,6 @@ def test_wrong_values_are_refused(make, message):
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
-
-# ------------------------------------------------------------------------- users' own types
 
 FIN = """
 modules:

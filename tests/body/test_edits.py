@@ -1,7 +1,5 @@
 """Edits of bodies: what each one does and refuses, and random sequences of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -63,9 +61,6 @@ def in_order(item: dict) -> dict:
 
 def names(body: Morphology) -> list[str]:
     return [module.name for module in body.modules]
-
-
-# ------------------------------------------------------------------------- one edit at a time
 
 
 def test_a_module_is_added_at_its_place_in_the_order():
@@ -243,9 +238,6 @@ def test_overlaps_are_kept_where_they_are_allowed():
     more = add_module(body, "core", 3, "FixedBrick")
     assert more.overlaps == body.overlaps
     assert remove_module(more, "b_2").overlaps == ()
-
-
-# ------------------------------------------------------------------------- random sequences
 
 
 def random_edit(body: Morphology, draw: np.random.Generator) -> list[Morphology]:

@@ -1,7 +1,5 @@
 """Volumes of meshes against closed forms and trimesh; refusals; the shapes of the modules."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,9 +36,6 @@ def join(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
 def inverted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with its faces turned round."""
     return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
-
-
-# --- volume and centre --------------------------------------------------------------------------
 
 
 def test_whoever_is_asked_hears_of_a_file(tmp_path):
@@ -83,9 +78,6 @@ def test_volume_and_centre_agree_with_trimesh(mesh):
     assert mesh_volume(mesh) == pytest.approx(mesh.volume, rel=1e-10)
     assert mesh_volume(mesh) == pytest.approx(experiment.signed_volume(mesh), rel=1e-10)
     np.testing.assert_allclose(mesh_center_of_volume(mesh), mesh.center_mass, atol=1e-10)
-
-
-# --- refusals -----------------------------------------------------------------------------------
 
 
 def changed(function) -> tuple[np.ndarray, np.ndarray]:
@@ -165,9 +157,6 @@ def test_good_meshes_pass(mesh):
     check_mesh(mesh)
 
 
-# --- files --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "STL"])
 def test_files_in_millimetres_are_read(tmp_path, suffix):
     mesh = box((20.0, 30.0, 40.0), center=(1.0, 2.0, 3.0))
@@ -232,9 +221,6 @@ def test_a_large_file_is_refused(tmp_path):
         file.truncate(65 * 2**20)
     with pytest.raises(InputError, match="expected at most 64 MiB; found more"):
         load_mesh(tmp_path / "large.stl")
-
-
-# --- the shapes of the modules ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("kind", "part"), PARTS, ids=PART_NAMES)

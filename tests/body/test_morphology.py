@@ -1,7 +1,5 @@
 """Robots from files: rest pose, masses, round trips, wild and wrong files, descriptors."""
 
-from __future__ import annotations
-
 import math
 import pickle
 import random
@@ -52,8 +50,6 @@ def write(folder: Path, text: str, name: str = "robot.yaml") -> Path:
 def read(folder: Path, text: str, **options) -> Morphology:
     return load_morphology(write(folder, text), **options)
 
-
-# ------------------------------------------------------------------------- the spider
 
 # Read off Revolve's own SDF of the spider: metres along a leg from the core's centre.
 FIRST_FRAME, FIRST_AXIS, FIRST_SERVO, FIRST_PLATE = 0.0555, 0.06015, 0.071025, 0.082775
@@ -161,9 +157,6 @@ def test_hinge_neighbours_of_a_chain_and_of_none():
     assert len(snake.hinge_neighbours()) == 7  # eight in a row, the core's link in the middle
 
 
-# ------------------------------------------------------------------------- our robots, wild robots
-
-
 @pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
 def test_our_robots_load_save_and_have_colours_and_names(path, tmp_path):
     robot = load_morphology(path)
@@ -223,8 +216,6 @@ def test_wild_brains_are_kept():
     assert robot.brain["params"]["node1"]["period"] == 7.95243
     assert [m.type for m in robot.modules if m.kind.sensor] == ["TouchSensor"] * 2
 
-
-# ------------------------------------------------------------------- as found in the wild
 
 WILD = """---
 id: 7
@@ -303,9 +294,6 @@ body:
     # The brick looks along -y, so its +x is the core's -x.
     assert sensor.position == pytest.approx([-0.019 - 0.00205, -0.0635, 0])
     assert sensor.rotation[:, 0] == pytest.approx([-1, 0, 0])
-
-
-# ------------------------------------------------------------------------- params
 
 
 def test_overrides_change_a_module(tmp_path):
@@ -452,9 +440,6 @@ def test_a_dead_band_is_scaled_on_both_sides(tmp_path):
     assert [part.thruster.thrust_at(x) for x in (-1, 0.7, 1)] == [-2.0, 0.0, 4.0]
 
 
-# ------------------------------------------------------------------------- the AUV and the fish
-
-
 def test_the_auv_pushes_up_and_ahead_without_torque():
     robot = ours("auv")
     force, torque = np.zeros((4, 3)), np.zeros((4, 3))
@@ -519,9 +504,6 @@ def test_trim_neutral_refuses_what_floats(tmp_path):
         trim_neutral(robot, WATER)
     with pytest.raises(InputError, match="density: expected a number > 0"):
         trim_neutral(robot, 0.0)
-
-
-# ------------------------------------------------------------------------- round trips
 
 
 def check_round_trip(robot: Morphology, folder: Path, **options) -> None:
@@ -624,8 +606,6 @@ def test_equality_sees_every_field(tmp_path):
         assert robot != read(tmp_path, base.replace(old, new))
 
 
-# ------------------------------------------------------------------------- overlap
-
 # A brick on each side of the core's front, and from one of them a chain that turns back into it.
 RING = """
 body:
@@ -677,9 +657,6 @@ body:
     fifth = "id: fourth, children: {1: {type: FixedBrick, id: fifth}}"  # reaches into the core
     with pytest.raises(InputError, match="overlapping: Core0 and fifth"):
         read(tmp_path, text.replace("id: fourth", fifth))
-
-
-# ------------------------------------------------------------------------- descriptors
 
 
 def test_descriptors_of_the_spider(spider):
@@ -781,8 +758,6 @@ def test_every_descriptor_has_a_unit(spider):
     assert all(UNITS.values())
 
 
-# ------------------------------------------------------------------------- wrong files
-
 HINGE_ON = "body: {type: Core, children: {1: {type: ActiveHinge, %s}}}"
 JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
 
@@ -839,9 +814,6 @@ def test_wrong_files_are_refused(tmp_path, text, message):
     assert "\n" not in found
 
 
-# ------------------------------------------------------------------------- bodies in memory
-
-
 def test_a_mapping_is_refused_as_a_file_is():
     with pytest.raises(InputError, match=r"^mine: body: expected modules that do not overlap"):
         make_morphology(yaml.safe_load(RING), source="mine")
@@ -856,9 +828,6 @@ def test_a_body_shares_nothing_with_its_mapping():
     robot.to_mapping()["body"]["params"]["note"].append("c")
     robot.to_mapping()["brain"]["type"].append("c")
     assert robot.modules[0].params["note"] == ["a"] and robot.brain == {"type": ["b"]}
-
-
-# ------------------------------------------------------------------------- all parts at rest
 
 
 @pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)
@@ -953,9 +922,6 @@ def test_too_many_modules_are_refused(tmp_path):
     tree = {"body": {"type": "Core", "children": {1: bush(6)}}}  # 1 + (3⁷ - 1)/2 = 1094
     with pytest.raises(InputError, match=f"expected at most {MAX_MODULES} modules; found more"):
         read(tmp_path, yaml.safe_dump(tree))
-
-
-# ------------------------------------------------------------------------- other processes
 
 
 def test_a_body_is_sent_small_and_whole(tmp_path):

@@ -1,7 +1,5 @@
 """The robots of Revolve's and revolve2's standard library."""
 
-from __future__ import annotations
-
 import pytest
 
 from laboratory import body

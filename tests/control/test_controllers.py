@@ -1,7 +1,5 @@
 """Controllers from genes to targets, and the servos that follow them."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import jax
@@ -66,9 +64,6 @@ MAKERS = {
 }
 
 
-# ------------------------------------------------------------------------- genes
-
-
 @pytest.mark.parametrize("name", ["spider", "gecko", "snake", "centipede", "core"])
 def test_the_number_of_genes_follows_from_the_body(name):
     robot = robot_of(name)
@@ -76,9 +71,6 @@ def test_the_number_of_genes_follows_from_the_body(name):
     assert make_cpg(robot).num_genes == n + pairs
     assert make_sine(robot).num_genes == 3 * n + 1
     assert make_sine(robot, harmonics=3).num_genes == 7 * n + 1
-
-
-# ------------------------------------------------------------------------- descriptions
 
 
 def described(robot, genes, **settings):
@@ -146,9 +138,6 @@ def test_what_does_not_swing_has_no_gait():
     assert not any(described(robot_of("core"), np.zeros(0), type="cpg").values())
 
 
-# ------------------------------------------------------------------------- targets
-
-
 @pytest.mark.parametrize("kind", MAKERS)
 @pytest.mark.parametrize("amplitude", [1.0, 0.4])
 def test_targets_stay_within_the_range(kind, amplitude):
@@ -203,9 +192,6 @@ def test_sine_is_a_sine():
     expected = np.pi / 4 * (0.5 * np.sin(0.3) + wave)
     assert targets[120:, 0, 0] == pytest.approx(expected[120:], abs=1e-9)
     assert not targets[:, 1:].any()
-
-
-# ------------------------------------------------------------------------- servos
 
 
 def strokes(robot, lanes=32):

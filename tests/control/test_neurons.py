@@ -1,7 +1,5 @@
 """Revolve's neural networks from a robot's YAML: read, run by hand, evolved and saved."""
 
-from __future__ import annotations
-
 import re
 
 import jax

@@ -1,7 +1,5 @@
 """What is felt at modules: MuJoCo's own sensors at sites, for one body, in a batch, and in MJX."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -277,8 +275,6 @@ def test_sensors_on_modules_reach_the_observation(robot, spiders):
     assert 100 * np.asarray(told.joint[0])[row] == pytest.approx(wanted, abs=1e-4)
 
 
-# ------------------------------------------------------------------------- touch
-
 PADS = """
 id: padded
 body:
@@ -389,9 +385,6 @@ def test_the_beds_force_on_a_body_counts_what_rides_on_it():
         assert found[0, lane] == pytest.approx(alone[0, own], rel=1e-9)
         assert found[1 + rows[0], lane] == pytest.approx(alone[1, own], rel=1e-9)
     assert alone.min() > 1
-
-
-# ------------------------------------------------------------------------- files
 
 
 @pytest.mark.parametrize(

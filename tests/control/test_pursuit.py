@@ -1,7 +1,5 @@
 """Pursuers against closed forms: straight lines, circles and Bouguer's curve of pursuit."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

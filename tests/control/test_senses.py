@@ -1,7 +1,5 @@
 """What a robot feels: against MuJoCo's own sensors, for one body, for many, and in MJX."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

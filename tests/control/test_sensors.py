@@ -1,7 +1,5 @@
 """Declared sensors: noise, range, rate and delay by hand; and how they are read."""
 
-from __future__ import annotations
-
 import re
 
 import jax
@@ -141,9 +139,6 @@ def test_a_sensor_of_bodies_speaks_of_core_and_hinges():
     assert observer.joint_names == ("contact",) and observer.signals == ("touch",)
 
 
-# ------------------------------------------------------------------------- files
-
-
 SENSED = f"""
 {OAR}
 sensors:
@@ -186,8 +181,6 @@ def test_a_delay_of_too_many_samples():
     with pytest.raises(InputError, match=r"sensors.0.delay: expected at most 2.56 s at 100 Hz"):
         make_observer([Sensor(type="gyro", delay=4.0)], DT)
 
-
-# ------------------------------------------------------------------------- the documentation
 
 GUIDE = (ROOT / "docs" / "senses.md").read_text(encoding="utf-8")
 

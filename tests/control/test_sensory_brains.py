@@ -1,7 +1,5 @@
 """Brains that listen, and splines: what all of them promise, and each by hand."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import jax
@@ -68,9 +66,6 @@ def drawn(controller, lanes=1, seed=0, scale=1.0):
     return scale * np.random.default_rng(seed).normal(size=(controller.num_genes, lanes))
 
 
-# ------------------------------------------------------------------------- what all promise
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["auv", "spider"])
@@ -126,9 +121,6 @@ def test_what_a_controller_asks_to_feel():
     plant = plant_of(robot_of("spider"))
     assert make("mlp", plant).signals == ("touch",)
     assert make("rnn", plant, sensors=None).signals == ()
-
-
-# ------------------------------------------------------------------------- by hand
 
 
 def network(robot, seed, **settings):

@@ -3,8 +3,6 @@
 In float64: sums run in another order, so numbers agree to 1e-12 of the largest beside them.
 """
 
-from __future__ import annotations
-
 import pickle
 from functools import lru_cache
 

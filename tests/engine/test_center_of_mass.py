@@ -1,7 +1,5 @@
 """Where a robot is and how long: its centre of mass by MuJoCo's, the stretched body by hand."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import mujoco

@@ -1,7 +1,5 @@
 """The bed: a penalty law at corners. Robots land, stay on top, gain no energy, and grip."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -50,9 +48,6 @@ def above(robot, places, clear, seed=0, speed=0.1):
     qpos[:2] = np.array(places).T
     qpos[2] = bed_height(robot.world.bed, qpos[0], qpos[1]) + clear
     return qpos, qvel
-
-
-# ------------------------------------------------------------------------- the law
 
 
 def test_force_on_a_point():
@@ -129,9 +124,6 @@ def test_plane_below_a_body():
     height, normal = bed_plane(FLAT, (jnp.asarray(x), jnp.asarray(y)))
     assert np.all(np.asarray(height) == FLAT.height)
     assert np.all(np.asarray(normal[2]) == 1)
-
-
-# ------------------------------------------------------------------------- landing
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """The population step against MuJoCo C, against MJX's step, and against itself."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 
@@ -77,9 +75,6 @@ def mujoco_qacc(model, qpos, qvel, ctrl):
 def relative(found, expected):
     """Largest error of each lane over its largest acceleration."""
     return np.abs(found - expected).max(0) / np.abs(expected).max(0)
-
-
-# ------------------------------------------------------------------------- accelerations
 
 
 @pytest.mark.slow
@@ -228,9 +223,6 @@ body:
     assert relative(accelerate(robot, *states), expected).max() < 1e-10
 
 
-# ------------------------------------------------------------------------- trajectories
-
-
 @pytest.mark.parametrize("drag", ["off", pytest.param("inertia_box", marks=pytest.mark.slow)])
 def test_trajectory_is_mujocos(drag):
     """300 steps of `mj_step`, joints within their limits: Euler with implicit joint damping."""
@@ -314,9 +306,6 @@ def test_power_is_what_the_servos_deliver():
     assert worked.sum(0).min() > 0
 
 
-# ------------------------------------------------------------------------- lanes
-
-
 @pytest.mark.slow
 def test_lanes_do_not_know_of_each_other(elbow):
     """A lane's bits depend neither on where it stands nor on a neighbour that blew up."""
@@ -356,9 +345,6 @@ def test_the_water_may_differ_between_lanes():
     assert qacc[2] == pytest.approx([sunk, -9.81, sunk])
     drag = 0.5 * 999.1026 * 1.05 * 0.089 * 0.045 * 0.3**2 / 0.09
     assert qacc[0] == pytest.approx([0.0, 0.0, drag])
-
-
-# ------------------------------------------------------------------------- symmetries, convergence
 
 
 def test_momentum_of_a_jointed_body_in_a_vacuum(arm):
@@ -433,9 +419,6 @@ def test_convergence_in_the_time_step():
 def test_convergence_of_a_jointed_body():
     """From half a millisecond on: when a servo's torque leaves its limit is known to a step."""
     check_order(elbow_robot, (0.0005, 0.00025, 0.000125))
-
-
-# ------------------------------------------------------------------------- what it refuses
 
 
 @pytest.mark.slow

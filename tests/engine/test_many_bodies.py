@@ -4,8 +4,6 @@ Tolerances: accelerations agree to 1e-9 relative in float64 (sums run in another
 and inertias span four decades), scores over 200 float32 steps to 1e-5.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 
@@ -242,9 +240,6 @@ def test_a_trajectory_is_that_of_the_body_alone():
             assert q[:, : len(q0)] == pytest.approx(q1, abs=1e-7)
             assert v[:, : len(v0)] == pytest.approx(v1, abs=1e-5)
             assert work == pytest.approx(work1, abs=1e-8)
-
-
-# ------------------------------------------------------------------------- scores
 
 
 @pytest.fixture(scope="module")
@@ -511,9 +506,6 @@ def test_what_it_cannot_do_is_refused_by_name(config, fitness):
         with pytest.raises(InputError) as error:
             make()
         assert message in str(error.value)
-
-
-# ------------------------------------------------------------------------- what is constant
 
 
 def test_constants_follow_from_the_types_of_modules_not_from_examples():

@@ -1,7 +1,5 @@
 """MJX's own contacts: MuJoCo's solver on top of our step, with the carried water in its matrix."""
 
-from __future__ import annotations
-
 import copy
 
 import mujoco
@@ -58,9 +56,6 @@ def clearance(robot, qpos):
         corner = corner + np.einsum("nij,nj->ni", turn, robot.contact_position)
         found.append(np.min(corner[:, 2] - bed_height(robot.world.bed, *corner[:, :2].T)))
     return np.array(found)
-
-
-# ------------------------------------------------------------------------- the setting
 
 
 def test_the_setting():
@@ -126,9 +121,6 @@ def test_modules_meet_the_bed_only():
     assert (plain.opt.cone, plain.nnumeric) == (mujoco.mjtCone.mjCONE_PYRAMIDAL, 0)
 
 
-# ------------------------------------------------------------------------- resting and sliding
-
-
 @pytest.fixture(scope="module")
 def slid():
     """The box set down, pushed along x, pushed along y, and set down above the water."""
@@ -183,9 +175,6 @@ def test_without_water_it_is_mujocos_step():
             assert v[k, :, lane] == pytest.approx(data.qvel, abs=1e-4)
 
 
-# ------------------------------------------------------------------------- with all of the water
-
-
 @pytest.fixture(scope="module")
 def wet():
     """The box with drag and everything: thrown about, and set down in currents."""
@@ -227,9 +216,6 @@ def test_a_current_moves_it_where_friction_gives_way(wet):
     assert np.abs(v[-1, :, 5:7]).max() < 1e-3
     assert q[-1, 0, 7] > 0.5
     assert 0.1 < v[-1, 0, 7] < 1.0
-
-
-# ------------------------------------------------------------------------- slow ones
 
 
 @pytest.mark.slow

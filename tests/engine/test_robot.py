@@ -1,7 +1,5 @@
 """The compiled robot: Revolve's geometry, masses, limits; tables that add up; MJCF that reloads."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 
@@ -40,9 +38,6 @@ def forward(robot):
     data = mujoco.MjData(robot.mj_model)
     mujoco.mj_forward(robot.mj_model, data)
     return data
-
-
-# ------------------------------------------------------------------------- the spider
 
 
 def test_spider_has_nine_bodies_fourteen_degrees_of_freedom(spider):
@@ -134,9 +129,6 @@ def test_every_hinge_is_revolves(name):
     assert [model.actuator(k).name for k in range(model.nu)] == hinges
 
 
-# ------------------------------------------------------------------------- every robot
-
-
 @pytest.mark.parametrize("path", OURS + WILD, ids=lambda p: f"{p.parent.name}-{p.stem}")
 def test_every_morphology_builds(path):
     morphology = load_morphology(path, allow_overlap=True)
@@ -195,9 +187,6 @@ body:
     assert chain.exposed[last][[0, 2]] == pytest.approx(1.0, abs=0.1)
     brick = robot.fluid.added_mass.sum(), chain.added_mass[last]
     assert brick[1][1] < brick[1][0]
-
-
-# ------------------------------------------------------------------------- options and files
 
 
 @pytest.mark.parametrize("name", ["spider", "gecko"])
@@ -265,9 +254,6 @@ def test_the_longest_step_of_mujocos_laws_does_not_depend_on_ours(coefficient):
     ):
         check_timestep(plate)
     check_timestep(box_robot((0.1, 0.1, 0.002), 0.02, tank, drag_coefficient=coefficient))
-
-
-# ------------------------------------------------------------------------- edited models
 
 
 @pytest.mark.parametrize("kind", ["spec", "model"])

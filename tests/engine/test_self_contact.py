@@ -1,7 +1,5 @@
 """Self-contact: depth, momentum, energy, mirrors, batches, MuJoCo's contacts, random bodies."""
 
-from __future__ import annotations
-
 import re
 from functools import lru_cache
 

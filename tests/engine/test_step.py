@@ -1,7 +1,5 @@
 """Whole steps with all laws at work: conserved, carried along, righted, differentiable."""
 
-from __future__ import annotations
-
 from functools import lru_cache, partial
 
 import jax
@@ -48,9 +46,6 @@ def quick_compiles():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         yield
-
-
-# ------------------------------------------------------------------------- conservation
 
 
 def impulse(lagrangian, qpos, qvel):
@@ -107,9 +102,6 @@ def test_servos_give_no_more_energy_than_they_deliver():
         energy = [lagrangian.energy(*s) for s in zip(row.T, rate.T, strict=True)]
         # End stops and friction take some; the step errs by a few per cent.
         assert np.all(energy < 1.02 * (start + done))
-
-
-# ------------------------------------------------------------------------- water that moves
 
 
 def gusty(tank, seed, seconds):
@@ -249,9 +241,6 @@ def test_a_floating_box_goes_with_a_long_wave():
     assert np.ptp(q[:, 2, 0]) > 1.9 * amplitude
 
 
-# ------------------------------------------------------------------------- parts
-
-
 def test_entrained_water_is_mass_without_weight():
     """A box flooded to 70 % moves as one that is heavier by that water, spread evenly over it."""
     size, mass, volume, share = (0.2, 0.1, 0.06), 0.4, 3e-4, 0.7
@@ -370,9 +359,6 @@ def test_ballast_in_the_keel_rights_a_body():
         angle = 2 * np.arcsin(q[:, 4 + axis, 0])
         assert omega * 3.0 / (2 * np.pi) > 0.5
         assert angle == pytest.approx(0.02 * np.cos(omega * time), abs=0.02 * 0.04)
-
-
-# ------------------------------------------------------------------------- gradients
 
 
 def check_slope(robot, *cases, kinks=(), compiled=QUICK):

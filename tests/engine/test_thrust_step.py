@@ -1,7 +1,5 @@
 """Thrusters and fins in whole steps: steady speed, lag, torque, MuJoCo's actuators, the fish."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -43,9 +41,6 @@ def quick_compiles():
 def driven(tank, **thruster):
     """A neutral cube with a thruster in its centre."""
     return box_robot(CUBE, NEUTRAL, tank, thruster=Thruster(**thruster))
-
-
-# ------------------------------------------------------------------------- one thruster
 
 
 def test_speed_under_thrust():
@@ -106,9 +101,6 @@ def test_out_of_the_water_there_is_nothing_to_push():
     assert qacc[3] == pytest.approx(-0.02 * 0.5 * share / (NEUTRAL * 0.1**2 / 6), rel=1e-6)
 
 
-# ------------------------------------------------------------------------- MuJoCo's actuators
-
-
 def linear(morphology):
     """The robot with thrusters as stock MuJoCo can have them: linear in the command."""
     modules = []
@@ -148,9 +140,6 @@ def test_a_linear_thruster_is_mujocos_filtered_actuator():
             assert data.qpos == pytest.approx(q[k, :, lane], abs=1e-9)
         assert data.qvel == pytest.approx(v[-1, :, lane], abs=1e-9)
         assert np.clip(ctrl[:, lane], -1, 1) * (1 - np.exp(-10)) == pytest.approx(data.act)
-
-
-# ------------------------------------------------------------------------- auv and fish
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """The fitness function: pure, batched, safe from one individual's failure. Known answers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Measures of episodes: tracks made by hand, for one robot and for several with fewer hinges."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -56,9 +54,6 @@ def swing(frequency, lags=(0.0, 0.7, 1.4), sizes=(0.4, 0.4, 0.4), time=TIME):
     return np.stack(waves, 1)
 
 
-# ------------------------------------------------------------------ the table
-
-
 @pytest.mark.slow
 def test_every_measure_is_made_and_in_the_tables_order():
     given = still(
@@ -90,9 +85,6 @@ def test_speed_through_the_water_leaves_drift_out():
     drift = np.outer(np.sin(TIME), [0.2, 0, 0])
     found = read(track(drift, water_velocity=gust), "water_speed_m_s")
     assert found["water_speed_m_s"] < 1e-3
-
-
-# ------------------------------------------------------------------ ways
 
 
 def test_there_and_back_again():
@@ -162,9 +154,6 @@ def test_a_jump():
     assert found["bed_force_n"] == pytest.approx((59 * 0.5 + 5) / 90)
 
 
-# ------------------------------------------------------------------ gaits
-
-
 @pytest.mark.parametrize("frequency", [0.5, 3.9])
 def test_a_wave_along_the_joints(frequency):
     found = read(still(angle=swing(frequency)), *GAIT)
@@ -228,9 +217,6 @@ def test_measures_leave_the_scores_gradient_whole():
     slopes = jax.grad(loss, (0, 1, 2))(given.angle, given.quat, given.bed_force)
     assert np.all(np.asarray(slopes[0]) == 1)
     assert all(np.all(np.isfinite(x)) for x in slopes)
-
-
-# ------------------------------------------------------------------ configurations
 
 
 def test_names_are_read_written_and_checked(tmp_path):

@@ -1,7 +1,5 @@
 """`simulate`: what it takes, what it refuses, what it returns, and the gradient through it."""
 
-from __future__ import annotations
-
 import math
 
 import jax
@@ -48,9 +46,6 @@ def still(elbow):
     return simulate(elbow, None, SPAN)
 
 
-# ------------------------------------------------------------------------- surfaces
-
-
 @pytest.mark.slow
 def test_depths_are_below_the_surface_of_the_water_that_is_given():
     """What is sensed, floats and is told of depth moves with the surface, all of it alike.
@@ -84,9 +79,6 @@ def test_a_start_without_direction_is_refused(elbow):
         simulate(elbow, None, SPAN, qpos=qpos)
 
 
-# ------------------------------------------------------------------------- what comes back
-
-
 @pytest.mark.slow
 def test_shapes_and_time(elbow, still):
     assert isinstance(still, Trajectory)
@@ -113,9 +105,6 @@ def test_body_poses_of_real_bodies(name):
         data.qpos[:] = row
         mujoco.mj_kinematics(robot.mj_model, data)
         assert places == pytest.approx(data.xpos, abs=1e-5)
-
-
-# ------------------------------------------------------------------------- what goes in
 
 
 def test_all_forms_of_joint_targets(elbow, still):
@@ -234,9 +223,6 @@ def test_simulate_is_the_population_step_with_one_lane(elbow):
     assert trajectory.power == pytest.approx(work[:, 0] / DT, abs=1e-3)
 
 
-# ------------------------------------------------------------------------- wrong inputs
-
-
 WRONG = [
     ({"ctrl": [0.1]}, "ctrl: expected [2] or [T, 2]; found [1]"),
     ({"ctrl": [0.1, math.nan]}, "ctrl: expected finite numbers; found NaN or infinity"),
@@ -262,9 +248,6 @@ def test_wrong_genes(elbow):
         simulate(elbow, bind_genes(controller, np.zeros(4)), SPAN)
     with pytest.raises(InputError, match=r"^genes: expected shape \[-1\]; found \[3, 1\]$"):
         simulate(elbow, bind_genes(controller, np.zeros((3, 1))), SPAN)
-
-
-# ------------------------------------------------------------------------- transformations
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Tasks that need senses: scores of known tracks, and the same pursuer wherever it swims."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -107,8 +105,6 @@ def test_scores_have_a_gradient_where_nothing_is_left(name):
 
         assert np.isfinite(jax.grad(score)(given.position)).all()
 
-
-# ------------------------------------------------------------------ whole episodes
 
 CHASED = {
     "task.duration": 2.0, "task.settle": 0.2, "task.trials": 2, "task.target_distance": 0.4,

@@ -1,7 +1,5 @@
 """Tasks own their starts, unit, and what they have recorded; one body and many see the same."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -119,9 +117,6 @@ def test_units_are_those_of_the_first_lines():
         assert score_unit(name) == task.unit
 
 
-# ---------------------------------------------------------------------------- how episodes start
-
-
 def lopsided():
     """A core with a brick on one side: its centre of mass is off, and its buoyancy elsewhere."""
     return add_module(body("core"), 0, 1, "FixedBrick")
@@ -203,9 +198,6 @@ def test_what_starts_on_the_bed_starts_level(settings):
     config["task"] = config["task"] | {"start_attitude": "righted"}
     with pytest.raises(InputError, match=r"start_attitude: expected level, as .* starts on"):
         make_fitness(config)
-
-
-# ------------------------------------------------------------------------- targets
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Gymnasium's vector environment: rewards add up to scores, episodes follow from seeds."""
 
-from __future__ import annotations
-
 import sys
 
 import jax
@@ -88,9 +86,6 @@ def replay(fitness, actions, every, seed, episode=0):
     ), key
 
 
-# ------------------------------------------------------------------ the interface
-
-
 @pytest.mark.slow
 def test_spaces_and_what_comes_out_are_as_gymnasium_has_them(env, episode):
     assert isinstance(env, gymnasium.vector.VectorEnv)
@@ -115,9 +110,6 @@ def test_spaces_and_what_comes_out_are_as_gymnasium_has_them(env, episode):
     env.reset(seed=0)
     with pytest.raises(InputError, match=r"actions: expected \[5, 1\]; found \[5\]"):
         env.step(np.zeros(5))
-
-
-# ------------------------------------------------------------------ rewards
 
 
 @pytest.mark.slow
@@ -216,9 +208,6 @@ def test_rewards_add_up_whatever_the_task_and_the_water(config, task):
             assert total[i] == pytest.approx(score, rel=2e-3, abs=1e-4)
 
 
-# ------------------------------------------------------------------ episodes
-
-
 @pytest.mark.slow
 def test_a_seed_says_everything(env, episode):
     again = run(env, strokes(STEPS + 3), seed=3)
@@ -292,9 +281,6 @@ def test_episodes_can_begin_anew_within_the_step(config, episode):
     assert np.array_equal(last["final_info"]["score"], episode[4][STEPS]["score"])
     assert np.array_equal(seen[STEPS], episode[0][STEPS + 1]) and over[STEPS].all()
     assert not over[STEPS + 1].any()
-
-
-# ------------------------------------------------------------------ what is refused
 
 
 def test_what_is_wrong_gets_one_message(config, monkeypatch):

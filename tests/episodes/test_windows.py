@@ -1,7 +1,5 @@
 """Slopes by genes through sensors, networks, servos and water, whole episodes and windows."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -165,8 +165,6 @@ def test_rows_of_a_table():
     ]  # fmt: skip
 
 
-# ------------------------------------------------------------------ ribs
-
 NO_RIBS = "ribs is not installed (pip install 'ribs>=0.12,<0.13')"
 
 

@@ -3,8 +3,6 @@
 The tests share them, in the order in which they stand here.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

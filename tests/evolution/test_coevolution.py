@@ -66,9 +66,6 @@ def main(*argv):
     return run_command(lambda argv: command.main(argv, make_toy_bodies), [str(a) for a in argv])
 
 
-# --- learning ---
-
-
 def founders(config, executor):
     evolution = BodyEvolution(config, executor)
     return evolution.ask(evolution.start()).offspring
@@ -147,8 +144,6 @@ def test_those_that_fail_have_no_score(folder):
     assert any(row["failed"] for row in rows)
     assert all(individual.body.num_hinges >= 3 for individual in search.elites)
 
-
-# --- generations ---
 
 SCHEMES = [
     {"type": "plus"},
@@ -261,8 +256,6 @@ def test_wrong_settings(folder, bodies, message):
         BodyEvolution(*start(folder, bodies))
 
 
-# --- the archive ---
-
 ARCHIVE = {
     "selection": {"type": "map_elites", "offspring": 8},
     "archive": {"axes": {"num_hinges": {"low": 0.5, "high": 4.5, "cells": 4},
@@ -281,9 +274,6 @@ def test_map_elites_keeps_the_best_of_each_kind(folder):
         assert {i.number for i in search.living} == {i.number for i in best.values()}
         assert row["coverage"] == pytest.approx(len(best) / 28)
     assert len(best) > 12
-
-
-# --- run folders ---
 
 
 def contents(folder):

@@ -1,7 +1,5 @@
 """Workers: the same bits whatever their number, and whatever happens to them."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -89,9 +87,6 @@ def is_alive(pid):
 
 def run_main(*argv, make_fitness=toys.make_toy):
     return run_command(lambda argv: command.main(argv, make_fitness), [str(a) for a in argv])
-
-
-# --- blocks ---
 
 
 @pytest.mark.parametrize("size", [1, 4, 11])
@@ -198,9 +193,6 @@ def test_functions_without_a_name_cannot_have_workers(tmp_path):
         make_executor(toy_config(tmp_path), 2, lambda config: toys.Toy())
 
 
-# --- jobs ---
-
-
 def test_a_job_takes_all_files_along(tmp_path):
     """So that workers elsewhere, and those that replace others, see what the run began with."""
     (tmp_path / "sea.yaml").write_text("current_field: river.csv\n")
@@ -268,9 +260,6 @@ def test_one_compiles_and_the_others_wait(cache):
         thread.join(20)
     assert entered == ["first", "first is done", "other", "other"]
     assert not together.broken
-
-
-# --- trouble ---
 
 
 @pytest.fixture(scope="module")
@@ -509,8 +498,6 @@ def test_an_accelerator_takes_the_whole_population(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="--workers: expected JAX to run on the CPU"):
         make_executor(toy_config(tmp_path), 2, toys.make_toy)
 
-
-# --- a real robot ---
 
 ROBOT = """
 id: knee

@@ -1,7 +1,5 @@
 """Faults of machine and disk, done to runs for real: what each costs, and what is said."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -71,9 +71,6 @@ def timeless(row):
     return {name: value for name, value in row.items() if name not in CLOCK}
 
 
-# --- scores to losses ---
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_failures_lose_by_the_spread_of_the_others(bad):
     losses = losses_from_scores(np.array([1.0, bad, -2.0, bad]))
@@ -99,9 +96,6 @@ def test_ties_are_broken_by_almost_nothing_even_for_xla(value):
     ranks = jax.jit(lambda x: jax.scipy.stats.rankdata(x))(losses)
     assert np.asarray(ranks).tolist() == list(range(1, 65))
     assert abs(losses[-1] - losses[0]) <= 64 * max(np.spacing(np.float32(abs(value))), 1e-30)
-
-
-# --- strategies ---
 
 
 QUICK = ("CMA_ES", "OpenES", "SNES", "PGPE")
@@ -165,9 +159,6 @@ def test_strategy_params_arrive():
     assert float(strategy.params.std_init) == 0.5
     de = make_strategy(settings(strategy="DE", strategy_params={"elitism": False}), 5)
     assert de.params.elitism is False
-
-
-# --- the loop ---
 
 
 def test_same_seed_same_bits():

@@ -1,7 +1,5 @@
 """Signals sent to real processes: what was finished is saved, and no run is begun by accident."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

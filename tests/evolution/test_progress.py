@@ -8,8 +8,6 @@ import pytest
 
 from mjx_revolve.evolution import progress
 
-# --- what it says while it goes on ---
-
 
 class Terminal(io.StringIO):
     """A terminal; `drawn` is what stood on it, one after the other."""

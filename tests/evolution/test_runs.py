@@ -57,9 +57,6 @@ def save(run, generation, keep=3):
     return run.save_checkpoint(generation, ARRAYS, {"note": "x"}, keep)
 
 
-# --- the folder ---
-
-
 @pytest.mark.parametrize("elsewhere", [False, True], ids=["beside", "elsewhere"])
 def test_a_run_folder_is_whole(tmp_path, monkeypatch, elsewhere):
     """All that a configuration names is copied; the folder moves, and the originals may go."""
@@ -223,9 +220,6 @@ def test_info_is_json(run):
         _ = run.info
 
 
-# --- files ---
-
-
 def test_a_failed_write_leaves_the_old_file(run):
     path = run.write("note.txt", b"old")
 
@@ -238,9 +232,6 @@ def test_a_failed_write_leaves_the_old_file(run):
     assert caught.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert not list(run.path.glob(".*note.txt"))
-
-
-# --- metrics ---
 
 
 def test_metrics_are_rfc_4180_at_any_time(run):
@@ -269,9 +260,6 @@ def test_broken_metrics(tmp_path, text):
     (tmp_path / "metrics.csv").write_text(text)
     with pytest.raises(InputError, match=r"metrics.csv: expected a number in every cell"):
         runs.RunFolder(tmp_path).load_metrics()
-
-
-# --- checkpoints ---
 
 
 def test_checkpoint_keeps_every_bit_and_dtype(run):
@@ -401,9 +389,6 @@ def test_a_run_writes_no_files_elsewhere_and_waits_for_none(run, tmp_path, name,
         runs.open_run_folder(run.path)
 
 
-# --- champion ---
-
-
 def test_champion_genes_come_back_bit_for_bit(run):
     genes = np.random.default_rng(0).normal(size=30).astype(np.float32)
     run.save_champion(genes, score=0.25, origin="test")
@@ -418,9 +403,6 @@ def test_champion_genes_come_back_bit_for_bit(run):
         (run.path / "champion" / "genes.yaml").write_text(f"genes: [0.5, {huge}]")
         with pytest.raises(InputError, match=r"list of finite numbers; found .{1,60} at 1$"):
             load_genes(run.path)
-
-
-# --- the compilation cache ---
 
 
 def test_half_written_cache_entries_are_removed_once(tmp_path):
@@ -457,9 +439,6 @@ def test_a_damaged_cache_entry_costs_only_time(tmp_path):
         for name, value in before.items():
             jax.config.update(name, value)
         compilation_cache.reset_cache()
-
-
-# --- pictures ---
 
 
 def swim(depth, steps=200):

@@ -49,8 +49,6 @@ def test_schemes_are_those_that_a_configuration_may_name():
     assert tuple(SCHEMES) == get_args(bodies_config.Scheme)
 
 
-# --- order
-
 # Speed and thrift. A, B and C trade one for the other; D is worse than B in both, E equals B in
 # thrift and is slower, F is worse than D, and G has failed.
 A, B, C, D, E, F, G = (0, 9), (4, 5), (8, 0), (3, 4), (2, 5), (3, 3), (7, NAN)
@@ -121,9 +119,6 @@ def test_order_does_not_depend_on_where_individuals_stand(objectives):
     for _ in range(5):
         shuffled = rng.permutation(40)
         assert (ids[shuffled][best_first(values[shuffled], ids[shuffled])] == expected).all()
-
-
-# --- survivors
 
 
 def test_plus_keeps_the_best_of_all():
@@ -204,9 +199,6 @@ def test_the_old_go_however_good_they_are():
     assert survivors("plus", youngest, 3, generation=50, max_age=2) == [1, 2]
 
 
-# --- parents
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_parents_are_two_and_drawn_by_the_generator_alone(scheme):
     found = candidates([5, 1, NAN, 7, 2])
@@ -243,9 +235,6 @@ def test_parents_are_drawn_uniformly_without_tournaments(scheme):
         assert np.bincount(column, minlength=4) / 20_000 == pytest.approx([0.25] * 4, abs=0.015)
 
 
-# --- settings
-
-
 def test_too_few_children_are_refused():
     check_selection(SelectionConfig(type="comma"), 8)
     check_selection(SelectionConfig(type="generational", elites=2, offspring=6), 8)
@@ -256,9 +245,6 @@ def test_too_few_children_are_refused():
         check_selection(SelectionConfig(type="generational", elites=2, offspring=5), 8)
     with pytest.raises(InputError, match=r"elites: expected less than .*\(8\); found 8$"):
         check_selection(SelectionConfig(type="generational", elites=8), 8)
-
-
-# --- novelty
 
 
 def test_novelty_is_the_mean_distance_to_the_nearest():

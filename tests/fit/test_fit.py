@@ -240,9 +240,6 @@ def test_a_plan_knows_more_with_each_motion(auv):
     assert not plan.unknown
 
 
-# --- coefficients in files ------------------------------------------------------------------------
-
-
 def test_morphologies_and_configurations_name_what_was_fitted(fitted, tmp_path):
     (tmp_path / "water.yaml").write_text(fitted.to_yaml())
     tree = {"id": "core", "type": "Core", "children": {1: {"id": "leg", "type": "ActiveHinge"}}}
@@ -275,9 +272,6 @@ def test_factors_of_one_coefficient_and_of_one_module():
     assert found.mass == pytest.approx(1.1 * robot.morphology.mass)
     with pytest.raises(InputError, match=r"water.yaml: modules.left_hip: expected `all` or a type"):
         correct_types(MODULES, {"left_hip": {}}, "water.yaml")
-
-
-# --- recordings -----------------------------------------------------------------------------------
 
 
 def write_csv(path, columns):
@@ -427,9 +421,6 @@ def test_prescribed_hinges_follow_what_was_measured():
     assert course_targets(course, 0.01).shape == (18,)
 
 
-# --- runs -----------------------------------------------------------------------------------------
-
-
 class Stop(Interrupts):
     """A signal that comes after so many looks."""
 
@@ -475,9 +466,6 @@ def test_a_fit_that_was_stopped_goes_on_bit_for_bit(signals, tmp_path):
     assert json.loads((tmp_path / "whole" / "fit.json").read_text())["values"][0]["found"]
     corrected = load_morphology(tmp_path / "whole" / "robot.yaml")
     assert dict(corrected.modules[0].kind.parts[0].factors)["drag"] == found.values[0].value
-
-
-# --- measured -------------------------------------------------------------------------------------
 
 
 @pytest.mark.long

@@ -1,7 +1,5 @@
 """A controller as Python, C99 and a ROS 2 node: the same commands as ours over an episode."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess
@@ -427,9 +425,6 @@ def test_names_cannot_leave_their_comment(tmp_path):
     compile(make_brain_node(brain, "brain"), "node.py", "exec")
     if shutil.which("cc"):
         run_c(tmp_path, brain, given)
-
-
-# --------------------------------------------------------------------- ROS 2, as far as it is used
 
 
 class _Node:

@@ -1,7 +1,5 @@
 """The command that writes robots and rollouts for other programs."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 

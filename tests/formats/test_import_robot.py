@@ -1,7 +1,5 @@
 """Robots from URDF and MJCF: what is taken over agrees with MuJoCo, what is not is named."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

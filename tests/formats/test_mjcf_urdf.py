@@ -1,7 +1,5 @@
 """Links and their names; MJCF and URDF as MuJoCo and yourdfpy read them."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import mujoco
@@ -60,9 +58,6 @@ def test_angles_turn_as_the_matrix_does(pitch):
     rotation = turn(2, -0.7) @ turn(1, pitch) @ turn(0, 2.1)
     roll, back, yaw = roll_pitch_yaw(rotation)
     np.testing.assert_allclose(turn(2, yaw) @ turn(1, back) @ turn(0, roll), rotation, atol=1e-9)
-
-
-# --- MJCF ---
 
 
 def load_mjcf(robot):
@@ -173,9 +168,6 @@ def test_mjcf_says_what_it_lacks():
     assert "fins" in note and "a surface" in note and "bed" in note
     waves = load_world("lake", waves=[{"amplitude": 0.05, "wavelength": 4.0}])
     assert "the world's waves" in make_mjcf(build_robot(body("core"), waves))
-
-
-# --- URDF ---
 
 
 def test_urdf_is_the_same_robot_to_mujoco(robot):

@@ -1,7 +1,5 @@
 """ROS 2 bags that rosbags wrote, as mcap-ros2-support reads them."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from types import SimpleNamespace

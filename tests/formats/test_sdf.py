@@ -1,7 +1,5 @@
 """SDF: its poses, masses and water, by a reader of our own and by Gazebo's in Drake."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import numpy as np

@@ -1,7 +1,5 @@
 """CPPN: bodies that a network describes, worked by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What all genotypes promise: bodies that are valid, within bounds, and that files give back."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import fields, replace
@@ -85,9 +83,6 @@ def distance(a, b):
     """At how many places two bodies differ."""
     one, other = places(a), places(b)
     return sum(one.get(path) != other.get(path) for path in one.keys() | other.keys())
-
-
-# ------------------------------------------------------------------------- properties
 
 
 @pytest.mark.slow
@@ -204,9 +199,6 @@ def test_modules_that_stay_in_their_place_keep_their_names(families, name):
     assert kept > 500 and lost < 0.02 * kept
 
 
-# ------------------------------------------------------------------------- bounds
-
-
 @kinds
 def test_bounds_that_nothing_keeps_are_said(name):
     space = replace(SPACES["bricks and hinges"], accepts=lambda body: False)
@@ -312,9 +304,6 @@ def test_users_own_types_grow_too(tmp_path, name):
     assert askew > 5
 
 
-# ------------------------------------------------------------------------- robots that there are
-
-
 def adopters():
     return [name for name in GENOTYPES if make(name, SPACES["tight"]).adopt is not None]
 
@@ -350,9 +339,6 @@ def test_any_robot_can_be_adopted(name, path):
     assert wide().refuses(child) is None and child.name == body.name
 
 
-# ------------------------------------------------------------------------- names and settings
-
-
 @kinds
 def test_settings_are_checked(name):
     with pytest.raises(InputError, match=r"test.yaml: bodies.params.colour: expected one of"):
@@ -379,8 +365,6 @@ def test_genomes_of_another_space_are_refused(families, name):
     if rebuilt is not None:  # it grows less where there is less room
         assert narrow.develop(rebuilt).num_hinges <= 3
 
-
-# ------------------------------------------------------------------------- users' own
 
 PAGE = (ROOT / "docs" / "evolution.md").read_text(encoding="utf-8")
 PAGE = PAGE.split("\n## Genotypes\n")[1].split("\n## Selection\n")[0]

@@ -1,7 +1,5 @@
 """Networks: worked by hand, how they vary, and what JSON gives back."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Plasticoding: the L-system worked by hand, step by step."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -27,8 +25,6 @@ LETTERS = make_alphabet(SPACE)
 def draw(sentence, space=SPACE, seed=None):
     return draw_sentence(sentence.split(), make_alphabet(space), space, seed=seed)
 
-
-# ------------------------------------------------------------------------- early development
 
 RULES = {
     "C": ("C", "addf", "AJ1", "moveb"),
@@ -63,9 +59,6 @@ def test_it_is_drawn_step_by_step():
     body = genotype.develop(Grammar("hand", rules))
     assert tree(body) == expected and body.name == "hand"
     assert [m.name for m in body.modules] == ["core", "ActiveHinge-1", "TouchSensor-3"]
-
-
-# ------------------------------------------------------------------------- late development
 
 
 def test_modules_are_mounted_and_moved_on_to():
@@ -131,9 +124,6 @@ def test_what_overlaps_or_exceeds_is_left_out():
     ]  # fmt: skip
 
 
-# ------------------------------------------------------------------------- the alphabet
-
-
 def test_letters_are_revolves_where_it_has_them(tmp_path):
     assert [*LETTERS] == ["B", "BV", "AJ1", "AJ2", "ST", "F", "FV", "T", "LT", "LTV"]
     assert [*make_alphabet(SPACE, upright=False)] == ["B", "AJ1", "AJ2", "ST", "F", "T", "LT"]
@@ -159,9 +149,6 @@ modules:
     # Sides that it does not have are no slots; the others come when its front is taken.
     body = draw("C addf Tee addl Tee addf Tee moveb addl Tee moveb addr Tee", space)
     assert [path for path, *_ in tree(body)] == [(1,), (1, 1), (1, 5), (1, 7)]
-
-
-# ------------------------------------------------------------------------- genomes
 
 
 def test_random_rules_are_groups_of_three():

@@ -1,7 +1,5 @@
 """The direct tree: each mutation by itself, and the mirror image of a limb."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

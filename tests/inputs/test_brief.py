@@ -1,7 +1,5 @@
 """What is printed of values in a notebook: a line, not all their numbers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -3,8 +3,6 @@
 `tests/malformed.py` has the files and what must be true; `make fuzz` looks for more.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -66,8 +64,6 @@ def refused(found):
     return isinstance(found, InputError)
 
 
-# --- morphologies ---------------------------------------------------------------------------------
-
 ROBOT = """
 id: mixed
 body:
@@ -104,8 +100,6 @@ def test_morphologies(folder, mutant):
     body.save(path)
     assert load_morphology(path) == body
 
-
-# --- module catalogues ----------------------------------------------------------------------------
 
 CATALOGUE = """
 modules:
@@ -159,8 +153,6 @@ def test_catalogues(folder, mutant):
     check_finite([dataclasses.asdict(kind) for kind in kinds.values()])
     assert all(kind.mass >= 0 for kind in kinds.values())
 
-
-# --- worlds ---------------------------------------------------------------------------------------
 
 WORLDS = (
     """
@@ -218,8 +210,6 @@ def test_worlds(folder, mutant):
     check_finite(json.loads(json.dumps(plain, default=dataclasses.asdict)))
 
 
-# --- configurations -------------------------------------------------------------------------------
-
 CONFIGS = tuple((ROOT / "configs" / f"{name}.yaml").read_text().replace("../morphologies/", "")
                 for name in ("lake_swim", "auv_hold_depth", "lake_map_elites"))  # fmt: skip
 # What only a strategy, a genotype or a user's own function knows.
@@ -267,8 +257,6 @@ def test_configurations(folder, mutant):
     assert load_config(folder / "again.yaml").model_dump() == config.model_dump()
 
 
-# --- brains ---------------------------------------------------------------------------------------
-
 GENES = """
 score: 0.5
 score_std: 0.1
@@ -310,9 +298,6 @@ def test_brains(folder, mutant):
 
 # Files that genes may name as their configuration.
 NAMED = ("own.py", ".", "/", "elbow.yaml")
-
-
-# --- run folders ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """Tasks and controllers in users' own files: every mistake is one line, and runs keep the code."""
 
-from __future__ import annotations
-
 import json
 import shutil
 
@@ -25,8 +23,6 @@ from mjx_revolve.view.report.repeat import repeat_commands
 
 OWN = '''
 """A task and a controller of one's own."""
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -100,9 +96,6 @@ def lab(tmp_path_factory):
     return make_fitness(folder / "swim.yaml", **{"task.params": {"height": 0.25}})
 
 
-# ------------------------------------------------------------------------- what they do
-
-
 @pytest.mark.slow
 def test_an_own_task_scores_what_an_own_controller_does(lab):
     scores, measures = lab.evaluate(GENES, jax.random.key(0))
@@ -129,9 +122,6 @@ def test_a_changed_file_is_read_anew_and_an_unchanged_one_is_not(folder):
     assert own_code.load_user_function(name, "task.type") is first
     (folder / "mine" / "own.py").write_text(OWN.replace("wish.height", "2 * wish.height"))
     assert own_code.load_user_function(name, "task.type") is not first
-
-
-# ------------------------------------------------------------------------- mistakes
 
 
 def check_line(message, action):
@@ -177,9 +167,6 @@ def test_wrong_controllers(folder, old, new, message):
     assert old in OWN
     own.write_text(OWN.replace(old, new))
     check_line(message.format(own=own), lambda: make_fitness("swim.yaml"))
-
-
-# ------------------------------------------------------------------------- runs
 
 
 def test_a_run_keeps_the_code(folder):

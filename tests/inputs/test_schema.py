@@ -1,7 +1,5 @@
 """Checked values: what they take, and every kind of complaint in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 from typing import Annotated, Any, Literal

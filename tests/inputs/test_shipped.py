@@ -1,7 +1,5 @@
 """Names of shipped files: where a path is taken, a name will do."""
 
-from __future__ import annotations
-
 import os
 import shutil
 

@@ -1,7 +1,5 @@
 """A stranger's run folder: what is run and read because of it, and what its names can do."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

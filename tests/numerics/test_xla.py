@@ -1,7 +1,5 @@
 """The compiler tricks: identities to JAX, and noticed when XLA stops taking them."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 

@@ -103,9 +103,6 @@ def show(*folders):
     return report_page.make_report([read_run(folder) for folder in folders])
 
 
-# --- who lived ---
-
-
 def test_lives_are_read_back(run):
     lives, problems = read_individuals(run)
     assert problems == [] and list(lives) == [0, 1, 2, 3, 4, 5]
@@ -187,9 +184,6 @@ def test_numbers_are_checked(run, tmp_path):
         load_episode(run, individual=1)
 
 
-# --- pictures ---
-
-
 def test_pictures_have_one_scale_and_fit():
     small, large = (make_morphology(body(hinges), MODULES) for hinges in (1, 4))
     together = draw_bodies([small, large])
@@ -224,9 +218,6 @@ def test_sizes_over_the_generations(run):
     assert np.allclose(mean.get_ydata(), [2.0, 5 / 3, 2.0])
     assert best.get_ydata().tolist() == [2.0, 2.0, 3.0]
     assert plot_descriptors(read_population(Path("/nowhere"))[0]) is None
-
-
-# --- the page ---
 
 
 @pytest.mark.slow
@@ -328,9 +319,6 @@ def test_best_individual_stands_in_for_a_lost_champion(run):
     assert record.stand_in == "best individual in individuals.jsonl, number 5"
     assert record.individual == 5 and record.genes.shape == (10,)
     assert report_page._champions_body(record, record.config).num_hinges == 3
-
-
-# --- commands ---
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """The page on how to build a robot: its numbers by MuJoCo and by building what it says."""
 
-from __future__ import annotations
-
 import base64
 import html
 import io

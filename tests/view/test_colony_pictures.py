@@ -39,9 +39,6 @@ def history():
     return make_history(EVENTS, {0: 0.1, 2: 0.3}, 60.0)
 
 
-# --- logs ---
-
-
 def test_events_are_read_back(tmp_path):
     """Damaged lines are left out and counted; one that is being written is no damage."""
     base = {"id": 0, "place": [1, 2, -1]}
@@ -79,9 +76,6 @@ def test_history_by_hand(history):
     assert history.spans[2].score == 0.3 and np.isnan(history.spans[1].score)
 
 
-# --- pictures ---
-
-
 def test_births_and_deaths_add_up(history):
     """Bars upwards are the births, those downwards the deaths."""
     top, low = plot_population(history, 8).axes
@@ -109,8 +103,6 @@ def test_empty_and_odd_histories_are_drawn():
                        plot_arena(history, colony)):  # fmt: skip
             assert figure_png(figure).startswith(b"\x89PNG")
 
-
-# --- a run ---
 
 SETTINGS = {
     "trim": "neutral",

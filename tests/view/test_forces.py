@@ -1,7 +1,5 @@
 """Forces on parts: closed forms, and the sum that the engines' step makes of them."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest
@@ -47,9 +45,6 @@ def states(robot: Robot, qpos, qvel=None, ctrl=None, command=None, time=None) ->
 
 def pose(x=0.0, y=0.0, z=-5.0, quat=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:
     return np.array([x, y, z, *quat])
-
-
-# ------------------------------------------------------------------------- closed forms
 
 
 def test_buoyancy_of_what_is_under_water():
@@ -121,9 +116,6 @@ def test_thrust_of_the_auv():
     assert not forces.thrust[0, others].any()
 
 
-# ------------------------------------------------------------------------- moving water
-
-
 def test_water_of_its_time():
     """Waves go on with time, a current's rows with the steps: drag sees the water of the moment."""
     sea = world(drag="faces", gravity=G, waves=[{"amplitude": 0.05, "wavelength": 2.0}])
@@ -151,8 +143,6 @@ def test_a_current_that_speeds_up_pushes():
     force = module_forces(robot, states(robot, pose()), water=water).buoyancy[0, 0]
     assert force == pytest.approx(RHO * np.prod(BRICK) * np.array([0.5, 0, G - 1]), rel=1e-5)
 
-
-# ------------------------------------------------------------------------- the step's sum
 
 _SEA = {
     "current": (0.2, -0.1, 0.0),
@@ -204,9 +194,6 @@ def test_sum_is_what_the_step_does(laws):
         for q, v, a in zip(qpos.T, qvel.T, acceleration.T, strict=True)
     ]
     assert total == pytest.approx(np.array(expected), rel=1e-3, abs=2e-4)
-
-
-# ------------------------------------------------------------------------- rows and mistakes
 
 
 @pytest.mark.parametrize("every", [0, 1.5])

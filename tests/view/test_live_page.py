@@ -1,7 +1,5 @@
 """A running world in a browser: the simulation, its server, its page, and its catalogue."""
 
-from __future__ import annotations
-
 import _thread
 import base64
 import http.client
@@ -89,9 +87,6 @@ def poses_of(data):
     return {
         key: part.reshape(len(data["t"]), -1) for key, part in zip(data["keys"], parts, strict=True)
     }
-
-
-# --------------------------------------------------------------------- the simulation
 
 
 def test_poses_are_those_of_the_tank(entries):
@@ -206,9 +201,6 @@ def test_commands_are_checked(data, match):
     with pytest.raises(InputError, match=match) as error:
         read_command(data)
     assert "\n" not in str(error.value)
-
-
-# --------------------------------------------------------------------- the server
 
 
 @pytest.fixture(scope="module")
@@ -346,9 +338,6 @@ def test_the_stream(served):
         assert all(rows[:, 2] == pytest.approx(-1, abs=1e-5) for rows in poses_of(data).values())
 
 
-# --------------------------------------------------------------------- the catalogue
-
-
 def test_the_stock_of_a_run(tmp_path):
     """Champion and individuals, the best first, with their genes; then shipped robots."""
     catalogue = load_catalogue([str(make_run(tmp_path / "run"))])
@@ -390,9 +379,6 @@ def test_what_cannot_be_dropped(tmp_path, monkeypatch, paths, match):
     settings.write_text(settings.read_text().replace('"sine"', '"cpg"'))
     with pytest.raises(InputError, match=match):
         load_catalogue(paths)
-
-
-# --------------------------------------------------------------------- the command
 
 
 def test_ctrl_c_ends_it(monkeypatch, capsys):
@@ -442,9 +428,6 @@ def test_a_port_that_is_taken(catalogue, served, monkeypatch, capsys):
     port = str(served.server_address[1])
     assert run_command(live.main, ["snake", "--port", port]) == 1
     assert f"port {port}: " in capsys.readouterr().err
-
-
-# --------------------------------------------------------------------- MuJoCo's viewer
 
 
 def test_the_scene_has_everybody_where_they_are(entries):
@@ -500,9 +483,6 @@ def test_keys_of_the_window(entries):
         assert len(simulation.robots) == 1 and not simulation.paused
 
 
-# --------------------------------------------------------------------- the true tank
-
-
 @pytest.mark.slow
 def test_a_true_tank(monkeypatch):
     """A neutral snake that keeps still goes with the water, once that has taken it along."""
@@ -530,8 +510,6 @@ def test_a_true_tank(monkeypatch):
         simulation.stop()
         thread.join(300)
 
-
-# --------------------------------------------------------------------- in a browser
 
 FACTS = "(document.documentElement?.dataset ?? {})"
 

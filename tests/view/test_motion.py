@@ -1,7 +1,5 @@
 """What a robot did, as plain values: known swims against what the analysis says of them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -47,9 +45,6 @@ def sine(elbow):
     phases = np.outer(2 * np.pi * TIME / PERIOD, [1, -1])
     trajectory = episode(elbow, TIME, qpos, ctrl=ctrl, power=np.full(len(TIME), 2.0))
     return analyse_motion(elbow, trajectory, counted_from=2.0, phases=phases)
-
-
-# ------------------------------------------------------------------ a known swim
 
 
 def test_how_fast_how_far_and_where_to(elbow, sine):
@@ -106,9 +101,6 @@ def test_a_task_counts_from_its_first_record():
     assert counted_time(
         TaskConfig(type="speed", duration=10.0, settle=2.0), 0.005
     ) == pytest.approx(2.1)
-
-
-# ------------------------------------------------------------------ paths and strokes
 
 
 def test_poses_are_spread_over_the_way():

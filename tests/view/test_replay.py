@@ -1,7 +1,5 @@
 """Films: what they show and when, how they are drawn and written, and the command."""
 
-from __future__ import annotations
-
 import io
 import math
 import os
@@ -43,9 +41,6 @@ STEP = 0.005
 SIZE = (160, 120)
 
 
-# --- an episode without a simulation ------------------------------------------------------------
-
-
 def swim(robot, seconds=1.0, velocity=(0.2, 0.1, 0.0), depth=1.0):
     """The robot carried along at a constant velocity, flapping."""
     time = STEP * np.arange(1, round(seconds / STEP) + 1)
@@ -78,9 +73,6 @@ def frames(episode, way):
     """A drawn film, and what it was drawn from."""
     film = make_film(episode, SIZE, 10)
     return film, list(draw_frames(film, way))
-
-
-# --- the camera ---------------------------------------------------------------------------------
 
 
 def plan(path, radius=0.2, surface=0.0, bed=None, aspect=4 / 3, **kw):
@@ -153,9 +145,6 @@ def test_what_floats_is_filmed_from_the_air():
     assert_in_frame(shots, path, 0.2)
 
 
-# --- the stage ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["spider", "auv", "fish"])
 def test_stage_stands_as_the_robot_does(name):
     robot = build_robot(body(name), load_world("lake"))
@@ -216,9 +205,6 @@ def test_normals_are_sharp_on_a_cube_and_smooth_on_a_pipe():
     assert (pipe.vertex_normals[pipe.faces][side] * outward).sum(-1) == pytest.approx(1, abs=0.01)
 
 
-# --- the water's light --------------------------------------------------------------------------
-
-
 def test_water_takes_red_first():
     clear = np.asarray(transmission(0.0, 1.0))
     assert clear == pytest.approx([1, 1, 1])
@@ -263,9 +249,6 @@ def test_from_the_air_what_is_deep_is_dimmer():
     assert dry[12, 16] == pytest.approx([200, 60, 40], abs=4)
     assert dry[..., 0].mean() > shallow[..., 0].mean() > deep[..., 0].mean() + 20
     assert deep[..., 2].mean() > deep[..., 0].mean()
-
-
-# --- films --------------------------------------------------------------------------------------
 
 
 def test_frames_are_evenly_spaced_and_between_the_rows(episode):
@@ -343,9 +326,6 @@ def test_the_bed_shows_where_it_is_near(spider, way):
     frame = next(iter(draw_frames(film, way)))
     low = frame[95:110, 60:].reshape(-1, 3).mean(0)
     assert low[0] > 80  # sand is no water
-
-
-# --- files --------------------------------------------------------------------------------------
 
 
 def moving_dot(count=30, size=SIZE):
@@ -427,9 +407,6 @@ def test_current_and_target_are_shown():
     assert (
         "target, 1.8 m" in signs(2, rows=moving)[0] and "target, 1.1 m" in signs(9, rows=moving)[0]
     )
-
-
-# --- colonies -----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -550,9 +527,6 @@ def test_the_command_films_a_colony(colony, way, tmp_path, monkeypatch, capsys):
         stream = file.streams.video[0]
         assert sum(1 for _ in file.decode(stream)) == 15
         assert (stream.width, stream.height) == SIZE
-
-
-# --- the command --------------------------------------------------------------------------------
 
 
 @pytest.fixture

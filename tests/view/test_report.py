@@ -117,9 +117,6 @@ def run_main(*argv):
     return run_command(report.main, [str(word) for word in argv])
 
 
-# --- groups ---
-
-
 @pytest.mark.slow
 def test_seeds_are_grouped_and_configurations_told_apart(lab, tmp_path):
     config, fitness, folder = lab["config"], lab["fitness"], lab["folder"]
@@ -168,9 +165,6 @@ def test_the_best_run_is_the_best_judged_one(lab, tmp_path):
     (group,) = group_runs([read_run(tmp_path / f"{seed}") for seed in range(3)])
     assert group.best().seed == 1
     assert group.scores() == [0.2, 0.3]
-
-
-# --- reading what is left ---
 
 
 def cut(path, share=0.5):
@@ -267,9 +261,6 @@ def test_a_folder_of_damaged_files_is_refused_with_the_reason(copy):
         read_run(copy)
 
 
-# --- the champion ---
-
-
 def test_the_replay_scores_as_evolution_did(lab, copy):
     replay = lab["replay"]
     assert replay.score == lab["score"]
@@ -304,9 +295,6 @@ def test_phases_of_oscillators_without_neighbours_turn_evenly(lab):
     way = np.tile(np.arange(10) / 10, 10)[:, None]
     expected = before.repeat(10, axis=0) + way * (commands - before).repeat(10, axis=0)
     assert np.allclose(trajectory.ctrl[:100], expected, atol=1e-4)
-
-
-# --- pictures ---
 
 
 def axes_of(figure):
@@ -397,9 +385,6 @@ def test_pictures_are_the_same_bytes_twice():
     assert b"<text" not in first  # no fonts needed
 
 
-# --- tables and commands ---
-
-
 def test_modules_are_counted_and_weighed():
     elbow = read(ELBOW)
     rows, foot = tables.count_modules(elbow)
@@ -445,9 +430,6 @@ def test_a_command_that_no_longer_fits_is_not_shown(lab, copy):
     runs.RunFolder(copy).update_info(xla_flags="--a --b", threads={"OPENBLAS_NUM_THREADS": "2"})
     ((_, command),) = report_repeat.repeat_commands(read_run(copy))
     assert command.startswith("OPENBLAS_NUM_THREADS=2 XLA_FLAGS='--a --b' python -m ")
-
-
-# --- the page ---
 
 
 class Page(HTMLParser):

@@ -1,7 +1,5 @@
 """What a champion felt, over time: what its brain was told, and the picture of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

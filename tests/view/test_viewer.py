@@ -1,7 +1,5 @@
 """Replay pages of episodes and colonies: what they receive, and what a real browser makes of it."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math
@@ -123,9 +121,6 @@ def bend(tree, qpos):
         hinge = rotation([np.cos(half), *np.sin(half) * axis])
         found.append((place + turn @ x[:3], turn @ rotation(x[3:7]) @ hinge))
     return found
-
-
-# --------------------------------------------------------------------- meshes and poses
 
 
 @pytest.mark.parametrize("name", ["spider", "snake", "gecko"])
@@ -256,9 +251,6 @@ def test_a_page_keeps_as_many_poses_as_fit(robots, tmp_path):
         assert time[[0, -1]] == pytest.approx(one.time[[0, -1]])
 
 
-# --------------------------------------------------------------------- episodes
-
-
 def test_an_episode_is_a_colony_of_one(episode, data):
     """Fifty poses a second of one robot, and its heading."""
     q = np.asarray(episode.trajectory.qpos)
@@ -379,9 +371,6 @@ def test_stops_where_numbers_end():
         episode_data(replace(episode, trajectory=replace(episode.trajectory, qvel=qvel)))
 
 
-# --------------------------------------------------------------------- files
-
-
 @pytest.fixture(scope="module")
 def page(episode, tmp_path_factory):
     path = tmp_path_factory.mktemp("viewer") / "new" / "spider.html"
@@ -435,8 +424,6 @@ def test_poses_are_checked(robots, tmp_path, time, change, match):
         write_colony_page([one], tmp_path / "page.html", "wrong")
     assert not list(tmp_path.iterdir())
 
-
-# --------------------------------------------------------------------- in a browser
 
 SIZE = (480, 300)
 
@@ -588,9 +575,6 @@ def test_the_browser_poses_robots_as_mujoco_does(browser, colony, robots):
     assert bones[:, :3] == pytest.approx(expected.position[0, 1:], abs=2e-5)
     quat = expected.quaternion[0, 1:][:, [1, 2, 3, 0]]
     assert np.abs((bones[:, 4:] * quat).sum(1)) == pytest.approx(1, abs=1e-5)
-
-
-# --------------------------------------------------------------------- the command line
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Added mass: Lamb's coefficients, Kirchhoff's equations, and what they conserve."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest
@@ -22,9 +20,6 @@ from references import Lagrangian
 
 RHO = 999.1026
 SIZE = (0.12, 0.08, 0.03)  # its carried water weighs from 0.2 to 1.6 times what it displaces
-
-
-# ------------------------------------------------------------------------- coefficients
 
 
 def test_sphere():
@@ -53,9 +48,6 @@ def test_a_box_is_the_ellipsoid_of_its_volume_and_proportions():
     assert box_added_mass(half)[0] == pytest.approx(lamb_coefficients(semi)[0])
     cube, _ = box_added_mass(np.full(3, 0.5))
     assert cube == pytest.approx(0.5)
-
-
-# ------------------------------------------------------------------------- one body
 
 
 def deep_box(**fields):
@@ -122,9 +114,6 @@ def test_conservation_over_a_rollout():
     assert drift[1] < 0.05
     # The angular impulse takes the place half a step late, so it is first order.
     assert drift[1] / drift[2] == pytest.approx(2.0, abs=0.4)
-
-
-# ------------------------------------------------------------------------- jointed bodies
 
 
 def check_lagrange(robot, lanes, seed=0):

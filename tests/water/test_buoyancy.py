@@ -1,7 +1,5 @@
 """Buoyancy: the cut box against exact geometry, and robots that fall, hover, float and bob."""
 
-from __future__ import annotations
-
 import itertools
 from functools import lru_cache, partial
 
@@ -63,9 +61,6 @@ def attitudes(n, seed=0):
         rows = np.arange(k * n // 4, n // 2)
         up[rows, draw.integers(0, 3, len(rows))] *= 10 ** draw.uniform(-12, 0, len(rows))
     return up / np.linalg.norm(up, axis=1)[:, None]
-
-
-# ------------------------------------------------------------------------- the cut box
 
 
 def test_the_reference_itself_against_counting_points():
@@ -302,9 +297,6 @@ def test_archimedes_and_the_lever_of_the_centre_of_volume():
     assert np.array(force, float) == pytest.approx(lift * np.array(up))
     arm = np.array([0.003, 0.0, 0.01]) + np.array([0.0, 0.0, -0.01]) / 0.5
     assert np.array(torque, float) == pytest.approx(np.cross(arm, lift * np.array(up)))
-
-
-# ------------------------------------------------------------------------- hovering and floating
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Chains and rods: oblique flow, turning, friction, wakes; what is compact has its faces' drag."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Drag: falls and coasts in closed form, MuJoCo's own laws, Gazebo's plate, no free energy."""
 
-from __future__ import annotations
-
 import jax
 import mujoco
 import numpy as np
@@ -25,7 +23,6 @@ from mjx_revolve.water.mujoco_drag import (
 RHO = 999.1026
 G = 9.81
 BRICK = ((0.041, 0.041, 0.0355), 0.0102 + 0.005, 1.07e-5)  # with 5 g of ballast, or it floats
-# ------------------------------------------------------------------------- falling and coasting
 
 
 @pytest.mark.parametrize("added_mass", [False, True])
@@ -65,9 +62,6 @@ def test_face_coefficients_against_strips():
         assert angular[i] == pytest.approx(total, rel=1e-6)
 
 
-# ------------------------------------------------------------------------- no free energy
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("drag", ["faces", "lift_drag"])
 def test_drag_takes_energy_from_a_jointed_body(drag, arm):
@@ -86,9 +80,6 @@ def test_drag_takes_energy_from_a_jointed_body(drag, arm):
     worked = np.array(worked)
     assert np.all(worked <= 1e-9)
     assert worked.min() < -1e-3
-
-
-# ------------------------------------------------------------------------- stability
 
 
 def test_absurd_speeds_slow_down():
@@ -111,9 +102,6 @@ def test_a_jointed_body_slows_down_from_more_than_it_can_reach():
     _, _, after, _ = march(robot, 1.0, qpos, qvel)
     assert np.all(np.isfinite(after))
     assert np.linalg.norm(after[-1, :3], axis=0).max() < 0.3
-
-
-# ------------------------------------------------------------------------- MuJoCo's own laws
 
 
 def test_a_body_that_displaces_nothing_has_the_inertia_boxs_drag():

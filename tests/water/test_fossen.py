@@ -1,7 +1,5 @@
 """Added mass and damping that modules state themselves, and coefficients per axis."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """The tables of laws: what a law must say before it may stand in them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax
@@ -125,9 +123,6 @@ def test_no_law_adds_energy_and_padding_has_no_effect(law):
             assert not np.any(x)
         angular = law.angular(blank) if law.angular else ()
         assert not np.any(angular)
-
-
-# ------------------------------------------------------------------------- a law of one's own
 
 
 @law_numbers

@@ -1,7 +1,5 @@
 """Gazebo's LiftDrag: against its source, by hand at chosen angles, its limits and its step."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -49,9 +47,6 @@ def turn(rotation, *vectors):
 def rotation_of(seed):
     q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     return q * np.sign(np.linalg.det(q))
-
-
-# ------------------------------------------------------------------------- Gazebo's own arithmetic
 
 
 def unit(x):
@@ -144,9 +139,6 @@ def test_named_departures():
     )
 
 
-# ------------------------------------------------------------------------- values by hand
-
-
 def test_pitching_moment():
     """About n = forward × upward, nose up: slope α q A up to the stall, then the other slope."""
     p = LiftDrag(cma=0.3, alpha_stall=0.4, cma_stall=-0.5)
@@ -194,9 +186,6 @@ def test_each_plate_its_own_numbers():
                 assert a == pytest.approx(b, abs=digits)
 
 
-# ------------------------------------------------------------------------- energy and damping
-
-
 @pytest.mark.parametrize("plate", PLATES)
 def test_never_adds_energy(plate):
     """Lift stands across the flow in the plate's plane, drag against it."""
@@ -226,9 +215,6 @@ def test_damping_is_never_less_than_the_slope(plate):
         bound = np.asarray(lift_drag_damping(flows, tuple(X), tuple(Z), AREA, RHO, p))
     assert np.all(bound >= 0)
     assert np.max(steepest / bound) <= 1
-
-
-# ------------------------------------------------------------------------- gradients
 
 
 @pytest.mark.parametrize("plate", PLATES)
@@ -289,9 +275,6 @@ def test_finite_everywhere(plate, dtype):
         assert np.abs(value[2, :6]).max() == 0  # along the span
 
 
-# ------------------------------------------------------------------------- parameters
-
-
 def test_gazebo_defaults():
     p = LiftDrag()
     assert (p.a0, p.cla, p.cda, p.cma) == (0, 1, 0.01, 0)
@@ -318,9 +301,6 @@ def test_wrong_parameters(fields, message):
     with pytest.raises(InputError) as found:
         LiftDrag(**fields)
     assert message in str(found.value)
-
-
-# ------------------------------------------------------------------------- in the water
 
 
 SIZE, MASS = (0.1, 0.06, 0.004), 0.1

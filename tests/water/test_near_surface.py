@@ -1,7 +1,5 @@
 """Added mass of what floats, and the waves that it radiates."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

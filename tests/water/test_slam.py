@@ -1,7 +1,5 @@
 """Bodies that enter and leave the water: who keeps the carried water's momentum and energy."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import jax
@@ -96,9 +94,6 @@ def tilted(lanes, height):
     return np.concatenate([np.zeros((2, lanes)), height, quat / np.linalg.norm(quat, axis=0)])
 
 
-# ------------------------------------------------------------------------- energy
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.02, 0.005])
 def test_a_box_that_bobs_and_tumbles_gains_no_energy(dt):
@@ -181,9 +176,6 @@ def test_a_jointed_body_gains_none_either():
     # First order: the bodies turn by the momenta of half a step before.
     assert found[1] < 0.02
     assert found[1] < 0.7 * found[0]
-
-
-# ------------------------------------------------------------------------- momentum
 
 
 @pytest.mark.slow

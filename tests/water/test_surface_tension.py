@@ -1,7 +1,5 @@
 """Surface tension on a box: the textbook's pull at upright walls, one energy, nothing far away."""
 
-from __future__ import annotations
-
 import itertools
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Thrusters: lag, curves and torque in closed form, in both precisions, with their gradients."""
 
-from __future__ import annotations
-
 import math
 
 import jax
@@ -35,9 +33,6 @@ def curve(name: str) -> Thruster:
     return ALL[name] or MODULES["Thruster"].parts[0].thruster
 
 
-# ------------------------------------------------------------------------- lag
-
-
 @pytest.mark.parametrize("dt", [0.005, 1.0])
 def test_a_step_passes_the_lag_as_an_exponential(dt):
     """s(t) = x (1 - e^(-t/τ)), whatever the step; rounding alone, of at most 200 steps."""
@@ -46,9 +41,6 @@ def test_a_step_passes_the_lag_as_an_exponential(dt):
     for _ in range(200):
         state, time = first_order_lag(state, asked, tau, dt), time + dt
         assert state == pytest.approx(asked * (1 - math.exp(-time / tau)), rel=1e-12)
-
-
-# ------------------------------------------------------------------------- curves
 
 
 def test_basic_thrust_goes_with_the_square_of_the_command():
@@ -107,9 +99,6 @@ def test_gradients_are_finite_everywhere_and_true_off_the_corners(name):
             return ideal_power(push(asked), 5e-4, 1000.0)
 
         assert np.isfinite(jax.vmap(jax.grad(power))(corners)).all()
-
-
-# ------------------------------------------------------------------------- power
 
 
 def test_ideal_power_is_thrust_times_the_speed_in_the_disc():

@@ -1,7 +1,5 @@
 """Laws that remember: plates that swing, fins whose lift lags behind their angle."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 
@@ -72,9 +70,6 @@ def past(law, numbers, velocities, dt):
 
     first = (jnp.zeros(()),) * law.memory
     return jax.lax.scan(step, first, jnp.asarray(velocities))
-
-
-# ------------------------------------------------------------------------- plates
 
 
 def test_thin_parts_alone_are_plates():
@@ -160,9 +155,6 @@ def test_a_plate_in_pieces_is_one_plate():
         assert float(half.faces[0]) == pytest.approx(float(whole.faces[0]) / 2)
 
 
-# ------------------------------------------------------------------------- fins
-
-
 @pytest.mark.parametrize("frequency", [0.1, 1.5])
 def test_a_fins_lift_lags_as_theodorsens_function_says(frequency, fin):
     """In small heave, lift over the quasi-steady one is C(k), k = ω c / 2 U, within 3 %."""
@@ -201,9 +193,6 @@ def test_a_fin_in_steady_flow_lifts_as_before_and_its_drag_follows(fin):
     assert drag == pytest.approx(lift * np.tan(angle) + friction, rel=1e-3)
     plain = LIFT_DRAG.force(PartFlow(tuple(velocity), (0.0,) * 3, 1.0), fin, WATER).force
     assert force @ across == pytest.approx(np.array(plain) @ across, rel=1e-4)
-
-
-# ------------------------------------------------------------------------- both, in the engine
 
 
 @pytest.mark.parametrize("law", [PLATE_WAKE, FIN_WAKE], ids=lambda law: law.name)

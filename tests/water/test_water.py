@@ -1,7 +1,5 @@
 """The water's own motion against its closed forms: waves, shear, velocities on a grid, gusts."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,9 +56,6 @@ def differences(function, place, d=1e-5):
     return np.stack([(function(place + s) - function(place - s)) / (2 * d) for s in steps])
 
 
-# ------------------------------------------------------------------------- what is absent
-
-
 def test_still_water_costs_nothing():
     """Plain numbers in, plain numbers out: nothing reaches the compiled step."""
     world = make_world(waves={"amplitude": 0, "wavelength": 3})
@@ -101,9 +96,6 @@ def test_all_motion_adds_up():
     assert zero.any() == 0
     assert np.allclose(velocity, current + sum(v for v, _ in alone), rtol=0, atol=1e-14)
     assert np.allclose(push, acceleration + alone[2][1], rtol=0, atol=1e-13)
-
-
-# ------------------------------------------------------------------------- waves
 
 
 @pytest.mark.parametrize("relative", [1e-3, 0.5, 3.0, 30.0])
@@ -215,9 +207,6 @@ def test_waves_are_carried_by_the_worlds_current():
     assert np.allclose(acceleration, moving(still, place, time)[1], rtol=0, atol=1e-12)
 
 
-# ------------------------------------------------------------------------- shear
-
-
 @pytest.mark.parametrize(
     ("shear", "depth", "share"),
     [
@@ -247,9 +236,6 @@ def test_shear_profiles(shear, depth, share):
     z = 0 * z - 7
     lanes = {"surface_height": jnp.asarray(z + np.asarray(depth), float)}
     assert np.allclose(moving(world, (0 * z, 0 * z, z), **lanes)[0], expected, rtol=0, atol=1e-6)
-
-
-# ------------------------------------------------------------------------- a grid
 
 
 EVEN = (np.linspace(-5, 5, 11), np.linspace(-3, 6, 4), np.linspace(-8, 0, 5))
@@ -312,9 +298,6 @@ def test_a_component_that_is_nowhere_costs_nothing():
     world = make_world(current_field=field)
     velocity, _ = flow(world, water_of(world), *jnp.asarray(places()))
     assert isinstance(velocity[2], float)
-
-
-# ------------------------------------------------------------------------- any state
 
 
 WORLDS = {
@@ -390,9 +373,6 @@ def test_gradients_against_differences(name):
         found = jnp.stack(jax.vmap(jax.jacfwd(velocity, argnums=(0, 1, 2)))(x, y, z))
     expected = differences(lambda p: moving(world, p)[0], place)
     assert np.allclose(np.moveaxis(found, 1, 2), expected, rtol=0, atol=1e-7)
-
-
-# ------------------------------------------------------------------------- gusts
 
 
 STD = np.array([0.3, 0.1, 0.02])

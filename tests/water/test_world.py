@@ -1,7 +1,5 @@
 """Worlds: the two that ship, users' own, overrides, every wrong input, and the lake's shape."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -36,9 +34,6 @@ def count(kind) -> int:
 DOWN = "gravity: expected a number, or (0, 0, -g), since the surface is level [m/s2]; found"
 UNKNOWN = "found an unknown key; did you mean"
 LAKE = load_world("lake").bed
-
-
-# ------------------------------------------------------------------------- reading
 
 
 @pytest.mark.parametrize("name", ["empty_underwater", "lake"])
@@ -139,9 +134,6 @@ def test_overrides(override, field, expected):
     assert getattr(water, field) == expected
     rest = {f.name for f in dataclasses.fields(World)} - {field}
     assert all(getattr(water, name) == getattr(load_world("lake"), name) for name in rest)
-
-
-# ------------------------------------------------------------------------- wrong inputs
 
 
 WRONG = [
@@ -260,9 +252,6 @@ def test_unknown_worlds(tmp_path):
         load_world(tmp_path / "none.yaml")
     with pytest.raises(InputError, match=r"^world: expected a name or a path; found 5$"):
         load_world(5)
-
-
-# ------------------------------------------------------------------------- velocities on a grid
 
 
 X, Y, Z = np.array([0.0, 1.0, 3.0]), np.array([-1.0, 2.0]), np.array([-4.0, -1.0])
@@ -408,9 +397,6 @@ def test_files_that_are_no_fields(tmp_path):
     for name in (*wrong, "folder.npz"):
         with pytest.raises(InputError, match=rf"{name}: expected .*; found:? [^\n]+$"):
             load_world("lake", current_field=tmp_path / name)
-
-
-# ------------------------------------------------------------------------- the bed
 
 
 def test_lake_extremes_are_exact():
